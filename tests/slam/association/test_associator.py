@@ -12,12 +12,14 @@ from recordings import building
 
 from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
-from evermap.slam.association.associator import Associator, fit_sighting_noise
+from evermap.slam.association.associator import Associator, compared, fit_sighting_noise
 from evermap.slam.association.identify import identified
+from evermap.slam.association.merging import propose_merges
 from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate
+from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, Landmarks
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
@@ -44,6 +46,57 @@ def test_a_small_world_is_sorted_out(seed: int) -> None:
     assert (scores.n_landmarks, scores.n_identities) == (8, 8)
     assert scores.purity == 1.0
     assert np.mean(row == NOBODY) < 0.02
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_of_the_odometry_is_learned_from_far_too_much(seed: int) -> None:
+    made = make_world(seed, n_poses=400, n_landmarks=8, prior=KNOWN_SENSORS)
+    associator = Associator(made.problem, replace(made.noise, odometry=4.0 * made.noise.odometry, pseudo_count=1.0))
+    for _ in made.problem.stamp_s:
+        associator.step()
+    learned = associator.learned_odometry(associator.finish())
+    driven = made.problem.drive.between(made.problem.stamp_s, made.truth.states)
+    found, true = (
+        np.sqrt(np.einsum("nkaa,k->a", driven.noise, sigma**2) / 399) for sigma in (learned, made.noise.odometry)
+    )
+    np.testing.assert_allclose(found, true, rtol=0.25)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_true_association_explains_most(seed: int) -> None:
+    made = world(seed)
+    associator = Associator(made.problem, made.noise)
+    for _ in made.problem.stamp_s:
+        associator.step()
+    found, rng = associator.finish(), np.random.default_rng(seed)
+    row, pose = found.landmark_row, found.measured.pose_row
+    late = (pose > 20) & (pose < 40)
+    swapped = np.where(late & (row == 0), 1, np.where(late & (row == 1), 0, row))
+    worse = [
+        replace(found, landmark_row=swapped),
+        replace(found, landmark_row=np.where(rng.random(len(row)) < 0.05, NOBODY, row)),
+        found.split([np.flatnonzero((row == 2) & (pose > 30))]),
+    ]
+    best = associator.against(found)
+    assert [associator.against(each) > best + 1.0 for each in worse] == [True] * 3
+    assert associator.against(worse[0]) > best + 100.0
+
+
+def test_one_landmark_that_is_five_becomes_one_again() -> None:
+    """Any two of the five pairs that say so follow from others: none of them is a rival to the rest."""
+    made = world(0)
+    associator = Associator(made.problem, made.noise)
+    for _ in made.problem.stamp_s:
+        associator.step()
+    found = associator.finish()
+    row, pose = found.landmark_row, found.measured.pose_row
+    broken = found.split([np.flatnonzero((row == 2) & (pose // 12 == part)) for part in range(1, 5)])
+    smoother = Smoother(broken.problem(), associator.noise, heavy=True)
+    marginals = smoother.marginals(broken.estimate)
+    assert broken.n_landmarks == found.n_landmarks + 4
+    everyone = np.ones(broken.n_landmarks, dtype=bool)
+    pairs = propose_merges(compared(broken, marginals, 0.1), probability=0.97, among=everyone, last=True, refused=set())
+    np.testing.assert_array_equal(broken.merged(pairs).landmark_row, row)
 
 
 def test_a_detection_of_nothing_is_nobodys() -> None:

@@ -25,6 +25,7 @@ from evermap.slam.filter_kernels import GATED
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
 from evermap.slam.motion import Motion
+from evermap.slam.noise import Extrapolation, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.sparse.system import exhausted
@@ -88,6 +89,8 @@ SPLIT_ROUNDS = 5
 """Times that contradictory visits are split off, at most."""
 CONTRADICTS = gates(1, 0.95)[1]
 """Squared distance of a visit from what is known without it, from which it is tried by itself."""
+NOISE_ROUNDS = 6
+"""Steps towards the noise of the odometry that the associated detections tell."""
 SAME_NATS = 0.5
 """By how much the cost must fall for as many landmarks: less is how far the optimum was iterated."""
 LAST_ROUNDS = 5
@@ -127,21 +130,24 @@ class Associator:
         problem: the measurements; its `landmark_row` is not looked at.
         noise: where the noise levels start.
         kind: (M, 2) class and name of every detection, `UNKNOWN` for none; None where there are none.
+        odometry: (5,) noise levels of the odometry, where they are known; None for `CAUTION` times those of `noise`.
     """
 
-    def __init__(self, problem: Problem, noise: Noise, kind: IntArray | None = None) -> None:
+    def __init__(
+        self, problem: Problem, noise: Noise, kind: IntArray | None = None, odometry: FloatArray | None = None
+    ) -> None:
         self._problem = problem
         self._kind = np.full((len(problem.pose_row), 2), UNKNOWN) if kind is None else kind
         self._of_kind: IntArray = np.zeros((0, 2), dtype=np.int64)
         self._seen_s = np.zeros(0)
         self._start_noise = noise
-        self.noise = replace(noise, odometry=CAUTION * noise.odometry)
+        self.noise = replace(noise, odometry=CAUTION * noise.odometry if odometry is None else odometry)
         """Noise levels that everything is solved with; detections carry their own."""
         self._slipping = replace(noise, odometry=SLIP * self.noise.odometry)
         self._first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
         self._pose = np.zeros((len(problem.stamp_s), 3))
         self._row: IntArray = np.full(len(problem.pose_row), NOBODY, dtype=np.int64)
-        self._sighting_noise = SightingNoise.constant(noise.detection)
+        self._sigma = INFLATION * SightingNoise.constant(noise.detection).of_detections(problem)
         self._filter = LocalFilter(problem.mount, problem.prior, most=MOST_COMPARED)
         self._done = 0
         self._next_stock = FIRST_STOCK
@@ -218,7 +224,7 @@ class Associator:
             self._go_on_from(again)
 
     def finish(self) -> Assignment:
-        """Settle everything processed so far."""
+        """Settle everything processed so far, and mend what was associated wrongly."""
         refused: set[tuple[int, int]] = set()
         solved = self._relaid(self._contradictions_split(self._settled(self._assignment()), refused))
         for _ in range(LAST_ROUNDS):
@@ -235,9 +241,41 @@ class Associator:
         assignment = assignment.without(_seldom(assignment))
         return assignment.without(~likely_real(assignment) & (assignment.told == 0))
 
+    def learned_odometry(self, assignment: Assignment) -> FloatArray:
+        """Return (5,) noise levels of the odometry by restricted likelihood, were all associations right.
+
+        Args:
+            assignment: what `finish` returned.
+        """
+        noise, ahead = self.noise, Extrapolation()
+        for _ in range(NOISE_ROUNDS):
+            solved = self._solved(assignment, noise)
+            assignment, smoother = solved.assignment, solved.smoother
+            inlier = smoother.inlier_probability(assignment.estimate)
+            fit = refine_noise(
+                assignment.problem(), assignment.estimate, solved.marginals, inlier, noise, self._start_noise
+            )
+            noise = replace(noise, odometry=ahead.ahead(noise, fit.noise).odometry)
+        return noise.odometry
+
+    def against(self, assignment: Assignment) -> float:
+        """Return the negative log likelihood [nats] of all detections under an assignment, up to a constant.
+
+        A detection of no landmark is as likely as an outlier of one. Comparable between assignments of one recording.
+
+        Args:
+            assignment: what `finish` returned, of this associator or another one of the same recording.
+        """
+        assignment = self._solved(assignment).assignment
+        solved = self._solved(replace(assignment, measured=self._with_sigma(assignment.measured)))  # its own noise
+        nobody = int((assignment.landmark_row == NOBODY).sum())
+        fit = solved.cost + float(np.log(solved.assignment.measured.sigma_given).sum())
+        told = float(_twice(assignment).sum()) + FEW_NATS * assignment.n_landmarks
+        return fit + self.noise.outlier_log_odds * nobody + told
+
     def _match(self, detections: IntArray) -> _Frame:
         """The frame's detections weighed against the landmarks known so far."""
-        sigma = INFLATION * self._sighting_noise.of_detections(self._problem)
+        sigma = self._sigma
         kind = self._kind[detections], self._of_kind
         pairings = pairings_of_frame(
             self._filter, self._problem, sigma, detections, density=self._density_m2, kind=kind
@@ -317,8 +355,7 @@ class Associator:
     def _with_sigma(self, measured: Problem) -> Problem:
         """Detections with the noise that has been learned."""
         count = len(measured.pose_row)
-        given = replace(measured, sigma_given=self._problem.sigma_given[:count])
-        return replace(measured, sigma_given=INFLATION * self._sighting_noise.of_detections(given))
+        return replace(measured, sigma_given=self._sigma[:count])
 
     def _without_chance(self, assignment: Assignment) -> Assignment:
         """Landmarks that were seen once or twice, long ago, were none."""
@@ -345,7 +382,7 @@ class Associator:
                 known = np.arange(now.n_landmarks) < now.n_landmarks - within[1]
                 among = known & (np.arange(now.n_landmarks) >= within[0])
             pairs = propose_merges(
-                compared(now, solved.marginals, density, at_once=within is not None), probability=P_MERGE,
+                compared(now, solved.marginals, density), probability=P_MERGE,
                 among=among, known=known, last=recent is None, refused=refused,
             )  # fmt: skip
             if not pairs and within is None and now.n_landmarks <= MOST_LAID:
@@ -424,22 +461,24 @@ class Associator:
             pairs = pairs[: len(pairs) // 2]
         return None
 
-    def _solved(self, assignment: Assignment) -> _Solved:
-        """Optimum, covariances and cost; learns the noise on the way."""
+    def _solved(self, assignment: Assignment, noise: Noise | None = None) -> _Solved:
+        """Optimum, covariances and cost; learns the noise of sightings on the way."""
         problem = assignment.problem()
-        smoother = Smoother(problem, self.noise, heavy=True)
+        noise = self.noise if noise is None else noise
+        smoother = Smoother(problem, noise, heavy=True)
         slices = smoother.solved_in_slices(assignment.estimate, iterations=8, tolerance=1e-3, settled=0.1)
         estimate, marginals = exhausted(slices)
         measured = assignment.measured
         given = self._problem.sigma_given[: len(measured.pose_row)]
         unknown = replace(problem, sigma_given=given[assignment.landmark_row >= 0])
         left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
-        self._sighting_noise = fit_sighting_noise(unknown, estimate, NOISE_FLOOR * self._start_noise.detection, left)
-        cost = smoother.under(self.noise, heavy=False).cost(estimate)
+        noise_of = fit_sighting_noise(unknown, estimate, NOISE_FLOOR * self._start_noise.detection, left)
+        self._sigma = INFLATION * noise_of.of_detections(self._problem)
+        cost = smoother.under(noise, heavy=False).cost(estimate)
         return _Solved(replace(assignment, estimate=estimate), marginals, cost, smoother)
 
 
-def compared(assignment: Assignment, marginals: Marginals, density: float, *, at_once: bool = False) -> Solution:
+def compared(assignment: Assignment, marginals: Marginals, density: float) -> Solution:
     """Return the landmarks of an assignment at its optimum, as `propose_merges` wants them."""
     place, kind, told = assignment.estimate.landmark, assignment.of_kind, assignment.told
 
@@ -462,7 +501,7 @@ def compared(assignment: Assignment, marginals: Marginals, density: float, *, at
 
     return Solution(
         place, marginals.landmark, differences, assignment.sightings, assignment.last_seen_s,
-        *assignment.seen_together(), kind, at_once,
+        *assignment.seen_together(), kind,
     )  # fmt: skip
 
 

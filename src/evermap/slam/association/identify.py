@@ -84,15 +84,23 @@ def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, k
     prepared = prepare(replace(recording, detections=replace(given, landmark_id=np.zeros_like(given.landmark_id))))
     problem = replace(prepared.problem, prior=prior.without_scale())
     name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
-    associator = Associator(problem, noise, np.column_stack([given.class_id, name])[prepared.used])
-    for _ in problem.stamp_s:
-        associator.step()
-    if keep_ids:
-        associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior))
-    assignment = associator.finish()
+    kind = np.column_stack([given.class_id, name])[prepared.used]
+
+    def finished(associator: Associator) -> Assignment:
+        for _ in problem.stamp_s:
+            associator.step()
+        if keep_ids:
+            associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior))
+        return associator.finish()
+
+    # how wrong the odometry is decides what may be one, and is known only afterwards: once more, with that
+    cautious = Associator(problem, noise, kind)
+    first = finished(cautious)
+    second = finished(Associator(problem, noise, kind, cautious.learned_odometry(first)))
+    assignment = min(first, second, key=cautious.against)
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
-    return Associated(row, name, assignment, associator.noise, prior)
+    return Associated(row, name, assignment, cautious.noise, prior)
 
 
 def _by_names(problem: Problem, name: IntArray, noise: Noise, prior: CalibrationPrior) -> FloatArray:

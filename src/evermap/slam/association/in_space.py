@@ -424,7 +424,7 @@ class SpatialAssociator:
         differences = _Differing(solved, SHARED_M**2 + (SHARED_SHARE * middle) ** 2, np.log(self._density * like), of)
         return Solution(
             solved.estimate.place[:, :3], own, differences, sightings, last_s,
-            *seen_together(self._view[used], row, int(self._view.max()) + 1, count), of, at_once=True,
+            *seen_together(self._view[used], row, int(self._view.max()) + 1, count), of,
         )  # fmt: skip
 
     def _wide_m(self) -> FloatArray:

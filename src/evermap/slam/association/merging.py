@@ -73,8 +73,6 @@ class Solution:
         sightings, last_seen_s: (L,) detections of each, stamp of the last.
         together, in_turn: (L, L) frames, see `seen_together`.
         kind: (L, P) class and name of each, `UNKNOWN` for none: different ones are never one.
-        at_once: True where nothing was merged on the way, so that many landmarks may be one: pairs that follow from
-            others are no evidence then, and no rivals.
     """
 
     place: FloatArray
@@ -85,7 +83,6 @@ class Solution:
     together: sparse.csr_array
     in_turn: sparse.csr_array
     kind: IntArray
-    at_once: bool = False
 
 
 def propose_merges(
@@ -180,9 +177,7 @@ def _agreed(
     younger, older = younger[inside], older[inside]
     conflict = _conflicts(younger, older, solution.together, solution.kind)
     ends = np.unique(np.column_stack([younger, older]), return_inverse=True)[1].reshape(-1, 2)
-    candidates = Candidates(
-        gap[inside], found.joint(inside), against[inside], conflict, ends if solution.at_once else None
-    )
+    candidates = Candidates(gap[inside], found.joint(inside), against[inside], conflict, ends)
     best: Consensus = consensus(candidates, gate=gates(1, CONFIDENCE, gap.shape[1])[1], loose=LOOSE_GATE)
     least = math.log(probability / (1.0 - probability)) if last or len(best.pairs) > FREE else FEW_NATS
     sure = best.pairs[best.margin >= least]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import TypeAlias, TypeVar
 
@@ -43,7 +44,7 @@ def exhausted(slices: Slices[_Result]) -> _Result:
             return result
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Factorised:
     """A least-squares problem with all but its border eliminated.
 
@@ -70,7 +71,7 @@ class Factorised:
             NumericalError: the border is not determined.
         """
         tree = self.system.tree
-        border = cho_solve(self._border(), self.right) if len(self.right) else self.right
+        border = cho_solve(self._border, self.right) if len(self.right) else self.right
         x = np.zeros(tree.begin[-1])
         for low, high, share in self.system.cuts(10.0 * tree.own * tree.size):
             back_substitute(tree, self.rows, self.own_right, border, x, low, high)
@@ -85,7 +86,7 @@ class Factorised:
         """
         if not len(self.right):
             return self.information
-        root = solve_triangular(self._border()[0], np.eye(len(self.right)), trans="T")
+        root = solve_triangular(self._border[0], np.eye(len(self.right)), trans="T")
         return np.asarray(root.T @ root)
 
     def spread(self, n_pairs: int = 0) -> Slices[Spread]:
@@ -111,7 +112,7 @@ class Factorised:
         ways, rest, _ = self._ways(variables, matrix)
         joint = ways @ ways.T
         if rest.size:
-            rest = solve_triangular(self._border()[0], rest.T, trans="T")
+            rest = solve_triangular(self._border[0], rest.T, trans="T")
             joint += rest.T @ rest
         return np.asarray(joint)
 
@@ -122,7 +123,7 @@ class Factorised:
         """
         first = np.concatenate([[0], np.cumsum(self.system.tree.dim[variables])])
         told, told_border, reached = self._ways(variables, matrix.T)
-        border = cho_solve(self._border(), told_border.T) if told_border.size else told_border.T
+        border = cho_solve(self._border, told_border.T) if told_border.size else told_border.T
         found = np.empty(matrix.shape)
         for at in range(0, len(variables), BATCH):
             some = variables[at : at + BATCH]
@@ -135,7 +136,7 @@ class Factorised:
     def columns(self, variables: IntArray) -> FloatArray:
         """Return (numbers, n) covariance of everything with some variables; the cost is that of n solutions."""
         ways, rest, reached = self._ways(variables)
-        border = cho_solve(self._border(), rest.T) if rest.size else rest.T
+        border = cho_solve(self._border, rest.T) if rest.size else rest.T
         return columns_of_inverse(self.system.tree, self.rows, ways, reached, border)
 
     def _ways(self, variables: IntArray, matrix: FloatArray | None = None) -> tuple[FloatArray, FloatArray, IntArray]:
@@ -146,6 +147,7 @@ class Factorised:
             self.system.tree, self.rows, self.system.node_of, wanted, np.ascontiguousarray(matrix, dtype=np.float64)
         )
 
+    @cached_property
     def _border(self) -> tuple[FloatArray, bool]:
         try:
             root, lower = cho_factor(self.information)
