@@ -202,7 +202,26 @@ Administrator = Annotated[str, _may(Role.ADMIN)]
 OfSite = Annotated[str | None, Query(pattern=f"^{SITE.pattern}$")]
 AtRevision = Annotated[int | None, Query(ge=0, le=2**31 - 1)]
 Number = Annotated[float | None, Query(allow_inf_nan=False)]
-router = APIRouter()
+
+
+class Problem(BaseModel):
+    """What is wrong, in one line."""
+
+    detail: str
+
+
+_PROBLEMS = {
+    400: "the body cannot be read",
+    401: "a token is needed",
+    403: "the token has not the role",
+    404: "there is no such thing",
+    409: "not as things are now",
+    413: "more bytes than an upload may have",
+    422: "a value is not valid",
+    429: "too many requests",
+    503: "the database does not answer",
+}
+router = APIRouter(responses={code: {"model": Problem, "description": what} for code, what in _PROBLEMS.items()})
 
 
 class Said(BaseModel):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from evermap.geometry import se2
-from evermap.maps.sessions.gaussian import WALK, log_ratio, settled
+from evermap.maps.sessions.gaussian import CONTRADICTS, WALK, log_ratio, settled
 from evermap.types import FloatArray
 
 
@@ -55,6 +55,8 @@ def test_the_metre_of_a_map_is_the_weighted_mean_of_those_of_its_sessions(
         found = settled(metre - true[k], shown[k] ** 2, (own[k], sigma[k]), variance, information)
         innovation = metre - true[k] - own[k]
         total = sigma[k] ** 2 + shown[k] ** 2 + 1.0 / information + WALK**2
+        assert found.off == pytest.approx(abs(innovation) / np.sqrt(total))
+        assume(found.off <= CONTRADICTS)
         weight = _by_all_sessions(true[: k + 1], shown[: k + 1], sigma[: k + 1])
         metre += np.log(found.map_factor)
         ours = np.array([true[0], *(true[j] + own[j] for j in range(1, k + 1))])
@@ -74,13 +76,33 @@ def test_sessions_of_one_robot_do_not_make_the_metre_surer(sigma: float, session
     variance, information = sigma**2, 1.0 / sigma**2
     gain = 1.0
     for _ in range(sessions):
-        found = settled(0.01, 1e-12, (0.0, sigma), variance, information)
+        found = settled(2.0 * sigma, 1e-12, (0.0, sigma), variance, information)
         assert found.variance == pytest.approx(sigma**2, rel=1e-6)
         # but what one of them says counts less and less, down to what the walk leaves
-        assert 0.0 < -np.log(found.map_factor) / 0.01 <= gain + 1e-12
-        gain = -np.log(found.map_factor) / 0.01
+        assert 0.0 < -np.log(found.map_factor) / (2.0 * sigma) <= gain + 1e-12
+        gain = -np.log(found.map_factor) / (2.0 * sigma)
         variance, information = found.variance, found.information
     assert gain >= WALK / (sigma + WALK) * 0.5
+
+
+@pytest.mark.parametrize("liar", [0, 2])
+@pytest.mark.parametrize("lie", [8.0, 12.0])
+def test_a_robot_whose_metre_contradicts_the_others_does_not_make_the_map_longer(liar: int, lie: float) -> None:
+    """Five robots in turn, one of them many standard deviations off; a map that begins with its metre comes round."""
+    sigma, rng = 0.02, np.random.default_rng(2)
+    robots = np.where(np.arange(5) == liar, lie * sigma, 0.2 * sigma * rng.standard_normal(5))
+    metre, variance, information = robots[0], sigma**2, 1.0 / sigma**2
+    contradicted = []
+    for turn in range(1, 40):
+        own = robots[turn % 5]
+        found = settled(metre - own, 1e-6, (0.0, sigma), variance, information)
+        metre += np.log(found.map_factor)
+        variance, information = found.variance, found.information
+        contradicted.append(turn % 5 if found.off > CONTRADICTS else -1)
+        if found.off > CONTRADICTS:
+            assert np.log(found.session_factor) == pytest.approx(metre - own)
+    assert abs(metre) < sigma
+    assert set(contradicted[10:]) == {-1, liar}
 
 
 @pytest.mark.parametrize("sigma", [0.005, 0.02, 0.1])
@@ -91,10 +113,10 @@ def test_a_session_that_knows_the_metre_settles_it(sigma: float) -> None:
         found = settled(0.0, 1e-8, (0.0, sigma), variance, information)
         variance, information = found.variance, found.information
     known = 1e-4
-    found = settled(0.03, 1e-10, (0.0, known), variance, information)
+    found = settled(1.5 * sigma, 1e-10, (0.0, known), variance, information)
     # weight of all that was known before: a walk's worth of information at the most
     rest = known**2 / WALK**2
-    assert found.map_factor == pytest.approx(np.exp(-0.03), rel=0.03 * 2.0 * rest)
+    assert found.map_factor == pytest.approx(np.exp(-1.5 * sigma), rel=1.5 * sigma * 2.0 * rest)
     assert np.sqrt(found.variance) <= known + rest * sigma + 1e-5
     # and the next that knows little does not spoil it by more than the walk
     after = settled(0.05, 1e-10, (0.0, sigma), found.variance, found.information)

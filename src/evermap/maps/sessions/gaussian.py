@@ -216,6 +216,8 @@ def of_unknown_size(own: OwnLandmarks, log_sigma: float) -> FloatArray:
 ITERATIONS = 5
 WALK = 0.002
 """Standard deviation by which the log of a map's metre wanders in a session, as its landmarks are replaced."""
+CONTRADICTS = 4.0
+"""Standard deviations by which the metre of a sound robot is not off that of many others: 1 in 16,000."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,12 +229,14 @@ class Size:
         session_factor: metres of that map for one of the session's own.
         variance: of the log of the map's metre, after the session.
         information: sum of the inverse variances of all sessions that the map's metre is the mean of.
+        off: standard deviations by which they differ; beyond `CONTRADICTS`, the session has the map's size.
     """
 
     map_factor: float
     session_factor: float
     variance: float
     information: float
+    off: float
 
 
 def settled(
@@ -241,7 +245,8 @@ def settled(
     """Return both sizes after they were compared.
 
     The map's metre is the mean of those of all sessions. What one robot gets wrong about the metre it gets wrong in
-    every session, so errors are taken as fully correlated: more sessions do not make the metre surer.
+    every session, so errors are taken as fully correlated: more sessions do not make the metre surer. A metre that
+    contradicts the map's does not change it, but halves what it is worth: one that began wrong comes round.
 
     Args:
         log_ratio: of the map's size over that of the session, as its landmarks show it.
@@ -255,11 +260,15 @@ def settled(
     after = 1.0 / (sigma**2 + ratio_variance)
     gain = after / (before + after)
     innovation = log_ratio - own
+    off = abs(innovation) / float(np.sqrt(1.0 / before + sigma**2 + ratio_variance))
+    if off > CONTRADICTS:
+        return Size(1.0, float(np.exp(log_ratio)), map_variance, before / 2.0, off)
     return Size(
         map_factor=float(np.exp(-gain * innovation)),
         session_factor=float(np.exp(own + innovation * sigma**2 / (1.0 / before + sigma**2 + ratio_variance))),
         variance=((1.0 - gain) * np.sqrt(map_variance) + gain * sigma) ** 2 + gain**2 * min(ratio_variance, 1.0),
         information=before + after,
+        off=off,
     )
 
 

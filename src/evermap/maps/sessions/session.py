@@ -19,6 +19,7 @@ from evermap.maps.living import EXISTS, Evidence, LivingMap, clique_rows
 from evermap.maps.sessions import believe, decide
 from evermap.maps.sessions.extend import Extended, Found, extended
 from evermap.maps.sessions.gaussian import (
+    CONTRADICTS,
     drifted,
     log_ratio,
     of_unknown_size,
@@ -249,6 +250,14 @@ def refit(
         if not part:
             living = resized(living, found.map_factor, found.variance, found.information)
         size *= found.session_factor
+        if found.off > CONTRADICTS:
+            longer = f"{abs(shown[0]):.1%} {'shorter' if shown[0] > 0.0 else 'longer'}"
+            remark = (
+                f"its metre is {longer} than the map's, {found.off:.1f} standard deviations: its ranges or its "
+                "odometer have drifted; it is entered in the metres of the map"
+            )
+            prepared = alone.prepared
+            alone = replace(alone, prepared=replace(prepared, warnings=(*prepared.warnings, remark)))
 
     def in_map(where: Laid) -> tuple[Outcome, bool]:
         stand = np.flatnonzero(where.place >= 0)
