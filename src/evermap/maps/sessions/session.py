@@ -250,14 +250,7 @@ def refit(
         if not part:
             living = resized(living, found.map_factor, found.variance, found.information)
         size *= found.session_factor
-        if found.off > CONTRADICTS:
-            longer = f"{abs(shown[0]):.1%} {'shorter' if shown[0] > 0.0 else 'longer'}"
-            remark = (
-                f"its metre is {longer} than the map's, {found.off:.1f} standard deviations: its ranges or its "
-                "odometer have drifted; it is entered in the metres of the map"
-            )
-            prepared = alone.prepared
-            alone = replace(alone, prepared=replace(prepared, warnings=(*prepared.warnings, remark)))
+        alone = _remarked(alone, shown[0], found.off)
 
     def in_map(where: Laid) -> tuple[Outcome, bool]:
         stand = np.flatnonzero(where.place >= 0)
@@ -288,6 +281,18 @@ def refit(
         )
         solved, _ = in_map(where)
     return living, where, replace(alone, outcome=solved)
+
+
+def _remarked(alone: Solved, log_ratio: float, off: float) -> Solved:
+    """A session with a remark where its metre contradicts the map's."""
+    if off <= CONTRADICTS:
+        return alone
+    longer = f"{abs(log_ratio):.1%} {'shorter' if log_ratio > 0.0 else 'longer'}"
+    remark = (
+        f"its metre is {longer} than the map's, {off:.1f} standard deviations: its ranges or its odometer have "
+        "drifted; it is entered in the metres of the map"
+    )
+    return replace(alone, prepared=replace(alone.prepared, warnings=(*alone.prepared.warnings, remark)))
 
 
 def fits(visit: Solved, alone: Solved, config: LivingConfig) -> bool:
