@@ -192,7 +192,7 @@ def test_a_session_is_uploaded_entered_and_asked_about(fleet: Fleet, zips: list[
     assert fleet("GET", "/maps").json() == [{"site": "ward", "head": 2, "approved": None}]
     revisions = fleet("GET", "/maps/ward/revisions", "read").json()
     assert [item["kind"] for item in revisions] == ["session", "session"]
-    assert revisions[0]["command"] == "evermap work (upload)"
+    assert (revisions[0]["command"], revisions[0]["robot"]) == ("evermap work", "upload")
     told = fleet("GET", "/maps/ward/changes?since=1").json()
     assert sum(revisions[1]["changes"].values()) == len(told)
     assert fleet("GET", "/maps/ward/diff?a=1&b=2").json()["b"] == 2
@@ -200,7 +200,9 @@ def test_a_session_is_uploaded_entered_and_asked_about(fleet: Fleet, zips: list[
     some = fleet("GET", "/maps/ward/landmarks?x_max=5&p_least=0.5&at_s=1e12").json()["landmarks"]
     assert 0 < len(some) < len(everything)
     assert all(item["x_m"] <= 5.0 for item in some)
-    assert fleet("GET", f"/maps/ward/landmarks/{some[0]['label']}/why").json()["landmark"] == some[0]["landmark"]
+    told = fleet("GET", f"/maps/ward/landmarks/{some[0]['label']}/why").json()
+    assert told["landmark"] == some[0]["landmark"]
+    assert {visit["robot"] for visit in told["sessions"]} == {"upload"}
     assert fleet("GET", "/maps/ward/lifetimes").json()["lifetimes"]
     for path in ("/maps/other/revisions", "/maps/ward/landmarks?revision=9", "/maps/ward/landmarks/nothing/why"):
         assert fleet("GET", path).status_code == 404, path

@@ -85,7 +85,7 @@ def print_why(answer: Answer) -> None:
         rows = [
             [
                 str(visit.revision),
-                visit.recording or "-",
+                " of ".join(filter(None, (visit.recording, visit.robot))) or "-",
                 stamp_text(visit.from_s, answer.clock),
                 stamp_text(visit.to_s, answer.clock),
                 str(visit.n_looks),

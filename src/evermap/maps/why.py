@@ -22,7 +22,7 @@ class Visit:
     """What one session saw of a landmark's clique.
 
     Attributes:
-        revision, recording: which session.
+        revision, recording, robot: which session, and whose.
         from_s, to_s: first and last look.
         n_looks: frames in which a place of it was looked at.
         n_hits, n_misses, expected: detections, misses, and the hits that were to be expected had it stood there.
@@ -32,6 +32,7 @@ class Visit:
 
     revision: int
     recording: str
+    robot: str
     from_s: float
     to_s: float
     n_looks: int
@@ -142,6 +143,7 @@ def _visit(revision: Revision, seen: Evidence) -> Visit:
     return Visit(
         revision=revision.number,
         recording=revision.provenance.recording,
+        robot=revision.provenance.robot,
         from_s=float(seen.stamp_s[0]),
         to_s=float(seen.stamp_s[-1]),
         n_looks=len(seen),

@@ -143,6 +143,7 @@ def answer_dict(answer: Answer) -> dict[str, Any]:
             {
                 "revision": visit.revision,
                 "recording": visit.recording,
+                "robot": visit.robot,
                 "stamp_from_s": visit.from_s,
                 "stamp_to_s": visit.to_s,
                 "looks": visit.n_looks,

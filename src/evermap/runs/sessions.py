@@ -70,7 +70,13 @@ class Entered(Shown):
         return grown(self.newest.members.landmark_id, self.living, self.changes)
 
     def commit(
-        self, store: MapStore, config: Config | None = None, *, command: str = "", wall_s: float = np.nan
+        self,
+        store: MapStore,
+        config: Config | None = None,
+        *,
+        command: str = "",
+        wall_s: float = np.nan,
+        robot: str = "",
     ) -> int:
         """Commit the map as the next revision; returns its number.
 
@@ -79,6 +85,7 @@ class Entered(Shown):
             config: settings of the session, as `enter_session` was given them.
             command: the command line.
             wall_s: what estimating took.
+            robot: whose session it is.
 
         Raises:
             StaleRevisionError: another commit came in between.
@@ -97,6 +104,7 @@ class Entered(Shown):
             stamp_from_s=float(stamps[0]),
             stamp_to_s=float(stamps[-1]),
             wall_s=wall_s,
+            robot=robot,
         )
         return store.commit(
             self.living,

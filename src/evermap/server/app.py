@@ -204,13 +204,13 @@ AtRevision = Annotated[int | None, Query(ge=0, le=2**31 - 1)]
 Number = Annotated[float | None, Query(allow_inf_nan=False)]
 
 
-class Problem(BaseModel):
+class Mistake(BaseModel):
     """What is wrong, in one line."""
 
     detail: str
 
 
-_PROBLEMS = {
+_MISTAKES = {
     400: "the body cannot be read",
     401: "a token is needed",
     403: "the token has not the role",
@@ -221,7 +221,7 @@ _PROBLEMS = {
     429: "too many requests",
     503: "the database does not answer",
 }
-router = APIRouter(responses={code: {"model": Problem, "description": what} for code, what in _PROBLEMS.items()})
+router = APIRouter(responses={code: {"model": Mistake, "description": what} for code, what in _MISTAKES.items()})
 
 
 class Said(BaseModel):

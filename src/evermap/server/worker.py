@@ -99,9 +99,10 @@ class Worker:
                         entered = enter_session(store, recording, self._config)
                         if not entered.session.found:
                             return JobOutcome(JobState.ASIDE, entered.session.set_aside[0], entered.parent)
-                        command = f"evermap work ({job.robot})"
                         took_s = time.perf_counter() - start
-                        number = entered.commit(store, self._config, command=command, wall_s=took_s)
+                        number = entered.commit(
+                            store, self._config, command="evermap work", wall_s=took_s, robot=job.robot
+                        )
                         return JobOutcome(JobState.ENTERED, ", ".join(entered.session.slam.warnings[:3]), number)
                 except StaleRevisionError:  # somebody committed meanwhile: again, from the newest
                     continue

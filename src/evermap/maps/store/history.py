@@ -35,6 +35,7 @@ _TYPES: Mapping[str, type | tuple[type, ...]] = {
     "stamp_to_s": (float, int, type(None)),
     "wall_s": (float, int, type(None)),
     "note": str,
+    "robot": str,
     "n_landmarks": int,
     "n_existing": int,
     "n_grown": (int, type(None)),
@@ -133,7 +134,7 @@ class Record:
             raise DamagedError("a part is not the record of a revision")
         if row.get("format") not in (FORMAT, IN_SPACE):
             raise DamagedError(f"a record of format {row.get('format')!r}, this evermap reads {FORMAT} and {IN_SPACE}")
-        row.setdefault("n_grown", None)  # an older evermap did not count them
+        row = {"n_grown": None, "robot": "", **row}  # an older evermap did not tell them
         for name, kind in _TYPES.items():
             if name not in row or not isinstance(row[name], kind) or isinstance(row[name], bool):
                 raise DamagedError(f"'{name}' of a revision is missing or of another type")

@@ -77,6 +77,7 @@ class Provenance:
         stamp_from_s, stamp_to_s: first and last stamp of what went in; nan where nothing did.
         wall_s: what making it took [s]; nan where nobody measured.
         note: an operator's word on it, for example 'pinned landmark 12'.
+        robot: whose session it is; '' where nobody said.
     """
 
     kind: RevisionKind = RevisionKind.SESSION
@@ -89,6 +90,7 @@ class Provenance:
     stamp_to_s: float = float("nan")
     wall_s: float = float("nan")
     note: str = ""
+    robot: str = ""
 
 
 @dataclass(frozen=True, slots=True)
