@@ -204,7 +204,7 @@ AtRevision = Annotated[int | None, Query(ge=0, le=2**31 - 1)]
 Number = Annotated[float | None, Query(allow_inf_nan=False)]
 
 
-class Mistake(BaseModel):
+class Detail(BaseModel):
     """What is wrong, in one line."""
 
     detail: str
@@ -221,7 +221,7 @@ _MISTAKES = {
     429: "too many requests",
     503: "the database does not answer",
 }
-router = APIRouter(responses={code: {"model": Mistake, "description": what} for code, what in _MISTAKES.items()})
+router = APIRouter(responses={code: {"model": Detail, "description": what} for code, what in _MISTAKES.items()})
 
 
 class Said(BaseModel):
