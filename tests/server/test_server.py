@@ -31,6 +31,7 @@ import uvicorn
 from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from sqlalchemy import text
 
 from evermap.config import Config
 from evermap.errors import ConfigError, InputError
@@ -217,6 +218,35 @@ def test_a_session_is_uploaded_entered_and_asked_about(fleet: Fleet, zips: list[
     assert fleet.client.get("/maps/ward/file", headers=unchanged).status_code == 200
     fresh = SiteStores(fleet.where).file("ward", 1)  # another process makes the same file
     assert (fresh.sha256, f'"{fresh.tag}"') == (file.headers["X-Checksum-Sha256"], file.headers["ETag"])
+
+
+def test_the_doctor_tells_what_is_wrong(fleet: Fleet, zips: list[bytes]) -> None:
+    command = [sys.executable, "-m", "evermap", "serve", "doctor", "--store", fleet.where, "--json"]
+
+    def looked(*more: str) -> tuple[int, dict[str, bool]]:
+        done = subprocess.run([*command, *more], capture_output=True, text=True, check=False)
+        assert not done.stderr
+        return done.returncode, {item["what"]: item["fine"] for item in json.loads(done.stdout)["checks"]}
+
+    fleet.upload(zips[0])
+    fleet.worker().step()
+    code, fine = looked("--url", "")
+    assert (code, set(fine.values())) == (0, {True})
+    fleet.upload(zips[1])
+    database = fleet.server.database
+    with database._writer.begin() as connection:
+        connection.execute(text("UPDATE job SET changed_at = '2020-01-01T00:00:00+00:00' WHERE state = 'queued'"))
+    database.revoke_token("admin")
+    code, fine = looked("--url", "ftp://maps")
+    assert code == 1
+    assert {what for what, well in fine.items() if not well} == {"tokens", "queue", "workers", "address"}
+
+
+def test_the_doctor_makes_nothing_where_there_is_nothing(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "evermap", "serve", "doctor", "--url", "", "--store", str(tmp_path / "maps")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.startswith("WRONG  database: ")) == (1, True)
+    assert not (tmp_path / "maps").exists()
 
 
 def test_an_answer_is_sent_again_only_once_the_map_is_newer(fleet: Fleet, zips: list[bytes]) -> None:

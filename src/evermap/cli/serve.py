@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,12 +12,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import urlsplit
 
 import typer
 
 from evermap.cli.options import AsJson, ConfigFile, Settings, configured
 from evermap.cli.terminal import print_json, print_table, say, warm_up
-from evermap.errors import ConfigError, MissingExtraError
+from evermap.errors import ConfigError, EvermapError, MissingExtraError, printable
 
 if TYPE_CHECKING:
     from evermap.server.database import Database, Job
@@ -39,6 +41,11 @@ Store = Annotated[
     ),
 ]
 _DEFAULT = "evermap-maps"
+_PATIENCE_S = 600.0
+"""A session that waits longer says that there are too few workers."""
+_MOST_UPLOADS = 10
+"""As many of the largest uploads have to fit on the disk."""
+_ASK_S = 5.0
 
 
 @app.callback()
@@ -146,6 +153,90 @@ def token(
         return
     typer.echo(text)
     say(f"the token of {name}, role {role}; it is shown once")
+
+
+@app.command("doctor")
+def doctor(
+    store: Store = _DEFAULT,
+    url: Annotated[
+        str, typer.Option(metavar="URL", help="Where robots reach the server; '' to leave that out.")
+    ] = "http://127.0.0.1:8080",
+    as_json: AsJson = False,
+) -> None:
+    """Look whether a server has all that it needs: a line for each, exit code 1 where something is wrong.
+
+    \b
+    Examples:
+      evermap serve doctor --store maps
+      evermap serve doctor --store postgresql://evermap@db/fleet --url https://maps.example.com
+    """
+    found = [*_of_database(store), *([_of_address(url)] if url else [])]
+    if as_json:
+        print_json({"checks": [{"what": what, "fine": fine, "told": told} for what, fine, told in found]})
+    else:
+        for what, fine, told in found:
+            typer.echo(f"{'fine ' if fine else 'WRONG'}  {what}: {told}")
+    if not all(fine for _, fine, _ in found):
+        raise typer.Exit(1)
+
+
+def _of_database(store: str) -> Iterator[tuple[str, bool, str]]:
+    """What is to be known of the store of a server: what, whether it is fine, and a line on it."""
+    from evermap.maps.store import is_address
+    from evermap.server.database import VERSION, Role
+    from evermap.server.sites import SiteStores
+    from evermap.server.uploads import UploadLimits
+    from evermap.server.worker import LEASE_S
+
+    try:
+        if not is_address(store) and not Path(store, "server.db").is_file():
+            raise ConfigError("holds no server yet", field="store", hint=f"evermap serve --store {store}")
+        database = _database(store)
+    except EvermapError as error:
+        yield "database", False, error.one_line()
+        return
+    yield "database", True, f"answers; tables of version {VERSION}"
+    roles = [row["role"] for row in database.tokens()]
+    told = ", ".join(f"{roles.count(role.name.lower())} {role.name.lower()}" for role in Role)
+    yield "tokens", "admin" in roles, told + ("" if "admin" in roles else "; evermap serve token NAME --role admin")
+    broken, sites = [], SiteStores(store)
+    for site in sites.names():
+        try:
+            with sites.store(site) as one:
+                one.named()
+        except EvermapError as error:
+            broken.append(f"{site}: {error.one_line()}")
+    yield "maps", not broken, "; ".join(broken) or f"{len(sites.names())}, each with a newest revision"
+    by_state, waits_s, working = database.queue()
+    told = ", ".join(f"{count} {state}" for state, count in sorted(by_state.items())) or "no session yet"
+    yield "queue", waits_s < _PATIENCE_S, f"{told}; the oldest that waits has done so for {waits_s:.0f} s"
+    idle = waits_s > LEASE_S and not working
+    yield "workers", not idle, "nobody works on what waits: evermap work" if idle else f"{working} busy"
+    limits, size = UploadLimits(), database.n_bytes()
+    yield "limits", True, f"{limits.n_bytes / 1e6:.0f} MB an upload, {limits.unpacked_bytes / 1e6:.0f} MB unpacked"
+    if size is None:
+        free = shutil.disk_usage(store).free
+        yield "disk", free > _MOST_UPLOADS * limits.n_bytes, f"{free / 1e9:.1f} GB free"
+    else:
+        yield "disk", True, f"the database has {size / 1e9:.2f} GB; what is free is known where it runs"
+
+
+def _of_address(url: str) -> tuple[str, bool, str]:
+    """Whether a server answers there, in a way that nobody can listen to."""
+    from urllib.request import urlopen
+
+    host, scheme = urlsplit(url).hostname or "", urlsplit(url).scheme
+    if scheme not in ("http", "https"):
+        return "address", False, f"'{printable(url, 100)}' is no address of a server: https://maps.example.com"
+    local = host in ("localhost", "127.0.0.1", "::1")
+    try:
+        with urlopen(f"{url.rstrip('/')}/healthz", timeout=_ASK_S) as answer:
+            told = json.load(answer)["evermap"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        return "address", False, f"no server answers at {url}: {printable(str(error), 100)}"
+    if scheme != "https" and not local:
+        return "address", False, f"{url} is not TLS, so tokens can be read on the way: --tls-cert, or a proxy"
+    return "address", True, f"evermap {told} answers at {url}{'' if not local else ', seen from this machine'}"
 
 
 def work(

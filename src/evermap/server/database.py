@@ -12,6 +12,7 @@ import hashlib
 import secrets
 import time
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Any
@@ -351,6 +352,25 @@ class Database:
         waiting = or_(_job.c.state.in_([JobState.QUEUED.value, JobState.WORKING.value]), _grown())
         with self._engine.begin() as connection:
             return connection.execute(select(func.count()).select_from(_job).where(waiting)).scalar_one()
+
+    def queue(self) -> tuple[dict[str, int], float, int]:
+        """Return sessions by state, how long the oldest waits that nobody has begun [s], and how many are in work."""
+        counts = select(_job.c.state, func.count()).group_by(_job.c.state)
+        oldest = select(func.min(_job.c.changed_at)).where(_job.c.state == JobState.QUEUED.value)
+        leased = and_(_job.c.state == JobState.WORKING.value, _job.c.lease_s >= time.time())
+        with self._engine.begin() as connection:
+            by_state = {str(state): int(count) for state, count in connection.execute(counts)}
+            since = connection.execute(oldest).scalar()
+            working = connection.execute(select(func.count()).select_from(_job).where(leased)).scalar_one()
+        waits_s = 0.0 if since is None else (datetime.now(UTC) - datetime.fromisoformat(since)).total_seconds()
+        return by_state, waits_s, working
+
+    def n_bytes(self) -> int | None:
+        """Return the size of the whole PostgreSQL database; None of SQLite, whose files lie open."""
+        if self._engine.dialect.name != "postgresql":
+            return None
+        with self._engine.begin() as connection:
+            return int(connection.execute(select(func.pg_database_size(func.current_database()))).scalar_one())
 
     def close(self) -> None:
         """Let go of all connections."""
