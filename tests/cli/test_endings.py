@@ -15,7 +15,7 @@ from evermap.errors import InputError
 VERBS = ["demo", "simulate", "check", "info", "slam", "live", "persist", "track", "view", "convert", "work", "bench"]
 GROUPS = {
     "map": ["log", "show", "diff", "export", "why", "verify", "gc", "revert", "pin", "unpin", "delete", "undelete"],
-    "serve": ["token"],
+    "serve": ["token", "doctor"],
     "survival": ["plot", "fit", "learn"],
 }
 

@@ -163,7 +163,9 @@ def doctor(
     ] = "http://127.0.0.1:8080",
     as_json: AsJson = False,
 ) -> None:
-    """Look whether a server has all that it needs: a line for each, exit code 1 where something is wrong.
+    """Look whether a server has all that it needs.
+
+    Database, tokens, maps, queue, workers, disk and TLS: a line each, exit code 1 where something is wrong.
 
     \b
     Examples:
