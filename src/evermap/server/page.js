@@ -4,7 +4,7 @@
 const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
 let token = sessionStorage.getItem("evermap-token") || "";
-let site = "", revisions = [], follows = null, asked = 0;
+let site = "", revisions = [], follows = null, asked = 0, compares = false; // with another than the one before
 
 async function get(path, signal) {
   const answer = await fetch(path, { headers: { Authorization: `Bearer ${token}` }, signal });
@@ -79,22 +79,58 @@ function draw(landmarks, changes) {
   $("map").replaceChildren(...nodes);
 }
 
+// P(exists) from look to look, as many as there were, not by time: a dot where it was seen, a cross where it was missed.
+function history(told) {
+  const { hits, p_exists: belief } = told.looks, [wide, tall] = [100, 30], nodes = [];
+  const svg = shape("svg", { viewBox: `-6 -2 ${wide + 8} ${tall + 9}`, role: "img", "aria-label": told.headline }, "history");
+  const across = (k) => (wide * (k + 0.5)) / Math.max(hits.length, 1), xs = hits.map((_, k) => across(k));
+  const ys = belief.map((p) => (p === null ? tall : tall * (1 - p)));
+  const text = (x, y, words) => Object.assign(shape("text", { x, y }, "tick"), { textContent: words });
+  for (const [y, words] of [[0, "1"], [tall / 2, "½"], [tall, "0"]]) {
+    nodes.push(shape("path", { d: `M0 ${y}H${wide}` }, "rule"), text(-4, y + 1.2, words));
+  }
+  let first = 0;
+  for (const one of told.sessions) { // a line before each, with its revision
+    const x = across(first - 0.5);
+    nodes.push(shape("path", { d: `M${x} 0V${tall + 3}` }, "rule"));
+    if (one.looks > hits.length / 20) nodes.push(text(x + 0.5, tall + 3, String(one.revision)));
+    first += one.looks;
+  }
+  if (hits.length) nodes.push(shape("path", { d: `M${xs.map((x, k) => `${x} ${ys[k]}`).join("L")}` }, "belief"));
+  const every = Math.ceil(hits.length / 300); // more are not to be told apart on so small a figure
+  xs.forEach((x, k) => {
+    if (k % every) return;
+    const seen = hits[k] > 0, y = ys[k];
+    const d = `M${x - 0.8} ${y - 0.8}l1.6 1.6m0 -1.6l-1.6 1.6`;
+    nodes.push(seen ? shape("circle", { cx: x, cy: y, r: 0.8 }, "there") : shape("path", { d }, "vanished thin"));
+  });
+  nodes.push(text(0, tall + 6, `P(exists) in ${hits.length} looks, by revision: ● seen, ✕ missed`));
+  svg.append(...nodes);
+  return svg;
+}
+
 async function why(one) {
   try {
     const told = await json(of(`landmarks/${encodeURIComponent(one.label)}/why?revision=${$("revision").value}`));
     const lines = [told.headline, ...told.reasons];
-    $("why").replaceChildren(...lines.map((line) => Object.assign(document.createElement("p"), { textContent: line })));
+    const words = lines.map((line) => Object.assign(document.createElement("p"), { textContent: line }));
+    $("why").replaceChildren(words[0], history(told), ...words.slice(1));
   } catch (error) { $("why").textContent = error.message; }
 }
 
 async function show() {
   const number = Number($("revision").value), mine = ++asked;
+  $("before").max = String(number - 1);
+  if (!compares) $("before").value = String(number - 1);
+  const before = Number($("before").value);
   $("number").textContent = String(number);
+  $("other").textContent = before ? String(before) : "an empty map";
   const item = revisions.find((one) => one.revision === number);
   if (!item) return;
-  const [found, told] = await Promise.all([json(of(`landmarks?revision=${number}`)), json(of(`changes?since=${number - 1}`))]);
+  const between = `diff?a=${before}&b=${number}`;
+  const [found, told] = await Promise.all([json(of(`landmarks?revision=${number}`)), json(of(between))]);
   if (mine !== asked) return; // the slider is elsewhere by now
-  const changes = told.filter((one) => one.revision === number);
+  const changes = told.changes;
   const labels = new Map(found.landmarks.map((one) => [one.landmark, one.label]));
   $("about").textContent = `${item.created_at}: ${item.note || item.recording}; ${item.existing} of ${item.landmarks} landmarks exist`;
   draw(found.landmarks, changes);
@@ -153,5 +189,9 @@ async function start() {
 
 $("enter").addEventListener("submit", (event) => { event.preventDefault(); token = $("token").value; start(); });
 $("site").addEventListener("change", choose);
+$("before").addEventListener("input", () => {
+  compares = $("before").value !== $("before").max;
+  show().catch((error) => say(error.message));
+});
 $("revision").addEventListener("input", () => show().catch((error) => say(error.message)));
 if (token) start();
