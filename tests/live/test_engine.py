@@ -296,6 +296,22 @@ def test_a_session_that_is_of_another_place_is_set_aside(tmp_path: Path, two_ses
         assert store.head() == 2
 
 
+def test_frames_that_are_left_out_change_no_pose_of_the_others(tmp_path: Path) -> None:
+    """What a relinearisation takes is done in their time. Only poses that were told before it had ended differ."""
+    config = Config(live={"readings_hz": 3.0, "revision_s": 0.0}, slam=SlamConfig(vote_ids=False))
+    with engine(tmp_path / "site.evermap", SESSIONS[0], config) as live:
+        steps = list(fed(live, SESSIONS[0]))
+        made = live.save()
+    assert made is not None
+    kept = made.session.recording
+    assert len(kept.frames) < 0.7 * len(SESSIONS[0].frames)
+    ours, replayed = online(steps), em.run_session(kept, None, config).slam.online
+    both, mine, theirs = np.intersect1d(ours.stamp_s, replayed.stamp_s, return_indices=True)
+    assert len(both) > 50
+    apart = np.abs(ours.pose_world_robot[mine] - replayed.pose_world_robot[theirs]).max(axis=1)
+    assert np.mean(apart > 1e-6) < 0.1
+
+
 def test_more_readings_than_the_map_needs_are_thinned(tmp_path: Path, two_sessions: Path) -> None:
     path, recording = copied(two_sessions, tmp_path), SESSIONS[2]
     with engine(path, recording, Config(live={"readings_hz": 5.0, "revision_s": 0.0})) as live:

@@ -223,6 +223,27 @@ def test_far_places_wait_and_come_back_where_their_neighbours_are(monkeypatch):
     assert np.sqrt(np.einsum("nii->ni", spread[24])) / sigma == pytest.approx(1.0, abs=0.2)
 
 
+def test_work_that_waits_changes_only_the_poses_that_were_told_before_it():
+    """A frame may leave its share of a relinearisation to the time until the next one: slice after slice, or none."""
+    recording = simulate_warehouse(WarehouseConfig(60, forward_scale=1.02, turn_scale=0.98, bearing_bias_rad=0.01))
+    prior, noise = beliefs(recording.sensor, SlamConfig())
+    at_once, waiting = (StreamingSlam(prepare(recording).problem, noise, prior) for _ in range(2))
+    told_earlier = 0
+    for row in range(len(at_once.online_pose)):
+        at_once.step()
+        waiting.step(later=True)
+        told_earlier += not np.array_equal(waiting.online_pose[row], at_once.online_pose[row])
+        for _ in range(row % 4):
+            waiting.work(1e-3)
+        if row % 2:
+            waiting.work()
+            np.testing.assert_array_equal(waiting.states, at_once.states)
+    assert 0 < told_earlier < 0.1 * row
+    mine, theirs = waiting.finish(), at_once.finish()
+    np.testing.assert_array_equal(mine.estimate.pose, theirs.estimate.pose)
+    np.testing.assert_array_equal(mine.estimate.landmark, theirs.estimate.landmark)
+
+
 def test_the_filter_is_the_smoother_where_all_is_nearly_linear():
     """From the first frame on, places met by their detections alone."""
     made = make_world(0, n_poses=6, n_landmarks=3, noisy=0.02, prior=KNOWN_SENSORS, p_seen=1.0)

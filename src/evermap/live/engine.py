@@ -182,6 +182,8 @@ class Engine:
             ready = self._inbox.ready(0.0 if self._filter is None else float(self._filter.states[5]))
             for frame, odometry, kept in ready:
                 self._process(frame, odometry, kept=kept)
+            if isinstance(self._filter, Mapper) and not any(kept for *_, kept in ready):
+                self._filter.work()
             if ready:
                 self._keep_house()
             if self._judge is not None:
@@ -262,7 +264,7 @@ class Engine:
             assert self._filter is not None
             driven = odometry - [start_s, 0.0, 0.0, 0.0]
             if not kept:
-                self._filter.drive(driven)
+                self._filter.skip(driven)
                 return
             located = self._filter.step(frame.stamp_s - start_s, driven, seen)
         self._located, self._last = located, frame

@@ -81,14 +81,24 @@ class Mapper:
         )
         robust, learns = settings.robust, settings.estimate_noise
         self._slam = StreamingSlam(self._problem, noise, prior, robust=robust, estimate_noise=learns)
+        self._later = False
 
     @property
     def states(self) -> FloatArray:
         """(9,) calibration states."""
         return self._slam.states
 
-    def drive(self, odometry: FloatArray) -> int:
-        """Take odometry as in `step`, of a frame that is left out; returns the row of its first."""
+    def skip(self, odometry: FloatArray) -> None:
+        """Take odometry as in `step`, of a frame that is left out: others will be, and are time for `work`."""
+        self._drive(odometry)
+        self._later = True
+
+    def work(self) -> None:
+        """Go on with what the last frame left for the time until the next one, for about a millisecond."""
+        self._slam.work(1.0)
+
+    def _drive(self, odometry: FloatArray) -> int:
+        """Take odometry; returns the row of its first."""
         at = int(np.searchsorted(self._odometry.rows[:, 0], odometry[0, 0]))
         rows = self._odometry.rows[:at]
         before = rows[np.searchsorted(rows[:, 0], odometry[0, 0] - HISTORY_S) :, [0, 3]]
@@ -109,11 +119,12 @@ class Mapper:
         Returns:
             Without places: the map is what is estimated.
         """
-        at = self.drive(odometry)
+        at = self._drive(odometry)
         known = np.flatnonzero((seen.landmark_id != UNKNOWN) & np.all(np.isfinite(seen.reading), axis=1))
         if len(known):
             self._grow(stamp_s, seen, known)
-            self._slam.step()
+            self._slam.step(later=self._later)
+            self._later = False
             at = len(self._stamps.rows) - 1
             pose, covariance = self._slam.online_pose[at].copy(), self._slam.online_covariance[at].copy()
         else:

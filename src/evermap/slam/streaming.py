@@ -142,6 +142,7 @@ class StreamingSlam:
         self._method = Static(len(problem.landmark_mean)) if method is None else method
         self._filter = SessionFilter(self._problem, noise, robust=robust)
         self._job: Slices[None] | None = None
+        self._owed_ms = 0.0
         self._disputed = False
         self._landmark = np.full((len(problem.landmark_mean), 2), np.nan)
         self._n_compared = np.zeros(len(problem.landmark_mean), dtype=np.int64)
@@ -159,8 +160,14 @@ class StreamingSlam:
         self.nis = np.full(len(problem.pose_row), np.nan)
         """(M,) squared Mahalanobis distance of every innovation; nan where the landmark was new."""
 
-    def step(self) -> None:
-        """Process the next pose: predict, compare, add, and relinearise when it is time."""
+    def step(self, *, later: bool = False) -> None:
+        """Process the next pose: predict, compare, add, and relinearise when it is time.
+
+        Args:
+            later: leave what the frame owes to a relinearisation to `work`, or to the next step: the frames that follow
+                are the same, while the pose of this one is told before the stream may go on at another optimum.
+        """
+        self.work()
         row = self._n_poses
         detections = self._problem.detections_of(row)
         if row > 0:
@@ -172,7 +179,9 @@ class StreamingSlam:
         self._filter.add(row, self._landmark)
         self._n_poses += 1
         self._plan(detections)
-        self._work()
+        self._owed_ms = self._a_frame_ms()
+        if not later:
+            self.work()
         if self._prior_map is not None and not self._aligned and self._can_align():
             self._enter_map()
         self.online_pose[row], self.online_covariance[row] = self._told(
@@ -242,17 +251,23 @@ class StreamingSlam:
         elif self._job is None and since >= max(SHORTEST_SPELL, int(share * self._relinearised_at)):
             self._job = self._relinearised(learn=False)
 
-    def _work(self) -> None:
-        """Go on with a relinearisation: a few slices a frame, or all of it where it may change places."""
-        left_ms = np.inf if self._job is not None and self._method.revises(self._problem) else SLICES_A_FRAME
-        while self._job is not None and left_ms > 0.0:
+    def _a_frame_ms(self) -> float:
+        """Work on a relinearisation in a frame: a few slices, or all of it where it may change places."""
+        return np.inf if self._job is not None and self._method.revises(self._problem) else SLICES_A_FRAME
+
+    def work(self, most_ms: float = np.inf) -> None:
+        """Advance a relinearisation by what the last frame owes to it, up to the slice that reaches `most_ms`."""
+        done_ms = 0.0
+        while self._job is not None and done_ms < min(self._owed_ms, most_ms):
             try:
-                left_ms -= next(self._job)
+                done_ms += next(self._job)
             except StopIteration:
                 self._job = None
+        self._owed_ms -= done_ms
 
     def finish(self) -> Outcome:
         """Smooth everything processed so far, with noise levels iterated to convergence, and divide the scale."""
+        self.work()
         if self._prior_map is not None and not self._aligned and self._can_align(final=True):
             self._enter_map()
         self._job = None
@@ -434,14 +449,15 @@ class StreamingSlam:
             self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, np.zeros((9, 9)))[2]
         following = SessionFilter(self._problem, self._noise, robust=self._robust)
         following.restart(estimate, self._noise, self._problem, marginals)
+        yield 1.0
         landmark = estimate.landmark.copy()
         for row in counted(n):
-            if row == self._n_poses:
-                break
             following.problem = self._problem
             landmark = np.pad(
                 landmark, ((0, len(self._problem.landmark_mean) - len(landmark)), (0, 0)), constant_values=np.nan
             )
+            if row == self._n_poses:
+                break
             following.drive(following.motion(row))
             detections = self._problem.detections_of(row)
             self._meet_new_landmarks(following, landmark, detections)
@@ -497,7 +513,8 @@ class StreamingSlam:
         self.online_pose[:done] = se2.compose(pose_map_world, self.online_pose[:done])
         self._restart(moved)
         self._job = self._relinearised(learn=True)
-        self._work()
+        self._owed_ms = self._a_frame_ms()
+        self.work()
 
 
 def divided(
