@@ -66,6 +66,7 @@ def test_a_part_that_nothing_happened_to_is_put_back_as_it_was() -> None:
     vicinity = Vicinity.of(living, some, em.Config().living, np.array([0.0, 0.0, 8.0, 8.0]))
     assert 0 < len(vicinity.part.places) < len(living.places)
     again = vicinity.put_back(vicinity.part)
+    assert again.covariance_m2 is living.covariance_m2
     for table in ("members", "sites", "places", "stays"):
         for column in fields(getattr(living, table)):
             if column.name in ("p_here", "p_kept"):

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 EVERY_S = 0.5
 """Time between two lines of progress."""
+SWITCH_S = 5e-4
+"""Turn of a thread while others wait: what is done beside the steps takes many, and a pose shall not wait for them."""
 
 
 MapFile = Annotated[
@@ -159,6 +161,7 @@ class _Drive:
         """Drive until the recording ends, or until it is stopped."""
         from evermap.live.feed import run_live
 
+        sys.setswitchinterval(SWITCH_S)
         # what is replayed faster than it was driven cannot wait for what is done beside it
         engine = self._engine(mapping=not localize, beside=realtime or self._recording is None)
         shown = _Shown(as_json=as_json, mailbox=self._mailbox)

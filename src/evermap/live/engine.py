@@ -202,8 +202,8 @@ class Engine:
             within: leave out what lies outside of this box `(x_min, y_min, x_max, y_max)`.
         """
         with self._lock:
-            living = self._living if self._judge is None else self._judge.living
-        return living.landmarks(at=at, within=within)
+            living, judge = self._living, self._judge
+        return (living if judge is None else judge.living).landmarks(at=at, within=within)
 
     def warm_up(self) -> None:
         """Compile the kernels, or load them, so that no step has to wait for it."""

@@ -50,10 +50,10 @@ GUESS_S = 1.0
 """Topics are guessed when messages of odometry and detections have come for so long: others may be better."""
 MOST_KEPT = 2_000
 """Messages of a topic that are kept until it is known what is read."""
-TOLD_S = 1.0
+TOLD_S = 0.1
 """Time between two messages that repeat a part of the map."""
-PART = 200
-"""Landmarks of such a part: those who come late have all of the map after some of them."""
+PART = 20
+"""Landmarks of such a part: those who come late have all of the map after some of them; few hold no pose up."""
 SEEN_P = 0.02
 """A landmark in view is told again when the probability that it exists, or its place [m], has changed by so much."""
 WAIT_S = 0.2
@@ -129,7 +129,7 @@ class Listener:
             return []
         found: list[Reading] = []
         assert self.settings is not None
-        for topic in {*self._content.motion, *self._content.seen}:
+        for topic in [topic for topic, stamps in self._content.stamps.items() if stamps]:
             if topic == self.settings.odometry:
                 found += self._velocities(topic)
             elif topic in [one.topic for one in self.settings.sensors.values()]:
@@ -381,6 +381,8 @@ class Teller:
         self._driven: tuple[str, FloatArray | None] = "base_link", None
         self._changes: list[MapChange] = []
         self._n_changes, self._at = 0, 0
+        self._whole: Landmarks | None = None
+        self._seen: Landmarks | None = None
         self._told: dict[int, FloatArray] = {}
         self._drawn: dict[int, str] = {}
         self._revision, self._next_s, self._stamp_s = -1, -math.inf, math.nan
@@ -444,15 +446,18 @@ class Teller:
 
     def _map(self, now: Now) -> None:
         """Landmarks in view of which something new is believed, and every second a part of all others."""
-        some = [rows_of(now.in_view, np.flatnonzero(self._is_news(now.in_view)))]
+        some = []
+        if now.in_view is not self._seen:  # else no frame was processed since
+            self._seen = now.in_view
+            some.append(rows_of(now.in_view, np.flatnonzero(self._is_news(now.in_view))))
         if time.monotonic() >= self._next_s or now.revision != self._revision:
-            self._next_s, self._revision = time.monotonic() + TOLD_S, now.revision
-            whole = self._engine.landmarks()
-            if now.frame == "prior_map":
-                self._erase(whole, now.stamp_s)
-            rows = np.arange(self._at, self._at + min(PART, len(whole))) % max(len(whole), 1)
-            self._at = int(rows[-1]) + 1 if len(rows) else 0
-            some.append(rows_of(whole, rows))
+            if now.revision != self._revision or self._whole is None or self._at >= len(self._whole):
+                self._whole, self._at, self._revision = self._engine.landmarks(), 0, now.revision
+                if now.frame == "prior_map":
+                    self._erase(self._whole, now.stamp_s)
+            self._next_s = time.monotonic() + TOLD_S
+            some.append(rows_of(self._whole, np.arange(self._at, min(self._at + PART, len(self._whole)))))
+            self._at += PART
         for landmarks in some:
             if not len(landmarks):
                 continue

@@ -94,8 +94,10 @@ class Vicinity:
         )
 
     def _covariance(self, part: LivingMap, places: Any) -> ChunkedCovariance:
-        """The joint covariance of all places after the session."""
+        """The joint covariance of all places after the session; as it was where that is of looks alone."""
         whole = self.whole
+        if part.covariance_m2 is self.part.covariance_m2:
+            return _chunked(whole)
         row = LivingMap.place_row(replace(part, places=places), part.places.landmark_id, part.places.site_id)
         was = whole.place_row(places.landmark_id, places.site_id)
         learned = of_places(part.covariance_m2, np.arange(len(part.places)), part.dim)
