@@ -605,7 +605,8 @@ def _bags(folder: Path, name: str) -> tuple[bytes, ...]:
 
     found = []
     for detector in DETECTORS:
-        if detector in ("aruco", "scene") and name.endswith("_sqlite"):  # of types that such a bag does not hold
+        unstated = detector in ("aruco", "scene", "fiducials", "apriltag_ros") and name.endswith("_sqlite")
+        if unstated or (detector == "markers" and name.endswith(".bag")):  # of types that such a bag does not hold
             continue
         path = write(folder / name.format(detector), detector)
         file = path if path.is_file() else next(one for one in path.iterdir() if one.suffix in (".mcap", ".db3"))

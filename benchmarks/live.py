@@ -7,12 +7,18 @@ latencies are those of `--paced`.
 
     python -m benchmarks.live                                 # an hour each: memory, share of a core
     python -m benchmarks.live --minutes 6 --size 1000 --paced # latency
+    python -m benchmarks.live --minutes 6 --size 1000 --zenoh # of `evermap live`, from message to message
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import resource
+import signal
+import socket
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -24,9 +30,12 @@ import numpy as np
 import evermap as em
 from evermap.config import Config
 from evermap.geometry import se2
+from evermap.io.rosbag import ros2_types, stamp_of
+from evermap.live.wires import Mailbox, Zenoh
 from evermap.maps.living import LivingMap
 from evermap.maps.store import Provenance, RevisionKind, open_store
 from evermap.maps.vicinity import in_chunks
+from evermap.runs.mcap import Ros, in_space
 from evermap.types import Clock, FloatArray, IntArray, Landmarks, Sensor
 
 SIZES = (1_000, 10_000)
@@ -38,6 +47,8 @@ P_DETECT = 0.9
 SIGMA = np.array([0.05, 0.02])
 SIGMA_MAP_M = 0.03
 SENSOR = Sensor(range_max_m=RANGE_M, p_detect=P_DETECT, sigma_range_m=0.05, sigma_bearing_rad=0.02)
+START_S = 1000.0
+"""Stamp of the first message over Zenoh: to ROS 0 is none."""
 WARM_UP = 60
 """Frames at the beginning that are not timed: the start pose is searched for."""
 
@@ -133,13 +144,109 @@ def _driven(engine: em.Engine, landmark: FloatArray, seconds: float, *, paced: b
     }
 
 
+class _Poses(Mailbox):
+    """How long after the odometry that tells of it each pose comes back from the bridge [s]."""
+
+    def __init__(self) -> None:
+        super().__init__(ours=True)
+        self.sent: dict[int, float] = {}
+        self.late_s: list[float] = []
+        self._types = ros2_types()
+
+    def put(self, topic: str, kind: str, raw: bytes, source: object) -> None:  # noqa: ARG002
+        """Take a message of the bridge."""
+        if topic.endswith("/pose"):
+            stamp_s = stamp_of(self._types.deserialize_cdr(raw, kind))
+            if (sent := self.sent.pop(round(stamp_s / ODOMETRY_S), None)) is not None:
+                self.late_s.append(time.perf_counter() - sent)
+
+
+def over_zenoh(size: int, seconds: float, *, known: bool) -> dict[str, Any]:
+    """Latency of `evermap live` in a process of its own, at the robot's end of Zenoh, its memory and share of a core.
+
+    A pose is that of the odometry before the newest, whose difference is the motion: timed is from the newest on.
+    """
+    landmark, surveyed = survey(size)
+    poses = _Poses()
+    with tempfile.TemporaryDirectory() as folder, socket.socket() as free:
+        path, sensor = Path(folder) / "site.evermap", Path(folder) / "sensor.toml"
+        if known:
+            with open_store(path, create=True) as store:
+                living = in_chunks(LivingMap.begun(surveyed), Config().living)
+                store.commit(living, Provenance(kind=RevisionKind.EDIT), parent=store.head())
+        sensor.write_text(
+            f"[limits]\nrange_max_m = {RANGE_M}\n[detection]\np_detect = {P_DETECT}\n[noise]\n"
+            f"sigma_range_m = {SIGMA[0]}\nsigma_bearing_rad = {SIGMA[1]}\n"
+        )
+        free.bind(("127.0.0.1", 0))
+        where = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+        free.close()
+        wire = Zenoh(f"listen={where}", poses)
+        command = [sys.executable, "-m", "evermap", "live", "--map", path, "--sensor", sensor, "--zenoh", where]
+        bridge = subprocess.Popen([str(part) for part in command], stdout=subprocess.DEVNULL)
+        time.sleep(15.0)  # until its kernels are loaded
+        used_s, start, memory = _used_s(bridge.pid), time.perf_counter(), []
+        for stamp_s, topic, kind, raw in _messages(landmark, seconds):
+            time.sleep(max(stamp_s - (time.perf_counter() - start), 0.0))
+            if topic == "/odom":
+                poses.sent[round((START_S + stamp_s) / ODOMETRY_S) - 1] = time.perf_counter()
+            wire.send(topic, kind, raw, 0)
+            if len(memory) * 60.0 <= stamp_s:
+                memory.append(round(_memory_mb(bridge.pid)))
+        core = (_used_s(bridge.pid) - used_s) / seconds
+        bridge.send_signal(signal.SIGTERM)
+        bridge.wait()
+        wire.close()
+    ms = 1e3 * np.array(poses.late_s[int(5.0 / ODOMETRY_S) :])  # after the topics are guessed
+    level = dict(
+        zip(("median_ms", "p99_ms", "p999_ms", "max_ms"), np.quantile(ms, [0.5, 0.99, 0.999, 1.0]), strict=True)
+    )
+    return {"map": size if known else 0, "minutes": seconds / 60, "poses": len(ms), **level, "core": core, "mb": memory}
+
+
+def _messages(landmark: FloatArray, seconds: float) -> Iterator[tuple[float, str, str, bytes]]:
+    """What the robot publishes, by when: odometry at once, detections a tenth of a second late."""
+    ros, rng, here, driven_s = Ros(ros2_types()), np.random.default_rng(2), se2.identity(), 0.0
+    for stamp_s, _, names, reading in frames(landmark, seconds):
+        while driven_s <= stamp_s + 0.1:
+            odometry = ros.odometry(START_S + driven_s, in_space(here[None])[0])
+            yield driven_s, "/odom", "nav_msgs/msg/Odometry", _raw(ros, odometry, "nav_msgs/msg/Odometry")
+            slip = rng.normal(size=2) * [0.02, 0.01]
+            step = np.array([SPEED_MPS + slip[0], 0.0, SPEED_MPS / RADIUS_M + slip[1]])
+            here, driven_s = se2.compose(here, se2.exp(step * ODOMETRY_S)), driven_s + ODOMETRY_S
+        found, header = [], ros.header(START_S + stamp_s, "base_link")
+        for name, (range_m, bearing) in zip(names.tolist(), reading.tolist(), strict=True):
+            at = np.array([range_m * np.cos(bearing), range_m * np.sin(bearing), 0.0, 0.0, 0.0, 0.0, 1.0])
+            what = ros.make("vision_msgs/ObjectHypothesis", "", 1.0)
+            result = ros.make("vision_msgs/ObjectHypothesisWithPose", what, ros.spread(at, np.zeros((6, 6))))
+            box = ros.make("vision_msgs/BoundingBox3D", ros.pose(at), ros.vector(np.zeros(3)))
+            found.append(ros.make("vision_msgs/Detection3D", header, [result], box, str(name)))
+        kind = "vision_msgs/msg/Detection3DArray"
+        yield (
+            stamp_s + 0.1,
+            "/detections",
+            kind,
+            _raw(ros, ros.make("vision_msgs/Detection3DArray", header, found), kind),
+        )
+
+
+def _raw(ros: Ros, message: Any, kind: str) -> bytes:
+    return bytes(ros.types.serialize_cdr(message, kind))
+
+
+def _used_s(pid: int) -> float:
+    """Time that a process and those that it has waited for took."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()
+    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
+
+
 def _cpu_s() -> float:
     own, others = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return own.ru_utime + own.ru_stime + others.ru_utime + others.ru_stime
 
 
-def _memory_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+def _memory_mb(pid: int | str = "self") -> float:
+    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
     return pages * resource.getpagesize() / 1e6
 
 
@@ -151,10 +258,14 @@ def main() -> None:
     parser.add_argument("--localize", action="store_true", help="the map stays as it is")
     parser.add_argument("--unknown", action="store_true", help="begin without a map")
     parser.add_argument("--paced", action="store_true", help="as fast as the robot drives, not as fast as it goes")
+    parser.add_argument("--zenoh", action="store_true", help="`evermap live`, at the pace of the robot")
     given = parser.parse_args()
     for size in given.size:
-        known, paced = not given.unknown, given.paced
-        row = drive(size, 60 * given.minutes, mapping=not given.localize, known=known, paced=paced)
+        known, seconds = not given.unknown, 60 * given.minutes
+        if given.zenoh:
+            row = over_zenoh(size, seconds, known=known)
+        else:
+            row = drive(size, seconds, mapping=not given.localize, known=known, paced=given.paced)
         shown = (f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values())
         print(" ".join(f"{name}={value}" for name, value in zip(row, shown, strict=True)), flush=True)
 

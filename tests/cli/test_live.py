@@ -71,6 +71,11 @@ def test_a_replay_enters_what_slam_enters_and_tells_poses_and_changes(tmp_path: 
         (["--zenoh", "tcp/localhost:7447"], "a living map is needed"),
         (["--map", "m.evermap", "--zenoh", "tcp/localhost:7447"], "--sensor sensor.toml"),
         (["--map", "m.evermap", "--zenoh", "nonsense", "--sensor", "{0}/sensor.toml"], "--zenoh"),
+        (["--map", "m.evermap", "--zenoh", "z.json5", "--sensor", "{0}/sensor.toml"], "z.json5: 1:"),
+        (["--map", "m.evermap", "--zenoh", "none.json5", "--sensor", "{0}/sensor.toml"], "none.json5: No such file"),
+        (["--replay", "{0}", "--map", "m.evermap", "--sensor", "none.toml"], "leave --sensor out"),
+        (["--replay", "{0}", "--map", "m.evermap", "--topics", "none.toml"], "leave --topics out"),
+        (["--replay", "{0}", "--map", "z.json5"], "z.json5: is no evermap map"),
         (["--map", "m.evermap", "--foxglove", "nonsense", "--sensor", "{0}/sensor.toml"], "no server at nonsense"),
         (["--map", "m.evermap", "--foxglove", "0", "--sensor", "none.toml"], "none.toml"),
         (
@@ -83,10 +88,12 @@ def test_mistakes_are_one_line(
     arguments: list[str], told: str, sessions: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("z.json5").write_text("{ junk", encoding="utf-8")
     result = run("live", *(argument.format(*sessions) for argument in arguments))
     assert result.exit_code == 2
     assert result.stderr.count("\n") == 1
     assert told in result.stderr
+    assert not Path("z.json5.live").exists()
 
 
 def started(*arguments: str | Path) -> subprocess.Popen[str]:

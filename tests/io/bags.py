@@ -44,6 +44,19 @@ class Ros:
         self.store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
         extra = {
             "aruco_msgs/msg/ArucoMarkers": "std_msgs/Header header\nint64[] marker_ids\ngeometry_msgs/Pose[] poses",
+            "fiducial_msgs/msg/FiducialTransform": (
+                "int32 fiducial_id\ngeometry_msgs/Transform transform\nfloat64 image_error\nfloat64 object_error\n"
+                "float64 fiducial_area"
+            ),
+            "fiducial_msgs/msg/FiducialTransformArray": (
+                "std_msgs/Header header\nint32 image_seq\nfiducial_msgs/FiducialTransform[] transforms"
+            ),
+            "apriltag_ros/msg/AprilTagDetection": (
+                "int32[] id\nfloat64[] size\ngeometry_msgs/PoseWithCovarianceStamped pose"
+            ),
+            "apriltag_ros/msg/AprilTagDetectionArray": (
+                "std_msgs/Header header\napriltag_ros/AprilTagDetection[] detections"
+            ),
             "foxglove_msgs/msg/CubePrimitive": "geometry_msgs/Pose pose\ngeometry_msgs/Vector3 size",
             "foxglove_msgs/msg/SceneEntity": (
                 "std_msgs/Header header\nstring id\nfoxglove_msgs/CubePrimitive[] cubes\n"
@@ -71,19 +84,44 @@ class Ros:
         return self.make("geometry_msgs/Pose", at, self.make("geometry_msgs/Quaternion", *map(float, pose[3:])))
 
     def transform(self, stamp_s: float, parent: str, child: str, pose: np.ndarray) -> Any:
+        return self.make("tf2_msgs/TFMessage", [self.stamped_transform(stamp_s, parent, child, pose)])
+
+    def stamped_transform(self, stamp_s: float, parent: str, child: str, pose: np.ndarray) -> Any:
+        inner = self.moved(pose)
+        return self.make("geometry_msgs/TransformStamped", self.header(stamp_s, parent), child, inner)
+
+    def moved(self, pose: np.ndarray) -> Any:
         at = self.make("geometry_msgs/Vector3", *map(float, pose[:3]))
         turn = self.make("geometry_msgs/Quaternion", *map(float, pose[3:]))
-        inner = self.make("geometry_msgs/Transform", at, turn)
-        one = self.make("geometry_msgs/TransformStamped", self.header(stamp_s, parent), child, inner)
-        return self.make("tf2_msgs/TFMessage", [one])
+        return self.make("geometry_msgs/Transform", at, turn)
+
+    def spread(self, pose: np.ndarray) -> Any:
+        return self.make("geometry_msgs/PoseWithCovariance", self.pose(pose), 0.01 * np.eye(6).ravel())
+
+    def twist(self, velocity: np.ndarray) -> Any:
+        parts = (self.make("geometry_msgs/Vector3", *map(float, part)) for part in (velocity[:3], velocity[3:]))
+        return self.make("geometry_msgs/Twist", *parts)
 
     def odometry(self, stamp_s: float, pose: np.ndarray) -> Any:
-        zero = self.make("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
-        still = self.make(
-            "geometry_msgs/TwistWithCovariance", self.make("geometry_msgs/Twist", zero, zero), np.zeros(36)
-        )
-        with_spread = self.make("geometry_msgs/PoseWithCovariance", self.pose(pose), 0.01 * np.eye(6).ravel())
-        return self.make("nav_msgs/Odometry", self.header(stamp_s, "odom"), "base_link", with_spread, still)
+        still = self.make("geometry_msgs/TwistWithCovariance", self.twist(np.zeros(6)), np.zeros(36))
+        return self.make("nav_msgs/Odometry", self.header(stamp_s, "odom"), "base_link", self.spread(pose), still)
+
+    def motion(self, kind: str, stamp_s: float, pose: np.ndarray, velocity: np.ndarray) -> Any:
+        """The pose, or the velocity from there on, as a message of one of the kinds that say where a robot drives."""
+        header, package = self.header(stamp_s, "odom"), "geometry_msgs"
+        if kind == "Odometry":
+            return self.odometry(stamp_s, pose)
+        if kind == "TransformStamped":
+            return self.stamped_transform(stamp_s, "odom", "base_link", pose)
+        said: Any = {
+            "PoseStamped": lambda: self.pose(pose),
+            "PoseWithCovarianceStamped": lambda: self.spread(pose),
+            "TwistStamped": lambda: self.twist(velocity),
+            "TwistWithCovarianceStamped": lambda: self.make(
+                f"{package}/TwistWithCovariance", self.twist(velocity), np.zeros(36)
+            ),
+        }[kind]
+        return self.make(f"{package}/{kind}", header, said())
 
     def camera(self, stamp_s: float) -> Any:
         fx, fy, cx, cy = CAMERA.intrinsics or ()
@@ -157,16 +195,51 @@ def scene(ros: Ros, stamp_s: float, k: int) -> Any:
     return ros.make("foxglove_msgs/SceneUpdate", found)
 
 
+def fiducials(ros: Ros, stamp_s: float, k: int) -> Any:
+    found = [
+        ros.make("fiducial_msgs/FiducialTransform", name, ros.moved(pose), 0.1, 0.1, 100.0)
+        for name, pose in in_camera(k).items()
+    ]
+    return ros.make("fiducial_msgs/FiducialTransformArray", ros.header(stamp_s, "camera_optical"), k, found)
+
+
+def apriltag_ros(ros: Ros, stamp_s: float, k: int) -> Any:
+    header, found = ros.header(stamp_s, "camera_optical"), []
+    for name, pose in in_camera(k).items():
+        posed = ros.make("geometry_msgs/PoseWithCovarianceStamped", header, ros.spread(pose))
+        sizes = np.array([SIZE_M])
+        found.append(ros.make("apriltag_ros/AprilTagDetection", np.array([name], dtype=np.int32), sizes, posed))
+    return ros.make("apriltag_ros/AprilTagDetectionArray", header, found)
+
+
+def markers(ros: Ros, stamp_s: float, k: int) -> Any:
+    """Of ROS 2 only, whose markers have more fields."""
+    header, found, nothing = ros.header(stamp_s, "camera_optical"), [], np.zeros(0, dtype=np.uint8)
+    for name, pose in in_camera(k).items():
+        size = ros.make("geometry_msgs/Vector3", 0.2, 0.2, 0.2)
+        colour, ever = ros.make("std_msgs/ColorRGBA", 1.0, 0.0, 0.0, 1.0), ros.make("builtin_interfaces/Duration", 0, 0)
+        picture, file = (ros.make("sensor_msgs/CompressedImage", header, "", nothing),
+                         ros.make("visualization_msgs/MeshFile", "", nothing))  # fmt: skip
+        found.append(ros.make(
+            "visualization_msgs/Marker", header, "", name, 1, 0, ros.pose(pose), size, colour, ever, False, [], [], "",
+            picture, [], "", "", file, False,
+        ))  # fmt: skip
+    return ros.make("visualization_msgs/MarkerArray", found)
+
+
 DETECTORS: dict[str, tuple[str, Callable[[Ros, float, int], Any]]] = {
     "tags": ("apriltag_msgs/AprilTagDetectionArray", tags),
     "objects": ("vision_msgs/Detection3DArray", objects),
     "directions": ("vision_msgs/Detection2DArray", directions),
     "aruco": ("aruco_msgs/ArucoMarkers", aruco),
     "scene": ("foxglove_msgs/SceneUpdate", scene),
+    "fiducials": ("fiducial_msgs/FiducialTransformArray", fiducials),
+    "apriltag_ros": ("apriltag_ros/AprilTagDetectionArray", apriltag_ros),
+    "markers": ("visualization_msgs/MarkerArray", markers),
 }
 
 
-def write(path: Path, detector: str, *, late_s: float = 0.0, mounted: bool = True, twist: bool = False) -> Path:
+def write(path: Path, detector: str, *, late_s: float = 0.0, mounted: bool = True, odometry: str = "Odometry") -> Path:
     """A bag of the drive: of ROS 1 where its name ends in `.bag`, else of ROS 2, in SQLite where in `_sqlite`."""
     from rosbags import rosbag1, rosbag2
     from rosbags.rosbag2 import StoragePlugin
@@ -181,7 +254,8 @@ def write(path: Path, detector: str, *, late_s: float = 0.0, mounted: bool = Tru
         raw = ros.store.serialize_cdr
     kind, detect = DETECTORS[detector]
     topics = {
-        "/odom": "nav_msgs/Odometry", "/gt/pose": "geometry_msgs/PoseStamped",
+        "/odom": f"{'nav' if odometry == 'Odometry' else 'geometry'}_msgs/{odometry}",
+        "/gt/pose": "geometry_msgs/PoseStamped",
         "/amcl_pose": "geometry_msgs/PoseStamped", "/camera/camera_info": "sensor_msgs/CameraInfo",
         "/tf_static": "tf2_msgs/TFMessage", "/tf": "tf2_msgs/TFMessage", "/camera/seen": kind,
         "/wheels/twist": "geometry_msgs/TwistStamped", "/rosout_agg": "std_msgs/String",
@@ -202,16 +276,9 @@ def write(path: Path, detector: str, *, late_s: float = 0.0, mounted: bool = Tru
             stamp_s = START_S + 0.1 * k
             pose = path_of(k)
             put("/tf", stamp_s, ros.transform(stamp_s, "odom", "base_link", pose))
-            if not twist:
-                put("/odom", stamp_s, ros.odometry(stamp_s, pose))
             step = se3.log(se3.compose(se3.inverse(pose), path_of(k + 1))) / 0.1
-            turning = [ros.make("geometry_msgs/Vector3", *map(float, part)) for part in (step[:3], step[3:])]
-            moving = ros.make("geometry_msgs/Twist", *turning)
-            put(
-                "/wheels/twist",
-                stamp_s,
-                ros.make("geometry_msgs/TwistStamped", ros.header(stamp_s, "base_link"), moving),
-            )
+            put("/odom", stamp_s, ros.motion(odometry, stamp_s, pose, step))
+            put("/wheels/twist", stamp_s, ros.motion("TwistStamped", stamp_s, pose, step))
             for topic in ("/gt/pose", "/amcl_pose"):
                 put(topic, stamp_s, ros.make("geometry_msgs/PoseStamped", ros.header(stamp_s, "map"), ros.pose(pose)))
             put("/camera/camera_info", stamp_s, ros.camera(stamp_s))

@@ -40,7 +40,17 @@ def places(recording: SpatialRecording) -> Iterator[tuple[int, np.ndarray]]:
 
 @pytest.mark.parametrize(
     ("name", "detector"),
-    [("drive.bag", "tags"), ("drive.bag", "aruco"), ("drive", "tags"), ("drive", "aruco"), ("drive_sqlite", "tags")],
+    [
+        ("drive.bag", "tags"),
+        ("drive.bag", "aruco"),
+        ("drive.bag", "fiducials"),
+        ("drive.bag", "apriltag_ros"),
+        ("drive", "tags"),
+        ("drive", "aruco"),
+        ("drive", "fiducials"),
+        ("drive", "apriltag_ros"),
+        ("drive_sqlite", "tags"),
+    ],
 )
 def test_tags_are_where_they_are(name: str, detector: str, tmp_path: Path) -> None:
     bag = write(tmp_path / name, detector)
@@ -110,16 +120,33 @@ def test_directions_to_what_one_camera_sees(tmp_path: Path) -> None:
     assert read_bag(bag).detections.position_sensor_m == pytest.approx(ahead, abs=1e-9)
 
 
-def test_drawings_are_read_where_there_is_nothing_else(tmp_path: Path) -> None:
-    recording = read_bag(write(tmp_path / "drive", "scene"))
+@pytest.mark.parametrize("detector", ["scene", "markers"])
+def test_drawings_are_read_where_there_is_nothing_else(detector: str, tmp_path: Path) -> None:
+    recording = read_bag(write(tmp_path / "drive", detector))
+    assert len(recording.detections) == 2 * STEPS
     for identity, pose in places(recording):
-        assert pose == pytest.approx(TAGS[int(recording.landmark_names[identity])], abs=1e-6)
+        assert pose == pytest.approx(TAGS[int(recording.landmark_names.get(identity, identity))], abs=1e-6)
 
 
-def test_velocities_are_integrated(tmp_path: Path) -> None:
-    recording = read_bag(write(tmp_path / "drive", "aruco", twist=True))
+@pytest.mark.parametrize("name", ["drive", "drive.bag"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "PoseStamped",
+        "PoseWithCovarianceStamped",
+        "TransformStamped",
+        "TwistStamped",
+        "TwistWithCovarianceStamped",
+    ],
+)
+def test_motion_is_read_of_poses_and_of_velocities(name: str, kind: str, tmp_path: Path) -> None:
+    bag = write(tmp_path / name, "aruco", odometry=kind)
+    settings_path(bag).write_text(bag_settings(bag).replace('odometry = "/wheels/twist"', 'odometry = "/odom"'))
+    recording = read_bag(bag)
     assert recording.odometry is not None
     assert recording.odometry.pose_world_robot == pytest.approx(np.array([path_of(k) for k in range(STEPS)]), abs=1e-6)
+    if kind == "PoseWithCovarianceStamped":
+        assert recording.odometry.variance == pytest.approx(np.full((STEPS, 6), 0.01))
 
 
 def test_clocks_that_differ_are_told_and_can_be_given_up(tmp_path: Path) -> None:

@@ -107,6 +107,7 @@ def live(
     if map_file is not None and replay is None and sensor is None:
         raise ConfigError("it is not known what the sensor sees", field="sensor", hint="--sensor sensor.toml")
     recording = None if replay is None else _recording(replay, robot)
+    _check_needed(recording, sensor, topics)
     mailbox = Mailbox() if replay is None else None
     wires = wires_of(zenoh, foxglove, mailbox)
     try:
@@ -125,6 +126,16 @@ def _recording(path: Path, robot: int | None) -> AnyRecording:
     from evermap.io import read_recording
 
     return read_recording(path, robot=robot)
+
+
+def _check_needed(recording: AnyRecording | None, sensor: Path | None, topics: Path | None) -> None:
+    """Refuse files that would say what a recording in the plane says itself."""
+    from evermap.types import Recording
+
+    for name, path in (("sensor", sensor), ("topics", topics)):
+        if path is not None and isinstance(recording, Recording):
+            problem = f"'{recording.name}' says itself what was seen by what"
+            raise ConfigError(problem, field=name, hint=f"leave --{name} out; it is for messages and for bags")
 
 
 def _be_the_robot(recording: AnyRecording, wires: Sequence[Wire]) -> None:

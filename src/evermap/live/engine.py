@@ -306,7 +306,7 @@ class Engine:
             self._keeper.write_if_due()
         if self._keeper.enter_if_waiting():
             self._go_on()
-        if self._judge is not None and now_s - self._judged_s >= live.judge_s:
+        if self._judge is not None and now_s - self._judged_s >= max(live.judge_s, self._judge.rest_s):
             self._judged_s = now_s
             self._keeper.beside("judge", self._judge.judge)
 

@@ -23,6 +23,9 @@ from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, 
 TAKEN_OVER_S = 300.0
 """Looks over so long become beliefs, and are forgotten: what is asked of them costs the same at any time."""
 
+REST_S = 2.5e-4
+"""Time between two questions for each sighting of the first one, at least: some twenty times what that takes."""
+
 
 class _Glance(NamedTuple):
     """A frame: stamp and pose (3,); landmarks (H,) that were seen at places of the map, with the sites of these; and
@@ -65,6 +68,8 @@ class Judge:
         self._known: set[tuple[Any, ...]] = set()
         self._found: list[MapChange] = []
         self._after: tuple[LivingMap, Vicinity | None] = living, None
+        self.rest_s = 0.0
+        """How long to wait until the next question, at least."""
 
     @property
     def living(self) -> LivingMap:
@@ -92,6 +97,7 @@ class Judge:
             glances = self._glances[:]
         if len(glances) < 2:
             return
+        self.rest_s = REST_S * sum(len(one.landmark_id) for one in glances)
         config, whole = self._config.living, self._whole
         living, vicinity = whole, None
         if len(whole.places) > config.whole_places:

@@ -87,6 +87,8 @@ class Keeper:
             ConfigError: another process feeds it.
         """
         if mapping:
+            if living is None and self.file.exists():
+                open_store(self.file, create=True).close()  # what is no map gets nothing beside it
             self.feed()
         try:
             living = self.load(create=mapping)[0] if living is None else living

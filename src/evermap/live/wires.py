@@ -139,7 +139,7 @@ class Zenoh:
             self._session: Any = zenoh.open(_zenoh_config(zenoh, where))
         except zenoh.ZError as error:
             hint = "tcp/localhost:7447, listen=tcp/0.0.0.0:7447, or the file of a session's configuration"
-            raise ConfigError(_first_line(error), field="zenoh", hint=hint) from None
+            raise ConfigError(f"{where}: {_first_line(error)}", field="zenoh", hint=hint) from None
         self._id = bytes.fromhex(str(self._session.zid()).rjust(32, "0"))[:16]
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=100)
         kinds = () if mailbox is None else ("*",) if mailbox.ours else KINDS
@@ -280,7 +280,7 @@ class _Clients:
 def _zenoh_config(zenoh: Any, where: str) -> Any:
     """Of a session, by the defaults of rmw_zenoh: no multicast, peers find each other by the router."""
     values: dict[str, Any] = {"timestamping/enabled": True}  # needed to keep messages for those who come later
-    if Path(where).is_file():
+    if Path(where).suffix in (".json", ".json5", ".yaml", ".yml"):
         config = zenoh.Config.from_file(where)
     else:
         config, listens, endpoint = zenoh.Config(), where.startswith("listen="), where.removeprefix("listen=")
@@ -300,8 +300,9 @@ def _zenoh_config(zenoh: Any, where: str) -> Any:
 
 
 def _first_line(error: Exception) -> str:
-    """What is wrong, without where in the library's source."""
-    return printable(re.split(r"\n| at /", str(error))[0] or type(error).__name__, 200)
+    """What is wrong, and with a file where, without where in the library's source."""
+    first, *others = str(error).split(" at /")[0].strip().splitlines() or [type(error).__name__]
+    return printable(": ".join([first.strip(" ->"), *(one.strip(" =") for one in others[-1:])]), 200)
 
 
 def wires_of(zenoh: str | None, foxglove: str | None, mailbox: Mailbox | None) -> list[Wire]:
