@@ -57,7 +57,7 @@ docs: $(RUNTIME) $(DOCUMENTATION)
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict --quiet
 
 docs-check: $(DEVELOPMENT)
-	$(VENV)/bin/python -m pytest tests/docs -m "slow or not slow"
+	$(PYTEST) tests/docs -m "slow or not slow"
 
 bench: $(DEVELOPMENT)
 	$(VENV)/bin/evermap bench

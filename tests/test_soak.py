@@ -72,6 +72,7 @@ mixes = st.builds(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(faults=mixes, seed=st.integers(0, 10_000))
 def test_whatever_goes_wrong_in_a_session_its_numbers_are_numbers(
@@ -97,6 +98,7 @@ def test_a_session_that_shows_no_two_places_of_the_map_leaves_it(
     assert any("map" in warning for warning in session.slam.warnings)
 
 
+@pytest.mark.slow
 def test_a_few_sessions_of_faults_do_not_spoil_the_map(soak: ModuleType) -> None:
     """Quick version of the soak below: fewer sessions, the same demands but for memory."""
     recordings = soak.world(0.2, seed=3)
@@ -122,6 +124,7 @@ def test_a_map_begins_with_what_is_sure_of_a_session(soak: ModuleType, silent_s:
     assert off_m.max() < 0.6
 
 
+@pytest.mark.slow
 def test_the_same_faults_make_the_same_map(visits: tuple[Recording, ...]) -> None:
     def maps() -> list[LivingMap]:
         living, after = LivingMap(), []

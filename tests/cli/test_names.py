@@ -141,6 +141,7 @@ def test_why_and_diff_of_a_map(site: Path, tmp_path: Path) -> None:
     assert len(shown & set(NAMES)) > 3
 
 
+@pytest.mark.slow
 def test_objects_and_their_lifetimes(tmp_path: Path) -> None:
     table = tmp_path / "detections.csv"
     run("track", "--init", table)

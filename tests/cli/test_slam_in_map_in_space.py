@@ -82,6 +82,7 @@ def refused(*arguments: str | Path) -> str:
     return result.stderr
 
 
+@pytest.mark.slow
 def test_sessions_in_space_of_which_one_is_late(days: list[Path], tmp_path: Path) -> None:
     site, out = tmp_path / "site.evermap", tmp_path / "out"
     first = slam(days[0], "--map", site, "--out", out)

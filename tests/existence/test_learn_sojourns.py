@@ -214,6 +214,7 @@ def test_evidence_of_learning_is_that_of_the_filter() -> None:
     assert learned.log_evidence == pytest.approx(learned.model.track(looks).log_evidence.sum(), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_rhythm_has_steps_within_its_ten_minutes() -> None:
     """Looks every half an hour: learning takes the same steps as the filter."""
     rng = np.random.default_rng(14)

@@ -143,6 +143,7 @@ def test_revisions_within_a_session_are_the_sessions_of_its_parts(tmp_path: Path
     assert np.median(np.hypot(*(pose.pose_world_robot[:, :2] - true).T)) < 0.5
 
 
+@pytest.mark.slow
 def test_a_revision_is_entered_by_a_process_beside_the_steps(tmp_path: Path) -> None:
     recording, path = SESSIONS[0], tmp_path / "site.evermap"
     with engine(path, recording, Config(live={"revision_s": 20.0}), beside=True) as live:

@@ -163,6 +163,7 @@ def pruned(path: Path, head: int) -> bool:
     return bool(checked.pruned)
 
 
+@pytest.mark.slow
 def test_killed_at_every_statement_of_pruning(tmp_path: Path) -> None:
     """Before each statement and each commit in turn: all of it is there, or only the newest revision."""
     path, head = tmp_path / "m.evermap", 4
@@ -185,6 +186,7 @@ def test_killed_at_every_statement_of_pruning(tmp_path: Path) -> None:
     assert pruned(path, head)
 
 
+@pytest.mark.slow
 def test_killed_inside_of_statements_of_pruning(tmp_path: Path) -> None:
     """At forty steps of the database engine, evenly over all: those that make the file smaller are among them."""
     path, head, every = tmp_path / "m.evermap", 4, 25
@@ -231,6 +233,7 @@ def test_killed_inside_of_statements_of_pruning(tmp_path: Path) -> None:
     assert {size for size, was in zip(sizes, done, strict=True) if was} >= {len(data)}
 
 
+@pytest.mark.slow
 def test_killed_at_random_instants_of_pruning(tmp_path: Path) -> None:
     """Also while the smaller file is written over the larger one."""
     path, head, count = tmp_path / "m.evermap", 3, 60

@@ -46,6 +46,7 @@ def lived(*, large: bool) -> tuple[em.Session, ...]:
     return tuple(sessions)
 
 
+@pytest.mark.slow
 def test_the_same_changes_are_told_of_a_large_map() -> None:
     n_dated = 0
     for small, large in zip(lived(large=False), lived(large=True), strict=True):

@@ -77,6 +77,7 @@ def test_nothing_is_seen_through_a_shut_door(world: World) -> None:
             assert count[inside].sum() <= 2  # wrong identities
 
 
+@pytest.mark.slow
 def test_a_short_life(tmp_path: Path) -> None:
     content = study.reproduce(tmp_path / "out", Settings(worlds=1, days=2, methods=("evermap",)))
     (run,) = content["runs"]

@@ -109,6 +109,7 @@ def test_tracks_of_patrols_are_the_stays_that_are_drawn_directly() -> None:
         assert np.abs(tracked[known] - direct[known]).max() <= 8.0
 
 
+@pytest.mark.slow
 def test_coverage_is_counted_as_it_should_be() -> None:
     """Of one class at two like places: the share of bands that hold the truth, once more by hand."""
     world = replace(SMALL_PATROLS, places=SMALL_PATROLS.places[:2])

@@ -52,6 +52,7 @@ def test_same_seed_same_recording() -> None:
     assert np.array_equal(first.detections.range_m, again.detections.range_m)
 
 
+@pytest.mark.slow
 def test_study_writes_what_it_measured(tmp_path: Path) -> None:
     content = study.reproduce(tmp_path / "out", study.Settings(robots=2, seed=19))
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["robots"] == content["robots"]

@@ -41,6 +41,7 @@ def test_points_of_a_hall_are_told_apart_and_met_again(drift):
     assert np.mean(found.detections.landmark_id[false] == UNKNOWN) > 0.8
 
 
+@pytest.mark.slow
 def test_the_loop_is_closed_behind_a_drift_of_metres():
     """Odometry alone has the landmarks of the second round two spacings off."""
     recording = hall(2, n_points=60, n_frames=450, step_s=0.6, drift=0.1)

@@ -65,6 +65,7 @@ def test_what_was_moved_turned_taken_and_brought_back_is_told_when_it_is_seen(se
     assert min(p.values()) > 0.9
 
 
+@pytest.mark.slow
 def test_of_a_large_map_a_session_touches_what_is_near() -> None:
     """The same changes and beliefs, whether a map is updated as one or in parts."""
     found = []
