@@ -149,7 +149,7 @@ class Associator:
         self._row: IntArray = np.full(len(problem.pose_row), NOBODY, dtype=np.int64)
         self._sigma = INFLATION * SightingNoise.constant(noise.detection).of_detections(problem)
         self._filter = LocalFilter(problem.mount, problem.prior, most=MOST_COMPARED)
-        self._done = 0
+        self._done, self._doubted = 0, 0
         self._next_stock = FIRST_STOCK
         self._density_m2 = landmark_density(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
 
@@ -241,6 +241,11 @@ class Associator:
         assignment = assignment.without(_seldom(assignment))
         return assignment.without(~likely_real(assignment) & (assignment.told == 0))
 
+    @property
+    def doubtful(self) -> float:
+        """Share of the detections so far that might have been of several landmarks when they were made."""
+        return self._doubted / max(int(self._first[self._done]), 1)
+
     def learned_odometry(self, assignment: Assignment) -> FloatArray:
         """Return (5,) noise levels of the odometry by restricted likelihood, were all associations right.
 
@@ -323,6 +328,7 @@ class Associator:
         self._row[known] = target
         local.update(target, problem.reading[known], frame.sigma[known], weighing=GATED)
         new = detections[frame.p_new >= P_NEW]
+        self._doubted += len(detections) - len(known) - len(new)
         self._row[new] = len(local.position) + np.arange(len(new))
         self._of_kind[target] = np.maximum(self._of_kind[target], self._kind[known])
         self._of_kind = np.vstack([self._of_kind, self._kind[new]])

@@ -26,6 +26,8 @@ ALL_TRIED = 100
 """Landmarks of a prior map up to which every pair of them is tried; beyond, an index over constellations is asked."""
 MOST_NAMED = 100
 """Landmarks known by name that a session is laid over a map by."""
+FEW_DOUBTFUL = 0.02
+"""Share of doubtful detections up to which who is who hardly depends on what is assumed of the odometry."""
 MAP_FLOOR_M = 1e-3
 """A prior map without uncertainty is taken to be known to a millimetre."""
 
@@ -93,11 +95,12 @@ def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, k
             associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior))
         return associator.finish()
 
-    # how wrong the odometry is decides what may be one, and is known only afterwards: once more, with that
     cautious = Associator(problem, noise, kind)
-    first = finished(cautious)
-    second = finished(Associator(problem, noise, kind, cautious.learned_odometry(first)))
-    assignment = min(first, second, key=cautious.against)
+    assignment = finished(cautious)
+    if cautious.doubtful > FEW_DOUBTFUL:
+        # how wrong the odometry is decides what may be one, and is known only afterwards: once more, with that
+        again = finished(Associator(problem, noise, kind, cautious.learned_odometry(assignment)))
+        assignment = min(assignment, again, key=cautious.against)
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
     return Associated(row, name, assignment, cautious.noise, prior)
