@@ -278,6 +278,14 @@ class Associator:
         told = float(_twice(assignment).sum()) + FEW_NATS * assignment.n_landmarks
         return fit + self.noise.outlier_log_odds * nobody + told
 
+    def better(self, first: Assignment, second: Assignment) -> Assignment:
+        """Choose the second assignment where it explains all detections clearly better, see `against`; else the first.
+
+        How many detections are of no landmark is taken to be known to the square root of their number.
+        """
+        chance = self.noise.outlier_log_odds * math.sqrt(np.count_nonzero(first.landmark_row == NOBODY))
+        return second if self.against(second) + chance < self.against(first) else first
+
     def _match(self, detections: IntArray) -> _Frame:
         """The frame's detections weighed against the landmarks known so far."""
         sigma = self._sigma

@@ -100,7 +100,7 @@ def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, k
     if cautious.doubtful > FEW_DOUBTFUL:
         # how wrong the odometry is decides what may be one, and is known only afterwards: once more, with that
         again = finished(Associator(problem, noise, kind, cautious.learned_odometry(assignment)))
-        assignment = min(assignment, again, key=cautious.against)
+        assignment = cautious.better(assignment, again)
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
     return Associated(row, name, assignment, cautious.noise, prior)
