@@ -34,6 +34,37 @@ def interrupt() -> None:
     signal.raise_signal(signal.SIGINT)
 
 
+READING = """
+import os, random, signal, sys, threading, time
+from evermap import interrupts
+from evermap.io.columns import read_columns
+
+heard, done, lost = threading.Event(), threading.Event(), []
+interrupts._leave = lambda number, frame: heard.set()
+interrupts.leave_on_signals()
+
+def ask():
+    for _ in range(100):
+        time.sleep(random.uniform(0.0, 0.004))
+        heard.clear()
+        os.kill(os.getpid(), signal.SIGINT)
+        lost.append(not heard.wait(1.0))
+    done.set()
+
+threading.Thread(target=ask).start()
+while not done.is_set():
+    read_columns(sys.argv[1], [])
+sys.exit(sum(lost))
+"""
+
+
+def test_an_interrupt_at_the_end_of_a_table_is_heard(tmp_path: Path) -> None:
+    """Arrow has handlers of its own while it reads, which lose one in ten."""
+    table = tmp_path / "table.csv"
+    table.write_text("stamp_s,range_m\n" + "1.5,2.25\n" * 5_000)
+    assert subprocess.run([sys.executable, "-c", READING, table], check=False).returncode == 0
+
+
 def test_a_held_block_ends_before_it_is_interrupted() -> None:
     done = []
 

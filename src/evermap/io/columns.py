@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
+from evermap.interrupts import raises
 from evermap.io.files import unpacked
 from evermap.io.table import Table, arrow_cells, dates_as_text, numbers_of, parse_csv, read_parquet
 from evermap.io.text import quote, reason
@@ -242,6 +243,8 @@ def _fast_csv(data: bytes, path: Path) -> Columns | None:
         return None
     header = parse_csv(head[0], path, [])
     names = list(header.columns)
+    if not raises():
+        pa.enable_signal_handlers(False)  # Arrow's own lose a signal that comes as a table ends, one in ten
     rows = data.count(b"\n", head.end()) + (not data.endswith(b"\n"))
     try:
         table = csv.read_csv(
