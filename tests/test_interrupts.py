@@ -14,8 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evermap import interrupts
+from evermap.cli.warmup import warm_up
 from evermap.interrupts import held, temporary, watched
 from evermap.pipeline import run_slam
+from evermap.slam.streaming import StreamingSlam
 from evermap_studies.sim import BuildingConfig, simulate_building
 from evermap_studies.workers import sheltered
 
@@ -32,6 +35,19 @@ def python_s_own_handler() -> Iterator[None]:
 
 def interrupt() -> None:
     signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupt_of_the_warm_up_is_for_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    def step(self: StreamingSlam, **given: bool) -> None:
+        steps.append(interrupts._open["watched"])
+        if sum(steps) == 5:  # what was done is enough to end with
+            interrupt()
+        whole(self, **given)
+
+    whole, steps = StreamingSlam.step, list[int]()
+    monkeypatch.setattr(StreamingSlam, "step", step)
+    with pytest.raises(KeyboardInterrupt):
+        warm_up.__wrapped__(search=False)
 
 
 READING = """

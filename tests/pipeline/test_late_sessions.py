@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,6 +70,23 @@ def assert_same(a: LivingMap, b: LivingMap) -> None:
 @pytest.fixture(scope="module")
 def in_order(tmp_path_factory: pytest.TempPathFactory) -> LivingMap:
     return built(tmp_path_factory.mktemp("order") / "site.evermap", range(4))
+
+
+def test_an_interrupt_while_later_sessions_are_entered_again_leaves_the_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(recording: Recording, *given: Any, **named: Any) -> em.Session:
+        session = run_session(recording, *given, **named)
+        return replace(session, slam=replace(session.slam, interrupted=recording is not SESSIONS[1]))
+
+    run_session = em.run_session
+    with open_store(tmp_path / "site.evermap", create=True) as store:
+        fed(store, SESSIONS[0])
+        fed(store, SESSIONS[2])
+        monkeypatch.setattr("evermap.pipeline.run_session", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            em.enter_session(store, SESSIONS[1])
+        assert store.head() == 2
 
 
 @pytest.mark.parametrize("order", [(0, 2, 3, 1), (3, 1, 0, 2), (1, 3, 0, 2)])

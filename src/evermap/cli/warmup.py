@@ -17,6 +17,7 @@ from evermap.types import (
     Odometry,
     Recording,
     Sensor,
+    SlamResult,
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
@@ -50,14 +51,15 @@ def warm_up(
         traffic: what boxes without identity in these need, too.
     """
     if in_space and sessions:
-        run_session(_flight(1e5), run_session(_flight(0.0)).living)
+        first = run_session(_flight(0.0))
+        _done(first.slam, run_session(_flight(1e5), first.living).slam)
         return
     if in_space:
         if traffic:
             from evermap.tracking.run import warm_up as of_the_tracker
 
             of_the_tracker()
-        run_slam(_flight(0.0), Config(slam={"unknown_ids": unknown_ids}))
+        _done(run_slam(_flight(0.0), Config(slam={"unknown_ids": unknown_ids})))
         return
     if localize:
         from evermap.slam.localize_recording import warm_up as of_the_localizer
@@ -73,9 +75,16 @@ def warm_up(
 
         of_the_association()
     if sessions:
-        run_session(_drive(1e5), run_session(_drive(0.0), config=config).living, config)
+        first = run_session(_drive(0.0), config=config)
+        _done(first.slam, run_session(_drive(1e5), first.living, config).slam)
     else:
-        run_slam(_drive(0.0), config)
+        _done(run_slam(_drive(0.0), config))
+
+
+def _done(*results: SlamResult) -> None:
+    """Raise `KeyboardInterrupt` where Ctrl-C ended one of the runs early: it was meant for the job."""
+    if any(result.interrupted for result in results):
+        raise KeyboardInterrupt
 
 
 def _drive(start_s: float) -> Recording:

@@ -381,6 +381,8 @@ def _again(store: MapStore, step: _Step, living: LivingMap) -> tuple[LivingMap, 
         session = run_session(recording, living, parse_config(step.revision.provenance.config))
     except DataError as error:
         raise UnbridgedError(f"revision {step.revision.number} cannot be brought in again: {error}") from None
+    if session.slam.interrupted:  # half of a session must not take the place of the whole
+        raise KeyboardInterrupt("the map is as it was")
     if not session.found:  # what is in the map is not dropped
         problem = f"revision {step.revision.number} cannot be brought in again: {session.set_aside[0]}"
         raise UnbridgedError(problem, path=store.where, hint="sessions that overlap with both, then this one again")
