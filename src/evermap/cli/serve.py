@@ -202,13 +202,14 @@ def _of_database(store: str) -> Iterator[tuple[str, bool, str]]:
     told = ", ".join(f"{roles.count(role.name.lower())} {role.name.lower()}" for role in Role)
     yield "tokens", "admin" in roles, told + ("" if "admin" in roles else "; evermap serve token NAME --role admin")
     broken, sites = [], SiteStores(store)
-    for site in sites.names():
+    names = sites.names()
+    for site in names:
         try:
             with sites.store(site) as one:
                 one.named()
         except EvermapError as error:
             broken.append(f"{site}: {error.one_line()}")
-    yield "maps", not broken, "; ".join(broken) or f"{len(sites.names())}, each with a newest revision"
+    yield "maps", not broken, "; ".join(broken) or f"{len(names)}, each with a newest revision"
     by_state, waits_s, working = database.queue()
     told = ", ".join(f"{count} {state}" for state, count in sorted(by_state.items())) or "no session yet"
     yield "queue", waits_s < _PATIENCE_S, f"{told}; the oldest that waits has done so for {waits_s:.0f} s"

@@ -119,7 +119,6 @@ class _Frame:
     pairings: Pairings
     taken: IntArray
     p_new: FloatArray
-    sigma: FloatArray
     evidence: float
 
 
@@ -273,7 +272,7 @@ class Associator:
         """
         assignment = self._solved(assignment).assignment
         solved = self._solved(replace(assignment, measured=self._with_sigma(assignment.measured)))  # its own noise
-        nobody = int((assignment.landmark_row == NOBODY).sum())
+        nobody = np.count_nonzero(assignment.landmark_row == NOBODY)
         fit = solved.cost + float(np.log(solved.assignment.measured.sigma_given).sum())
         told = float(_twice(assignment).sum()) + FEW_NATS * assignment.n_landmarks
         return fit + self.noise.outlier_log_odds * nobody + told
@@ -288,10 +287,9 @@ class Associator:
 
     def _match(self, detections: IntArray) -> _Frame:
         """The frame's detections weighed against the landmarks known so far."""
-        sigma = self._sigma
         kind = self._kind[detections], self._of_kind
         pairings = pairings_of_frame(
-            self._filter, self._problem, sigma, detections, density=self._density_m2, kind=kind
+            self._filter, self._problem, self._sigma, detections, density=self._density_m2, kind=kind
         )
         probability, evidence, _ = pairing_probability(pairings, confidence=GATE)
         known = np.zeros(len(detections))
@@ -300,7 +298,7 @@ class Associator:
         away = self._problem.stamp_s[self._done] - self._seen_s[pairings.target] > FORGET_S
         least = np.where(away & ~pairings.followed, P_RETURN, P_MATCH)
         taken = np.flatnonzero((probability >= least) | self._harmless(pairings, probability, known, least))
-        return _Frame(pairings, taken, 1.0 - known, sigma, evidence)
+        return _Frame(pairings, taken, 1.0 - known, evidence)
 
     def _harmless(self, pairings: Pairings, probability: FloatArray, known: FloatArray, least: FloatArray) -> BoolArray:
         """(K,) the best pairing of a detection where a wrong choice bends nothing, and the end or a merge will tell.
@@ -334,7 +332,7 @@ class Associator:
         problem, local, pairings = self._problem, self._filter, frame.pairings
         known, target = detections[pairings.source[frame.taken]], pairings.target[frame.taken]
         self._row[known] = target
-        local.update(target, problem.reading[known], frame.sigma[known], weighing=GATED)
+        local.update(target, problem.reading[known], self._sigma[known], weighing=GATED)
         new = detections[frame.p_new >= P_NEW]
         self._doubted += len(detections) - len(known) - len(new)
         self._row[new] = len(local.position) + np.arange(len(new))
@@ -345,7 +343,7 @@ class Associator:
         at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
         for row, place in zip(self._row[new].tolist(), at, strict=True):
             local.meet(row, place)
-        local.update(self._row[new], problem.reading[new], frame.sigma[new], weighing=GATED)
+        local.update(self._row[new], problem.reading[new], self._sigma[new], weighing=GATED)
 
     def _take_stock(self) -> None:
         """Solve everything so far, merge what is one, and go on from there."""
