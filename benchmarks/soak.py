@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import gc
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -105,13 +105,15 @@ class Soak:
         }
 
 
-def world(hours: float, seed: int) -> tuple[Recording, ...]:
+def world(
+    hours: float, seed: int, *, session_s: float = SESSION_S, a_day: int = SESSIONS_A_DAY
+) -> tuple[Recording, ...]:
     """Sessions of a robot that drives for so many hours in all, by day, at low rates of its sensors."""
-    sessions = max(2, round(hours * 3600.0 / SESSION_S))
+    sessions = max(2, round(hours * 3600.0 / session_s))
     config = BuildingConfig(
-        days=-(-sessions // SESSIONS_A_DAY),
-        sessions_per_day=min(sessions, SESSIONS_A_DAY),
-        patrol_s=SESSION_S,
+        days=-(-sessions // a_day),
+        sessions_per_day=min(sessions, a_day),
+        patrol_s=session_s,
         drive=DriveConfig(truth_hz=20.0),
         odometry=OdometryConfig(rate_hz=10.0),
         sensor=SimulatedSensor(rate_hz=2.0),
@@ -120,16 +122,22 @@ def world(hours: float, seed: int) -> tuple[Recording, ...]:
 
 
 def soak(recordings: tuple[Recording, ...], faults: FaultConfig = FAULTLESS, *, seed: int = 0) -> Soak:
-    """Session after session into one map.
+    """Session after session into one map, with faults."""
+    faulty = (with_faults(recording, faults, seed=1000 * seed + row) for row, recording in enumerate(recordings))
+    return entered(faulty, recordings)
+
+
+def entered(told: Iterable[Recording], recordings: tuple[Recording, ...]) -> Soak:
+    """Session after session into one map, as they are `told`, scored by the recordings as they truly were.
 
     Sessions that are refused with an `EvermapError` leave the map as it is; anything else that is raised goes through.
     """
     found, living, pose_truth_map = Soak(), LivingMap(), None
-    for row, recording in enumerate(recordings):
+    for row, (given, recording) in enumerate(zip(told, recordings, strict=True)):
         found.driven_s += float(np.ptp(recording.odometry.stamp_s))
         session: Session | None = None
         try:
-            session = run_session(with_faults(recording, faults, seed=1000 * seed + row), living)
+            session = run_session(given, living)
             living = session.living
         except (DataError, NumericalError) as refusal:
             found.refused.append(f"session {row}: {refusal}")
@@ -246,13 +254,15 @@ def _rmse(session: Session, recording: Recording, pose_truth_map: FloatArray) ->
 
 
 def _off(session: Session, recording: Recording, pose_truth_map: FloatArray) -> float:
-    """Frames are recognised by their readings, which no two share, whatever is stamped on them."""
+    """Frames are recognised by their readings, which no two share, whatever is stamped on them; nan where none is."""
     truth, path, used, told = recording.truth, session.slam.trajectory, session.recording, recording.detections
     assert truth is not None
     assert isinstance(used, Recording)
     order = np.argsort(told.range_m)
     at = np.minimum(np.searchsorted(told.range_m[order], used.detections.range_m), len(order) - 1)
     same = told.range_m[order][at] == used.detections.range_m
+    if not same.any():
+        return float("nan")
     frame, row = np.unique(used.detections.frame[same], return_index=True)
     stamp_s, taken_s = used.frames.stamp_s[frame], recording.frames.stamp_s[told.frame[order[at[same][row]]]]
     inside = (stamp_s >= path.stamp_s[0]) & (stamp_s <= path.stamp_s[-1])

@@ -200,3 +200,22 @@ def test_24_hours_of_faults(soak: ModuleType) -> None:
     assert ours["recall"] > LEAST_SHARE * theirs["recall"]
     # the map grows with what has come and gone, and with strangers; the process grows by no more than that and noise
     assert faulty.growth_mb() < 20.0 + 3e-3 * (faulty.map_kb[-1] - faulty.map_kb[len(recordings) // 4])
+
+
+def test_lies_of_a_robot(soak: ModuleType, visits: tuple[Recording, ...]) -> None:
+    """Each of them changes what it says it does, and no truth."""
+    from benchmarks.liars import LIES, lie
+
+    honest, rng = visits[0], np.random.default_rng(0)
+    told = {kind: lie(honest, kind, visits[1], rng) for kind in LIES}
+    before = honest.detections
+    np.testing.assert_array_equal(told["nothing"].detections.range_m, before.range_m)
+    np.testing.assert_allclose(told["ranges 10 %"].detections.range_m, 1.1 * before.range_m)
+    np.testing.assert_allclose(told["ranges 0.3 m"].detections.range_m, before.range_m + 0.3)
+    np.testing.assert_allclose(told["bearings 6 degrees"].detections.bearing_rad, before.bearing_rad + 0.1)
+    grown = told["drifts"].detections.range_m / before.range_m
+    assert grown[0] < grown[-1] < 1.1
+    assert told["sees 2.5 m"].detections.range_m.max() < 2.5
+    assert 0.2 < len(told["detects a third"].detections) / len(before) < 0.5
+    assert 0.1 < np.mean(told["misreads"].detections.landmark_id != before.landmark_id) < 0.2
+    assert told["another building"] is visits[1]

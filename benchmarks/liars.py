@@ -1,0 +1,102 @@
+"""One of five robots has something wrong with it: what does that do to the map that they share?
+
+Five robots take turns in a simulated building (20 sessions), each of them calibrated anew in every session; the last
+one's readings are falsified. Precision and recall are those of the landmarks that the map believes in after the first
+round, on average over the sessions.
+
+    python -m benchmarks.liars                            # the table of docs/server.md
+    python -m benchmarks.liars --seeds 0 --lies nothing "ranges 10 %"
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.soak import entered, world
+from evermap.types import Recording, rows_of
+
+ROBOTS, SESSION_S, SESSIONS = 5, 120.0, 20
+LIES = (
+    "nothing",
+    "bearings 6 degrees",
+    "ranges 0.3 m",
+    "detects a third",
+    "sees 2.5 m",
+    "misreads",
+    "ranges 10 %",
+    "ranges 5 %",
+    "drifts",
+    "another building",
+)
+
+
+def lie(recording: Recording, kind: str, elsewhere: Recording, rng: np.random.Generator) -> Recording:
+    """Return the recording of a robot with something wrong, one of `LIES`.
+
+    Args:
+        recording: what an honest one records.
+        kind: what is wrong.
+        elsewhere: a recording of another building, at the same time.
+        rng: of what is wrong at random.
+
+    Raises:
+        KeyError: `kind` is not in `LIES`.
+    """
+    told = recording.detections
+    if kind == "another building":
+        return elsewhere
+    if kind in ("detects a third", "sees 2.5 m"):
+        kept = rng.random(len(told)) < 0.35 if kind == "detects a third" else told.range_m < 2.5
+        return replace(recording, detections=rows_of(told, kept))
+    if kind == "misreads":
+        names, wrong = told.landmark_id.copy(), rng.random(len(told)) < 0.2
+        names[wrong] = rng.choice(np.unique(names), np.count_nonzero(wrong))
+        return replace(recording, detections=replace(told, landmark_id=names))
+    into = (recording.frames.stamp_s[told.frame] - recording.frames.stamp_s[0]) / SESSION_S
+    factor, longer, turned = {
+        "nothing": (1.0, 0.0, 0.0),
+        "bearings 6 degrees": (1.0, 0.0, 0.1),
+        "ranges 0.3 m": (1.0, 0.3, 0.0),
+        "ranges 10 %": (1.1, 0.0, 0.0),
+        "ranges 5 %": (1.05, 0.0, 0.0),
+        "drifts": (1.0 + 0.1 * into, 0.0, 0.26 * into),
+    }[kind]
+    wrong = replace(told, range_m=told.range_m * factor + longer, bearing_rad=told.bearing_rad + turned)
+    return replace(recording, detections=wrong)
+
+
+def scores(kind: str, seed: int) -> tuple[float, float, float]:
+    """Return precision and recall of the map after the first round, and the share of the liar's sessions set aside."""
+    hours = SESSIONS * SESSION_S / 3600.0
+    honest, other = (world(hours, at, session_s=SESSION_S, a_day=ROBOTS) for at in (seed, seed + 500))
+    rng, last = np.random.default_rng(seed), ROBOTS - 1
+
+    def told() -> Iterator[Recording]:
+        for row, (recording, elsewhere) in enumerate(zip(honest, other, strict=True)):
+            yield lie(recording, kind, elsewhere, rng) if row % ROBOTS == last else recording
+
+    found = entered(told(), honest)
+    apart = [row for row in range(last, len(honest), ROBOTS) if row in found.set_aside or np.isnan(found.rmse_m[row])]
+    precision, recall = (float(np.mean(share[ROBOTS:])) for share in (found.precision, found.recall))
+    return precision, recall, len(apart) / (len(honest) // ROBOTS)
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--lies", choices=LIES, nargs="+", default=LIES)
+    chosen = parser.parse_args()
+    print("| what is wrong | seed | precision | recall | its sessions set aside |\n|---|---:|---:|---:|---:|")
+    for kind in chosen.lies:
+        for seed in chosen.seeds:
+            precision, recall, aside = scores(kind, seed)
+            print(f"| {kind} | {seed} | {precision:.3f} | {recall:.3f} | {aside:.0%} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
