@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -33,6 +34,8 @@ EVERY_S = 0.5
 """Time between two lines of progress."""
 SWITCH_S = 5e-4
 """Turn of a thread while others wait: what is done beside the steps takes many, and a pose shall not wait for them."""
+MMAP_THRESHOLD, LARGE = -3, 2**18
+"""A parameter of glibc's `mallopt`, and the size [bytes] from which on blocks are returned when they are freed."""
 
 
 MapFile = Annotated[
@@ -152,6 +155,18 @@ def _be_the_robot(recording: AnyRecording, wires: Sequence[Wire]) -> None:
             say(f"sent {count} messages")
 
 
+def _give_memory_back() -> None:
+    """Have large blocks returned to the system when they are freed.
+
+    As arrays come and go, glibc raises the size from which it does so to 32 MB; what is asked of the map every few
+    seconds then leaves the heap full of holes for good.
+    """
+    import ctypes
+
+    with suppress(OSError, TypeError, AttributeError):  # another C library
+        ctypes.CDLL(None).mallopt(MMAP_THRESHOLD, LARGE)
+
+
 class _Drive:
     """A drive: an engine, its readings, and the connections and terminal that show what it knows."""
 
@@ -173,12 +188,15 @@ class _Drive:
         from evermap.live.feed import run_live
 
         sys.setswitchinterval(SWITCH_S)
+        _give_memory_back()
         # what is replayed faster than it was driven cannot wait for what is done beside it
         engine = self._engine(mapping=not localize, beside=realtime or self._recording is None)
         shown = _Shown(as_json=as_json, mailbox=self._mailbox)
         with engine:
             readings = self._readings(engine, shown, realtime=realtime)
             warm_up(engine.warm_up)
+            gc.collect()
+            gc.freeze()  # what is loaded by now stays: to look it through again would take a tenth of a second
             kept(self._map_file, f"what was driven enters {self._map_file} when it is fed again")
             with self._teller(engine, wires) as tell:
 
