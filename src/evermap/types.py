@@ -20,6 +20,7 @@ import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
+from functools import lru_cache
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -111,6 +112,7 @@ def _as_kind(array: Any, owner: str, name: str, *, whole: bool) -> Any:
     return array.astype(np.int64 if whole else np.float64)
 
 
+@lru_cache(maxsize=2**14)
 def landmark_id_of(name: str) -> int:
     """Return the identity of a landmark that is called by a text, the same on every machine and in every session.
 

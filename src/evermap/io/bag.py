@@ -47,7 +47,7 @@ from evermap.types import (
     landmark_id_of,
     rows_of,
 )
-from evermap.valid import CAMERA_MODELS
+from evermap.valid import CAMERA_MODELS, is_covariance
 
 METADATA = "metadata.yaml"
 """Of a folder that is a bag of ROS 2."""
@@ -420,7 +420,7 @@ def _identities(seen: list[tuple[int, Seen]], settings: BagSettings, names: dict
     kinds = [one.identity for one in settings.sensors.values()]
     identity = np.full(len(seen), UNKNOWN)
     for row, (k, one) in enumerate(seen):
-        said: int | str | None = {"id": one.identity, "class": one.label or None}.get(kinds[k])
+        said = one.identity if kinds[k] == "id" else one.label or None if kinds[k] == "class" else None
         if isinstance(said, str):
             identity[row] = landmark_id_of(said)
             names[int(identity[row])] = said
@@ -457,9 +457,11 @@ def _placed(
     unturned = np.isnan(pose).any(axis=1) | ~(np.linalg.norm(pose[:, 3:], axis=1) > 1e-6)
     pose[unturned, 3:] = np.nan
     position, covariance = pose[:, :3].copy(), found.covariance_sensor_m2.copy()
-    for row, (_, one) in enumerate(seen):
-        if one.covariance is not None:
-            covariance[row] = one.covariance
+    told = np.array([row for row, (_, one) in enumerate(seen) if one.covariance is not None], dtype=np.int64)
+    if len(told):
+        spread = np.array([seen[row][1].covariance for row in told])
+        stated = is_covariance(spread)
+        covariance[told[stated]] = spread[stated]
     rays, spread = directions(pixel, found.sensor, sensors)
     position[aimed], covariance[aimed] = rays[aimed], spread[aimed]
     return replace(

@@ -16,7 +16,6 @@ import numpy as np
 from evermap.geometry import se3
 from evermap.io.rosbag import MOST_HAMMING, Handler, Topic, pose_of, scan, seconds, stamp_of
 from evermap.types import FloatArray
-from evermap.valid import is_covariance
 
 POSES = ("Odometry", "PoseWithCovarianceStamped", "PoseStamped", "TransformStamped")
 TWISTS = ("TwistWithCovarianceStamped", "TwistStamped")
@@ -24,7 +23,7 @@ FRAMES = ("TFMessage", "tfMessage")
 
 
 class Seen(NamedTuple):
-    """One detection; `look` is the number of its message."""
+    """One detection; `look` is the number of its message, `covariance` (3, 3) as it says, which may be none."""
 
     look: int
     identity: int | str | None = None
@@ -197,26 +196,23 @@ def _markers(message: Any, look: int) -> Iterator[Seen]:
 
 def _objects(message: Any, look: int) -> Iterator[Seen]:
     for one in message.detections:
-        best = max(one.results, key=_score, default=None)
+        best = one.results[0] if len(one.results) == 1 else max(one.results, key=_score, default=None)
         hypothesis = getattr(best, "hypothesis", best)
         label = "" if hypothesis is None else str(getattr(hypothesis, "class_id", getattr(hypothesis, "id", "")))
-        known: dict[str, Any] = {
-            "identity": str(getattr(one, "id", "")) or None,
-            "label": label,
-            "score": float("nan") if best is None else _score(best),
-        }
+        score = float("nan") if hypothesis is None else float(hypothesis.score)
+        known = look, str(getattr(one, "id", "")) or None, label, score
         if hasattr(one.bbox, "size_x"):
             center = getattr(one.bbox.center, "position", one.bbox.center)
-            yield Seen(look, **known, pixel=(center.x, center.y))
+            yield Seen(*known, pixel=(center.x, center.y))
             continue
         size = (one.bbox.size.x, one.bbox.size.y, one.bbox.size.z)
-        sized = all(side > 0.0 for side in size)
+        sized = size[0] > 0.0 and size[1] > 0.0 and size[2] > 0.0
         if not sized and best is not None:
             spread = np.asarray(best.pose.covariance, dtype=np.float64).reshape(6, 6)[:3, :3]
-            stated = bool(np.trace(spread) > 0.0 and is_covariance(spread[None])[0])
-            yield Seen(look, **known, pose=pose_of(_inner(best.pose)), covariance=spread if stated else None)
+            said = spread[0, 0] + spread[1, 1] + spread[2, 2] > 0.0
+            yield Seen(*known, pose_of(_inner(best.pose)), spread if said else None)
         else:
-            yield Seen(look, **known, pose=pose_of(one.bbox.center), size=size if sized else (np.nan,) * 3)
+            yield Seen(*known, pose_of(one.bbox.center), size=size if sized else (np.nan,) * 3)
 
 
 def _score(result: Any) -> float:

@@ -28,6 +28,7 @@ from evermap.io.bag import (
     stated_settings,
 )
 from evermap.io.bag_messages import POSES, BagContent, handler_of
+from evermap.io.cdr import Cdr
 from evermap.io.rosbag import Topic, pose_of, ros2_types, seconds, stamp_of
 from evermap.live.engine import Engine
 from evermap.live.feed import Reading, SensorLook, Velocity, in_time
@@ -44,7 +45,17 @@ from evermap.runs.mcap import (
     told,
     where,
 )
-from evermap.types import ANY_RANGE_M2, UNKNOWN, AnyRecording, FloatArray, Landmarks, MapChange, Sensor, rows_of
+from evermap.types import (
+    ANY_RANGE_M2,
+    UNKNOWN,
+    AnyRecording,
+    BoolArray,
+    FloatArray,
+    Landmarks,
+    MapChange,
+    Sensor,
+    rows_of,
+)
 
 GUESS_S = 1.0
 """Topics are guessed when messages of odometry and detections have come for so long: others may be better."""
@@ -87,7 +98,7 @@ class Listener:
 
     def __init__(self, sensor: Sensor, numbered: bool, stated: Path | None, say: Callable[[str], None]) -> None:
         self._mount, self._numbered, self._say = np.array(sensor.mount_robot_sensor), numbered, say
-        self._types, self._content = ros2_types(), BagContent()
+        self._types, self._content = Cdr(ros2_types()), BagContent()
         self._handlers: dict[str, Any] = {}
         self._sources: dict[str, object] = {}
         self._said: set[str] = set()
@@ -119,7 +130,7 @@ class Listener:
             return []
         self._sources[message.topic] = message.source
         try:
-            handler(self._types.deserialize_cdr(message.raw, message.kind), message.received_s)
+            handler(self._types.decode(message.raw, message.kind), message.received_s)
         except KeyError:
             self._once(f"the type {message.kind} of {message.topic} is not known: it is not read")
             return []
@@ -187,13 +198,12 @@ class Listener:
                 yield Velocity(stamp_s, row[0], row[1], row[5])
             return
         child = content.frames.get(topic, "")
-        mount = content.mount(self.base_frame, child) if child else None
+        mount = content.mount(self.base_frame, child) if child not in ("", self.base_frame) else None
         for stamp_s, row in zip(stamps, content.motion[topic], strict=True):
             pose = np.array(row[:7])
             if not np.linalg.norm(pose[3:]) > 0.5:
                 continue
-            pose = se3.normalised(pose)
-            here = _on_the_floor(pose if mount is None else se3.compose(pose, se3.inverse(mount)))
+            here = _on_the_floor(pose if mount is None else se3.compose(se3.normalised(pose), se3.inverse(mount)))
             before, self._driven = self._driven, (source, stamp_s, here)
             self._odometry.append((stamp_s, here))
             if before is not None and before[0] == source and stamp_s > before[1]:
@@ -313,9 +323,9 @@ def _read(listener: Listener, message: Message, refused: Callable[[str], None]) 
 
 
 def _on_the_floor(pose: FloatArray) -> FloatArray:
-    """Poses (..., 7) as (..., 3): where they are on the floor, and their heading."""
-    turn = se3.rotation_of(pose)
-    return np.concatenate([pose[..., :2], np.arctan2(turn[..., 1, 0], turn[..., 0, 0])[..., None]], axis=-1)
+    """A pose (7,), whose quaternion may have any length, as (3,): where it is on the floor, and its heading."""
+    x, y, _, qx, qy, qz, qw = pose.tolist()
+    return np.array([x, y, math.atan2(2.0 * (qx * qy + qw * qz), qw**2 + qx**2 - qy**2 - qz**2)])
 
 
 class Scene(Protocol):
@@ -468,11 +478,12 @@ class Teller:
             pairs = list(drawn(self._ros, landmarks, np.full(len(landmarks), now.stamp_s)))
             self._draw([marker for marker, _ in pairs], [], [entity for _, entity in pairs], now.stamp_s)
 
-    def _is_news(self, seen: Landmarks) -> list[bool]:
+    def _is_news(self, seen: Landmarks) -> BoolArray:
         """Whether each landmark is elsewhere, or otherwise believed in, than was told."""
-        said = [self._told.get(one) for one in seen.landmark_id.tolist()]
         now = np.column_stack([seen.position_m, seen.p_exists])
-        return [k is None or bool((np.abs(k - one) > SEEN_P).any()) for k, one in zip(said, now, strict=True)]
+        untold = np.full(now.shape[1], np.nan)
+        said = np.array([self._told.get(one, untold) for one in seen.landmark_id.tolist()]).reshape(now.shape)
+        return ~(np.abs(said - now) <= SEEN_P).all(axis=1)
 
     def _draw(self, markers: list[Any], gone: list[Any], entities: list[Any], stamp_s: float) -> None:
         ros = self._ros

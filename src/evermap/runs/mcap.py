@@ -7,6 +7,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,14 +82,19 @@ def nanoseconds(stamp_s: float) -> int:
     return max(whole * 10**9 + round((stamp_s - whole) * 1e9), 0)
 
 
+@cache
+def _whole(name: str) -> str:
+    """The name of a type as it is in a store."""
+    return name.replace("/", "/msg/")
+
+
 class Ros(NamedTuple):
     """Messages of ROS 2 by the names of their types, with what is in most of them."""
 
     types: Any
 
     def make(self, name: str, *values: Any) -> Any:
-        package, kind = name.split("/")
-        return self.types.types[f"{package}/msg/{kind}"](*values)
+        return self.types.types[_whole(name)](*values)
 
     def time(self, stamp_s: float) -> Any:
         nano = nanoseconds(stamp_s)
@@ -98,13 +104,12 @@ class Ros(NamedTuple):
         return self.make("std_msgs/Header", self.time(stamp_s), frame)
 
     def vector(self, values: FloatArray) -> Any:
-        return self.make("geometry_msgs/Vector3", *map(float, values))
+        return self.make("geometry_msgs/Vector3", *values.tolist())
 
     def pose(self, pose: FloatArray) -> Any:
-        at, turn = map(float, pose[:3]), map(float, pose[3:])
-        return self.make(
-            "geometry_msgs/Pose", self.make("geometry_msgs/Point", *at), self.make("geometry_msgs/Quaternion", *turn)
-        )
+        values = pose.tolist()
+        at, turn = self.make("geometry_msgs/Point", *values[:3]), self.make("geometry_msgs/Quaternion", *values[3:])
+        return self.make("geometry_msgs/Pose", at, turn)
 
     def spread(self, pose: FloatArray, covariance: FloatArray) -> Any:
         return self.make("geometry_msgs/PoseWithCovariance", self.pose(pose), covariance.ravel())
@@ -272,20 +277,21 @@ def drawn(ros: Ros, landmarks: Landmarks, stamp_s: FloatArray) -> Iterator[tuple
 
     pose, size = poses_of(landmarks), _sizes(landmarks)
     labels = labels_of(landmarks.class_id, landmarks.class_names)
-    none = ros.make("builtin_interfaces/Duration", 0, 0)
+    none, tint = ros.make("builtin_interfaces/Duration", 0, 0), rgb(LANDMARK)
     nothing = np.zeros(0, dtype=np.uint8)
-    file, picture = (ros.make("visualization_msgs/MeshFile", "", nothing), "sensor_msgs/CompressedImage")
+    file = ros.make("visualization_msgs/MeshFile", "", nothing)
+    picture = ros.make("sensor_msgs/CompressedImage", ros.header(0.0, ""), "", nothing)
     for row, identity in enumerate(landmarks.landmark_id.tolist()):
         at_s, p = float(stamp_s[row]), float(landmarks.p_exists[row])
-        name, shape = landmarks.names.get(identity, str(identity)), ros.vector(size[row])
+        name, shape, here = landmarks.names.get(identity, str(identity)), ros.vector(size[row]), ros.pose(pose[row])
         turned = landmarks.rotation is not None and np.isfinite(landmarks.rotation[row]).all()
         marker = ros.make(
             "visualization_msgs/Marker", ros.header(at_s, "map"), labels[row], identity & MARKER_ID,
-            CUBE if turned else SPHERE, 0, ros.pose(pose[row]), shape, ros.colour(rgb(LANDMARK), p, "std_msgs"), none,
-            False, [], [], "", ros.make(picture, ros.header(at_s, ""), "", nothing), [], name, "", file, False,
+            CUBE if turned else SPHERE, 0, here, shape, ros.colour(tint, p, "std_msgs"), none,
+            False, [], [], "", picture, [], name, "", file, False,
         )  # fmt: skip
-        colour = ros.colour(rgb(LANDMARK), p, "foxglove_msgs")
-        body = ros.make(f"foxglove_msgs/{'Cube' if turned else 'Sphere'}Primitive", ros.pose(pose[row]), shape, colour)
+        colour = ros.colour(tint, p, "foxglove_msgs")
+        body = ros.make(f"foxglove_msgs/{'Cube' if turned else 'Sphere'}Primitive", here, shape, colour)
         said = {"class": labels[row], "p_exists": f"{p:.4f}"}
         text = f"{name} {p:.2f}" if p < 0.995 else name
         yield marker, _entity(ros, at_s, entity_id(name), body, said, text, pose[row])

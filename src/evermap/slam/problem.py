@@ -86,17 +86,17 @@ class Drive:
         """
         if velocity.shape[1] == 3:
             velocity = np.column_stack([velocity, beyond_jitter(stamp_s, velocity[:, 2])])
-        silence = np.diff(stamp_s)
-        silent = np.flatnonzero(silence > SILENCE_S)
-        at = silent + 1
-        stamps = np.insert(stamp_s, at, stamp_s[silent] + 0.5 * SILENCE_S)
-        counted = np.minimum(silence[silent], LONGEST_SILENCE_S)
-        rate = (SILENT_VARIANCE + (velocity[silent, :3] ** 2).sum(axis=1) * counted) * counted / silence[silent]
-        unknown = np.insert(np.zeros(len(stamp_s)), at, rate)
-        velocities = np.insert(velocity, at, 0.0, axis=0)
+        silence, unknown = np.diff(stamp_s), np.zeros(len(stamp_s))
+        if len(silent := np.flatnonzero(silence > SILENCE_S)):
+            at = silent + 1
+            counted = np.minimum(silence[silent], LONGEST_SILENCE_S)
+            rate = (SILENT_VARIANCE + (velocity[silent, :3] ** 2).sum(axis=1) * counted) * counted / silence[silent]
+            unknown = np.insert(unknown, at, rate)
+            stamp_s = np.insert(stamp_s, at, stamp_s[silent] + 0.5 * SILENCE_S)
+            velocity = np.insert(velocity, at, 0.0, axis=0)
         # after the last row nothing is known either
-        stamps = np.append(stamps, stamps[-1] + 0.5 * SILENCE_S)
-        return cls(stamps, np.vstack([velocities, np.zeros(4)]), np.append(unknown, SILENT_VARIANCE))
+        stamps = np.append(stamp_s, stamp_s[-1] + 0.5 * SILENCE_S)
+        return cls(stamps, np.vstack([velocity, np.zeros(4)]), np.append(unknown, SILENT_VARIANCE))
 
 
 def beyond_jitter(stamp_s: FloatArray, turn_radps: FloatArray) -> FloatArray:
