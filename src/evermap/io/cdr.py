@@ -60,7 +60,7 @@ class _Source:
     """
 
     def __init__(self, types: Any, kind: str) -> None:
-        self._types, self._known = types, {"np": np, "range": range, "str": str, "ValueError": ValueError}
+        self._types, self._known = types, dict[str, Any](np=np)
         self._lines = ["def decode(raw):", " at = 0"]
         self._indent, self._n, self._run, self._format, self._start = " ", 0, list[str](), "<", 1
         self._kind = kind

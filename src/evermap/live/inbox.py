@@ -7,11 +7,11 @@ and when the odometry is known up to it: what is later than that would change a 
 from __future__ import annotations
 
 import threading
-from bisect import bisect_left, bisect_right, insort
+from bisect import bisect_left, insort
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -47,6 +47,8 @@ STRAY_S = 10.0
 """A stamp that is so much later than all others is believed when the next one says the same: a clock may hiccup."""
 BURST_S = 10.0
 """Time over which readings are counted where there are too many."""
+ROOM = 1_000
+"""Rows of odometry for which there is room at first."""
 
 
 class LiveFrame(NamedTuple):
@@ -78,7 +80,7 @@ class Inbox:
     def __init__(self, about: Recording, reorder_s: float, readings_hz: float) -> None:
         self._lock = threading.Lock()
         self._about, self._reorder_s, self._readings_hz = about, reorder_s, readings_hz
-        self._odometry: list[tuple[float, float, float, float]] = []
+        self._odometry, self._n_odometry = np.empty((4, ROOM)), 0
         self._pending: list[LiveFrame] = []
         self._kept: list[LiveFrame] = []
         self._room = readings_hz * BURST_S
@@ -92,7 +94,7 @@ class Inbox:
         readings whose stamps were of no time."""
         self._classes: list[str] = list(about.class_names)
         self._texts: dict[int, str] = dict(about.landmark_names)
-        self._written = 0, 0
+        self._n_kept = self._n_written = 0
 
     def odometry(self, stamp_s: float, velocity: tuple[float, float, float]) -> None:
         """Add velocities, forward, lateral and turn, which hold from a stamp on.
@@ -153,22 +155,23 @@ class Inbox:
             return self._window(self.settled_s)
 
     def written(self, *, last: bool = False) -> Recording:
-        """Return what is kept and was not asked for before, as far as nothing can come in between; the `last` time all
-        odometry that there is.
+        """Return what is kept, as far as nothing can come in between, the `last` time all odometry that there is; what
+        was returned is kept no more.
         """
         with self._lock:
-            until = len(self._odometry) if last else bisect_right(self._odometry, (self.settled_s, np.inf))
-            odometry, frames = self._odometry[self._written[0] : until], self._kept[self._written[1] :]
-            self._written = until, len(self._kept)
+            until = self._n_odometry if last else self._odometry_until(self.settled_s, "right")
+            odometry = self._odometry[:, self._n_written : until].T.copy()
+            frames, self._kept, self._n_written = self._kept, [], until
+            self._forget()
             classes, texts = tuple(self._classes), dict(self._texts)
         return _recorded(self._about, odometry, frames, classes, texts)
 
     def cut(self, name: str) -> None:
         """Begin another recording after the last frame that was given out; its odometry begins some seconds before."""
         with self._lock:
-            first = bisect_left(self._odometry, (self.settled_s - BEFORE_S,))
-            self._odometry = self._odometry[max(first - 1, 0) :]
-            self._kept, self._written = [], (0, 0)
+            self._n_written = self._n_odometry
+            self._forget()
+            self._kept, self._n_kept, self._n_written = [], 0, 0
             self._about = replace(self._about, name=name)
 
     @property
@@ -177,15 +180,15 @@ class Inbox:
         return self._about.name
 
     def __len__(self) -> int:
-        """Frames that are kept."""
-        return len(self._kept)
+        """Frames of the recording so far, those that were written included."""
+        return self._n_kept
 
     @property
     def n_bytes(self) -> int:
         """Memory of the readings, about."""
         with self._lock:
             frames = sum(one.rows.nbytes + 200 for one in (*self._kept, *self._pending))
-            return frames + 190 * len(self._odometry)
+            return frames + self._odometry.nbytes
 
     def _in_time(self, stamp_s: float, put: Callable[[], None]) -> None:
         """Put a reading in; one whose stamp is far later than all others when the next one says the same."""
@@ -202,11 +205,15 @@ class Inbox:
         self.newest_s = max(self.newest_s, stamp_s)
 
     def _put_odometry(self, row: tuple[float, float, float, float]) -> None:
-        at = bisect_left(self._odometry, row[:1])
-        if at < len(self._odometry) and self._odometry[at][0] == row[0]:
+        at, count = self._odometry_until(row[0]), self._n_odometry
+        if at < count and self._odometry[0, at] == row[0]:
             self.n_repeated += 1
             return
-        self._odometry.insert(at, row)
+        if count == self._odometry.shape[1]:
+            self._odometry = np.hstack([self._odometry, np.empty_like(self._odometry)])
+        self._odometry[:, at + 1 : count + 1] = self._odometry[:, at:count]
+        self._odometry[:, at] = row
+        self._n_odometry += 1
         self.first_s, self.odometry_s = min(self.first_s, row[0]), max(self.odometry_s, row[0])
 
     def _put_frame(self, frame: LiveFrame) -> None:
@@ -215,9 +222,19 @@ class Inbox:
             frame = LiveFrame(frame.stamp_s, np.vstack([self._pending.pop(at).rows, frame.rows]))
         insort(self._pending, frame, key=lambda one: one.stamp_s)
 
+    def _odometry_until(self, stamp_s: float, side: Literal["left", "right"] = "left") -> int:
+        return int(np.searchsorted(self._odometry[0, : self._n_odometry], stamp_s, side))
+
     def _window(self, stamp_s: float) -> FloatArray:
-        first = max(bisect_left(self._odometry, (stamp_s - BEFORE_S,)) - 1, 0)
-        return np.array(self._odometry[first:]).reshape(-1, 4)
+        first = max(self._odometry_until(stamp_s - BEFORE_S) - 1, 0)
+        return self._odometry[:, first : self._n_odometry].T.copy()
+
+    def _forget(self) -> None:
+        """Drop the odometry that was written and that no frame will be given out with."""
+        first = min(max(self._odometry_until(self.settled_s - BEFORE_S) - 1, 0), self._n_written)
+        kept = self._odometry[:, first : self._n_odometry]
+        self._odometry = np.hstack([kept, np.empty((4, ROOM))])
+        self._n_odometry, self._n_written = kept.shape[1], self._n_written - first
 
     def _keep(self, frame: LiveFrame, before_s: float) -> bool:
         """Whether there is room for a frame's readings: a bucket that fills with time."""
@@ -228,6 +245,7 @@ class Inbox:
             return False
         self._room -= len(frame.rows)
         self._kept.append(frame)
+        self._n_kept += 1
         return True
 
     def _refuse_late(self, stamp_s: float, what: str) -> None:
@@ -296,12 +314,12 @@ def joined(parts: Sequence[Recording]) -> Recording:
 
 def _recorded(
     about: Recording,
-    odometry: list[tuple[float, float, float, float]],
+    odometry: FloatArray,
     frames: list[LiveFrame],
     classes: tuple[str, ...],
     texts: dict[int, str],
 ) -> Recording:
-    stamp_s, forward_mps, lateral_mps, angular_radps = _columns(np.array(odometry).reshape(-1, 4))
+    stamp_s, forward_mps, lateral_mps, angular_radps = _columns(odometry)
     rows = np.concatenate([np.zeros((0, 6)), *(one.rows for one in frames)])
     count = [len(one.rows) for one in frames]
     name, range_m, bearing_rad, kind, sigma_range, sigma_bearing = _columns(rows)

@@ -483,7 +483,7 @@ class Teller:
         now = np.column_stack([seen.position_m, seen.p_exists])
         untold = np.full(now.shape[1], np.nan)
         said = np.array([self._told.get(one, untold) for one in seen.landmark_id.tolist()]).reshape(now.shape)
-        return ~(np.abs(said - now) <= SEEN_P).all(axis=1)
+        return np.asarray(~(np.abs(said - now) <= SEEN_P).all(axis=1))
 
     def _draw(self, markers: list[Any], gone: list[Any], entities: list[Any], stamp_s: float) -> None:
         ros = self._ros
