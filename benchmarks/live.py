@@ -184,7 +184,7 @@ def over_zenoh(size: int, seconds: float, *, known: bool) -> dict[str, Any]:
         wire = Zenoh(f"listen={where}", poses)
         command = [sys.executable, "-m", "evermap", "live", "--map", path, "--sensor", sensor, "--zenoh", where]
         bridge = subprocess.Popen([str(part) for part in command], stdout=subprocess.DEVNULL)
-        time.sleep(15.0)  # until its kernels are loaded
+        _wait_until_idle(bridge.pid)
         used_s, start, memory = _used_s(bridge.pid), time.perf_counter(), []
         for stamp_s, topic, kind, raw in _messages(landmark, seconds):
             time.sleep(max(stamp_s - (time.perf_counter() - start), 0.0))
@@ -238,6 +238,14 @@ def _used_s(pid: int) -> float:
     """Time that a process and those that it has waited for took."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()
     return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
+
+
+def _wait_until_idle(pid: int) -> None:
+    """Wait until a process that loads, or compiles, kernels has done so."""
+    before, used_s = -np.inf, 0.0
+    while used_s - before > 0.05:
+        time.sleep(5.0)
+        before, used_s = used_s, _used_s(pid)
 
 
 def _cpu_s() -> float:
