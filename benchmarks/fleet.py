@@ -7,6 +7,11 @@ PostgreSQL where its wheel is installed, else SQLite.
 
     evermap bench --only fleet
     python -m benchmarks.fleet --sites 20 --sessions 20 --kills 50
+
+And what do sites learn from each other? Stays at 20 simulated sites are seen at one look a day; each next stay is
+forecast by what its own site has seen, by all stays as of one site, and by `evermap learn`:
+
+    python -m benchmarks.fleet --lifetimes
 """
 
 from __future__ import annotations
@@ -14,6 +19,7 @@ from __future__ import annotations
 import argparse
 import io
 import itertools
+import math
 import os
 import signal
 import socket
@@ -31,8 +37,12 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from evermap.io import write_native
-from evermap.maps.living import LivingMap
+from evermap.maps.learning import ClassEvidence, ClassLives, with_priors
+from evermap.maps.lives import Lives
+from evermap.maps.living import LivingMap, Stays
 from evermap.maps.store import open_store
+from evermap.runs.company import Company
+from evermap.survival import LifetimePrior
 from evermap_studies.sim import BuildingConfig, simulate_building
 
 if TYPE_CHECKING:
@@ -52,6 +62,25 @@ TOLERANCE = 1e-9
 METRICS: dict[str, tuple[str, float, str]] = {
     "fleet_once_share": ("higher", 0.001, "share of uploaded sessions that are in their map exactly once"),
     "fleet_equal_share": ("higher", 0.001, "share of maps that equal those of the right order"),
+    "fleet_pooled_ratio": ("higher", 0.02, "probability of the next stay, learned over 20 sites over alone; geometric"),
+}
+
+DAY_S = 86_400.0
+COMPANY_SITES, COMPANY_SEEDS = 20, 3
+MEAN_DAYS = np.array([1.0, 4.0, 12.0, 40.0])
+"""Of stays of four classes, in the company."""
+SEEN_PER_CLASS, SEEN_DAYS, NEXT = 4.0, 30, 40
+"""Stays of a class at a site on average, days with a look each, and next stays that are forecast."""
+WORLDS: dict[str, dict[str, Any]] = {
+    "sites are alike": {"spread": 0.0},
+    "means differ by a factor of 1.6": {"spread": 0.5},
+    "... of 2.7": {"spread": 1.0},
+    "... of 7.4": {"spread": 2.0},
+    "... of 1.6, and all of a site together by 2": {"spread": 0.5, "common": 0.7},
+    "... of 1.6, one stay of a class at a site": {"spread": 0.5, "per_class": 1.0},
+    "... of 1.6, 15 stays of a class at a site": {"spread": 0.5, "per_class": 15.0},
+    "... of 1.6, log-normal stays": {"spread": 0.5, "law": "lognormal"},
+    "... of 1.6, of two kinds, not named": {"spread": 0.5, "law": "mixture"},
 }
 
 
@@ -65,9 +94,119 @@ def run(
         with Processes(Path(folder)) as processes:
             shown = _driven(processes, uploads, kills, rng)
             once, equal = _compared(processes, uploads, expected)
+    company = lifetimes()
+    own, _, learned, *_ = company["means differ by a factor of 1.6"].values()
     store = "PostgreSQL" if processes.postgres else "SQLite"
+    shown |= {"lifetimes": company}
     shown |= {"sites": sites, "sessions": sum(map(len, uploads.values())), "store": store}
-    return {"fleet_once_share": once, "fleet_equal_share": equal}, shown
+    return {
+        "fleet_once_share": once, "fleet_equal_share": equal, "fleet_pooled_ratio": float(np.exp(learned - own)),
+    }, shown  # fmt: skip
+
+
+def lifetimes(sites: int = COMPANY_SITES, seeds: int = COMPANY_SEEDS, seed: int = SEED) -> dict[str, dict[str, float]]:
+    """Mean log score of the next stay, by world and by what it is forecast with."""
+    found = {}
+    for name, world in WORLDS.items():
+        scores = [_scored(np.random.default_rng([seed, k]), sites, **world) for k in range(seeds)]
+        found[name] = {way: float(np.mean([one[way] for one in scores])) for way in scores[0]}
+    return found
+
+
+def _scored(rng: np.random.Generator, sites: int, spread: float, **world: Any) -> dict[str, float]:
+    maps, nexts = zip(*(_site(rng, spread, **world) for _ in range(sites)), strict=True)
+    company = Company.of([ClassEvidence.of(living) for living in maps])
+    everywhere, elsewhere = Company.of([_as_one(maps)]).lifetimes(0), company.lifetimes()
+    scores: dict[str, list[float]] = {}
+    for number, (living, stays) in enumerate(zip(maps, nexts, strict=True)):
+        own = ClassLives.of(living.stays, living.lives).lives
+        learned = company.lifetimes(number)
+        told = with_priors(living, learned, company.class_names, worth=20)
+        entered = ClassLives.of(told.stays, told.lives).lives
+        for kind, name in enumerate(living.class_names):
+            ways = {
+                "its own stays": own.of(kind).stay,
+                "all stays as of one site": everywhere[name].stay,
+                "evermap learn": learned[name].stay,
+                "a map that was told": entered.of(kind).stay,
+                "a site without stays": elsewhere[name].stay,
+            }
+            for way, prior in ways.items():
+                scores.setdefault(way, []).append(_log_score(prior, *stays[kind]))
+    return {way: float(np.mean(values)) for way, values in scores.items()}
+
+
+def _as_one(maps: tuple[LivingMap, ...]) -> ClassEvidence:
+    """The evidence of all sites added up, as if they were one."""
+    names = maps[0].class_names
+    stay = absence = 0.0
+    for living in maps:
+        of = ClassEvidence.of(living)
+        member = np.array([[float(name == other) for other in of.class_names] for name in names])
+        stay, absence = stay + np.tensordot(member, of.stay, 1), absence + np.tensordot(member, of.absence, 1)
+    none = np.zeros(len(names), dtype=np.int64)
+    return ClassEvidence(names, np.asarray(stay), np.asarray(absence), none, none)
+
+
+def _site(
+    rng: np.random.Generator,
+    spread: float,
+    common: float = 0.0,
+    per_class: float = SEEN_PER_CLASS,
+    law: str = "weibull",
+) -> tuple[LivingMap, list[tuple[Any, Any]]]:
+    """A map that has seen some stays at looks once a day; the next stays of each class, with the hour of looks."""
+    looks_s = np.cumsum(rng.uniform(0.5, 1.5, SEEN_DAYS)) * DAY_S
+    means_s = MEAN_DAYS * DAY_S * np.exp(common * rng.normal() + spread * rng.normal(size=len(MEAN_DAYS)))
+    shapes = np.exp(0.2 * rng.normal(size=len(MEAN_DAYS)))
+    rows, nexts = [], []
+    for kind, (mean_s, shape) in enumerate(zip(means_s, shapes, strict=True)):
+        n = rng.poisson(per_class)
+        came_s = rng.uniform(looks_s[0] - 5.0 * DAY_S, looks_s[-1], n)
+        first = np.searchsorted(looks_s, came_s)
+        after = np.searchsorted(looks_s, came_s + _drawn(rng, law, mean_s, shape, n))
+        times_s = np.concatenate([[-np.inf], looks_s, [np.inf]])
+        seen = first < after  # the others came and went between two looks
+        rows += [(kind, *times_s[[i, i + 1, k, k + 1]]) for i, k in zip(first[seen], after[seen], strict=True)]
+        nexts.append((_drawn(rng, law, mean_s, shape, NEXT), rng.uniform(0.0, DAY_S, NEXT)))
+    table, names = np.array(rows).reshape(-1, 5), np.arange(len(rows))
+    times = table[:, 1:].T
+    stays = Stays(
+        names,
+        names,
+        table[:, 0].astype(np.int64),
+        np.zeros((len(rows), 2)),
+        *times,
+        np.isfinite(times[3]).astype(float),
+    )
+    classes = tuple(f"{mean:g} d" for mean in MEAN_DAYS)
+    return LivingMap(stays=stays, lives=Lives(looks_s=looks_s), class_names=classes), nexts
+
+
+def _drawn(rng: np.random.Generator, law: str, mean_s: float, shape: float, n: int) -> Any:
+    """Lifetimes of this mean."""
+    if law == "lognormal":
+        return mean_s * np.exp(1.2 * rng.normal(size=n) - 0.72)
+    if law == "mixture":
+        return mean_s * np.where(rng.random(n) < 0.5, 0.2, 1.8) * rng.exponential(size=n)
+    return mean_s * rng.weibull(shape, n) / math.gamma(1.0 + 1.0 / shape)
+
+
+def _log_score(prior: LifetimePrior, lasted_s: Any, first_look_s: Any) -> float:
+    """Mean log probability of the looks between which stays end, of looks once a day from a random hour on."""
+    last = np.floor((lasted_s - first_look_s) / DAY_S)
+    left, right = (np.maximum(first_look_s + DAY_S * k, 0.0) for k in (last, last + 1.0))
+    ended = np.exp(prior.log_survival(left)) - np.exp(prior.log_survival(right))
+    return float(np.log(np.maximum(ended, 1e-12)).mean())
+
+
+def lifetimes_as_markdown(company: dict[str, dict[str, float]]) -> str:
+    """The scores as a table."""
+    ways = list(next(iter(company.values())))
+    lines = [f"| mean log score of the next stay | {' | '.join(ways)} |", f"|---|{'---:|' * len(ways)}"]
+    return "\n".join(
+        [*lines, *(f"| {name} | {' | '.join(f'{of[way]:.3f}' for way in ways)} |" for name, of in company.items())]
+    )
 
 
 def as_markdown(shown: dict[str, Any]) -> str:
@@ -82,7 +221,13 @@ def as_markdown(shown: dict[str, Any]) -> str:
     lines += [f"| {name} | {n} | {middle:.1f} ms | {p99:.1f} ms |" for name, (n, middle, p99) in waits.items()]
     first, last = shown["memory_mb"]
     return "\n".join(
-        [*lines, "", f"memory of the server: {first:.0f} MB at the first quarter, {last:.0f} MB at the end"]
+        [
+            *lines,
+            "",
+            f"memory of the server: {first:.0f} MB at the first quarter, {last:.0f} MB at the end",
+            "",
+            lifetimes_as_markdown(shown["lifetimes"]),
+        ]
     )
 
 
@@ -300,7 +445,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name, default in (("sites", SITES), ("sessions", SESSIONS), ("kills", KILLS), ("seed", SEED)):
         parser.add_argument(f"--{name}", type=int, default=default)
-    ratios, shown = run(**vars(parser.parse_args()))
+    parser.add_argument("--lifetimes", action="store_true", help="of these alone")
+    given = vars(parser.parse_args())
+    if given.pop("lifetimes"):
+        print(lifetimes_as_markdown(lifetimes(seed=given["seed"])))
+        return
+    ratios, shown = run(**given)
     print(as_markdown(shown))
     print(ratios)
 

@@ -12,7 +12,10 @@ import evermap
 from evermap.cli.main import app
 from evermap.errors import InputError
 
-VERBS = ["demo", "simulate", "check", "info", "slam", "live", "persist", "track", "view", "convert", "work", "bench"]
+VERBS = [
+    "demo", "simulate", "check", "info", "slam", "live", "persist", "track", "view", "convert", "work", "learn",
+    "bench",
+]  # fmt: skip
 GROUPS = {
     "map": ["log", "show", "diff", "export", "why", "verify", "gc", "revert", "pin", "unpin", "delete", "undelete"],
     "serve": ["token", "doctor"],

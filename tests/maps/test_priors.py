@@ -201,6 +201,16 @@ def test_mistakes_are_one_line(site: Path, tmp_path: Path, prior: str, words: li
     assert all(word in result.stderr for word in words), result.stderr
 
 
+def test_a_file_may_tell_of_classes_that_the_site_has_not_yet(site: Path, tmp_path: Path) -> None:
+    said = {name: RunLength(WEIBULL, ENDLESS, 60.0) for name in ("crane", "pallet", "")}
+    file, new = save_models(NamedModels(said, "class"), tmp_path / "company.json"), tmp_path / "new.evermap"
+    result = run("slam", site.parent / "day0", "--map", new, "--out", tmp_path / "out", "--prior", file, "--set",
+                 "output.figures=false", "--set", "output.report=false", "--set", "output.rerun=false")  # fmt: skip
+    assert result.exit_code == 0, result.output
+    shown = json.loads(run("map", "show", new, "--json").stdout)["priors"]
+    assert {said["class"] for said in shown} == {"", "crane", "pallet"}
+
+
 def test_a_prior_needs_a_map(tmp_path: Path) -> None:
     result = run("slam", tmp_path, "--prior", "never-leaves")
     assert result.exit_code == 2

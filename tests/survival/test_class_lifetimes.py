@@ -15,9 +15,13 @@ from evermap.survival.class_lifetimes import (
     LOG_MEAN,
     LOG_SHAPE,
     LOGIT_RETURN,
+    SHAPE_SPREAD,
+    SITE_SPREADS,
     Sightings,
+    SitesPosterior,
     absence_log_likelihood,
     absence_posterior,
+    finer,
     stay_log_likelihood,
     stay_posterior,
 )
@@ -147,3 +151,115 @@ def test_who_never_comes_back_is_gone() -> None:
     curve = absence_posterior(values).curve(0)
     assert curve.p_never_leaves > 0.5
     assert np.exp(curve.log_conditional_survival(DAY_S, 30.0 * DAY_S)) > 0.95
+
+
+# --- many sites ---
+
+MIDDLES, WIDTHS = np.log(np.array([3.0, 8.0, 20.0, 50.0]) * DAY_S), np.array([0.6, 0.4, 0.8, 0.5])
+"""Of likelihoods of four sites, normal in the log of the mean."""
+
+
+def of_sites(middles: np.ndarray, widths: np.ndarray, n_second: int = len(LOG_SHAPE)) -> np.ndarray:
+    """Log likelihoods (S, 1, M, A) that say nothing of the second parameter."""
+    normal = -0.5 * np.square((LOG_MEAN - middles[:, None]) / widths[:, None])
+    return np.repeat(normal[:, None, :, None], n_second, axis=3)
+
+
+@pytest.mark.parametrize("site", [0, 3, None])
+def test_sites_of_normal_likelihoods_have_the_posterior_of_a_normal_hierarchy(site: int | None) -> None:
+    """In closed form given the spreads and the level, over which the reference sums by itself; no grid of means."""
+    levels, between_classes = np.linspace(math.log(3600.0), math.log(3650.0 * DAY_S), 12), (0.5, 1.0, 2.0, 4.0)
+    step = (LOG_MEAN[1] - LOG_MEAN[0]) / 4.0
+    ends = LOG_MEAN[0] - 0.5 * step, LOG_MEAN[-1] + 0.5 * step
+    log_weights, means, variances = [], [], []
+    for between in SITE_SPREADS[False][0]:
+        for level in levels:
+            for spread in between_classes:
+                # the last of the unknowns is the site's own; the class' mean is integrated out
+                covariance = spread**2 + between**2 * np.eye(5)
+                seen_covariance = covariance[:4, :4] + np.diag(WIDTHS**2)
+                cross = covariance[4, :4] if site is None else covariance[site, :4]
+                gain = np.linalg.solve(seen_covariance, cross)
+                log_evidence = law.multivariate_normal(np.full(4, level), seen_covariance).logpdf(MIDDLES)
+                inside = np.diff(law.norm(level, spread).cdf(ends))[0]  # means lie on the grid
+                log_weights.append(log_evidence - math.log(inside))
+                means.append(level + gain @ (MIDDLES - level))
+                variances.append(covariance[4, 4] - gain @ cross)
+    weights = np.exp(np.array(log_weights) - max(log_weights))
+    nodes = finer(LOG_MEAN)
+    mixed = law.norm(np.array(means)[:, None], np.sqrt(variances)[:, None])
+    expected = (weights / weights.sum()) @ (mixed.cdf(nodes + 0.5 * step) - mixed.cdf(nodes - 0.5 * step))
+
+    found = SitesPosterior.of(of_sites(MIDDLES, WIDTHS))
+    posterior = found.site(None if site is None else of_sites(MIDDLES, WIDTHS)[site]).weight[0]
+    np.testing.assert_allclose(posterior.sum(axis=1), expected, atol=2e-4)
+    assert 0.5 * np.abs(posterior.sum(axis=1) - expected).sum() < 2e-3  # total variation
+
+
+def some_sites(count: int, seed: int = 0) -> np.ndarray:
+    """Log likelihoods (S, 2, M, A) of watched stays of two classes."""
+    rng = np.random.default_rng(seed)
+    each = []
+    for _ in range(count):
+        lasted = rng.exponential(1.0, (2, 3)) * np.array([[2.0], [20.0]]) * rng.lognormal(0.0, 0.7)
+        begun = np.zeros(6)
+        stays = seen(begun - 0.5, begun, np.floor(lasted.ravel()), np.floor(lasted.ravel()) + 1.0)
+        each.append(stay_log_likelihood(stays).reshape(2, 3, len(LOG_MEAN), len(LOG_SHAPE)).sum(axis=1))
+    return np.stack(each)
+
+
+def test_sites_that_do_not_differ_are_one_and_those_that_differ_in_everything_are_alone() -> None:
+    sites = some_sites(5)
+    pool, alike = stay_posterior(sites.sum(axis=0)), SitesPosterior.of(sites, spreads=((0.0,), (0.0,)))
+    np.testing.assert_allclose(alike.site(sites[2]).weight, pool.weight, atol=1e-14)
+    np.testing.assert_allclose(alike.site().weight, pool.weight, atol=1e-14)
+    apart = SitesPosterior.of(sites, spreads=((np.inf,), (np.inf,)))
+    for one in sites:
+        by_itself = SitesPosterior.of(one[None], spreads=((np.inf,), (np.inf,))).site(one).weight
+        np.testing.assert_allclose(apart.site(one).weight[:-1], by_itself[:-1], atol=1e-14)
+    flat = np.ptp(apart.site().weight, axis=(1, 2))
+    np.testing.assert_allclose(flat, 0.0, atol=1e-15)  # nothing of a site that was not seen
+
+
+def test_one_site_with_a_known_spread_of_shapes_has_the_posterior_of_its_map() -> None:
+    one = some_sites(1)
+    found = SitesPosterior.of(one, spreads=((0.0,), (0.0,))).site(one[0])
+    np.testing.assert_allclose(found.weight, stay_posterior(one[0]).weight, atol=1e-14)
+    np.testing.assert_allclose(found.curve(0).rates, stay_posterior(one[0]).curve(0).rates, rtol=1e-9)
+
+
+def test_a_site_without_data_changes_nothing_and_is_a_new_one() -> None:
+    sites, empty = some_sites(4), np.zeros((1, 2, len(LOG_MEAN), len(LOG_SHAPE)))
+    without, found = SitesPosterior.of(sites), SitesPosterior.of(np.concatenate([sites, empty]))
+    np.testing.assert_allclose(found.site(sites[1]).weight, without.site(sites[1]).weight, atol=1e-12)
+    np.testing.assert_allclose(found.site(empty[0]).weight, without.site().weight, atol=1e-12)
+    np.testing.assert_allclose(found.p_pair, without.p_pair, atol=1e-12)
+
+
+def test_the_order_of_sites_does_not_matter() -> None:
+    sites = some_sites(6)
+    one, other = SitesPosterior.of(sites), SitesPosterior.of(sites[::-1])
+    np.testing.assert_allclose(one.site(sites[0]).weight, other.site(sites[0]).weight, atol=1e-12)
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_how_far_sites_differ_is_learned(spread: float) -> None:
+    rng = np.random.default_rng(3)
+    middles = math.log(10.0 * DAY_S) + spread * rng.normal(size=40) + 0.3 * rng.normal(size=40)
+    found = SitesPosterior.of(of_sites(middles, np.full(40, 0.3)))
+    assert found.p_pair @ found.spreads[:, 0] == pytest.approx(spread, abs=0.25)
+    absences = SitesPosterior.of(of_sites(middles, np.full(40, 0.3), len(LOGIT_RETURN)), improper=True)
+    assert absences.p_pair @ absences.spreads[:, 0] == pytest.approx(spread, abs=0.25)
+
+
+def test_shapes_of_sites_lie_about_those_of_the_company() -> None:
+    """Normal likelihoods of log shapes, and a normal prior: the posterior of one site is normal, in closed form."""
+    middles, width, between = np.array([0.1, 0.4, 0.6]), 0.2, 0.5
+    shapes = -0.5 * np.square((LOG_SHAPE - middles[:, None]) / width)
+    sites = np.repeat(shapes[:, None, None, :], len(LOG_MEAN), axis=2)
+    found = SitesPosterior.of(sites, spreads=((0.0,), (between,))).site(sites[0]).weight[0].sum(axis=0)
+    covariance = SHAPE_SPREAD**2 + between**2 * np.eye(3)
+    gain = np.linalg.solve(covariance + width**2 * np.eye(3), covariance[0])
+    nodes = finer(LOG_SHAPE)
+    assert found @ nodes == pytest.approx(gain @ middles, abs=0.02)
+    assert found @ nodes**2 - (found @ nodes) ** 2 == pytest.approx(covariance[0, 0] - gain @ covariance[0], rel=0.1)

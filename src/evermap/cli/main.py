@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from evermap import __version__, interrupts, plugins
-from evermap.cli import bench, check, convert, info, live, persist, reproduce, serve, slam, survival, track, view
+from evermap.cli import bench, check, convert, info, learn, live, persist, reproduce, serve, slam, survival, track, view
 from evermap.cli import map as living_map
 from evermap.cli.options import Verb
 from evermap.cli.terminal import fail, say, warn
@@ -102,6 +102,7 @@ app.command("convert")(convert.convert)
 app.add_typer(living_map.app)
 app.add_typer(serve.app)
 app.command("work")(serve.work)
+app.command("learn", help=learn.HELP)(learn.learn)
 app.add_typer(survival.app)
 app.add_typer(reproduce.app)
 app.command("bench")(bench.bench)

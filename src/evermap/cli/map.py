@@ -219,6 +219,8 @@ def export(
       evermap map export site.evermap --out speed.yaml --speed-mask --ahead 12h
       evermap map export site.evermap --out open.geojson --route-graph graph.geojson
     """
+    from evermap.existence.models import save_lifetimes
+    from evermap.maps.learning import lifetimes_by_class
     from evermap.maps.store import open_store
     from evermap.runs.folder import check_output_file
     from evermap.survival.durations import parse_duration_s
@@ -237,16 +239,18 @@ def export(
         p_least = 0.0 if speed_mask or route_graph is not None else 0.5
     landmarks = living.landmarks(p_least=p_least)
     told = {"out": None if out is None else str(out), "landmarks": len(landmarks), **write(living, landmarks)}
-    classes = [] if lifetimes is None else _write_lifetimes(living, lifetimes)
+    learned = {} if lifetimes is None else lifetimes_by_class(living)
+    if lifetimes is not None:
+        save_lifetimes(learned, lifetimes)
     if as_json:
-        said = {"lifetimes": None if lifetimes is None else str(lifetimes), "classes": classes}
+        said = {"lifetimes": None if lifetimes is None else str(lifetimes), "classes": list(learned)}
         print_json({"map": file, "revision": number, **told, **said})
         return
     if out is not None:
         closed = f"; {len(told['closed'])} of {told['edges']} edges are closed" if "edges" in told else ""
         say(f"wrote {len(landmarks)} landmarks of revision {number} to {out}{closed}")
     if lifetimes is not None:
-        say(f"wrote lifetimes of {len(classes)} classes to {lifetimes}; use it with: evermap slam --prior {lifetimes}")
+        say(f"wrote lifetimes of {len(learned)} classes to {lifetimes}; use it with: evermap slam --prior {lifetimes}")
 
 
 @app.command("why")
@@ -282,17 +286,6 @@ def why(
         print_json({"map": file, **answer_dict(answer)})
         return
     print_why(answer)
-
-
-def _write_lifetimes(living: LivingMap, path: Path) -> list[str]:
-    """The lifetimes of a map as a file of models; returns the classes in it."""
-    from evermap.existence.models import NamedModels, save_models
-    from evermap.existence.run_length import RunLength
-    from evermap.maps.learning import lifetimes_by_class
-
-    models = {name: RunLength.from_lifetimes(found) for name, found in lifetimes_by_class(living).items()}
-    save_models(NamedModels(models, "class"), path)
-    return list(models)
 
 
 def _writer(

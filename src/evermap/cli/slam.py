@@ -450,7 +450,9 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
         raise ConfigError(
             "in a map is for the plane", field="slam.unknown_ids", hint="leave out --unknown-ids, or --map"
         )
-    said = priors_of(*priors_by_class(priors))
+    common, by_class = priors_by_class(priors)
+    said = priors_of(common, by_class)
+    later = [name for name in said if name not in (by_class or {})]  # a file tells of classes of other sites, too
     unknown = config.slam.unknown_ids
     warm_up(lambda: compile_kernels(unknown_ids=unknown, sessions=not localize, localize=localize, in_space=in_space))
     with held():  # a map without its tables is none
@@ -467,7 +469,7 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
                 living = at_time(store, float(stamps[0]) if len(stamps) else 0.0)
                 result = run_localization(recording, living, config, realtime=realtime, progress=progress)
             else:
-                entered = enter_session(store, recording, config, priors=said, progress=progress)
+                entered = enter_session(store, recording, config, priors=said, later=later, progress=progress)
                 result, recording = replace(entered.session.slam, changes=entered.changes), entered.session.recording
         elapsed_s = time.perf_counter() - start
         _write(out, recording, result, config, _info(config, elapsed_s, realtime=realtime, entered=entered), **how)

@@ -168,6 +168,15 @@ def load_models(path: str | Path) -> NamedModels:
         raise InputError(error.problem, path=path, field=error.field, hint=error.hint) from error
 
 
+def save_lifetimes(lifetimes: Mapping[str, Lifetimes], path: str | Path) -> Path:
+    """Write lifetimes by class to a file that `lifetimes_of` reads, and return its path; errors as `save_models`."""
+    from evermap.existence.run_length import RunLength
+
+    return save_models(
+        NamedModels({name: RunLength.from_lifetimes(of) for name, of in lifetimes.items()}, "class"), path
+    )
+
+
 def save_model(model: PresenceModel, path: str | Path) -> Path:
     """Write one model to a JSON file and return its path; errors as `save_models`."""
     return save_models(NamedModels({"": model}), path)

@@ -242,6 +242,8 @@ class ClassLives:
 class _Learned:
     """Posteriors and probabilities of all classes, the last row of one that was never seen."""
 
+    of_stays: FloatArray
+    of_absences: FloatArray
     stay: ClassPosterior
     absence: ClassPosterior
     p_hop: FloatArray
@@ -269,11 +271,11 @@ def _learned(history: History, before: Lives, settings: LifetimeConfig) -> _Lear
         stays.last_s[away], stays.gone_s[away], history.seen_away_s[away], history.back_s[away]
     )
     log_likelihood *= stays.p_gone[away, None, None]
-    log_likelihood = _by_class(log_likelihood, history.kind[away], n_classes)
-    of_absence = [
+    of_absences = _by_class(log_likelihood, history.kind[away], n_classes)
+    absences_said = [
         life.n_stays * absence_said(life.absence, settings) if life and life.tells_absence else None for life in said
     ]
-    absence = absence_posterior(log_likelihood, _stacked(of_absence))
+    absence = absence_posterior(of_absences, _stacked(absences_said))
     p_hop = history.shares(history.hopped, ended)
     back_by_hop = p_hop * history.shares(history.there_again, history.hopped_twice)
     here_again = history.shares(history.back_here, history.away & np.isfinite(history.back_s))
@@ -290,12 +292,43 @@ def _learned(history: History, before: Lives, settings: LifetimeConfig) -> _Lear
         going_on = rows_of(seen, doubted)
         going_on = replace(going_on, gone_s=np.full(len(going_on.gone_s), np.inf))
         log_likelihood[doubted] = p_gone * log_likelihood[doubted] + (1.0 - p_gone) * stay_log_likelihood(going_on)
-    log_likelihood = _by_class(log_likelihood, kind, n_classes)
-    of_stay = [life.n_stays * stay_said(life.stay, settings) if life else None for life in said]
-    stay = stay_posterior(log_likelihood, _stacked(of_stay))
+    of_stays = _by_class(log_likelihood, kind, n_classes)
+    stays_said = [life.n_stays * stay_said(life.stay, settings) if life else None for life in said]
+    stay = stay_posterior(of_stays, _stacked(stays_said))
     p_known = history.shares(history.to_known, history.had_choice)
     counts = (history.counts(mask).astype(np.int64) for mask in (history.recent, history.recent & ended))
-    return _Learned(stay, absence, p_hop, p_known, *counts)
+    return _Learned(of_stays, of_absences, stay, absence, p_hop, p_known, *counts)
+
+
+@dataclass(frozen=True, slots=True)
+class ClassEvidence:
+    """What the stays of a map say by themselves of each of its C classes, without what a user has said.
+
+    Attributes:
+        class_names: of each; '' for landmarks without a class.
+        stay: (C, M, A) log likelihoods on `LOG_MEAN` and `LOG_SHAPE`.
+        absence: (C, M, A) on `LOG_MEAN` and `LOGIT_RETURN`.
+        n_stays, n_ended: (C,) stays, and how many of them were seen to end.
+    """
+
+    class_names: tuple[str, ...]
+    stay: FloatArray
+    absence: FloatArray
+    n_stays: IntArray
+    n_ended: IntArray
+
+    @classmethod
+    def of(cls, living: LivingMap, settings: LifetimeConfig = USUAL) -> Self:
+        """Collect it from the history of a map; of no class where no session has ended."""
+        if not (len(living.stays) and len(living.lives.looks_s)):
+            stay, absence = (np.zeros((0, len(LOG_MEAN), len(second))) for second in (LOG_SHAPE, LOGIT_RETURN))
+            none = np.zeros(0, dtype=np.int64)
+            return cls((), stay, absence, none, none)
+        history = History.of(living.stays, living.lives.looks_s, settings)
+        untold = replace(living.lives, prior_class_id=np.zeros(0, dtype=np.int64), prior=())
+        learned, names = _learned(history, untold, settings), dict(enumerate(living.class_names))
+        class_names = tuple(names.get(class_id, "") for class_id in history.class_ids.tolist())
+        return cls(class_names, learned.of_stays, learned.of_absences, learned.n_stays[:-1], learned.n_ended[:-1])
 
 
 def stay_said(prior: LifetimePrior, settings: LifetimeConfig = USUAL) -> FloatArray:
@@ -352,7 +385,7 @@ def with_priors(living: LivingMap, said: Mapping[str, Lifetimes], class_names: S
     Raises:
         ConfigError: neither the map nor the recording has such a class.
     """
-    names = living.class_names + tuple(name for name in class_names if name not in living.class_names)
+    names = tuple(dict.fromkeys((*living.class_names, *class_names)))
     known = dict(zip(living.lives.prior_class_id.tolist(), living.lives.prior, strict=True))
     for name, lifetimes in said.items():
         if name and name not in names:

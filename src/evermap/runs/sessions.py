@@ -131,6 +131,7 @@ def enter_session(
     config: Config | None = None,
     *,
     priors: Mapping[str, Lifetimes] | None = None,
+    later: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Entered:
     """Bring a session into the newest map of a store, at its place in time.
@@ -141,6 +142,7 @@ def enter_session(
         config: settings of this session; the others are brought in again with their own.
         priors: how long things of a class stay, and stay away, as `maps.learning.with_priors` takes them; they stay in
             the map.
+        later: classes with a prior that neither the map nor the recording needs to have yet.
         progress: told after every frame of this session.
 
     Raises:
@@ -165,7 +167,7 @@ def enter_session(
     stamps = recording.frames.stamp_s
     start_s = float(stamps[0]) if len(stamps) else np.inf
     worth = (config or Config()).living.prior_stays
-    said = with_priors(newest, priors or {}, recording.class_names, worth) if priors else newest
+    said = newest if not priors else with_priors(newest, priors, (*recording.class_names, *later), worth)
     if not start_s < newest.session_start_s:
         session = run_session(recording, said, config, progress=progress)
         return Entered(session, newest, session.living, session.changes, (), head, {RECORDING: data})

@@ -12,13 +12,18 @@ the classes have in common; without any data that is a constant hazard of unknow
 The likelihood of a stay is that of `censored`, with the arrival marginalised between the look before and the first
 sighting. A stay without a look before began any time before: then the same sum over arrivals is the law of the residual
 life of a stationary renewal process, `int_r^inf S / mean`.
+
+Many sites add a level between: mean and shape of a class are the company's, those of a site are normal about them, with
+spreads that all classes share and that are on a grid as well (`SitesPosterior`).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,6 +45,12 @@ SHAPE_SPREAD = 0.5
 _LEVELS = np.linspace(math.log(3600.0), math.log(3650.0 * 86400.0), 12)
 _SPREADS = np.array([0.5, 1.0, 2.0, 4.0])
 """Between classes: means of log mean durations (an hour to ten years), and standard deviations about them."""
+SITE_SPREADS = {
+    False: ((0.0, 0.25, 0.5, 1.0, 2.0), (0.0, 0.25, 0.5)),
+    True: ((0.0, 0.25, 0.5, 1.0, 2.0), (0.0, 0.5, 1.0, 2.0)),
+}
+"""Standard deviations between the sites of a company: of log means, from sites that are alike to a factor of seven; and
+of log shapes, or logits of the probability of return (`improper`). All pairs are equally probable before."""
 _EDGES_S = np.concatenate([[0.0], np.geomspace(1800.0, 1e9, 23)])
 """Curves have constant hazards between these ages."""
 _INSTANTS = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
@@ -94,9 +105,7 @@ def stay_posterior(log_likelihood: FloatArray, said: FloatArray | float = 0.0) -
         log_likelihood: of what was seen; it is interpolated to a finer grid.
         said: (C, M', A') log likelihoods on that grid, `finer` of both, of what else is known; none where it is 0.
     """
-    second = finer(LOG_SHAPE)
-    weight = _posterior(log_likelihood, -0.5 * np.square(second / SHAPE_SPREAD), said)
-    return ClassPosterior(weight, np.exp(finer(LOG_MEAN)), np.exp(second), improper=False)
+    return _posterior_of(_fine(log_likelihood) + said, improper=False)
 
 
 def absence_posterior(log_likelihood: FloatArray, said: FloatArray | float = 0.0) -> ClassPosterior:
@@ -106,9 +115,85 @@ def absence_posterior(log_likelihood: FloatArray, said: FloatArray | float = 0.0
         log_likelihood: of what was seen.
         said: as of `stay_posterior`.
     """
-    share = 1.0 / (1.0 + np.exp(-finer(LOGIT_RETURN)))
-    weight = _posterior(log_likelihood, np.log(share * (1.0 - share)), said)  # even over probabilities
-    return ClassPosterior(weight, np.exp(finer(LOG_MEAN)), share, improper=True)
+    return _posterior_of(_fine(log_likelihood) + said, improper=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SitesPosterior(Shown):
+    """What many sites say together of the durations of C classes, and of a class that none of them has.
+
+    For each pair of spreads, of log mean and of second parameter, the posterior of the company's own; a site's are
+    normal about them. Given the spreads all sums are exact on the grid, and the spreads are summed over: nothing is set
+    to its most probable value (Gelman et al. 2013, section 5.3).
+
+    Attributes:
+        log_weight: (H, C + 1, M, A) log posterior probabilities of the company's mean and second parameter, with those
+            of the H pairs; the last row for a new class.
+        spreads: (H, 2) the pairs.
+        kernels: of each, matrices (M, M) and (A, A) of a site's given the company's.
+        improper: as of `ClassPosterior`.
+    """
+
+    log_weight: FloatArray
+    spreads: FloatArray
+    kernels: tuple[tuple[FloatArray, FloatArray], ...]
+    improper: bool
+
+    @classmethod
+    def of(
+        cls,
+        log_likelihood: FloatArray,
+        *,
+        improper: bool = False,
+        spreads: tuple[tuple[float, ...], tuple[float, ...]] | None = None,
+    ) -> Self:
+        """Compute it from log likelihoods (S, C, M, A) of S sites, as `stay_posterior` takes them, 0 without data.
+
+        Args:
+            log_likelihood: of what was seen at each site; of absences where `improper`.
+            improper: whether the second parameter is the probability of return.
+            spreads: between sites, of log means and of second parameters; inf for sites that tell nothing of each
+                other.
+        """
+        axes = finer(LOG_MEAN), finer(LOGIT_RETURN if improper else LOG_SHAPE)
+        each = np.array(list(itertools.product(*(spreads or SITE_SPREADS[improper]))))
+        pairs = tuple((_about(axes[0], mean_spread), _about(axes[1], spread)) for mean_spread, spread in each.tolist())
+        log_weight = np.zeros((len(pairs), log_likelihood.shape[1], len(axes[0]), len(axes[1])))
+        for site in log_likelihood:
+            fine = _fine(site)
+            for row, pair in enumerate(pairs):
+                log_weight[row] += _log_evidence(fine, pair)
+        parts = [_classes(of_pair, improper) for of_pair in log_weight]
+        said = np.concatenate([log_weight, np.zeros_like(log_weight[:, :1])], axis=1)
+        with np.errstate(divide="ignore"):
+            log_weight = said + np.log(np.stack([part.prior for part in parts]))
+        log_weight -= _log_sums(log_weight)
+        log_pair = np.array([part.log_evidence for part in parts])
+        log_weight += (log_pair - np.logaddexp.reduce(log_pair))[:, None, None, None]
+        return cls(log_weight, each, pairs, improper)
+
+    @property
+    def p_pair(self) -> FloatArray:
+        """(H,) posterior probabilities of the pairs of spreads."""
+        return np.asarray(np.exp(_log_sums(self.log_weight)[:, -1, 0, 0]))
+
+    def site(self, log_likelihood: FloatArray | None = None) -> ClassPosterior:
+        """Return the posterior of a site's classes.
+
+        Args:
+            log_likelihood: (C, M, A) of the site, one of those that this was computed from; None for another site.
+        """
+        log_weight = self.log_weight.copy()
+        fine = None if log_likelihood is None else _fine(log_likelihood)
+        if fine is not None:  # what the other sites say of the company
+            for row, pair in enumerate(self.kernels):
+                log_weight[row, :-1] -= _log_evidence(fine, pair)
+        weight = np.exp(log_weight - log_weight.max(axis=(0, 2, 3), keepdims=True))
+        of_pairs = (mean.T @ part @ second for part, (mean, second) in zip(weight, self.kernels, strict=True))
+        of_site = np.sum(list(of_pairs), axis=0)
+        if fine is not None:
+            of_site[:-1] *= np.exp(fine - fine.max(axis=(1, 2), keepdims=True, initial=-np.inf))
+        return _normalised(of_site, self.improper)
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,26 +294,78 @@ def absence_log_likelihood(
     return np.asarray(np.log(seen.mean(axis=1)) - np.log((first[..., None] * share + (1.0 - share)).mean(axis=1)))
 
 
-def _posterior(log_likelihood: FloatArray, log_second: FloatArray, said: FloatArray | float) -> FloatArray:
-    """Return the posterior (C + 1, M, A) on the finer grid, with level and spread of the classes summed over."""
-    fine = _cubic(len(LOG_MEAN)) @ log_likelihood @ _cubic(log_likelihood.shape[2]).T + said
-    fine = np.exp(fine - fine.max(axis=(1, 2), keepdims=True, initial=-np.inf))
-    second = np.exp(log_second - log_second.max())
+@dataclass(frozen=True, slots=True)
+class _Classes:
+    """Prior (C + 1, M, A) of each class given the data of all others; log evidence of all, up to a constant."""
+
+    prior: FloatArray
+    log_evidence: float
+
+
+def _classes(fine: FloatArray, improper: bool) -> _Classes:
+    """Sum over level and spread of the classes, given log likelihoods (C, M, A) on the finer grid."""
+    if improper:
+        share = _second(improper)
+        second = share * (1.0 - share)  # even over probabilities
+    else:
+        second = np.exp(-0.5 * np.square(finer(LOG_SHAPE) / SHAPE_SPREAD))
     second /= second.sum()
+    most = fine.max(axis=(1, 2), keepdims=True, initial=-np.inf)
     means = finer(LOG_MEAN)
     common = np.exp(-0.5 * np.square((means - _LEVELS[:, None, None]) / _SPREADS[:, None])).reshape(-1, len(means))
     common /= common.sum(axis=1, keepdims=True)  # (H, M)
-    evidence = np.maximum((fine @ second) @ common.T, _LEAST)  # (C, H)
+    evidence = np.maximum((np.exp(fine - most) @ second) @ common.T, _LEAST)  # (C, H)
     log_hyper = np.log(evidence).sum(axis=0)
     hyper = np.exp(log_hyper - log_hyper.max())
+    log_evidence = float(log_hyper.max() + np.log(hyper.sum()) + most.sum())
     hyper /= hyper.sum()
-    weight = (
-        np.concatenate(
-            [((hyper / evidence) @ common)[:, :, None] * fine, (hyper @ common)[None, :, None] * np.ones_like(second)]
-        )
-        * second
-    )
-    return np.asarray(weight / weight.sum(axis=(1, 2), keepdims=True))
+    of_means = np.concatenate([(hyper / evidence) @ common, (hyper @ common)[None]])
+    return _Classes(of_means[:, :, None] * second, log_evidence)
+
+
+def _posterior_of(fine: FloatArray, improper: bool) -> ClassPosterior:
+    """Return the posterior of classes of one site, from log likelihoods (C, M, A) on the finer grid."""
+    weight = _classes(fine, improper).prior
+    weight[:-1] *= np.exp(fine - fine.max(axis=(1, 2), keepdims=True, initial=-np.inf))
+    return _normalised(weight, improper)
+
+
+def _normalised(weight: FloatArray, improper: bool) -> ClassPosterior:
+    weight = weight / weight.sum(axis=(1, 2), keepdims=True)
+    return ClassPosterior(weight, np.exp(finer(LOG_MEAN)), _second(improper), improper)
+
+
+def _second(improper: bool) -> FloatArray:
+    """Return the second parameters (A,) on the finer grid."""
+    if improper:
+        return np.asarray(1.0 / (1.0 + np.exp(-finer(LOGIT_RETURN))))
+    return np.asarray(np.exp(finer(LOG_SHAPE)))
+
+
+def _about(nodes: FloatArray, spread: float) -> FloatArray:
+    """Return probabilities (N, N) of the nodes, normal about each of them; even where the spread is infinite."""
+    if spread == 0.0:
+        return np.eye(len(nodes))
+    near = np.exp(-0.5 * np.square((nodes - nodes[:, None]) / spread))
+    return np.asarray(near / near.sum(axis=1, keepdims=True))
+
+
+def _log_evidence(fine: FloatArray, pair: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """Return the log evidence (C, M, A) of one site's data for each mean and second parameter of the company's."""
+    most = fine.max(axis=(1, 2), keepdims=True, initial=-np.inf)
+    seen = pair[0] @ np.exp(fine - most) @ pair[1].T
+    return np.asarray(np.log(np.maximum(seen, _LEAST)) + most)
+
+
+def _log_sums(log_weight: FloatArray) -> FloatArray:
+    """Return the log of the sums over the last two axes, which are kept."""
+    most = log_weight.max(axis=(-2, -1), keepdims=True)
+    return np.asarray(most + np.log(np.exp(log_weight - most).sum(axis=(-2, -1), keepdims=True)))
+
+
+def _fine(log_likelihood: FloatArray) -> FloatArray:
+    """Return log likelihoods (C, M, A) on the finer grid."""
+    return np.asarray(_cubic(len(LOG_MEAN)) @ log_likelihood @ _cubic(log_likelihood.shape[2]).T)
 
 
 def finer(nodes: FloatArray) -> FloatArray:
@@ -263,6 +400,4 @@ def _survival(ages_s: FloatArray, mean_s: FloatArray, second: FloatArray, improp
 @lru_cache
 def _survival_table(improper: bool) -> FloatArray:
     """Return the survival (J, M A) at the edges of curves."""
-    nodes = LOGIT_RETURN if improper else LOG_SHAPE
-    second = 1.0 / (1.0 + np.exp(-finer(nodes))) if improper else np.exp(finer(nodes))
-    return _survival(_EDGES_S, np.exp(finer(LOG_MEAN)), second, improper)
+    return _survival(_EDGES_S, np.exp(finer(LOG_MEAN)), _second(improper), improper)

@@ -1,0 +1,181 @@
+"""`evermap learn`: lifetimes learned over all maps of a company."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from evermap.cli.options import AsJson, ConfigFile, Force, Settings, ShowConfig, configured
+from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say
+from evermap.errors import ConfigError
+
+if TYPE_CHECKING:
+    from evermap.existence.lifetimes import Lifetimes
+    from evermap.runs.company import Company
+    from evermap.runs.folder import RunFolder
+
+HELP = """\
+Learn how long things stay, over the maps of many sites.
+
+A class has a lifetime in the company, and each site one of its own, near it: nearer, the fewer stays the site has seen,
+and the more alike the sites are. Both are learned from the histories of the maps, which stay as they are.
+
+\b
+In --out there are company.json, for sites without a map, and sites/NAME.json, for each: files for --prior of
+`evermap slam --map`, and for `evermap persist --model`.
+
+\b
+Examples:
+  evermap learn maps/*.evermap --out lifetimes
+  evermap learn --store postgresql://evermap@db/fleet --workers 4
+  evermap learn --store maps --cluster tcp://scheduler:8786
+  evermap slam day9 --map maps/ward-3.evermap --prior lifetimes/sites/ward-3.json
+"""
+
+
+def learn(
+    maps: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="MAP", help="Files, or postgresql://user@host/database/SITE.", show_default=False),
+    ] = None,
+    store: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHERE",
+            help="All maps of a server: folder, or postgresql://user@host/database.",
+            show_default="none",
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the lifetimes.")] = Path("evermap-out/lifetimes"),
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=1024,
+            help="Processes here that read maps; 1 needs no Dask.",
+            show_default="one for each core, where Dask is installed",
+        ),
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="tcp://HOST:PORT", help="Dask scheduler whose workers read the maps.", show_default="none"
+        ),
+    ] = None,
+    force: Force = False,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    show_config: ShowConfig = False,
+    as_json: AsJson = False,
+) -> None:
+    """Learn how long things stay, over the maps of many sites."""
+    chosen = configured(config, settings, show=show_config)
+    from evermap.runs.company import Company, collect
+    from evermap.runs.folder import RunFolder
+
+    if cluster is not None and workers is not None:
+        raise ConfigError("are the cluster's", field="workers", hint="leave out --workers, or --cluster")
+    sites = _sites(maps or [], store)
+    if cluster is not None:
+        sites = {name: where if "://" in where else str(Path(where).absolute()) for name, where in sites.items()}
+    files = [where for where in sites.values() if "://" not in where]
+    with RunFolder(out, force=force, inputs=files) as folder:
+        with progress_bar("reading maps", speed=False) as progress:
+            found = collect(
+                list(sites.values()), chosen.living.lifetimes, workers=workers, cluster=cluster, progress=progress
+            )
+        settings_told = {"living": {"lifetimes": chosen.living.lifetimes.to_dict()}}
+        told = {"command": command_line(), "input": ", ".join(sites), "config": settings_told}
+        summary = folder.finish({**told, **_written(folder, Company.of(found), list(sites))})
+    if as_json:
+        print_json(summary)
+        return
+    _print(summary, out)
+
+
+def _sites(maps: list[str], store: str | None) -> dict[str, str]:
+    """Files and addresses of maps by the names of their sites.
+
+    Raises:
+        ConfigError: no map, or two of one name.
+    """
+    found: dict[str, str] = {}
+    for where in maps:
+        name = where.rstrip("/").rpartition("/")[2] if "://" in where else Path(where).stem
+        if name in found:
+            raise ConfigError(f"two maps are called '{name}'", field="MAP", hint="another name for one of the files")
+        found[name] = where
+    for name, where in [] if store is None else _stored(store):
+        if name in found:
+            raise ConfigError(f"a site of it is called '{name}', as a map", field="store", hint="leave out that map")
+        found[name] = where
+    if not found:
+        raise ConfigError("there is no map", path=store, hint="evermap learn MAP..., or --store WHERE")
+    return found
+
+
+def _stored(store: str) -> list[tuple[str, str]]:
+    from sqlalchemy.exc import ArgumentError, DBAPIError
+
+    from evermap.server.sites import SiteStores
+
+    stores = SiteStores(store)
+    try:
+        return [(name, stores.address(name)) for name in stores.names()]
+    except (ArgumentError, ValueError):
+        raise ConfigError("is no address of a database", field="store", hint="postgresql://user@host/base") from None
+    except DBAPIError as error:
+        hint = "check the address, the rights of the user, and that the server runs"
+        raise ConfigError(f"the database cannot be used: {error.orig}", field="store", hint=hint) from None
+
+
+def _half_gone_s(lifetimes: Lifetimes) -> float | None:
+    half_s = float(lifetimes.stay.quantile(0.5))
+    return half_s if math.isfinite(half_s) else None
+
+
+def _written(folder: RunFolder, company: Company, names: list[str]) -> dict[str, Any]:
+    """Write the files of a company and its sites; return what was learned, for the summary."""
+    from evermap.existence.models import save_lifetimes
+
+    general = company.lifetimes()
+    save_lifetimes(general, folder.path("company.json"))
+    own: dict[str, dict[str, Lifetimes]] = {}
+    with progress_bar("learning", speed=False) as progress:
+        for number, name in enumerate(names):
+            own[name] = company.lifetimes(number)
+            save_lifetimes(own[name], folder.path(f"sites/{name}.json"))
+            if progress:
+                progress(number + 1, len(names))
+    sites = {
+        site: {
+            name: {"stays": n_stays, "stays_that_ended": n_ended, "half_gone_s": _half_gone_s(lifetimes[name])}
+            for name, n_stays, n_ended in zip(of.class_names, of.n_stays.tolist(), of.n_ended.tolist(), strict=True)
+        }
+        for of, (site, lifetimes) in zip(company.sites, own.items(), strict=True)
+    }
+    classes = {}
+    for name, lifetimes in general.items():
+        seen = [of[name] for of in sites.values() if name in of]
+        counts = {key: sum(one[key] for one in seen) for key in ("stays", "stays_that_ended")}
+        classes[name] = {"sites": len(seen), **counts, "half_gone_s": _half_gone_s(lifetimes)}
+    differ = float(math.exp(company.stay.p_pair @ company.stay.spreads[:, 0]))
+    return {"classes": classes, "sites": sites, "factor_between_sites": differ}
+
+
+def _print(summary: dict[str, Any], out: Path) -> None:
+    """What a person wants to know of it."""
+    from evermap.survival.durations import duration_text
+
+    rows = []
+    for name, one in summary["classes"].items():
+        half_gone_s = one["half_gone_s"]
+        numbers = (one["sites"], one["stays"], one["stays_that_ended"])
+        half = duration_text(math.inf if half_gone_s is None else half_gone_s)
+        rows.append((name or "any other", *(f"{number:,}" for number in numbers), half))
+    title = f"{len(summary['sites'])} sites, mean stays differ by a factor of {summary['factor_between_sites']:.1f}"
+    print_table(title, rows, ("class", "sites", "stays", "ended", "half gone at a new site"), numbers=(1, 2, 3))
+    say(f"written to {out}; use it with: evermap slam REC --map MAP --prior {out}/sites/SITE.json")
