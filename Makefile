@@ -1,6 +1,6 @@
 # Everything starts here; nothing is needed but python3 (3.11 or newer) and make.
 #   make demo    set up and run the demonstration       make test    set up and run the tests
-#   make lint    style, formatting and types            make docs-check    run the commands of the documents
+#   make lint    style, formatting, types, security     make docs-check    run the commands of the documents
 #   make docs    set up and build the documentation as a site, into out/site
 #   make bench   compare with the committed baseline    make clean   remove what make made
 #   make experiments    whole experiments, most on the recordings in ../shared/data, minutes long
@@ -19,7 +19,7 @@ DEVELOPMENT = $(VENV)/.stamp-development
 DOCUMENTATION = $(VENV)/.stamp-documentation
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo test test-slow test-all experiments lint format docs docs-check bench lock clean
+.PHONY: help setup setup-dev demo test test-slow test-all experiments lint audit format docs docs-check bench lock clean
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 7
@@ -47,6 +47,16 @@ lint: $(DEVELOPMENT)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+	$(VENV)/bin/bandit --quiet --recursive --configfile pyproject.toml src studies/src
+
+# Known flaws of the pinned versions. Its database is in the internet, so it is no part of the continuous integration.
+audit: $(DEVELOPMENT)
+	@$(PIP_INSTALL) --constraint requirements-dev.lock pip-audit
+	@$(VENV)/bin/pip-audit --strict --vulnerability-service osv --disable-pip --no-deps --progress-spinner off \
+	  --requirement requirements-dev.lock --requirement requirements-docs.lock 2>$(VENV)/audit.txt || { \
+	  grep -q ConnectionError $(VENV)/audit.txt \
+	    && echo "make audit asks https://api.osv.dev for known flaws of the pinned versions: it needs the internet" >&2 \
+	    || cat $(VENV)/audit.txt >&2; exit 1; }
 
 format: $(DEVELOPMENT)
 	$(VENV)/bin/ruff format .

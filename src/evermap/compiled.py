@@ -7,7 +7,7 @@ import functools
 import gc
 import hashlib
 import os
-import pickle
+import pickle  # nosec  # B403: for the name of its error: the index of kept code is numba's, in a folder of this user
 import stat
 import sys
 import tempfile

@@ -233,7 +233,7 @@ def _of_address(url: str) -> tuple[str, bool, str]:
         return "address", False, f"'{printable(url, 100)}' is no address of a server: https://maps.example.com"
     local = host in ("localhost", "127.0.0.1", "::1")
     try:
-        with urlopen(f"{url.rstrip('/')}/healthz", timeout=_ASK_S) as answer:
+        with urlopen(f"{url.rstrip('/')}/healthz", timeout=_ASK_S) as answer:  # nosec  # B310: http or https, see above
             told = json.load(answer)["evermap"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         return "address", False, f"no server answers at {url}: {printable(str(error), 100)}"
@@ -308,7 +308,7 @@ def _uvicorn() -> Any:
 def _working(store: str, count: int) -> Iterator[None]:
     """Run workers beside this process, and end them with it; what they were at goes back to the queue."""
     command = [sys.executable, "-m", "evermap", "work", "--store", store]
-    processes = [subprocess.Popen(command, stdin=subprocess.DEVNULL) for _ in range(count)]
+    processes = [subprocess.Popen(command, stdin=subprocess.DEVNULL) for _ in range(count)]  # nosec  # B603: ourselves
     try:
         yield
     finally:
