@@ -11,9 +11,10 @@ from scipy import stats as law
 from simulated_stays import TrueStay, as_seen, histories, two_looks_a_day
 
 from evermap.config import LifetimeConfig
-from evermap.maps.learning import ClassLives
+from evermap.maps.learning import ClassEvidence, ClassLives, with_priors
 from evermap.maps.lives import Lives
-from evermap.maps.living import Stays
+from evermap.maps.living import LivingMap, Stays
+from evermap.runs.company import Company
 from evermap.survival.general_purpose import GeneralPurpose
 from evermap.types import UNKNOWN
 from evermap_studies.sim.config import DAY_S, DEFAULT_CLASSES, Duration, ObjectClass
@@ -96,6 +97,34 @@ def test_a_new_class_gets_what_the_others_have_in_common() -> None:
     _, lower, upper = ClassLives.of(stays, lives).band(17, [2.0 * DAY_S])
     _, lower_known, upper_known = ClassLives.of(stays, lives).band(3, [2.0 * DAY_S])
     assert upper - lower > 2.0 * (upper_known - lower_known)
+
+
+def test_a_site_forecasts_better_with_what_other_sites_have_seen() -> None:
+    """Ten sites of three days; what is there now, and its class moves by itself: is it there seven looks later?"""
+    names, now_s, then_s = tuple(item.name for item in DEFAULT_CLASSES), LOOKS_S[5], LOOKS_S[12]
+    true = [histories(DEFAULT_CLASSES, END_S, np.random.default_rng(seed), 60.0 * DAY_S) for seed in range(10)]
+    maps = [
+        LivingMap(stays=as_seen(of, LOOKS_S[:6]), lives=Lives(looks_s=LOOKS_S[:6]), class_names=names) for of in true
+    ]
+    company = Company.of([ClassEvidence.of(living) for living in maps])
+    loss: dict[str, list[float]] = {"alone": [], "learned": [], "told": []}
+    for site, (living, of) in enumerate(zip(maps, true, strict=True)):
+        there = {(stay.thing, stay.site) for stay in of if stay.start_s <= now_s and then_s < stay.end_s}
+        learned, stays = company.lifetimes(site), living.stays
+        told = with_priors(living, learned, company.class_names, worth=20)
+        alone, entered = (ClassLives.of(stays, lives).lives for lives in (living.lives, told.lives))
+        for row in np.flatnonzero(np.isinf(stays.gone_s)):
+            kind, age_s = int(stays.class_id[row]), now_s - stays.first_s[row]
+            if DEFAULT_CLASSES[kind].mount == "hinge":
+                continue  # may be back
+            was = (int(stays.clique_id[row]), int(stays.site_id[row]) % 1000) in there
+            priors = alone.of(kind).stay, learned[names[kind]].stay, entered.of(kind).stay
+            for way, prior in zip(loss, priors, strict=True):
+                p = float(np.exp(prior.log_conditional_survival(age_s, age_s + then_s - now_s)))
+                loss[way].append(-np.log(p if was else 1.0 - p))
+    mean = {way: float(np.mean(values)) for way, values in loss.items()}
+    assert mean["learned"] < 0.85 * mean["alone"]
+    assert mean["told"] < 0.85 * mean["alone"]
 
 
 def test_order_of_stays_does_not_matter() -> None:

@@ -1,9 +1,9 @@
-"""Lifetimes learned over all maps of a company (`evermap learn`), and by whom: this process, or a Dask cluster.
+"""Learn lifetimes over all maps of a company (`evermap learn`), in this process or on a Dask cluster.
 
 A class has a mean stay and a shape in the company, and its own at every site, about them; how far sites differ is
 learned, too (`survival.class_lifetimes.SitesPosterior`). Of each map only the log likelihoods of its classes are
 needed, some kilobytes. They are collected by as many processes as there are; what follows is computed in one, in the
-order of the sites, so the result does not depend on who collected.
+order of the sites, so the result does not depend on the number of processes.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def _evidence(where: str, settings: LifetimeConfig) -> ClassEvidence | EvermapEr
     from evermap.maps.store import open_store
 
     try:
-        with threadpool_limits(limits=1, user_api="blas"), open_store(where) as store:  # the same sums for everybody
+        with threadpool_limits(limits=1, user_api="blas"), open_store(where) as store:  # the same sums in every process
             return ClassEvidence.of(store.load(), settings)
     except EvermapError as error:
         return error
