@@ -34,6 +34,8 @@ EVERY_S = 0.5
 """Time between two lines of progress."""
 SWITCH_S = 5e-4
 """Turn of a thread while others wait: what is done beside the steps takes many, and a pose shall not wait for them."""
+OBJECTS = 20_000
+"""Those after which garbage is looked for: one message of a hundred detections is more than the usual 700."""
 MMAP_THRESHOLD, LARGE = -3, 2**18
 """A parameter of glibc's `mallopt`, and the size [bytes] from which on blocks are returned when they are freed."""
 
@@ -197,6 +199,7 @@ class _Drive:
             warm_up(engine.warm_up)
             gc.collect()
             gc.freeze()  # what is loaded by now stays: to look it through again would take a tenth of a second
+            gc.set_threshold(OBJECTS)
             kept(self._map_file, f"what was driven enters {self._map_file} when it is fed again")
             with self._teller(engine, wires) as tell:
 
