@@ -162,10 +162,7 @@ class _Poses(Mailbox):
 
 
 def over_zenoh(size: int, seconds: float, *, known: bool) -> dict[str, Any]:
-    """Latency of `evermap live` in a process of its own, at the robot's end of Zenoh, its memory and share of a core.
-
-    A pose is that of the odometry before the newest, whose difference is the motion: timed is from the newest on.
-    """
+    """Latency of `evermap live`, a process of its own, at the robot's end of Zenoh; its memory and share of a core."""
     landmark, surveyed = survey(size)
     poses = _Poses()
     with tempfile.TemporaryDirectory() as folder, socket.socket() as free:
@@ -189,7 +186,7 @@ def over_zenoh(size: int, seconds: float, *, known: bool) -> dict[str, Any]:
         for stamp_s, topic, kind, raw in _messages(landmark, seconds):
             time.sleep(max(stamp_s - (time.perf_counter() - start), 0.0))
             if topic == "/odom":
-                poses.sent[round((START_S + stamp_s) / ODOMETRY_S) - 1] = time.perf_counter()
+                poses.sent[round((START_S + stamp_s) / ODOMETRY_S)] = time.perf_counter()
             wire.send(topic, kind, raw, 0)
             if len(memory) * 60.0 <= stamp_s:
                 memory.append(round(_memory_mb(bridge.pid)))

@@ -84,7 +84,8 @@ def test_poses_become_velocities_and_detections_lie_on_the_floor() -> None:
     assert "/odom" in said[0]
     velocity = np.array([tuple(reading) for reading in one.of(Velocity)])
     assert velocity[:, 0] == pytest.approx(START_S + 0.1 * np.arange(19), abs=1e-6)
-    assert velocity[:, 1:] == pytest.approx(np.tile([0.5, 0.0, 0.1], (19, 1)), abs=1e-5)
+    assert velocity[:, 1:4] == pytest.approx(np.tile([0.5, 0.0, 0.1], (19, 1)), abs=1e-5)
+    assert velocity[:, 4] == pytest.approx(velocity[:, 0] + 0.1, abs=1e-6)  # known until the newest pose
     looks = one.of(SensorLook)
     assert len(looks) == 20
     for k, look in enumerate(looks):
@@ -143,7 +144,7 @@ def test_velocities_are_taken_as_they_are() -> None:
         message = ros.make("geometry_msgs/TwistStamped", ros.header(START_S + 0.1 * k, "base_link"), twist)
         one.say(k, "/wheels", "geometry_msgs/msg/TwistStamped", message)
         one.boxes(k, {"3": where(k, 3)}, "base_link")
-    assert one.of(Velocity)[-1][1:] == pytest.approx((0.3, 0.1, -0.2))
+    assert one.of(Velocity)[-1][1:4] == pytest.approx((0.3, 0.1, -0.2))
     assert one.listener.odometry_at(START_S) == ("base_link", None)
 
 

@@ -136,14 +136,26 @@ class Engine:
         return self._inbox.n_bytes
 
     def odometry(
-        self, stamp_s: float, forward_mps: float, lateral_mps: float = 0.0, angular_radps: float = 0.0
+        self,
+        stamp_s: float,
+        forward_mps: float,
+        lateral_mps: float = 0.0,
+        angular_radps: float = 0.0,
+        until_s: float = -math.inf,
     ) -> None:
         """Take velocities, which hold until the next ones.
+
+        Args:
+            stamp_s: from when on they hold.
+            forward_mps: along the robot.
+            lateral_mps: to its left.
+            angular_radps: its turn, counter-clockwise.
+            until_s: until when they are known to hold, as between two poses; where only the next ones tell, leave out.
 
         Raises:
             InputError: no finite numbers, or so late that frames after it are processed.
         """
-        self._inbox.odometry(stamp_s, (forward_mps, lateral_mps, angular_radps))
+        self._inbox.odometry(stamp_s, (forward_mps, lateral_mps, angular_radps), until_s)
 
     def detections(
         self,

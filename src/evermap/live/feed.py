@@ -5,6 +5,7 @@ A recording that is replayed is such an iterator; a transport of a robot's middl
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -24,6 +25,7 @@ class Velocity(NamedTuple):
     forward_mps: float
     lateral_mps: float
     angular_radps: float
+    until_s: float = -math.inf
 
 
 class SensorLook(NamedTuple):

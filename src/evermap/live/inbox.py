@@ -85,7 +85,7 @@ class Inbox:
         self._kept: list[LiveFrame] = []
         self._room = readings_hz * BURST_S
         self.newest_s = self.odometry_s = self.settled_s = -np.inf
-        """Newest stamp of all, of the odometry, and of the frames that were given out."""
+        """Newest stamp of all, until which the odometry is known, and of the frames that were given out."""
         self.first_s = np.inf
         """First stamp of the odometry."""
         self._stray: tuple[float, Callable[[], None]] | None = None
@@ -96,8 +96,8 @@ class Inbox:
         self._texts: dict[int, str] = dict(about.landmark_names)
         self._n_kept = self._n_written = 0
 
-    def odometry(self, stamp_s: float, velocity: tuple[float, float, float]) -> None:
-        """Add velocities, forward, lateral and turn, which hold from a stamp on.
+    def odometry(self, stamp_s: float, velocity: tuple[float, float, float], until_s: float = -np.inf) -> None:
+        """Add velocities, forward, lateral and turn, which hold from a stamp on, until another one where that is known.
 
         Raises:
             InputError: no finite numbers, or the stamp is before frames that were processed.
@@ -110,7 +110,7 @@ class Inbox:
         row = float(stamp_s), forward_mps, lateral_mps, angular_radps
         with self._lock:
             self._refuse_late(row[0], "odometry")
-            self._in_time(row[0], partial(self._put_odometry, row))
+            self._in_time(row[0], partial(self._put_odometry, row, float(until_s)))
 
     def detections(self, stamp_s: float, columns: Sequence[Any]) -> None:
         """Add a look: ids (or texts), ranges, bearings, classes by name, and both sigmas; None where not given.
@@ -204,7 +204,7 @@ class Inbox:
         put()
         self.newest_s = max(self.newest_s, stamp_s)
 
-    def _put_odometry(self, row: tuple[float, float, float, float]) -> None:
+    def _put_odometry(self, row: tuple[float, float, float, float], until_s: float) -> None:
         at, count = self._odometry_until(row[0]), self._n_odometry
         if at < count and self._odometry[0, at] == row[0]:
             self.n_repeated += 1
@@ -214,7 +214,7 @@ class Inbox:
         self._odometry[:, at + 1 : count + 1] = self._odometry[:, at:count]
         self._odometry[:, at] = row
         self._n_odometry += 1
-        self.first_s, self.odometry_s = min(self.first_s, row[0]), max(self.odometry_s, row[0])
+        self.first_s, self.odometry_s = min(self.first_s, row[0]), max(self.odometry_s, row[0], until_s)
 
     def _put_frame(self, frame: LiveFrame) -> None:
         at = bisect_left(self._pending, frame.stamp_s, key=lambda one: one.stamp_s)

@@ -208,7 +208,7 @@ class Listener:
             self._odometry.append((stamp_s, here))
             if before is not None and before[0] == source and stamp_s > before[1]:
                 forward, lateral, turn = se2.log(se2.between(before[2], here)) / (stamp_s - before[1])
-                yield Velocity(before[1], float(forward), float(lateral), float(turn))
+                yield Velocity(before[1], float(forward), float(lateral), float(turn), stamp_s)
 
     def _looks(self, topic: str) -> Iterator[SensorLook]:
         assert self.settings is not None
