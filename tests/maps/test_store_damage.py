@@ -194,7 +194,7 @@ def test_a_damaged_part_that_is_shared_is_written_anew(path: Path) -> None:
         assert_same(store.load(3), living)  # and is whole again
 
 
-@pytest.mark.parametrize("content", [b"not a database, but long enough to be one" * 50, b"PK\3\4", b"\0" * 5000])
+@pytest.mark.parametrize("content", [b"not a database, but long enough to be one" * 50, b"PK\3\4", b"\0" * 5000, b"\n"])
 def test_another_file_is_no_map(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "photo.jpg"
     path.write_bytes(content)
