@@ -275,3 +275,20 @@ def test_settings_are_written_beside_the_bag_once(tmp_path: Path) -> None:
     again = run(app, ["slam", "--init-bag", str(bag)])
     assert again.exit_code == 2
     assert "is there already" in again.output
+
+
+def test_settings_of_another_bag_are_taken_by_an_option(tmp_path: Path) -> None:
+    """One file for all bags of a robot; it comes before the one beside a bag."""
+    bag, file = write(tmp_path / "drive", "tags"), tmp_path / "robot.toml"
+    file.write_text(bag_settings(bag) + f"\n[tags]\nsize_m = {SIZE_M}\n")
+    settings_path(bag).write_text("[bag]\nodometry = 'none such'\n")
+    run, out = CliRunner().invoke, tmp_path / "native"
+    done = run(app, ["convert", str(bag), str(out), "--topics", str(file)])
+    assert done.exit_code == 0, done.output
+    assert len(read_recording(out).detections) == len(read_bag(bag, topics=file).detections) > 0
+    missing = run(app, ["slam", str(bag), "--topics", str(tmp_path / "none.toml")])
+    assert missing.exit_code == 2
+    assert "none.toml: cannot be read" in missing.output
+    no_bag = run(app, ["slam", str(out), "--topics", str(file)])
+    assert no_bag.exit_code == 2
+    assert "native: has no topics" in no_bag.output

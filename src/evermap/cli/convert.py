@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from evermap.cli.options import Topics
 from evermap.cli.terminal import print_json, say, warn
 
 
@@ -24,6 +25,7 @@ def convert(
     robot: Annotated[
         int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)
     ] = None,
+    topics: Topics = None,
     table_format: Annotated[TableFormat, typer.Option("--format", help="Format of the tables.")] = TableFormat.CSV,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
     force: Annotated[
@@ -41,7 +43,7 @@ def convert(
     from evermap.runs.folder import RunFolder
 
     folder = RunFolder(out, force=force, inputs=[recording_path], renew=False)
-    recording = read_recording(recording_path, robot=robot)
+    recording = read_recording(recording_path, robot=robot, topics=topics)
     with folder:
         write_native(recording, folder.path("."), table_format.value)
     for remark in recording.warnings:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.options import ConfigFile, Robot, Settings, configured
+from evermap.cli.options import ConfigFile, Robot, Settings, Topics, configured
 from evermap.cli.terminal import echo, print_table, say, warm_up, warn
 from evermap.errors import ConfigError
 from evermap.interrupts import kept, watched
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 EVERY_S = 0.5
 """Time between two lines of progress."""
-SWITCH_S = 5e-4
-"""Turn of a thread while others wait: what is done beside the steps takes many, and a pose shall not wait for them."""
 OBJECTS = 20_000
 """Those after which garbage is looked for: one message of a hundred detections is more than the usual 700."""
 MMAP_THRESHOLD, LARGE = -3, 2**18
@@ -58,9 +56,6 @@ ZenohEndpoint = Annotated[
 ]
 FoxglovePort = Annotated[
     str | None, typer.Option(metavar="[HOST:]PORT", help="Serve Foxglove's WebSocket there, as 8765.")
-]
-Topics = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Which topics are what, as slam --init-bag writes it.")
 ]
 OnlyLocalize = Annotated[bool, typer.Option("--localize", help="Only localise; the map stays as it is.")]
 Paced = Annotated[bool, typer.Option("--realtime", help="Replay at the pace of the recording.")]
@@ -189,7 +184,6 @@ class _Drive:
         """Drive until the recording ends, or until it is stopped."""
         from evermap.live.feed import run_live
 
-        sys.setswitchinterval(SWITCH_S)
         _give_memory_back()
         # what is replayed faster than it was driven cannot wait for what is done beside it
         engine = self._engine(mapping=not localize, beside=realtime or self._recording is None)

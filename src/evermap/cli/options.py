@@ -29,6 +29,10 @@ ShowConfig = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Write into --out even if it holds other files; they stay.")]
 Robot = Annotated[int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)]
+Topics = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Which topics are what, as slam --init-bag writes it.", show_default=False),
+]
 TableOut = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<input>")]
 Priors = Annotated[
     list[str] | None,

@@ -18,6 +18,7 @@ from evermap.cli.options import (
     Robot,
     Settings,
     ShowConfig,
+    Topics,
     configured,
     default_out,
     priors_by_class,
@@ -159,6 +160,7 @@ Examples:
 def slam(
     input: Recorded = None,
     robot: Robot = None,
+    topics: Topics = None,
     out: Out = None,
     config: ConfigFile = None,
     settings: Settings = None,
@@ -196,22 +198,21 @@ def slam(
         raise ConfigError("a recording is needed", field="input", hint=hint)
     if len(paths) > 1 and map_file is None:
         raise ConfigError("several recordings are sessions of a map", field="input", hint="--map FILE, or one of them")
-    _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method)
+    _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, shift=shift)
     if prior and (map_file is None or localize):
         raise ConfigError("is for a session of a map", field="prior", hint="--map FILE, without --localize")
-    if shift and prior_map is None:
-        raise ConfigError("there is no map to shift", field="shift", hint="--prior-map truth, or --prior-map FILE")
-    from evermap.io import parse_shift, shifted
+    from evermap.io import parse_shift, read_recording, shifted
 
+    read = partial(read_recording, robot=robot, topics=topics)
     shifts = [parse_shift(text) for text in shift or []]
 
     def known(recording: AnyRecording) -> Landmarks | None:
         return None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
 
     options = None if map_file is None else MapOptions(map_file, prior or [], localize, realtime)
-    inputs = [*paths, config, None if prior_map == "truth" else prior_map, map_file]
+    inputs = [*paths, config, topics, None if prior_map == "truth" else prior_map, map_file]
     how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
-    work = partial(_estimate, robot=robot, config=chosen, known=known, options=options, realtime=realtime, how=how)
+    work = partial(_estimate, read=read, config=chosen, known=known, options=options, realtime=realtime, how=how)
     if len(paths) == 1:
         work(paths[0], out)
     else:
@@ -240,7 +241,7 @@ def _estimate(
     path: Path,
     out: Path | None,
     *,
-    robot: int | None,
+    read: Callable[[Path], AnyRecording],
     config: Config,
     known: Callable[[AnyRecording], Landmarks | None],
     options: MapOptions | None,
@@ -249,12 +250,11 @@ def _estimate(
     later: bool = False,
 ) -> None:
     """Read a recording, run, and write the folder; `later` as in `MapOptions`."""
-    from evermap.io import read_recording
     from evermap.runs.folder import check_replaceable
 
     if out is not None:  # better now than after the run
         check_replaceable(out, force=how["force"], inputs=how["inputs"])
-    recording = read_recording(path, robot=robot)
+    recording = read(path)
     if out is None:
         out = default_out(recording.name)
         check_replaceable(out, force=how["force"], inputs=how["inputs"])
@@ -351,7 +351,11 @@ def main_numbers(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _check_map_options(map_file: str | None, *, localize: bool, prior_map: str | None, method: str | None) -> None:
+def _check_map_options(
+    map_file: str | None, *, localize: bool, prior_map: str | None, method: str | None, shift: list[str] | None
+) -> None:
+    if shift and prior_map is None:
+        raise ConfigError("there is no map to shift", field="shift", hint="--prior-map truth, or --prior-map FILE")
     if map_file is None:
         if localize:
             raise ConfigError("needs a map", field="localize", hint="--map FILE")

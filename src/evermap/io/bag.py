@@ -113,12 +113,13 @@ def settings_path(path: str | Path) -> Path:
     return path.with_name(path.resolve().name + ".toml")
 
 
-def read_bag(path: str | Path, robot: int | None = None) -> SpatialRecording:
+def read_bag(path: str | Path, robot: int | None = None, topics: str | Path | None = None) -> SpatialRecording:
     """Return the recording in a bag, by its settings file where there is one, else by what its topics seem to be.
 
     Args:
         path: `.bag` or `.bag.bz2` of ROS 1; of ROS 2 a folder with `metadata.yaml`, a `.mcap` or a `.db3`.
         robot: must be None.
+        topics: its settings file; None for the one beside it.
 
     Raises:
         InputError: the bag or its settings are missing or damaged, or a topic in the settings is not in the bag.
@@ -128,9 +129,9 @@ def read_bag(path: str | Path, robot: int | None = None) -> SpatialRecording:
     path = Path(path)
     if robot is not None:
         raise InputError(f"there is no robot {robot}: a bag is of one", path=path, hint="leave it out")
-    content, stated = scanned(path), settings_path(path)
+    content, stated = scanned(path), settings_path(path) if topics is None else Path(topics)
     settings = guessed_settings(content)
-    if not stated.is_file():
+    if topics is None and not stated.is_file():
         return _recording(path, content, settings, guessed=True)
     return _recording(path, content, stated_settings(stated, content, settings), guessed=False)
 

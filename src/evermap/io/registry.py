@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from evermap.errors import InputError
-from evermap.io.bag import BAG
+from evermap.io.bag import BAG, read_bag
 from evermap.io.files import Reader, file_sets, find_file_set
 from evermap.io.mrclam import MRCLAM
 from evermap.io.native import NATIVE
@@ -37,18 +37,26 @@ def reader_for(path: str | Path) -> Reader:
     raise InputError(f"no recording found, it holds {holds}; looked for {wanted}", path=path)
 
 
-def read_recording(path: str | Path, robot: int | None = None) -> Recording | SpatialRecording:
+def read_recording(
+    path: str | Path, robot: int | None = None, *, topics: str | Path | None = None
+) -> Recording | SpatialRecording:
     """Read a recording of any known format, in the plane or in space.
 
     Args:
         path: folder, zip or file.
         robot: number of the robot where the format has several; None for its first complete one.
+        topics: file that states which topics of a bag are what; None for the one beside it, or a guess.
 
     Raises:
         InputError: missing, malformed or of an unknown format.
         DataError: well-formed, but nothing can be estimated from it.
     """
-    return reader_for(path).read(Path(path), robot)
+    reader = reader_for(path)
+    if topics is None:
+        return reader.read(Path(path), robot)
+    if reader is not BAG:
+        raise InputError("has no topics", path=path, hint="leave --topics out; it is for bags")
+    return read_bag(path, robot, topics)
 
 
 def read_planar(path: str | Path, robot: int | None = None) -> Recording:
