@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from evermap.maps.sessions.session import Session
     from evermap.maps.store import open_store
     from evermap.maps.why import why
-    from evermap.pipeline import run_localization, run_session, run_slam
+    from evermap.pipeline import run_localization, run_session, run_slam, run_together
     from evermap.runs.folder import write_run
     from evermap.runs.persist.run import run_persist
     from evermap.runs.persist.table import read_looks
@@ -54,7 +54,7 @@ _HOME = {
     "evermap.maps.sessions.session": ("Session",),
     "evermap.maps.store": ("open_store",),
     "evermap.maps.why": ("why",),
-    "evermap.pipeline": ("run_localization", "run_session", "run_slam"),
+    "evermap.pipeline": ("run_localization", "run_session", "run_slam", "run_together"),
     "evermap.runs.folder": ("write_run",),
     "evermap.runs.persist.run": ("run_persist",),
     "evermap.runs.persist.table": ("read_looks",),
@@ -110,6 +110,7 @@ __all__ = [
     "run_persist",
     "run_session",
     "run_slam",
+    "run_together",
     "run_track",
     "why",
     "write_native",

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -66,6 +67,56 @@ def run_slam(
     with _one_thread():
         solved = solve(recording, prepared, prior, noise, config.slam, realtime=realtime, progress=progress)
         return existing(solved, concluded(solved), config.living)
+
+
+def run_together(
+    recordings: Mapping[int, Recording], config: Config | None = None, *, progress: Progress | None = None
+) -> dict[int, SlamResult]:
+    """Estimate several robots that drove at the same time as one problem: landmarks are one where their ids are.
+
+    Robots that saw each other (`Recording.robot_sightings`) tie each other's poses. Each is solved alone first.
+
+    Args:
+        recordings: by the numbers by which robots call each other; in the plane, their stamps on one clock.
+        config: settings; None for the defaults.
+        progress: told after every frame of each.
+
+    Returns:
+        the result of each, all in the frame of the first one's first pose.
+
+    Raises:
+        InputError: no `Recording`, or one with values that cannot be.
+        DataError: nothing can be estimated from one, or nothing ties one to the others.
+        ConfigError: landmarks without identities are those of one robot (`slam.unknown_ids`).
+        NumericalError: no finite optimum.
+    """
+    from evermap.maps.sessions.session import existing
+    from evermap.slam.check import odd, valid
+    from evermap.slam.estimate import solve
+    from evermap.slam.intake import beliefs, prepare
+    from evermap.slam.result import concluded
+    from evermap.slam.together import Member, solve_together
+
+    config = config or Config()
+    if config.slam.unknown_ids:
+        problem = "landmarks that several robots see are known by their ids"
+        raise ConfigError(problem, field="slam.unknown_ids", hint="leave it out, or run the robots one by one")
+    members = []
+    with _one_thread():
+        for number, given in recordings.items():
+            recording = valid(given, config.sensor)
+            remarks = odd(recording, settings=config.slam.check)
+            prior, noise = beliefs(recording.sensor, config.slam)
+            recording, voted = _voted(recording, config)
+            prepared = prepare(recording, None, (*remarks, *voted))
+            alone = solve(recording, prepared, prior, noise, config.slam, progress=progress)
+            if alone.interrupted:
+                raise KeyboardInterrupt
+            members.append(Member(number, alone, noise))
+        return {
+            number: existing(solved, replace(concluded(solved, online.frame), online=online), config.living)
+            for number, solved, online in zip(recordings, *solve_together(members), strict=True)
+        }
 
 
 def _voted(recording: AnyRecordingT, config: Config) -> tuple[AnyRecordingT, tuple[str, ...]]:

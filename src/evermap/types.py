@@ -273,7 +273,7 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True)
 class RobotSightings(_Columns):
-    """Sightings of other robots: read and reported, not used as landmarks. One row a sighting."""
+    """Sightings of other robots, used where these are solved together. One row a sighting."""
 
     stamp_s: FloatArray
     robot_id: IntArray
@@ -294,7 +294,8 @@ class Trajectory(_Columns):
         pose_world_robot: (N, 3) x [m], y [m], theta [rad, wrapped to (-pi, pi]]; in space (N, 7) x, y, z [m] and a unit
             quaternion qx, qy, qz, qw.
         covariance: (N, 3, 3) or (N, 6, 6) in the robot's frame (right perturbation); zeros where the poses are exact.
-        frame: what 'world' is: 'first_pose', 'prior_map' or 'truth'.
+        frame: what 'world' is: 'first_pose', of robots solved together 'first_robot' (its first pose), 'prior_map' or
+            'truth'.
     """
 
     stamp_s: FloatArray
@@ -459,7 +460,7 @@ class Recording(Shown):
         name: short label, e.g. 'MRCLAM_Dataset6 robot 1'.
         truth: reference trajectory, for evaluation only; None where unknown, may cover a part of the recording.
         true_landmarks: surveyed landmarks, for evaluation or as a prior map; None where unknown.
-        robot_sightings: sightings of other robots, reported only.
+        robot_sightings: sightings of other robots, for `run_together`.
         objects: (K, 2) landmark ids and the objects that they are on, as an object detector says; empty where there is
             none. Objects are numbered within the recording.
         warnings: counted, human-readable remarks of the reader ('3 detections of unknown barcodes dropped').

@@ -255,3 +255,33 @@ def test_interrupted_run_is_written_and_says_so(
     assert f"is in {tmp_path / 'run'}" in result.stderr
     assert json.loads(result.stdout)["interrupted"] is True
     assert (tmp_path / "run" / "map.parquet").is_file()
+
+
+def test_robots_of_one_time_are_solved_together(template: Path, tmp_path: Path) -> None:
+    """Two robots that drove and saw the same: both in the first one's frame, and as it is alone."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        write_native(read_recording(template), folder)
+    result = run("slam", first, second, "--together", "--out", tmp_path / "out", *QUICK)
+    assert result.exit_code == 0, result.stderr
+    outs = [tmp_path / "out" / name for name in ("template-1", "template-2")]
+    maps = [read_landmarks(out / "map.parquet") for out in outs]
+    np.testing.assert_allclose(maps[0].position_m, maps[1].position_m)
+    paths = [read_tum(out / "trajectory.tum").pose_world_robot for out in outs]
+    np.testing.assert_allclose(paths[0], paths[1], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ([], "'--together': there is one robot"),
+        (["--map", "m.evermap"], "'--map': is for one robot at a time"),
+        (["--prior-map", "truth"], "'--prior-map': is for one robot at a time"),
+        (["--robot", "1"], "'--robot': is for one robot at a time"),
+        (["--realtime"], "'--realtime': is for one robot at a time"),
+    ],
+)
+def test_what_is_for_one_robot_is_refused(template: Path, options: list[str], said: str) -> None:
+    result = run("slam", template, "--together", *options)
+    assert result.exit_code == 2
+    assert said in result.stderr

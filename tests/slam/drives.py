@@ -87,7 +87,7 @@ def driven(
     poses = _at(truth, stamps, frame_s + states[5])
     return World(
         landmark, poses, states, Drive.from_rows(stamps, velocity), frame_s,
-        [_seen(rng, p, landmark, states) for p in poses],
+        [seen_from(rng, p, landmark, states) for p in poses],
     )  # fmt: skip
 
 
@@ -98,7 +98,7 @@ def _at(truth: np.ndarray, stamps: np.ndarray, when: np.ndarray) -> np.ndarray:
     return se2.compose(truth[k], se2.exp(part * se2.log(se2.between(truth[k], truth[k + 1]))))
 
 
-def _seen(rng: np.random.Generator, pose: np.ndarray, landmark: np.ndarray, states: np.ndarray) -> FrameSightings:
+def seen_from(rng: np.random.Generator, pose: np.ndarray, landmark: np.ndarray, states: np.ndarray) -> FrameSightings:
     away = se2.transform(se2.inverse(pose), landmark)
     r, b = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
     seen = np.flatnonzero((r > 0.3) & (r < SENSOR.range_max_m) & (np.abs(b) < 2.0) & (rng.random(len(r)) < 0.9))

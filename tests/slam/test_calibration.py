@@ -67,6 +67,25 @@ def test_scale_is_divided_by_the_closed_form_posterior(product, sigma):
     assert after[FORWARD, FORWARD] == pytest.approx(spread[1, 1], rel=1e-9)
 
 
+@pytest.mark.parametrize("share", [None, 0.0])
+def test_the_metre_of_several_robots_is_their_mean(share):
+    """In lengths that are too long by a logarithm, by least squares over all slopes and scales."""
+    prior = replace(default_prior(), slope_share=share)
+    slope, forward = np.array([0.0, 0.013, -0.02]), np.array([1.04, 1.02, 0.99])
+    states, nothing = np.tile(prior.mean, (3, 1)), np.zeros((9, 9))
+    states[:, SLOPE], states[:, FORWARD] = slope, forward
+    told = [prior.metre(own, nothing) for own in states]
+    weight = np.array([1.0 / prior.sigma[SLOPE] ** 2, 1.0 / prior.sigma[FORWARD] ** 2 if share is None else 0.0])
+    best = (weight[1] * np.log(forward) - weight[0] * np.log1p(slope)).sum() / (3 * weight.sum())
+    for r in range(3):
+        divided, after, factor, sigma = prior.split_scale(states[r], nothing, (*told[:r], *told[r + 1 :]))
+        assert factor == pytest.approx(np.exp(-best))
+        assert sigma == pytest.approx(1.0 / np.sqrt(3 * (prior.sigma[[SLOPE, FORWARD]] ** -2.0).sum()))
+        assert divided[SLOPE] == pytest.approx((1.0 + slope[r]) / factor - 1.0)
+        assert divided[FORWARD] == pytest.approx(forward[r] * factor)
+        assert after[SLOPE, SLOPE] == pytest.approx(sigma**2)
+
+
 def test_division_explains_every_reading_as_well():
     """Graph and divided solution predict the same ranges and the same motion, in their own metres."""
     prior = default_prior()

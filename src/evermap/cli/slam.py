@@ -53,7 +53,8 @@ Recorded = Annotated[
     list[Path] | None,
     typer.Argument(
         metavar="INPUT...",
-        help="Folder in the native format, zip or ROS bag; with --map also several, in the order of their sessions.",
+        help="Folder in the native format, zip or ROS bag; with --map also several, in the order of their sessions, "
+        "and with --together one for each robot.",
         show_default=False,
     ),
 ]
@@ -123,6 +124,13 @@ Shifts = Annotated[
         help="Move landmarks of the prior map, e.g. 11,12,13:+1.0 [m, m, degrees]; for experiments; repeatable.",
     ),
 ]
+Together = Annotated[
+    bool,
+    typer.Option(
+        "--together",
+        help="The inputs are robots 1, 2, ... of one time, or one input has several robots: solve them as one problem.",
+    ),
+]
 Realtime = Annotated[bool, typer.Option("--realtime", help="Process at the pace of the recording.")]
 Template = Annotated[
     Path | None,
@@ -149,6 +157,7 @@ Examples:
   evermap slam my-recording --out out/mine
   evermap slam monday.mcap
   evermap slam MRCLAM_Dataset6.zip --robot 1 --out out/robot1
+  evermap slam MRCLAM_Dataset6.zip --together --out out/all
   evermap slam MRCLAM_Dataset6.zip --prior-map truth --shift "11,12,13:+1.0" --method viterbi
   evermap slam monday --map building.evermap
   evermap slam tuesday wednesday --map building.evermap --out out/week
@@ -174,6 +183,7 @@ def slam(
     prior: MapPriors = None,
     localize: Localize = False,
     shift: Shifts = None,
+    together: Together = False,
     realtime: Realtime = False,
     as_json: AsJson = False,
     force: Force = False,
@@ -183,24 +193,19 @@ def slam(
     show_config: ShowConfig = False,
 ) -> None:
     """Estimate trajectory and landmarks of a recording and write the folder of the run."""
-    if init is not None:
-        _write_template(init, in_space=in_space)
+    if init is not None or init_bag is not None or in_space:
+        _write_what_is_to_edit(init, init_bag, in_space=in_space)
         return
-    if init_bag is not None:
-        _write_bag_settings(init_bag)
-        return
-    if in_space:
-        raise ConfigError("is for a template", field="3d", hint="--init DIR --3d")
     given = {"sensor_model": sensor_model, "method": method, "unknown_ids": _associated(unknown_ids, empty_ids)}
     chosen = configured(config, settings, given, within="slam", show=show_config)
     if not (paths := input or []):
         hint = "a folder, zip or ROS bag; --init DIR shows what to put in"
         raise ConfigError("a recording is needed", field="input", hint=hint)
-    if len(paths) > 1 and map_file is None:
-        raise ConfigError("several recordings are sessions of a map", field="input", hint="--map FILE, or one of them")
-    _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, shift=shift)
-    if prior and (map_file is None or localize):
-        raise ConfigError("is for a session of a map", field="prior", hint="--map FILE, without --localize")
+    if together:
+        _check_together(map_file=map_file, prior_map=prior_map, robot=robot, realtime=realtime or None, topics=topics)
+        _each_together(paths, out, chosen, {"as_json": as_json, "force": force, "inputs": [*paths, config]})
+        return
+    _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, shift=shift, prior=prior)
     from evermap.io import parse_shift, read_recording, shifted
 
     read = partial(read_recording, robot=robot, topics=topics)
@@ -215,6 +220,9 @@ def slam(
     work = partial(_estimate, read=read, config=chosen, known=known, options=options, realtime=realtime, how=how)
     if len(paths) == 1:
         work(paths[0], out)
+    elif map_file is None:
+        hint = "--map FILE, --together for robots of one time, or one of them"
+        raise ConfigError("several recordings are sessions of a map", field="input", hint=hint)
     else:
         _each(paths, out, work)
 
@@ -296,6 +304,39 @@ def run_and_write(
         raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}")
 
 
+def _each_together(paths: Sequence[Path], out: Path | None, config: Config, how: _How) -> None:
+    """Read several robots, run them as one problem, and write a folder for each.
+
+    Raises:
+        ConfigError: there is one robot.
+    """
+    from evermap.cli.warmup import warm_up as compile_kernels
+    from evermap.io import list_robots, read_planar
+    from evermap.pipeline import run_together
+    from evermap.runs.folder import check_replaceable
+
+    if len(paths) > 1:
+        recordings = {number: read_planar(path) for number, path in enumerate(paths, start=1)}
+    else:
+        recordings = {number: read_planar(paths[0], robot=number) for number in list_robots(paths[0])}
+    if len(recordings) < 2:
+        raise ConfigError("there is one robot", field="together", hint="name the recordings of the others, too")
+    folders = {number: default_out(recording.name) for number, recording in recordings.items()}
+    if len(set(folders.values())) < len(folders):
+        folders = {number: Path(f"{folder}-{number}") for number, folder in folders.items()}
+    if out is not None:
+        folders = {number: out / folder.name for number, folder in folders.items()}
+    for folder in folders.values():  # better now than after the run
+        check_replaceable(folder, force=how["force"], inputs=how["inputs"])
+    warm_up(lambda: compile_kernels(search=True))
+    start = time.perf_counter()
+    with progress_bar(f"{len(recordings)} robots") as progress:
+        results = run_together(recordings, config, progress=progress)
+    elapsed_s = time.perf_counter() - start
+    for number, result in results.items():
+        _write(folders[number], recordings[number], result, config, _info(config, elapsed_s, realtime=False), **how)
+
+
 class _How(TypedDict):
     """How a run is written: see `write_run`; `as_json` prints its summary as JSON."""
 
@@ -352,10 +393,18 @@ def main_numbers(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _check_map_options(
-    map_file: str | None, *, localize: bool, prior_map: str | None, method: str | None, shift: list[str] | None
+    map_file: str | None,
+    *,
+    localize: bool,
+    prior_map: str | None,
+    method: str | None,
+    shift: list[str] | None,
+    prior: list[str] | None,
 ) -> None:
     if shift and prior_map is None:
         raise ConfigError("there is no map to shift", field="shift", hint="--prior-map truth, or --prior-map FILE")
+    if prior and (map_file is None or localize):
+        raise ConfigError("is for a session of a map", field="prior", hint="--map FILE, without --localize")
     if map_file is None:
         if localize:
             raise ConfigError("needs a map", field="localize", hint="--map FILE")
@@ -368,9 +417,22 @@ def _check_map_options(
         )
 
 
-def _write_template(folder: Path, *, in_space: bool) -> None:
+def _check_together(**given: object) -> None:
+    """Refuse what is for one robot."""
+    for field, value in given.items():
+        if value is not None:
+            raise ConfigError("is for one robot at a time", field=field, hint="leave it or --together out")
+
+
+def _write_what_is_to_edit(folder: Path | None, bag: Path | None, *, in_space: bool) -> None:
+    """Write a template of a recording, or what is read of a bag."""
     from evermap.io import write_template
 
+    if folder is None:
+        if bag is None:
+            raise ConfigError("is for a template", field="3d", hint="--init DIR --3d")
+        _write_bag_settings(bag)
+        return
     write_template(folder, in_space=in_space)
     say(f"wrote a template to {folder}; fill it with your recording, then: evermap slam {folder}")
 

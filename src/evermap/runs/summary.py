@@ -25,6 +25,7 @@ SUMMARY_SCHEMA_VERSION = "2"
 
 _FRAME_MEANING = {
     "first_pose": "the robot's first pose: origin where it stood, {axes}; metres",
+    "first_robot": "the first robot's first pose: origin where it stood, {axes}; metres",
     "prior_map": "the frame of the map that was given; metres",
     "truth": "the frame of the recording's own reference; metres",
 }

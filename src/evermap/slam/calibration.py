@@ -187,47 +187,81 @@ class CalibrationPrior:
         `k_v / (1 + a1)` explains every reading as well. So the graph holds `a1` at its mean, lets the forward scale
         carry the uncertainty of both, and `split_scale` divides what it found between them afterwards.
         """
-        if not self._shares_scale:
+        if not self.shares_scale:
             return self
+        return self.relative(0.0)
+
+    def relative(self, slope_sigma: float) -> CalibrationPrior:
+        """Return the prior of the states in the metres of a range sensor whose slope is known as well as this one's.
+
+        Args:
+            slope_sigma: of the range slope against that sensor's: 0 where it is this one.
+        """
         sigma, free = self.sigma.copy(), self.free.copy()
-        free[SLOPE] = False
         sigma[FORWARD] = np.hypot(sigma[FORWARD], sigma[SLOPE])
+        sigma[SLOPE], free[SLOPE] = max(slope_sigma, LEAST_SIGMA), slope_sigma > 0.0
         return replace(self, sigma=sigma, free=free)
 
     @property
-    def _shares_scale(self) -> bool:
+    def shares_scale(self) -> bool:
         """True where neither the range slope nor the forward scale is given, so that only their product shows."""
         return bool(self.free[SLOPE] and self.free[FORWARD])
 
-    def split_scale(self, states: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
+    def metre(self, states: FloatArray, covariance: FloatArray) -> tuple[float, float, float]:
+        """Return by how much the graph's lengths are too long as a robot's priors have it.
+
+        Args:
+            states: (9,) estimate in which nothing but these priors says what a metre is.
+            covariance: (9, 9) of it.
+
+        Returns:
+            The logarithm; the variance that it has from the estimate; and the precision that the priors give it.
+        """
+        precision = 1.0 / self.sigma[SLOPE] ** 2 + 1.0 / self.sigma[FORWARD] ** 2
+        share = self._slope_share
+        log = share * np.log(states[FORWARD] / self.mean[FORWARD])
+        log -= (1.0 - share) * np.log((1.0 + states[SLOPE]) / (1.0 + self.mean[SLOPE]))
+        variance = share**2 * covariance[FORWARD, FORWARD] + (1.0 - share) ** 2 * covariance[SLOPE, SLOPE]
+        return float(log), float(variance), float(precision)
+
+    @property
+    def _slope_share(self) -> float:
+        """Of what range slope and odometer scale show together, the sensor's."""
+        believed = self.sigma[SLOPE] ** 2 / (self.sigma[SLOPE] ** 2 + self.sigma[FORWARD] ** 2)
+        return float(believed if self.slope_share is None else self.slope_share)
+
+    def split_scale(
+        self, states: FloatArray, covariance: FloatArray, others: tuple[tuple[float, float, float], ...] = ()
+    ) -> tuple[FloatArray, FloatArray, float, float]:
         """Divide the product of range and odometry scale between its two factors, by their priors.
 
         Args:
             states: (9,) estimate made with `without_scale`.
             covariance: (9, 9) of it.
+            others: what other robots say (`metre`) whose lengths are the same; their mean counts, by precision.
 
         Returns:
             States and covariance with the slope in them; the factor by which all lengths of trajectory and map have
             to be multiplied; and the standard deviation of its logarithm.
         """
-        if not self._shares_scale:
+        if not (self.shares_scale or others):
             return states, covariance, 1.0, 0.0
         states, covariance = states.copy(), covariance.copy()
-        sigma_slope, sigma_forward = self.sigma[SLOPE], self.sigma[FORWARD]
-        believed = sigma_slope**2 / (sigma_slope**2 + sigma_forward**2)
-        share = believed if self.slope_share is None else self.slope_share
-        surplus = np.log(states[FORWARD] / self.mean[FORWARD])
-        log_slope = share * surplus
-        # what the product does not tell keeps the prior's spread; what it tells has the product's
-        spread = np.sqrt(believed) * sigma_forward
-        variance = spread**2 + share**2 * covariance[FORWARD, FORWARD]
-        states[SLOPE] = (1.0 + self.mean[SLOPE]) * np.exp(log_slope) - 1.0
+        if not others:  # the slope was held
+            covariance[SLOPE] = covariance[:, SLOPE] = 0.0
+        told = np.array([self.metre(states, covariance), *others])
+        weight, spread = told[:, 2] / told[:, 2].sum(), 1.0 / told[:, 2].sum()
+        log_slope, variance = float(weight @ told[:, 0]), spread + float(weight**2 @ told[:, 1])
+        states[SLOPE] = (1.0 + states[SLOPE]) * np.exp(log_slope) - 1.0
         states[FORWARD] *= np.exp(-log_slope)
         for state, power in ((SLIP, -1.0), (SKEW, 1.0), (CURVATURE, 1.0)):
             if self.free[state]:
                 states[state] *= np.exp(power * log_slope)
-        covariance[SLOPE, SLOPE] = variance
-        covariance[FORWARD, FORWARD] = (1.0 - share) ** 2 * covariance[FORWARD, FORWARD] + spread**2
+        # what the product does not tell keeps the prior's spread; what it tells has the product's
+        by_forward, by_slope = weight[0] * self._slope_share, weight[0] * (1.0 - self._slope_share)
+        own, drives = covariance[SLOPE, SLOPE], covariance[FORWARD, FORWARD]
+        covariance[SLOPE, SLOPE] = spread + by_forward**2 * drives + (1.0 - by_slope) ** 2 * own
+        covariance[FORWARD, FORWARD] = spread + (1.0 - by_forward) ** 2 * drives
         return states, covariance, float(np.exp(-log_slope)), float(np.sqrt(variance))
 
     def split_angle(self, states: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -331,67 +332,118 @@ class Noise:
         return np.where(np.isfinite(sigma_given), sigma_given, self.detection)
 
 
+class Block(NamedTuple):
+    """Where a problem is in a system of equations, which may be that of several.
+
+    Attributes:
+        first: row of its first pose among the variables; the others follow.
+        landmarks: (K,) variables of its known landmarks.
+        border: first of its two variables of calibration states.
+        odometry, detections: rows of its first factors of these kinds; the others follow.
+        n_pairs: factors of odometry of the whole system, which are its first.
+    """
+
+    first: int
+    landmarks: IntArray
+    border: int
+    odometry: int
+    detections: int
+    n_pairs: int
+
+
 class Marginals:
     """Covariances at an optimum, worked out when they are asked for.
 
     Args:
-        solved: the factorised normal equations of poses, known landmarks, sensor and motion states; their factors begin
-            with odometry and detections.
+        solved: the factorised normal equations, calibration states in their border.
         n_poses: N of them.
         n_detections: M.
         known: (L,) landmarks that have a position; what is asked of others is zero.
+        block: where in the equations these are; None where they are all of it: poses, known landmarks, sensor and
+            motion states, and their factors begin with odometry and detections.
     """
 
-    def __init__(self, solved: Factorised, n_poses: int, n_detections: int, known: BoolArray) -> None:
+    def __init__(
+        self,
+        solved: Factorised,
+        n_poses: int,
+        n_detections: int,
+        known: BoolArray,
+        *,
+        block: Block | None = None,
+    ) -> None:
         self._solved, self._n, self._m, self.known = solved, n_poses, n_detections, known
+        n_known = int(known.sum())
+        alone = Block(0, n_poses + np.arange(n_known), n_poses + n_known, 0, n_poses - 1, n_poses - 1)
+        self._block = alone if block is None else block
+
+    def of(self, block: Block, n_poses: int, n_detections: int, known: BoolArray) -> Marginals:
+        """Return those of another block of the same equations."""
+        other = Marginals(self._solved, n_poses, n_detections, known, block=block)
+        other._held = self._held
+        return other
 
     def in_slices(self) -> Slices[None]:
         """Compute all that the factorised equations hold, in slices."""
-        self._held = yield from self._solved.spread(self._n - 1)
+        self._held = yield from self._solved.spread(self._block.n_pairs)
 
     @cached_property
     def _held(self) -> Spread:
-        return exhausted(self._solved.spread(self._n - 1))
+        return exhausted(self._solved.spread(self._block.n_pairs))
 
     @property
     def pose(self) -> FloatArray:
         """(N, 3, 3) covariance of every pose, in its own frame."""
-        return self._held.own[: self._held.own_first[self._n]].reshape(self._n, 3, 3)
+        first, last = self._held.own_first[[self._block.first, self._block.first + self._n]]
+        return self._held.own[first:last].reshape(self._n, 3, 3)
 
     @cached_property
     def consecutive(self) -> FloatArray:
         """(N, 3, 3) of pose i with pose i + 1; the last is zero."""
-        pairs = self._held.pairs if self._n > 1 else np.zeros((0, 3, 3))
+        first = self._block.odometry
+        pairs = self._held.pairs[first : first + self._n - 1] if self._n > 1 else np.zeros((0, 3, 3))
         return np.concatenate([pairs, np.zeros((1, 3, 3))])
 
     @cached_property
     def landmark(self) -> FloatArray:
         """(L, 2, 2) covariance of every landmark."""
-        first, last = self._held.own_first[[self._n, self._n + int(self.known.sum())]]
         landmark = np.zeros((len(self.known), 2, 2))
-        landmark[self.known] = self._held.own[first:last].reshape(-1, 2, 2)
+        rows = self._held.own_first[self._block.landmarks][:, None] + np.arange(4)
+        landmark[self.known] = self._held.own[rows].reshape(-1, 2, 2)
         return landmark
 
     @cached_property
     def states(self) -> FloatArray:
         """(9, 9) covariance of the calibration states."""
-        return self._solved.border_covariance()
+        tree = self._solved.system.tree
+        at = tree.in_border[self._block.border] + np.arange(9)
+        return self._solved.border_covariance()[np.ix_(at, at)]
 
     @property
     def with_states(self) -> FloatArray:
         """(G, 9) covariance of everything with the calibration states: poses, known landmarks, states."""
-        n = self._n + int(self.known.sum())
-        return self._solved.columns(np.array([n, n + 1]))
+        begin, part = self._solved.system.tree.begin, self._block
+        first, states = begin[part.first], begin[part.border]
+        rows = [
+            np.arange(first, first + 3 * self._n),
+            (begin[part.landmarks][:, None] + np.arange(2)).ravel(),
+            np.arange(states, states + 9),
+        ]
+        found: FloatArray = self._solved.columns(part.border + np.arange(2))[np.concatenate(rows)]
+        return found
 
     @property
     def explained_odometry(self) -> FloatArray:
         """(N - 1, 3, 3) `A S A'`: part of whitened odometry residuals that the estimate's own uncertainty explains."""
-        return self._held.of_factors[: self._held.of_factors_first[self._n - 1]].reshape(-1, 3, 3)
+        first = self._block.odometry
+        first, last = self._held.of_factors_first[[first, first + self._n - 1]]
+        return self._held.of_factors[first:last].reshape(-1, 3, 3)
 
     @property
     def explained_detections(self) -> FloatArray:
         """(M, 2, 2) the same of the detections, weighted as inliers."""
-        first, last = self._held.of_factors_first[[self._n - 1, self._n - 1 + self._m]]
+        first = self._block.detections
+        first, last = self._held.of_factors_first[[first, first + self._m]]
         return self._held.of_factors[first:last].reshape(-1, 2, 2)
 
     def joint(
@@ -401,13 +453,16 @@ class Marginals:
 
         With `by` (C, numbers of these, all known) that of what this matrix makes of them, (C, C).
         """
-        n = self._n
+        part = self._block
         rank = np.cumsum(self.known) - 1
         rows = np.asarray(landmarks, dtype=np.int64)
         known = self.known[rows]
-        every = [np.zeros(0, dtype=np.int64) if poses is None else poses, n + rank[rows[known]]]
+        every = [
+            np.zeros(0, dtype=np.int64) if poses is None else part.first + poses,
+            part.landmarks[rank[rows[known]]],
+        ]
         if states:
-            every.append(n + int(self.known.sum()) + np.arange(2))
+            every.append(part.border + np.arange(2))
         found = self._solved.joint(np.concatenate(every), by)
         if known.all():
             return found
@@ -420,7 +475,7 @@ class Marginals:
     def product(self, landmarks: IntArray, matrix: FloatArray) -> FloatArray:
         """Return (2 L, K) the joint covariance of known landmarks (L,) times a matrix (2 L, K), without the former."""
         rank = np.cumsum(self.known) - 1
-        return self._solved.product(self._n + rank[np.asarray(landmarks, dtype=np.int64)], matrix)
+        return self._solved.product(self._block.landmarks[rank[np.asarray(landmarks, dtype=np.int64)]], matrix)
 
     @cached_property
     def shared(self) -> FloatArray:
@@ -433,6 +488,7 @@ class Marginals:
         n = self._n
         kept = np.append(np.repeat(self.known, 2), np.ones(9, dtype=bool))
         cross = np.zeros((n, 3, len(kept)))
-        found = self._solved.columns(np.arange(n, len(self._solved.system.tree.dim)))
-        cross[:, :, kept] = found[: 3 * n].reshape(n, 3, -1)
+        found = self._solved.columns(np.append(self._block.landmarks, self._block.border + np.arange(2)))
+        first = self._solved.system.tree.begin[self._block.first]
+        cross[:, :, kept] = found[first : first + 3 * n].reshape(n, 3, -1)
         return cross

@@ -36,10 +36,10 @@ LONGEST_PAUSE_S = 60.0
 """Longer pauses are divided no further: a clock that was set forward by a day would make a million poses of it."""
 
 
-def concluded(solved: Solved) -> SlamResult:
-    """Return trajectory and map, what moved, and what may have moved instead."""
+def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
+    """Return trajectory and map, what moved, and what may have moved instead; from `scratch` in the frame so called."""
     prepared, outcome, recording = solved.prepared, solved.outcome, solved.recording
-    frame = "prior_map" if outcome.aligned else "first_pose"
+    frame = "prior_map" if outcome.aligned else scratch
     found = result(solved, frame, landmarks(prepared, outcome, recording, frame))
     warnings = list(found.warnings)
     if prepared.prior_map is not None and not outcome.aligned:

@@ -54,7 +54,7 @@ class Linearised:
 
 
 @dataclass(frozen=True, slots=True)
-class _Structure:
+class Equations:
     """What does not change with values and noise, as long as the same landmarks are known.
 
     Attributes:
@@ -87,14 +87,19 @@ class Smoother:
     def __init__(self, problem: Problem, noise: Noise, *, heavy: bool = False, robust: bool = True) -> None:
         self.problem = problem
         self.noise = noise
-        self._heavy = heavy
-        self._robust = robust
-        self._structure: _Structure | None = None
+        self.heavy = heavy
+        self.robust = robust
+        self._structure: Equations | None = None
         self._last: tuple[Estimate, Linearised] | None = None
+
+    @property
+    def states_sigma(self) -> FloatArray:
+        """(9,) standard deviations of the prior of the calibration states."""
+        return self.problem.prior.sigma
 
     def under(self, noise: Noise, *, heavy: bool) -> Smoother:
         """Return the smoother of the same problem at other noise; what is known of its structure is kept."""
-        other = Smoother(self.problem, noise, heavy=heavy, robust=self._robust)
+        other = Smoother(self.problem, noise, heavy=heavy, robust=self.robust)
         other._structure = self._structure
         return other
 
@@ -253,8 +258,8 @@ class Smoother:
             noise.of_detections(problem.sigma_given),
             problem.mount,
             problem.prior.free,
-            noise.outlier_log_odds if self._robust else np.inf,
-            self._heavy and self._robust,
+            noise.outlier_log_odds if self.robust else np.inf,
+            self.heavy and self.robust,
         )
         bounds = [*range(0, len(estimate.pose), POSES_A_SLICE), len(estimate.pose)]
         rows = np.searchsorted(problem.pose_row, bounds).tolist()
@@ -285,11 +290,11 @@ class Smoother:
         return now
 
     def _eliminated(self, estimate: Estimate, now: Linearised, damping: float) -> Slices[Factorised]:
-        system, n, prior = self._structure_of(estimate).system, len(estimate.pose), self.problem.prior
-        extra, states = self._extra(system, n), 1.0 / prior.sigma**2
+        system, n = self._structure_of(estimate).system, len(estimate.pose)
+        extra, states = self._extra(system, n), 1.0 / self.states_sigma**2
         if damping > 0.0:
             own = extra + curvature(system.tree, system.factors, now.values)
-            own[-9:] += states
+            own[-len(states) :] += states
             extra = extra + damping * own
         return system.factorised(
             now.values, extra=extra, border_information=np.diag(states), border_right=now.states_right
@@ -297,13 +302,13 @@ class Smoother:
 
     def _extra(self, system: System, n_poses: int) -> FloatArray:
         extra = np.zeros(system.tree.begin[-1])
-        extra[3 * n_poses : -9] = HELD
+        extra[3 * n_poses : -len(self.states_sigma)] = HELD
         return extra
 
-    def _structure_of(self, estimate: Estimate) -> _Structure:
+    def _structure_of(self, estimate: Estimate) -> Equations:
         return exhausted(self._structured(estimate))
 
-    def _structured(self, estimate: Estimate) -> Slices[_Structure]:
+    def _structured(self, estimate: Estimate) -> Slices[Equations]:
         known, kept = estimate.known, self._structure
         if kept is not None and np.array_equal(kept.known, known):
             return kept
@@ -353,7 +358,7 @@ class Smoother:
         yield MS * n
         border = np.array([sensor, motion])
         tree = yield from tree_of(dim, factors, at, border)
-        self._structure = _Structure(known, rank, System(dim, factors, at, border, tree), at, roots, rows)
+        self._structure = Equations(known, rank, System(dim, factors, at, border, tree), at, roots, rows)
         return self._structure
 
     def _moved(self, estimate: Estimate, step: FloatArray) -> Estimate:
@@ -366,8 +371,9 @@ class Smoother:
         pose[:, 1] += s * by[:, 0] + c * by[:, 1]
         pose[:, 2] += by[:, 2]
         landmark = estimate.landmark.copy()
-        landmark[estimate.known] += step[3 * n : -9].reshape(-1, 2)
-        return Estimate(pose, landmark, estimate.states + step[-9:])
+        states = len(estimate.states)
+        landmark[estimate.known] += step[3 * n : -states].reshape(-1, 2)
+        return Estimate(pose, landmark, estimate.states + step[-states:])
 
 
 def _roots(information: sparse.csr_array, rows: IntArray) -> tuple[tuple[FloatArray, ...], tuple[IntArray, ...]]:

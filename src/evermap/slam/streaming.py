@@ -331,9 +331,9 @@ class StreamingSlam:
             if self._estimate_noise:
                 noise = fit.noise if heavy else ahead.ahead(noise, fit.noise)
             if heavy:
-                heavy = round_ == 0 and not _settled(before, noise, NOISE_NEAR)
+                heavy = round_ == 0 and not levels_settled(before, noise, NOISE_NEAR)
                 steps = 1 if heavy else STEPS_A_ROUND
-            elif _settled(before, fit.noise, NOISE_CONVERGED) or not self._estimate_noise:
+            elif levels_settled(before, fit.noise, NOISE_CONVERGED) or not self._estimate_noise:
                 noise = fit.noise if self._estimate_noise else noise
                 break
         assert fit is not None
@@ -525,6 +525,7 @@ def divided(
     revision: Explanation,
     *,
     aligned: bool,
+    others: tuple[tuple[float, float, float], ...] = (),
 ) -> Outcome:
     """Return what a session knows at its optimum, with what only shows together divided as its sensor states it.
 
@@ -535,14 +536,17 @@ def divided(
         noise: levels at which it was solved.
         revision: the method's last word.
         aligned: True where lengths and frame are those of a map.
+        others: what other robots say of its lengths (`CalibrationPrior.metre`).
     """
     smoother, estimate, marginals = solved
-    prior, worth = prior.spared(p_needed), smoother.worth(estimate, marginals)
+    believed, worth = prior, smoother.worth(estimate, marginals)
+    prior = prior.spared(p_needed)
     covariance = marginals.states * np.sqrt(np.outer(worth, worth))
     covariance += np.diag(prior.doubt(p_needed, estimate.states))
     states, scale, log_sigma = estimate.states, 1.0, 0.0
-    if not aligned:
-        states, covariance, scale, log_sigma = prior.split_scale(states, covariance)
+    if others or not aligned:
+        divides = believed if others else prior
+        states, covariance, scale, log_sigma = divides.split_scale(states, covariance, others)
     front = prior.front(states, smoother.problem.mount)
     states, covariance, *askew = prior.split_angle(states, covariance)
     pose = se2.compose(estimate.pose * [scale, scale, 1.0], front)
@@ -564,8 +568,8 @@ def divided(
     )
 
 
-def _settled(before: Noise, after: Noise, within: float) -> bool:
-    """True where no noise level changed by more than this share of itself."""
+def levels_settled(before: Noise, after: Noise, within: float) -> bool:
+    """Return whether no noise level changed by more than this share of itself."""
     old = np.concatenate([before.detection, before.odometry])
     new = np.concatenate([after.detection, after.odometry])
     return bool(np.all(np.abs(new / old - 1.0) < within))

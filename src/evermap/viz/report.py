@@ -91,7 +91,7 @@ def _lead(summary: Mapping[str, Any]) -> str:
         f" of {counts['landmarks']:,} landmarks"
     )
     if counts["robot_sightings"]:
-        text += f"; {counts['robot_sightings']:,} sightings of other robots were read and not used"
+        text += f"; {counts['robot_sightings']:,} sightings of other robots, which --together uses"
     return f"{text}.<br>Read from <code>{escape(source)}</code>." if source else f"{text}."
 
 

@@ -1,0 +1,352 @@
+"""Several robots that drove at the same time, solved together.
+
+Each is solved alone first. Then their frames are laid over each other, by landmarks with the same id and by sightings
+of each other; the instants of those become poses; and all is solved as one problem (`slam.encounters`), noise levels
+and the calibration states that are needed included. The metre that one robot alone cannot tell from its odometer is
+the mean of what all of them say (`CalibrationPrior.metre`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+
+from evermap.errors import DataError
+from evermap.geometry import se2
+from evermap.geometry.rigid import consensus
+from evermap.slam.bridge import bridged
+from evermap.slam.calibration import SLOPE, needed
+from evermap.slam.encounters import Encounters, Together
+from evermap.slam.estimate import Solved
+from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.slam.result import online as told_online
+from evermap.slam.smoother import Smoother
+from evermap.slam.sparse.system import exhausted
+from evermap.slam.streaming import (
+    ALIGNED_INFORMATION,
+    FINAL_GAIN,
+    FINAL_ROUNDS,
+    FINAL_TOLERANCE,
+    MIN_ALIGN_LANDMARKS,
+    NEAR_NOISE,
+    NOISE_CONVERGED,
+    STEPS_A_ROUND,
+    Outcome,
+    divided,
+    levels_settled,
+    sighted_at,
+)
+from evermap.types import FloatArray, IntArray, Trajectory
+
+ONE_INSTANT_S = 1e-3
+"""Instants that are this close are one: a robot moves a millimetre in between."""
+MOST_TIES = 200
+"""Sightings of one robot by another by which their frames are laid over each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A robot's recording by itself, and who it is.
+
+    Attributes:
+        number: by which others call it.
+        alone: its recording by itself, from scratch.
+        start: noise levels before the first frame.
+    """
+
+    number: int
+    alone: Solved
+    start: Noise
+
+
+def solve_together(members: Sequence[Member]) -> tuple[list[Solved], list[Trajectory]]:
+    """Return the members solved together, and what each knew at the time, in the frame of the first one's first pose.
+
+    Args:
+        members: landmarks with the same id are one, unless one of them saw it move.
+
+    Raises:
+        DataError: nothing ties one of them to the others.
+        NumericalError: no finite optimum.
+    """
+    met, stamps, remarks = _sighted(members)
+    own = [_extended(member, stamp_s) for member, stamp_s in zip(members, stamps, strict=True)]
+    motion = _placed(members, own, met)
+    joint, estimate = _laid_together(members, own, met, motion)
+    joint, estimate, _ = _levelled(members, joint, estimate, heavy=True)
+    joint, estimate, p_needed = _as_needed(joint, estimate)
+    joint, estimate, fits = _levelled(members, joint, estimate)
+    joint, estimate = _ahead(members[0], joint, estimate)
+    estimate, marginals = exhausted(joint.solved_in_slices(estimate, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN))
+    outcomes = _divided(members, joint, estimate, marginals, p_needed, fits)
+    solved, online = [], []
+    frames = ["first_pose", *["first_robot"] * (len(members) - 1)]
+    for member, outcome, by, said, frame in zip(members, outcomes, motion, remarks, frames, strict=True):
+        alone = member.alone
+        turned = alone.outcome.scale / outcome.scale * se2.rotation(by[2])
+        changes = outcome.revision.changes
+        moved = tuple(replace(change, displacement_m=tuple(turned @ change.displacement_m)) for change in changes)
+        revision = replace(outcome.revision, changes=moved)
+        prepared = replace(alone.prepared, warnings=(*alone.prepared.warnings, *said))
+        solved.append(replace(alone, prepared=prepared, outcome=replace(outcome, revision=revision)))
+        told = told_online(alone.prepared, alone.slam, alone.recording, frame)
+        online.append(replace(told, pose_world_robot=se2.compose(by, told.pose_world_robot)))
+    return solved, online
+
+
+def _sighted(members: Sequence[Member]) -> tuple[Encounters, list[FloatArray], list[tuple[str, ...]]]:
+    """Encounters of robots while both have poses; instants of the poses of each, those of the sightings included."""
+    number = np.array([member.number for member in members])
+    start_s = np.array([member.alone.prepared.start_s for member in members])
+    stamps = [member.alone.outcome.problem.stamp_s for member in members]
+    spans = np.array([[own[0], own[-1]] for own in stamps]) + start_s[:, None]
+    pairs, instants, readings = [], [], []
+    remarks: list[tuple[str, ...]] = []
+    for r, member in enumerate(members):
+        seen = member.alone.recording.robot_sightings
+        remarks.append(())
+        if seen is None:
+            continue
+        other = np.argmax(seen.robot_id[:, None] == number, axis=1)
+        good = (number[other] == seen.robot_id) & (other != r)
+        for robot in (np.full(len(other), r), other):
+            good &= (seen.stamp_s >= spans[robot, 0]) & (seen.stamp_s <= spans[robot, 1])
+        if not good.all():
+            why = "not of these robots, or not while both saw landmarks"
+            remarks[r] = (f"{np.count_nonzero(~good)} sightings of robots not used: {why}",)
+        pairs.append(np.column_stack([np.full(len(other), r), other])[good])
+        instants.append(seen.stamp_s[good])
+        readings.append(np.column_stack([seen.range_m, seen.bearing_rad])[good])
+    pair = np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])
+    stamp_s, reading = np.concatenate([np.zeros(0), *instants]), np.concatenate([np.zeros((0, 2)), *readings])
+    merged = [
+        _with_instants(own, np.sort(stamp_s[(pair == r).any(axis=1)]) - start_s[r]) for r, own in enumerate(stamps)
+    ]
+    first = np.cumsum([0, *(len(own) for own in merged)])
+    row = np.zeros_like(pair)
+    for r, own in enumerate(merged):
+        some = pair == r
+        row[some] = first[r] + _nearest(own, np.broadcast_to(stamp_s[:, None], pair.shape)[some] - start_s[r])
+    return Encounters(row[:, 0], row[:, 1], pair[:, 0], reading), merged, remarks
+
+
+def _with_instants(own_s: FloatArray, new_s: FloatArray) -> FloatArray:
+    """Instants (N,), and those of others, sorted, that are none of them."""
+    new_s = new_s[np.abs(own_s[_nearest(own_s, new_s)] - new_s) > ONE_INSTANT_S]
+    return np.sort(np.concatenate([own_s, new_s[np.diff(new_s, prepend=-np.inf) > ONE_INSTANT_S]]))
+
+
+def _nearest(own_s: FloatArray, stamp_s: FloatArray) -> IntArray:
+    """Rows of the instants (N,) that are nearest to others."""
+    after = np.clip(np.searchsorted(own_s, stamp_s), 1, len(own_s) - 1)
+    return after - (stamp_s - own_s[after - 1] < own_s[after] - stamp_s)
+
+
+def _extended(member: Member, stamp_s: FloatArray) -> tuple[Problem, Estimate]:
+    """A robot's problem with poses at more instants, without priors of places, and where it puts everything [m]."""
+    outcome, problem = member.alone.outcome, member.alone.outcome.problem
+    graph, spread = outcome.graph_estimate, outcome.graph_marginals
+    pose, _ = bridged(
+        stamp_s, problem.stamp_s, graph.pose, spread.pose, spread.consecutive, problem.drive, graph.states,
+        outcome.noise.noise,
+    )  # fmt: skip
+    states, _, scale, _ = member.alone.prior.split_scale(graph.states, np.zeros((9, 9)))
+    count = len(graph.landmark)
+    extended = replace(
+        problem,
+        stamp_s=stamp_s,
+        pose_row=np.searchsorted(stamp_s, problem.stamp_s)[problem.pose_row],
+        landmark_mean=np.zeros((count, 2)),
+        landmark_information=sparse.csr_array((2 * count, 2 * count)),
+    )
+    return extended, Estimate(pose * [scale, scale, 1.0], graph.landmark * scale, states)
+
+
+def _placed(members: Sequence[Member], own: Sequence[tuple[Problem, Estimate]], met: Encounters) -> FloatArray:
+    """(R, 3) motions of each robot's frame into that of the first one, by landmarks and sightings that agree.
+
+    Raises:
+        DataError: nothing ties one of them to the others.
+    """
+    first = np.cumsum([0, *(len(estimate.pose) for _, estimate in own)])
+    robot = np.repeat(np.arange(len(own)), np.diff(first))
+    pose, other = np.concatenate([estimate.pose for _, estimate in own]), robot[met.observed]
+    sighted = np.zeros((len(other), 2))
+    for r, (problem, estimate) in enumerate(own):
+        mine = met.robot == r
+        sighted[mine] = sighted_at(pose[met.observer[mine]], met.reading[mine], estimate.states, problem.mount)
+    names = [member.alone.prepared.landmark_id for member in members]
+
+    def ties(a: int, b: int) -> tuple[FloatArray, FloatArray]:
+        """Return the same points in the frames of robots a and b."""
+        _, of_a, of_b = np.intersect1d(names[a], names[b], return_indices=True)
+        points = [np.hstack([own[a][1].landmark[of_a], own[b][1].landmark[of_b]])]
+        for x, y in ((a, b), (b, a)):
+            some = np.flatnonzero((met.robot == x) & (other == y))
+            some = some[:: 1 + len(some) // MOST_TIES]
+            seen = [sighted[some], pose[met.observed[some], :2]]
+            points.append(np.hstack(seen if x == a else seen[::-1]))
+        both = np.concatenate(points)
+        both = both[np.isfinite(both).all(axis=1)]
+        return both[:, :2], both[:, 2:]
+
+    motion, placed = np.zeros((len(own), 3)), {0}
+    while len(placed) < len(own):
+        best, found = 0, None
+        for b in set(range(len(own))) - placed:
+            theirs, mine = zip(*(ties(a, b) for a in placed), strict=True)
+            there = [se2.transform(motion[a], at) for a, at in zip(placed, theirs, strict=True)]
+            by, agree = consensus(np.concatenate(mine), np.concatenate(there))
+            if agree.sum() > best:
+                best, found = int(agree.sum()), (b, by)
+        if found is None or best < MIN_ALIGN_LANDMARKS:
+            lost = ", ".join(members[r].alone.recording.name for r in range(len(own)) if r not in placed)
+            what = f"nothing ties {lost} to {members[0].alone.recording.name}"
+            raise DataError(what, hint="landmarks with the same ids, or sightings of each other, and one clock")
+        motion[found[0]] = found[1]
+        placed.add(found[0])
+    return motion
+
+
+def _shared(members: Sequence[Member]) -> list[IntArray]:
+    """Which place each place of each robot is: one for those with the same id, but of what one of them saw move."""
+    revisions = [member.alone.outcome.revision for member in members]
+    names = [member.alone.prepared.landmark_id for member in members]
+    moved = {
+        int(own[k]) for own, said in zip(names, revisions, strict=True) for c in said.changes for k in c.landmark_ids
+    }
+    stay = np.setdiff1d(np.concatenate(names), list(moved))
+    places, count = [], len(stay)
+    for own, revision in zip(names, revisions, strict=True):
+        rows = np.arange(count, count + len(revision.estimate.landmark))
+        shared = np.flatnonzero(np.isin(own, stay))
+        rows[shared] = np.searchsorted(stay, own[shared])
+        places.append(rows)
+        count += len(rows)
+    return places
+
+
+def _laid_together(
+    members: Sequence[Member], own: Sequence[tuple[Problem, Estimate]], met: Encounters, motion: FloatArray
+) -> tuple[Together, Estimate]:
+    """The problem of all, and where it is when each robot's own solution is moved by (R, 3)."""
+    places = _shared(members)
+    landmark = np.full((max(int(rows.max()) for rows in places) + 1, 2), np.nan)
+    pose, robots = [], []
+    metric = not all(member.alone.prior.shares_scale for member in members)
+    for r, (member, (problem, estimate), by) in enumerate(zip(members, own, motion, strict=True)):
+        at, pose_r = se2.transform(by, estimate.landmark), se2.compose(by, estimate.pose)
+        new = np.isfinite(at[:, 0]) & np.isnan(landmark[places[r], 0])
+        landmark[places[r][new]] = at[new]
+        prior, held = member.alone.prior, problem.start_information if r == 0 else ALIGNED_INFORMATION
+        if not metric:  # in the metres of the first one's ranges: all free within their priors prefer a small world
+            prior = prior.relative(np.sqrt(2.0) * prior.sigma[SLOPE] if r else 0.0)
+        placed = replace(problem, start_pose=pose_r[0], start_information=held, prior=prior)
+        robots.append(Smoother(placed, member.alone.outcome.noise.noise, robust=member.alone.settings.robust))
+        pose.append(pose_r)
+    start_s = np.array([member.alone.prepared.start_s for member in members])
+    sigma = np.array([robot.noise.detection for robot in robots])
+    states = np.concatenate([estimate.states for _, estimate in own])
+    return Together(robots, places, start_s - start_s.min(), met, sigma), Estimate(
+        np.concatenate(pose), landmark, states
+    )
+
+
+def _levelled(
+    members: Sequence[Member], joint: Together, estimate: Estimate, *, heavy: bool = False
+) -> tuple[Together, Estimate, list[NoiseFit]]:
+    """The optimum and its noise levels, in turns until neither changes; `heavy` outliers at first, if wanted."""
+    ahead, start = [Extrapolation() for _ in members], joint.sigma
+    for round_ in range(FINAL_ROUNDS):
+        first = heavy and round_ == 0
+        joint = joint.of([robot.under(robot.noise, heavy=first) for robot in joint.robots], joint.sigma)
+        solved = joint.solved_in_slices(estimate, iterations=STEPS_A_ROUND, tolerance=NEAR_NOISE)
+        estimate, marginals = exhausted(solved)
+        own, parts = joint.estimates(estimate), joint.parts(estimate, marginals)
+        fits = [
+            refine_noise(robot.problem, one, part, robot.inlier_probability(one), robot.noise, member.start)
+            for member, robot, one, part in zip(members, joint.robots, own, parts, strict=True)
+        ]
+        learning, settled = [], not first
+        for member, robot, fit, before in zip(members, joint.robots, fits, ahead, strict=True):
+            noise = robot.noise
+            if member.alone.settings.estimate_noise:
+                settled &= levels_settled(noise, fit.noise, NOISE_CONVERGED)
+                noise = fit.noise if first else before.ahead(noise, fit.noise)
+            learning.append(robot.under(noise, heavy=False))
+        if settled:
+            break
+        joint = joint.of(learning, _refined(members, joint, estimate, marginals, start))
+    return joint, estimate, [replace(fit, noise=robot.noise) for fit, robot in zip(fits, joint.robots, strict=True)]
+
+
+def _refined(
+    members: Sequence[Member], joint: Together, estimate: Estimate, marginals: Marginals, start: FloatArray
+) -> FloatArray:
+    """(R, 2) noise of what each robot measures of others, as `refine_noise` has that of landmarks."""
+    square, weight = joint.squares(estimate)
+    left = weight[:, None] * np.maximum(1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2), 0.0)
+    sigma = joint.sigma.copy()
+    for r, member in enumerate(members):
+        if member.alone.settings.estimate_noise:
+            mine, pseudo = joint.met.robot == r, member.start.pseudo_count
+            counts = left[mine].sum(axis=0) + pseudo
+            sigma[r] = np.sqrt((square[mine].sum(axis=0) + pseudo * start[r] ** 2) / counts)
+    return sigma
+
+
+def _as_needed(joint: Together, estimate: Estimate) -> tuple[Together, Estimate, list[FloatArray]]:
+    """The same under priors of the calibration states that are needed; how much each is."""
+    marginals = exhausted(joint.marginals_in_slices(estimate))
+    robots, states, p_needed = [], [], []
+    parts = zip(joint.robots, joint.estimates(estimate), joint.parts(estimate, marginals), strict=True)
+    for robot, own, part in parts:
+        worth, prior = robot.worth(own, part), robot.problem.prior
+        p_needed.append(needed(prior, own.states, part.states, worth))
+        if not np.all(np.isnan(p_needed[-1])):
+            prior = prior.averaged(p_needed[-1], np.diag(part.states), worth)
+        robots.append(Smoother(replace(robot.problem, prior=prior), robot.noise, robust=robot.robust))
+        states.append(np.where(prior.free, own.states, prior.mean))
+    return joint.of(robots, joint.sigma), replace(estimate, states=np.concatenate(states)), p_needed
+
+
+def _ahead(first: Member, joint: Together, estimate: Estimate) -> tuple[Together, Estimate]:
+    """The same, turned so that the first robot's first pose has its front ahead."""
+    problem = joint.robots[0].problem
+    start = se2.inverse(first.alone.prior.front(estimate.states[:9], problem.mount))
+    turn, robots = se2.compose(start, se2.inverse(problem.start_pose)), []
+    for robot in joint.robots:
+        turned = replace(robot.problem, start_pose=se2.compose(turn, robot.problem.start_pose))
+        robots.append(Smoother(turned, robot.noise, robust=robot.robust))
+    pose, landmark = se2.compose(turn, estimate.pose), se2.transform(turn, estimate.landmark)
+    return joint.of(robots, joint.sigma), Estimate(pose, landmark, estimate.states)
+
+
+def _divided(
+    members: Sequence[Member],
+    joint: Together,
+    estimate: Estimate,
+    marginals: Marginals,
+    p_needed: Sequence[FloatArray],
+    fits: Sequence[NoiseFit],
+) -> list[Outcome]:
+    """What each robot knows at the optimum, in metres that all agree on; changes are as each alone has them."""
+    own, parts = joint.estimates(estimate), joint.parts(estimate, marginals)
+    priors = [member.alone.prior for member in members]
+    told = [
+        prior.metre(one.states, part.states) if all(other.shares_scale for other in priors) else None
+        for prior, one, part in zip(priors, own, parts, strict=True)
+    ]
+    outcomes = []
+    for r, (member, robot) in enumerate(zip(members, joint.robots, strict=True)):
+        revision = replace(member.alone.outcome.revision, problem=robot.problem, estimate=own[r], rivals=())
+        others = tuple(said for k, said in enumerate(told) if said is not None and k != r)
+        outcome = divided(
+            (robot, own[r], parts[r]), priors[r], p_needed[r], fits[r], revision, aligned=True, others=others
+        )
+        outcomes.append(replace(outcome, aligned=False))
+    return outcomes
