@@ -129,18 +129,15 @@ class Associator:
         problem: the measurements; its `landmark_row` is not looked at.
         noise: where the noise levels start.
         kind: (M, 2) class and name of every detection, `UNKNOWN` for none; None where there are none.
-        odometry: (5,) noise levels of the odometry, where they are known; None for `CAUTION` times those of `noise`.
     """
 
-    def __init__(
-        self, problem: Problem, noise: Noise, kind: IntArray | None = None, odometry: FloatArray | None = None
-    ) -> None:
+    def __init__(self, problem: Problem, noise: Noise, kind: IntArray | None = None) -> None:
         self._problem = problem
         self._kind = np.full((len(problem.pose_row), 2), UNKNOWN) if kind is None else kind
         self._of_kind: IntArray = np.zeros((0, 2), dtype=np.int64)
         self._seen_s = np.zeros(0)
         self._start_noise = noise
-        self.noise = replace(noise, odometry=CAUTION * noise.odometry if odometry is None else odometry)
+        self.noise = replace(noise, odometry=CAUTION * noise.odometry)
         """Noise levels that everything is solved with; detections carry their own."""
         self._slipping = replace(noise, odometry=SLIP * self.noise.odometry)
         self._first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
@@ -222,10 +219,18 @@ class Associator:
         if gained + _twice(now).sum() > _twice(again.assignment).sum():
             self._go_on_from(again)
 
-    def finish(self) -> Assignment:
-        """Settle everything processed so far, and mend what was associated wrongly."""
+    def finish(self, begun: Assignment | None = None) -> Assignment:
+        """Settle everything processed so far, and mend what was associated wrongly.
+
+        Args:
+            begun: who is who to begin with, of the same detections; None for what `step` found.
+        """
         refused: set[tuple[int, int]] = set()
-        solved = self._relaid(self._contradictions_split(self._settled(self._assignment()), refused))
+        if begun is None:
+            begun = self._assignment()
+        else:
+            self._sigma = begun.measured.sigma_given
+        solved = self._relaid(self._contradictions_split(self._settled(begun), refused))
         for _ in range(LAST_ROUNDS):
             before = solved.assignment
             again = reassigned(before, solved.marginals.explained_detections, density=self._density_m2)
@@ -276,14 +281,6 @@ class Associator:
         fit = solved.cost + float(np.log(solved.assignment.measured.sigma_given).sum())
         told = float(_twice(assignment).sum()) + FEW_NATS * assignment.n_landmarks
         return fit + self.noise.outlier_log_odds * nobody + told
-
-    def better(self, first: Assignment, second: Assignment) -> Assignment:
-        """Choose the second assignment where it explains all detections clearly better, see `against`; else the first.
-
-        How many detections are of no landmark is taken to be known to the square root of their number.
-        """
-        chance = self.noise.outlier_log_odds * math.sqrt(np.count_nonzero(first.landmark_row == NOBODY))
-        return second if self.against(second) + chance < self.against(first) else first
 
     def _match(self, detections: IntArray) -> _Frame:
         """The frame's detections weighed against the landmarks known so far."""

@@ -14,6 +14,7 @@ from scipy.linalg import block_diag
 from evermap.slam.association.assignment import NOBODY, Assignment, alike
 from evermap.slam.association.associator import P_MERGE, Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
+from evermap.slam.association.particles import WIDER, drawn
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
@@ -27,7 +28,12 @@ ALL_TRIED = 100
 MOST_NAMED = 100
 """Landmarks known by name that a session is laid over a map by."""
 FEW_DOUBTFUL = 0.02
-"""Share of doubtful detections up to which who is who hardly depends on what is assumed of the odometry."""
+"""Share of doubtful detections up to which who is who is not drawn by particles."""
+RUNS, MOST_ROUNDS, MOST_IN_VAIN = 4, 6, 2
+"""Draws of which one is settled, how often, and how often in a row without gain."""
+LITTLE_NATS = 0.07
+"""A hundredth of what a detection of no landmark costs: by which all detections are explained better, for each of them,
+before it is worth while to draw again."""
 MAP_FLOOR_M = 1e-3
 """A prior map without uncertainty is taken to be known to a millimetre."""
 
@@ -88,22 +94,42 @@ def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, k
     name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
     kind = np.column_stack([given.class_id, name])[prepared.used]
 
-    def finished(associator: Associator) -> Assignment:
-        for _ in problem.stamp_s:
-            associator.step()
-        if keep_ids:
-            associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior))
-        return associator.finish()
-
-    cautious = Associator(problem, noise, kind)
-    assignment = finished(cautious)
-    if cautious.doubtful > FEW_DOUBTFUL:
-        # how wrong the odometry is decides what may be one, and is known only afterwards: once more, with that
-        again = finished(Associator(problem, noise, kind, cautious.learned_odometry(assignment)))
-        assignment = cautious.better(assignment, again)
+    associator = Associator(problem, noise, kind)
+    for _ in problem.stamp_s:
+        associator.step()
+    if keep_ids:
+        associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior))
+    assignment = associator.finish()
+    if associator.doubtful > FEW_DOUBTFUL:
+        assignment = searched(associator, assignment)
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
-    return Associated(row, name, assignment, cautious.noise, prior)
+    return Associated(row, name, assignment, associator.noise, prior)
+
+
+def searched(associator: Associator, assignment: Assignment) -> Assignment:
+    """Return what explains all detections best, by particles that start from the best so far, again and again.
+
+    Of `RUNS` draws the one that foretold the detections best is settled, and kept if it explains them better. The
+    search ends where that gains little, or twice nothing.
+
+    Args:
+        associator: which has seen all frames.
+        assignment: what it finished with.
+    """
+    cost, little = associator.against(assignment), LITTLE_NATS * len(assignment.landmark_row)
+    odometry, in_vain = associator.learned_odometry(assignment), 0
+    for k, seeds in enumerate(np.arange(MOST_ROUNDS * RUNS).reshape(-1, RUNS).tolist()):
+        draws = (drawn(assignment, odometry, seed, wider=WIDER[k % len(WIDER)]) for seed in seeds)
+        begun, _ = max(draws, key=lambda draw: draw[1])
+        trial = associator.finish(begun)
+        gained = cost - (against := associator.against(trial))
+        if gained > 0.0:
+            assignment, cost, odometry = trial, against, associator.learned_odometry(trial)
+        in_vain = 0 if gained > little else in_vain + 1
+        if in_vain == MOST_IN_VAIN or 0.0 < gained <= little:
+            break
+    return assignment
 
 
 def _by_names(problem: Problem, name: IntArray, noise: Noise, prior: CalibrationPrior) -> FloatArray:

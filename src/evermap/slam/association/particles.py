@@ -1,0 +1,393 @@
+"""Who is who by particles: whole histories of associations are drawn, and weighed by how well they foretold the rest.
+
+FastSLAM (Montemerlo and Thrun 2003: FastSLAM 2.0 and its association for each particle): a particle is a path; given
+it, landmarks are independent, so each has its own. A detection is of a landmark, of a new one or of none, drawn by its
+likelihoods, and moves the path before the next is weighed. A wrong choice dies out when what follows contradicts it: a
+filter of one Gaussian has no such way back, and a batch solution finds none where a whole group of landmarks was taken
+for its neighbours. Particles forget their past and take errors for independent, so that what they draw is a start for
+the batch solution, which decides (`identify`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from evermap.compiled import kept
+from evermap.slam.association.assignment import NOBODY, Assignment
+from evermap.slam.association.jcbb import gates
+from evermap.slam.kernels import composed, wrapped
+from evermap.slam.problem import Estimate
+from evermap.types import UNKNOWN, FloatArray, IntArray
+
+MOST_PARTICLES, FEWEST_PARTICLES = 300, 30
+WORK = 2e9
+"""Pairs of detections and landmarks that are looked at in a run, at most, as long as there are particles enough."""
+NONE_NATS = 7.0
+"""By which a detection of no landmark is less likely than a perfect one of a landmark."""
+NEW_NATS = NONE_NATS + math.log(20.0)
+"""The same for one of a landmark that was not met before: of detections of none that is known, one in twenty."""
+WIDER = 1.2, 1.5
+"""Of the noise of sightings, in turn: errors of one place are alike, so that they tell less than if they were not."""
+BENT = 0.3
+"""Standard deviation of landmarks that are known at the start, relative to the way to the next: a group of them may be
+beside where it belongs, by less than what takes one for another."""
+GATE = gates(1, 1.0 - 1e-4)[1]
+SEEN, FORGET_S = 3, 20.0
+"""Detections that make a landmark; what has less after so long is forgotten."""
+ROOM = 2, 64
+"""Landmarks of a particle at most: so many for each that is known, and more."""
+FEWEST_EFFECTIVE = 0.5
+"""Share of particles that count, below which they are drawn anew."""
+NAMED_NATS = math.log(100.0)
+"""Odds for a landmark whose name is read."""
+
+
+_kernel = kept(effort=3, error_model="numpy")
+
+
+class _Seen(NamedTuple):
+    """Detections: rows of each frame (N + 1,), readings, variances and labels (M, 2), stamps of frames (N,)."""
+
+    first: IntArray
+    reading: FloatArray
+    variance: FloatArray
+    label: IntArray
+    stamp_s: FloatArray
+
+
+class _Sensor(NamedTuple):
+    """Mount (3,) and calibration states (9,)."""
+
+    mount: FloatArray
+    states: FloatArray
+
+
+class _Cloud(NamedTuple):
+    """P particles with room for L landmarks each; `of` is which landmark a slot is of, -1 for none."""
+
+    pose: FloatArray
+    place: FloatArray
+    spread: FloatArray
+    label: IntArray
+    sightings: IntArray
+    last_s: FloatArray
+    of: IntArray
+    slots: IntArray
+    met: IntArray
+
+
+class _Options(NamedTuple):
+    """Landmarks that a detection may be of: slots, log likelihoods, innovations, their covariances and derivatives."""
+
+    slot: IntArray
+    score: FloatArray
+    innovation: FloatArray
+    covariance: FloatArray
+    by_pose: FloatArray
+    taken_at: IntArray
+
+
+def drawn(assignment: Assignment, odometry: FloatArray, seed: int, *, wider: float = WIDER[0]) -> tuple[Assignment, float]:
+    """Return who is who as the best of particles has it, and the log evidence of all of them, up to a constant.
+
+    Args:
+        assignment: at its optimum, with the noise of sightings; its landmarks are known to within `BENT`.
+        odometry: (5,) noise levels of the odometry.
+        seed: of what is drawn.
+        wider: of the noise of sightings.
+    """
+    problem, states = assignment.measured, assignment.estimate.states
+    count = np.clip(WORK / (len(problem.reading) * max(assignment.n_landmarks, 1)), FEWEST_PARTICLES, MOST_PARTICLES)
+    motion = problem.drive.between(problem.stamp_s, states)
+    spread = np.tensordot(motion.noise, odometry**2, (1, 0)) + motion.floor
+    noise = np.concatenate([np.eye(3)[None] / problem.start_information, spread])
+    steps = np.vstack([problem.start_pose, motion.increment])
+    first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
+    seen = _Seen(first, problem.reading, (wider * problem.sigma_given) ** 2, assignment.kind, problem.stamp_s)
+    cloud = _begun(assignment, int(count))
+    row, pose, evidence = _run(seen, _Sensor(problem.mount, states), steps, noise, cloud, seed)
+    met, row[row >= 0] = np.unique(row[row >= 0], return_inverse=True)
+    found = Assignment(problem, row, Estimate(pose, np.zeros((len(met), 2)), states.copy()), assignment.kind)
+    order = np.argsort(row, kind="stable")[np.count_nonzero(row == NOBODY) :]
+    of_each = np.split(found.points()[order], np.flatnonzero(np.diff(row[order])) + 1)
+    place = np.array([np.median(points, axis=0) for points in of_each]).reshape(-1, 2)
+    return replace(found, estimate=replace(found.estimate, landmark=place)), evidence
+
+
+def _begun(assignment: Assignment, count: int) -> _Cloud:
+    """Particles that know the landmarks of an assignment, each about where it is."""
+    place, n = assignment.estimate.landmark, assignment.n_landmarks
+    room = ROOM[0] * n + ROOM[1]
+    cloud = _Cloud(
+        np.zeros((count, 3)), np.zeros((count, room, 2)), np.zeros((count, room, 3)),
+        np.full((count, room, 2), UNKNOWN), np.zeros((count, room), dtype=np.int64), np.zeros((count, room)),
+        np.full((count, room), NOBODY), np.full(count, n), np.full(count, n),
+    )  # fmt: skip
+    if n:
+        away = KDTree(place).query(place, 2)[0][:, 1] if n > 1 else np.ones(1)
+        cloud.place[:, :n], cloud.label[:, :n], cloud.of[:, :n] = place, assignment.of_kind, np.arange(n)
+        cloud.spread[:, :n, 0] = cloud.spread[:, :n, 2] = (BENT * away) ** 2
+        cloud.sightings[:, :n] = SEEN
+    return cloud
+
+
+@_kernel
+def _run(
+    seen: Any, sensor: Any, steps: FloatArray, noise: FloatArray, cloud: Any, seed: int
+) -> tuple[IntArray, FloatArray, float]:
+    """Frame by frame all particles, then back along the ancestors of the best."""
+    np.random.seed(seed)
+    frames, count, room = len(steps), len(cloud.pose), cloud.of.shape[1]
+    path, parent = np.zeros((frames, count, 3)), np.zeros((frames, count), dtype=np.int32)
+    row = np.full((len(seen.reading), count), NOBODY, dtype=np.int32)
+    weight, evidence = np.zeros(count), 0.0
+    options = _Options(
+        np.zeros(room, dtype=np.int64), np.zeros(room + 2), np.zeros((room, 2)), np.zeros((room, 3)),
+        np.zeros((room, 2, 3)), np.full(room, -1),
+    )  # fmt: skip
+    most = 1
+    for t in range(frames):
+        most = max(most, seen.first[t + 1] - seen.first[t])
+    chosen, covariance = np.zeros(most, dtype=np.int64), np.zeros((3, 3))
+    across, gain, step = np.zeros((3, 2)), np.zeros((3, 2)), np.zeros(3)
+    for t in range(frames):
+        start, end = seen.first[t], seen.first[t + 1]
+        for i in range(count):
+            pose, covariance[:] = cloud.pose[i], noise[t]
+            _move(pose, steps[t])
+            for d in range(start, end):
+                n = _weigh(seen, d, sensor, pose, covariance, cloud, i, t * count + i, options)
+                k, gained = _draw(options.score, n, seen.variance[d])
+                weight[i] += gained
+                if k < n:
+                    _correct(pose, covariance, options, k, across, gain, step)
+                    options.taken_at[options.slot[k]] = t * count + i
+                    chosen[d - start] = options.slot[k]
+                else:
+                    chosen[d - start] = n - 1 - k  # -1 none, -2 new
+            _sample(pose, covariance, step)
+            for d in range(start, end):
+                row[d, i] = _place(seen, d, seen.stamp_s[t], sensor, cloud, i, chosen[d - start])
+            path[t, i], parent[t, i] = cloud.pose[i], i
+        top = weight.max()
+        share = np.exp(weight - top)
+        if t < frames - 1 and share.sum() ** 2 < FEWEST_EFFECTIVE * count * (share * share).sum():
+            evidence += top + np.log(share.mean())
+            weight[:] = 0.0
+            _resample(cloud, share / share.sum(), parent[t])
+    best = np.argmax(weight)
+    evidence += weight.max() + np.log(np.exp(weight - weight.max()).mean())
+    found, poses = np.full(len(seen.reading), NOBODY), np.zeros((frames, 3))
+    for t in range(frames - 1, -1, -1):
+        if t < frames - 1:
+            best = parent[t, best]
+        poses[t] = path[t, best]
+        for d in range(seen.first[t], seen.first[t + 1]):
+            found[d] = row[d, best]
+    return found, poses, evidence
+
+
+@_kernel
+def _weigh(
+    seen: Any, d: int, sensor: Any, pose: FloatArray, covariance: FloatArray, cloud: Any, i: int, now: int, options: Any
+) -> int:
+    """Landmarks of particle `i` in whose gate detection `d` is, with all that an update needs; their number."""
+    mount, states, label = sensor.mount, sensor.states, seen.label[d]
+    c, s, cm, sm = math.cos(pose[2]), math.sin(pose[2]), math.cos(mount[2]), math.sin(mount[2])
+    bearing = seen.reading[d, 1] - states[4]
+    range_m = (seen.reading[d, 0] - states[0]) / (1.0 + states[1] + states[2] * bearing + states[3] * bearing**2)
+    own = seen.variance[d, 0] + covariance[0, 0] + covariance[1, 1] + (mount[0] ** 2 + mount[1] ** 2) * covariance[2, 2]
+    x, y, n = pose[0] + c * mount[0] - s * mount[1], pose[1] + s * mount[0] + c * mount[1], 0
+    for k in range(cloud.slots[i]):
+        if cloud.of[i, k] < 0 or options.taken_at[k] == now:
+            continue
+        dx, dy = cloud.place[i, k, 0] - x, cloud.place[i, k, 1] - y
+        r = math.sqrt(dx * dx + dy * dy) + 1e-9
+        if (r - range_m) ** 2 > 2.0 * GATE * (own + cloud.spread[i, k, 0] + cloud.spread[i, k, 2]):
+            continue
+        known, spread = cloud.label[i, k], cloud.spread[i, k]
+        differs, named = False, label[1] != UNKNOWN and label[1] == known[1]
+        for q in range(2):
+            differs |= label[q] != UNKNOWN and known[q] != UNKNOWN and label[q] != known[q]
+        if differs:
+            continue
+        ax, ay = c * dx + s * dy, -s * dx + c * dy  # from the sensor, in the robot's axes
+        rx, ry = mount[0] + ax, mount[1] + ay
+        ux, uy = (cm * ax + sm * ay) / r, (-sm * ax + cm * ay) / r
+        expected = math.atan2(uy, ux)
+        gain = 1.0 + states[1] + states[2] * expected + states[3] * expected**2
+        e0, e1 = seen.reading[d, 0] - states[0] - gain * r, wrapped(bearing - expected)
+        g = options.by_pose[n]
+        a0, a1, b0, b1 = gain * ax / r, gain * ay / r, -ay / (r * r), ax / (r * r)
+        g[0, 0], g[0, 1], g[0, 2] = -a0, -a1, a0 * ry - a1 * rx
+        g[1, 0], g[1, 1], g[1, 2] = -b0, -b1, b0 * ry - b1 * rx
+        a0, a1, b0, b1 = c * a0 - s * a1, s * a0 + c * a1, c * b0 - s * b1, s * b0 + c * b1
+        v00 = a0 * a0 * spread[0] + 2.0 * a0 * a1 * spread[1] + a1 * a1 * spread[2] + seen.variance[d, 0]
+        v01 = a0 * b0 * spread[0] + (a0 * b1 + a1 * b0) * spread[1] + a1 * b1 * spread[2]
+        v11 = b0 * b0 * spread[0] + 2.0 * b0 * b1 * spread[1] + b1 * b1 * spread[2] + seen.variance[d, 1]
+        for p in range(3):
+            for q in range(3):
+                v00 += g[0, p] * covariance[p, q] * g[0, q]
+                v01 += g[0, p] * covariance[p, q] * g[1, q]
+                v11 += g[1, p] * covariance[p, q] * g[1, q]
+        det = v00 * v11 - v01 * v01
+        distance = (v11 * e0 * e0 - 2.0 * v01 * e0 * e1 + v00 * e1 * e1) / det
+        if distance > GATE:
+            continue
+        sightings = cloud.sightings[i, k]
+        score = math.log(sightings / (sightings + 1.0)) - 0.5 * (distance + math.log(det))
+        options.slot[n], options.score[n] = k, score + (NAMED_NATS if named else 0.0)
+        options.innovation[n, 0], options.innovation[n, 1] = e0, e1
+        options.covariance[n, 0], options.covariance[n, 1], options.covariance[n, 2] = v00, v01, v11
+        n += 1
+    return n
+
+
+@_kernel
+def _draw(score: FloatArray, n: int, variance: FloatArray) -> tuple[int, float]:
+    """One of `n` landmarks, none (n) or a new one (n + 1), by their likelihoods; and the log of their sum."""
+    perfect = -0.5 * math.log(variance[0] * variance[1])
+    score[n], score[n + 1] = perfect - NONE_NATS, perfect - NEW_NATS
+    top, total = score[: n + 2].max(), 0.0
+    for k in range(n + 2):
+        total += math.exp(score[k] - top)
+    left, k = np.random.random() * total, 0
+    while k < n + 1:
+        left -= math.exp(score[k] - top)
+        if left <= 0.0:
+            break
+        k += 1
+    return k, top + math.log(total) - perfect
+
+
+@_kernel
+def _correct(
+    pose: FloatArray, covariance: FloatArray, options: Any, k: int, across: FloatArray, gain: FloatArray,
+    step: FloatArray,
+) -> None:  # fmt: skip
+    """Update the pose, its error in its own frame, with option `k`, its place marginalised; with room for products."""
+    h, e, v = options.by_pose[k], options.innovation[k], options.covariance[k]
+    det = v[0] * v[2] - v[1] * v[1]
+    for p in range(3):
+        for a in range(2):
+            across[p, a] = covariance[p, 0] * h[a, 0] + covariance[p, 1] * h[a, 1] + covariance[p, 2] * h[a, 2]
+        gain[p, 0] = (across[p, 0] * v[2] - across[p, 1] * v[1]) / det
+        gain[p, 1] = (across[p, 1] * v[0] - across[p, 0] * v[1]) / det
+        step[p] = gain[p, 0] * e[0] + gain[p, 1] * e[1]
+    for p in range(3):
+        for q in range(3):
+            covariance[p, q] -= gain[p, 0] * across[q, 0] + gain[p, 1] * across[q, 1]
+    _move(pose, step)
+
+
+@_kernel
+def _move(pose: FloatArray, step: FloatArray) -> None:
+    """Compose a pose with a step, in place."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    pose[0] += c * step[0] - s * step[1]
+    pose[1] += s * step[0] + c * step[1]
+    pose[2] += step[2]
+
+
+@_kernel
+def _sample(pose: FloatArray, covariance: FloatArray, step: FloatArray) -> None:
+    """Draw a pose from a Gaussian in its own frame, in place; the covariance becomes its Cholesky factor."""
+    for p in range(3):
+        for q in range(p + 1):
+            value = covariance[p, q]
+            for m in range(q):
+                value -= covariance[p, m] * covariance[q, m]
+            covariance[p, q] = math.sqrt(max(value, 1e-16)) if p == q else value / covariance[q, q]
+    step[:] = 0.0
+    for q in range(3):
+        drawn_now = np.random.standard_normal()
+        for p in range(q, 3):
+            step[p] += covariance[p, q] * drawn_now
+    _move(pose, step)
+
+
+@_kernel
+def _place(seen: Any, d: int, stamp_s: float, sensor: Any, cloud: Any, i: int, slot: int) -> int:
+    """Update the landmark in a slot with a detection, or start one (-2); return which it is, -1 for none."""
+    if slot == -1:
+        return -1
+    pose, mount, states, variance = cloud.pose[i], sensor.mount, sensor.states, seen.variance[d]
+    at = composed(pose, mount)
+    bearing = seen.reading[d, 1] - states[4]
+    gain = 1.0 + states[1] + states[2] * bearing + states[3] * bearing**2
+    if slot == -2:
+        slot = _free_slot(cloud, i, stamp_s)
+        if slot < 0:
+            return -1
+        r, angle = (seen.reading[d, 0] - states[0]) / gain, bearing + at[2]
+        c, s = math.cos(angle), math.sin(angle)
+        along, aside = variance[0] / gain**2, variance[1] * r * r
+        cloud.place[i, slot, 0], cloud.place[i, slot, 1] = at[0] + r * c, at[1] + r * s
+        spread = cloud.spread[i, slot]
+        spread[0], spread[1] = c * c * along + s * s * aside, c * s * (along - aside)
+        spread[2] = s * s * along + c * c * aside
+        cloud.of[i, slot], cloud.sightings[i, slot], cloud.label[i, slot] = cloud.met[i], 0, seen.label[d]
+        cloud.met[i] += 1
+    else:
+        dx, dy, spread = cloud.place[i, slot, 0] - at[0], cloud.place[i, slot, 1] - at[1], cloud.spread[i, slot]
+        r = math.sqrt(dx * dx + dy * dy) + 1e-9
+        expected = wrapped(math.atan2(dy, dx) - at[2])
+        gain = 1.0 + states[1] + states[2] * expected + states[3] * expected**2
+        e0, e1 = seen.reading[d, 0] - states[0] - gain * r, wrapped(bearing - expected)
+        a0, a1, b0, b1 = gain * dx / r, gain * dy / r, -dy / (r * r), dx / (r * r)
+        p00, p01 = spread[0] * a0 + spread[1] * a1, spread[1] * a0 + spread[2] * a1
+        p10, p11 = spread[0] * b0 + spread[1] * b1, spread[1] * b0 + spread[2] * b1
+        v00, v01, v11 = a0 * p00 + a1 * p01 + variance[0], b0 * p00 + b1 * p01, b0 * p10 + b1 * p11 + variance[1]
+        det = v00 * v11 - v01 * v01
+        k00, k01 = (p00 * v11 - p10 * v01) / det, (p10 * v00 - p00 * v01) / det
+        k10, k11 = (p01 * v11 - p11 * v01) / det, (p11 * v00 - p01 * v01) / det
+        cloud.place[i, slot, 0] += k00 * e0 + k01 * e1
+        cloud.place[i, slot, 1] += k10 * e0 + k11 * e1
+        spread[0] -= k00 * p00 + k01 * p10
+        spread[1] -= k00 * p01 + k01 * p11
+        spread[2] -= k10 * p01 + k11 * p11
+        for q in range(2):
+            cloud.label[i, slot, q] = max(cloud.label[i, slot, q], seen.label[d, q])
+    cloud.sightings[i, slot] += 1
+    cloud.last_s[i, slot] = stamp_s
+    return int(cloud.of[i, slot])
+
+
+@_kernel
+def _free_slot(cloud: Any, i: int, stamp_s: float) -> int:
+    """A slot that is free, as what was in it was seen too seldom; -1 where there is none."""
+    for k in range(cloud.slots[i]):
+        if cloud.sightings[i, k] < SEEN and stamp_s - cloud.last_s[i, k] > FORGET_S:
+            return k
+    if cloud.slots[i] == cloud.of.shape[1]:
+        return -1
+    cloud.slots[i] += 1
+    return int(cloud.slots[i] - 1)
+
+
+@_kernel
+def _resample(cloud: Any, share: FloatArray, parent: IntArray) -> None:
+    """Draw particles by their shares (P,), with one random number (systematic); those that are not drawn give way."""
+    count = len(share)
+    copies, at, drawn_to, free = np.zeros(count, dtype=np.int64), np.random.random() / count, share[0], 0
+    j = 0
+    for _ in range(count):
+        while drawn_to < at and j < count - 1:
+            j += 1
+            drawn_to += share[j]
+        copies[j] += 1
+        at += 1.0 / count
+    for j in range(count):
+        for _ in range(1, copies[j]):
+            while copies[free] > 0:
+                free += 1
+            copies[free], parent[free], n = 1, j, cloud.slots[j]
+            cloud.pose[free], cloud.slots[free], cloud.met[free] = cloud.pose[j], n, cloud.met[j]
+            cloud.place[free, :n], cloud.spread[free, :n] = cloud.place[j, :n], cloud.spread[j, :n]
+            cloud.label[free, :n], cloud.sightings[free, :n] = cloud.label[j, :n], cloud.sightings[j, :n]
+            cloud.last_s[free, :n], cloud.of[free, :n] = cloud.last_s[j, :n], cloud.of[j, :n]
