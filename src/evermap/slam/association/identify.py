@@ -29,7 +29,7 @@ MOST_NAMED = 100
 """Landmarks known by name that a session is laid over a map by."""
 FEW_DOUBTFUL = 0.02
 """Share of doubtful detections up to which who is who is not drawn by particles."""
-RUNS, MOST_ROUNDS, MOST_IN_VAIN = 4, 6, 2
+RUNS, MOST_ROUNDS, MOST_IN_VAIN = 4, 6, 3
 """Draws of which one is settled, how often, and how often in a row without gain."""
 LITTLE_NATS = 0.07
 """A hundredth of what a detection of no landmark costs: by which all detections are explained better, for each of them,
@@ -111,7 +111,7 @@ def searched(associator: Associator, assignment: Assignment) -> Assignment:
     """Return what explains all detections best, by particles that start from the best so far, again and again.
 
     Of `RUNS` draws the one that foretold the detections best is settled, and kept if it explains them better. The
-    search ends where that gains little, or twice nothing.
+    search ends where that gains little, or several times nothing.
 
     Args:
         associator: which has seen all frames.

@@ -25,7 +25,7 @@ from evermap.slam.problem import Estimate
 from evermap.types import UNKNOWN, FloatArray, IntArray
 
 MOST_PARTICLES, FEWEST_PARTICLES = 300, 30
-WORK = 2e9
+WORK = 1e8
 """Pairs of detections and landmarks that are looked at in a run, at most, as long as there are particles enough."""
 NONE_NATS = 7.0
 """By which a detection of no landmark is less likely than a perfect one of a landmark."""
@@ -36,7 +36,7 @@ WIDER = 1.2, 1.5
 BENT = 0.3
 """Standard deviation of landmarks that are known at the start, relative to the way to the next: a group of them may be
 beside where it belongs, by less than what takes one for another."""
-GATE = gates(1, 1.0 - 1e-4)[1]
+GATE = float(gates(1, 1.0 - 1e-4)[1])
 SEEN, FORGET_S = 3, 20.0
 """Detections that make a landmark; what has less after so long is forgotten."""
 ROOM = 2, 64
@@ -92,7 +92,9 @@ class _Options(NamedTuple):
     taken_at: IntArray
 
 
-def drawn(assignment: Assignment, odometry: FloatArray, seed: int, *, wider: float = WIDER[0]) -> tuple[Assignment, float]:
+def drawn(
+    assignment: Assignment, odometry: FloatArray, seed: int, *, wider: float = WIDER[0]
+) -> tuple[Assignment, float]:
     """Return who is who as the best of particles has it, and the log evidence of all of them, up to a constant.
 
     Args:
@@ -129,7 +131,7 @@ def _begun(assignment: Assignment, count: int) -> _Cloud:
         np.full((count, room), NOBODY), np.full(count, n), np.full(count, n),
     )  # fmt: skip
     if n:
-        away = KDTree(place).query(place, 2)[0][:, 1] if n > 1 else np.ones(1)
+        away = np.asarray(KDTree(place).query(place, 2)[0])[:, 1] if n > 1 else np.ones(1)
         cloud.place[:, :n], cloud.label[:, :n], cloud.of[:, :n] = place, assignment.of_kind, np.arange(n)
         cloud.spread[:, :n, 0] = cloud.spread[:, :n, 2] = (BENT * away) ** 2
         cloud.sightings[:, :n] = SEEN
@@ -141,7 +143,7 @@ def _run(
     seen: Any, sensor: Any, steps: FloatArray, noise: FloatArray, cloud: Any, seed: int
 ) -> tuple[IntArray, FloatArray, float]:
     """Frame by frame all particles, then back along the ancestors of the best."""
-    np.random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - of the compiled code, in this thread
     frames, count, room = len(steps), len(cloud.pose), cloud.of.shape[1]
     path, parent = np.zeros((frames, count, 3)), np.zeros((frames, count), dtype=np.int32)
     row = np.full((len(seen.reading), count), NOBODY, dtype=np.int32)
@@ -256,7 +258,7 @@ def _draw(score: FloatArray, n: int, variance: FloatArray) -> tuple[int, float]:
     top, total = score[: n + 2].max(), 0.0
     for k in range(n + 2):
         total += math.exp(score[k] - top)
-    left, k = np.random.random() * total, 0
+    left, k = np.random.random() * total, 0  # noqa: NPY002
     while k < n + 1:
         left -= math.exp(score[k] - top)
         if left <= 0.0:
@@ -305,7 +307,7 @@ def _sample(pose: FloatArray, covariance: FloatArray, step: FloatArray) -> None:
             covariance[p, q] = math.sqrt(max(value, 1e-16)) if p == q else value / covariance[q, q]
     step[:] = 0.0
     for q in range(3):
-        drawn_now = np.random.standard_normal()
+        drawn_now = np.random.standard_normal()  # noqa: NPY002
         for p in range(q, 3):
             step[p] += covariance[p, q] * drawn_now
     _move(pose, step)
@@ -374,8 +376,8 @@ def _free_slot(cloud: Any, i: int, stamp_s: float) -> int:
 def _resample(cloud: Any, share: FloatArray, parent: IntArray) -> None:
     """Draw particles by their shares (P,), with one random number (systematic); those that are not drawn give way."""
     count = len(share)
-    copies, at, drawn_to, free = np.zeros(count, dtype=np.int64), np.random.random() / count, share[0], 0
-    j = 0
+    copies, drawn_to, free, j = np.zeros(count, dtype=np.int64), share[0], 0, 0
+    at = np.random.random() / count  # noqa: NPY002
     for _ in range(count):
         while drawn_to < at and j < count - 1:
             j += 1
