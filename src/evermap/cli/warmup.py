@@ -72,8 +72,10 @@ def warm_up(
     of_the_estimator(search=search or sessions)
     if unknown_ids:
         from evermap.slam.association.consensus import warm_up as of_the_association
+        from evermap.slam.association.particles import warm_up as of_the_particles
 
         of_the_association()
+        of_the_particles()
     if sessions:
         first = run_session(_drive(0.0), config=config)
         _done(first.slam, run_session(_drive(1e5), first.living, config).slam)

@@ -111,7 +111,7 @@ def drawn(
     steps = np.vstack([problem.start_pose, motion.increment])
     first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
     seen = _Seen(first, problem.reading, (wider * problem.sigma_given) ** 2, assignment.kind, problem.stamp_s)
-    cloud = _begun(assignment, int(count))
+    cloud = _begun(assignment.estimate.landmark, assignment.of_kind, int(count))
     row, pose, evidence = _run(seen, _Sensor(problem.mount, states), steps, noise, cloud, seed)
     met, row[row >= 0] = np.unique(row[row >= 0], return_inverse=True)
     found = Assignment(problem, row, Estimate(pose, np.zeros((len(met), 2)), states.copy()), assignment.kind)
@@ -121,9 +121,17 @@ def drawn(
     return replace(found, estimate=replace(found.estimate, landmark=place)), evidence
 
 
-def _begun(assignment: Assignment, count: int) -> _Cloud:
-    """Particles that know the landmarks of an assignment, each about where it is."""
-    place, n = assignment.estimate.landmark, assignment.n_landmarks
+def warm_up() -> None:
+    """Compile what `drawn` needs."""
+    one, two = np.zeros((1, 2)), np.ones((2, 2))
+    seen = _Seen(np.arange(3), two, two, np.full((2, 2), UNKNOWN), np.arange(2.0))
+    cloud = _begun(one, np.full((1, 2), UNKNOWN), 2)
+    _run(seen, _Sensor(np.zeros(3), np.zeros(9)), np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), cloud, 0)
+
+
+def _begun(place: FloatArray, label: IntArray, count: int) -> _Cloud:
+    """Particles that know landmarks (L, 2), each about where it is."""
+    n = len(place)
     room = ROOM[0] * n + ROOM[1]
     cloud = _Cloud(
         np.zeros((count, 3)), np.zeros((count, room, 2)), np.zeros((count, room, 3)),
@@ -131,8 +139,8 @@ def _begun(assignment: Assignment, count: int) -> _Cloud:
         np.full((count, room), NOBODY), np.full(count, n), np.full(count, n),
     )  # fmt: skip
     if n:
-        away = np.asarray(KDTree(place).query(place, 2)[0])[:, 1] if n > 1 else np.ones(1)
-        cloud.place[:, :n], cloud.label[:, :n], cloud.of[:, :n] = place, assignment.of_kind, np.arange(n)
+        away = np.ravel(KDTree(place).query(place, [2])[0]) if n > 1 else np.ones(1)
+        cloud.place[:, :n], cloud.label[:, :n], cloud.of[:, :n] = place, label, np.arange(n)
         cloud.spread[:, :n, 0] = cloud.spread[:, :n, 2] = (BENT * away) ** 2
         cloud.sightings[:, :n] = SEEN
     return cloud
