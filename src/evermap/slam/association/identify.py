@@ -110,7 +110,7 @@ def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, k
 def searched(associator: Associator, assignment: Assignment) -> Assignment:
     """Return what explains all detections best, by particles that start from the best so far, again and again.
 
-    Of `RUNS` draws the one that foretold the detections best is settled, and kept if it explains them better. The
+    Of `RUNS` draws the one that predicted the detections best is settled, and kept if it explains them better. The
     search ends where that gains little, or several times nothing.
 
     Args:

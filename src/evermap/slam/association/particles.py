@@ -1,4 +1,4 @@
-"""Who is who by particles: whole histories of associations are drawn, and weighed by how well they foretold the rest.
+"""Who is who by particles: whole histories of associations are drawn, and weighed by how well they predicted the rest.
 
 FastSLAM (Montemerlo and Thrun 2003: FastSLAM 2.0 and its association for each particle): a particle is a path; given
 it, landmarks are independent, so each has its own. A detection is of a landmark, of a new one or of none, drawn by its
@@ -17,10 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from evermap.compiled import kept
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.jcbb import gates
-from evermap.slam.kernels import composed, wrapped
+from evermap.slam.kernels import composed, kernel, wrapped
 from evermap.slam.problem import Estimate
 from evermap.types import UNKNOWN, FloatArray, IntArray
 
@@ -45,9 +44,6 @@ FEWEST_EFFECTIVE = 0.5
 """Share of particles that count, below which they are drawn anew."""
 NAMED_NATS = math.log(100.0)
 """Odds for a landmark whose name is read."""
-
-
-_kernel = kept(effort=3, error_model="numpy")
 
 
 class _Seen(NamedTuple):
@@ -146,7 +142,7 @@ def _begun(place: FloatArray, label: IntArray, count: int) -> _Cloud:
     return cloud
 
 
-@_kernel
+@kernel
 def _run(
     seen: Any, sensor: Any, steps: FloatArray, noise: FloatArray, cloud: Any, seed: int
 ) -> tuple[IntArray, FloatArray, float]:
@@ -202,7 +198,7 @@ def _run(
     return found, poses, evidence
 
 
-@_kernel
+@kernel
 def _weigh(
     seen: Any, d: int, sensor: Any, pose: FloatArray, covariance: FloatArray, cloud: Any, i: int, now: int, options: Any
 ) -> int:
@@ -258,7 +254,7 @@ def _weigh(
     return n
 
 
-@_kernel
+@kernel
 def _draw(score: FloatArray, n: int, variance: FloatArray) -> tuple[int, float]:
     """One of `n` landmarks, none (n) or a new one (n + 1), by their likelihoods; and the log of their sum."""
     perfect = -0.5 * math.log(variance[0] * variance[1])
@@ -275,7 +271,7 @@ def _draw(score: FloatArray, n: int, variance: FloatArray) -> tuple[int, float]:
     return k, top + math.log(total) - perfect
 
 
-@_kernel
+@kernel
 def _correct(
     pose: FloatArray, covariance: FloatArray, options: Any, k: int, across: FloatArray, gain: FloatArray,
     step: FloatArray,
@@ -295,7 +291,7 @@ def _correct(
     _move(pose, step)
 
 
-@_kernel
+@kernel
 def _move(pose: FloatArray, step: FloatArray) -> None:
     """Compose a pose with a step, in place."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -304,7 +300,7 @@ def _move(pose: FloatArray, step: FloatArray) -> None:
     pose[2] += step[2]
 
 
-@_kernel
+@kernel
 def _sample(pose: FloatArray, covariance: FloatArray, step: FloatArray) -> None:
     """Draw a pose from a Gaussian in its own frame, in place; the covariance becomes its Cholesky factor."""
     for p in range(3):
@@ -321,7 +317,7 @@ def _sample(pose: FloatArray, covariance: FloatArray, step: FloatArray) -> None:
     _move(pose, step)
 
 
-@_kernel
+@kernel
 def _place(seen: Any, d: int, stamp_s: float, sensor: Any, cloud: Any, i: int, slot: int) -> int:
     """Update the landmark in a slot with a detection, or start one (-2); return which it is, -1 for none."""
     if slot == -1:
@@ -368,7 +364,7 @@ def _place(seen: Any, d: int, stamp_s: float, sensor: Any, cloud: Any, i: int, s
     return int(cloud.of[i, slot])
 
 
-@_kernel
+@kernel
 def _free_slot(cloud: Any, i: int, stamp_s: float) -> int:
     """A slot that is free, as what was in it was seen too seldom; -1 where there is none."""
     for k in range(cloud.slots[i]):
@@ -380,7 +376,7 @@ def _free_slot(cloud: Any, i: int, stamp_s: float) -> int:
     return int(cloud.slots[i] - 1)
 
 
-@_kernel
+@kernel
 def _resample(cloud: Any, share: FloatArray, parent: IntArray) -> None:
     """Draw particles by their shares (P,), with one random number (systematic); those that are not drawn give way."""
     count = len(share)
