@@ -97,7 +97,7 @@ def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, k
     associator = Associator(problem, noise, kind)
     for _ in problem.stamp_s:
         associator.step()
-    if keep_ids:
+    if (name != UNKNOWN).any():
         associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior))
     assignment = associator.finish()
     if associator.doubtful > FEW_DOUBTFUL:
