@@ -112,7 +112,7 @@ def drawn(
     met, row[row >= 0] = np.unique(row[row >= 0], return_inverse=True)
     found = Assignment(problem, row, Estimate(pose, np.zeros((len(met), 2)), states.copy()), assignment.kind)
     order = np.argsort(row, kind="stable")[np.count_nonzero(row == NOBODY) :]
-    of_each = np.split(found.points()[order], np.flatnonzero(np.diff(row[order])) + 1)
+    of_each = np.split(found.points()[order], np.flatnonzero(np.diff(row[order])) + 1)[: len(met)]
     place = np.array([np.median(points, axis=0) for points in of_each]).reshape(-1, 2)
     return replace(found, estimate=replace(found.estimate, landmark=place)), evidence
 
