@@ -94,7 +94,7 @@ def test_who_was_exchanged_is_told_apart_again(seed: int) -> None:
     before = identity_scores(wrong.landmark_row, true).purity
     purity = [identity_scores(drawn(wrong, odometry, k)[0].landmark_row, true).purity for k in range(3)]
     assert before < 0.97 < max(purity)
-    again = searched(associator, wrong)
+    again = searched(associator, wrong, lambda _: wrong)
     assert associator.against(again) < associator.against(found) + 1.0
     assert identity_scores(again.landmark_row, true).purity == 1.0
     assert np.mean(again.landmark_row == NOBODY) < 0.02

@@ -129,15 +129,18 @@ class Associator:
         problem: the measurements; its `landmark_row` is not looked at.
         noise: where the noise levels start.
         kind: (M, 2) class and name of every detection, `UNKNOWN` for none; None where there are none.
+        odometry: (5,) noise levels of the odometry, where they are known; None for `CAUTION` times those of `noise`.
     """
 
-    def __init__(self, problem: Problem, noise: Noise, kind: IntArray | None = None) -> None:
+    def __init__(
+        self, problem: Problem, noise: Noise, kind: IntArray | None = None, odometry: FloatArray | None = None
+    ) -> None:
         self._problem = problem
         self._kind = np.full((len(problem.pose_row), 2), UNKNOWN) if kind is None else kind
         self._of_kind: IntArray = np.zeros((0, 2), dtype=np.int64)
         self._seen_s = np.zeros(0)
         self._start_noise = noise
-        self.noise = replace(noise, odometry=CAUTION * noise.odometry)
+        self.noise = replace(noise, odometry=CAUTION * noise.odometry if odometry is None else odometry)
         """Noise levels that everything is solved with; detections carry their own."""
         self._slipping = replace(noise, odometry=SLIP * self.noise.odometry)
         self._first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))

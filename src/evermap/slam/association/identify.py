@@ -6,6 +6,7 @@ A detection's landmark may be decided by what is seen minutes later; the estimat
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,10 +30,10 @@ MOST_NAMED = 100
 """Landmarks known by name that a session is laid over a map by."""
 FEW_DOUBTFUL = 0.02
 """Share of doubtful detections up to which who is who is not drawn by particles."""
-RUNS, MOST_ROUNDS, MOST_IN_VAIN = 4, 6, 3
+RUNS, MOST_ROUNDS, MOST_IN_VAIN = 4, 6, 2
 """Draws of which one is settled, how often, and how often in a row without gain."""
-LITTLE_NATS = 0.07
-"""A hundredth of what a detection of no landmark costs: by which all detections are explained better, for each of them,
+LITTLE_NATS = 0.035
+"""A 200th of what a detection of no landmark costs: by which all detections are explained better, for each of them,
 before it is worth while to draw again."""
 MAP_FLOOR_M = 1e-3
 """A prior map without uncertainty is taken to be known to a millimetre."""
@@ -94,36 +95,46 @@ def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, k
     name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
     kind = np.column_stack([given.class_id, name])[prepared.used]
 
-    associator = Associator(problem, noise, kind)
-    for _ in problem.stamp_s:
-        associator.step()
-    if (name != UNKNOWN).any():
-        associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior))
-    assignment = associator.finish()
-    if associator.doubtful > FEW_DOUBTFUL:
-        assignment = searched(associator, assignment)
+    def finished(associator: Associator) -> Assignment:
+        for _ in problem.stamp_s:
+            associator.step()
+        if (name != UNKNOWN).any():
+            associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior))
+        return associator.finish()
+
+    cautious = Associator(problem, noise, kind)
+    assignment = finished(cautious)
+    if cautious.doubtful > FEW_DOUBTFUL:
+        again = lambda odometry: finished(Associator(problem, noise, kind, odometry))  # noqa: E731
+        assignment = searched(cautious, assignment, again)
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
-    return Associated(row, name, assignment, associator.noise, prior)
+    return Associated(row, name, assignment, cautious.noise, prior)
 
 
-def searched(associator: Associator, assignment: Assignment) -> Assignment:
+def searched(associator: Associator, assignment: Assignment, again: Callable[[FloatArray], Assignment]) -> Assignment:
     """Return what explains all detections best, by particles that start from the best so far, again and again.
 
-    Of `RUNS` draws the one that predicted the detections best is settled, and kept if it explains them better. The
-    search ends where that gains little, or several times nothing.
+    Of `RUNS` draws the one that predicted the detections best is settled, and kept if it explains them better. Where it
+    does not, frame by frame is tried once more, with the noise of the odometry that the first pass tells. The search
+    ends where it gains little, or several times nothing.
 
     Args:
         associator: which has seen all frames.
         assignment: what it finished with.
+        again: returns what another one finishes with under (5,) noise levels of the odometry.
     """
     cost, little = associator.against(assignment), LITTLE_NATS * len(assignment.landmark_row)
-    odometry, in_vain = associator.learned_odometry(assignment), 0
+    odometry = at_first = associator.learned_odometry(assignment)
+    in_vain, asked = 0, False
     for k, seeds in enumerate(np.arange(MOST_ROUNDS * RUNS).reshape(-1, RUNS).tolist()):
         draws = (drawn(assignment, odometry, seed, wider=WIDER[k % len(WIDER)]) for seed in seeds)
-        begun, _ = max(draws, key=lambda draw: draw[1])
-        trial = associator.finish(begun)
-        gained = cost - (against := associator.against(trial))
+        trial = associator.finish(max(draws, key=lambda draw: draw[1])[0])
+        against = associator.against(trial)
+        if against >= cost and not asked:
+            trial, asked = again(at_first), True
+            against = associator.against(trial)
+        gained = cost - against
         if gained > 0.0:
             assignment, cost, odometry = trial, against, associator.learned_odometry(trial)
         in_vain = 0 if gained > little else in_vain + 1
