@@ -99,7 +99,8 @@ $(DOCUMENTATION): requirements-docs.lock | $(VENV)/bin/python
 	$(PIP_INSTALL) --requirement requirements-docs.lock
 	@touch $@
 
-# For maintainers: renew the pins. Index addresses are kept out of the files: they are the machine's business.
+# For maintainers: renew the pins, under the oldest Python that users have (Debian's 3.11.2), which newer packages may
+# refuse. Index addresses are kept out of the files: they are the machine's business.
 COMPILE = $(VENV)/bin/pip-compile --quiet --upgrade --strip-extras --no-header --annotation-style=line \
           --no-emit-index-url --no-emit-find-links --no-emit-trusted-host
 lock: $(DEVELOPMENT)
