@@ -3,6 +3,7 @@
 #   make lint    style, formatting, types, security     make docs-check    run the commands of the documents
 #   make docs    set up and build the documentation as a site, into out/site
 #   make bench   compare with the committed baseline    make clean   remove what make made
+#   make browser    a Chromium, for the tests of the server's page, which are skipped without one
 #   make experiments    whole experiments, most on the recordings in ../shared/data, minutes long
 # Use another interpreter or folder with `make PYTHON=python3.12 VENV=/somewhere/venv test`.
 PYTHON ?= python3
@@ -19,10 +20,10 @@ DEVELOPMENT = $(VENV)/.stamp-development
 DOCUMENTATION = $(VENV)/.stamp-documentation
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo test test-slow test-all experiments lint audit format docs docs-check bench lock clean
+.PHONY: help setup setup-dev demo browser test test-slow test-all experiments lint audit format docs docs-check bench lock clean
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 7
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 8
 
 setup: $(RUNTIME)
 setup-dev: $(DEVELOPMENT)
@@ -32,6 +33,16 @@ demo: $(RUNTIME)
 
 test: $(DEVELOPMENT)
 	$(PYTEST)
+
+# A browser and axe-core, for tests/server/test_page.py; where we may not install one, it says how.
+browser: $(DEVELOPMENT)
+	@command -v chromium-headless-shell >/dev/null || command -v chromium >/dev/null || command -v google-chrome >/dev/null \
+	  || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
+	       && echo "installing chromium-headless-shell" && apt-get -qq update >/dev/null \
+	       && DEBIAN_FRONTEND=noninteractive apt-get -qq install --yes --no-install-recommends chromium-headless-shell >/dev/null; } \
+	  || { echo "the tests of the page need a Chromium; on Debian: sudo apt-get install chromium-headless-shell" >&2; exit 1; }
+	@$(VENV)/bin/python -m pip download --quiet --disable-pip-version-check --no-deps --dest out/browser axe-playwright-python==0.1.8
+	@$(VENV)/bin/python -m zipfile --extract out/browser/axe_playwright_python-0.1.8-*.whl out/browser
 
 # What is slow, but for whole experiments.
 test-slow: $(DEVELOPMENT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import itertools
 import json
@@ -135,6 +136,7 @@ def test_nobody_is_answered_without_a_token(fleet: Fleet) -> None:
         for method in methods:
             if path != "/healthz":
                 filled = path.replace("{site}", "ward").replace("{number}", "1").replace("{landmark}", "1")
+                filled = filled.replace("{robot}", "upload")
                 for headers in (
                     {},
                     {"Authorization": "Bearer nobody"},
@@ -155,6 +157,8 @@ def test_nobody_is_answered_without_a_token(fleet: Fleet) -> None:
         ("POST", "/maps/ward/delete", Role.APPROVE),
         ("POST", "/jobs/1/retry", Role.APPROVE),
         ("GET", "/jobs/1/payload", Role.APPROVE),
+        ("GET", "/robots", Role.READ),
+        ("PUT", "/robots/upload/maps", Role.UPLOAD),
         ("GET", "/audit", Role.ADMIN),
     ],
 )
@@ -305,6 +309,61 @@ def test_an_operator_edits_reverts_and_approves(fleet: Fleet, zips: list[bytes])
     notes = fleet("GET", "/audit").json()
     assert [(note["who"], note["status"]) for note in notes[:2]] == [("approve", 200), ("admin", 422)]
     assert any("/maps/ward/delete" in note["what"] for note in notes)
+
+
+def held(version: int | str, status: str = "ENABLED", site: str = "ward") -> dict[str, str]:
+    return {"mapId": site, "mapVersion": str(version), "mapStatus": status}
+
+
+def test_a_robot_is_led_to_the_approved_revision(fleet: Fleet, zips: list[bytes]) -> None:
+    fleet.upload(zips[0])
+    fleet.worker().step()
+    name = fleet("GET", "/maps/ward/landmarks").json()["landmarks"][0]["label"]
+    fleet("POST", "/maps/ward/pin", json={"landmarks": [name]})
+    assert fleet("GET", "/whoami", "upload").json() == {"name": "upload", "role": "upload"}
+    assert fleet("GET", "/maps/ward/actions").status_code == 404
+    fleet("POST", "/maps/ward/approve", json={"revision": 1})
+
+    def wanted(robot: str = "upload") -> dict[str, dict[str, str]]:
+        listed = fleet("GET", f"/maps/ward/actions?robot={robot}", "upload").json()["actions"]
+        assert {one["blockingType"] for one in listed} <= {"NONE"}
+        assert len({one["actionId"] for one in listed}) == len(listed)
+        return {one["actionType"]: {p["key"]: p["value"] for p in one["actionParameters"]} for one in listed}
+
+    assert list(wanted()) == ["downloadMap", "enableMap"]
+    asked = wanted()["downloadMap"]
+    assert (asked["mapId"], asked["mapVersion"]) == ("ward", "1")
+    file = fleet("GET", asked["mapDownloadLink"], "upload").content
+    assert hashlib.sha256(file).hexdigest() == asked["mapHash"]
+
+    def reports(*maps: dict[str, str], robot: str = "upload", role: str = "upload") -> int:
+        return fleet("PUT", f"/robots/{robot}/maps", role, json=[*maps]).status_code
+
+    assert reports(held(1, "DISABLED"), held("2.1", site="another")) == 200
+    assert wanted() == {"enableMap": {"mapId": "ward", "mapVersion": "1"}}
+    assert list(wanted("nobody")) == ["downloadMap", "enableMap"]
+    assert reports(held(1)) == 200
+    assert wanted() == {}
+    assert fleet("GET", "/robots", "read").json()[0]["maps"] == [held(1)]
+    fleet("POST", "/maps/ward/approve", json={"revision": 2})
+    assert wanted()["downloadMap"]["mapVersion"] == "2"
+    assert reports(held(1, "DISABLED"), held(2)) == 200
+    assert wanted() == {}
+    assert reports(held(1), robot="robot-8") == 403
+    assert reports(held(1), robot="robot-8", role="approve") == 200
+    assert [one["robot"] for one in fleet("GET", "/robots").json()] == ["robot-8", "upload"]
+    for wrong in ([held(1), held(2)], [held(1, "SOMEHOW")], [{}], {}, [held(1)] * 101):
+        assert fleet("PUT", "/robots/upload/maps", "upload", json=wrong).status_code == 422
+    assert fleet("GET", "/robots").json()[1]["maps"] == [held(1, "DISABLED"), held(2)]
+
+
+def test_a_store_of_before_there_were_robots_is_read(tmp_path: Path) -> None:
+    import sqlite3
+
+    Database(tmp_path).close()
+    with sqlite3.connect(tmp_path / "server.db") as connection:
+        connection.execute("DROP TABLE robot")
+    assert Database(tmp_path).robots() == []
 
 
 def renamed(data: bytes, change: Callable[[dict[str, bytes]], Mapping[str, bytes]], **how: Any) -> bytes:
@@ -549,6 +608,13 @@ def test_new_revisions_are_events(fleet: Fleet, zips: list[bytes]) -> None:
         assert next(line for line in lines if line.startswith("id:")) == "id: 1"
         fleet("POST", "/maps/ward/pin", json={"landmarks": ["1"]})
         assert next(line for line in lines if line.startswith("id:")) == "id: 2"
+        for method, path, what in (
+            ("PUT", "/robots/upload/maps", []),
+            ("PUT", "/robots/upload/maps", [held(1)]),
+            ("POST", "/maps/ward/approve", {"revision": 1}),
+        ):
+            fleet(method, path, json=what)
+            assert next(line for line in lines if line == "event: beside")
     served.should_exit = True
     thread.join()
 
@@ -606,7 +672,7 @@ def fuzzed(fleet: Fleet, asked: list[tuple[str, str, dict[str, Any]]], data: st.
         },
     )
     content = data.draw(st.one_of(st.binary(max_size=40), body.map(json.dumps).map(str.encode)))
-    answer = fleet(method, f"{path}?{text}", content=content if method == "POST" else None)
+    answer = fleet(method, f"{path}?{text}", content=None if method == "GET" else content)
     assert answer.status_code < 500, (method, path, text, content, answer.text)
 
 

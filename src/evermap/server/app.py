@@ -13,10 +13,11 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib import resources
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
+from uuid import uuid4
 
 import numpy as np
-from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException, Query, Request, Response
+from fastapi import APIRouter, Body, Depends, FastAPI, Header, HTTPException, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
@@ -115,7 +116,7 @@ async def _guard(request: Request, answer: Callable[[Request], Awaitable[Respons
     response.headers["Content-Security-Policy"] = _POLICY
     response.headers["X-Content-Type-Options"] = "nosniff"
     response.headers["Cache-Control"] = "no-cache"
-    if request.method != "GET":
+    if request.method == "POST":
         who = getattr(request.state, "who", "-")
         what = f"{request.method} {request.url.path} {getattr(request.state, 'said', '')}"
         with suppress(*AWAY):  # the answer says so
@@ -179,7 +180,7 @@ def _may(role: Role) -> Any:
         if known is None:
             raise HTTPException(401, "a token is needed", {"WWW-Authenticate": "Bearer"})
         name, has = known
-        request.state.who = name
+        request.state.who, request.state.role = name, has
         if not server.admits(name):
             raise HTTPException(429, "too many requests", {"Retry-After": "1"})
         if has < role:
@@ -199,6 +200,7 @@ Reader = Annotated[str, _may(Role.READ)]
 Uploader = Annotated[str, _may(Role.UPLOAD)]
 Approver = Annotated[str, _may(Role.APPROVE)]
 Administrator = Annotated[str, _may(Role.ADMIN)]
+RobotName = Annotated[str, Field(min_length=1, max_length=100)]
 OfSite = Annotated[str | None, Query(pattern=f"^{SITE.pattern}$")]
 AtRevision = Annotated[int | None, Query(ge=0, le=2**31 - 1)]
 Number = Annotated[float | None, Query(allow_inf_nan=False)]
@@ -231,11 +233,25 @@ class Said(BaseModel):
     note: str = Field("", max_length=500)
 
 
+class HeldMap(BaseModel):
+    """A map on a robot, as an entry of `maps` in the state of VDA 5050."""
+
+    map_id: str = Field(alias="mapId", min_length=1, max_length=100)
+    map_version: str = Field(alias="mapVersion", min_length=1, max_length=100)
+    status: Literal["ENABLED", "DISABLED"] = Field(alias="mapStatus")
+
+
 class Chosen(BaseModel):
     """A revision that an operator chose."""
 
     revision: int = Field(ge=0, le=2**31 - 1)
     note: str = Field("", max_length=500)
+
+
+@router.get("/whoami")
+def show_token(request: Request, who: Reader) -> dict[str, str]:
+    """Tell the name and the role of the token."""
+    return {"name": who, "role": request.state.role.name.lower()}
 
 
 @router.get("/healthz")
@@ -255,12 +271,12 @@ def page(request: Request) -> Response:
 
 
 @router.get("/maps")
-def list_maps(server: Answering, _: Reader) -> list[dict[str, Any]]:
-    """List the sites, with the newest revision and the approved one."""
+def list_maps(server: Answering, _: Reader, site: OfSite = None) -> list[dict[str, Any]]:
+    """List the sites, or one of them, with the newest revision and the approved one."""
     told = []
-    for site in server.sites.names():
-        with server.sites.store(site) as store:
-            told.append({"site": site, "head": store.head(), "approved": server.database.approved(site)})
+    for name in server.sites.names() if site is None else [site]:
+        with server.sites.store(name) as store:
+            told.append({"site": name, "head": store.head(), "approved": server.database.approved(name)})
     return told
 
 
@@ -421,6 +437,56 @@ def approve(request: Request, site: str, chosen: Chosen, server: Answering, who:
     return {"site": site, "approved": server.database.approved(site)}
 
 
+@router.get("/maps/{site}/actions")
+def actions(request: Request, site: str, server: Answering, _: Reader, robot: RobotName | None = None) -> Response:
+    """List the instant actions of VDA 5050 by which a robot comes to use the approved revision, in their order.
+
+    Of a robot that is named, only what it still lacks, by the maps that it said it holds.
+    """
+    chosen = server.database.approved(site)
+    if chosen is None:
+        raise HTTPException(404, "no revision of it is approved")
+    number = chosen["revision"]
+    told = [one for item in server.database.robots() if item["robot"] == robot for one in item["maps"]]
+    held = {one["mapStatus"] for one in told if (one["mapId"], one["mapVersion"]) == (site, str(number))}
+    which = {"mapId": site, "mapVersion": str(number)}
+    wanted = []
+    if not held:
+        link = f"{request.base_url}maps/{site}/file?revision={number}"
+        file = {"mapDownloadLink": link, "mapHash": server.sites.file(site, number).sha256}
+        wanted.append(_instant("downloadMap", {**which, **file}))
+    if "ENABLED" not in held:
+        wanted.append(_instant("enableMap", which))
+    return PlainJSON({"actions": wanted})
+
+
+def _instant(kind: str, parameters: dict[str, str]) -> dict[str, Any]:
+    listed = [{"key": key, "value": value} for key, value in parameters.items()]
+    return {"actionType": kind, "actionId": str(uuid4()), "blockingType": "NONE", "actionParameters": listed}
+
+
+@router.get("/robots")
+def list_robots(server: Answering, _: Reader) -> list[dict[str, Any]]:
+    """List the maps that robots hold, as they said."""
+    return server.database.robots()
+
+
+@router.put("/robots/{robot}/maps")
+def hold(
+    request: Request, robot: RobotName, server: Answering, who: Uploader,
+    maps: Annotated[list[HeldMap], Body(max_length=100)],
+) -> dict[str, Any]:  # fmt: skip
+    """Say which maps a robot holds, the `maps` of its state in VDA 5050: by the robot itself, or by an approver."""
+    if robot != who and request.state.role < Role.APPROVE:
+        raise HTTPException(403, f"the token is of {who}: another robot is spoken for with the role approve")
+    enabled = [one.map_id for one in maps if one.status == "ENABLED"]
+    if len(set(enabled)) < len(enabled):
+        raise HTTPException(422, "two versions of one map are enabled")
+    held = [one.model_dump(by_alias=True) for one in maps]
+    server.database.hold(robot, held)
+    return {"robot": robot, "maps": held}
+
+
 @router.post("/maps/{site}/revert")
 def revert(request: Request, site: str, chosen: Chosen, server: Answering, who: Approver) -> dict[str, Any]:
     """Go back to an older revision, by a new one."""
@@ -461,7 +527,9 @@ async def events(
     request: Request, site: str, server: Answering, _: Reader, since: AtRevision = None,
     last_event_id: Annotated[str, Header()] = "",
 ) -> StreamingResponse:  # fmt: skip
-    """Send an event for every new revision (Server-Sent Events); `Last-Event-ID` or `since` says from where."""
+    """Send events (Server-Sent Events): `revision` for every new one, after `Last-Event-ID` or `since`, and `beside`
+    whenever the approval, the robots' maps or the newest sessions have changed.
+    """
     told = int(last_event_id) if last_event_id.isdecimal() and len(last_event_id) < 10 else since
     head = await run_in_threadpool(_head, server, site)
     told = head if told is None else min(told, head)
@@ -469,9 +537,12 @@ async def events(
 
 
 async def _news(request: Request, server: Server, site: str, told: int) -> AsyncIterator[str]:
-    alive = time.monotonic()
+    alive, beat = time.monotonic(), await run_in_threadpool(_beat, server, site)
     yield ": following\n\n"
     while not await request.is_disconnected():
+        if (now := await run_in_threadpool(_beat, server, site)) not in (None, beat):
+            beat = now
+            yield "event: beside\ndata: {}\n\n"
         for number, text in await run_in_threadpool(_since, server, site, told):
             yield f"id: {number}\nevent: revision\ndata: {text}\n\n"
             told = number
@@ -484,6 +555,14 @@ async def _news(request: Request, server: Server, site: str, told: int) -> Async
 def _head(server: Server, site: str) -> int:
     with server.sites.store(site) as store:
         return store.head()
+
+
+def _beat(server: Server, site: str) -> tuple[Any, ...] | None:
+    """What changes with all that is beside the map; None while the database does not answer."""
+    try:
+        return server.database.pulse(site)
+    except AWAY:
+        return None
 
 
 def _since(server: Server, site: str, told: int) -> list[tuple[int, str]]:

@@ -1,4 +1,4 @@
-"""What a server keeps beside its maps: tokens, the queue of uploaded sessions, approvals, and who did what.
+"""What a server keeps beside its maps: tokens, uploaded sessions, approvals, what robots hold, and who did what.
 
 In SQLite it is one file, `server.db` in the folder of the maps; in PostgreSQL a schema `evermap_server` in their
 database. A job is never lost: a worker leases it for a while and renews the lease as long as it lives; what a killed
@@ -9,6 +9,7 @@ as the map grows, the less often the larger that is; a refused one stays, with t
 from __future__ import annotations
 
 import hashlib
+import json
 import secrets
 import time
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from sqlalchemy import (
     Text,
     UniqueConstraint,
     and_,
+    case,
     delete,
     exists,
     func,
@@ -55,6 +57,8 @@ AWAY = (OperationalError, InterfaceError)
 """What a database that does not answer raises."""
 MOST_TRIES = 10
 """Workers that may die of a session before it is refused: more than chance has at the same one."""
+SHOWN = 20
+"""Newest sessions of a site, of which followers are told what becomes of them."""
 
 _GROWTH = 4
 """A session that never fits is tried a number of times that grows as the logarithm of the map's revisions."""
@@ -97,6 +101,14 @@ _approval = Table(
     Column("site", Text, nullable=False),
     Column("revision", Integer, nullable=False),
     Column("who", Text, nullable=False),
+    Column("at", Text, nullable=False),
+)
+_robot = Table(
+    "robot",
+    metadata,
+    Column("name", Text, primary_key=True),
+    Column("maps", Text, nullable=False),
+    Column("told", Integer, nullable=False),
     Column("at", Text, nullable=False),
 )
 _audit = Table(
@@ -187,8 +199,9 @@ class Database:
         with self._engine.execution_options(writes=True).begin() as connection:
             if on_server:
                 connection.execute(CreateSchema(SCHEMA, if_not_exists=True))
-            if "server" not in inspect(connection).get_table_names():
-                metadata.create_all(connection)
+            begun = inspect(connection).has_table("server")
+            metadata.create_all(connection)  # an older evermap does without the tables that it does not know
+            if not begun:
                 connection.execute(insert(_server).values(version=VERSION))
             version = connection.execute(select(_server.c.version)).scalar()
         if version != VERSION:
@@ -333,6 +346,38 @@ class Database:
         with self._engine.begin() as connection:
             row = connection.execute(question.order_by(_approval.c.id.desc()).limit(1)).mappings().one_or_none()
         return None if row is None else dict(row)
+
+    def hold(self, robot: str, maps: list[dict[str, str]]) -> None:
+        """Keep which maps a robot says that it holds, instead of what it said before."""
+        values = {"maps": json.dumps(maps), "at": now_utc()}
+        news = case((_robot.c.maps == values["maps"], 0), else_=1)
+        for _ in range(2):  # again where it says so the first time, and twice at once
+            try:
+                with self._writer.begin() as connection:
+                    changed = update(_robot).where(_robot.c.name == robot).values(**values, told=_robot.c.told + news)
+                    if not connection.execute(changed).rowcount:
+                        connection.execute(insert(_robot).values(name=robot, **values, told=1))
+                return
+            except IntegrityError:
+                continue
+
+    def robots(self) -> list[dict[str, Any]]:
+        """Return the robots that said which maps they hold, and when."""
+        question = select(_robot.c.name, _robot.c.maps, _robot.c.at).order_by(_robot.c.name)
+        with self._engine.begin() as connection:
+            rows = connection.execute(question).all()
+        return [{"robot": row.name, "maps": json.loads(row.maps), "at": row.at} for row in rows]
+
+    def pulse(self, site: str) -> tuple[Any, ...]:
+        """Return values of which one differs once anything beside the map of a site has changed: its approval, what
+        robots hold, or one of the newest sessions.
+        """
+        newest = select(_job.c.id, _job.c.state, _job.c.tries).where(_job.c.site == site)
+        with self._engine.begin() as connection:
+            approved = connection.execute(select(func.max(_approval.c.id)).where(_approval.c.site == site)).scalar()
+            told = connection.execute(select(func.count(), func.sum(_robot.c.told))).one()
+            jobs = connection.execute(newest.order_by(_job.c.id.desc()).limit(SHOWN)).all()
+        return approved, *told, *map(tuple, jobs)
 
     def note(self, who: str, what: str, status: int) -> None:
         """Note who asked for a change, and what came of it."""

@@ -1,0 +1,390 @@
+"""The page in a real browser: who sees and does what, by pointer, keyboard and touch, live, and readable for everybody.
+
+`make browser` installs a Chromium, and fetches axe-core; any Chromium on the path will do, or `CHROMIUM=/path/to/it`.
+Without one these tests are skipped. `PICTURES=FOLDER` keeps the screenshots.
+"""
+
+from __future__ import annotations
+
+import base64
+import fcntl
+import io
+import json
+import os
+import shutil
+import signal
+import threading
+import time
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import pytest
+
+pytest.importorskip("fastapi", reason="a server needs evermap[server]")
+pytest.importorskip("httpx", reason="needs httpx: pip install 'evermap[dev]'")
+
+import httpx
+import uvicorn
+
+from evermap.config import Config
+from evermap.io import write_native
+from evermap.server.app import Server, create_app
+from evermap.server.database import Database, Role
+from evermap.server.sites import SiteStores
+from evermap.server.uploads import UploadLimits, checked_digest
+from evermap.server.worker import Worker
+from evermap_studies.sim import BuildingConfig, simulate_building
+
+NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
+AXE = Path(__file__).resolve().parents[2] / "out/browser/axe_playwright_python/axe.min.js"
+HOSTILE = "<img src=x onerror=\"document.title='broken'\">"
+WAIT_S = 60.0
+LOOKS = {
+    "light": (1280, 900, "light", False),
+    "dark": (1280, 900, "dark", False),
+    "phone": (375, 760, "light", True),
+    "phone-dark": (375, 760, "dark", True),
+}
+"""Width and height of the window, colours, and whether it is touched."""
+
+
+@pytest.fixture(scope="session")
+def chromium() -> str:
+    for name in (os.environ.get("CHROMIUM"), *NAMES):
+        if name and (found := shutil.which(name)):
+            return found
+    pytest.skip("no Chromium: make browser, or CHROMIUM=/path/to/it")
+
+
+@dataclass
+class Browser:
+    """A page in a headless Chromium, told what to do by its DevTools protocol over a pair of pipes."""
+
+    process: int
+    commands: BinaryIO
+    answers: Iterator[dict[str, Any]]
+    session: str = ""
+    number: int = 0
+    faults: list[str] = field(default_factory=list)
+
+    @classmethod
+    def opened(cls, program: str, folder: Path) -> Browser:
+        ends = [fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in (*os.pipe(), *os.pipe())]
+        asked, asks, told, tells = ends
+        options = ["--headless", "--no-sandbox", "--remote-debugging-pipe", f"--user-data-dir={folder}"]
+        options += ["--disable-gpu", "--disable-dev-shm-usage", "--no-zygote", "--hide-scrollbars"]
+        quiet = (os.POSIX_SPAWN_OPEN, 2, str(folder / "chromium.log"), os.O_WRONLY | os.O_CREAT, 0o600)
+        pipes = [(os.POSIX_SPAWN_DUP2, asked, 3), (os.POSIX_SPAWN_DUP2, tells, 4), quiet]
+        process = os.posix_spawn(program, [program, *options], os.environ, file_actions=pipes, setpgroup=0)
+        os.close(asked)
+        os.close(tells)
+        browser = cls(process, os.fdopen(asks, "wb", buffering=0), messages(os.fdopen(told, "rb", buffering=0)))
+        target = browser("Target.createTarget", url="about:blank")["targetId"]
+        browser.session = browser("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Log", "Inspector"):
+            browser(f"{domain}.enable")
+        return browser
+
+    def __call__(self, method: str, **params: Any) -> dict[str, Any]:
+        self.number += 1
+        sent = {"id": self.number, "method": method, "params": params}
+        self.commands.write(json.dumps(sent | ({"sessionId": self.session} if self.session else {})).encode() + b"\0")
+        for message in self.answers:
+            assert message.get("method") != "Inspector.targetCrashed", "the page has crashed"
+            if message.get("id") == self.number:
+                assert "error" not in message, (method, message)
+                answer: dict[str, Any] = message["result"]
+                return answer
+            if message.get("method") == "Runtime.exceptionThrown" or (
+                message.get("method") == "Log.entryAdded"
+                and message["params"]["entry"]["level"] == "error"
+                and message["params"]["entry"].get("source") != "network"
+            ):
+                self.faults.append(json.dumps(message["params"])[:500])
+        raise AssertionError("the browser has ended")
+
+    def close(self) -> None:
+        os.killpg(self.process, signal.SIGKILL)
+        os.waitpid(self.process, 0)
+        self.commands.close()
+
+    def value(self, expression: str) -> Any:
+        told = self("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in told, told
+        return told["result"].get("value")
+
+    def wait(self, expression: str) -> None:
+        end = time.monotonic() + WAIT_S
+        while not self.value(f"Boolean({expression})"):
+            shown = self.value("document.body?.innerText")
+            assert time.monotonic() < end, f"{expression} is never true; the page says\n{shown}"
+            time.sleep(0.05)
+
+    def text(self, which: str) -> str:
+        return str(self.value(f"document.querySelector({which!r}).textContent"))
+
+    def press(self, key: str, text: str = "") -> None:
+        code = {"Tab": 9, "Enter": 13, "ArrowLeft": 37, "ArrowRight": 39}.get(key, 0)
+        text = {"Enter": "\r"}.get(key, text)
+        told = {"key": key, "code": key, "windowsVirtualKeyCode": code}
+        self("Input.dispatchKeyEvent", type="keyDown", **told, **({"text": text} if text else {}))
+        self("Input.dispatchKeyEvent", type="keyUp", **told)
+
+    def tab_to(self, wanted: str) -> None:
+        """Press the tabulator until something has the focus."""
+        for _ in range(200):
+            self.press("Tab")
+            if self.value(f"document.activeElement.matches({wanted!r})"):
+                assert self.value("getComputedStyle(document.activeElement).outlineStyle") != "none"
+                return
+        raise AssertionError(f"the keyboard does not get to {wanted}")
+
+    def show(self, width: int, height: int, colours: str, touched: bool) -> None:
+        self(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=2 if touched else 1,
+            mobile=touched,
+        )  # fmt: skip
+        self("Emulation.setTouchEmulationEnabled", enabled=touched)
+        self("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": colours}])
+
+    def picture(self, name: str) -> None:
+        folder = os.environ.get("PICTURES")
+        if folder:
+            data = self("Page.captureScreenshot", captureBeyondViewport=True)["data"]
+            Path(folder).mkdir(parents=True, exist_ok=True)
+            Path(folder, f"{name}.png").write_bytes(base64.b64decode(data))
+
+    def log_in(self, address: str, token: str) -> None:
+        self("Page.navigate", url=address)
+        self.wait("document.readyState === 'complete' && document.getElementById('token')")
+        self.value("document.getElementById('token').focus()")
+        self("Input.insertText", text=token)
+        self.press("Enter")
+        self.wait("document.getElementById('state').textContent === 'live'")
+
+
+def messages(pipe: BinaryIO) -> Iterator[dict[str, Any]]:
+    waiting = b""
+    while part := pipe.read(1 << 16):
+        *whole, waiting = (waiting + part).split(b"\0")
+        yield from map(json.loads, whole)
+
+
+@pytest.fixture
+def browser(chromium: str, tmp_path: Path) -> Iterator[Browser]:
+    opened = Browser.opened(chromium, tmp_path)
+    yield opened
+    opened.close()
+    assert not opened.faults
+
+
+@dataclass
+class Site:
+    """A server at an address, with what an operator may do beside the page."""
+
+    server: Server
+    tokens: dict[str, str]
+    port: int = 0
+
+    def start(self) -> None:
+        config = uvicorn.Config(create_app(self.server), port=self.port, log_level="error", timeout_graceful_shutdown=1)
+        self.served = uvicorn.Server(config)
+        self.thread = threading.Thread(target=self.served.run)
+        self.thread.start()
+        while not self.served.started:
+            time.sleep(0.01)
+        self.port = self.served.servers[0].sockets[0].getsockname()[1]
+        self.address = f"http://127.0.0.1:{self.port}"
+
+    def stop(self) -> None:
+        self.served.should_exit = True
+        self.thread.join()
+
+    def __call__(self, method: str, path: str, role: str = "admin", **what: Any) -> httpx.Response:
+        headers = {"Authorization": f"Bearer {self.tokens[role]}"}
+        answer = httpx.request(method, self.address + path, headers=headers, timeout=60.0, **what)
+        assert answer.status_code < 300, answer.text
+        return answer
+
+
+@pytest.fixture(scope="module")
+def stored(chromium: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
+    """A store, with its tokens: four sessions of two robots, of which the second is approved; a robot is behind."""
+    assert chromium
+    folder = tmp_path_factory.mktemp("page")
+    database, sites = Database(folder / "maps"), SiteStores(str(folder / "maps"))
+    for number, recording in enumerate(simulate_building(BuildingConfig(days=4, patrol_s=60.0), 3).sessions):
+        write_native(recording, folder / f"day{number}")
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+            for path in sorted((folder / f"day{number}").iterdir()):
+                archive.write(path, path.name)
+        data = buffer.getvalue()
+        database.enqueue("ward", checked_digest(data, UploadLimits()), data, f"robot-{7 + number % 2}")
+    worker = Worker(database, sites, Config())
+    while worker.step():
+        pass
+    database.approve("ward", 2, "admin")
+    for robot, version in (("robot-7", "2"), ("robot-8", "1"), ("robot-9", "2")):
+        database.hold(robot, [{"mapId": "ward", "mapVersion": version, "mapStatus": "ENABLED"}])
+    tokens = {role.name.lower(): database.add_token(role.name.lower(), role) for role in Role}
+    database.close()
+    return folder / "maps", tokens
+
+
+@pytest.fixture
+def site(stored: tuple[Path, dict[str, str]], tmp_path: Path) -> Iterator[Site]:
+    """A server of a copy of that."""
+    shutil.copytree(stored[0], tmp_path / "maps")
+    database = Database(tmp_path / "maps")
+    site = Site(Server(database, SiteStores(str(tmp_path / "maps"))), stored[1])
+    site.start()
+    yield site
+    site.stop()
+    database.close()
+
+
+def test_an_operator_approves_by_keyboard_and_sees_it_live(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["approve"])
+    assert browser.text("#approved").startswith("Revision 2 is approved (by admin")
+    assert browser.value("[...document.querySelectorAll('#candidates button')].map((one) => one.textContent)") == [
+        "Revision 4",
+        "Revision 3",
+    ]
+    assert (browser.text("#number"), browser.text("#other")) == ("4", "2")
+    difference = site("GET", "/maps/ward/diff?a=2&b=4").json()
+    assert browser.value("document.querySelectorAll('#changes li').length") == len(difference["changes"])
+    browser.tab_to("#candidates li:nth-child(2) button")
+    browser.press("Enter")
+    browser.wait("document.getElementById('number').textContent === '3'")
+    browser.tab_to("#approve-note")
+    browser("Input.insertText", text="looked at it")
+    browser.press("Enter")
+    browser.wait("document.getElementById('said').textContent === 'revision 3 is approved'")
+    assert site("GET", "/maps").json()[0]["approved"]["who"] == "approve"
+    assert "looked at it" in site("GET", "/audit").json()[0]["what"]
+    browser.wait("document.getElementById('approved').textContent.startsWith('Revision 3 is approved')")
+    # what others do is seen without a word to the page
+    site("POST", "/maps/ward/approve", json={"revision": 4})
+    browser.wait("document.getElementById('approved').textContent.startsWith('Revision 4 is approved')")
+    held = [{"mapId": "ward", "mapVersion": "4", "mapStatus": "ENABLED"}]
+    site("PUT", "/robots/robot-7/maps", json=held)
+    browser.wait("document.getElementById('holders').textContent.startsWith('1 of 3 use revision 4')")
+
+
+def test_an_operator_deletes_with_the_evidence_before_them(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["approve"])
+    name = site("GET", "/maps/ward/landmarks").json()["landmarks"][0]["label"]
+    browser.tab_to("#name")
+    browser("Input.insertText", text=name)
+    browser.press("Enter")
+    browser.wait("document.querySelector('#why svg')")
+    assert browser.value("document.activeElement.id") == "why-head"
+    assert browser.value("document.querySelectorAll('#why .there, #why .vanished').length") > 1
+    browser.tab_to("#word-note")
+    browser("Input.insertText", text=HOSTILE)
+    browser.tab_to("#deletes")
+    browser.press("Enter")
+    browser.wait("document.getElementById('deletes').textContent.startsWith('Undelete')")
+    assert HOSTILE in site("GET", "/maps/ward/revisions").json()[-1]["note"]
+    browser.wait("document.getElementById('number').textContent === '5'")
+    browser.wait(f"document.getElementById('about').textContent.includes({json.dumps(HOSTILE)})")
+    assert browser.value("document.title") == "evermap"
+    assert browser.value("document.querySelectorAll('main img').length") == 0
+    browser.value("document.getElementById('deletes').click()")
+    browser.wait("document.getElementById('deletes').textContent.startsWith('Delete')")
+    browser.value("document.querySelector('#candidates li:last-child button').click()")
+    browser.wait("document.getElementById('number').textContent === '3'")
+    browser.value("document.getElementById('reverts').click()")
+    browser.wait("document.getElementById('said').textContent === 'revision 7 is as revision 3 was'")
+
+
+def test_who_only_reads_has_no_buttons_that_change(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["read"])
+    browser.value("document.querySelector('#changes button, #find button').click()")
+    browser.value("why(document.querySelector('#names option').value)")
+    browser.wait("document.querySelector('#why svg')")
+    assert browser.value("[...document.querySelectorAll('.operator')].every((one) => !one.offsetParent)")
+    assert browser.value("document.querySelectorAll('#candidates button').length") == 2
+
+
+def test_the_map_is_moved_and_asked_by_finger_and_by_key(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["phone"])
+    browser.log_in(site.address, site.tokens["read"])
+    assert browser.value("document.documentElement.scrollWidth <= innerWidth"), "the phone scrolls sideways"
+    width = "Number(document.getElementById('map').getAttribute('viewBox').split(' ')[2])"
+    whole = browser.value(width)
+    browser.value("document.getElementById('map').scrollIntoView({ block: 'center' })")
+    middle = browser.value(
+        "(({ x, y, width, height }) => [x + width / 2, y + height / 2])"
+        "(document.getElementById('map').getBoundingClientRect())"
+    )
+
+    def touch(kind: str, *fingers: tuple[float, float]) -> None:
+        points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(fingers)]
+        browser("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+
+    x, y = middle
+    touch("touchStart", (x - 30, y), (x + 30, y))
+    for step in range(31, 100, 3):
+        touch("touchMove", (x - step, y), (x + step, y))
+    touch("touchEnd")
+    browser.wait(f"{width} < {whole} / 2.5")
+    mark = browser.value(
+        "(() => { const far = (one) => Math.hypot(one.x - innerWidth / 2, one.y - innerHeight / 2);"
+        " return [...document.querySelectorAll('.mark')].map((one) => one.getBoundingClientRect())"
+        ".sort((a, b) => far(a) - far(b)).map((one) => [one.x + one.width / 2, one.y + one.height / 2])[0]; })()"
+    )
+    touch("touchStart", (mark[0] + 8, mark[1]))  # a finger is not exact
+    touch("touchEnd")
+    browser.wait("document.querySelector('#why svg')")
+    browser.value("document.getElementById('map').focus()")
+    browser.press("0", "0")
+    browser.wait(f"Math.abs({width} - {whole}) < 1e-6")
+    browser.press("+", "+")
+    browser.wait(f"{width} < {whole}")
+    left = "Number(document.getElementById('map').getAttribute('viewBox').split(' ')[0])"
+    before = browser.value(left)
+    browser.press("ArrowRight")
+    browser.wait(f"{left} > {before}")
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_everybody_can_read_it(site: Site, browser: Browser, look: str) -> None:
+    axe = Path(os.environ.get("AXE", AXE))
+    browser.show(*LOOKS[look])
+    browser.log_in(site.address, site.tokens["approve"])
+    browser.value("goTo(document.querySelector('#names option').value)")
+    browser.wait("document.querySelector('#why svg')")
+    browser.value("scrollTo(0, 0)")
+    browser.picture(look)
+    if look == "light":
+        for kind in ("deuteranopia", "achromatopsia"):
+            browser("Emulation.setEmulatedVisionDeficiency", type=kind)
+            browser.picture(kind)
+        browser("Emulation.setEmulatedVisionDeficiency", type="none")
+    if not axe.is_file():
+        pytest.skip("no axe-core: make browser, or AXE=/path/to/axe.min.js")
+    browser.value(axe.read_text(encoding="utf-8") + ";0")
+    found = browser.value(
+        "axe.run().then((told) => told.violations.map((one) =>"
+        " `${one.impact} ${one.id}: ${one.nodes.map((node) => node.html).join(' ')}`))"
+    )
+    assert not found
+
+
+def test_a_server_that_comes_back_is_followed_again(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["read"])
+    site.stop()
+    browser.wait("document.getElementById('state').textContent.startsWith('the server is away')")
+    site.start()
+    site("POST", "/maps/ward/approve", json={"revision": 4})
+    browser.wait("document.getElementById('state').textContent === 'live'")
+    browser.wait("document.getElementById('approved').textContent.startsWith('Revision 4 is approved')")
