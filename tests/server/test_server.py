@@ -37,14 +37,17 @@ from sqlalchemy import text
 from evermap.config import Config
 from evermap.errors import ConfigError, InputError
 from evermap.io import write_native
+from evermap.io.bag import bag_settings, read_bag
 from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store, verify_store
 from evermap.runs.sessions import enter_session
+from evermap.server import uploads
 from evermap.server.app import Server, create_app
 from evermap.server.database import MOST_TRIES, Database, JobState, Role
 from evermap.server.sites import SiteStores
 from evermap.server.uploads import UploadLimits, checked_digest, recording_of
 from evermap.server.worker import Worker
+from evermap.types import SpatialRecording
 from evermap_studies.sim import BuildingConfig, simulate_building
 
 COUNT = 6
@@ -404,7 +407,13 @@ HOSTILE: dict[str, Callable[[bytes], bytes]] = {
     "parquet": lambda data: renamed(data, lambda files: {**files, "day0/frames.parquet": b"PAR1"}),
     "rows": lambda data: renamed(data, lambda files: {**files, "day0/objects.parquet": many_rows()}),
     "empty": lambda _: zipped({"a/readme.csv": b""}),
+    "two bags": lambda _: zipped({"a.db3": SQLITE, "b.db3": SQLITE}),
+    "two settings": lambda _: zipped({"a.db3": SQLITE, "b.toml": b"", "c.toml": b""}),
+    "no bag": lambda _: zipped({"a.mcap": SQLITE}),
+    "bag outside": lambda _: zipped({"../a.db3": SQLITE}),
+    "settings only": lambda _: zipped({"metadata.yaml": b"", "a.toml": b""}),
 }
+SQLITE = b"SQLite format 3\0"
 
 
 def many_rows() -> bytes:
@@ -458,6 +467,99 @@ def test_the_digest_is_of_the_session_and_not_of_the_zip(zips: list[bytes]) -> N
         == checked_digest(zips[0], UploadLimits())
         != checked_digest(zips[1], UploadLimits())
     )
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Files of ROS 1, ROS 2 as MCAP and in SQLite, and one of tags, whose size it does not tell."""
+    pytest.importorskip("rosbags", reason="the extra ros is not installed")
+    from bags import write
+
+    folder = tmp_path_factory.mktemp("bags")
+    written = [write(folder / name, "objects") for name in ("ros1.bag", "mcap", "sqlite_sqlite")]
+    written.append(write(folder / "tags", "tags"))
+    ros1, mcap, sqlite, tags = (next(p for p in (one, *one.glob("*")) if p.suffix in ENDINGS) for one in written)
+    return {"ros1": ros1, "mcap": mcap, "sqlite": sqlite, "tags": tags}
+
+
+ENDINGS = (".bag", ".mcap", ".db3")
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap", "sqlite"])
+def test_a_bag_is_read_as_it_is_and_in_a_zip(bags: dict[str, Path], kind: str) -> None:
+    path, limits = bags[kind], UploadLimits()
+    data, wanted = path.read_bytes(), read_bag(path)
+    digest = checked_digest(data, limits)
+    packed = zipped({f"monday/{path.name}": data, "monday/readme.txt": b"x"})
+    assert checked_digest(packed, limits) == digest
+    for one in (data, packed):
+        found = recording_of(one, digest)
+        assert isinstance(found, SpatialRecording)
+        assert found.name == f"session-{digest[:12]}"
+        assert found.source == f"upload:{digest}"
+        assert found.warnings == wanted.warnings
+        assert found.odometry is not None
+        assert wanted.odometry is not None
+        assert found.clock is wanted.clock
+        for name in ("landmark_id", "position_sensor_m", "rotation", "covariance_sensor_m2"):
+            a, b = (getattr(item.detections, name) for item in (found, wanted))
+            np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(found.odometry.pose_world_robot, wanted.odometry.pose_world_robot, atol=1e-9)
+        np.testing.assert_allclose(found.frames.stamp_s, wanted.frames.stamp_s, rtol=0.0, atol=1e-6)
+
+
+def test_a_bag_of_several_files_is_read_by_its_metadata(bags: dict[str, Path]) -> None:
+    folder = bags["mcap"].parent
+    data = zipped({f"{folder.name}/{path.name}": path.read_bytes() for path in folder.iterdir()})
+    found = recording_of(data, checked_digest(data, UploadLimits()))
+    assert len(found.detections) == len(read_bag(folder).detections)
+
+
+def test_a_bag_is_uploaded_with_the_settings_of_its_robot(fleet: Fleet, bags: dict[str, Path]) -> None:
+    data = bags["tags"].read_bytes()
+    alone = fleet.upload(data).json()["id"]
+    settings = bag_settings(bags["tags"]).replace("# [tags]\n# size_m = 0.16", "") + "[tags]\nsize_m = 0.2\n"
+    whole = fleet.upload(zipped({"drive.mcap": data, "robot.toml": settings.encode()})).json()["id"]
+    worker = fleet.worker()
+    while worker.step():
+        pass
+    told = fleet("GET", f"/jobs/{alone}").json()
+    assert told["state"] == "rejected"
+    assert "does not say how large its tags are" in told["reason"]
+    assert "evermap-upload" not in told["reason"]
+    assert fleet("GET", f"/jobs/{whole}").json()["state"] == "entered", fleet("GET", f"/jobs/{whole}").text
+    assert {one["label"] for one in fleet("GET", "/maps/ward/landmarks").json()["landmarks"]} == {"3", "7"}
+
+
+def test_a_bag_takes_no_more_than_its_share(
+    bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sqlite3
+
+    def refused(data: bytes, convert: str) -> str:
+        with monkeypatch.context() as patched:
+            patched.setattr(uploads, "_CONVERT", convert)
+            with pytest.raises(InputError) as told:
+                recording_of(data, checked_digest(data, UploadLimits()))
+        return told.value.problem
+
+    usual = uploads._CONVERT
+    endless = (
+        "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x, 'a', 'ros2msg', 'b', 'c' FROM c"
+    )
+    with sqlite3.connect(tmp_path / "endless.db3") as database:
+        database.executescript(f"""
+            CREATE TABLE messages (id, topic_id, timestamp, data); CREATE TABLE topics (id, name, type);
+            CREATE TABLE schema (schema_version); INSERT INTO schema VALUES (4);
+            CREATE VIEW message_definitions (id, topic_type, encoding, encoded_message_definition,
+            type_description_hash) AS {endless}
+        """)
+    told = refused((tmp_path / "endless.db3").read_bytes(), usual.replace(f"({uploads._BAG_CPU_S},", "(4,"))
+    assert told.startswith("cannot be read as a bag")
+    little = usual.replace(str(uploads._BAG_BYTES), "60000000")
+    assert refused(bags["ros1"].read_bytes(), little)
+    with pytest.raises(InputError, match="cannot be read as a bag"):
+        recording_of(SQLITE, checked_digest(SQLITE, UploadLimits()))
 
 
 def test_a_refused_session_is_kept_with_its_reason(fleet: Fleet, zips: list[bytes]) -> None:

@@ -282,7 +282,7 @@ def list_maps(server: Answering, _: Reader, site: OfSite = None) -> list[dict[st
 
 @router.post("/maps/{site}/sessions", status_code=202)
 async def upload(request: Request, response: Response, site: str, server: Answering, who: Uploader) -> dict[str, Any]:
-    """Queue a session: the body is a zip of a native folder. Sent twice, it is entered once."""
+    """Queue a session: the body is a zip of a native folder or of a bag, or a bag. Sent twice, it is entered once."""
     server.sites.address(site)
     most, body = server.limits.n_bytes, bytearray()
     async for part in request.stream():

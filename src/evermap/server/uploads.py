@@ -1,23 +1,43 @@
-"""Uploaded sessions: a zip of a native folder, checked before anything reads it, and never unpacked to the disk."""
+"""Uploaded sessions: a native folder in a zip, or a bag, checked before anything reads it.
+
+Tables are never unpacked to the disk. Bags are packed inside, hold programs' own formats, and are read by others' code:
+that happens in a process of its own, which has so much memory and time, and leaves a native folder or an error.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import io
+import json
 import re
 import stat
+import subprocess
+import sys
 import tempfile
 import zipfile
 import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
-from evermap.errors import InputError
+from evermap.errors import EvermapError, InputError
 from evermap.types import AnyRecording
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. ()+-]{0,119}")
 """Parts of paths: nothing hidden, no '..', no drive, no control character."""
 _READ = (".csv", ".parquet", ".toml")
+_BAGS = {".mcap": b"\x89MCAP0\r\n", ".bag": b"#ROSBAG V", ".db3": b"SQLite format 3\0"}
+"""Endings of bags, and how they begin."""
+_BAG_READ = (*_BAGS, "metadata.yaml", ".toml")
+_BAG_CPU_S, _BAG_BYTES = 600, 4_000_000_000
+"""Of the process that reads a bag; 17 MB of messages take it 3 s and 0.14 GB."""
+_CONVERT = f"""
+import resource
+resource.setrlimit(resource.RLIMIT_CPU, ({_BAG_CPU_S}, {_BAG_CPU_S}))
+resource.setrlimit(resource.RLIMIT_DATA, ({_BAG_BYTES}, {_BAG_BYTES}))
+resource.setrlimit(resource.RLIMIT_FSIZE, ({_BAG_BYTES}, {_BAG_BYTES}))
+from evermap.__main__ import run
+run()
+"""
 _ENCRYPTED = 0x1
 _VALUE_BYTES = 8
 _ROTTEN = (
@@ -51,20 +71,37 @@ def checked_digest(data: bytes, limits: UploadLimits) -> str:
     """Return the SHA-256 of the session in an upload, the same however it was packed.
 
     Raises:
-        InputError: it is no zip of a native folder, or may harm who reads it.
+        InputError: it is neither a zip of a native folder or of a bag, nor a bag, or may harm who reads it.
     """
+    parts = _parts(data, limits)
+    digest = hashlib.sha256()
+    for name in sorted(parts):
+        digest.update(f"{name}\n".encode() + parts[name])
+    return digest.hexdigest()
+
+
+def _parts(data: bytes, limits: UploadLimits) -> dict[str, bytes]:
+    """The files that a recording is read from, by name; a bag that is one file is always called the same."""
+    for ending, start in _BAGS.items():
+        if data.startswith(start):
+            return {f"session{ending}": data}
     if data.count(b"PK\x01\x02") > 2 * limits.n_files:  # before millions of entries are listed
         raise InputError(f"holds more than {limits.n_files} files")
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             wanted = _members(archive.infolist(), limits)
             parts = {name: _content(archive, info, limits) for name, info in wanted.items()}
+    except InputError:
+        raise
     except _ROTTEN as error:
-        raise InputError(f"is no readable zip: {str(error)[:120]}", hint="zip -r session.zip FOLDER") from None
-    digest = hashlib.sha256()
-    for name in sorted(parts):
-        digest.update(f"{name}\n".encode() + parts[name])
-    return digest.hexdigest()
+        hint = "zip -r session.zip FOLDER, or a bag: .mcap, .bag, .db3"
+        raise InputError(f"is no readable zip: {str(error)[:120]}", hint=hint) from None
+    bags = [name for name in parts if name.endswith((*_BAGS,))]
+    if not bags or "metadata.yaml" in parts:
+        return parts
+    if len(bags) > 1:
+        raise InputError(f"holds {len(bags)} bags", hint="one, or the folder with its metadata.yaml")
+    return {f"session{Path(name).suffix}": content for name, content in parts.items()}
 
 
 def _members(infos: list[zipfile.ZipInfo], limits: UploadLimits) -> dict[str, zipfile.ZipInfo]:
@@ -86,12 +123,17 @@ def _members(infos: list[zipfile.ZipInfo], limits: UploadLimits) -> dict[str, zi
             raise InputError("holds a link, or a file that is encrypted", field=info.filename[:80])
         if parts[-1].endswith(".gz"):
             raise InputError("is compressed twice", field=info.filename[:80], hint="plain CSV or Parquet in the zip")
-        if parts[-1].endswith(_READ):
+        if parts[-1].endswith((*_READ, *_BAG_READ)):
             if parts[-1] in found:
                 raise InputError("holds two files of that name", field=info.filename[:80])
             found[parts[-1]] = info
-    if not {"detections.csv", "detections.parquet"} & found.keys():
-        raise InputError("holds no detections", hint="a zip of a folder as docs/formats.md describes it")
+    if {"detections.csv", "detections.parquet"} & found.keys():
+        return {name: info for name, info in found.items() if name.endswith(_READ)}
+    if not any(name.endswith((*_BAGS,)) for name in found):
+        raise InputError("holds no detections and no bag", hint="a zip of a folder as docs/formats.md describes it")
+    found = {name: info for name, info in found.items() if name.endswith(_BAG_READ)}
+    if sum(name.endswith(".toml") for name in found) > 1:
+        raise InputError("holds two settings files", hint="one that says which topics of the bag are what")
     return found
 
 
@@ -99,6 +141,9 @@ def _content(archive: zipfile.ZipFile, info: zipfile.ZipInfo, limits: UploadLimi
     content = archive.read(info)
     if content[:2] == b"\x1f\x8b":
         raise InputError("is compressed twice", field=info.filename[:80], hint="plain CSV or Parquet in the zip")
+    start = _BAGS.get(Path(info.filename).suffix, b"")
+    if not content.startswith(start):
+        raise InputError("is no bag", field=info.filename[:80], hint="record it again, or leave it out")
     if info.filename.endswith(".parquet"):
         _check_parquet(content, info.filename, limits)
     return content
@@ -122,17 +167,51 @@ def recording_of(data: bytes, digest: str) -> AnyRecording:
     """Read the recording of a checked upload.
 
     Raises:
-        InputError, DataError: as `evermap.io.read_native`, without the place of the file on this machine.
+        InputError, DataError: as `evermap.io.read_native` and `read_bag`, without the place on this machine.
     """
     from evermap.io import read_native
 
+    remarks: tuple[str, ...] = ()
     with tempfile.TemporaryDirectory(prefix="evermap-upload-") as folder:
-        path = Path(folder) / f"session-{digest[:12]}.zip"
-        path.write_bytes(data)
+        path = Path(folder) / f"session-{digest[:12]}"
+        parts = _parts(data, UploadLimits())
         try:
+            if any(name.endswith((*_BAGS,)) for name in parts):
+                remarks = _convert(parts, path)
+            else:
+                path = path.with_suffix(".zip")
+                path.write_bytes(data)
             recording = read_native(path)
-        except InputError as error:
+        except EvermapError as error:
             error.path = None if error.path is None else Path(error.path.name)
             raise
     # equal sessions are equal recordings, wherever they were read
-    return replace(recording, source=f"upload:{digest}")
+    return replace(recording, source=f"upload:{digest}", warnings=(*remarks, *recording.warnings))
+
+
+def _convert(parts: dict[str, bytes], out: Path) -> tuple[str, ...]:
+    """Write a bag as a native folder, in a process that cannot take more than its share; returns remarks on it.
+
+    Raises:
+        InputError: it cannot be read, or not with so much memory and time.
+    """
+    bag = out.with_name("bag") / out.name
+    bag.mkdir(parents=True)
+    whole = "metadata.yaml" in parts
+    files = {name: bag / (name if whole else f"{out.name}{Path(name).suffix}") for name in parts}
+    for name, path in files.items():
+        path.write_bytes(parts[name])
+    settings = [str(path) for path in files.values() if path.suffix == ".toml"]
+    bag = bag if whole else next(path for path in files.values() if path.suffix in _BAGS)
+    command = [sys.executable, "-c", _CONVERT, "convert", str(bag), str(out), "--format", "parquet", "--json"]
+    command += [f"--topics={name}" for name in settings]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=2 * _BAG_CPU_S)
+    except subprocess.TimeoutExpired:
+        raise InputError(f"cannot be read as a bag within {2 * _BAG_CPU_S} s") from None
+    if done.returncode == 2:
+        told = done.stderr.strip().rpartition("\n")[2].replace(f"{bag.parent}/", "")
+        raise InputError(told.removeprefix("evermap: error: "))
+    if done.returncode:
+        raise InputError(f"cannot be read as a bag within {_BAG_CPU_S} s of computing and {_BAG_BYTES / 1e9:.0f} GB")
+    return tuple(json.loads(done.stdout)["warnings"])

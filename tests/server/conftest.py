@@ -1,0 +1,8 @@
+"""Bags are written by the tests of their reader."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "io"))
