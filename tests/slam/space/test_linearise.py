@@ -19,7 +19,7 @@ from evermap.slam.space.linearise import (
     weighed,
 )
 
-LEVEL = np.array([0.1, 0.05, 0.7, 1.3, 0.4])
+LEVEL = np.array([0.1, 0.05, 0.7, 2.1, 1.3, 0.4])
 STEP = 1e-6
 
 
@@ -42,7 +42,7 @@ def a_sighting(
         kind=np.array([kind]),
         oriented=np.array([int(oriented)]),
         measured=measured,
-        root=np.triu(random.normal(0.0, 3.0, (1, 3, 3))),
+        root=random.normal(0.0, 3.0, (1, 3, 3)),
         sigma_rad=np.array([0.3]),
         corner=random.normal(0.0, 0.3, (1, 4, 2)),
         corner_root=random.normal(0.0, 20.0, (1, 4, 2, 2)),

@@ -224,8 +224,7 @@ class SpatialAssociator:
         self._noise = replace(DRIVEN, translation=CAUTION * DRIVEN.translation, rotation=CAUTION * DRIVEN.rotation)
         mount = problem.mount[problem.sensor]
         self._at = se3.transform(mount, problem.measured[:, :3])
-        root = se3.rotation_of(mount) @ np.linalg.inv(problem.measured_root)
-        self._covariance = INFLATION**2 * root @ np.swapaxes(root, 1, 2)
+        self._root = INFLATION * se3.rotation_of(mount) @ np.linalg.inv(problem.measured_root)
         self._ways = se3.compose(mount, problem.either)
         self._turned = problem.kind != POINT
         self._view = np.unique(problem.pose_row * len(problem.mount) + problem.sensor, return_inverse=True)[1]
@@ -279,7 +278,7 @@ class SpatialAssociator:
         source, target = (each.ravel() for each in np.indices((len(view), len(near.row))))
         kept = alike(self._kind[view[source]], self._of[near.row[target]])
         source, target = source[kept], target[kept]
-        own = self._noise.position**2 * self._covariance[view]
+        own = self._covariance(view)
         innovation = self._at[view[source]] - near.place[target]
         at = 3 * target[:, None] + np.arange(3)
         spread = near.covariance[at[:, :, None], at[:, None, :]] + own[source]
@@ -334,7 +333,7 @@ class SpatialAssociator:
         near.meet(self._row[new])
         seen = np.append(known, new)
         at = np.append(match.target, len(near.row) - len(new) + np.arange(len(new)))
-        near.update(at, self._at[seen], self._noise.position**2 * self._covariance[seen])
+        near.update(at, self._at[seen], self._covariance(seen))
         sigma = np.where(self._turned[seen], self._problem.sigma_rad[seen], 0.0)
         near.ways[:, at], near.sigma_rad[at], near.seen_s[at] = self._ways[:, seen], sigma, now_s
 
@@ -427,9 +426,14 @@ class SpatialAssociator:
             *seen_together(self._view[used], row, int(self._view.max()) + 1, count), of,
         )  # fmt: skip
 
+    def _covariance(self, rows: IntArray | slice) -> FloatArray:
+        """(K, 3, 3) of positions on the robot, at the noise levels as they are."""
+        root = self._root[rows] * np.array([self._noise.across, self._noise.across, self._noise.along])
+        return np.asarray(root @ np.swapaxes(root, 1, 2))
+
     def _wide_m(self) -> FloatArray:
         """(M,) standard deviation of a position, along its widest axis."""
-        return np.asarray(self._noise.position * np.sqrt(np.linalg.eigvalsh(self._covariance)[:, 2]))
+        return np.sqrt(np.linalg.eigvalsh(self._covariance(slice(None)))[:, 2])
 
     def _reassigned(self, solved: _Solved) -> IntArray:
         """(M,) the landmark that every detection most probably is of, given all poses; see `revise.reassigned`."""
@@ -444,7 +448,7 @@ class SpatialAssociator:
         kept = self._within(seen, np.stack([turned, turned]), oriented, np.zeros(len(seen)))
         seen, row = seen[kept], row[kept]
         axes = se3.rotation_of(pose[seen])
-        spread = LEFT * self._noise.position**2 * axes @ self._covariance[seen] @ np.swapaxes(axes, 1, 2)
+        spread = LEFT * axes @ self._covariance(seen) @ np.swapaxes(axes, 1, 2)
         off = at[seen] - place[row, :3]
         squared = np.einsum("ki,ki->k", off, np.linalg.solve(spread, off[..., None])[..., 0])
         score = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(self._density)

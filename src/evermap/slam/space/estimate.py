@@ -8,12 +8,13 @@ import numpy as np
 
 from evermap.geometry import se3
 from evermap.slam.space.linearise import (
+    ACROSS,
+    ALONG,
     CORNERS,
     ODOMETRY,
     ORIENTATION,
     PIXEL,
     POSE,
-    POSITION,
     ROTATION,
     ROWS,
     TRANSLATION,
@@ -28,7 +29,7 @@ CONVERGED = 0.02
 """Relative change of all noise levels that ends it."""
 PRIOR_WEIGHT = 10.0
 """Numbers that the noise level before the first frame is worth."""
-FLOOR = np.array([1e-4, 1e-5, 0.05, 0.05, 0.03])
+FLOOR = np.array([1e-4, 1e-5, 0.05, 0.05, 0.05, 0.03])
 """No noise level is lower: nothing is that good for long."""
 MOST_CANDIDATES = 60
 ANGLE_FLOOR = 0.05
@@ -86,7 +87,8 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
             levels[level] = _level(before[level], start[level], total, count)
     of_detection = trace[1]
     for level, some, rows in (
-        (POSITION, kind != CORNERS, slice(0, 3)),
+        (ACROSS, kind != CORNERS, slice(0, 2)),
+        (ALONG, (kind != CORNERS) & ~problem.ray, slice(2, 3)),  # ranges that nobody measured fit
         (ORIENTATION, kind == POSE, slice(3, 6)),
         (PIXEL, kind == CORNERS, slice(0, 8)),
     ):
@@ -95,9 +97,7 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
             squares = (now.residual[some, rows] ** 2).sum(axis=1)
             total = float(w @ squares + of_detection[some, rows].sum())
             count = float(w.sum()) * (rows.stop - rows.start)
-            if level == POSITION:
-                count -= float(w @ problem.ray[some])  # ranges that nobody measured fit
-            elif level == ORIENTATION:
+            if level == ORIENTATION:
                 count -= float(w @ problem.about_axis[some])
             levels[level] = _level(before[level], start[level], total, count)
     return SpatialNoise(*np.maximum(levels, FLOOR).tolist())

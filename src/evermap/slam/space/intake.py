@@ -98,7 +98,7 @@ def prepare_space(
         sensor=detections.sensor[used],
         kind=some.kind,
         measured=some.measured,
-        measured_root=_roots(some.covariance),
+        measured_root=_roots(some.covariance, some.measured[:, :3]),
         sigma_rad=some.sigma_rad,
         corner=some.corner,
         corner_root=some.corner_root,
@@ -333,10 +333,14 @@ def _sigma_rad(recording: SpatialRecording) -> FloatArray:
     return np.where(np.isfinite(given.sigma_rad), given.sigma_rad, stated[given.sensor])
 
 
-def _roots(covariance: FloatArray) -> FloatArray:
-    """Upper triangular (M, 3, 3) that whiten."""
-    information = np.linalg.inv(covariance)
-    return np.ascontiguousarray(np.swapaxes(np.linalg.cholesky(information), 1, 2))
+def _roots(covariance: FloatArray, at: FloatArray) -> FloatArray:
+    """(M, 3, 3) that whiten positions (M, 3): the range last, and the rest given the range."""
+    normal = at / np.linalg.norm(at, axis=1, keepdims=True)
+    normal[:, 2] += np.where(normal[:, 2] < 0.0, -1.0, 1.0)
+    outer = normal[:, :, None] * normal[:, None, :]
+    mirror = np.eye(3) - 2.0 * outer / (normal**2).sum(axis=1)[:, None, None]  # has the ray as its last row
+    information = np.linalg.inv(mirror @ covariance @ mirror)
+    return np.ascontiguousarray(np.swapaxes(np.linalg.cholesky(information), 1, 2) @ mirror)
 
 
 def _mount_sigma(settings: SpaceConfig) -> FloatArray:

@@ -27,7 +27,7 @@ STATES = 7
 """Numbers of a sensor's calibration: a twist of its mount, and seconds by which its stamps are late."""
 ODOMETRY = 78
 """Numbers of an odometry factor: six rows by two poses and the right side."""
-TRANSLATION, ROTATION, POSITION, ORIENTATION, PIXEL = range(5)
+TRANSLATION, ROTATION, ACROSS, ALONG, ORIENTATION, PIXEL = range(6)
 """Rows of the noise levels."""
 BEHIND = 0.02
 """A corner must be this far ahead of the camera [m]; of one that is not nothing can be said."""
@@ -46,7 +46,7 @@ class SpatialSightings(NamedTuple):
         pose_row, place, sensor, kind: (M,) what saw which place how.
         oriented: (M,) 1 where the place has an orientation, 0 of points.
         measured: (M, 7) the place in the sensor's frame.
-        root: (M, 3, 3) upper triangular, whitens the position but for the noise level.
+        root: (M, 3, 3) whitens the position but for the noise levels: rows across the line of sight, then along it.
         sigma_rad: (M,) of the orientation, but for the noise level.
         corner: (M, 4, 2) corners at depth 1.
         corner_root: (M, 4, 2, 2) pixels by these.
@@ -145,7 +145,7 @@ def linearise_sightings(
         place: (P, 7) places; of points the orientation is not looked at.
         mount: (S, 7) poses of the sensors on the robot.
         velocity: (N, 6) twist of the robot a second, by which late stamps count.
-        level: (5,) noise levels.
+        level: (6,) noise levels.
         seen: the detections.
         heavy: tails that never let go, while the estimate may be far off.
         values: filled in: rows of each by its pose, place, sensor and the right side.
@@ -206,19 +206,9 @@ def _position_or_pose(
         pose_residual(pose, place, mount, seen.measured[m], e, jx, jl, jm)
     else:
         point_residual(pose, place, mount, seen.measured[m], e, jx, jl, jm)
-    for a in range(3):  # upper triangular: rows below a are still to come
-        factor = 1.0 / level[POSITION]
-        total = 0.0
-        for k in range(a, 3):
-            total += seen.root[m, a, k] * e[k]
-        e[a] = factor * total
-        for b in range(6):
-            x, y, z = 0.0, 0.0, 0.0
-            for k in range(a, 3):
-                x += seen.root[m, a, k] * jx[k, b]
-                y += seen.root[m, a, k] * jl[k, b]
-                z += seen.root[m, a, k] * jm[k, b]
-            jx[a, b], jl[a, b], jm[a, b] = factor * x, factor * y, factor * z
+    _whitened(seen.root[m], level, e.reshape(8, 1))
+    for part in (jx, jl, jm):
+        _whitened(seen.root[m], level, part)
     if seen.kind[m] == POSE:
         factor = 1.0 / (level[ORIENTATION] * seen.sigma_rad[m])
         for a in range(3, 6):
@@ -227,6 +217,16 @@ def _position_or_pose(
                 jx[a, b] *= factor
                 jl[a, b] *= factor
                 jm[a, b] *= factor
+
+
+@kernel
+def _whitened(root: FloatArray, level: FloatArray, rows: FloatArray) -> None:
+    """Whiten the first three of some rows, in place."""
+    for b in range(rows.shape[1]):
+        x, y, z = rows[0, b], rows[1, b], rows[2, b]
+        for a in range(3):
+            sigma = level[ALONG] if a == 2 else level[ACROSS]
+            rows[a, b] = (root[a, 0] * x + root[a, 1] * y + root[a, 2] * z) / sigma
 
 
 @kernel

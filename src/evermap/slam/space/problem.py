@@ -31,21 +31,28 @@ class SpatialNoise:
     Attributes:
         translation: of the odometry, metres for the square root of a second.
         rotation: of the odometry, radians for the square root of a second.
-        position: factor on the stated standard deviations of positions.
+        across: factor on the stated standard deviations of positions across the line of sight.
+        along: the same of ranges, which detectors that know a size are far worse at than at directions.
         orientation: factor on those of orientations.
         pixel: of corners in an image [px].
     """
 
     translation: float = 0.05
     rotation: float = 0.02
-    position: float = 1.0
+    across: float = 1.0
+    along: float = 1.0
     orientation: float = 1.0
     pixel: float = 1.0
 
     @property
     def levels(self) -> FloatArray:
-        """Return them as (5,)."""
-        return np.array([self.translation, self.rotation, self.position, self.orientation, self.pixel])
+        """Return them as (6,)."""
+        return np.array([self.translation, self.rotation, self.across, self.along, self.orientation, self.pixel])
+
+    @property
+    def position(self) -> float:
+        """Return the factor for all axes that gives a position the same volume of uncertainty."""
+        return float(np.cbrt(self.across**2 * self.along))
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +90,7 @@ class SpatialProblem:
         steady: True where the noise of that is not learned, but held where it starts.
         pose_row, place, sensor, kind: (M,) which pose saw which place how; sorted by pose.
         measured: (M, 7) the place in the sensor's frame.
-        measured_root: (M, 3, 3) upper triangular, whitens the position but for its noise level.
+        measured_root: (M, 3, 3) whitens the position but for its noise levels; see `SpatialSightings`.
         sigma_rad: (M,) of the orientation, but for its noise level.
         corner, corner_root, half_m: of tags in an image; see `SpatialSightings`.
         other: (M, 7) the other orientation that explains the corners, with its position; nan where there is none.

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from evermap.geometry import se3
 from evermap.slam.space.intake import SpatialIntake, most_of
-from evermap.slam.space.linearise import CORNERS, ORIENTATION, PIXEL, POSE, POSITION, ROTATION, ROWS, TRANSLATION
+from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PIXEL, POSE, ROTATION, ROWS, TRANSLATION
 from evermap.slam.space.problem import SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear
 from evermap.slam.space.solve import SpatialSolved
@@ -42,7 +42,8 @@ MOUNT = "correction of the sensor's stated mount, or delay of its stamps"
 _LEVELS = {
     TRANSLATION: ("sigma_odometry_m", "m/sqrt(s)", "noise of the odometry's translation"),
     ROTATION: ("sigma_odometry_rad", "rad/sqrt(s)", "noise of the odometry's rotation"),
-    POSITION: ("position_noise_factor", "1", "noise of detected positions over what is stated"),
+    ACROSS: ("direction_noise_factor", "1", "noise of positions across the line of sight over what is stated"),
+    ALONG: ("range_noise_factor", "1", "noise of ranges over what is stated"),
     ORIENTATION: ("orientation_noise_factor", "1", "noise of detected orientations over what is stated"),
     PIXEL: ("sigma_corner_px", "px", "noise of tag corners in the image"),
 }
@@ -209,7 +210,8 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
     has = {
         TRANSLATION: problem.driven,
         ROTATION: problem.driven,
-        POSITION: bool((problem.kind != CORNERS).any()),
+        ACROSS: bool((problem.kind != CORNERS).any()),
+        ALONG: bool(((problem.kind != CORNERS) & ~problem.ray).any()),
         ORIENTATION: bool((problem.kind == POSE).any()),
         PIXEL: bool((problem.kind == CORNERS).any()),
     }
