@@ -88,16 +88,16 @@ def drift_of(problem: SpatialProblem, driven: FloatArray) -> Drift:
         return Drift(None, None, share)
     growth = float(np.clip(min(_least_growth(curve) for curve in curves), *_shared_growth(problem, at, stamp_s)))
     persist_s = [each_s for each_s in PERSIST_S if each_s <= max(float(np.ptp(stamp_s)), PERSIST_S[0])]
-    gain, lasting_s = 0.0, []
+    gain, lasting = 0.0, np.zeros(len(persist_s))
     for curve in curves:
         white = max(_fitted(curve, [], lever * growth)[1] for lever in LEVERS)
         parts, log_likelihood = max((_fitted(curve, persist_s, lever * growth) for lever in LEVERS), key=lambda f: f[1])
         gain += max(log_likelihood - white, 0.0)
-        lasting_s.append(float(parts[1:] @ persist_s) / max(float(parts.sum()), 1e-12))
+        lasting += parts[1:] / max(float(parts.sum()), 1e-12) / len(curves)
     if gain > PERSISTS * len(curves):
         for place in range(len(problem.oriented)):
             mine = np.flatnonzero(problem.place == place)
-            share[mine] = 1.0 / (1.0 + 2.0 * float(np.mean(lasting_s)) * _rate(stamp_s[mine]))
+            share[mine] = 1.0 / (1.0 + _others(stamp_s[mine], np.array(persist_s)) @ lasting)
     translation = float(np.sqrt(max(0.5 * growth, LEAST_DRIFT**2)))
     range_m = float(np.median(np.linalg.norm(problem.measured[:, :3], axis=1)))
     return Drift(translation, translation / max(range_m, 1.0), share)
@@ -178,11 +178,15 @@ def _medians(lag_s: FloatArray, square: FloatArray, fewest: int = FEWEST_PAIRS) 
     return median[:, 0], np.maximum(median[:, 1], 1e-12)
 
 
-def _rate(stamp_s: FloatArray) -> FloatArray:
-    """(K,) detections of one place a second, around each."""
-    half_s = 0.5 * PERSIST_S[1]
-    first, last = np.searchsorted(stamp_s, stamp_s - half_s), np.searchsorted(stamp_s, stamp_s + half_s, side="right")
-    return np.asarray((last - first - 1) / PERSIST_S[1])
+def _others(stamp_s: FloatArray, persist_s: FloatArray) -> FloatArray:
+    """(K, T) how many other detections of one place err like each, for each correlation time: sums of correlations."""
+    decay, found = np.exp(-np.diff(stamp_s)[:, None] / persist_s), np.zeros((len(stamp_s), len(persist_s)))
+    for rows, kept in ((range(1, len(found)), decay), (range(len(found) - 2, -1, -1), decay[::-1])):
+        total = np.zeros(len(persist_s))
+        for row, share in zip(rows, kept, strict=True):
+            total = share * (total + 1.0)
+            found[row] += total
+    return found
 
 
 SIGMA_SCALE, SIGMA_BEND = 0.05, 1e-3
