@@ -12,8 +12,8 @@ from evermap.metrics.summary import compare_with_truth
 from evermap.pipeline import run_slam
 from evermap.slam.space.drift import drift_of
 from evermap.slam.space.estimate import first_places
-from evermap.slam.space.intake import prepare_space
-from evermap.types import SpatialRecording
+from evermap.slam.space.intake import SpatialIntake, prepare_space
+from evermap.types import SpatialRecording, rows_of
 
 from .rooms import Room
 
@@ -29,6 +29,12 @@ def lasting(recording: SpatialRecording, sigma_m: float, time_s: float) -> Spati
         error[k + 1] = rest * error[k] + np.sqrt(1.0 - rest**2) * random.normal(0.0, sigma_m, error[0].shape)
     at = seen.position_sensor_m + error[seen.frame, seen.landmark_id]
     return replace(recording, detections=replace(seen, position_sensor_m=at))
+
+
+def alike(intake: SpatialIntake, time_s: float) -> np.ndarray:
+    """Return (M,) how many detections of the same landmark err like each, itself among them."""
+    place, stamp_s = intake.problem.place, intake.problem.stamp_s[intake.problem.pose_row]
+    return (np.exp(-np.abs(stamp_s[:, None] - stamp_s) / time_s) * (place[:, None] == place)).sum(axis=1)
 
 
 def improvement(recording: SpatialRecording) -> float:
@@ -55,10 +61,25 @@ def test_errors_that_last_are_found_and_do_not_pull_a_good_odometry_away(seed: i
     recording = lasting(Room.of(seed).walk(seed, drift=0.002), 0.06, 5.0)
     intake = prepare_space(recording, Config().slam.space)
     found = drift_of(intake.problem, intake.driven_pose)
-    assert (found.share < 0.1).all()
+    assert np.median(found.share * alike(intake, 5.0)) == pytest.approx(1.0, rel=0.25)
     assert found.translation is not None
     assert found.translation < 0.006
     assert improvement(recording) < 1.1
+
+
+def test_a_lone_detection_is_no_newer_than_the_time_that_errors_last() -> None:
+    recording = lasting(Room.of(0).walk(0, drift=0.002), 0.06, 20.0)
+    seen = recording.detections
+    mine = np.flatnonzero(seen.landmark_id == seen.landmark_id[0])
+    stamp_s = recording.frames.stamp_s[seen.frame]
+    lone = mine[len(mine) // 2]
+    kept = (seen.landmark_id != seen.landmark_id[0]) | (np.abs(stamp_s - stamp_s[lone]) > 2.0)
+    kept[lone] = True
+    intake = prepare_space(replace(recording, detections=rows_of(seen, kept)), Config().slam.space)
+    found = drift_of(intake.problem, intake.driven_pose)
+    row = np.flatnonzero(intake.used == np.count_nonzero(kept[:lone]))[0]
+    assert found.share[row] * alike(intake, 20.0)[row] == pytest.approx(1.0, rel=0.5)
+    assert found.share[row] < 0.3
 
 
 def test_places_begin_where_most_of_their_detections_are() -> None:
