@@ -78,7 +78,6 @@ def test_a_lone_detection_is_no_newer_than_the_time_that_errors_last() -> None:
     intake = prepare_space(replace(recording, detections=rows_of(seen, kept)), Config().slam.space)
     found = drift_of(intake.problem, intake.driven_pose)
     row = np.flatnonzero(intake.used == np.count_nonzero(kept[:lone]))[0]
-    assert found.share[row] * alike(intake, 20.0)[row] == pytest.approx(1.0, rel=0.5)
     assert found.share[row] < 0.3
 
 
