@@ -81,6 +81,22 @@ def test_a_lone_detection_is_no_newer_than_the_time_that_errors_last() -> None:
     assert found.share[row] < 0.3
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_ranges_that_are_far_worse_than_directions_do_not_move_things(seed: int) -> None:
+    """Sizes in an image tell ranges: here by 10 % each, and all 8 % too long. Things are where the directions meet."""
+    recording = Room.of(seed).walk(seed, drift=0.002)
+    seen = recording.detections
+    wrong = 1.08 + 0.1 * np.random.default_rng(seed).normal(size=(len(seen), 1))
+    recording = replace(recording, detections=replace(seen, position_sensor_m=wrong * seen.position_sensor_m))
+    result = run_slam(recording)
+    levels = {parameter.name: parameter.value for parameter in result.parameters}
+    assert levels["direction_noise_factor"] == pytest.approx(1.0, abs=0.2)
+    assert 8.0 < levels["range_noise_factor"] < 16.0  # of 2 cm, at 2 m
+    found = compare_with_truth(recording, result, rate_hz=10.0)
+    assert found.landmarks is not None
+    assert found.landmarks.rmse_m < 0.06
+
+
 def test_places_begin_where_most_of_their_detections_are() -> None:
     """Not where the first ones are, which may be wrong."""
     room = Room.of(3)
