@@ -433,7 +433,7 @@ class SpatialAssociator:
 
     def _wide_m(self) -> FloatArray:
         """(M,) standard deviation of a position, along its widest axis."""
-        return np.sqrt(np.linalg.eigvalsh(self._covariance(slice(None)))[:, 2])
+        return np.asarray(np.sqrt(np.linalg.eigvalsh(self._covariance(slice(None)))[:, 2]))
 
     def _reassigned(self, solved: _Solved) -> IntArray:
         """(M,) the landmark that every detection most probably is of, given all poses; see `revise.reassigned`."""
