@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -239,12 +240,16 @@ DETECTORS: dict[str, tuple[str, Callable[[Ros, float, int], Any]]] = {
 }
 
 
+release = cache(Ros)
+"""Its types are read once."""
+
+
 def write(path: Path, detector: str, *, late_s: float = 0.0, mounted: bool = True, odometry: str = "Odometry") -> Path:
     """A bag of the drive: of ROS 1 where its name ends in `.bag`, else of ROS 2, in SQLite where in `_sqlite`."""
     from rosbags import rosbag1, rosbag2
     from rosbags.rosbag2 import StoragePlugin
 
-    ros = Ros(1 if path.suffix == ".bag" else 2)
+    ros = release(1 if path.suffix == ".bag" else 2)
     if ros.version == 1:
         writer: Any = rosbag1.Writer(path)
         raw = ros.store.serialize_ros1

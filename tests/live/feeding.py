@@ -16,7 +16,7 @@ from evermap.maps.store import open_store
 from evermap.types import Recording, Trajectory
 from evermap_studies.sim import BuildingConfig, simulate_building
 
-SESSIONS = simulate_building(BuildingConfig(days=4, patrol_s=45.0), 3).sessions
+SESSIONS = simulate_building(BuildingConfig(days=4, patrol_s=35.0), 3).sessions
 AT_THE_END = Config(live={"revision_s": 0.0})
 
 Message = tuple[float, str, int]

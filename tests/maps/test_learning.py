@@ -36,12 +36,13 @@ def test_bands_cover_the_lifetimes_of_the_simulated_building(warmup_days: float)
     for seed in SEEDS:
         stays = seen_in_four_weeks(seed, warmup_days)
         lives = ClassLives.of(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]).lives
+        learned = ClassLives.of(stays, lives)
         for kind, item in enumerate(DEFAULT_CLASSES):
             if item.stay is None:
                 continue
             truth = law.gamma(item.stay.shape, scale=item.stay.mean_days / item.stay.shape)
             ages_days = truth.ppf([0.1, 0.3, 0.5, 0.7, 0.9])
-            _, lower, upper = ClassLives.of(stays, lives).band(kind, ages_days * DAY_S)
+            _, lower, upper = learned.band(kind, ages_days * DAY_S)
             survival = truth.sf(ages_days)
             covered.append((lower <= survival) & (survival <= upper))
     assert np.mean(covered) >= 0.9

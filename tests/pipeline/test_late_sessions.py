@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +57,22 @@ def built(path: Path | str, order: Sequence[int], recordings: Sequence[Recording
         return store.load()
 
 
+@cache
+def fed_in(order: tuple[int, ...]) -> bytes:
+    """The file of a map into which sessions came in this order; each beginning of an order is computed once."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = begun(Path(folder), *order[:-1]) if order[1:] else Path(folder) / "site.evermap"
+        built(path, order[-1:])
+        return path.read_bytes()
+
+
+def begun(folder: Path, *order: int) -> Path:
+    """A map of a test's own into which sessions came in this order."""
+    path = folder / "site.evermap"
+    path.write_bytes(fed_in(order))
+    return path
+
+
 def assert_same(a: LivingMap, b: LivingMap) -> None:
     """But for the numbers of cliques and sites, which count up."""
     one, other = a.landmarks(), b.landmarks()
@@ -69,7 +87,8 @@ def assert_same(a: LivingMap, b: LivingMap) -> None:
 
 @pytest.fixture(scope="module")
 def in_order(tmp_path_factory: pytest.TempPathFactory) -> LivingMap:
-    return built(tmp_path_factory.mktemp("order") / "site.evermap", range(4))
+    with open_store(begun(tmp_path_factory.mktemp("order"), 0, 1, 2, 3)) as store:
+        return store.load()
 
 
 def test_an_interrupt_while_later_sessions_are_entered_again_leaves_the_map(
@@ -80,9 +99,7 @@ def test_an_interrupt_while_later_sessions_are_entered_again_leaves_the_map(
         return replace(session, slam=replace(session.slam, interrupted=recording is not SESSIONS[1]))
 
     run_session = em.run_session
-    with open_store(tmp_path / "site.evermap", create=True) as store:
-        fed(store, SESSIONS[0])
-        fed(store, SESSIONS[2])
+    with open_store(begun(tmp_path, 0, 2)) as store:
         monkeypatch.setattr("evermap.pipeline.run_session", interrupted)
         with pytest.raises(KeyboardInterrupt):
             em.enter_session(store, SESSIONS[1])
@@ -91,7 +108,8 @@ def test_an_interrupt_while_later_sessions_are_entered_again_leaves_the_map(
 
 @pytest.mark.parametrize("order", [(0, 2, 3, 1), (3, 1, 0, 2), (1, 3, 0, 2)])
 def test_the_order_of_arrival_makes_no_difference(tmp_path: Path, in_order: LivingMap, order: Sequence[int]) -> None:
-    assert_same(built(tmp_path / "site.evermap", order), in_order)
+    with open_store(begun(tmp_path, *order)) as store:
+        assert_same(store.load(), in_order)
 
 
 def test_a_late_session_with_which_a_later_one_is_lost_stays_out(tmp_path: Path) -> None:
@@ -122,8 +140,7 @@ class Overtaken:
 
 
 def test_a_late_session_that_was_overtaken_is_entered_again(tmp_path: Path) -> None:
-    with open_store(tmp_path / "site.evermap", create=True) as store:
-        fed(store, SESSIONS[3])
+    with open_store(begun(tmp_path, 3)) as store:
         entered = em.enter_session(Overtaken(store, SESSIONS[0]), SESSIONS[1])  # type: ignore[arg-type]
         with pytest.raises(StaleRevisionError):
             entered.commit(store)
@@ -134,9 +151,7 @@ def test_nor_in_a_database(site_address: str, in_order: LivingMap) -> None:
 
 
 def test_a_late_session_says_what_it_changed_and_what_was_brought_in_again(tmp_path: Path) -> None:
-    with open_store(tmp_path / "site.evermap", create=True) as store:
-        for k in (0, 1, 3):
-            fed(store, SESSIONS[k])
+    with open_store(begun(tmp_path, 0, 1, 3)) as store:
         entered = fed(store, SESSIONS[2])
         assert entered.replayed == (SESSIONS[3].name,)
         assert store.head() == 4
@@ -145,9 +160,7 @@ def test_a_late_session_says_what_it_changed_and_what_was_brought_in_again(tmp_p
 
 
 def test_an_operators_word_is_kept(tmp_path: Path) -> None:
-    with open_store(tmp_path / "site.evermap", create=True) as store:
-        for k in (0, 1):
-            fed(store, SESSIONS[k])
+    with open_store(begun(tmp_path, 0, 1)) as store:
         landmark = int(store.load().members.landmark_id[2])
         edited(store, landmark)
         fed(store, SESSIONS[3])
@@ -157,9 +170,7 @@ def test_an_operators_word_is_kept(tmp_path: Path) -> None:
 
 
 def test_a_session_is_evidence_once(tmp_path: Path) -> None:
-    with open_store(tmp_path / "site.evermap", create=True) as store:
-        for k in (0, 1):
-            fed(store, SESSIONS[k])
+    with open_store(begun(tmp_path, 0, 1)) as store:
         with pytest.raises(InputError, match="is in the map already, as revision 1"):
             em.enter_session(store, SESSIONS[0])
         assert store.head() == 2
@@ -196,9 +207,7 @@ def test_a_revision_without_its_recording_is_named(tmp_path: Path) -> None:
 
 
 def test_a_pruned_map_goes_on_as_if_it_were_whole(tmp_path: Path, in_order: LivingMap) -> None:
-    with open_store(tmp_path / "site.evermap", create=True) as store:
-        for k in (0, 1, 2):
-            fed(store, SESSIONS[k])
+    with open_store(begun(tmp_path, 0, 1, 2)) as store:
         assert store.prune(1).revisions == (1, 2)
         with pytest.raises(InputError, match="is in the map already, as revision 1"):
             em.enter_session(store, SESSIONS[0])
@@ -209,18 +218,14 @@ def test_a_pruned_map_goes_on_as_if_it_were_whole(tmp_path: Path, in_order: Livi
 
 
 def test_a_late_session_starts_from_a_revision_that_is_kept(tmp_path: Path, in_order: LivingMap) -> None:
-    path = tmp_path / "site.evermap"
-    built(path, (0, 1, 3))
-    with open_store(path) as store:
+    with open_store(begun(tmp_path, 0, 1, 3)) as store:
         assert store.prune(2).kept == (2, 3)
         fed(store, SESSIONS[2])
         assert_same(store.load(), in_order)
 
 
 def test_a_late_session_before_what_is_kept_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "site.evermap"
-    built(path, (0, 1, 3))
-    with open_store(path) as store:
+    with open_store(begun(tmp_path, 0, 1, 3)) as store:
         store.prune(1)
         line = (
             f"site.evermap: {SESSIONS[2].name}: begins before the session of revision 3, but the content of revision 2 "
@@ -233,9 +238,7 @@ def test_a_late_session_before_what_is_kept_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_map_as_it_was(tmp_path: Path) -> None:
-    with open_store(tmp_path / "site.evermap", create=True) as store:
-        for k in (0, 1, 2):
-            fed(store, SESSIONS[k])
+    with open_store(begun(tmp_path, 0, 1, 2)) as store:
         for k in (0, 1, 2):
             assert at_time(store, float(SESSIONS[k].frames.stamp_s[-1])).stamp_s == store.load(k + 1).stamp_s
         assert at_time(store, 0.0).stamp_s == store.load(1).stamp_s

@@ -85,10 +85,9 @@ def driven(
         truth[k + 1] = x, y, heading
     frame_s = FRAME_S * np.arange(n_frames)
     poses = _at(truth, stamps, frame_s + states[5])
-    return World(
-        landmark, poses, states, Drive.from_rows(stamps, velocity), frame_s,
-        [seen_from(rng, p, landmark, states) for p in poses],
-    )  # fmt: skip
+    away = se2.transform(se2.inverse(poses)[:, None], landmark)
+    sightings = [_seen(rng, one, states) for one in away]
+    return World(landmark, poses, states, Drive.from_rows(stamps, velocity), frame_s, sightings)
 
 
 def _at(truth: np.ndarray, stamps: np.ndarray, when: np.ndarray) -> np.ndarray:
@@ -99,7 +98,11 @@ def _at(truth: np.ndarray, stamps: np.ndarray, when: np.ndarray) -> np.ndarray:
 
 
 def seen_from(rng: np.random.Generator, pose: np.ndarray, landmark: np.ndarray, states: np.ndarray) -> FrameSightings:
-    away = se2.transform(se2.inverse(pose), landmark)
+    return _seen(rng, se2.transform(se2.inverse(pose), landmark), states)
+
+
+def _seen(rng: np.random.Generator, away: np.ndarray, states: np.ndarray) -> FrameSightings:
+    """What is detected of landmarks (N, 2) in the robot's frame."""
     r, b = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
     seen = np.flatnonzero((r > 0.3) & (r < SENSOR.range_max_m) & (np.abs(b) < 2.0) & (rng.random(len(r)) < 0.9))
     r, b = r[seen], b[seen]

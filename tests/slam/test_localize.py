@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 
 import gtsam
 import numpy as np
@@ -32,9 +34,16 @@ from evermap.slam.problem import Drive
 COUNT, SIDE_M = 40, 14.0
 
 
-def world(seed: int, **options: object) -> tuple[np.random.Generator, World]:
+@cache
+def _world(seed: int, n_frames: int) -> tuple[np.random.Generator, World]:
     rng = np.random.default_rng(seed)
-    return rng, driven(rng, place_randomly(rng, COUNT, SIDE_M), **options)
+    return rng, driven(rng, place_randomly(rng, COUNT, SIDE_M), n_frames=n_frames)
+
+
+def world(seed: int, n_frames: int = 150) -> tuple[np.random.Generator, World]:
+    """A world of the test's own, and the generator as it is after drawing it; each world is drawn once."""
+    rng, drawn = deepcopy(_world(seed, n_frames))
+    return rng, drawn
 
 
 def within_chance(total: float, degrees: int) -> bool:

@@ -63,7 +63,7 @@ def log_marginal_likelihood(world: World, noise: Noise, start: Estimate) -> floa
 def test_stationary_point_tops_the_marginal_likelihood():
     """Slope over curvature of the log likelihood by the log level is the distance to the top."""
     states = default_prior().mean + 0.2 * default_prior().sigma * PRIOR.free
-    world = make_world(21, n_poses=40, n_landmarks=5, prior=PRIOR, states=states)
+    world = make_world(21, n_poses=25, n_landmarks=5, prior=PRIOR, states=states)
     fit, estimate = fitted(world)
     middle = log_marginal_likelihood(world, fit.noise, estimate)
     for k in range(7):

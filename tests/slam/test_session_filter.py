@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import scipy.stats
-from drives import FRAME_S, NOISE, SENSOR, driven, nees, place_randomly, prior
+from drives import FRAME_S, NOISE, SENSOR, World, driven, nees, place_randomly, prior
 
 from evermap.config import SlamConfig
 from evermap.geometry import se2
@@ -27,13 +29,16 @@ def beliefs(turn_scale: float) -> CalibrationPrior:
     return CalibrationPrior(default.mean, sigma, free)
 
 
-def told(
-    seed: int, believed: CalibrationPrior, *, blind: bool, view_rad: float = np.pi
-) -> tuple[np.ndarray, np.ndarray]:
-    """(F, 3) errors and (F, 3, 3) covariances of the poses; behind a blind interval all landmarks are new ones."""
-    rng = np.random.default_rng(seed)
+@cache
+def drawn(seed: int, turn_scale: float) -> World:
+    rng, believed = np.random.default_rng(seed), beliefs(turn_scale)
     states = believed.mean + believed.sigma * believed.free * rng.normal(size=9)
-    world = driven(rng, place_randomly(rng, 40, 14.0), n_frames=150, states=states)
+    return driven(rng, place_randomly(rng, 40, 14.0), n_frames=150, states=states)
+
+
+def told(seed: int, turn_scale: float, *, blind: bool, view_rad: float = np.pi) -> tuple[np.ndarray, np.ndarray]:
+    """(F, 3) errors and (F, 3, 3) covariances of the poses; behind a blind interval all landmarks are new ones."""
+    world, believed = drawn(seed, turn_scale), beliefs(turn_scale)
     odometry = np.column_stack([world.drive.stamp_s, world.drive.velocity[:, :3]])[:-1]
     mapper, found = Mapper(SENSOR, believed, NOISE, SETTINGS), []
     for k, seen in enumerate(world.sightings):
@@ -52,11 +57,11 @@ def told(
     ("turn_scale", "blind", "view_rad"), [(0.05, False, np.pi), (0.1, True, np.pi), (0.1, True, 0.6)]
 )
 def test_poses_are_as_uncertain_as_the_filter_says(turn_scale, blind, view_rad):
-    runs, believed = 40, beliefs(turn_scale)
+    runs = 40
     low, high = scipy.stats.chi2.ppf([0.5e-4, 1.0 - 0.5e-4], [3 * runs, 3 * runs])
     heading_low, heading_high = scipy.stats.chi2.ppf([0.5e-4, 1.0 - 0.5e-4], [runs, runs])
     error, covariance = zip(
-        *(told(seed, believed, blind=blind, view_rad=view_rad) for seed in range(runs)), strict=True
+        *(told(seed, turn_scale, blind=blind, view_rad=view_rad) for seed in range(runs)), strict=True
     )
     for frame in (100, 149):
         wrong, spread = np.array([one[frame] for one in error]), np.array([one[frame] for one in covariance])

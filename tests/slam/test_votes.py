@@ -17,6 +17,7 @@ from evermap_studies.sim import WarehouseConfig, simulate_warehouse
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
 SPACE = SpaceConfig()
+WAREHOUSE = simulate_warehouse(WarehouseConfig(n_landmarks=60, rate_hz=2.0))
 
 
 def with_ids(recording: AnyRecordingT, landmark_id: IntArray) -> AnyRecordingT:
@@ -35,7 +36,7 @@ def misread(recording: AnyRecordingT, rate: float) -> AnyRecordingT:
 @pytest.mark.parametrize(
     "recording",
     [
-        pytest.param(simulate_warehouse(WarehouseConfig(n_landmarks=60, rate_hz=2.0)), id="warehouse"),
+        pytest.param(WAREHOUSE, id="warehouse"),
         pytest.param(simulate_park(ParkConfig(n_trees=80, drive_m=600.0), seed=3), id="park"),
         pytest.param(hall(1, n_points=40, n_frames=300), id="space"),
     ],
@@ -49,21 +50,29 @@ def test_ids_that_the_seconds_around_contradict_are_left_out(recording, rate):
     assert (without_contradicted_ids(recording, SPACE).detections.landmark_id != true).mean() < 0.002
 
 
+def rmse_m(recording, *config):
+    """Of the trajectory of the warehouse."""
+    assert WAREHOUSE.truth is not None
+    return evaluate_trajectory(run_slam(recording, *config).trajectory, WAREHOUSE.truth, rate_hz=2.0).rmse_m
+
+
+AS_READ = Config(slam={"vote_ids": False})
+
+
 def test_a_fifth_of_the_ids_wrong_is_nearly_as_good_as_none():
-    recording = simulate_warehouse(WarehouseConfig(n_landmarks=60, rate_hz=2.0))
-    wrongly, as_read = misread(recording, 0.2), Config(slam={"vote_ids": False})
-    assert recording.truth is not None
-    off = [
-        evaluate_trajectory(run_slam(*args).trajectory, recording.truth, rate_hz=2.0).rmse_m
-        for args in ((recording, as_read), (recording,), (wrongly, as_read), (wrongly,))
-    ]
-    assert off[1] == pytest.approx(off[0], rel=0.02)
-    assert off[2] > 5.0 * off[0]
-    assert off[3] < 1.5 * off[0]
+    right = rmse_m(WAREHOUSE, AS_READ)
+    assert rmse_m(WAREHOUSE) == pytest.approx(right, rel=0.02)
+    assert rmse_m(misread(WAREHOUSE, 0.2)) < 1.5 * right
+
+
+@pytest.mark.slow
+def test_without_the_vote_a_fifth_of_the_ids_wrong_is_far_worse():
+    """What the vote is for; of the world, not of the vote: that would be missed by the test above."""
+    assert rmse_m(misread(WAREHOUSE, 0.2), AS_READ) > 5.0 * rmse_m(WAREHOUSE, AS_READ)
 
 
 def test_an_id_on_two_landmarks_is_not_used_and_named():
-    recording = simulate_warehouse(WarehouseConfig(n_landmarks=60, rate_hz=2.0))
+    recording = WAREHOUSE
     true = recording.detections.landmark_id
     together = np.zeros((60, 60))
     for frame in np.unique(recording.detections.frame):
@@ -78,7 +87,7 @@ def test_an_id_on_two_landmarks_is_not_used_and_named():
     result = run_slam(twins)
     assert found.warnings[-1] in result.warnings
     off = evaluate_trajectory(result.trajectory, recording.truth, rate_hz=2.0).rmse_m
-    assert off < 1.5 * evaluate_trajectory(run_slam(recording).trajectory, recording.truth, rate_hz=2.0).rmse_m
+    assert off < 1.5 * rmse_m(recording)
 
 
 def test_what_is_seen_beside_another_in_one_frame_is_no_misreading_of_it():

@@ -213,7 +213,8 @@ def run(*arguments: str | Path) -> Result:
     return CliRunner().invoke(app, ["reproduce", "bateman2020", *(str(argument) for argument in arguments)])
 
 
-def test_command_runs_what_it_is_asked_for(tmp_path: Path) -> None:
+def test_command_runs_what_it_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bateman2020, "default_settings", small)
     chosen = ("--world", "pose-noise", "--filters", "oracle, jcf", "--runs", "2", "--seed", "3")
     result = run(*chosen, "--json", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import functools
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -151,8 +152,9 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
     return topics
 
 
+@functools.cache
 def ros2_types() -> Any:
-    """Return the message types of ROS 2 and those of `UNSTATED`, as `rosbags` has them.
+    """Return the message types of ROS 2 and those of `UNSTATED`, as `rosbags` has them; the same object every time.
 
     Raises:
         MissingExtraError: `rosbags` is not installed.

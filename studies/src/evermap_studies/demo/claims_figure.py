@@ -79,14 +79,16 @@ def _reliability(axes: Axes, line: Line, length_s: FloatArray) -> None:
         mine = (length_s == length)[line.claims.session]
         if not mine.any():
             continue
+        first = not axes.lines
         stated, true = float(line.claims.probability[mine].mean()), float(line.claims.is_true[mine].mean())
         axes.plot([stated, true], [row, row], color=GRID, lw=3.0, zorder=1)
-        axes.plot(stated, row, "o", mfc="none", mec=INK, ms=7, zorder=2, label="told, mean" if not row else None)
-        axes.plot(true, row, "o", color=ESTIMATE, ms=6, zorder=3, label="true" if not row else None)
+        axes.plot(stated, row, "o", mfc="none", mec=INK, ms=7, zorder=2, label="told, mean" if first else None)
+        axes.plot(true, row, "o", color=ESTIMATE, ms=6, zorder=3, label="true" if first else None)
         axes.annotate(f"n = {int(mine.sum())}", (0.02, row), va="center", fontsize=8)
     axes.set_yticks(np.arange(len(lengths)), [f"{length:g} s" for length in lengths])
     axes.set_xlim(0.0, 1.03)
     axes.set_ylim(len(lengths) - 0.5, -0.5)
     axes.set_title("evermap: told and true")
     axes.set_xlabel("probability")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=2)
+    if axes.lines:
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=2)
