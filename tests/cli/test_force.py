@@ -10,8 +10,8 @@ from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
 from evermap.io import read_recording, write_template
+from evermap.runs.examples import write_looks
 from evermap.runs.folder import MANIFEST
-from evermap.runs.persist.example import write_example
 
 
 def run(*arguments: object) -> Result:
@@ -31,7 +31,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         write_template(home / folder)
     for folder in ("d", "conf", "out", "empty"):
         (home / folder).mkdir()
-    write_example(home / "d" / "looks.csv")
+    write_looks(home / "d" / "looks.csv")
     (home / "conf" / "mine.toml").write_text("[slam]\nseed = 1\n")
     (home / "out" / "map.parquet").write_bytes(b"a prior map")
     (home / "link").symlink_to(home / "rec")

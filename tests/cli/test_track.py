@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
-from evermap.runs.track import example
+from evermap.runs import examples
 from evermap.runs.track.lifetimes import read_lifetimes
 
 HOUR_S = 3600.0
@@ -49,7 +49,7 @@ def true_stays() -> list[Any]:
     """Stays of the example during which the robot passed at least once."""
     random = np.random.default_rng(12)
     patrols = [24.0 * day + hour for day in range(4) for hour in range(8, 21, 2)]
-    return [s for s in example._stays(random) if any(s.begin_h <= patrol < s.end_h for patrol in patrols)]
+    return [s for s in examples._stays(random) if any(s.begin_h <= patrol < s.end_h for patrol in patrols)]
 
 
 def test_every_stay_is_a_spell_of_its_class_and_place(yard: Path) -> None:

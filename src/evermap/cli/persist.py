@@ -143,9 +143,9 @@ def persist(
 ) -> None:
     """Filter a table of looks and write the folder of the run."""
     if init is not None:
-        from evermap.runs.persist.example import write_example
+        from evermap.runs.examples import write_looks
 
-        write_example(init)
+        write_looks(init)
         say(f"wrote an example to {init}; try: evermap persist {init}")
         return
     common, by_class = priors_by_class(prior)

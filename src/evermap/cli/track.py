@@ -120,9 +120,9 @@ def track(
 ) -> None:
     """Follow the objects of a table of detections and write the folder of the run."""
     if init is not None:
-        from evermap.runs.track.example import RANGE_M, write_example
+        from evermap.runs.examples import RANGE_M, write_detections
 
-        write_example(init)
+        write_detections(init)
         say(f"wrote an example to {init}; try: evermap track {init} --range-m {RANGE_M:g}")
         return
     common, by_class = priors_by_class(prior)

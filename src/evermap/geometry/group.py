@@ -64,9 +64,6 @@ class Group(Protocol):
     def bracket(self, twist: ArrayLike) -> FloatArray:
         """Return Lie brackets with twists as matrices (..., dim, dim); their exponential is `adjoint(exp(twist))`."""
 
-    def right_jacobian(self, twist: ArrayLike) -> FloatArray:
-        """Return matrices (..., dim, dim): `exp(twist + d) = exp(twist) * exp(right_jacobian d)` for small `d`."""
-
     def right_jacobian_inverse(self, twist: ArrayLike) -> FloatArray:
         """Return matrices (..., dim, dim): `log(exp(twist) * exp(d)) = twist + right_jacobian_inverse d`, small `d`."""
 

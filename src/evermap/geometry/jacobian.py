@@ -1,4 +1,4 @@
-"""Right Jacobians of the exponential map, in the plane and in space by the same formula.
+"""Inverse right Jacobians of the exponential map, in the plane and in space by the same formula.
 
 With `A` the bracket of a twist and `q` the square of its rotation, `A (A^2 + q)^2 = 0` in SE(3), and `A (A^2 + q) = 0`
 in SE(2). Any power series of `A` is therefore a polynomial of degree four, of which the terms with `A (A^2 + q)` vanish
@@ -19,7 +19,7 @@ SERIES_BELOW = 1.0
 TERMS = 10
 B_SERIES = [(-1) ** m / factorial(2 * m + 2) for m in reversed(range(TERMS))]
 C_SERIES = [(-1) ** m / factorial(2 * m + 3) for m in reversed(range(TERMS))]
-BY_B_SERIES, BY_C_SERIES = np.polyder(B_SERIES), np.polyder(C_SERIES)
+BY_B_SERIES = np.polyder(B_SERIES)
 
 
 def coefficients(q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -34,12 +34,10 @@ def coefficients(q: FloatArray) -> tuple[FloatArray, FloatArray]:
     return b, np.where(small, np.polyval(C_SERIES, q), (t - np.sin(t)) / (safe * t))
 
 
-def slopes(q: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives by `q` of both `coefficients`."""
+def slope(q: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Return the derivative by `q` of the first of both `coefficients`."""
     small = q < SERIES_BELOW
-    twice = np.where(small, 2.0, 2.0 * q)
-    by_b = np.where(small, np.polyval(BY_B_SERIES, q), (1.0 - 2.0 * b - q * c) / twice)
-    return by_b, np.where(small, np.polyval(BY_C_SERIES, q), (b - 3.0 * c) / twice)
+    return np.where(small, np.polyval(BY_B_SERIES, q), (1.0 - 2.0 * b - q * c) / np.where(small, 2.0, 2.0 * q))
 
 
 def inverse_coefficient(q: FloatArray) -> FloatArray:
@@ -48,7 +46,7 @@ def inverse_coefficient(q: FloatArray) -> FloatArray:
     The inverse of the left Jacobian of a rotation vector is `1 - W / 2 + d W^2`.
     """
     b, c = coefficients(q)
-    return np.asarray(-slopes(q, b, c)[0] / b)
+    return np.asarray(-slope(q, b, c) / b)
 
 
 def inverse_slope(q: FloatArray, d: FloatArray) -> FloatArray:
@@ -58,17 +56,10 @@ def inverse_slope(q: FloatArray, d: FloatArray) -> FloatArray:
     return np.where(small, series, (1.0 - 12.0 * d + 4.0 * q * d * d) / np.where(small, 1.0, 8.0 * q))
 
 
-def right_jacobian(bracket: FloatArray, q: FloatArray) -> FloatArray:
-    """Return the right Jacobian (..., n, n) of twists with this bracket (..., n, n) and squared rotation (...)."""
-    b, c = coefficients(q)
-    b, c, by_b, by_c = (value[..., None, None] for value in (b, c, *slopes(q, b, c)))
-    square, rest = _square_and_rest(bracket, q)
-    one = np.eye(bracket.shape[-1])
-    return np.asarray(one - b * bracket + c * square + by_b * rest - by_c * (rest @ bracket))
-
-
 def right_jacobian_inverse(bracket: FloatArray, q: FloatArray) -> FloatArray:
-    """Return the inverse of `right_jacobian`, for rotations of less than a full turn."""
+    """Return the inverse of the right Jacobian (..., n, n) of twists with this bracket (..., n, n) and squared rotation
+    (...), for rotations of less than a full turn.
+    """
     d = inverse_coefficient(q)
     d, by_d = d[..., None, None], inverse_slope(q, d)[..., None, None]
     square, rest = _square_and_rest(bracket, q)

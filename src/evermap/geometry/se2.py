@@ -136,12 +136,6 @@ def bracket(twist: ArrayLike) -> FloatArray:
     return out
 
 
-def right_jacobian(twist: ArrayLike) -> FloatArray:
-    """Return matrices (..., 3, 3): `exp(twist + d) = exp(twist) * exp(right_jacobian d)` for small `d`."""
-    twist = np.asarray(twist, dtype=np.float64)
-    return jacobian.right_jacobian(bracket(twist), twist[..., 2] ** 2)
-
-
 def right_jacobian_inverse(twist: ArrayLike) -> FloatArray:
     """Return matrices (..., 3, 3): `log(exp(twist) * exp(d)) = twist + right_jacobian_inverse d` for small `d`."""
     twist = np.asarray(twist, dtype=np.float64)

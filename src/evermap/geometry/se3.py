@@ -152,12 +152,6 @@ def bracket(twist: ArrayLike) -> FloatArray:
     return _two_by_two(_crossing(twist[..., 3:]), _crossing(twist[..., :3]))
 
 
-def right_jacobian(twist: ArrayLike) -> FloatArray:
-    """Return matrices (..., 6, 6): `exp(twist + d) = exp(twist) * exp(right_jacobian d)` for small `d`."""
-    twist = np.asarray(twist, dtype=np.float64)
-    return jacobian.right_jacobian(bracket(twist), _dot(twist[..., 3:], twist[..., 3:])[..., 0])
-
-
 def right_jacobian_inverse(twist: ArrayLike) -> FloatArray:
     """Return matrices (..., 6, 6): `log(exp(twist) * exp(d)) = twist + right_jacobian_inverse d` for small `d`."""
     twist = np.asarray(twist, dtype=np.float64)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from evermap.io.files import Reader
+from pathlib import Path
+
+from evermap.errors import InputError
+from evermap.io.bag import BAG, read_bag
+from evermap.io.files import Reader, file_sets, find_file_set
 from evermap.io.landmarks import read_landmarks, read_prior_map, write_map_geojson, write_map_parquet
-from evermap.io.mrclam import read_mrclam
-from evermap.io.native import read_native
+from evermap.io.mrclam import MRCLAM, read_mrclam
+from evermap.io.native import NATIVE, read_native
 from evermap.io.native_write import write_native
-from evermap.io.registry import READERS, list_robots, read_planar, read_recording, reader_for
 from evermap.io.shifts import Shift, parse_shift, shifted
+from evermap.io.tagslam import TAGSLAM
 from evermap.io.template import write_template
 from evermap.io.tum import read_tum, write_tum
+from evermap.io.ycbv import YCBV
+from evermap.types import Recording, SpatialRecording
 
 __all__ = [
     "READERS",
@@ -33,3 +39,70 @@ __all__ = [
     "write_template",
     "write_tum",
 ]
+
+READERS: tuple[Reader, ...] = (MRCLAM, TAGSLAM, YCBV, BAG, NATIVE)
+"""All formats, in the order in which they are asked. A new reader is added here and nowhere else."""
+
+
+def reader_for(path: str | Path) -> Reader:
+    """Return the first reader that recognises the path.
+
+    Raises:
+        InputError: nothing is there, a zip is damaged, or no reader recognises it; the message says what is looked for.
+    """
+    path = Path(path)
+    found = file_sets(path)
+    for reader in READERS:
+        if reader.matches(path):
+            return reader
+    if path.is_file() and not found:
+        hint = f"its folder {path.parent}, or a zip of it"
+        raise InputError("a single file is not a recording", path=path, hint=hint)
+    names = sorted(name for files in found for name in files.members)
+    holds = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "") if names else "no files"
+    wanted = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in READERS)
+    raise InputError(f"no recording found, it holds {holds}; looked for {wanted}", path=path)
+
+
+def read_recording(
+    path: str | Path, robot: int | None = None, *, topics: str | Path | None = None
+) -> Recording | SpatialRecording:
+    """Read a recording of any known format, in the plane or in space.
+
+    Args:
+        path: folder, zip or file.
+        robot: number of the robot where the format has several; None for its first complete one.
+        topics: file that states which topics of a bag are what; None for the one beside it, or a guess.
+
+    Raises:
+        InputError: missing, malformed or of an unknown format.
+        DataError: well-formed, but nothing can be estimated from it.
+    """
+    reader = reader_for(path)
+    if topics is None:
+        return reader.read(Path(path), robot)
+    if reader is not BAG:
+        raise InputError("has no topics", path=path, hint="leave --topics out; it is for bags")
+    return read_bag(path, robot, topics)
+
+
+def read_planar(path: str | Path, robot: int | None = None) -> Recording:
+    """Read a recording as `read_recording`, and refuse one that is in space.
+
+    Raises:
+        InputError: as `read_recording`, or the recording is in space.
+        DataError: well-formed, but nothing can be estimated from it.
+    """
+    recording = read_recording(path, robot)
+    if not isinstance(recording, Recording):
+        raise InputError("the recording is in space; this works in the plane", path=path)
+    return recording
+
+
+def list_robots(path: str | Path) -> tuple[int, ...]:
+    """Return robots of a recording that can be read, in ascending order; empty where they have no numbers."""
+    reader = reader_for(path)
+    if Path(path).is_file() and reader.endings and str(path).endswith(reader.endings):
+        return ()
+    files = find_file_set(path, reader.holds)
+    return () if files is None else reader.robots(files)

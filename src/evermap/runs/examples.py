@@ -1,10 +1,10 @@
-"""A small table of detections for `evermap track --init`: a robot passes through a yard seven times a day."""
+"""Small tables for `--init`: of looks for `evermap persist`, of detections for `evermap track`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,16 +12,73 @@ from evermap.io.files import write_new
 from evermap.io.table import csv_text
 from evermap.types import FloatArray
 
+_DAY_S, _HOUR_S = 86400.0, 3600.0
+
+# ------------------------------------------- looks: a robot passes six things every now and then for a week
+
+_WEEK_DAYS = 7
+_P_MISS, _P_FALSE = 0.1, 0.02
+# What is there from when to when [days]; a thing that is there at the end stays.
+_THERE_DAYS: dict[str, tuple[str, tuple[tuple[float, float], ...]]] = {
+    "pillar-1": ("pillar", ((0.0, 99.0),)),
+    "pillar-2": ("pillar", ((0.0, 99.0),)),
+    "pallet-7": ("pallet", ((0.0, 2.6),)),
+    "pallet-8": ("pallet", ((1.4, 5.3),)),
+    "pallet-9": ("pallet", ((3.2, 99.0),)),
+    "cart-3": ("cart", ((0.0, 1.1), (1.9, 3.4), (4.5, 6.1))),
+}
+_ABOUT_LOOKS = """\
+Looks of a detector at things that come and go: replace these rows by your own, in any order.
+stamp_s     seconds, of any clock
+feature_id  any name or number
+detected    1: detected, 0: looked at and not detected; empty: no look, but the belief is wanted
+optional    p_miss, p_false: of this look, where --p-miss and --p-false do not fit
+optional    class_id: any name, for lifetimes of classes, as in --prior cart=exponential:half-life=1d
+optional    present: the truth, 1 or 0, empty where unknown; it only scores the result"""
+
+
+def write_looks(path: str | Path) -> Path:
+    """Write a commented table that `evermap persist` takes as it is; the same bytes every time.
+
+    Raises:
+        InputError: the file exists, or cannot be written.
+    """
+    return write_new(path, csv_text(_look_columns(), comment=_ABOUT_LOOKS))
+
+
+def _look_columns() -> dict[str, Any]:
+    random = np.random.default_rng(8)
+    columns: dict[str, list[str]] = {"stamp_s": [], "feature_id": [], "class_id": [], "detected": [], "present": []}
+    for day in range(_WEEK_DAYS):
+        for hour in np.arange(8.0, 18.0, 0.5):  # half-hourly patrols, by day only
+            stamp_s = day * _DAY_S + hour * _HOUR_S + float(random.integers(0, 900))
+            for name, (kind, stays) in _THERE_DAYS.items():
+                if random.random() < 0.3:
+                    continue  # not in view this time
+                there = any(begin <= stamp_s / _DAY_S < end for begin, end in stays)
+                detected = random.random() < (1.0 - _P_MISS if there else _P_FALSE)
+                _append(columns, stamp_s, name, kind, str(int(detected)), str(int(there)))
+    for name, (kind, _) in _THERE_DAYS.items():
+        _append(columns, (_WEEK_DAYS + 1) * _DAY_S, name, kind, "", "")
+    return columns
+
+
+def _append(columns: dict[str, list[str]], stamp_s: float, *cells: str) -> None:
+    for column, cell in zip(columns.values(), (f"{stamp_s:.0f}", *cells), strict=True):
+        column.append(cell)
+
+
+# ------------------------------------------- detections: a robot passes through a yard seven times a day
+
 RANGE_M = 12.0
 """How far the example's sensor sees, for `--range-m`."""
-_HOUR_S = 3600.0
 _DAYS, _PATROL_HOURS = 4, range(8, 21, 2)
 _STEP_S, _FRAMES, _SPEED_MPS = 0.5, 40, 1.5
 _P_DETECT, _P_CLUTTER, _SIGMA_M = 0.95, 0.05, 0.1
 _PLACES = tuple((x, y) for y in (-5.0, 5.0) for x in (3.0, 9.0, 15.0, 21.0, 27.0))
 _MEAN_STAY_H = {"pallet": 20.0, "cart": 5.0}
 _PILLARS = ((0.0, 8.0), (30.0, 8.0))
-_COMMENT = """\
+_ABOUT_DETECTIONS = """\
 Detections of objects in space: replace these rows by your own, in any order.
 stamp_s   seconds, of any clock; rows of one stamp are a frame
 x_m, y_m, z_m  where in the world; a row without is a frame in which nothing was detected, and as important
@@ -40,7 +97,7 @@ class _Stay(NamedTuple):
     end_h: float
 
 
-def write_example(path: str | Path) -> Path:
+def write_detections(path: str | Path) -> Path:
     """Write a commented table that `evermap track --range-m 12` takes as it is; the same bytes every time.
 
     Raises:
@@ -53,7 +110,7 @@ def write_example(path: str | Path) -> Path:
     for cells in _rows(np.random.default_rng(12)):
         for column, cell in zip(columns.values(), cells, strict=True):
             column.append(cell)
-    return write_new(path, csv_text(columns, comment=_COMMENT))
+    return write_new(path, csv_text(columns, comment=_ABOUT_DETECTIONS))
 
 
 def _rows(random: np.random.Generator) -> Iterator[tuple[str, ...]]:
