@@ -77,7 +77,8 @@ def scores(kind: str, seed: int) -> tuple[float, float, float]:
 
     def told() -> Iterator[Recording]:
         for row, (recording, elsewhere) in enumerate(zip(honest, other, strict=True)):
-            yield lie(recording, kind, elsewhere, rng) if row % ROBOTS == last else recording
+            drive = lie(recording, kind, elsewhere, rng) if row % ROBOTS == last else recording
+            yield replace(drive, robot=f"robot {row % ROBOTS}")
 
     found = entered(told(), honest)
     apart = [row for row in range(last, len(honest), ROBOTS) if row in found.set_aside or np.isnan(found.rmse_m[row])]

@@ -466,6 +466,7 @@ class Recording(Shown):
         warnings: counted, human-readable remarks of the reader ('3 detections of unknown barcodes dropped').
         source: where it was read from.
         landmark_names: texts behind the ids of landmarks that were given as such (`landmark_id_of`).
+        robot: whose session it is; '' where nobody said. A map keeps it with the revision, not with what was measured.
     """
 
     name: str
@@ -482,6 +483,7 @@ class Recording(Shown):
     source: str = ""
     clock: Clock = Clock.RECORDING
     landmark_names: Mapping[int, str] = field(default_factory=dict)
+    robot: str = ""
 
     def _facts(self) -> dict[str, Any]:
         return {
@@ -622,6 +624,7 @@ class SpatialRecording(Shown):
         landmark_names: texts behind the ids of landmarks that were given as such (`landmark_id_of`).
         symmetries: turns after which objects look the same, by the names of their classes; as
             `geometry.symmetry.Symmetry.generated` reads them.
+        robot: whose session it is, as of a `Recording`.
     """
 
     name: str
@@ -637,6 +640,7 @@ class SpatialRecording(Shown):
     clock: Clock = Clock.RECORDING
     landmark_names: Mapping[int, str] = field(default_factory=dict)
     symmetries: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    robot: str = ""
 
     @property
     def robot_sightings(self) -> None:

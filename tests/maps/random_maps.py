@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from evermap.maps.lives import EVERYWHERE, Life, Lives
-from evermap.maps.living import Evidence, LivingMap, Members, Places, Sites, Stays
+from evermap.maps.living import Evidence, LivingMap, Members, Metres, Places, Sites, Stays
 from evermap.sensing.sightlines import HEADINGS, SightLines, Views
 from evermap.survival import Exponential, GeneralPurpose, Mixture, PiecewiseConstantHazard, Weibull
 from evermap.types import UNKNOWN, ChangeKind, Clock, MapChange
@@ -111,6 +111,12 @@ def random_map(
         sites=replace(living.sites, p_kept=p_here * random.random(len(p_here))),
         stays=replace(living.stays, p_gone=ended * random.uniform(0.5, 1.0, len(ended))),
         sightlines=random_lines(random, living.places),
+        metres=Metres(
+            np.array([0, 2**52 + 1]),
+            random.normal(size=2) * 0.01,
+            random.uniform(1e-6, 1e-3, 2),
+            np.array([np.inf, 1e4]),
+        ),
         views=Views(
             random.integers(-40, 40, (30, 2)),
             random.integers(0, HEADINGS, 30),

@@ -331,7 +331,7 @@ def to_format_1(manifest: dict[str, Any]) -> None:
     columns, values = manifest["columns"], manifest["values"]
     manifest["format"] = 1
     for name in [*columns]:
-        if name.startswith(("sightlines.", "views.")) or name in ("sites.p_kept", "stays.p_gone"):
+        if name.startswith(("sightlines.", "views.", "metres.")) or name in ("sites.p_kept", "stays.p_gone"):
             del columns[name]
     for name in [*values]:
         if name.startswith(("sightlines.", "views.")) or name in ("log_size_information", "session_start_s"):

@@ -33,6 +33,7 @@ def fed(store: MapStore, recording: Recording) -> em.Entered:
         config=to_toml(Config()),
         stamp_from_s=float(stamps[0]),
         stamp_to_s=float(stamps[-1]),
+        robot=recording.robot,
     )
     store.commit(
         entered.living,
@@ -148,6 +149,17 @@ def test_a_late_session_that_was_overtaken_is_entered_again(tmp_path: Path) -> N
 
 def test_nor_in_a_database(site_address: str, in_order: LivingMap) -> None:
     assert_same(built(site_address, (3, 1, 0, 2)), in_order)
+
+
+def test_nor_whose_sessions_they_are(tmp_path: Path) -> None:
+    """Three robots, one of which reads ranges too long: a session that is replayed is that of its robot."""
+    whose = [replace(session, robot=f"robot {k % 3}") for k, session in enumerate(SESSIONS)]
+    told = whose[1].detections
+    whose[1] = replace(whose[1], detections=replace(told, range_m=1.05 * told.range_m))
+    late, wanted = (built(tmp_path / f"{order}.evermap", order, whose) for order in ((0, 3, 2, 1), (0, 1, 2, 3)))
+    assert_same(late, wanted)
+    np.testing.assert_array_equal(late.metres.log_metre, wanted.metres.log_metre)
+    assert late.metres.log_metre.tolist()[1] > 0.03
 
 
 def test_a_late_session_says_what_it_changed_and_what_was_brought_in_again(tmp_path: Path) -> None:

@@ -104,6 +104,7 @@ def read_mrclam(path: str | Path, robot: int | None = None) -> Recording:
         robot_sightings=sightings,
         source=str(path),
         clock=Clock.UNIX,
+        robot=f"robot {robot}",
     )
     return finish_recording(recording, warnings=warnings)
 

@@ -217,6 +217,24 @@ class Boxes(_Rows):
 
 
 @dataclass(frozen=True, slots=True)
+class Metres(_Rows):
+    """What the robots of a map, as far as sessions have names of theirs, say of its metre: (R,) rows.
+
+    Attributes:
+        robot_id: `landmark_id_of` the robot's name; 0 of the sessions that have none, and of a survey.
+        log_metre: log of the robot's metre over the map's, the mean of its sessions: positive where it reads ranges too
+            long.
+        log_variance: of the log of the robot's metre over the true one.
+        information: sum of the inverse variances of all sessions of which the robot's metre is the mean.
+    """
+
+    robot_id: IntArray
+    log_metre: FloatArray
+    log_variance: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class LivingMap(Shown):
     """All that is known of a place at one instant; what one session hands to the next.
 
@@ -230,6 +248,7 @@ class LivingMap(Shown):
             space.
         log_size_variance: variance of the log of the map's metre over the true one; 0 where a sensor knows the metre.
         log_size_information: sum of the inverse variances of that, of all sessions of which the metre is the mean.
+        metres: what each robot says of the metre, of which the map has what they agree on.
         lives: how long things of a class stay, stay away, and where they turn up again.
         sightlines: from where each place can be seen.
         views: from where the robot looked, and when.
@@ -251,6 +270,7 @@ class LivingMap(Shown):
     covariance_m2: JointCovariance = field(default_factory=lambda: np.zeros((0, 0)))
     log_size_variance: float = 0.0
     log_size_information: float = np.inf
+    metres: Metres = field(default_factory=Metres.empty)
     lives: Lives = field(default_factory=Lives)
     sightlines: SightLines = field(default_factory=SightLines.empty)
     views: Views = field(default_factory=Views.empty)

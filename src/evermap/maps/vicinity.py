@@ -88,6 +88,7 @@ class Vicinity:
             covariance_m2=self._covariance(part, places),
             log_size_variance=whole.log_size_variance,
             log_size_information=whole.log_size_information,
+            metres=whole.metres,
             sightlines=lines.like,
             views=views.like,
             sight=Sight(lines, views),

@@ -76,7 +76,6 @@ class Entered(Shown):
         *,
         command: str = "",
         wall_s: float = np.nan,
-        robot: str = "",
     ) -> int:
         """Commit the map as the next revision; returns its number.
 
@@ -85,7 +84,6 @@ class Entered(Shown):
             config: settings of the session, as `enter_session` was given them.
             command: the command line.
             wall_s: what estimating took.
-            robot: whose session it is.
 
         Raises:
             StaleRevisionError: another commit came in between.
@@ -104,7 +102,7 @@ class Entered(Shown):
             stamp_from_s=float(stamps[0]),
             stamp_to_s=float(stamps[-1]),
             wall_s=wall_s,
-            robot=robot,
+            robot=recording.robot,
         )
         return store.commit(
             self.living,
@@ -378,7 +376,7 @@ def _again(store: MapStore, step: _Step, living: LivingMap) -> tuple[LivingMap, 
     from evermap.maps.store.measured import unpack_recording
     from evermap.pipeline import run_session
 
-    recording = unpack_recording(store.attached(step.recording))
+    recording = replace(unpack_recording(store.attached(step.recording)), robot=step.revision.provenance.robot)
     try:
         session = run_session(recording, living, parse_config(step.revision.provenance.config))
     except DataError as error:

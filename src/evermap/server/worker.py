@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from evermap.config import Config
 from evermap.errors import EvermapError
@@ -90,7 +90,7 @@ class Worker:
 
     def _enter(self, job: Job, data: bytes) -> JobOutcome:
         try:
-            recording = recording_of(data, job.digest)
+            recording = replace(recording_of(data, job.digest), robot=job.robot)
             while True:
                 start = time.perf_counter()
                 try:
@@ -100,9 +100,7 @@ class Worker:
                         if not entered.session.found:
                             return JobOutcome(JobState.ASIDE, entered.session.set_aside[0], entered.parent)
                         took_s = time.perf_counter() - start
-                        number = entered.commit(
-                            store, self._config, command="evermap work", wall_s=took_s, robot=job.robot
-                        )
+                        number = entered.commit(store, self._config, command="evermap work", wall_s=took_s)
                         return JobOutcome(JobState.ENTERED, ", ".join(entered.session.slam.warnings[:3]), number)
                 except StaleRevisionError:  # somebody committed meanwhile: again, from the newest
                     continue

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -9,8 +12,19 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from evermap.geometry import se2
-from evermap.maps.sessions.gaussian import CONTRADICTS, WALK, log_ratio, settled
-from evermap.types import FloatArray
+from evermap.maps.living import LivingMap, Metres
+from evermap.maps.sessions.gaussian import (
+    AS_GOOD,
+    CONTRADICTS,
+    DRIFTED,
+    P_DRIFTED,
+    WALK,
+    agreed,
+    log_ratio,
+    settled,
+    settled_by,
+)
+from evermap.types import FloatArray, landmark_id_of
 
 
 def _by_all_sessions(ratio: list[float], shown: list[float], sigma: list[float]) -> FloatArray:
@@ -103,6 +117,108 @@ def test_a_robot_whose_metre_contradicts_the_others_does_not_make_the_map_longer
             assert np.log(found.session_factor) == pytest.approx(metre - own)
     assert abs(metre) < sigma
     assert set(contradicted[10:]) == {-1, liar}
+
+
+def _by_all_assignments(log_metre: FloatArray, sigma: FloatArray) -> tuple[float, FloatArray]:
+    """What `agreed` says, by each way in which some robots have drifted: products of Gaussians, integrated by hand."""
+    mass, mean, drifted = [], [], []
+    for share in AS_GOOD:
+        for has in product([False, True], repeat=len(sigma)):
+            which = np.array(has)
+            variance = np.where(which, (DRIFTED * sigma) ** 2, (share * sigma) ** 2 + WALK**2)
+            weight = 1.0 / variance
+            middle = float(weight @ log_metre / weight.sum())
+            chi2 = float(weight @ (log_metre - middle) ** 2)
+            likelihood = np.exp(-0.5 * chi2) / np.sqrt(np.prod(variance) * weight.sum())
+            mass.append(likelihood * np.prod(np.where(which, P_DRIFTED, 1.0 - P_DRIFTED)))
+            mean.append(middle)
+            drifted.append(which)
+    share_of = np.array(mass) / np.sum(mass)
+    return float(share_of @ np.array(mean)), np.asarray(share_of @ np.array(drifted, dtype=np.float64))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_robots_agree_on_is_the_mean_over_all_ways_in_which_some_have_drifted(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sigma = rng.uniform(0.01, 0.03, 5)
+    log_metre = 0.3 * sigma * rng.standard_normal(5)
+    log_metre[0] += 0.06 * (seed % 2)
+    middle, p_drifted = agreed(log_metre, sigma)
+    wanted, p_wanted = _by_all_assignments(log_metre, sigma)
+    assert middle == pytest.approx(wanted, abs=0.01 * sigma.min())
+    np.testing.assert_allclose(p_drifted, p_wanted, atol=0.005)
+
+
+@given(st.lists(st.floats(-0.1, 0.1), min_size=1, max_size=6), st.floats(-0.2, 0.2))
+def test_what_robots_agree_on_lies_between_them_and_moves_with_them(said: list[float], by: float) -> None:
+    log_metre, sigma = np.array(said), np.full(len(said), 0.02)
+    middle, _ = agreed(log_metre, sigma)
+    assert log_metre.min() - 1e-12 <= middle <= log_metre.max() + 1e-12
+    assert agreed(log_metre + by, sigma)[0] == pytest.approx(middle + by, abs=1e-9)
+    assert agreed(-log_metre, sigma)[0] == pytest.approx(-middle, abs=1e-9)
+    if len(said) == 2:  # nobody knows which of them is right
+        assert middle == pytest.approx(log_metre.mean(), abs=1e-9)
+
+
+def _fleet(robots: FloatArray, sigma: float, turns: int) -> tuple[float, LivingMap, set[int]]:
+    """Robots in turn, whose metres are `robots` too long: the log of the map's metre, and who is told in the end."""
+    metre = robots[0]
+    living = LivingMap(log_size_variance=sigma**2, log_size_information=1.0 / sigma**2)
+    names = ("", "one", "two", "three", "four")
+    told: set[int] = set()
+    for turn in range(1, turns):
+        k = turn % len(robots)
+        found, metres = settled_by((metre - robots[k], 1e-6), (0.0, sigma), living, names[k])
+        metre += np.log(found.map_factor)
+        assert np.log(found.session_factor) == pytest.approx(metre - robots[k], abs=1e-3)
+        living = replace(
+            living, log_size_variance=found.variance, log_size_information=found.information, metres=metres
+        )
+        if found.apart and turn >= turns - len(robots):
+            told.add(k)
+    return float(metre), living, told
+
+
+@pytest.mark.parametrize("liar", range(5))
+def test_the_metre_of_one_robot_is_told_by_the_agreement_of_the_others(liar: int) -> None:
+    """By 2.5 standard deviations of its priors, in each of its sessions, also where the map began with it."""
+    sigma, rng = 0.02, np.random.default_rng(liar)
+    robots = 0.05 * sigma * rng.standard_normal(5)
+    robots[liar] += 2.5 * sigma
+    metre, living, told = _fleet(robots, sigma, 40)
+    assert abs(metre) < 0.2 * sigma
+    assert told == {liar}
+    np.testing.assert_allclose(np.sort(living.metres.log_metre)[-1], 2.5 * sigma, atol=0.4 * sigma)
+
+
+def test_the_mean_of_robots_that_scatter_as_they_should_is_the_metre() -> None:
+    sigma = 0.02
+    metre, _, told = _fleet(sigma * np.array([-1.0, 1.0, 0.2, -0.5, 0.6]), sigma, 40)
+    assert metre == pytest.approx(0.06 * sigma, abs=0.15 * sigma)
+    assert not told
+
+
+def test_the_metre_of_one_robot_is_that_of_its_sessions_with_and_without_a_name() -> None:
+    sigma, rng = 0.02, np.random.default_rng(0)
+    first = Metres(*map(np.array, ([landmark_id_of("one")], [0.0], [sigma**2], [1.0 / sigma**2])))
+    named = LivingMap(log_size_variance=sigma**2, log_size_information=1.0 / sigma**2, metres=first)
+    variance, information = sigma**2, 1.0 / sigma**2
+    for shown in rng.normal(0.0, sigma, 8):
+        found, metres = settled_by((shown, 1e-6), (0.0, sigma), named, "one")
+        wanted = settled(shown, 1e-6, (0.0, sigma), variance, information)
+        assert (found.map_factor, found.session_factor) == (
+            pytest.approx(wanted.map_factor, abs=1e-15),
+            pytest.approx(wanted.session_factor, abs=1e-15),
+        )
+        assert (found.variance, found.off, found.apart) == (pytest.approx(wanted.variance), wanted.off, 0.0)
+        variance, information = wanted.variance, wanted.information
+        named = replace(named, log_size_variance=variance, log_size_information=information, metres=metres)
+
+
+def test_a_survey_knows_the_metre_better_than_a_robot() -> None:
+    found, metres = settled_by((0.05, 1e-6), (0.0, 0.02), LivingMap(), "one")
+    assert abs(np.log(found.map_factor)) < 0.1 * 0.05
+    assert len(metres) == 2
 
 
 @pytest.mark.parametrize("sigma", [0.005, 0.02, 0.1])

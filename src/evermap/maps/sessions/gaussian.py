@@ -14,16 +14,17 @@ import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import softmax
 
 from evermap.config import FitConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, of_places
 from evermap.geometry.group import PLANE, SPACE
 from evermap.geometry.rigid import rigid
-from evermap.maps.living import LivingMap
+from evermap.maps.living import LivingMap, Metres
 from evermap.slam.problem import Marginals
 from evermap.slam.streaming import Outcome
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray, landmark_id_of
 
 
 def with_session(
@@ -103,16 +104,17 @@ def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
     return np.asarray(covariance_m2 + drift_m**2 * np.eye(len(covariance_m2)))
 
 
-def resized(living: LivingMap, factor: float, log_size_variance: float, log_size_information: float) -> LivingMap:
+def resized(living: LivingMap, size: Size, metres: Metres) -> LivingMap:
     """Return the map longer by a factor, about its middle; how well its metre is known goes with it."""
     position = living.places.position_m
     middle = position.mean(axis=0)
     return replace(
         living,
-        places=replace(living.places, position_m=middle + factor * (position - middle)),
-        covariance_m2=factor**2 * of_places(living.covariance_m2, np.arange(len(position))),
-        log_size_variance=log_size_variance,
-        log_size_information=log_size_information,
+        places=replace(living.places, position_m=middle + size.map_factor * (position - middle)),
+        covariance_m2=size.map_factor**2 * of_places(living.covariance_m2, np.arange(len(position))),
+        log_size_variance=size.variance,
+        log_size_information=size.information,
+        metres=metres,
     )
 
 
@@ -218,6 +220,14 @@ WALK = 0.002
 """Standard deviation by which the log of a map's metre wanders in a session, as its landmarks are replaced."""
 CONTRADICTS = 4.0
 """Standard deviations by which the metre of a sound robot is not off that of many others: 1 in 16,000."""
+P_DRIFTED, DRIFTED = 0.05, 4.0
+"""Robots whose metre is not what their sensor is said to know, and by how many times that, as standard deviation."""
+AS_GOOD = np.geomspace(0.05, 1.0, 9)
+"""Robots of one map may know their metre better than is said, all by one factor, each of these as likely."""
+P_TOLD = 0.95
+"""Probability of a robot to have drifted from which on it is told."""
+UNHEARD = 1e-9
+"""Information on the metre of a robot of which the map has no session."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,6 +240,7 @@ class Size:
         variance: of the log of the map's metre, after the session.
         information: sum of the inverse variances of all sessions that the map's metre is the mean of.
         off: standard deviations by which they differ; beyond `CONTRADICTS`, the session has the map's size.
+        apart: log of the robot's metre over that of the robots together, where it has probably drifted; else 0.
     """
 
     map_factor: float
@@ -237,6 +248,7 @@ class Size:
     variance: float
     information: float
     off: float
+    apart: float = 0.0
 
 
 def settled(
@@ -270,6 +282,73 @@ def settled(
         information=before + after,
         off=off,
     )
+
+
+def settled_by(
+    shown: tuple[float, float], session: tuple[float, float], living: LivingMap, robot: str
+) -> tuple[Size, Metres]:
+    """Return both sizes after a session of a robot was compared with the map, and what each robot says since.
+
+    Errors of the metre are a robot's, alike in all its sessions. So each robot has the mean of its sessions, as
+    `settled` has it, and the map what its robots have together (`agreed`), however long each of them drives.
+
+    Args:
+        shown: the log of the map's size over that of the session, and its variance (`log_ratio`).
+        session: as of `settled`.
+        living: the map.
+        robot: whose session it is; '' where nobody said.
+    """
+    metres, name = living.metres, landmark_id_of(robot) if robot else 0
+    if not robot and not len(metres):
+        return settled(*shown, session, living.log_size_variance, living.log_size_information), metres
+    if not len(metres):  # sessions without a name, or a survey
+        metres = Metres(*map(np.array, ([0], [0.0], [living.log_size_variance], [living.log_size_information])))
+    if name not in metres.robot_id:
+        metres = metres.joined(Metres(*map(np.array, ([name], [0.0], [session[1] ** 2], [UNHEARD]))))
+    row = int(np.flatnonzero(metres.robot_id == name)[0])
+    log_metre, variance, information = (
+        column.copy() for column in (metres.log_metre, metres.log_variance, metres.information)
+    )
+    own = settled(shown[0] + log_metre[row], shown[1], session, variance[row], information[row])
+    log_metre[row] += np.log(own.map_factor)
+    variance[row], information[row] = own.variance, own.information
+    middle, p_drifted = agreed(log_metre, np.sqrt(variance))
+    size = Size(
+        map_factor=float(np.exp(middle)),
+        session_factor=float(own.session_factor * np.exp(middle - log_metre[row])),
+        variance=float(np.average(np.sqrt(variance), weights=1.0 / np.maximum(variance, WALK**2))) ** 2,
+        information=own.information,
+        off=own.off,
+        apart=float(log_metre[row] - middle) if p_drifted[row] > P_TOLD else 0.0,
+    )
+    return size, Metres(metres.robot_id, log_metre - middle, variance, information)
+
+
+def agreed(log_metre: FloatArray, sigma: FloatArray) -> tuple[float, FloatArray]:
+    """Return the metre that robots have together, and for each of them the probability that its own has drifted.
+
+    The metre of a robot is off by what its priors say, or, as robots of one make may agree better than that, by a
+    share of it that is one for all; that of a robot that has drifted, by some times more, whatever the share. Metre
+    (with a flat prior) and share are integrated over. So one robot in five that is off by no more than its priors
+    allow is told by the agreement of the others, and where robots scatter as they are said to, their mean counts.
+
+    Args:
+        log_metre: (R,) what each robot says.
+        sigma: (R,) standard deviations by its priors.
+    """
+    if len(log_metre) == 1:
+        return float(log_metre[0]), np.zeros(1)
+    sigma = np.maximum(sigma, WALK)
+    beyond = 2.0 * sigma.max()
+    metre = np.linspace(log_metre.min() - beyond, log_metre.max() + beyond, 1201)
+    squared = (log_metre - metre[:, None]) ** 2
+    variance = (AS_GOOD[:, None, None] * sigma) ** 2 + WALK**2
+    sound = np.log(1.0 - P_DRIFTED) - 0.5 * (np.log(variance) + squared / variance)
+    variance = (DRIFTED * sigma) ** 2
+    drifted = np.log(P_DRIFTED) - 0.5 * (np.log(variance) + squared / variance)
+    either = np.logaddexp(sound, drifted)
+    weight = softmax(either.sum(axis=2))
+    return float(weight.sum(axis=0) @ metre), np.einsum("sm,smr->r", weight, np.exp(drifted - either))
 
 
 def log_ratio(

@@ -15,17 +15,19 @@ from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
-from evermap.maps.living import EXISTS, Evidence, LivingMap, clique_rows
+from evermap.maps.living import EXISTS, Evidence, LivingMap, Metres, clique_rows
 from evermap.maps.sessions import believe, decide
 from evermap.maps.sessions.extend import Extended, Found, extended
 from evermap.maps.sessions.gaussian import (
     CONTRADICTS,
+    Size,
     drifted,
     log_ratio,
     of_unknown_size,
     own_landmarks,
     resized,
     settled,
+    settled_by,
 )
 from evermap.maps.sessions.looks import PlaceLooks, Sighting, Watch, arrivals, looked_at
 from evermap.maps.sessions.placing import Held, Laid, all_at_home, laid_over, refitted, unbent, with_glimpsed
@@ -49,6 +51,7 @@ from evermap.types import (
     Sensor,
     SlamResult,
     SpatialRecording,
+    landmark_id_of,
     rows_of,
 )
 
@@ -235,8 +238,6 @@ def refit(
     outcome, names = alone.outcome, alone.prepared.landmark_id
     size = outcome.scale
     if outcome.log_scale_sigma > 0.0:
-        # a part does not change the metre of the rest
-        information = np.inf if part else living.log_size_information
         own = own_landmarks(outcome, config.fit)
         _, mine, theirs = np.intersect1d(names[own.row], where.landmark_id[where.place >= 0], return_indices=True)
         places = where.place[where.place >= 0][theirs]
@@ -246,11 +247,14 @@ def refit(
             living.places.position_m[places],
             drifted(of_places(living.covariance_m2, places), where.drift_m),
         )
-        found = settled(*shown, (0.0, outcome.log_scale_sigma), living.log_size_variance, information)
-        if not part:
-            living = resized(living, found.map_factor, found.variance, found.information)
+        own_metre = 0.0, outcome.log_scale_sigma
+        if part:  # it does not change the metre of the rest
+            found = settled(*shown, own_metre, living.log_size_variance, np.inf)
+        else:
+            found, metres = settled_by(shown, own_metre, living, alone.recording.robot)
+            living = resized(living, found, metres)
         size *= found.session_factor
-        alone = _remarked(alone, shown[0], found.off)
+        alone = _remarked(alone, shown[0], found)
 
     def in_map(where: Laid) -> tuple[Outcome, bool]:
         stand = np.flatnonzero(where.place >= 0)
@@ -283,14 +287,16 @@ def refit(
     return living, where, replace(alone, outcome=solved)
 
 
-def _remarked(alone: Solved, log_ratio: float, off: float) -> Solved:
-    """A session with a remark where its metre contradicts the map's."""
-    if off <= CONTRADICTS:
+def _remarked(alone: Solved, log_ratio: float, found: Size) -> Solved:
+    """A session with a remark where its metre contradicts the map's, or its robot's those of the others."""
+    contradicts = found.off > CONTRADICTS
+    if not (contradicts or found.apart):
         return alone
-    longer = f"{abs(log_ratio):.1%} {'shorter' if log_ratio > 0.0 else 'longer'}"
+    off, than = (-log_ratio, "the map's") if contradicts else (found.apart, "that of all robots of the map together")
+    by = f"{found.off:.1f} standard deviations" if contradicts else "more than these differ"
     remark = (
-        f"its metre is {longer} than the map's, {off:.1f} standard deviations: its ranges or its odometer have "
-        "drifted; it is entered in the metres of the map"
+        f"its metre is {abs(off):.1%} {'shorter' if off < 0.0 else 'longer'} than {than}, {by}: its ranges or its "
+        "odometer have drifted; it is entered in the metres of the map"
     )
     return replace(alone, prepared=replace(alone.prepared, warnings=(*alone.prepared.warnings, remark)))
 
@@ -422,6 +428,9 @@ def entered(
         variance = visit.outcome.log_scale_sigma**2
         information = 1.0 / variance if variance > 0.0 else np.inf
         living = replace(living, log_size_variance=variance, log_size_information=information)
+        if robot := visit.recording.robot:
+            first = [landmark_id_of(robot)], [0.0], [variance], [information]
+            living = replace(living, metres=Metres(*map(np.array, first)))
     return extended(living, p_site, found, config, 0.0 if where is None else where.drift_m)
 
 

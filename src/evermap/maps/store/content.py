@@ -52,7 +52,8 @@ MEMBERS = "members."
 """The table that stays of a pruned revision: whose evidence it has, and what operators said."""
 _LIFE = ("lives.life", "lives.prior")
 _NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s", "places.rotation",
-          "places.rotation_covariance", "boxes.landmark_id", "boxes.size_m")  # fmt: skip
+          "places.rotation_covariance", "boxes.landmark_id", "boxes.size_m", "metres.robot_id",
+          "metres.log_metre", "metres.log_variance", "metres.information")  # fmt: skip
 """Not written where there is none, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
@@ -305,6 +306,7 @@ _EQUALLY_LONG = {
     "stays": tuple(item.name for item in fields(Stays)),
     "dated": ("site_id", "stamp_s"),
     "boxes": ("landmark_id", "size_m"),
+    "metres": ("robot_id", "log_metre", "log_variance", "information"),
     "lives": ("class_id", "chunk", "life"),
     "sightlines": ("site_id", "landmark_id", "cell", "hits", "looks"),
     "views": ("cell", "heading", "stamp_s", "frames"),
@@ -324,7 +326,7 @@ _FINITE = (
     "places.position_m", "stays.position_m", "log_size_variance", "dated.stamp_s", "lives.chunk_m",
     "sightlines.cell_m", "sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown",
     "boxes.size_m", "views.cell_m", "views.stamp_s", "views.frames", "stays.first_s", "stays.last_s",
-    "sites.since_s", "sites.seen_s",
+    "sites.since_s", "sites.seen_s", "metres.log_metre", "metres.log_variance",
 )  # fmt: skip
 _NUMBERS = ("stays.elsewhere_s", "stays.gone_s", "lives.looks_s", "stamp_s", "session_start_s")
 _PROBABILITIES = ("sites.p_here", "sites.p_kept", "stays.p_gone")
@@ -422,7 +424,7 @@ def _flaws_of_values(living: LivingMap) -> Iterator[str]:
         values = attrgetter(column)(living)
         if not np.all((values >= 0.0) & (values <= 1.0 + 1e-6)):
             yield f"'{column}' is not a probability"
-    if not living.log_size_information > 0.0:
+    if not (living.log_size_information > 0.0 and np.all(living.metres.information > 0.0)):
         yield "'log_size_information' is not positive"
     if any(np.any(attrgetter(column)(living) < 0.0) for column in _COUNTS):
         yield "a negative count in 'sightlines' or 'views'"
