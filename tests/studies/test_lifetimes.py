@@ -19,7 +19,7 @@ from evermap.survival import Weibull
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.views import View
 from evermap.types import UNKNOWN
-from evermap_studies.lifetimes import truth
+from evermap_studies.lifetimes import figures, truth
 from evermap_studies.lifetimes.moving import track
 from evermap_studies.lifetimes.rooms import as_values, study_rooms
 from evermap_studies.lifetimes.study import Settings, reproduce
@@ -207,8 +207,11 @@ def test_everything_is_written(results) -> None:
     assert f"| forklift | {parked['stays']} |" in text
 
 
-def test_same_seed_same_numbers(results, tmp_path: Path) -> None:
+def test_same_seed_same_numbers(results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _, table, _, settings = results
+    for name in ("draw_scene", "draw_moving", "draw_truth", "draw_coverage"):  # drawn above
+        monkeypatch.setattr(figures, name, lambda *_: None)
+    monkeypatch.setattr("evermap_studies.frame.save_all", lambda *_: None)
     again = reproduce(tmp_path / "out", settings)
     assert again["truth"] == table["truth"]
     assert again["moving"] == table["moving"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,14 @@ from evermap_studies.demo.truth import truth_of
 SCENARIO = Scenario(days=2, patrol_lengths_s=(40.0, 60.0), wing_opens_day=1, change_rate=3.0)
 SEED = 3
 FILES = ("trajectory.tum", "online.tum", "map.geojson", "true_events.jsonl", "changes.jsonl")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def nothing_is_timed() -> Iterator[None]:
+    """Kernels need not be compiled before the first session: a slow test below looks at that, in its own process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("evermap_studies.demo.study._compile", lambda: None)
+        yield
 
 
 @pytest.fixture(scope="module")
