@@ -81,6 +81,16 @@ def test_a_lone_detection_is_no_newer_than_the_time_that_errors_last() -> None:
     assert found.share[row] < 0.3
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_two_landmarks_of_a_map_are_enough_beside_an_odometry_that_hardly_drifts(seed: int) -> None:
+    """By their positions alone everything may turn about the line between them."""
+    room = Room.of(seed, ("mug",), 2)
+    recording = lasting(room.walk(seed, drift=1e-4, n_frames=1000), 0.06, 20.0)
+    found = compare_with_truth(recording, run_slam(recording, prior_map=room.map().as_prior(0.02)), rate_hz=10.0)
+    assert found.poses is not None
+    assert found.poses.rmse_m < 0.001  # after alignment
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_ranges_that_are_far_worse_than_directions_do_not_move_things(seed: int) -> None:
     """Sizes in an image tell ranges: here by 10 % each, and all 8 % too long. Things are where the directions meet."""

@@ -280,7 +280,7 @@ def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched) -> Spatia
     sigma[:, :3] = np.sqrt(own + DRIFT_M**2)[:, None]
     sigma[:, 2] = np.hypot(sigma[:, 2], HEIGHT_M)
     prior = PlacePrior(row, pose, sigma, matched.probability[row])
-    problem = replace(optimum.smoother.problem, prior=prior, start_sigma=np.full(6, FREE), steady=True)
+    problem = replace(optimum.smoother.problem, prior=prior, start_sigma=FREE, steady=True)
     noise, found = optimum.noise, optimum
     for translation, rotation in ((0.0, 0.0), *WANDERS):
         if translation <= noise.translation and translation > 0.0:

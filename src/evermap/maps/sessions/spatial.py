@@ -394,5 +394,5 @@ def _held(visit: SpatialVisit, living: LivingMap, where: Laid) -> SpatialOptimum
     sigma[turned, 3:] = np.sqrt(spread[turned] + DRIFT_RAD**2)[:, None]
     sigma[:, 3:][unseen > 0.0] = ANY_RAD
     prior = PlacePrior(row.astype(np.int64), pose, sigma, np.ones(len(row)))
-    problem = replace(problem, prior=prior, start_sigma=np.full(6, FREE))
+    problem = replace(problem, prior=prior, start_sigma=FREE)
     return converged(problem, optimum.estimate, optimum.noise, heavy_rounds=0)

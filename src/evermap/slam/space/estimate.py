@@ -109,7 +109,9 @@ def _level(before: float, start: float, total: float, count: float) -> float:
 
 
 def _traces(smoother: SpatialSmoother, of_factors: FloatArray, first: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Diagonals of `A S A'` of odometry (N - 1, 6) and detections (M, 8); weighted, as the Jacobians are."""
+    """Diagonals of `A S A'` of odometry (N - 1, 6) and detections (M, 8); weighted, as the Jacobians are: leverages, which
+    are in [0, 1] but for rounding.
+    """
     problem = smoother.problem
     n_steps, kind = len(problem.increment), problem.kind
     steps = of_factors[: 36 * n_steps].reshape(n_steps, 6, 6)
@@ -119,7 +121,7 @@ def _traces(smoother: SpatialSmoother, of_factors: FloatArray, first: IntArray) 
         some, rows = kind == k, int(ROWS[k])
         at = begin[some][:, None] + (rows + 1) * np.arange(rows)
         found[some, :rows] = of_factors[at]
-    return np.einsum("nii->ni", steps), found
+    return np.clip(np.einsum("nii->ni", steps), 0.0, 1.0), np.clip(found, 0.0, 1.0)
 
 
 def as_seen(problem: SpatialProblem, estimate: SpatialEstimate, measured: FloatArray) -> FloatArray:

@@ -24,8 +24,9 @@ DRIVEN = SpatialNoise(pixel=2.0)
 """With odometry: metres and radians of drift for the square root of a second."""
 STEADY = 3e-4, 1e-5
 """The same of odometry that is believed."""
-FREE = 1e3
-"""Deviation by which the first pose is held where a map says where it is [m, rad]."""
+FREE = np.repeat([1e3, ANY_RAD], 3)
+"""Deviation by which the first pose is held where a map says where it is [m, rad]; two points of a map leave a turn about
+the line between them to it, and a turn by a thousand radians would drown what the odometry knows in rounding."""
 LOOSE_M = 0.05
 """A given map is believed no better than this until it is known what stands."""
 MOST_TRIED = 200
@@ -141,7 +142,7 @@ def _with_map(
     # positions of a map are in its axes, those of tags in their own: all alike
     stated[:, :3] = stated[:, :3].max(axis=1, keepdims=True)
     prior = PlacePrior(place.astype(np.int64), pose, np.maximum(stated, LOOSE_M), np.ones(len(rows)))
-    return replace(problem, prior=prior, start_sigma=np.full(6, FREE)), stated, rows.astype(np.int64)
+    return replace(problem, prior=prior, start_sigma=FREE), stated, rows.astype(np.int64)
 
 
 def _likelier(
