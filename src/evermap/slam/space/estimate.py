@@ -109,8 +109,8 @@ def _level(before: float, start: float, total: float, count: float) -> float:
 
 
 def _traces(smoother: SpatialSmoother, of_factors: FloatArray, first: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Diagonals of `A S A'` of odometry (N - 1, 6) and detections (M, 8); weighted, as the Jacobians are: leverages, which
-    are in [0, 1] but for rounding.
+    """Diagonals of `A S A'` of odometry (N - 1, 6) and detections (M, 8); weighted, as the Jacobians are: leverages,
+    which are in [0, 1] but for rounding.
     """
     problem = smoother.problem
     n_steps, kind = len(problem.increment), problem.kind

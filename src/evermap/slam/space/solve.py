@@ -25,8 +25,8 @@ DRIVEN = SpatialNoise(pixel=2.0)
 STEADY = 3e-4, 1e-5
 """The same of odometry that is believed."""
 FREE = np.repeat([1e3, ANY_RAD], 3)
-"""Deviation by which the first pose is held where a map says where it is [m, rad]; two points of a map leave a turn about
-the line between them to it, and a turn by a thousand radians would drown what the odometry knows in rounding."""
+"""Deviation by which the first pose is held where a map says where it is [m, rad]. Two points of a map leave it a turn
+about the line between them; one by a thousand radians would drown what the odometry knows in rounding."""
 LOOSE_M = 0.05
 """A given map is believed no better than this until it is known what stands."""
 MOST_TRIED = 200
