@@ -229,22 +229,23 @@ def _pairings(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: B
     place = se2.transform(motion, source.place)
     gap = place[:, None] - target.place[None]
     s, t = np.nonzero(allowed & (np.linalg.norm(gap, axis=2) < NEAR_M))
-    turn = se2.rotation(motion[2])
-    n = len(s)
-    by_source = np.zeros((2 * n, len(source.covariance)))
-    by_target = np.zeros((2 * n, len(target.covariance)))
-    by_motion = np.zeros((2 * n, 3))
-    lever = place - place.mean(axis=0)
-    for k in range(n):
-        two = slice(2 * k, 2 * k + 2)
-        by_source[two, 2 * s[k] : 2 * s[k] + 2] = turn
-        by_target[two, 2 * t[k] : 2 * t[k] + 2] = np.eye(2)
-        by_motion[two] = [[1.0, 0.0, -lever[s[k], 1]], [0.0, 1.0, lever[s[k], 0]]]
-    covariance = by_source @ source.covariance @ by_source.T + by_target @ target.covariance @ by_target.T
-    covariance += (by_motion * MOTION_SIGMA**2) @ by_motion.T
+    turn, n = se2.rotation(motion[2]), len(s)
+    of_source = _blocks(source.covariance, s)
+    covariance = _blocks(target.covariance, t) + np.einsum("ij,kjml,nl->kimn", turn, of_source, turn)
+    lever = (place - place.mean(axis=0))[s]
+    by_motion = np.zeros((n, 2, 3))
+    by_motion[:, :, :2], by_motion[:, 0, 2], by_motion[:, 1, 2] = np.eye(2), -lever[:, 1], lever[:, 0]
+    around = (by_motion * MOTION_SIGMA**2).reshape(2 * n, 3) @ by_motion.reshape(2 * n, 3).T
     return Pairings(
-        s.astype(np.int64), t.astype(np.int64), gap[s, t], covariance, np.full(n, np.log(density)), len(source.place)
-    )
+        s.astype(np.int64), t.astype(np.int64), gap[s, t], covariance.reshape(2 * n, 2 * n) + around,
+        np.full(n, np.log(density)), len(source.place),
+    )  # fmt: skip
+
+
+def _blocks(covariance: FloatArray, rows: IntArray) -> FloatArray:
+    """(n, 2, n, 2) of some places, of a covariance (2 P, 2 P)."""
+    count = len(covariance) // 2
+    return covariance.reshape(count, 2, count, 2)[rows][:, :, rows]
 
 
 MIN_SIGHTINGS = 2

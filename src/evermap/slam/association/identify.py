@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -31,7 +33,9 @@ MOST_NAMED = 100
 FEW_DOUBTFUL = 0.02
 """Share of doubtful detections up to which who is who is not drawn by particles."""
 RUNS, MOST_ROUNDS, MOST_IN_VAIN = 4, 6, 2
-"""Draws of which one is settled, how often, and how often in a row without gain."""
+"""Draws of which some are settled, how often, and how often in a row without gain."""
+SETTLED = 120
+"""Landmarks of the draws that are settled in a round, at most, or one draw: then that takes no longer than to draw."""
 LITTLE_NATS = 0.035
 """A 200th of what a detection of no landmark costs: by which all detections are explained better, for each of them,
 before it is worth while to draw again."""
@@ -115,9 +119,9 @@ def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, k
 def searched(associator: Associator, assignment: Assignment, again: Callable[[FloatArray], Assignment]) -> Assignment:
     """Return what explains all detections best, by particles that start from the best so far, again and again.
 
-    Of `RUNS` draws the one that predicted the detections best is settled, and kept if it explains them better. Where it
-    does not, frame by frame is tried once more, with the noise of the odometry that the first pass tells. The search
-    ends where it gains little, or several times nothing.
+    Of `RUNS` draws those that predicted the detections best are settled, of many landmarks one, of few all; what then
+    explains them best is kept if it is better than before. Where it is not, frame by frame is tried once more, with the
+    noise of the odometry that the first pass tells. The search ends where it gains little, or several times nothing.
 
     Args:
         associator: which has seen all frames.
@@ -128,9 +132,11 @@ def searched(associator: Associator, assignment: Assignment, again: Callable[[Fl
     odometry = at_first = associator.learned_odometry(assignment)
     in_vain, asked = 0, False
     for k, seeds in enumerate(np.arange(MOST_ROUNDS * RUNS).reshape(-1, RUNS).tolist()):
-        draws = (drawn(assignment, odometry, seed, wider=WIDER[k % len(WIDER)]) for seed in seeds)
-        trial = associator.finish(max(draws, key=lambda draw: draw[1])[0])
-        against = associator.against(trial)
+        draw = functools.partial(drawn, assignment, odometry, wider=WIDER[k % len(WIDER)])
+        with ThreadPoolExecutor(len(seeds)) as pool:
+            draws = [each for each, _ in sorted(pool.map(draw, seeds), key=itemgetter(1), reverse=True)]
+        trials = [associator.finish(each) for each in draws[: max(1, SETTLED // max(draws[0].n_landmarks, 1))]]
+        against, trial = min(((associator.against(each), each) for each in trials), key=itemgetter(0))
         if against >= cost and not asked:
             trial, asked = again(at_first), True
             against = associator.against(trial)

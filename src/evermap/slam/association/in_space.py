@@ -509,11 +509,11 @@ class _Differing:
         new += np.where(both, self._turns(younger, older), -1.5 * math.log(2.0 * math.pi))
 
         def together(some: IntArray) -> FloatArray:
-            onto = np.zeros((len(some), 6, len(joint)))
-            np.put_along_axis(onto, np.repeat(at[some][:, None], 6, axis=1), by[some], axis=2)
-            onto[:, :, -1] = 0.0
+            used, column = np.unique(at[some], return_inverse=True)
+            onto = np.zeros((len(some), 6, len(used)))
+            np.put_along_axis(onto, np.repeat(column.reshape(len(some), 1, 12), 6, axis=1), by[some], axis=2)
             rows = onto[:, :dim].reshape(len(some) * dim, -1)
-            return np.asarray(rows @ joint @ rows.T + np.diag(idle[some, :dim].ravel()))
+            return np.asarray(rows @ joint[np.ix_(used, used)] @ rows.T + np.diag(idle[some, :dim].ravel()))
 
         new += 0.0 if dim == 6 else 1.5 * math.log(2.0 * math.pi)
         return Differences(gap[:, :dim], own[:, :dim, :dim], new, together)

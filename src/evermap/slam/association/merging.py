@@ -7,7 +7,7 @@ compared only. `consensus` weighs the candidates of a group of landmarks at the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -33,6 +33,8 @@ MIN_SIGHTINGS = 2
 """Detections of a landmark that is compared: one alone may be of nothing."""
 GROUP = 24
 """Landmarks, met one after the other, that are looked up in the rest of the map at the same time."""
+MOST_TOGETHER = 500
+"""Landmarks whose joint covariance is held for groups that are looked up one after the other."""
 MOST_PAIRS = 400
 """Pairs of a group that are weighed, those with most evidence by themselves."""
 MOST_NEAR = 80
@@ -60,6 +62,11 @@ class Differences:
     covariance: FloatArray
     log_density: FloatArray
     joint: Callable[[IntArray], FloatArray]
+
+    def part(self, begin: int, end: int) -> Differences:
+        """Return the pairs from one row to another."""
+        each = self.gap[begin:end], self.covariance[begin:end], self.log_density[begin:end]
+        return Differences(*each, lambda rows: self.joint(begin + rows))
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,16 +122,34 @@ def propose_merges(
     kept = np.array([(int(u), int(o)) not in refused for u, o in zip(younger, older, strict=True)], dtype=bool)
     kept &= alike(solution.kind[younger], solution.kind[older])
     younger, older = younger[kept], older[kept]
-    merges: list[tuple[int, int]] = []
     order = sources[np.argsort(solution.last_seen_s[sources], kind="stable")[::-1]]
+    groups = list[IntArray]()
     for begin in range(0, len(order), GROUP):
-        mine = np.isin(younger, order[begin : begin + GROUP])
+        of = np.isin(younger, order[begin : begin + GROUP])
         # a pair of two sources is looked at once, with the source that comes first
         later = order[begin + GROUP :]
-        mine |= np.isin(older, order[begin : begin + GROUP]) & np.isin(older, sources) & ~np.isin(younger, later)
-        if mine.any():
-            merges += _agreed(solution, younger[mine], older[mine], probability, last=last)
+        of |= np.isin(older, order[begin : begin + GROUP]) & np.isin(older, sources) & ~np.isin(younger, later)
+        groups.append(np.flatnonzero(of))
+    merges = list[tuple[int, int]]()
+    for some in _batches(groups, younger, older):
+        rows, first = np.concatenate(some), np.cumsum([0, *map(len, some)])
+        found = solution.differences(younger[rows], older[rows])
+        for mine, begin in zip(some, first.tolist(), strict=False):
+            part = found.part(begin, begin + len(mine))
+            merges += _agreed(solution, younger[mine], older[mine], part, probability, last=last)
     return _without_contradictions(sorted(set(merges)), solution.kind)
+
+
+def _batches(groups: list[IntArray], younger: IntArray, older: IntArray) -> Iterator[list[IntArray]]:
+    """Groups of rows of pairs, one after the other, as long as what they compare is few landmarks."""
+    some, there = list[IntArray](), np.zeros(0, dtype=np.int64)
+    for mine in groups:
+        more = np.union1d(there, np.append(younger[mine], older[mine]))
+        if some and len(more) > MOST_TOGETHER:
+            yield some
+            some, more = [], np.unique(np.append(younger[mine], older[mine]))
+        some, there = [*some, mine], more
+    yield some
 
 
 def _without_contradictions(merges: list[tuple[int, int]], kind: IntArray) -> list[tuple[int, int]]:
@@ -161,10 +186,9 @@ def _near(place: FloatArray, covariance: FloatArray, sources: IntArray, targets:
 
 
 def _agreed(
-    solution: Solution, younger: IntArray, older: IntArray, probability: float, *, last: bool
+    solution: Solution, younger: IntArray, older: IntArray, found: Differences, probability: float, *, last: bool
 ) -> list[tuple[int, int]]:
     """Pairs (younger, older) of a group that are one for certain."""
-    found = solution.differences(younger, older)
     gap, own = found.gap, found.covariance
     squared = np.einsum("ki,ki->k", gap, np.linalg.solve(own, gap[..., None])[..., 0])
     together, in_turn = (entries(each, younger, older) for each in (solution.together, solution.in_turn))

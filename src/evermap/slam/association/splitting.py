@@ -20,6 +20,9 @@ from evermap.types import BoolArray, FloatArray, IntArray
 LEAST_M2 = 1e-6
 """Information [1/m^2] of what ties a visit to nothing else."""
 
+TOGETHER = 32
+"""Visits that are weighed at a time."""
+
 
 class Visits(NamedTuple):
     """Stretches of time in which a landmark was seen, of landmarks that have several; V of them.
@@ -64,25 +67,36 @@ def weighed_visits(
     every = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
     every = [every[k] for k in np.flatnonzero(wanted[of])]
     landmark = np.array([row[visit[0]] for visit in every], dtype=np.int64)
-    squared, evidence = np.empty(len(every)), np.empty(len(every))
-    shared = 2.0 * assignment.shared_variance
-    for k, visit in enumerate(every):
-        gap, own = _apart(linear[visit], pose[visit], int(landmark[k]), marginals)
-        own = own + shared[landmark[k]] * np.eye(2)
-        squared[k] = gap @ np.linalg.solve(own, gap)
-        evidence[k] = -0.5 * (squared[k] + np.linalg.slogdet(2.0 * np.pi * own)[1]) - math.log(density)
+    shared = 2.0 * assignment.shared_variance[landmark]
+    gap, own = np.empty((len(every), 2)), np.empty((len(every), 2, 2))
+    for at in range(0, len(every), TOGETHER):
+        some = slice(at, at + TOGETHER)
+        gap[some], own[some] = _apart(linear, pose, every[some], landmark[some], marginals)
+    own += shared[:, None, None] * np.eye(2)
+    squared = np.einsum("va,va->v", gap, np.linalg.solve(own, gap[:, :, None])[:, :, 0])
+    evidence = -0.5 * (squared + np.linalg.slogdet(2.0 * np.pi * own)[1]) - math.log(density)
     return Visits([used[visit] for visit in every], landmark, squared, evidence)
 
 
-def _apart(linear: FloatArray, pose: IntArray, landmark: int, marginals: Marginals) -> tuple[FloatArray, FloatArray]:
-    """(2,) from a visit's landmark to that of the others, were they two, and its covariance (2, 2)."""
-    poses, at = np.unique(pose, return_inverse=True)
-    n, tie = 3 * len(poses), linear[:, :, 3:5]
-    tied = np.einsum("kra,krb->kab", linear[:, :, :10], tie)
-    through = np.zeros((n + 11, 2))
-    np.add.at(through[:n].reshape(-1, 3, 2), at, tied[:, :3])
-    through[n : n + 7] = tied[:, 3:].sum(axis=0)
-    explained = marginals.joint(np.array([landmark]), poses=poses, states=True, by=through.T)
-    information = through[n : n + 2] - explained + LEAST_M2 * np.eye(2)
-    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    return covariance @ np.einsum("kra,kr->a", tie, linear[:, :, 10]), covariance
+def _apart(
+    linear: FloatArray, pose: IntArray, visits: list[IntArray], landmark: IntArray, marginals: Marginals
+) -> tuple[FloatArray, FloatArray]:
+    """(V, 2) from each visit's landmark to that of the others, were they two, and the covariances (V, 2, 2)."""
+    rows, of = np.concatenate(visits), np.repeat(np.arange(len(visits)), [len(visit) for visit in visits])
+    (poses, at), (places, which) = (np.unique(each, return_inverse=True) for each in (pose[rows], landmark))
+    tie, n = linear[rows][:, :, 3:5], 3 * len(poses)
+    tied = np.einsum("kra,krb->kba", linear[rows][:, :, :10], tie)
+    through = np.zeros((len(visits), 2, n + 2 * len(places) + 9))
+    for b in range(3):
+        np.add.at(through, (of[:, None], np.arange(2), 3 * at[:, None] + b), tied[:, :, b])
+    own = np.zeros((len(visits), 2, 7))
+    np.add.at(own, of, tied[:, :, 3:])
+    for b in range(2):
+        through[np.arange(len(visits)), :, n + 2 * which + b] = own[:, :, b]
+    through[:, :, n + 2 * len(places) : n + 2 * len(places) + 5] = own[:, :, 2:]
+    joint = marginals.joint(places, poses=poses, states=True, by=through.reshape(2 * len(visits), -1))
+    explained = joint.reshape(len(visits), 2, len(visits), 2)[np.arange(len(visits)), :, np.arange(len(visits))]
+    covariance = np.asarray(np.linalg.inv(own[:, :, :2] - explained + LEAST_M2 * np.eye(2)), dtype=np.float64)
+    force = np.zeros((len(visits), 2))
+    np.add.at(force, of, np.einsum("kra,kr->ka", tie, linear[rows][:, :, 10]))
+    return np.einsum("vab,vb->va", covariance, force), covariance
