@@ -222,19 +222,21 @@ class Associator:
         if gained + _twice(now).sum() > _twice(again.assignment).sum():
             self._go_on_from(again)
 
-    def finish(self, begun: Assignment | None = None) -> Assignment:
+    def finish(self, begun: Assignment | None = None, *, goal: float = math.inf) -> Assignment:
         """Settle everything processed so far, and mend what was associated wrongly.
 
         Args:
             begun: who is who to begin with, of the same detections; None for what `step` found.
+            goal: a cost, as of `against`; what will not reach it is given up.
         """
         refused: set[tuple[int, int]] = set()
+        total = math.inf
         if begun is None:
             begun = self._assignment()
         else:
             self._sigma = begun.measured.sigma_given
         solved = self._relaid(self._contradictions_split(self._settled(begun), refused))
-        for _ in range(LAST_ROUNDS):
+        for left in reversed(range(LAST_ROUNDS)):
             before = solved.assignment
             again = reassigned(before, solved.marginals.explained_detections, density=self._density_m2)
             again = with_overlooked(again)
@@ -242,7 +244,10 @@ class Associator:
             count = min(before.n_landmarks, again.n_landmarks)
             changed = np.mean(_partners(before.landmark_row) != _partners(again.landmark_row))
             solved = self._contradictions_split(self._settled(again), refused)
-            if changed <= SAME_SHARE and solved.assignment.n_landmarks == before.n_landmarks == count:
+            total, last = self._total(solved), total
+            hopeless = total - left * (last - total) > goal
+            same = changed <= SAME_SHARE and solved.assignment.n_landmarks == before.n_landmarks == count
+            if hopeless or same:
                 break
         assignment = solved.assignment
         assignment = assignment.without(_seldom(assignment))
@@ -279,9 +284,14 @@ class Associator:
             assignment: what `finish` returned, of this associator or another one of the same recording.
         """
         assignment = self._solved(assignment).assignment
-        solved = self._solved(replace(assignment, measured=self._with_sigma(assignment.measured)))  # its own noise
+        measured = self._with_sigma(assignment.measured)  # its own noise
+        return self._total(self._solved(replace(assignment, measured=measured)))
+
+    def _total(self, solved: _Solved) -> float:
+        """`against` under the noise that it was solved with."""
+        assignment = solved.assignment
         nobody = np.count_nonzero(assignment.landmark_row == NOBODY)
-        fit = solved.cost + float(np.log(solved.assignment.measured.sigma_given).sum())
+        fit = solved.cost + float(np.log(assignment.measured.sigma_given).sum())
         told = float(_twice(assignment).sum()) + FEW_NATS * assignment.n_landmarks
         return fit + self.noise.outlier_log_odds * nobody + told
 

@@ -135,7 +135,8 @@ def searched(associator: Associator, assignment: Assignment, again: Callable[[Fl
         draw = functools.partial(drawn, assignment, odometry, wider=WIDER[k % len(WIDER)])
         with ThreadPoolExecutor(len(seeds)) as pool:
             draws = [each for each, _ in sorted(pool.map(draw, seeds), key=itemgetter(1), reverse=True)]
-        trials = [associator.finish(each) for each in draws[: max(1, SETTLED // max(draws[0].n_landmarks, 1))]]
+        settled = max(1, SETTLED // max(draws[0].n_landmarks, 1))
+        trials = [associator.finish(each, goal=cost) for each in draws[:settled]]
         against, trial = min(((associator.against(each), each) for each in trials), key=itemgetter(0))
         if against >= cost and not asked:
             trial, asked = again(at_first), True
