@@ -355,6 +355,22 @@ def test_the_map_is_moved_and_asked_by_finger_and_by_key(site: Site, browser: Br
     browser.wait(f"{left} > {before}")
 
 
+def test_lifetimes_are_told_by_class_and_by_place(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["read"])
+    learned = site("GET", "/maps/ward/lifetimes").json()["lifetimes"]
+    assert browser.value("document.querySelectorAll('#lives tbody tr').length") == len(learned)
+    told = {**learned[0], "half_gone_s": 7200.0, "stays": 5, "stays_that_ended": 2, "class": "cart"}
+    browser.value(f"stays([{json.dumps({**told, 'chunk': [1, -2], 'chunk_m': 10.0})}])")
+    row = "[...document.querySelectorAll('#lives td')].map((one) => one.textContent)"
+    assert browser.value(row) == ["cart", "10 to 20 m, -20 to -10 m", "2.0 h", "5, 2"]
+    browser.value("document.querySelector('#lives button').click()")
+    drawn = browser.value(
+        "['x', 'y', 'width', 'height'].map((one) => document.querySelector('.tile').getAttribute(one))"
+    )
+    assert drawn == ["10", "10", "10", "10"]  # y of the picture falls
+
+
 @pytest.mark.parametrize("look", LOOKS)
 def test_everybody_can_read_it(site: Site, browser: Browser, look: str) -> None:
     axe = Path(os.environ.get("AXE", AXE))

@@ -215,6 +215,8 @@ def test_a_session_is_uploaded_entered_and_asked_about(fleet: Fleet, zips: list[
     for path in ("/maps/other/revisions", "/maps/ward/landmarks?revision=9", "/maps/ward/landmarks/nothing/why"):
         assert fleet("GET", path).status_code == 404, path
     file = fleet("GET", "/maps/ward/file?revision=1")
+    described = fleet("GET", "/openapi.json").json()["paths"]["/maps/{site}/file"]["get"]["responses"]["200"]
+    assert list(described["content"]) == [file.headers["Content-Type"]]
     (tmp_path / "first.evermap").write_bytes(file.content)
     assert verify_store(tmp_path / "first.evermap").sound
     with open_store(tmp_path / "first.evermap") as store, fleet.server.sites.store("ward") as served:
@@ -302,7 +304,8 @@ def test_an_operator_edits_reverts_and_approves(fleet: Fleet, zips: list[bytes])
     assert fleet("POST", "/maps/ward/delete", json={**said, "landmarks": ["nothing"]}).status_code == 422
     assert fleet("POST", "/maps/ward/revert", json={"revision": 1}).json()["revision"] == 3
     assert fleet("GET", "/maps/ward/file?approved=true").status_code == 404
-    assert fleet("POST", "/maps/ward/approve", json={"revision": 4}).status_code == 422
+    for wrong in (4, False, "2"):
+        assert fleet("POST", "/maps/ward/approve", json={"revision": wrong}).status_code == 422
     assert fleet("POST", "/maps/ward/approve", "approve", json={"revision": 2}).status_code == 200
     assert fleet("GET", "/maps").json()[0]["approved"]["who"] == "approve"
     assert (

@@ -223,6 +223,13 @@ _MISTAKES = {
     429: "too many requests",
     503: "the database does not answer",
 }
+
+
+def _as(media_type: str) -> dict[str, Any]:
+    """How an answer that is not JSON is described."""
+    return {"response_class": Response, "responses": {200: {"content": {media_type: {}}}}}
+
+
 router = APIRouter(responses={code: {"model": Detail, "description": what} for code, what in _MISTAKES.items()})
 
 
@@ -244,7 +251,7 @@ class HeldMap(BaseModel):
 class Chosen(BaseModel):
     """A revision that an operator chose."""
 
-    revision: int = Field(ge=0, le=2**31 - 1)
+    revision: int = Field(ge=0, le=2**31 - 1, strict=True)
     note: str = Field("", max_length=500)
 
 
@@ -311,13 +318,13 @@ def show_job(number: Annotated[int, Field(ge=0, le=2**31 - 1)], server: Answerin
     return asdict(_job(server, number))
 
 
-@router.get("/jobs/{number}/payload")
+@router.get("/jobs/{number}/payload", **_as("application/octet-stream"))
 def show_payload(number: Annotated[int, Field(ge=0, le=2**31 - 1)], server: Answering, _: Approver) -> Response:
-    """Return the zip of a session that waits or was refused."""
+    """Return the bytes of a session that waits or was refused, as they were uploaded."""
     data = server.database.payload(_job(server, number).id)
     if data is None:
         raise HTTPException(404, "its recording is in the map")
-    return Response(data, media_type="application/zip")
+    return Response(data, media_type="application/octet-stream")
 
 
 @router.post("/jobs/{number}/retry")
@@ -411,7 +418,7 @@ def lifetimes(request: Request, site: str, _: Reader, revision: AtRevision = Non
     return _told(request, site, told)
 
 
-@router.get("/maps/{site}/file")
+@router.get("/maps/{site}/file", **_as("application/vnd.sqlite3"))
 def map_file(
     request: Request, site: str, server: Answering, _: Reader, revision: AtRevision = None, approved: bool = False,
 ) -> Response:  # fmt: skip
@@ -522,7 +529,7 @@ def audit(
     return server.database.audit(most)
 
 
-@router.get("/maps/{site}/events")
+@router.get("/maps/{site}/events", **_as("text/event-stream"))
 async def events(
     request: Request, site: str, server: Answering, _: Reader, since: AtRevision = None,
     last_event_id: Annotated[str, Header()] = "",

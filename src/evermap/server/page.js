@@ -292,20 +292,30 @@ function compare(number, before) {
   show().catch((error) => say(error.message));
 }
 
+// Learned lifetimes; of a place, a button shows where that is.
+function stays(lifetimes) {
+  const place = ({ chunk, chunk_m: size }) => {
+    if (!chunk) return "everywhere";
+    const [x, y] = [chunk[0] * size, chunk[1] * size];
+    const mark = () => {
+      tile = { x, y: -y - size, width: size, height: size };
+      paint();
+      $("map").scrollIntoView({ block: "nearest" });
+    };
+    const text = `${x} to ${x + size} m, ${y} to ${y + size} m`;
+    return button(text, mark, `Show on the map: ${text}`);
+  };
+  table("lives", ["Class", "Where (x, y)", "Half are gone after", "Stays seen, ended"], lifetimes.map((one) =>
+    [one.class || "all", place(one), duration(one.half_gone_s), `${one.stays}, ${one.stays_that_ended}`]));
+}
+
 async function refresh(newest) {
-  const [log, lives] = await Promise.all([json(of("revisions")), json(of("lifetimes"))]);
+  const [log, learned] = await Promise.all([json(of("revisions")), json(of("lifetimes"))]);
   revisions = log;
   const head = revisions.length ? revisions[revisions.length - 1].revision : 0;
   $("revision").max = String(head);
   if (newest) $("revision").value = String(head);
-  const place = ({ chunk, chunk_m: size }) => {
-    if (!chunk) return "everywhere";
-    const [x, y] = [chunk[0] * size, chunk[1] * size];
-    const mark = () => { tile = { x, y: -y - size, width: size, height: size }; paint(); $("map").scrollIntoView({ block: "nearest" }); };
-    return button(`${x} to ${x + size} m, ${y} to ${y + size} m`, mark, `Show x ${x} to ${x + size} m, y ${y} to ${y + size} m on the map`);
-  };
-  table("lives", ["Class", "Where (x, y)", "Half are gone after", "Stays seen, ended"], lives.lifetimes.map((one) =>
-    [one.class || "all", place(one), duration(one.half_gone_s), `${one.stays}, ${one.stays_that_ended}`]));
+  stays(learned.lifetimes);
   await show();
 }
 
