@@ -776,7 +776,8 @@ def fuzzed(fleet: Fleet, asked: list[tuple[str, str, dict[str, Any]]], data: st.
             "revision": st.one_of(st.integers(), ODD),
         },
     )
-    content = data.draw(st.one_of(st.binary(max_size=40), body.map(json.dumps).map(str.encode)))
+    maps = st.lists(st.builds(held, ODD, st.sampled_from(["ENABLED", "DISABLED", ""]), ODD), max_size=3)
+    content = data.draw(st.one_of(st.binary(max_size=40), st.one_of(body, maps).map(json.dumps).map(str.encode)))
     answer = fleet(method, f"{path}?{text}", content=None if method == "GET" else content)
     assert answer.status_code < 500, (method, path, text, content, answer.text)
 
@@ -789,10 +790,15 @@ def test_no_question_is_a_defect(fleet: Fleet, zips: list[bytes]) -> None:
         said = json.dumps({"landmarks": ["1"], "note": note}).encode()
         assert fleet("POST", "/maps/ward/pin", content=said).status_code == status
         fleet("POST", "/maps/ward/unpin", content=said)
+    fleet("POST", "/maps/ward/approve", json={"revision": 1})
     paths = ("/audit", "/jobs", "/maps", "/maps/ward/revisions", "/maps/ward/landmarks/1/why")
     assert {fleet("GET", path).status_code for path in paths} == {200}
     assert fleet("GET", "/jobs?site=%00").status_code == 422
-    assert fleet("GET", "/maps/%00/revisions").status_code == 404
+    for path in ("revisions", "actions", "file?approved=true", "events"):
+        assert fleet("GET", f"/maps/%00/{path}").status_code == 404
+    assert fleet("PUT", "/robots/%00/maps", json=[]).status_code == 422
+    assert fleet("PUT", "/robots/1/maps", json=[held("\0", site="\0\u202e")]).status_code == 200
+    assert fleet("GET", "/maps/ward/actions?robot=%00").status_code in (404, 422)
     asked = [
         (method.upper(), path, operation)
         for path, methods in fleet.client.get("/openapi.json").json()["paths"].items()

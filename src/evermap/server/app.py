@@ -200,7 +200,7 @@ Reader = Annotated[str, _may(Role.READ)]
 Uploader = Annotated[str, _may(Role.UPLOAD)]
 Approver = Annotated[str, _may(Role.APPROVE)]
 Administrator = Annotated[str, _may(Role.ADMIN)]
-RobotName = Annotated[str, Field(min_length=1, max_length=100)]
+RobotName = Annotated[str, Field(pattern=r"^[^\x00-\x1f]{1,100}$")]
 OfSite = Annotated[str | None, Query(pattern=f"^{SITE.pattern}$")]
 AtRevision = Annotated[int | None, Query(ge=0, le=2**31 - 1)]
 Number = Annotated[float | None, Query(allow_inf_nan=False)]
@@ -424,13 +424,18 @@ def map_file(
 ) -> Response:  # fmt: skip
     """Return the map as one file, of a revision, of the approved one, or of the newest."""
     if approved:
-        chosen = server.database.approved(site)
-        if chosen is None:
-            raise HTTPException(404, "no revision of it is approved")
-        revision = chosen["revision"]
+        revision = _approved(server, site)
     found = server.sites.file(site, revision)
     told = {"X-Checksum-Sha256": found.sha256, "Content-Disposition": f'attachment; filename="{site}.evermap"'}
     return _tagged(request, found.data, found.tag, "application/vnd.sqlite3", **told)
+
+
+def _approved(server: Server, site: str) -> int:
+    server.sites.address(site)  # PostgreSQL takes no zero bytes, as what is no name may hold
+    chosen = server.database.approved(site)
+    if chosen is None:
+        raise HTTPException(404, "no revision of it is approved")
+    return int(chosen["revision"])
 
 
 @router.post("/maps/{site}/approve")
@@ -450,10 +455,7 @@ def actions(request: Request, site: str, server: Answering, _: Reader, robot: Ro
 
     Of a robot that is named, only what it still lacks, by the maps that it said it holds.
     """
-    chosen = server.database.approved(site)
-    if chosen is None:
-        raise HTTPException(404, "no revision of it is approved")
-    number = chosen["revision"]
+    number = _approved(server, site)
     told = [one for item in server.database.robots() if item["robot"] == robot for one in item["maps"]]
     held = {one["mapStatus"] for one in told if (one["mapId"], one["mapVersion"]) == (site, str(number))}
     which = {"mapId": site, "mapVersion": str(number)}
