@@ -38,7 +38,7 @@ test: $(DEVELOPMENT)
 browser: $(DEVELOPMENT)
 	@command -v chromium-headless-shell >/dev/null || command -v chromium >/dev/null || command -v google-chrome >/dev/null \
 	  || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
-	       && echo "installing chromium-headless-shell" && apt-get -qq update >/dev/null \
+	       && echo "installing chromium-headless-shell" && apt-get -qq -o Acquire::Retries=0 -o Acquire::http::Timeout=20 update >/dev/null \
 	       && DEBIAN_FRONTEND=noninteractive apt-get -qq install --yes --no-install-recommends chromium-headless-shell >/dev/null; } \
 	  || { echo "the tests of the page need a Chromium; on Debian: sudo apt-get install chromium-headless-shell" >&2; exit 1; }
 	@$(VENV)/bin/python -m pip download --quiet --disable-pip-version-check --no-deps --dest out/browser axe-playwright-python==0.1.8
@@ -90,7 +90,7 @@ $(VENV)/bin/python:
 	@$(PYTHON) -m venv $(VENV) >/dev/null 2>&1 \
 	  || { rm -rf $(VENV); $(PYTHON) -m virtualenv --quiet $(VENV) >/dev/null 2>&1; } \
 	  || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
-	       && echo "installing python3-venv" && apt-get -qq update >/dev/null \
+	       && echo "installing python3-venv" && apt-get -qq -o Acquire::Retries=0 -o Acquire::http::Timeout=20 update >/dev/null \
 	       && DEBIAN_FRONTEND=noninteractive apt-get -qq install --yes python3-venv >/dev/null \
 	       && rm -rf $(VENV) && $(PYTHON) -m venv $(VENV); } \
 	  || { rm -rf $(VENV); echo "evermap needs Python's venv module; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
