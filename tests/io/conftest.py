@@ -79,7 +79,7 @@ def space() -> Files:
         "truth.csv": "stamp_s,x_m,y_m,z_m,qx,qy,qz,qw\n" + "0,0,0,0,0,0,0,1\n1,0.4,0,0,0,0,0,-1\n",
         "landmarks.csv": "landmark_id,x_m,y_m,z_m,qx,qy,qz,qw,sigma_m,sigma_rad,tag_size_m,class_id\n"
         f"door,1,2,3,0,{turn},0,{turn},0.1,0.2,0.3,tag\n7,4,5,6,,,,,,,,pole\n",
-        "sensor.toml": '[recording]\nname = "hall"\nclock = "unix"\n[limits]\nrange_max_m = 20\n'
+        "sensor.toml": '[recording]\nname = "hall"\nrobot = "lift 2"\nclock = "unix"\n[limits]\nrange_max_m = 20\n'
         "[noise]\nsigma_m = 0.05\n[mount]\nz_m = 0.5\nqx = 0.0\nqy = 0.0\nqz = 1.0\nqw = 0.0\n"
         "[detection]\np_detect = 0.8\n",
     }

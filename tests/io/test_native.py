@@ -188,6 +188,7 @@ def recordings(draw: st.DrawFn) -> Recording:
     )
     return Recording(
         name=draw(st.text(max_size=10).filter(str.isprintable)),
+        robot=draw(st.text(max_size=10).filter(str.isprintable)),
         odometry=Odometry(
             stamps(odometry_count), *(column(odometry_count, -900, 900) for _ in range(3)), clock=clock
         ),

@@ -80,6 +80,7 @@ def assert_equal(a: Any, b: Any, where: str = "recording") -> None:
 def test_every_column_arrives(lay_out: Callable, space: Files) -> None:
     recording = read(lay_out, space)
     assert recording.name == "hall"
+    assert recording.robot == "lift 2"
     assert recording.clock == "unix"
     assert recording.warnings == ()
     turn = np.sqrt(0.5)

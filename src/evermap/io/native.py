@@ -110,6 +110,7 @@ def _planar_recording(
         class_names=class_names,
         source=source,
         clock=clock,
+        robot=settings.robot,
         landmark_names=names,
     )
     return finish_recording(recording, warnings=warnings)

@@ -126,6 +126,7 @@ def spatial_recording(
         class_names=class_names,
         source=source,
         clock=settings.clock,
+        robot=settings.robot,
         landmark_names=names,
         symmetries=rig.symmetries,
     )

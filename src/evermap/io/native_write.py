@@ -156,6 +156,7 @@ def _called(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
 def _settings(recording: Recording | SpatialRecording) -> Settings:
     return Settings(
         name=recording.name,
+        robot=recording.robot,
         clock=recording.clock,
         frames_complete=recording.frames.complete,
         class_names=_class_names(recording),

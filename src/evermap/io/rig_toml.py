@@ -14,7 +14,7 @@ from evermap.errors import suggestion
 from evermap.geometry import se3
 from evermap.geometry.symmetry import HINT, Symmetry
 from evermap.io.files import FileSet
-from evermap.io.sensor_toml import FORMAT_VERSION, Settings, TomlReader, toml_string, toml_text
+from evermap.io.sensor_toml import Settings, TomlReader, recording_section, toml_string, toml_text
 from evermap.io.spatial import AT, QUATERNION
 from evermap.types import FloatArray, IntArray, Sensor, SpatialSensor, landmark_id_of
 from evermap.valid import CAMERA_MODELS
@@ -95,13 +95,7 @@ def rig_toml(
     sensors: Sequence[SpatialSensor], settings: Settings, symmetries: Mapping[str, tuple[str, ...]]
 ) -> dict[str, str]:
     """Return the texts of the files, by name, from which `read_rig` makes sensors, settings and symmetries again."""
-    about = {
-        "format_version": FORMAT_VERSION,
-        "name": settings.name,
-        "clock": settings.clock.value,
-        "frames_complete": settings.frames_complete,
-        "class_names": settings.class_names or None,
-    }
+    about = recording_section(settings)
     sections: dict[str, dict[str, Any]] = {}
     for sensor in sensors:
         is_camera = sensor.intrinsics is not None

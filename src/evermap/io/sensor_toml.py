@@ -31,7 +31,7 @@ _LIMITS: dict[str, dict[str, tuple[float, float]]] = {
     "sensor": {"sigma_scale": (0.0, 1.0), "sigma_offset_m": (0.0, 1e3), "sigma_angle_rad": (0.0, 2 * pi)},
     "odometry": {"sigma_odometer_scale": (0.0, 1.0), "sigma_askew_rad": (0.0, 2 * pi)},
 }
-_RECORDING = ("format_version", "name", "clock", "frames_complete", "class_names")
+_RECORDING = ("format_version", "name", "robot", "clock", "frames_complete", "class_names")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +39,7 @@ class Settings:
     """Content of `sensor.toml`; None where the file says nothing."""
 
     name: str | None = None
+    robot: str = ""
     clock: Clock = Clock.RECORDING
     frames_complete: bool | None = None
     class_names: tuple[str, ...] | None = None
@@ -64,18 +65,24 @@ def sensor_toml(settings: Settings) -> str:
     """Return the text of a `sensor.toml` that reads back as `settings`."""
     sensor = settings.sensor
     sections: dict[str, dict[str, Any]] = {
-        "recording": {
-            "format_version": FORMAT_VERSION,
-            "name": settings.name,
-            "clock": settings.clock.value,
-            "frames_complete": settings.frames_complete,
-            "class_names": settings.class_names or None,
-        },
+        "recording": recording_section(settings),
         **{name: {key: getattr(sensor, key, None) for key in keys} for name, keys in _LIMITS.items()},
         "sensor": {key: getattr(sensor, key) for key in ("kind", *_LIMITS["sensor"])},
         "mount": dict(zip(_LIMITS["mount"], sensor.mount_robot_sensor, strict=True)),
     }
     return toml_text(sections)
+
+
+def recording_section(settings: Settings) -> dict[str, Any]:
+    """Return the section `[recording]`."""
+    return {
+        "format_version": FORMAT_VERSION,
+        "name": settings.name,
+        "robot": settings.robot or None,
+        "clock": settings.clock.value,
+        "frames_complete": settings.frames_complete,
+        "class_names": settings.class_names or None,
+    }
 
 
 def toml_text(sections: dict[str, dict[str, Any]]) -> str:
@@ -161,7 +168,8 @@ class TomlReader:
     def recording(self, sensor: Sensor) -> Settings:
         content = self.section("recording", _RECORDING)
         types: dict[str, type] = {
-            "format_version": int, "name": str, "clock": str, "frames_complete": bool, "class_names": list,
+            "format_version": int, "name": str, "robot": str, "clock": str, "frames_complete": bool,
+            "class_names": list,
         }  # fmt: skip
         for key, value in content.items():
             if not isinstance(value, types[key]):
@@ -176,6 +184,7 @@ class TomlReader:
             raise self.error("recording", "class_names", "a name appears twice")
         return Settings(
             name=content.get("name"),
+            robot=content.get("robot", ""),
             clock=self.choice("recording", "clock", Clock, "no clock") or Clock.RECORDING,
             frames_complete=content.get("frames_complete"),
             class_names=None if names is None else tuple(names),
