@@ -129,7 +129,8 @@ def propose_merges(
         # a pair of two sources is looked at once, with the source that comes first
         later = order[begin + GROUP :]
         of |= np.isin(older, order[begin : begin + GROUP]) & np.isin(older, sources) & ~np.isin(younger, later)
-        groups.append(np.flatnonzero(of))
+        if of.any():
+            groups.append(np.flatnonzero(of))
     merges = list[tuple[int, int]]()
     for some in _batches(groups, younger, older):
         rows, first = np.concatenate(some), np.cumsum([0, *map(len, some)])
@@ -149,7 +150,8 @@ def _batches(groups: list[IntArray], younger: IntArray, older: IntArray) -> Iter
             yield some
             some, more = [], np.unique(np.append(younger[mine], older[mine]))
         some, there = [*some, mine], more
-    yield some
+    if some:
+        yield some
 
 
 def _without_contradictions(merges: list[tuple[int, int]], kind: IntArray) -> list[tuple[int, int]]:
