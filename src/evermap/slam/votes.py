@@ -70,7 +70,7 @@ def without_contradicted_ids(recording: AnyRecordingT, settings: SpaceConfig) ->
     landmark_id, warnings = given.landmark_id.copy(), list(recording.warnings)
     landmark_id[used[left_out]] = UNKNOWN
     if wrong.any():
-        warnings.append(f"{int(wrong.sum())} detections whose landmark_id those of the seconds around contradict")
+        warnings.append(f"{int(wrong.sum())} detections whose landmark_id contradicts the frames around")
     texts = recording.landmark_names
     twice = [texts.get(one, str(one)) for one in np.unique(given.landmark_id[used[doubled[name]]]).tolist()]
     if twice:
