@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
 from pydantic import Field, field_validator
 
-from evermap.config.section import Count, Positive, Probability, Section, Share
+from evermap.config.section import Count, NotNegative, Positive, Probability, Section, Share
 from evermap.errors import ConfigError
-from evermap.types import Sensor, SensorKind
+from evermap.types import FloatArray, Sensor, SensorKind
 
 
 class CalibrationConfig(Section):
@@ -50,6 +51,47 @@ class ChangesConfig(Section):
     p_moved: float = Field(default=0.01, gt=0, lt=1, description="prior probability that anything moved at all")
     move_sigma_m: Positive = Field(default=0.7, description="standard deviation of a displacement, each axis [m]")
     p_rotated: Probability = Field(default=0.1, description="share of moves that also turn the group")
+    turn_sigma_rad: Positive = Field(default=0.5, description="standard deviation of such a turn [rad]")
+    rigid_m: Positive = Field(default=0.005, description="members of a group keep their distances to within this [m]")
+    p_swapped: Share = Field(default=1e-5, description="probability that any two landmarks of a map were mixed up")
+    displaced_log_odds: float = Field(
+        default=7.0, description="prior log odds against a landmark being elsewhere for a part of the session [nats]"
+    )
+    map_factor_spread: Positive = Field(
+        default=0.35, description="by how much the sigmas of a map may be wrong: standard deviation of their logarithm"
+    )
+    softness_m: tuple[Positive, ...] = Field(
+        default=(0.005, 0.01, 0.02, 0.04),
+        min_length=1,
+        description="errors that the sightings of a landmark in a part of the session may share; evidence chooses [m]",
+    )
+    usual_softness_m: Positive = Field(
+        default=0.02, description="the same while it is decided what was swapped or elsewhere for a while [m]"
+    )
+    fewest_sightings: Count = Field(
+        default=3, description="sightings in a part of the session that tell where a landmark was then, at least"
+    )
+    most_groups: Count = Field(default=4, description="groups that may have moved, at most")
+    most_candidates: Count = Field(default=40, description="landmarks that may have moved, at most: the likeliest")
+    visit_gap_s: Positive = Field(
+        default=10.0, description="a landmark that was not seen for longer than this is visited anew [s]"
+    )
+    interval: Share = Field(default=0.95, description="probability of the interval in which a change is told to be")
+    rival_nats: NotNegative = Field(
+        default=5.0, description="explanations less probable than the best by up to this are reported beside it [nats]"
+    )
+    most_rivals: int = Field(default=2, ge=0, description="explanations reported beside the best, at most")
+    disagreement: Positive = Field(
+        default=4.0, description="chi-square a degree of freedom above which a map without changes explains nothing"
+    )
+    loose_map_m: Positive = Field(
+        default=1.0, description="standard deviation of a map that must not bend what is seen [m]"
+    )
+
+    @property
+    def spread(self) -> FloatArray:
+        """(3,) standard deviations of a displacement in x [m] and y [m], and of its angle [rad]."""
+        return np.array([self.move_sigma_m, self.move_sigma_m, self.turn_sigma_rad])
 
 
 class CheckConfig(Section):

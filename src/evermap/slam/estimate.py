@@ -12,7 +12,6 @@ from evermap import plugins
 from evermap.config import SlamConfig
 from evermap.interrupts import watched
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.joint import Joint, may_search
 from evermap.slam.intake import Prepared
 from evermap.slam.method import Method, Static
@@ -147,11 +146,6 @@ def _method(prepared: Prepared, prior: CalibrationPrior, sensor: Sensor, setting
     if settings.method == "nohyp":
         return Static(n_landmarks)
     if settings.method == "joint":
-        changes = ChangePrior(
-            p_moved=settings.changes.p_moved,
-            move_sigma_m=settings.changes.move_sigma_m,
-            p_rotated=settings.changes.p_rotated,
-        )
-        return Joint(n_landmarks, prior, prepared.given_map(), changes, robust=settings.robust)
+        return Joint(n_landmarks, prior, prepared.given_map(), settings.changes, robust=settings.robust)
     method: Method = plugins.load("evermap.methods", settings.method)(n_landmarks, settings, sensor)
     return method

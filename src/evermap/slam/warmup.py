@@ -7,10 +7,10 @@ import functools
 import numpy as np
 from scipy import sparse
 
+from evermap.config import ChangesConfig
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import WindowEvidence, compare
-from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import find_changes
 from evermap.slam.noise import START
 from evermap.slam.problem import Drive, Problem
@@ -83,4 +83,4 @@ def _search() -> None:
     place, sure, count = 3.0 * np.eye(3, 2), np.eye(6), 3
     evidence = WindowEvidence(np.arange(count), np.zeros(count, dtype=np.int64), place, sure, np.zeros(6), 0.0)
     comparison = compare(evidence, place, np.tile(np.eye(2), (count, 1, 1)), np.ones(count, dtype=np.bool_))
-    find_changes(evidence, comparison, place, 1, ChangePrior())
+    find_changes(evidence, comparison, place, 1, ChangesConfig())

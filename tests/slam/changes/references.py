@@ -8,8 +8,8 @@ from math import comb, log
 import numpy as np
 from scipy.stats import multivariate_normal
 
+from evermap.config import ChangesConfig
 from evermap.slam.changes.evidence import Comparison, WindowEvidence
-from evermap.slam.changes.gain import ChangePrior
 
 
 def log_normal(e: np.ndarray, covariance: np.ndarray) -> float:
@@ -60,7 +60,7 @@ def membership(evidence: WindowEvidence, members: np.ndarray, onset: int = 0) ->
     return np.kron(moved[:, None].astype(float), np.eye(2))
 
 
-def log_group_prior(prior: ChangePrior, n_landmarks: int, size: int, *, turns: bool = False) -> float:
+def log_group_prior(prior: ChangesConfig, n_landmarks: int, size: int, *, turns: bool = False) -> float:
     """`log (eps / (1 - eps)) 2^-n / C(N, n)`, and the share of groups that turn or that do not."""
     share = prior.p_rotated if turns else 1.0 - prior.p_rotated
     return log(prior.p_moved / (1 - prior.p_moved) / 2**size / comb(n_landmarks, size)) + log(share)
@@ -73,7 +73,7 @@ def all_labellings(count: int, groups: int) -> np.ndarray:
     return labels[(labels <= largest + 1).all(axis=1)]
 
 
-def gains_of_all(labels: np.ndarray, comparison: Comparison, prior: ChangePrior) -> np.ndarray:
+def gains_of_all(labels: np.ndarray, comparison: Comparison, prior: ChangesConfig) -> np.ndarray:
     """(H,) closed-form gains of labellings in one window, without turns, all at once."""
     count, groups = labels.shape[1], int(labels.max())
     a = comparison.precision.reshape(count, 2, count, 2)

@@ -11,9 +11,9 @@ from problems import World, default_prior, make_world
 from references import log_group_prior, log_normal, random_covariance, static_evidence
 from test_gain import gain_of
 
+from evermap.config import ChangesConfig
 from evermap.slam.calibration import FORWARD, SKEW, SLIP, SLOPE
 from evermap.slam.changes.evidence import WindowEvidence, compare, in_sensor_metres, landmark_evidence
-from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.problem import Estimate, Problem, independent
 
 KNOWN_SIZE = default_prior(range_slope=0.0)
@@ -22,7 +22,7 @@ KNOWN_SIZE = default_prior(range_slope=0.0)
 
 def evidence_of(world: World, bounds: list[int], estimate: Estimate | None = None) -> WindowEvidence:
     estimate = world.truth if estimate is None else estimate
-    return landmark_evidence(world.problem, estimate, world.noise, world.problem.prior, np.array(bounds))
+    return landmark_evidence(world.problem, estimate, world.noise, world.problem.prior, np.array(bounds), 3)
 
 
 def problem_of_copies(problem: Problem, evidence: WindowEvidence, bounds: list[int]) -> Problem:
@@ -229,7 +229,7 @@ def test_landmarks_that_no_map_holds_say_only_what_changes() -> None:
 
 def test_complement_differs_by_the_size_prior_alone() -> None:
     """Seen from an unknown start, half of the landmarks moved one way, or the other half the other way."""
-    prior = ChangePrior()
+    prior = ChangesConfig()
     for seed in range(3):
         world = make_world(seed, n_poses=40, n_landmarks=7, start_information=1e-6, turn_radps=0.2)
         evidence = evidence_of(world, [0, 40])

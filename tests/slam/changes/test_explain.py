@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from problems import make_world
 
+from evermap.config import ChangesConfig
 from evermap.geometry import se2
-from evermap.slam.changes.explain import SLACK_M, GivenMap, MovedGroup, explained
+from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
 from evermap.slam.problem import Estimate
 
+PRIOR = ChangesConfig()
 SPREAD = np.array([0.7, 0.7, 0.5])
 COUNT = 6
 
@@ -24,7 +26,7 @@ def given() -> GivenMap:
 def told(given: GivenMap, *groups: MovedGroup):
     world = make_world(1, n_poses=20, n_landmarks=COUNT)
     estimate = Estimate(world.truth.pose, given.mean + 0.01, world.truth.states)
-    return (world.problem, *explained(world.problem, estimate, given, groups, SPREAD))
+    return (world.problem, *explained(world.problem, estimate, given, groups, PRIOR))
 
 
 def rows(places: np.ndarray) -> np.ndarray:
@@ -88,7 +90,7 @@ def test_within_the_session(given: GivenMap) -> None:
     covariance = np.linalg.inv(problem.landmark_information.toarray()[np.ix_(all_rows, all_rows)])
     old = blockdiag(given.covariance[members])
     columns = columns_of(given.mean[members], None)
-    motion = (columns * SPREAD[:2] ** 2) @ columns.T + SLACK_M**2 * np.eye(4)
+    motion = (columns * SPREAD[:2] ** 2) @ columns.T + PRIOR.rigid_m**2 * np.eye(4)
     np.testing.assert_allclose(covariance, np.block([[old, old], [old, old + motion]]), rtol=1e-5, atol=1e-8)
     np.testing.assert_allclose(start.landmark[6:], start.landmark[members] + [0.4, -0.2])
     stamp_s = before.stamp_s[before.pose_row]
@@ -108,7 +110,7 @@ def test_new_places_that_no_map_holds_are_tied_to_the_old_alone(given: GivenMap)
     together = np.tile(np.eye(2), (2, 1))
     np.testing.assert_allclose(problem.landmark_information.toarray()[both] @ together, 0.0, atol=1e-9)
     difference = np.linalg.inv(problem.landmark_information.toarray()[np.ix_(rows([6]), rows([6]))])
-    np.testing.assert_allclose(difference, (SPREAD[0] ** 2 + SLACK_M**2) * np.eye(2))
+    np.testing.assert_allclose(difference, (SPREAD[0] ** 2 + PRIOR.rigid_m**2) * np.eye(2))
 
 
 def test_two_groups_at_two_times(given: GivenMap) -> None:

@@ -17,14 +17,15 @@ from references import (
 )
 from scipy.integrate import quad
 
+from evermap.config import ChangesConfig
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
-from evermap.slam.changes.gain import ChangePrior, Tables, hypothesis_gain
+from evermap.slam.changes.gain import Tables, hypothesis_gain, log_onset, log_prior
 from evermap.slam.changes.search import item_columns
 from evermap.slam.problem import Estimate
 
-PRIOR = ChangePrior()
+PRIOR = ChangesConfig()
 
 
 def gain_of(
@@ -35,7 +36,7 @@ def gain_of(
     label: list[int],
     onset: list[int],
     turns: list[bool],
-    prior: ChangePrior = PRIOR,
+    prior: ChangesConfig = PRIOR,
 ) -> tuple[float, np.ndarray]:
     count = len(position)
     quadratic, linear = item_columns(evidence, comparison, position, n_windows, np.arange(count))
@@ -43,7 +44,7 @@ def gain_of(
         np.array(label),
         np.array([0, *onset]),
         np.array([False, *turns]),
-        Tables(quadratic, linear, position, prior.spread, prior.log_prior(count, count), prior.log_onset(n_windows)),
+        Tables(quadratic, linear, position, prior.spread, log_prior(prior, count, count), log_onset(n_windows)),
     )
 
 
@@ -105,9 +106,8 @@ def log_marginal_likelihood(
 
 
 @pytest.mark.parametrize("onset", [0, 1])
-def test_gain_is_what_the_solved_problem_gains(onset: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gain_is_what_the_solved_problem_gains(onset: int) -> None:
     """The problem that `explained` hands to least squares has the likelihood that the search promised."""
-    monkeypatch.setattr("evermap.slam.changes.explain.SLACK_M", 1e-5)
     from problems import make_world
 
     problem = make_world(0, n_poses=4, n_landmarks=6).problem
@@ -120,7 +120,7 @@ def test_gain_is_what_the_solved_problem_gains(onset: int, monkeypatch: pytest.M
         estimate = Estimate(np.zeros((4, 3)), given.mean.copy(), problem.prior.mean)
         likelihoods = []
         for groups in ((), (MovedGroup(members, False, motion[0], onset, since),)):
-            told, _, landmark = explained(problem, estimate, given, groups, PRIOR.spread)
+            told, _, landmark = explained(problem, estimate, given, groups, PRIOR.model_copy(update={"rigid_m": 1e-5}))
             last = np.arange(6)
             last[landmark[6:]] = np.arange(6, len(landmark))
             place = np.where(evidence.window >= 1, last[evidence.landmark], evidence.landmark)

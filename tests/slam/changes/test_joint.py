@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from worlds import Move, Session, landmark_rmse, make_session, pose_rmse
 
+from evermap.config import ChangesConfig
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
-from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.method import Explanation
 from evermap.slam.smoother import Smoother
 from evermap.types import ChangeKind, MapChange
@@ -113,7 +113,7 @@ def told(session: Session, *moves: Move) -> Explanation:
         for m in moves
     )
     start = replace(session.world.truth, landmark=session.before)
-    problem, start, landmark = explained(session.problem, start, session.given, groups, ChangePrior().spread)
+    problem, start, landmark = explained(session.problem, start, session.given, groups, ChangesConfig())
     estimate = Smoother(problem, session.world.noise).optimum(start)
     current = np.arange(len(session.before))
     current[landmark] = np.arange(len(landmark))

@@ -9,13 +9,13 @@ import pytest
 from references import static_evidence
 from worlds import Move, make_session
 
+from evermap.config import ChangesConfig
 from evermap.slam.changes.evidence import compare, landmark_evidence
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.changes.gain import ChangePrior
-from evermap.slam.changes.weigh import MAP_FACTOR_SPREAD, MAP_FACTORS, Verdict, weigh
+from evermap.slam.changes.weigh import MAP_FACTORS, Verdict, weigh
 from evermap.slam.smoother import Smoother
 
-PRIOR = ChangePrior(p_moved=0.3, move_sigma_m=0.08)
+PRIOR = ChangesConfig(p_moved=0.3, move_sigma_m=0.08)
 """A third of the worlds changes, half of them by less than what shows, so that probabilities spread."""
 N_LANDMARKS = 10
 DURATION_S = 160.0
@@ -43,7 +43,7 @@ def drawn_moves(rng: np.random.Generator) -> tuple[Move, ...]:
 
 def drawn_map_factor(rng: np.random.Generator) -> float:
     """How much worse a map is than it says."""
-    return float(np.exp(np.clip(MAP_FACTOR_SPREAD * rng.normal(), *np.log([MAP_FACTORS[0], MAP_FACTORS[-1]]))))
+    return float(np.exp(np.clip(PRIOR.map_factor_spread * rng.normal(), *np.log([MAP_FACTORS[0], MAP_FACTORS[-1]]))))
 
 
 def is_right(verdict: Verdict, moves: tuple[Move, ...]) -> bool:
@@ -135,7 +135,7 @@ def test_misfit_of_a_static_world_is_a_chi_square(n_windows: int) -> None:
         )
         estimate = Smoother(free, world.noise).optimum(world.truth)
         bounds = np.linspace(0, 200, n_windows + 1).astype(int)
-        evidence = landmark_evidence(free, estimate, world.noise, world.problem.prior, bounds)
+        evidence = landmark_evidence(free, estimate, world.noise, world.problem.prior, bounds, PRIOR.fewest_sightings)
         comparison = compare(evidence, given.mean, given.covariance, given.given)
         misfit += comparison.misfit
         freedom += comparison.freedom

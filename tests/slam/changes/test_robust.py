@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from references import static_evidence
 
+from evermap.config import ChangesConfig
 from evermap.slam.changes.evidence import WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import find_changes
 from evermap.slam.changes.weigh import weigh, without_transients
 
-PRIOR = ChangePrior()
+PRIOR = ChangesConfig()
 COUNT, WINDOWS = 6, 4
 SIGMA_M = 0.02
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from references import all_labellings, comparison_of, gains_of_all, slam_like_covariance, static_evidence
 
-from evermap.slam.changes.gain import ChangePrior
-from evermap.slam.changes.search import MOST_GROUPS, find_changes
+from evermap.config import ChangesConfig
+from evermap.slam.changes.search import find_changes
 
-PRIOR = ChangePrior(p_rotated=0.0)
+PRIOR = ChangesConfig(p_rotated=0.0)
 
 
 def random_comparison(seed: int):
@@ -24,8 +24,8 @@ def random_comparison(seed: int):
 
 
 def test_search_finds_the_best_of_all_hypotheses() -> None:
-    """All sets of up to `MOST_GROUPS` groups are enumerated: 3845 of seven landmarks, 18002 of eight."""
-    enumerated = {count: all_labellings(count, MOST_GROUPS) for count in (7, 8)}
+    """All sets of up to `most_groups` groups are enumerated: 3845 of seven landmarks, 18002 of eight."""
+    enumerated = {count: all_labellings(count, PRIOR.most_groups) for count in (7, 8)}
     assert [len(enumerated[count]) for count in (7, 8)] == [3845, 18002]
     found = 0
     for seed in range(75):
@@ -45,7 +45,7 @@ def test_search_finds_the_best_of_all_hypotheses() -> None:
 
 def test_weights_of_what_was_kept_are_nearly_those_of_everything() -> None:
     """Normalised over what the climb met, the best hypothesis is about as probable as over all there are."""
-    enumerated = {count: all_labellings(count, MOST_GROUPS) for count in (7, 8)}
+    enumerated = {count: all_labellings(count, PRIOR.most_groups) for count in (7, 8)}
     worst = 0.0
     for seed in range(20):
         position, comparison = random_comparison(seed)
@@ -60,7 +60,7 @@ def test_weights_of_what_was_kept_are_nearly_those_of_everything() -> None:
 
 def test_no_hypothesis_is_told_twice_and_the_best_comes_first() -> None:
     position, comparison = random_comparison(3)
-    hypotheses = find_changes(static_evidence(position), comparison, position, 1, ChangePrior())
+    hypotheses = find_changes(static_evidence(position), comparison, position, 1, ChangesConfig())
     rows = np.column_stack([hypotheses.label, hypotheses.onset, hypotheses.turns])
     assert len(np.unique(rows, axis=0)) == len(rows)
     assert np.all(np.diff(hypotheses.gain) <= 0.0)

@@ -11,12 +11,14 @@ from worlds import Move, Session, make_session
 
 from evermap.slam.changes.evidence import WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.changes.joint import P_SWAPPED, likeliest_swap, with_swap
+from evermap.slam.changes.joint import likeliest_swap, with_swap
 from evermap.types import ChangeKind
+
+P_SWAPPED = 1e-5
 
 
 def swap_of(evidence: WindowEvidence, given: GivenMap):
-    return likeliest_swap(evidence, compare(evidence, given.mean, given.covariance, given.given), given)
+    return likeliest_swap(evidence, compare(evidence, given.mean, given.covariance, given.given), given, P_SWAPPED)
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -33,7 +33,7 @@ def sightings(world: World, at_s: float, by: np.ndarray, rng: np.random.Generato
 
 def timed(world: World, problem: Problem, by: np.ndarray) -> tuple[float, tuple[float, float]]:
     old = world.truth.landmark[MEMBERS]
-    return parting_time(problem, world.truth, QUIET, MEMBERS, old, old + by, WHOLE)
+    return parting_time(problem, world.truth, QUIET, MEMBERS, old, old + by, WHOLE, 0.95)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from problems import World, default_prior, make_world, slow_detection
 
+from evermap.config import ChangesConfig
 from evermap.geometry import se2
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.joint import Joint
 from evermap.slam.method import Explanation
 from evermap.slam.problem import Estimate, Problem, independent
@@ -56,11 +56,11 @@ class Session:
         start = replace(start, landmark=self.before.copy())
         return Smoother(self.problem, self.world.noise, heavy=True).optimum(start, tolerance=1e-4)
 
-    def method(self, prior: ChangePrior | None = None) -> Joint:
+    def method(self, prior: ChangesConfig | None = None) -> Joint:
         """The joint search, before it has seen anything."""
-        return Joint(len(self.before), self.world.problem.prior, self.given, prior or ChangePrior())
+        return Joint(len(self.before), self.world.problem.prior, self.given, prior or ChangesConfig())
 
-    def revised(self, prior: ChangePrior | None = None) -> tuple[Joint, Explanation]:
+    def revised(self, prior: ChangesConfig | None = None) -> tuple[Joint, Explanation]:
         """What the method makes of the whole session, as the estimator asks it at the end."""
         method = self.method(prior)
         problem, estimate = method.unprejudiced(self.problem, self.static)

@@ -22,8 +22,6 @@ from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
-FEWEST_SIGHTINGS = 3
-"""Sightings that make a copy: one or two may be wrong identities."""
 TINY_INFORMATION = 1e-6
 """Of poses at the borders of windows that nothing holds [1/m^2]: a kilometre."""
 
@@ -115,6 +113,7 @@ def landmark_evidence(
     noise: Noise,
     prior: CalibrationPrior,
     bounds: IntArray,
+    fewest: int,
     *,
     sized: bool = True,
 ) -> WindowEvidence:
@@ -126,13 +125,14 @@ def landmark_evidence(
         noise: the noise levels.
         prior: of the calibration, as the user means it.
         bounds: (W + 1,) first pose of every window, and the number of poses.
+        fewest: sightings that make a copy, at least: one or two may be wrong identities.
         sized: divide range slope and size by their priors; else positions stay in the metres of the sensor, which is
             enough where there is no map to compare with.
     """
     estimate = in_sensor_metres(estimate, prior)
     held = prior.without_scale()
     n_windows = len(bounds) - 1
-    pieces = [_piece(problem, estimate, noise, held, *bounds[w : w + 2]) for w in range(n_windows)]
+    pieces = [_piece(problem, estimate, noise, held, (bounds[w], bounds[w + 1], fewest)) for w in range(n_windows)]
     information, right, at_pose = _joined(pieces)
     states = np.arange(len(right) - N_STATES, len(right))
     information[states, states] += 1.0 / held.sigma**2
@@ -240,11 +240,12 @@ class _Piece(NamedTuple):
 
 
 def _piece(
-    problem: Problem, estimate: Estimate, noise: Noise, prior: CalibrationPrior, start: int, stop: int
+    problem: Problem, estimate: Estimate, noise: Noise, prior: CalibrationPrior, window: tuple[int, int, int]
 ) -> _Piece:
+    start, stop, fewest = window
     last = min(stop + 1, len(problem.stamp_s))
     low, high = np.searchsorted(problem.pose_row, [start, stop])
-    enough = np.bincount(problem.landmark_row[low:high], minlength=len(problem.landmark_mean)) >= FEWEST_SIGHTINGS
+    enough = np.bincount(problem.landmark_row[low:high], minlength=len(problem.landmark_mean)) >= fewest
     used = low + np.flatnonzero(enough[problem.landmark_row[low:high]])
     landmark, row = np.unique(problem.landmark_row[used], return_inverse=True)
     pose_row = problem.pose_row[used]

@@ -13,14 +13,12 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from evermap.config import ChangesConfig
 from evermap.geometry import se2
 from evermap.slam.kernels import detection_residual, kernel, outlier_loss
 from evermap.slam.problem import Estimate, Noise, Problem, between_rows, embedded, independent, padded
 from evermap.slam.smoother import Smoother
 from evermap.types import BoolArray, FloatArray, IntArray
-
-SLACK_M = 0.005
-"""Members of a group keep their distances to within this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +93,7 @@ class MovedGroup:
 
 
 def explained(
-    problem: Problem, estimate: Estimate, given: GivenMap, groups: tuple[MovedGroup, ...], spread: FloatArray
+    problem: Problem, estimate: Estimate, given: GivenMap, groups: tuple[MovedGroup, ...], prior: ChangesConfig
 ) -> tuple[Problem, Estimate, IntArray]:
     """Return the problem in a world where `groups` moved.
 
@@ -104,7 +102,7 @@ def explained(
         estimate: values to start from, one row a landmark.
         given: the map; its covariance as it shall be believed.
         groups: what moved.
-        spread: (3,) prior standard deviations of displacement and angle.
+        prior: how changes are distributed.
 
     Returns:
         Problem, start values, and (L',) the landmark of every place.
@@ -117,7 +115,7 @@ def explained(
     places: list[int] = list(range(count))
     stamp_s = problem.stamp_s[problem.pose_row]
     for group in groups:
-        offset, motion_covariance = group.motion_prior(mean, spread)
+        offset, motion_covariance = group.motion_prior(mean, prior.spread)
         members = group.members
         if group.since_s is None:
             rows = se2.xy_rows(members)
@@ -131,7 +129,7 @@ def explained(
         places.extend(int(j) for j in members)
         old_rows = se2.xy_rows(members)
         new_rows = se2.xy_rows(new)
-        tie = np.linalg.inv(motion_covariance + SLACK_M**2 * np.eye(len(old_rows)))
+        tie = np.linalg.inv(motion_covariance + prior.rigid_m**2 * np.eye(len(old_rows)))
         both = np.concatenate([old_rows, new_rows])
         information = padded(information, len(new))
         parted = embedded(np.kron([[1.0, -1.0], [-1.0, 1.0]], tie), both, 2 * len(places))
@@ -147,8 +145,6 @@ def explained(
     )
 
 
-SHARE = 0.95
-"""Of the posterior of the instant that lies between the two stamps reported."""
 HELD_M = 0.005
 """To this the other landmarks are held meanwhile."""
 
@@ -182,6 +178,7 @@ def parting_time(
     old: FloatArray,
     new: FloatArray,
     within_s: tuple[float, float],
+    interval: float,
 ) -> tuple[float, tuple[float, float]]:
     """Return the first stamp [s] at the new places, and two stamps between which the change happened.
 
@@ -193,6 +190,7 @@ def parting_time(
         old: (k, 2) their places before.
         new: (k, 2) and after.
         within_s: the change is known to lie between these two stamps.
+        interval: probability that it lies between the stamps returned.
     """
     stamp_s = problem.stamp_s[problem.pose_row]
     inside = (stamp_s >= within_s[0]) & (stamp_s <= within_s[1])
@@ -221,8 +219,8 @@ def parting_time(
     weight *= np.maximum(np.diff(stamp_s), 1e-9)
     cumulated = np.cumsum(weight) / weight.sum()
     best = int(np.argmax(weight))
-    low = int(np.searchsorted(cumulated, 0.5 * (1.0 - SHARE)))
-    high = min(int(np.searchsorted(cumulated, 0.5 * (1.0 + SHARE))), len(weight) - 1)
+    low = int(np.searchsorted(cumulated, 0.5 * (1.0 - interval)))
+    high = min(int(np.searchsorted(cumulated, 0.5 * (1.0 + interval))), len(weight) - 1)
     return float(stamp_s[best + 1]), (float(stamp_s[low]), float(stamp_s[high + 1]))
 
 

@@ -15,12 +15,12 @@ window on'. `quadratic` and `linear` hold `T'AT` and `T'b` for the four columns 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import gammaln
 
+from evermap.config import ChangesConfig
 from evermap.slam.kernels import kernel
 from evermap.types import FloatArray, IntArray
 
@@ -220,41 +220,21 @@ def _solve(factor: FloatArray, right: FloatArray) -> None:
         right[a] /= factor[a, a]
 
 
-@dataclass(frozen=True, slots=True)
-class ChangePrior:
-    """How changes are distributed before anything is seen.
+def log_prior(prior: ChangesConfig, n_landmarks: int, largest: int) -> FloatArray:
+    """Return (largest + 1, 2) log priors of a group by size, moved only and also turned: `eps 2^-n / C(N, n)`."""
+    size = np.arange(largest + 1)
+    choices = gammaln(n_landmarks + 1) - gammaln(size + 1) - gammaln(n_landmarks - size + 1)
+    group = np.log(prior.p_moved) - np.log1p(-prior.p_moved) - size * np.log(2.0) - choices
+    with np.errstate(divide="ignore"):
+        table: FloatArray = group[:, None] + np.log([1.0 - prior.p_rotated, prior.p_rotated])
+    table[:2, 1] = -np.inf  # one landmark alone has nothing to turn
+    table[0] = 0.0
+    return table
 
-    Attributes:
-        p_moved: probability that a group moved at all.
-        move_sigma_m: standard deviation of a displacement, each axis.
-        p_rotated: share of groups that also turned.
-        turn_sigma_rad: standard deviation of a turn.
-    """
 
-    p_moved: float = 0.01
-    move_sigma_m: float = 0.7
-    p_rotated: float = 0.1
-    turn_sigma_rad: float = 0.5
-
-    @property
-    def spread(self) -> FloatArray:
-        """(3,) standard deviations of x [m], y [m] and angle [rad]."""
-        return np.array([self.move_sigma_m, self.move_sigma_m, self.turn_sigma_rad])
-
-    def log_prior(self, n_landmarks: int, largest: int) -> FloatArray:
-        """Return (largest + 1, 2) log priors of a group by size, moved only and also turned: `eps 2^-n / C(N, n)`."""
-        size = np.arange(largest + 1)
-        choices = gammaln(n_landmarks + 1) - gammaln(size + 1) - gammaln(n_landmarks - size + 1)
-        group = np.log(self.p_moved) - np.log1p(-self.p_moved) - size * np.log(2.0) - choices
-        with np.errstate(divide="ignore"):
-            table: FloatArray = group[:, None] + np.log([1.0 - self.p_rotated, self.p_rotated])
-        table[:2, 1] = -np.inf  # one landmark alone has nothing to turn
-        table[0] = 0.0
-        return table
-
-    def log_onset(self, n_windows: int) -> FloatArray:
-        """Return (W,) of the window from which on a group has moved: before the session as likely as within it."""
-        if n_windows == 1:
-            return np.zeros(1)
-        log_prior: FloatArray = np.log(np.append(0.5, np.full(n_windows - 1, 0.5 / (n_windows - 1))))
-        return log_prior
+def log_onset(n_windows: int) -> FloatArray:
+    """Return (W,) log prior of the window from which on a group has moved: before the session as likely as within."""
+    if n_windows == 1:
+        return np.zeros(1)
+    table: FloatArray = np.log(np.append(0.5, np.full(n_windows - 1, 0.5 / (n_windows - 1))))
+    return table

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
+from evermap.config import ChangesConfig
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, in_sensor_metres, landmark_evidence
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained, parting_time, unswayed
-from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import item_columns
 from evermap.slam.changes.weigh import Verdict, weigh
 from evermap.slam.method import Compare, Explanation, Method, Rival
@@ -29,26 +29,12 @@ from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import outvoted
 from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
 
-RIVAL_NATS = 5.0
-"""Explanations that are less probable than the best by no more than this are reported beside it."""
-MOST_RIVALS = 2
-DISAGREEMENT = 4.0
-"""Chi-square over its degrees of freedom above which a map without changes does not explain what was seen."""
-LOOSE_MAP_M = 1.0
-"""Standard deviation of a map that bends nothing, but keeps what little is known of near where the map has it."""
-SWAP_SOFTNESS_M = 0.02
-"""Error that the sightings of a window share, while it is decided which identities are swapped."""
-VISIT_GAP_S = 10.0
-"""A landmark that was not seen for longer than this is visited anew."""
-VISIT_MARGIN = 0.5
-MOST_VISITS = 8
+VISIT_MARGIN, MOST_VISITS = 0.5, 8
 """Visits that get windows of their own: this share of the interval around it, and this many."""
 ROUNDS = 6
 """Searches at the end of a session, at most."""
-POSES_A_WINDOW = 60
-MOST_WINDOWS = 12
-MOST_ITEMS = 400
-"""Landmarks times windows, so that a search stays a matter of milliseconds."""
+POSES_A_WINDOW, MOST_WINDOWS, MOST_ITEMS = 60, 12, 400
+"""Size of a search: poses a window, windows, and landmarks times windows, so that it takes milliseconds."""
 
 
 def may_search(n_frames: int, *, in_map: bool) -> bool:
@@ -72,7 +58,7 @@ class Joint(Method):
         n_landmarks: int,
         calibration: CalibrationPrior,
         given: GivenMap | None,
-        prior: ChangePrior,
+        prior: ChangesConfig,
         *,
         robust: bool = True,
     ) -> None:
@@ -106,7 +92,7 @@ class Joint(Method):
             self._base(problem),
             prior=self._calibration.without_scale(),
             landmark_mean=self._given.mean,
-            landmark_information=independent(self._given.given[:, None, None] * np.eye(2) / LOOSE_MAP_M**2),
+            landmark_information=independent(self._given.given[:, None, None] * np.eye(2) / self._prior.loose_map_m**2),
         )
         start = in_sensor_metres(self._where_most_agree(self._first_places(estimate)), self._calibration)
         # what the map puts in the wrong place is where most of its sightings say, whatever the map
@@ -142,9 +128,8 @@ class Joint(Method):
             return Explanation(problem, estimate, self._current())
         for _ in range(ROUNDS if final else 1):
             bounds = self._bounds(base)
-            evidence = landmark_evidence(
-                base, self._first_places(estimate), noise, self._calibration, bounds, sized=in_map
-            )
+            first, fewest = self._first_places(estimate), self._prior.fewest_sightings
+            evidence = landmark_evidence(base, first, noise, self._calibration, bounds, fewest, sized=in_map)
             if len(evidence.landmark) == 0:
                 return Explanation(problem, estimate, self._current())
             before = self.verdict
@@ -199,7 +184,7 @@ class Joint(Method):
     ) -> tuple[Problem, Estimate, IntArray]:
         """The problem in a world where these groups moved, a start, and the landmark of every place."""
         start = _with_copies(self._first_places(estimate), evidence, groups)
-        return explained(base, start, believed, groups, self._prior.spread)
+        return explained(base, start, believed, groups, self._prior)
 
     def _rivals(
         self,
@@ -213,8 +198,8 @@ class Joint(Method):
         """Explanations nearly as probable as the best, each solved on its own."""
         assert self.verdict is not None
         rivals = []
-        for found, probability in self.verdict.alternatives[:MOST_RIVALS]:
-            if probability < self.verdict.probability * math.exp(-RIVAL_NATS):
+        for found, probability in self.verdict.alternatives[: self._prior.most_rivals]:
+            if probability < self.verdict.probability * math.exp(-self._prior.rival_nats):
                 break
             groups = tuple(self._timed(group, base, estimate, noise, evidence, bounds) for group in found)
             problem, start, landmark = self._explained(base, estimate, evidence, believed, groups)
@@ -233,7 +218,7 @@ class Joint(Method):
 
     def _warnings(self, *, in_map: bool) -> tuple[str, ...]:
         assert self.verdict is not None
-        if in_map and not self._groups and self.verdict.misfit > DISAGREEMENT:
+        if in_map and not self._groups and self.verdict.misfit > self._prior.disagreement:
             return ("the prior map disagrees with what was seen, and no change explains it: cannot localise in it",)
         return ()
 
@@ -242,9 +227,10 @@ class Joint(Method):
     ) -> tuple[Verdict, GivenMap]:
         """The verdict, and the map with the landmarks that carry each other's identity at each other's place."""
         verdict = weigh(evidence, given, self._prior, n_windows, before=self.verdict, thorough=thorough)
-        soft = evidence.softened(SWAP_SOFTNESS_M)
+        soft = evidence.softened(self._prior.usual_softness_m)
         while given.given.any():
-            swap = likeliest_swap(soft, compare(soft, given.mean, given.covariance, given.given), given)
+            comparison = compare(soft, given.mean, given.covariance, given.given)
+            swap = likeliest_swap(soft, comparison, given, self._prior.p_swapped)
             if swap is None:
                 break
             other = with_swap(given, swap.first, swap.second)
@@ -265,7 +251,7 @@ class Joint(Method):
         n_seen = len(np.unique(self._landmark[problem.landmark_row]))
         windows = max(min(n_poses // POSES_A_WINDOW, MOST_WINDOWS, MOST_ITEMS // max(n_seen, 1)), 1)
         bounds = np.linspace(0, n_poses, windows + 1).astype(np.int64)
-        cuts = [cut for group in self._groups for cut in _visits(problem, group)]
+        cuts = [cut for group in self._groups for cut in _visits(problem, group, self._prior.visit_gap_s)]
         return np.unique(np.append(bounds, np.searchsorted(problem.stamp_s, cuts)))
 
     def _current(self) -> IntArray:
@@ -305,6 +291,7 @@ class Joint(Method):
             old[group.members],
             group.moved(old),
             within_s,
+            self._prior.interval,
         )
         return replace(group, since_s=since_s, between_s=between_s)
 
@@ -337,12 +324,12 @@ class _Loosened(NamedTuple):
     start: Estimate
 
 
-def _visits(problem: Problem, group: MovedGroup) -> FloatArray:
+def _visits(problem: Problem, group: MovedGroup, gap_s: float) -> FloatArray:
     """When a group was met again [s], around the time when it is thought to have moved."""
     if group.between_s is None or group.since_s is None:
         return np.zeros(0)
     stamps = problem.stamp_s[problem.pose_row[np.isin(problem.landmark_row, group.members)]]
-    starts = stamps[1:][np.diff(stamps) > VISIT_GAP_S]
+    starts = stamps[1:][np.diff(stamps) > gap_s]
     margin = VISIT_MARGIN * (group.between_s[1] - group.between_s[0])
     near = (starts >= group.between_s[0] - margin) & (starts <= group.between_s[1] + margin)
     return np.append(starts[near][:MOST_VISITS], group.since_s)
@@ -382,10 +369,6 @@ def _with_copies(estimate: Estimate, evidence: WindowEvidence, groups: tuple[Mov
     return Estimate(estimate.pose, landmark, estimate.states)
 
 
-P_SWAPPED = 1e-5
-"""Prior probability that any two landmarks of a map were mixed up."""
-
-
 class Swap(NamedTuple):
     """Two landmarks, and the log prior of their being mixed up."""
 
@@ -394,13 +377,14 @@ class Swap(NamedTuple):
     log_prior: float
 
 
-def likeliest_swap(evidence: WindowEvidence, comparison: Comparison, given: GivenMap) -> Swap | None:
+def likeliest_swap(evidence: WindowEvidence, comparison: Comparison, given: GivenMap, p_swapped: float) -> Swap | None:
     """Return the two landmarks that gain most by taking each other's place; None if that gains less than it costs.
 
     Args:
         evidence: of the copies.
         comparison: the same, seen from the map.
         given: the map.
+        p_swapped: prior probability that any two landmarks were mixed up.
     """
     candidates = np.intersect1d(np.unique(evidence.landmark), np.flatnonzero(given.given))
     count = len(candidates)
@@ -418,7 +402,7 @@ def likeliest_swap(evidence: WindowEvidence, comparison: Comparison, given: Give
     gain: FloatArray = (step * (pull[first] - pull[second])).sum(axis=1)
     gain -= 0.5 * np.einsum("ka,kab,kb->k", step, stiff, step)
     best = int(np.argmax(gain))
-    log_prior = float(np.log(P_SWAPPED) - np.log(len(gain)))
+    log_prior = float(np.log(p_swapped) - np.log(len(gain)))
     if gain[best] + log_prior <= 0.0:
         return None
     return Swap(int(candidates[first[best]]), int(candidates[second[best]]), log_prior)

@@ -6,16 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from evermap.config import ChangesConfig
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence
-from evermap.slam.changes.gain import ChangePrior, Tables, hypothesis_gain
+from evermap.slam.changes.gain import Tables, hypothesis_gain, log_onset, log_prior
 from evermap.slam.kernels import kernel
 from evermap.types import BoolArray, FloatArray, IntArray
 
-MOST_GROUPS = 4
-"""Groups in one hypothesis, at most."""
-MOST_CANDIDATES = 40
-"""Landmarks that may move in one search; in larger maps those that would gain most alone."""
 NEAR = 5.0
 """Hypotheses within this of the best [nats] have their neighbours weighed too, or their own weights would be too large;
 """
@@ -46,7 +43,7 @@ def find_changes(
     comparison: Comparison,
     position: FloatArray,
     n_windows: int,
-    prior: ChangePrior,
+    prior: ChangesConfig,
     *,
     start: Hypotheses | None = None,
 ) -> Hypotheses:
@@ -65,8 +62,8 @@ def find_changes(
     count = len(candidates)
     label, onset, turns = (
         np.zeros(count, np.int64),
-        np.zeros(MOST_GROUPS + 1, np.int64),
-        np.zeros(MOST_GROUPS + 1, bool),
+        np.zeros(prior.most_groups + 1, np.int64),
+        np.zeros(prior.most_groups + 1, bool),
     )
     if start is not None:
         label[:], onset[:], turns[:] = start.label[0, candidates], start.onset[0], start.turns[0]
@@ -75,10 +72,10 @@ def find_changes(
         linear,
         position[candidates],
         prior.spread,
-        prior.log_prior(len(np.unique(evidence.landmark)), count),
-        prior.log_onset(n_windows),
+        log_prior(prior, len(np.unique(evidence.landmark)), count),
+        log_onset(n_windows),
     )
-    may_turn, weighed = prior.p_rotated > 0.0, Weighed.nothing(count, MOST_GROUPS)
+    may_turn, weighed = prior.p_rotated > 0.0, Weighed.nothing(count, prior.most_groups)
     _climb_from_many_starts((label, onset, turns), tables, weighed, may_turn=may_turn)
     near = weighed.ranked
     for k in near[weighed.gain[near] > weighed.best[0] - NEAR][:MOST_WIDENED]:
@@ -93,7 +90,7 @@ def find_changes(
 
 
 def _candidates(
-    evidence: WindowEvidence, comparison: Comparison, n_landmarks: int, prior: ChangePrior, start: Hypotheses | None
+    evidence: WindowEvidence, comparison: Comparison, n_landmarks: int, prior: ChangesConfig, start: Hypotheses | None
 ) -> IntArray:
     """Landmarks that may have moved: in a large map those that would gain most alone, and those already suspected."""
     gain = np.full(n_landmarks, -np.inf)
@@ -106,7 +103,7 @@ def _candidates(
         gain[j] = pull @ np.linalg.solve(precision + np.eye(2) / prior.spread[0] ** 2, pull)
     suspected = np.zeros(n_landmarks, bool) if start is None else start.label[0] > 0
     gain[suspected] = np.inf
-    order = np.argsort(-gain, kind="stable")[:MOST_CANDIDATES]
+    order = np.argsort(-gain, kind="stable")[: prior.most_candidates]
     return np.sort(order[gain[order] > -np.inf])
 
 

@@ -12,20 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evermap.config import ChangesConfig
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap, MovedGroup
-from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import Hypotheses, find_changes
 from evermap.types import BoolArray, FloatArray, IntArray
 
 MAP_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
-"""By which the standard deviations of the map may be wrong."""
-MAP_FACTOR_SPREAD = 0.35
-"""Standard deviation of the logarithm of that factor: a map's own word is nearly always right within one of two."""
-SOFTNESS_M = (0.005, 0.01, 0.02, 0.04)
-"""Errors that the sightings of one landmark in one window may share."""
-TRANSIENT_SOFTNESS_M = 0.02
-"""The same while it is decided which copies are displaced alone."""
+"""By which the standard deviations of the map may be wrong: the grid on which that is weighed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +50,7 @@ class Verdict:
 def weigh(
     evidence: WindowEvidence,
     given: GivenMap,
-    prior: ChangePrior,
+    prior: ChangesConfig,
     n_windows: int,
     *,
     before: Verdict | None = None,
@@ -75,12 +69,13 @@ def weigh(
         thorough: try all degrees of belief, else those of `before`.
     """
     factor = 1.0 if before is None else before.map_factor
-    softness = 0.0 if n_windows == 1 else (0.01 if before is None else before.softness_m)
+    usual = prior.softness_m[(len(prior.softness_m) - 1) // 2]
+    softness = 0.0 if n_windows == 1 else (usual if before is None else before.softness_m)
     position = np.where(given.given[:, None], given.mean, evidence.first_seen(given.mean))
     if n_windows > 1 and not spared:
 
         def search(evidence: WindowEvidence, start: Hypotheses | None) -> tuple[Comparison, Hypotheses]:
-            soft = evidence.softened(TRANSIENT_SOFTNESS_M)
+            soft = evidence.softened(prior.usual_softness_m)
             comparison = compare(soft, given.mean, given.covariance * factor**2, given.given)
             return comparison, find_changes(soft, comparison, position, n_windows, prior, start=start)
 
@@ -100,7 +95,7 @@ def weigh(
         factor = max(MAP_FACTORS, key=lambda f: tried(f, softness))
     improved = thorough
     while improved:  # one step up or down in either, as long as that gains
-        neighbours = [(factor, s) for s in _beside(SOFTNESS_M, softness)] if n_windows > 1 else []
+        neighbours = [(factor, s) for s in _beside(prior.softness_m, softness)] if n_windows > 1 else []
         if given.given.any():
             neighbours += [(f, softness) for f in _beside(MAP_FACTORS, factor)]
         best = max(neighbours, key=lambda trial: tried(*trial))
@@ -136,7 +131,7 @@ def _try(
     evidence: WindowEvidence,
     given: GivenMap,
     position: FloatArray,
-    prior: ChangePrior,
+    prior: ChangesConfig,
     n_windows: int,
     factor: float,
     softness: float,
@@ -145,7 +140,7 @@ def _try(
     soft = evidence.softened(softness)
     comparison = compare(soft, given.mean, given.covariance * factor**2, given.given)
     hypotheses = find_changes(soft, comparison, position, n_windows, prior, start=start)
-    base = comparison.log_evidence - 0.5 * (np.log(factor) / MAP_FACTOR_SPREAD) ** 2
+    base = comparison.log_evidence - 0.5 * (np.log(factor) / prior.map_factor_spread) ** 2
     return _Trial(factor, softness, comparison, hypotheses, base)
 
 
@@ -216,15 +211,12 @@ def _groups(hypotheses: Hypotheses, row: int, seen: _SeenWithin) -> tuple[_Key, 
     return key, tuple(groups)
 
 
-LOG_ODDS = 7.0
-"""Prior log odds against a copy being displaced alone."""
-
 Search = Callable[[WindowEvidence, Hypotheses | None], tuple[Comparison, Hypotheses]]
 """Compares an evidence with the map and finds changes, from a start."""
 
 
 def without_transients(
-    evidence: WindowEvidence, position: FloatArray, prior: ChangePrior, search: Search
+    evidence: WindowEvidence, position: FloatArray, prior: ChangesConfig, search: Search
 ) -> WindowEvidence:
     """Return the evidence without copies that are displaced alone.
 
@@ -242,12 +234,12 @@ def without_transients(
         still = np.where(spared, 0.0, _gains(after, prior.move_sigma_m))
         candidates: list[tuple[int, float]] = []  # a copy, and what leaving it out gains over keeping it
         worst = int(np.argmax(still))
-        if still[worst] > LOG_ODDS:
-            candidates.append((worst, still[worst] - LOG_ODDS))
+        if still[worst] > prior.displaced_log_odds:
+            candidates.append((worst, still[worst] - prior.displaced_log_odds))
         worst = int(np.argmax(alone))
-        if alone[worst] > LOG_ODDS and all(worst != other for other, _ in candidates):
+        if alone[worst] > prior.displaced_log_odds and all(worst != other for other, _ in candidates):
             _, others = search(_dropped(evidence, worst), found)
-            candidates.append((worst, alone[worst] - LOG_ODDS + float(others.gain[0] - found.gain[0])))
+            candidates.append((worst, alone[worst] - prior.displaced_log_odds + float(others.gain[0] - found.gain[0])))
         best, gain = max(candidates, key=lambda candidate: candidate[1], default=(0, 0.0))
         if gain <= 0.0:
             break
@@ -281,7 +273,7 @@ def _gains(comparison: Comparison, sigma_m: float) -> FloatArray:
 
 
 def _explained_away(
-    evidence: WindowEvidence, comparison: Comparison, found: Hypotheses, position: FloatArray, prior: ChangePrior
+    evidence: WindowEvidence, comparison: Comparison, found: Hypotheses, position: FloatArray, prior: ChangesConfig
 ) -> Comparison:
     """The comparison with the motions of the best hypothesis integrated out."""
     columns: list[FloatArray] = []
