@@ -36,35 +36,37 @@ Examples:
 """
 
 
+Maps = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="MAP", help="Files, or postgresql://user@host/database/SITE.", show_default=False),
+]
+Store = Annotated[
+    str | None,
+    typer.Option(
+        metavar="WHERE", help="All maps of a server: folder, or postgresql://user@host/database.", show_default="none"
+    ),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=1024,
+        help="Processes here; 1 needs no Dask.",
+        show_default="one for each core, where Dask is installed",
+    ),
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler whose workers do it.", show_default="none"),
+]
+
+
 def learn(
-    maps: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="MAP", help="Files, or postgresql://user@host/database/SITE.", show_default=False),
-    ] = None,
-    store: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WHERE",
-            help="All maps of a server: folder, or postgresql://user@host/database.",
-            show_default="none",
-        ),
-    ] = None,
+    maps: Maps = None,
+    store: Store = None,
     out: Annotated[Path, typer.Option(help="Folder for the lifetimes.")] = Path("evermap-out/lifetimes"),
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            max=1024,
-            help="Processes here that read maps; 1 needs no Dask.",
-            show_default="one for each core, where Dask is installed",
-        ),
-    ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            metavar="tcp://HOST:PORT", help="Dask scheduler whose workers read the maps.", show_default="none"
-        ),
-    ] = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     force: Force = False,
     config: ConfigFile = None,
     settings: Settings = None,
@@ -76,11 +78,8 @@ def learn(
     from evermap.runs.company import Company, collect
     from evermap.runs.folder import RunFolder
 
-    if cluster is not None and workers is not None:
-        raise ConfigError("are the cluster's", field="workers", hint="leave out --workers, or --cluster")
-    sites = _sites(maps or [], store)
-    if cluster is not None:
-        sites = {name: where if "://" in where else str(Path(where).absolute()) for name, where in sites.items()}
+    one_of(workers, cluster)
+    sites = sites_of(maps or [], store, cluster)
     files = [where for where in sites.values() if "://" not in where]
     with RunFolder(out, force=force, inputs=files) as folder:
         with progress_bar("reading maps", speed=False) as progress:
@@ -96,8 +95,14 @@ def learn(
     _print(summary, out)
 
 
-def _sites(maps: list[str], store: str | None) -> dict[str, str]:
-    """Files and addresses of maps by the names of their sites.
+def one_of(workers: int | None, cluster: str | None) -> None:
+    """Refuse processes here and a cluster at once."""
+    if cluster is not None and workers is not None:
+        raise ConfigError("are the cluster's", field="workers", hint="leave out --workers, or --cluster")
+
+
+def sites_of(maps: list[str], store: str | None, cluster: str | None = None) -> dict[str, str]:
+    """Return files and addresses of maps by the names of their sites; whole paths where a cluster reads them.
 
     Raises:
         ConfigError: no map, or two of one name.
@@ -113,8 +118,10 @@ def _sites(maps: list[str], store: str | None) -> dict[str, str]:
             raise ConfigError(f"a site of it is called '{name}', as a map", field="store", hint="leave out that map")
         found[name] = where
     if not found:
-        raise ConfigError("there is no map", path=store, hint="evermap learn MAP..., or --store WHERE")
-    return found
+        raise ConfigError("there is no map", path=store, hint="files of maps, or --store WHERE")
+    if cluster is None:
+        return found
+    return {name: where if "://" in where else str(Path(where).absolute()) for name, where in found.items()}
 
 
 def _stored(store: str) -> list[tuple[str, str]]:

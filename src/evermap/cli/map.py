@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.map_edits import AsJson, MapFile, delete, gc, pin, revert, undelete, unpin, verify
+from evermap.cli.map_edits import AsJson, MapFile, delete, gc, pin, reenter, revert, undelete, unpin, verify
 from evermap.cli.terminal import check_picture, echo, print_json, print_table, say, write_picture
 from evermap.errors import ConfigError
 
@@ -356,5 +356,5 @@ def _route_graph(out: Path, graph: Path, clearance_m: float, _: LivingMap, landm
     return {"edges": len(edges), "closed": [edge.number for edge in edges if edge.closed], "doubtful": doubtful}
 
 
-for command in (verify, gc, revert, pin, unpin, delete, undelete):
+for command in (verify, gc, reenter, revert, pin, unpin, delete, undelete):
     app.command()(command)

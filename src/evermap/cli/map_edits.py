@@ -1,15 +1,19 @@
 """`evermap map revert | pin | unpin | delete | undelete`: an operator's word, as revisions that can be reverted.
 
-`verify` and `gc` look after the file.
+`verify` and `gc` look after the file, `reenter` enters all sessions of many maps again.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from evermap.cli.terminal import command_line, print_json, say
+from evermap.cli.learn import Cluster, Maps, Store, Workers, one_of, sites_of
+from evermap.cli.options import ConfigFile, Settings, configured
+from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say
+from evermap.errors import ConfigError, EvermapError
 
 MapFile = Annotated[str, typer.Argument(metavar="FILE", help="The map, as `evermap slam --map FILE` writes it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
@@ -55,8 +59,6 @@ def verify(file: MapFile, as_json: AsJson = False) -> None:
     Example:
       evermap map verify site.evermap
     """
-    from pathlib import Path
-
     from evermap.maps.store import verify_store
     from evermap.maps.store.history import ranges
 
@@ -114,6 +116,56 @@ def gc(
         say(f"{done}: the content of {ranges(found.revisions)} ({what}); {ranges(found.kept)} kept")
     else:
         say(f"nothing to prune: {len(found.kept)} revisions have content")
+
+
+def reenter(
+    maps: Maps = None,
+    store: Store = None,
+    out: Annotated[Path, typer.Option(help="Folder of the copies, to continue from.")] = Path("evermap-out/reentered"),
+    adopt: Annotated[bool, typer.Option("--adopt", help="Append them to the maps, each at once.")] = False,
+    workers: Workers = None,
+    cluster: Cluster = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+) -> None:
+    """Enter all sessions of many maps again, with other settings or after an upgrade.
+
+    Each map is copied to --out and entered there; the maps stay as they are, and can be compared. With --adopt the new
+    revisions are appended to the maps: a map has all of them or none, and `evermap map revert` goes back. What an
+    attempt that was stopped has entered is not entered again.
+
+    \b
+    Examples:
+      evermap map reenter maps/*.evermap --set living.returns=false --adopt
+      evermap map reenter --store postgresql://evermap@db/fleet --cluster tcp://scheduler:8786 --out /shared/reentered
+    """
+    one_of(workers, cluster)
+    chosen = configured(config, settings) if config or settings else None
+    from evermap.runs.company import reenter_all
+
+    sites = sites_of(maps or [], store, cluster)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot be made: {error.strerror}", path=out, field="out", hint="another folder") from None
+    with progress_bar("entering sessions", speed=False) as progress:
+        found = reenter_all(
+            sites, out.absolute(), chosen, adopt=adopt, workers=workers, cluster=cluster, progress=progress
+        )
+    done = {site: one for site, one in found.items() if not isinstance(one, EvermapError)}
+    failed = {site: one for site, one in found.items() if isinstance(one, EvermapError)}
+    if as_json:
+        told = {name: {key: getattr(one, key) for key in one.__slots__} for name, one in done.items()}
+        print_json({"out": str(out), "sites": told, "failed": {site: one.one_line() for site, one in failed.items()}})
+    elif done:
+        rows = [(site, *(f"{number:,}" for number in (one.sessions, one.kept, one.parent, one.revision)),
+                 "yes" if one.adopted else "no") for site, one in done.items()]  # fmt: skip
+        head = ("site", "sessions", "kept", "after revision", "newest", "adopted")
+        print_table(f"in {out}", rows, head, numbers=(1, 2, 3, 4))
+    for first in failed.values():
+        first.problem += f" ({len(failed)} of {len(found)} maps stay as they are)" if len(found) > 1 else ""
+        raise first
 
 
 def pin(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:

@@ -1,4 +1,4 @@
-"""Learn lifetimes over all maps of a company (`evermap learn`), in this process or on a Dask cluster.
+"""What concerns all maps of a company, in this process or on a Dask cluster: `evermap learn`, `evermap map reenter`.
 
 A class has a mean stay and a shape in the company, and its own at every site, about them; how far sites differ is
 learned, too (`survival.class_lifetimes.SitesPosterior`). Of each map only the log likelihoods of its classes are
@@ -9,10 +9,11 @@ order of the sites, so the result does not depend on the number of processes.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -27,6 +28,9 @@ from evermap.types import FloatArray, Progress
 
 if TYPE_CHECKING:
     from distributed import Client
+
+    from evermap.config import Config
+    from evermap.runs.sessions import Reentered
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,28 +105,97 @@ def collect(
         MissingExtraError: workers or a cluster are asked for, and Dask is not installed.
         ConfigError: no scheduler answers, a worker dies, or has no evermap.
     """
-    found: dict[int, ClassEvidence] = {}
-    with _spread(len(maps), workers, cluster) as spread:
-        for number, site in spread(partial(_evidence, settings=settings), maps):
-            if isinstance(site, EvermapError):
-                raise site
-            found[number] = site
+    found = spread_over(
+        maps, partial(_evidence, settings=settings), workers=workers, cluster=cluster, progress=progress
+    )
+    for site in found:
+        if isinstance(site, EvermapError):
+            raise site
+    return found
+
+
+def reenter_all(
+    maps: Mapping[str, str],
+    out: Path,
+    config: Config | None = None,
+    *,
+    adopt: bool = False,
+    workers: int | None = None,
+    cluster: str | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Reentered | EvermapError]:
+    """Enter all sessions of many maps again (`runs.sessions.reenter`); returns what came of it, by site.
+
+    Args:
+        maps: files or addresses by the names of their sites; the workers of a cluster reach them, and `out`, under the
+            same names.
+        out: folder of the copies, `SITE.evermap`, from which an attempt that was stopped is continued.
+        config: settings of all sessions; None for those of each.
+        adopt: append them to the maps.
+        workers: and what follows it as `collect` takes them.
+        cluster: address of a Dask scheduler.
+        progress: told after every map.
+
+    Raises:
+        MissingExtraError, ConfigError: as `collect`; what is wrong with a map is its result.
+    """
+    works = {where: out / f"{site}.evermap" for site, where in maps.items()}
+    again = partial(_again, works=works, config=config, adopt=adopt)
+    found = spread_over(list(works), again, workers=workers, cluster=cluster, progress=progress)
+    return dict(zip(maps, found, strict=True))
+
+
+def spread_over(
+    items: Sequence[str],
+    apply: Callable[[str], Any],
+    *,
+    workers: int | None = None,
+    cluster: str | None = None,
+    progress: Progress | None = None,
+) -> list[Any]:
+    """Return what a function gives for each of many names, in their order: here, in processes, or on a cluster.
+
+    Args:
+        items: the names.
+        apply: the function; an `EvermapError` that it raises is its answer, as Dask would raise another.
+        workers: and what follows it as `collect` takes them.
+        cluster: address of a Dask scheduler.
+        progress: told after every one.
+
+    Raises:
+        MissingExtraError, ConfigError: as `collect`.
+    """
+    found: dict[int, Any] = {}
+    with _spread(len(items), workers, cluster) as spread:
+        for number, one in spread(partial(_apart, apply=apply), items):
+            found[number] = one
             if progress:
-                progress(len(found), len(maps))
-    return [found[number] for number in range(len(maps))]
+                progress(len(found), len(items))
+    return [found[number] for number in range(len(items))]
 
 
-def _evidence(where: str, settings: LifetimeConfig) -> ClassEvidence | EvermapError:
-    """What a map says of its classes. Errors are results: those of Dask are others."""
+def _apart(item: str, apply: Callable[[str], Any]) -> Any:
+    """With the same sums in every process; errors are results."""
     from threadpoolctl import threadpool_limits
 
-    from evermap.maps.store import open_store
-
     try:
-        with threadpool_limits(limits=1, user_api="blas"), open_store(where) as store:  # the same sums in every process
-            return ClassEvidence.of(store.load(), settings)
+        with threadpool_limits(limits=1, user_api="blas"):
+            return apply(item)
     except EvermapError as error:
         return error
+
+
+def _evidence(where: str, settings: LifetimeConfig) -> ClassEvidence:
+    from evermap.maps.store import open_store
+
+    with open_store(where) as store:
+        return ClassEvidence.of(store.load(), settings)
+
+
+def _again(where: str, works: Mapping[str, Path], config: Config | None, adopt: bool) -> Reentered:
+    from evermap.runs.sessions import reenter
+
+    return reenter(where, works[where], config, adopt=adopt)
 
 
 _Spread = Callable[[Callable[[str], Any], Sequence[str]], Iterator[tuple[int, Any]]]

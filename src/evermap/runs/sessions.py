@@ -7,22 +7,36 @@ kept with their revisions. So the map is the one that the right order would have
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evermap.errors import DataError, InputError
-from evermap.maps.store import Attachment, MapStore, Provenance, PrunedRevisionError, Revision, RevisionKind
+from evermap import __version__
+from evermap.errors import DataError, EvermapError, InputError
+from evermap.maps.store import (
+    Attachment,
+    MapStore,
+    Provenance,
+    PrunedRevisionError,
+    Revision,
+    RevisionKind,
+    StaleRevisionError,
+    open_store,
+)
 from evermap.show import Shown
 from evermap.types import Progress
 
 if TYPE_CHECKING:
     from evermap.config import Config
     from evermap.existence.lifetimes import Lifetimes
+    from evermap.maps.lives import Life
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.session import Session
+    from evermap.maps.store.sql import SqlStore
     from evermap.types import AnyRecording, IntArray, Landmarks, MapChange
 
 
@@ -364,26 +378,206 @@ def _history(store: MapStore, kept: dict[int, Attachment]) -> list[_Step]:
 
 def _again(store: MapStore, step: _Step, living: LivingMap) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """The map after a session or an edit that it has had before, and what changed."""
+    if step.recording is None:
+        return _edited_again(store, step, living), ()
+    session = _session_again(store, step, living)
+    return session.living, session.changes
+
+
+def _edited_again(store: MapStore, step: _Step, living: LivingMap) -> LivingMap:
     from evermap.maps.diff import edits
 
-    if step.recording is None:
-        number = step.revision.number
-        for landmark, word in edits(store.members(step.revision.parent), store.members(number)):
-            if landmark in living.members.landmark_id:
-                living = living.edited(landmark, **WORDS[word])
-        return living, ()
+    for landmark, word in edits(store.members(step.revision.parent), store.members(step.revision.number)):
+        if landmark in living.members.landmark_id:
+            living = living.edited(landmark, **WORDS[word])
+    return living
+
+
+def _session_again(store: MapStore, step: _Step, living: LivingMap, config: Config | None = None) -> Session:
+    """A session that a map has had before, with its own settings unless there are others."""
     from evermap.config import parse_config
     from evermap.maps.store.measured import unpack_recording
     from evermap.pipeline import run_session
 
+    assert step.recording is not None
     recording = replace(unpack_recording(store.attached(step.recording)), robot=step.revision.provenance.robot)
+    problem = f"revision {step.revision.number} cannot be brought in again"
     try:
-        session = run_session(recording, living, parse_config(step.revision.provenance.config))
+        session = run_session(recording, living, config or parse_config(step.revision.provenance.config))
     except DataError as error:
-        raise UnbridgedError(f"revision {step.revision.number} cannot be brought in again: {error}") from None
+        raise UnbridgedError(f"{problem}: {error}") from None
     if session.slam.interrupted:  # half of a session must not take the place of the whole
         raise KeyboardInterrupt("the map is as it was")
     if not session.found:  # what is in the map is not dropped
-        problem = f"revision {step.revision.number} cannot be brought in again: {session.set_aside[0]}"
+        problem = f"{problem}: {session.set_aside[0]}"
         raise UnbridgedError(problem, path=store.where, hint="sessions that overlap with both, then this one again")
-    return session.living, session.changes
+    return session
+
+
+@dataclass(frozen=True, slots=True)
+class Reentered(Shown):
+    """What came of entering all sessions of a map again.
+
+    Attributes:
+        sessions: how many it has.
+        kept: how many of them an earlier attempt had entered already.
+        parent: the newest revision of the map, which they follow.
+        revision: the newest after them; `parent` where there are none.
+        adopted: whether the map has them.
+    """
+
+    sessions: int
+    kept: int
+    parent: int
+    revision: int
+    adopted: bool
+
+
+def reenter(where: str, work: Path, config: Config | None = None, *, adopt: bool = False) -> Reentered:
+    """Enter all sessions of a map again, in order of time, and the edits at their time, as revisions after its newest.
+
+    They are written to a copy of the map, the first as a revert to what there was before all sessions. An attempt that
+    was stopped is continued: what an earlier one entered alike, of the same recordings with the same settings by the
+    same evermap, is taken over. What reads the map sees the last of them or none.
+
+    Args:
+        where: the map, as `open_store` takes it.
+        work: file of the copy, which is there when all are entered.
+        config: settings of all sessions; None for those of each.
+        adopt: append them to the map itself, in one transaction; what came in meanwhile is entered, too.
+
+    Raises:
+        InputError: a session of the map keeps no recording, or what was before the first is pruned.
+        UnbridgedError: a session is not found any more; the map stays as it was.
+        DataError, NumericalError: as `pipeline.run_session`.
+    """
+    from evermap.maps.store.sql import SqlStore
+
+    with open_store(where) as store:
+        assert isinstance(store, SqlStore)
+        while True:
+            found = _reentered(store, work, config)
+            if not adopt or found.revision == found.parent:
+                return found
+            try:
+                with open_store(work) as entered:
+                    assert isinstance(entered, SqlStore)
+                    store.extend(entered)
+                return replace(found, adopted=True)
+            except StaleRevisionError:  # somebody committed meanwhile
+                continue
+
+
+def _reentered(store: SqlStore, work: Path, config: Config | None) -> Reentered:
+    from evermap.maps.store.measured import RECORDING
+    from evermap.maps.store.sql import SqlStore
+    from evermap.maps.store.sqlite import snapshot
+
+    head = store.head()
+    steps = _history(store, {item.revision: item for item in store.attachments() if item.name == RECORDING})
+    sessions = [step for step in steps if step.recording is not None]
+    if not sessions:
+        return Reentered(0, 0, head, head, adopted=False)
+    base = min(step.revision.parent for step in sessions)
+    steps = sorted((step for step in steps if step.revision.number > base), key=lambda step: step.start_s)
+    part, before = (work.with_name(f".{work.name}.{kind}") for kind in ("part", "before"))
+    earlier = max((path for path in (part, before, work) if path.exists()), key=_written_by, default=None)
+    if earlier == part:
+        earlier = part.replace(before)
+    part.unlink(missing_ok=True)
+    snapshot(store, part, head)
+    with open_store(part) as fresh:
+        assert isinstance(fresh, SqlStore)
+        fresh.revert(base, Provenance(note=f"all sessions of revision {head} again"))
+        kept = _taken_over(earlier, fresh, base, steps, config)
+        living = fresh.load()
+        if not kept:
+            living = _before_sessions(living, store.load(head))
+        for step in steps[kept:]:
+            living = _entered_again(store, fresh, step, living, config)
+        revision = fresh.head()
+    part.replace(work)
+    before.unlink(missing_ok=True)
+    return Reentered(len(sessions), sum(s.recording is not None for s in steps[:kept]), head, revision, adopted=False)
+
+
+def _before_sessions(living: LivingMap, newest: LivingMap) -> LivingMap:
+    """The map before its first session, with what users said of lifetimes, which is of no time."""
+    lives = replace(living.lives, prior_class_id=newest.lives.prior_class_id, prior=newest.lives.prior)
+    living = replace(living, class_names=newest.class_names, lives=lives) if len(lives.prior) else living
+    return living if len(living.places) else replace(living, clock=newest.clock)
+
+
+def _entered_again(
+    store: MapStore, fresh: MapStore, step: _Step, living: LivingMap, config: Config | None
+) -> LivingMap:
+    """Commit a session or an edit to the copy of a map; returns the map after it."""
+    from evermap.config import to_toml
+    from evermap.maps.store.measured import RECORDING
+
+    said = step.revision.provenance
+    if step.recording is None:
+        living = _edited_again(store, step, living)
+        fresh.commit(living, said, parent=fresh.head())
+        return living
+    start = time.perf_counter()
+    session = _session_again(store, step, living, config)
+    if config is not None:
+        said = replace(said, config=to_toml(config), seed=config.slam.seed)
+    said = replace(said, wall_s=time.perf_counter() - start)
+    attached = {RECORDING: step.recording}
+    parent = fresh.head()
+    fresh.commit(session.living, said, session.changes, session.evidence, parent=parent, attachments=attached)
+    return session.living
+
+
+def _written_by(earlier: Path) -> int:
+    """How many revisions an earlier attempt has written after its revert; 0 of a file that cannot be read."""
+    try:
+        with open_store(earlier) as store:
+            return store.head() - _last_revert(store)
+    except (EvermapError, ValueError):
+        return 0
+
+
+def _last_revert(store: MapStore) -> int:
+    return max(item.number for item in store.log() if item.provenance.kind is RevisionKind.REVERT)
+
+
+def _said(living: LivingMap) -> dict[str, Life]:
+    """What users said of lifetimes, by class; '' for all others."""
+    named = (*living.class_names, "")
+    return {named[kind]: prior for kind, prior in zip(living.lives.prior_class_id, living.lives.prior, strict=True)}
+
+
+def _taken_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequence[_Step], config: Config | None) -> int:
+    """Copy what an earlier attempt has entered alike, from its first step on; returns the number of steps."""
+    from evermap.config import to_toml
+    from evermap.maps.store.measured import RECORDING
+    from evermap.maps.store.sql import SqlStore
+
+    if earlier is None or not _written_by(earlier):
+        return 0
+    with open_store(earlier) as old:
+        assert isinstance(old, SqlStore)
+        log, start = {item.number: item for item in old.log()}, _last_revert(old)
+        same = old.named(log[start].restores)[1] == fresh.named(base)[1]
+        if not same or _said(old.load()) != _said(fresh.load(fresh.head() - 1)):
+            return 0
+        digests = {item.revision: item.digest for item in old.attachments()}
+        for count, step in enumerate(steps):
+            number = start + count + 1
+            wanted = replace(step.revision.provenance, wall_s=np.nan)
+            if step.recording is not None and config is not None:
+                wanted = replace(wanted, config=to_toml(config), seed=config.slam.seed)
+            digest = None if step.recording is None else step.recording.digest
+            if number not in log or log[number].evermap_version != __version__ or digests.get(number) != digest:
+                return count
+            said = log[number].provenance
+            if repr(replace(said, wall_s=np.nan)) != repr(wanted):  # nan is not equal to itself
+                return count
+            seen = old.evidence(revisions=[number])
+            attached = {} if step.recording is None else {RECORDING: step.recording}
+            parent = fresh.head()
+            fresh.commit(old.load(number), said, old.changes(number), seen, parent=parent, attachments=attached)
+    return len(steps)

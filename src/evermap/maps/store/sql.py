@@ -405,6 +405,36 @@ class SqlStore(Shown):
                 connection.execute(insert(schema.revision), numbers)
             self._move_anchor(connection, head, records.get(head), pruned)
 
+    def extend(self, other: SqlStore) -> int:
+        """Take over all revisions that another store has after the newest of this one, whole or not at all; returns the
+        newest.
+
+        Raises:
+            StaleRevisionError: the newest of this one is none of the other's.
+        """
+        with other._reading() as theirs, self._writing() as connection:
+            named: dict[int, Any] = {row.number: row.record for row in theirs.execute(select(schema.revision))}
+            (head, anchor), (last, newest) = self._anchor(connection), other._anchor(theirs)
+            if named.get(head) != anchor:
+                problem = f"revision {head} is none of {other._where}; nothing was written"
+                raise StaleRevisionError(problem, path=self._where, hint="the same again")
+            fetch, wanted = partial(other._fetched, theirs), {named[number] for number in named if number > head}
+            for number, record in other._chain(theirs, head + 1)[0].items():
+                if number > head:
+                    wanted |= record.parts() | content.names_in(record.content, fetch)
+                    if record.evidence is not None:
+                        index = content.read_text(record.evidence, fetch([record.evidence])[record.evidence])
+                        wanted |= {row.name for row in read_index(index)}
+            for some in _batches(sorted(wanted)):
+                there = connection.execute(select(schema.chunk.c.name).where(schema.chunk.c.name.in_(some))).scalars()
+                rows = [{"name": name, "data": data} for name, data in fetch(set(some) - set(there)).items()]
+                if rows:
+                    connection.execute(insert(schema.chunk), rows)
+            if new := [{"number": number, "record": name} for number, name in sorted(named.items()) if number > head]:
+                connection.execute(insert(schema.revision), new)
+                self._move_anchor(connection, last, newest)
+        return last
+
     def _with_evidence(self, evidence: Evidence | None, chunks: dict[bytes, Chunk]) -> bytes | None:
         """The name of the index of what a session saw, None for nothing; its chunks are added to `chunks`."""
         if evidence is None or not len(evidence):
