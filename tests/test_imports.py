@@ -33,8 +33,8 @@ RULES = {
     "tracking": "errors compiled show types config geometry survival valid io sensing existence",
     "viz": "errors types geometry stamps survival metrics existence",
     "slam": "errors interrupts compiled plugins show types config geometry valid sensing tracking",
-    "maps": "errors show types config geometry stamps survival sensing existence tracking slam",
-    "pipeline": "errors types config valid slam maps",
+    "maps": "errors show types config geometry stamps survival valid sensing existence tracking slam",
+    "pipeline": "errors compiled types config slam maps",
     "runs": (
         "errors interrupts show types config geometry stamps survival valid io metrics existence tracking viz maps "
         "pipeline"

@@ -24,6 +24,15 @@ from evermap.interrupts import held, raises
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
+@contextlib.contextmanager
+def single_threaded() -> Iterator[None]:
+    """Keep BLAS to one thread: matrices are small, and more threads sum in another order on another machine."""
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
+
+
 UNREADABLE = (AttributeError, ImportError, EOFError, pickle.UnpicklingError)
 """Raised by an index of kept code that names types which this evermap does not have any more, or that was cut off."""
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from evermap.config import CheckConfig, CleaningConfig, Config, SensorConfig, Sl
 from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.show import Shown
-from evermap.slam.cleaning import spikes
+from evermap.slam.cleaning import clean, spikes
 from evermap.slam.mistakes import HONEST, USUAL, likeliest, off, pairs_of
 from evermap.types import (
     UNKNOWN,
@@ -420,6 +420,46 @@ def valid(recording: Recording, sensor: SensorConfig, prior_map: Landmarks | Non
     if prior_map is not None:
         check_landmarks(prior_map, "prior_map")
     return replace(recording, sensor=sensor.applied_to(recording.sensor))
+
+
+@overload
+def screened(
+    recording: Recording, config: Config, prior_map: Landmarks | None = ..., *, repair: bool = ...
+) -> tuple[Recording, tuple[str, ...]]: ...
+@overload
+def screened(
+    recording: SpatialRecording, config: Config, prior_map: Landmarks | None = ..., *, repair: bool = ...
+) -> tuple[SpatialRecording, tuple[str, ...]]: ...
+def screened(
+    recording: Any, config: Config, prior_map: Landmarks | None = None, *, repair: bool = False
+) -> tuple[Any, tuple[str, ...]]:
+    """Return a recording without ids that other detections contradict, and remarks on it.
+
+    Args:
+        recording: what a reader returned, or anything else; a recording in space, or without ids to use, as it is.
+        config: settings.
+        prior_map: landmarks that are checked with it.
+        repair: leave out what is impossible in a recording in the plane (`slam.cleaning`), instead of refusing it.
+
+    Raises:
+        InputError: no recording, or values that cannot be, in it or in the prior map.
+        DataError: nothing can be estimated from it.
+    """
+    from evermap.slam.space.moving import has_traffic
+    from evermap.slam.votes import without_contradicted_ids
+
+    settings, remarks = config.slam, tuple[str, ...]()
+    if not isinstance(recording, SpatialRecording):
+        if repair:
+            recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
+            recording = clean(recording, settings.cleaning)
+        else:
+            recording = valid(recording, config.sensor, prior_map)
+        remarks = odd(recording, identities=settings.unknown_ids is not True, settings=settings.check)
+    if settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording):  # the tracker tells who is who
+        return recording, remarks
+    voted = without_contradicted_ids(recording, settings.space)
+    return voted, (*remarks, *voted.warnings[len(recording.warnings) :])
 
 
 def check_recording(recording: AnyRecording, config: Config | None = None) -> Check:

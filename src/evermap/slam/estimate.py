@@ -13,12 +13,11 @@ from evermap.config import SlamConfig
 from evermap.interrupts import watched
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.joint import Joint, may_search
-from evermap.slam.intake import Prepared
+from evermap.slam.intake import Prepared, beliefs, prepare
 from evermap.slam.method import Method, Static
-from evermap.slam.problem import Noise
 from evermap.slam.streaming import Outcome, StreamingSlam
 from evermap.slam.warmup import warm_up
-from evermap.types import FloatArray, Progress, Recording, Sensor
+from evermap.types import FloatArray, Landmarks, Progress, Recording, Sensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +57,10 @@ class Solved:
 
 def solve(
     recording: Recording,
-    prepared: Prepared,
-    prior: CalibrationPrior,
-    noise: Noise,
     settings: SlamConfig,
     *,
+    prior_map: Landmarks | None = None,
+    remarks: tuple[str, ...] = (),
     realtime: bool = False,
     progress: Progress | None = None,
 ) -> Solved:
@@ -70,17 +68,19 @@ def solve(
 
     Args:
         recording: cleaned, with known identities.
-        prepared: the same as the estimator wants it.
-        prior: of the calibration states.
-        noise: levels to start from.
         settings: of the estimator.
+        prior_map: landmarks to localise in; None maps from scratch.
+        remarks: on the recording.
         realtime: process at the recording's pace.
         progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.
 
     Raises:
+        DataError: fewer than two frames with a landmark of known identity.
         NumericalError: no finite optimum.
     """
-    in_map = prepared.prior_map is not None
+    prior, noise = beliefs(recording.sensor, settings)
+    prepared = prepare(recording, prior_map, remarks)
+    in_map = prior_map is not None
     warm_up(search=settings.method == "joint" and may_search(len(prepared.problem.stamp_s), in_map=in_map))
     slam = StreamingSlam(
         prepared.problem,

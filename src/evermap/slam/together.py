@@ -8,7 +8,7 @@ the mean of what all of them say (`CalibrationPrior.metre`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from evermap.slam.bridge import bridged
 from evermap.slam.calibration import SLOPE, needed
 from evermap.slam.encounters import Encounters, Together
 from evermap.slam.estimate import Solved
+from evermap.slam.intake import beliefs
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.result import online as told_online
@@ -55,24 +56,29 @@ class Member:
     Attributes:
         number: by which others call it.
         alone: its recording by itself, from scratch.
-        start: noise levels before the first frame.
     """
 
     number: int
     alone: Solved
-    start: Noise
+
+    @property
+    def start(self) -> Noise:
+        """Noise levels before the first frame."""
+        return beliefs(self.alone.recording.sensor, self.alone.settings)[1]
 
 
-def solve_together(members: Sequence[Member]) -> tuple[list[Solved], list[Trajectory]]:
-    """Return the members solved together, and what each knew at the time, in the frame of the first one's first pose.
+def solve_together(alone: Mapping[int, Solved]) -> tuple[list[Solved], list[Trajectory]]:
+    """Return robots solved together, and what each knew at the time, in the frame of the first one's first pose.
 
     Args:
-        members: landmarks with the same id are one, unless one of them saw it move.
+        alone: each by itself, by the number by which others call it; landmarks with the same id are one, unless one
+            of the robots saw it move.
 
     Raises:
         DataError: nothing ties one of them to the others.
         NumericalError: no finite optimum.
     """
+    members = [Member(number, one) for number, one in alone.items()]
     met, stamps, remarks = _sighted(members)
     own = [_extended(member, stamp_s) for member, stamp_s in zip(members, stamps, strict=True)]
     motion = _placed(members, own, met)
@@ -86,14 +92,14 @@ def solve_together(members: Sequence[Member]) -> tuple[list[Solved], list[Trajec
     solved, online = [], []
     frames = ["first_pose", *["first_robot"] * (len(members) - 1)]
     for member, outcome, by, said, frame in zip(members, outcomes, motion, remarks, frames, strict=True):
-        alone = member.alone
-        turned = alone.outcome.scale / outcome.scale * se2.rotation(by[2])
+        one = member.alone
+        turned = one.outcome.scale / outcome.scale * se2.rotation(by[2])
         changes = outcome.revision.changes
         moved = tuple(replace(change, displacement_m=tuple(turned @ change.displacement_m)) for change in changes)
         revision = replace(outcome.revision, changes=moved)
-        prepared = replace(alone.prepared, warnings=(*alone.prepared.warnings, *said))
-        solved.append(replace(alone, prepared=prepared, outcome=replace(outcome, revision=revision)))
-        told = told_online(alone.prepared, alone.slam, alone.recording, frame)
+        prepared = replace(one.prepared, warnings=(*one.prepared.warnings, *said))
+        solved.append(replace(one, prepared=prepared, outcome=replace(outcome, revision=revision)))
+        told = told_online(one.prepared, one.slam, one.recording, frame)
         online.append(replace(told, pose_world_robot=se2.compose(by, told.pose_world_robot)))
     return solved, online
 

@@ -10,7 +10,7 @@ from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, blocks, of_places
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.gaussian import anchored, own_landmarks
-from evermap.maps.sessions.session import laid
+from evermap.maps.sessions.planar import laid
 from evermap.pipeline import bring_in, solve_alone
 from evermap.slam.estimate import Solved
 from evermap.types import FloatArray, IntArray

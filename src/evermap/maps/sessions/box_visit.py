@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from evermap.config import FitConfig, LivingConfig, TrackConfig
+from evermap.config import LivingConfig, TrackConfig
 from evermap.geometry import se3
 from evermap.maps.living import Boxes, LivingMap
 from evermap.maps.sessions.extend import Extended, Found
@@ -19,7 +19,7 @@ from evermap.slam.space.intake import most_of
 from evermap.slam.space.moving import TILT, TrafficIntake, boxes_of, conclude_in_traffic, mounts_of
 from evermap.slam.space.solve import SpatialSolved
 from evermap.tracking.frame import heading_of
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SlamResult
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SlamResult, SpatialRecording
 
 SEEN = 0.5
 """Inlier probability from which on a detection shows a box."""
@@ -132,6 +132,11 @@ class BoxVisit(SpatialVisit):
     kept: BoolArray
     tied_m: FloatArray
 
+    @property
+    def used(self) -> SpatialRecording:
+        """The recording of which `concluded` names rows."""
+        return self.taken.recording
+
     @functools.cached_property
     def landmark_id(self) -> IntArray:
         """(P,) ids of the places of the problem."""
@@ -160,9 +165,9 @@ class BoxVisit(SpatialVisit):
         rotation[known] = np.column_stack([0.0 * half, 0.0 * half, np.sin(half), np.cos(half)])[known]
         return row, rotation
 
-    def found(self, where: Laid | None, living: LivingMap, settings: FitConfig) -> Found:
+    def found(self, where: Laid | None, living: LivingMap, config: LivingConfig) -> Found:
         """Return the landmarks of the session in the frame of a map; every box is a body of its own."""
-        found = super().found(where, living, settings)
+        found = super().found(where, living, config)
         mine = np.isin(found.landmark_id, self.landmark_id[self.boxes.place])
         assert found.rotation is not None
         assert found.rotation_covariance is not None

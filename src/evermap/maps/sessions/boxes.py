@@ -24,6 +24,7 @@ from evermap.geometry import se3
 from evermap.geometry.chunked import blocks
 from evermap.geometry.rigid import consensus
 from evermap.maps.living import LivingMap
+from evermap.maps.sessions.believe import aged
 from evermap.maps.sessions.box_search import (
     DRIFT_M,
     GATE,
@@ -38,10 +39,11 @@ from evermap.maps.sessions.box_search import (
     regained,
 )
 from evermap.maps.sessions.box_visit import HEADING_RAD, TIED_M, BoxVisit, SeenBoxes, seen_boxes
-from evermap.maps.sessions.placing import Laid
+from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, around
+from evermap.maps.sessions.spatial import SpatialVisit, localised_in_space
 from evermap.maps.sessions.witnessed import Witnessed
 from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.moving import TrafficIntake, rescaled, solve_in_traffic
+from evermap.slam.space.moving import TrafficIntake, has_traffic, rescaled, solve_in_traffic, take_in_traffic
 from evermap.slam.space.problem import PlacePrior
 from evermap.slam.space.result import identities_of, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved
@@ -77,6 +79,32 @@ TAILS = (0.7, 1.0), (0.3, 3.0)
 """Shares of deviations, and how much wider they are than expected."""
 RETURNS = 0.5
 """Probability beforehand that what is seen to come to where a box of the map had stood is that box."""
+
+
+def localised(
+    recording: SpatialRecording,
+    living: LivingMap,
+    config: Config,
+    remarks: tuple[str, ...] = (),
+    progress: Progress | None = None,
+) -> Localised[SpatialVisit]:
+    """Return a session in space where it lies in a map; boxes without identity get theirs from the map.
+
+    Arguments are those of `spatial.localised_in_space`.
+    """
+    if not has_traffic(recording):
+        return localised_in_space(recording, living, config, remarks, progress)
+    settings, taken = config.living, take_in_traffic(recording, config.slam.space, config.track)
+    p_site = aged(living, settings, float(taken.recording.frames.stamp_s[0])).p_here
+    seen, where = visited_in_traffic(taken, living, p_site, config, progress)
+    visit: SpatialVisit = seen
+    if where is None and len(living.places):
+        return Localised.lost(visit, living, NOT_FOUND)
+    part, vicinity = visit.named(living), None
+    if where is not None and len(living.places) > settings.whole_places:
+        vicinity, where = around(part, where, visit.path_m, visit.floor_sensor, settings)
+        part = vicinity.part
+    return Localised(visit, part, where, vicinity)
 
 
 def visited_in_traffic(
@@ -409,14 +437,3 @@ def _doubtful(seen: SeenBoxes, matched: _Matched, living: LivingMap) -> BoolArra
     tied = np.linalg.norm(at[:, None] - at[held], axis=2).min(axis=1) <= TIED_M
     among = np.linalg.norm(at[:, None] - known, axis=2).min(axis=1, initial=np.inf) <= AMONG_M
     return np.asarray(~held & ~tied & among)
-
-
-def without_strays(living: LivingMap) -> LivingMap:
-    """Return a map without sizes and names of boxes that it has forgotten."""
-    boxes = living.boxes
-    stays = np.isin(boxes.landmark_id, living.members.landmark_id)
-    if stays.all():
-        return living
-    gone = set(boxes.landmark_id[~stays].tolist())
-    texts = tuple(text for text in living.landmark_texts if landmark_id_of(text) not in gone)
-    return replace(living, boxes=boxes[stays], landmark_texts=texts)

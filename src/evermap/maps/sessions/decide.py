@@ -13,7 +13,7 @@ from evermap.maps.diff import elsewhere, motion_of, with_swaps
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks
-from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
+from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange, landmark_id_of
 
 USUAL = DecisionConfig()
 
@@ -486,3 +486,14 @@ def _members_at(living: LivingMap, site: int) -> tuple[int, ...]:
         return ()
     rows = living.places.site_id == living.sites.site_id[site]
     return tuple(int(name) for name in np.sort(living.places.landmark_id[rows]))
+
+
+def without_strays(living: LivingMap) -> LivingMap:
+    """Return a map without sizes and names of boxes that it has forgotten."""
+    boxes = living.boxes
+    stays = np.isin(boxes.landmark_id, living.members.landmark_id)
+    if stays.all():
+        return living
+    gone = set(boxes.landmark_id[~stays].tolist())
+    texts = tuple(text for text in living.landmark_texts if landmark_id_of(text) not in gone)
+    return replace(living, boxes=boxes[stays], landmark_texts=texts)

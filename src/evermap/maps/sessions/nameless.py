@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.optimize import linear_sum_assignment
 
-from evermap.config import LivingConfig, OverlayConfig
+from evermap.config import Config, LivingConfig, OverlayConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import blocks, of_places
 from evermap.geometry.rigid import rigid
@@ -35,8 +35,7 @@ from evermap.slam.association.constellation import CERTAIN_NATS, NEAR_M, LocalMa
 from evermap.slam.association.identify import ALL_TRIED, Associated, associated
 from evermap.slam.association.jcbb import gates
 from evermap.slam.association.place_index import LEAD_NATS, PlaceIndex
-from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.problem import Noise
+from evermap.slam.intake import beliefs
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Recording, landmark_id_of
 
 WINDOW, FEWEST = 12, 4
@@ -92,27 +91,23 @@ def without_ids(recording: Recording) -> Recording:
     return replace(recording, detections=replace(detections, landmark_id=nobody), landmark_names={})
 
 
-def named_in(
-    recording: Recording, living: LivingMap, prior: CalibrationPrior, noise: Noise, config: LivingConfig
-) -> Recording:
+def named_in(recording: Recording, living: LivingMap, config: Config) -> Recording:
     """Return a recording with landmark ids by geometry: those of a map where its landmarks were met, new ones else.
 
     Args:
         recording: with the map's class numbers; detections with a landmark id keep it (see `without_ids`).
         living: the map.
-        prior: of the calibration states.
-        noise: where noise levels start.
-        config: priors of what moved.
+        config: settings.
 
     Raises:
         DataError: too few frames with detections, or too many for the memory.
     """
-    found = associated(recording, prior, noise, keep_ids=True)
+    found = associated(recording, *beliefs(recording.sensor, config.slam), keep_ids=True)
     start_s = float(recording.frames.stamp_s[0])
     landmark_id = found.assignment.name
     if len(living.places):
-        p_site = aged(living, config, start_s).p_here
-        member = _Assigned(found, living, _Stood.of(living, p_site), config).members()
+        p_site = aged(living, config.living, start_s).p_here
+        member = _Assigned(found, living, _Stood.of(living, p_site), config.living).members()
         known = (member >= 0) & (landmark_id == UNKNOWN)
         landmark_id[known] = living.members.landmark_id[member[known]]
     names = _new_names(found, recording, landmark_id, start_s)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -15,13 +15,24 @@ from evermap.geometry.rigid import consensus, rigid
 from evermap.geometry.symmetry import Symmetries
 from evermap.maps.living import LivingMap, Places
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
+from evermap.maps.vicinity import Vicinity, cliques_of, near
 from evermap.slam.calibration import FORWARD, N_STATES, SLOPE, CalibrationPrior
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_TOLERANCE, Outcome, divided, sighted_at
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
 
+VisitT = TypeVar("VisitT")
 USUAL = FitConfig()
+NOT_FOUND = (
+    "too few of its landmarks were seen standing to each other as it says",
+    "begin another map with it, or first enter a session that sees both",
+)
+CONTRADICTED = (
+    "most sightings contradict it or each other; the session is bent, or of another place",
+    "`evermap check` names what is odd; `--set living.search=gate` enters it all the same, by what most agree on",
+)
+"""Why a session cannot be localised in a map, and what to try."""
 SMALLEST_P = 1e-6
 STOOD_RAD, MOVED_RAD = (0.02, 0.06, 0.15), (0.2, 1.0)
 """How far landmarks in space seem turned from session to session: standard deviations, of a group all alike."""
@@ -53,6 +64,30 @@ class Laid:
         """Return the same without what is assumed."""
         place = np.where(self.assumed, ELSEWHERE, self.place)
         return replace(self, place=place, assumed=np.zeros(len(place), dtype=np.bool_))
+
+
+@dataclass(frozen=True, slots=True)
+class Localised(Generic[VisitT]):
+    """A session in a map.
+
+    Attributes:
+        visit: the session, solved with the map as its prior; by itself where it is lost, or begins a map.
+        living: the map, or the part of it that the session can touch.
+        where: the session lies in it; None where it is lost, or begins a map.
+        vicinity: that part; None for the whole.
+        reason: why it is lost, and what to try; empty where it is not.
+    """
+
+    visit: VisitT
+    living: LivingMap
+    where: Laid | None = None
+    vicinity: Vicinity | None = None
+    reason: tuple[str, ...] = ()
+
+    @classmethod
+    def lost(cls, visit: VisitT, living: LivingMap, reason: tuple[str, str]) -> Localised[VisitT]:
+        """Return a session that cannot be localised."""
+        return cls(visit, living, reason=reason)
 
 
 class Turned(NamedTuple):
@@ -253,6 +288,35 @@ def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid
         probability=np.concatenate([where.probability, np.ones(len(names))])[order],
         assumed=np.concatenate([where.assumed, np.zeros(len(names), dtype=np.bool_)])[order],
     )
+
+
+def widened(
+    seen: Vicinity, where: Laid, path_m: FloatArray, sensor: Sensor, config: LivingConfig
+) -> tuple[Vicinity, Laid]:
+    """Return the part of a large map with all that a sensor may have seen on a path (N, 2 or 3), and where a session
+    lies in it.
+    """
+    living, reach_m = seen.whole, sensor.range_max_m + config.near_m
+    cliques, box = living.sites.clique_id, np.array([-np.inf, -np.inf, np.inf, np.inf])
+    if np.isfinite(reach_m):  # else all there is may be in view
+        cliques, box = near(living, path_m, reach_m)
+    vicinity = Vicinity.of(living, np.union1d(np.unique(seen.part.sites.clique_id), cliques), config, box)
+    at = where.place >= 0
+    place = where.place.copy()
+    places = seen.part.places[place[at]]
+    place[at] = vicinity.part.place_row(places.landmark_id, places.site_id)
+    return vicinity, replace(where, place=place)
+
+
+def around(
+    living: LivingMap, where: Laid, path_m: FloatArray, sensor: Sensor, config: LivingConfig
+) -> tuple[Vicinity, Laid]:
+    """Return the part of a large map that a session can touch, and where it lies there, by rows of the whole."""
+    at = where.place >= 0
+    seen = Vicinity.of(living, cliques_of(living, where.landmark_id[at]), config)
+    place, places = where.place.copy(), living.places[where.place[at]]
+    place[at] = seen.part.place_row(places.landmark_id, places.site_id)
+    return widened(seen, replace(where, place=place), path_m, sensor, config)
 
 
 HEAVY_STEPS = 6

@@ -13,21 +13,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from evermap.config import FitConfig, LivingConfig
+from evermap.config import Config, LivingConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.maps.living import EXISTS, Dated, LivingMap
+from evermap.maps.sessions.believe import aged
 from evermap.maps.sessions.extend import Extended, Found
 from evermap.maps.sessions.gaussian import anchored, drifted
 from evermap.maps.sessions.looks import Watch
-from evermap.maps.sessions.placing import Laid, Turned, laid_over
+from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, Turned, laid_over, widened
 from evermap.maps.sessions.witnessed import Witnessed
+from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.sensing import learned
 from evermap.sensing.profile import Assumed, Field, Projection
 from evermap.sensing.visibility import WORTH_A_LOOK, LooksAt
 from evermap.slam.space.against_map import by_itself
 from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.intake import SpatialIntake, most_of
+from evermap.slam.space.intake import SpatialIntake, most_of, prepare_space
 from evermap.slam.space.problem import ANY_RAD, PlacePrior
 from evermap.slam.space.result import concluded_in_space, identities_of, located, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved, solve_space
@@ -79,9 +81,18 @@ class SpatialVisit:
     solved: SpatialSolved
     witnessed: Witnessed = field(default_factory=Witnessed.nothing)
 
+    @property
+    def used(self) -> SpatialRecording:
+        """The recording of which `concluded` names rows."""
+        return self.recording
+
     def concluded(self) -> SlamResult:
         """Return the session as the estimator has it."""
         return concluded_in_space(self.recording, self.intake, self.solved)
+
+    def begun(self, living: LivingMap) -> LivingMap:
+        """Return an empty map as it is: in space the metre is that of the sensors."""
+        return living
 
     @property
     def start_s(self) -> float:
@@ -169,8 +180,9 @@ class SpatialVisit:
         oriented = self.optimum.smoother.problem.oriented[row, None]
         return row, np.where(oriented, self.optimum.estimate.place[row, 3:], np.nan)
 
-    def found(self, where: Laid | None, living: LivingMap, settings: FitConfig) -> Found:
+    def found(self, where: Laid | None, living: LivingMap, config: LivingConfig) -> Found:
         """Return the landmarks of the session in the frame of a map; None for `where` begins one."""
+        settings = config.fit
         problem, place = self.optimum.smoother.problem, self.optimum.estimate.place
         names, count = self.landmark_id, len(place)
         good = np.flatnonzero(self.inlier >= settings.inlier)
@@ -317,6 +329,36 @@ def visited(
     if where is None or np.count_nonzero(where.place >= 0) < 2:
         return visit, None
     return replace(visit, solved=replace(visit.solved, optimum=_held(visit, living, where), from_map=None)), where
+
+
+def localised_in_space(
+    recording: SpatialRecording,
+    living: LivingMap,
+    config: Config,
+    remarks: tuple[str, ...] = (),
+    progress: Progress | None = None,
+) -> Localised[SpatialVisit]:
+    """Return a session solved where it lies in a map, or in the part of a large one that it can touch.
+
+    Args:
+        recording: the session.
+        living: the map, with its classes (`session.admitted`).
+        config: settings.
+        remarks: on the recording.
+        progress: told after every frame.
+    """
+    settings, intake = config.living, prepare_space(recording, config.slam.space, remarks)
+    part, vicinity = living, None
+    if len(living.places) > settings.whole_places:
+        vicinity = Vicinity.of(living, cliques_of(living, names_of(intake).ravel()), settings)
+        part = vicinity.part
+    visit, where = visited(intake, recording, part, aged(part, settings, intake.start_s).p_here, settings, progress)
+    if where is None and len(living.places):
+        return Localised.lost(visit, living, NOT_FOUND)
+    if vicinity is not None and where is not None:
+        vicinity, where = widened(vicinity, where, visit.path_m, visit.floor_sensor, settings)
+        part = vicinity.part
+    return Localised(visit, visit.named(part), where, vicinity)
 
 
 def standing(living: LivingMap, p_site: FloatArray) -> Landmarks:

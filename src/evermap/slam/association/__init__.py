@@ -1,1 +1,23 @@
 """Which detection is which landmark, by geometry alone: for recordings without identities."""
+
+from __future__ import annotations
+
+from evermap.config import SlamConfig
+from evermap.types import AnyRecording, Landmarks, SpatialRecording
+
+
+def with_identities(recording: AnyRecording, settings: SlamConfig, prior_map: Landmarks | None = None) -> AnyRecording:
+    """Return the recording with landmark ids by geometry where `slam.unknown_ids` asks for them.
+
+    Errors are those of `identify.identified` in the plane, and of `in_space.identified_in_space`.
+    """
+    from evermap.slam.association.identify import identified
+    from evermap.slam.association.in_space import identified_in_space
+    from evermap.slam.intake import beliefs
+
+    keep_ids = settings.unknown_ids == "empty"
+    if not settings.unknown_ids:
+        return recording
+    if isinstance(recording, SpatialRecording):
+        return identified_in_space(recording, settings.space, prior_map, keep_ids=keep_ids)
+    return identified(recording, *beliefs(recording.sensor, settings), prior_map=prior_map, keep_ids=keep_ids)

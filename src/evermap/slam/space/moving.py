@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeGuard
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from evermap.tracking.run import TrackResult, run_track
 from evermap.tracking.standing import WHEN_S, Stood, long_enough, standing
 from evermap.types import (
     UNKNOWN,
+    AnyRecording,
     ChangeKind,
     FloatArray,
     Frames,
@@ -66,9 +68,11 @@ class Traffic:
     gauge: Gauge
 
 
-def has_traffic(recording: SpatialRecording) -> bool:
+def has_traffic(recording: AnyRecording) -> TypeGuard[SpatialRecording]:
     """Return whether there are boxes without identity, and odometry."""
-    return recording.odometry is not None and len(recording.odometry) > 1 and len(boxes_of(recording)) > 0
+    if not isinstance(recording, SpatialRecording) or recording.odometry is None:
+        return False
+    return len(recording.odometry) > 1 and len(boxes_of(recording)) > 0
 
 
 def run_in_traffic(

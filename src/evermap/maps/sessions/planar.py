@@ -1,0 +1,419 @@
+"""A session in the plane: solved by itself, laid over a map, solved again with the map as its prior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+
+from evermap.config import Config, LivingConfig
+from evermap.errors import DataError, NumericalError
+from evermap.geometry import se2
+from evermap.geometry.chunked import of_places
+from evermap.geometry.rigid import rigid
+from evermap.maps.living import LivingMap, Metres
+from evermap.maps.sessions import believe
+from evermap.maps.sessions.extend import Extended, Found
+from evermap.maps.sessions.gaussian import (
+    CONTRADICTS,
+    Size,
+    drifted,
+    log_ratio,
+    of_unknown_size,
+    own_landmarks,
+    resized,
+    settled,
+    settled_by,
+)
+from evermap.maps.sessions.looks import Sighting, Watch
+from evermap.maps.sessions.placing import (
+    CONTRADICTED,
+    NOT_FOUND,
+    Held,
+    Laid,
+    Localised,
+    all_at_home,
+    laid_over,
+    refitted,
+    unbent,
+    widened,
+    with_glimpsed,
+)
+from evermap.maps.sessions.witnessed import Witnessed
+from evermap.maps.vicinity import Vicinity, cliques_of
+from evermap.slam import result as of_slam
+from evermap.slam.cleaning import some_frames
+from evermap.slam.estimate import Solved, solve
+from evermap.slam.streaming import Outcome, silent_links
+from evermap.types import (
+    UNKNOWN,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Progress,
+    Recording,
+    Sensor,
+    SlamResult,
+    landmark_id_of,
+)
+
+STRETCH = 3
+"""Windows of sightings that contradict the rest where poses are wrong: a few misread ones are outliers, and no more."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanarVisit:
+    """A session in the plane, in a frame of its own or in that of a map.
+
+    Attributes:
+        solved: the recording and its estimate.
+    """
+
+    solved: Solved
+
+    @property
+    def recording(self) -> Recording:
+        """The recording as it was used."""
+        return self.solved.recording
+
+    @property
+    def used(self) -> Recording:
+        """The recording of which `concluded` names rows."""
+        return self.recording
+
+    @property
+    def start_s(self) -> float:
+        """Stamp of the first frame that has a pose."""
+        return self.solved.start_s
+
+    @property
+    def end_s(self) -> float:
+        """Stamp of the last frame that was processed."""
+        return self.solved.end_s
+
+    @property
+    def floor_sensor(self) -> Sensor:
+        """The sensor."""
+        return self.recording.sensor
+
+    @property
+    def witnessed(self) -> Witnessed:
+        """What was seen to come to rest, or to leave: nothing, since nothing is tracked."""
+        return Witnessed.nothing()
+
+    def concluded(self, scratch: str = "first_pose") -> SlamResult:
+        """Return the session as the estimator has it; without a map in the frame that is called `scratch`."""
+        return of_slam.concluded(self.solved, scratch)
+
+    def begun(self, living: LivingMap) -> LivingMap:
+        """Return an empty map with the metre of this session, its first."""
+        variance = self.solved.outcome.log_scale_sigma**2
+        information = 1.0 / variance if variance > 0.0 else np.inf
+        living = replace(living, log_size_variance=variance, log_size_information=information)
+        if robot := self.recording.robot:
+            first = [landmark_id_of(robot)], [0.0], [variance], [information]
+            living = replace(living, metres=Metres(*map(np.array, first)))
+        return living
+
+    def found(self, where: Laid | None, living: LivingMap, config: LivingConfig) -> Found:  # noqa: ARG002
+        """Return the landmarks of the session in the frame of a map; None for `where` begins one."""
+        visit = self.solved
+        begins, in_place = where is None, None
+        if where is not None:
+            in_place = np.searchsorted(visit.prepared.landmark_id, where.landmark_id[where.place >= 0])
+        own = own_landmarks(visit.outcome, config.fit, in_place)
+        detection, landmark = _inliers(visit, config.fit.inlier)
+        stamps = visit.recording.frames.stamp_s[visit.recording.detections.frame[detection]]
+        count = len(visit.prepared.landmark_id)
+        first, last = np.full(count, np.inf), np.full(count, -np.inf)
+        np.minimum.at(first, landmark, stamps)
+        np.maximum.at(last, landmark, stamps)
+        kind = np.full(count, UNKNOWN, dtype=np.int64)
+        kind[landmark] = visit.recording.detections.class_id[detection]
+        seen = np.flatnonzero(np.isfinite(last[own.row]))
+        row = own.row[seen]
+        names = visit.prepared.landmark_id[row]
+        place, probability = np.full(len(names), -1, dtype=np.int64), np.ones(len(names))
+        if where is not None:
+            _, here, there = np.intersect1d(names, where.landmark_id, return_indices=True)
+            place[here], probability[here] = where.place[there], where.probability[there]
+        covariance = own.begun(seen, config.whole_places) if begins else of_places(own.covariance_m2, seen)
+        body = np.full(len(names), UNKNOWN, dtype=np.int64)
+        _, here, there = np.intersect1d(names, visit.recording.objects[:, 0], return_indices=True)
+        body[here] = visit.recording.objects[there, 1]
+        return Found(
+            names, kind[row], place, probability, own.position_m[seen], covariance, body, first[row], last[row]
+        )
+
+    def watched(self, entry: Extended, config: LivingConfig) -> Watch:
+        """Return at which places of the map the session looked, by the nominal field of view."""
+        visit = self.solved
+        recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
+        trajectory = of_slam.trajectory(prepared, outcome, recording, "")
+        stamps = recording.frames.stamp_s
+        frames = np.flatnonzero((stamps >= visit.start_s) & (stamps <= visit.end_s + 1e-9)).astype(np.int64)
+        pose = trajectory.pose_world_robot[of_slam.rows_at(trajectory, recording, frames)]
+        detection, landmark = _inliers(visit, config.fit.inlier)
+        place_of = np.full(len(prepared.landmark_id), -1, dtype=np.int64)
+        _, rows, found = np.intersect1d(prepared.landmark_id, entry.landmark_id, return_indices=True)
+        place_of[rows] = entry.place[found]
+        _place_glimpsed(place_of, entry, visit, config.fit.glimpse_m)
+        hit = place_of[landmark]
+        frame = np.searchsorted(frames, recording.detections.frame[detection])
+        sighting = Sighting(stamps[frames], pose, frame[hit >= 0], hit[hit >= 0])
+        return Watch.of(sighting, entry.living.places.position_m, recording.sensor)
+
+
+def solve_session(
+    recording: Recording, remarks: tuple[str, ...], config: Config, progress: Progress | None = None
+) -> Solved:
+    """Solve a session by itself: clean, with known identities. What moved is asked when it lies over the map.
+
+    Raises:
+        DataError: fewer than two frames with a landmark of known identity.
+        NumericalError: no finite optimum.
+    """
+    settings = config.slam.model_copy(update={"method": "nohyp", "unknown_ids": False})
+    return solve(recording, settings, remarks=remarks, progress=progress)
+
+
+def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = True) -> Localised[PlanarVisit]:
+    """Return a session that was solved alone, solved again where it lies in a map.
+
+    Args:
+        alone: the session.
+        living: the map, with its classes (`session.admitted`).
+        config: settings.
+        cut: solve without the frames that say nothing sure (`doubtful`), if there are any.
+    """
+    settings, lost = config.living, Localised.lost(PlanarVisit(alone), living, CONTRADICTED)
+    large = len(living.places) > settings.whole_places
+    vicinity, where = near_session(living, alone, settings) if large else (None, None)
+    part, visit = living if vicinity is None else vicinity.part, alone
+    p_site = believe.aged(part, settings, alone.start_s).p_here
+    where = where if large else laid(part, p_site, alone, settings)
+    if where is None and len(part.places):
+        return Localised.lost(PlanarVisit(alone), living, NOT_FOUND)
+    if where is not None:
+        in_part = vicinity is not None
+        part, where, visit = refit(part, p_site, where, alone, settings, robust=config.slam.robust, part=in_part)
+    if settings.search == "joint":
+        if cut:
+            some = without(visit, doubtful(visit, where, settings))
+            if some is None:
+                return lost
+            if some is not visit.recording:
+                try:
+                    return localised(solve_session(some, visit.prepared.warnings, config), living, config, cut=False)
+                except (DataError, NumericalError):  # too little is left
+                    return lost
+        if where is not None and not fits(visit, alone, settings):
+            return lost
+    return Localised(PlanarVisit(visit), part, where, vicinity)
+
+
+def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingConfig) -> Laid | None:
+    """Return where the session lies in the map; None where it shows nothing that stands as in the map."""
+    own = own_landmarks(alone.outcome, config.fit)
+    names = alone.prepared.landmark_id[own.row]
+    log_sigma = np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance))
+    where = laid_over(living, p_site, names, own.position_m, of_unknown_size(own, float(log_sigma)), config)
+    if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
+        return None
+    if config.search == "joint":
+        together = _seen_together(alone, own.row, config.fit.inlier)
+        where = unbent(living, p_site, where, own.position_m, together, config.fit)
+    glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
+    return with_glimpsed(living, where, glimpsed)
+
+
+def _seen_together(alone: Solved, row: IntArray, least: float) -> sparse.csr_array:
+    """(K, K) frames in which two landmarks of a session, rows of its problem, were seen where they are."""
+    fits = alone.outcome.inlier >= least
+    problem = alone.outcome.problem
+    landmark, pose = (rows[: len(fits)][fits] for rows in (problem.landmark_row, problem.pose_row))
+    rank = np.full(len(problem.landmark_mean), -1, dtype=np.int64)
+    rank[row] = np.arange(len(row))
+    known = rank[landmark] >= 0
+    ones = np.ones(int(known.sum()))
+    seen = sparse.csr_array((ones, (rank[landmark[known]], pose[known])), shape=(len(row), len(problem.stamp_s)))
+    return sparse.csr_array(seen @ seen.T)
+
+
+def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tuple[Vicinity, Laid | None]:
+    """Return the part of a large map that a session can touch, and where the session lies in it; None as of `laid`.
+
+    That is what the sensor may have seen on its way, once the session is laid over those that it names, and some more.
+    """
+    own = own_landmarks(alone.outcome, config.fit)
+    named = cliques_of(living, alone.prepared.landmark_id[own.row])
+    seen = Vicinity.of(living, named, config)
+    where = laid(seen.part, believe.aged(seen.part, config, alone.start_s).p_here, alone, config)
+    if where is None:
+        return seen, None
+    path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
+    return widened(seen, where, path, alone.recording.sensor, config)
+
+
+def refit(
+    living: LivingMap, p_site: FloatArray, where: Laid, alone: Solved, config: LivingConfig, *, robust: bool, part: bool
+) -> tuple[LivingMap, Laid, Solved]:
+    """Return the session solved again, its landmarks held by the map's places at which they stand; and the map,
+    resized.
+
+    A session that had to be straightened for that is asked again what stands where it stood. Where the map is only a
+    part of a larger one it keeps its size.
+    """
+    outcome, names = alone.outcome, alone.prepared.landmark_id
+    size = outcome.scale
+    if outcome.log_scale_sigma > 0.0:
+        own = own_landmarks(outcome, config.fit)
+        _, mine, theirs = np.intersect1d(names[own.row], where.landmark_id[where.place >= 0], return_indices=True)
+        places = where.place[where.place >= 0][theirs]
+        shown = log_ratio(
+            own.position_m[mine],
+            of_places(own.covariance_m2, mine),
+            living.places.position_m[places],
+            drifted(of_places(living.covariance_m2, places), where.drift_m),
+        )
+        own_metre = 0.0, outcome.log_scale_sigma
+        if part:  # it does not change the metre of the rest
+            found = settled(*shown, own_metre, living.log_size_variance, np.inf)
+        else:
+            found, metres = settled_by(shown, own_metre, living, alone.recording.robot)
+            living = resized(living, found, metres)
+        size *= found.session_factor
+        alone = _remarked(alone, shown[0], found)
+
+    def in_map(where: Laid) -> tuple[Outcome, bool]:
+        stand = np.flatnonzero(where.place >= 0)
+        row = np.searchsorted(names, where.landmark_id[stand])
+        position = living.places.position_m[where.place[stand]]
+        motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
+        covariance = drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
+        return refitted(
+            outcome, outcome.prior, motion, size, Held(row, position, covariance), settings=config.fit, robust=robust
+        )
+
+    solved, straightened = in_map(where)
+    if where.assumed.any() and solved.inlier.mean() < (1.0 - config.fit.most_lost) * outcome.inlier.mean():
+        as_seen = where.as_seen()
+        other, straightened_too = in_map(as_seen)
+        if other.inlier.mean() > solved.inlier.mean():  # it was not bent: they did move together
+            where, solved, straightened = as_seen, other, straightened_too
+    if straightened:
+        at_home = all_at_home(living, p_site, where)
+        solved, _ = in_map(at_home)
+        landmark = alone.prepared.problem.landmark_row[: len(solved.inlier)]
+        n_fit, count = (np.bincount(landmark, w, minlength=len(names)) for w in (solved.inlier, np.ones(len(landmark))))
+        stays = (2.0 * n_fit > count)[np.searchsorted(names, where.landmark_id)]
+        where = replace(
+            where,
+            place=np.where(stays, at_home.place, where.place),
+            probability=np.where(stays, 1.0, where.probability),
+        )
+        solved, _ = in_map(where)
+    return living, where, replace(alone, outcome=solved)
+
+
+def _remarked(alone: Solved, log_ratio: float, found: Size) -> Solved:
+    """A session with a remark where its metre contradicts the map's, or its robot's those of the others."""
+    contradicts = found.off > CONTRADICTS
+    if not (contradicts or found.apart):
+        return alone
+    off, than = (-log_ratio, "the map's") if contradicts else (found.apart, "that of all robots of the map together")
+    by = f"{found.off:.1f} standard deviations" if contradicts else "more than these differ"
+    remark = (
+        f"its metre is {abs(off):.1%} {'shorter' if off < 0.0 else 'longer'} than {than}, {by}: its ranges or its "
+        "odometer have drifted; it is entered in the metres of the map"
+    )
+    return replace(alone, prepared=replace(alone.prepared, warnings=(*alone.prepared.warnings, remark)))
+
+
+def fits(visit: Solved, alone: Solved, config: LivingConfig) -> bool:
+    """Return False for a session that the map contradicts: what fits together by itself does not fit once it is held
+    there.
+    """
+    return bool(visit.outcome.inlier.mean() >= config.fit.least_fit * alone.outcome.inlier.mean())
+
+
+def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> BoolArray:
+    """Return (F,) frames of a session that say nothing sure: they are not entered.
+
+    Where the odometry was silent, a session falls into parts, if what was seen does not tie them. Those that show none
+    of the map, or in a map that begins, all but the largest, may be anywhere. And where most sightings of a stretch
+    contradict all others, its poses are wrong, or the identities.
+
+    Args:
+        visit: the session, solved with the map as its prior.
+        where: it lies in the map; None for a map's first.
+        config: `fit`.
+    """
+    outcome, settings = visit.outcome, config.fit
+    problem, pose, marginals = outcome.problem, outcome.graph_estimate.pose, outcome.graph_marginals
+    n_poses, n_seen = len(pose), len(outcome.inlier)
+    loose = silent_links(problem, outcome.graph_estimate)
+    if loose.any():
+        carry = se2.adjoint(se2.between(pose[1:], pose[:-1]))
+        across = carry @ marginals.consecutive[:-1]
+        spread = carry @ marginals.pose[:-1] @ carry.transpose(0, 2, 1) + marginals.pose[1:]
+        spread -= across + across.transpose(0, 2, 1)
+        off_m = np.sqrt(np.maximum(np.linalg.eigvalsh(spread[:, :2, :2])[:, -1], 0.0))
+        loose &= (spread[:, 2, 2] > settings.loose_rad**2) | (off_m > settings.loose_m)
+    part = np.append(0, np.cumsum(loose))
+    row, landmark = problem.pose_row[:n_seen], problem.landmark_row[:n_seen]
+    counts = outcome.inlier >= settings.inlier
+    if where is not None:
+        held = np.isin(visit.prepared.landmark_id, where.landmark_id[where.place >= 0])
+        counts &= np.append(held, np.zeros(len(problem.landmark_mean) - len(held), dtype=np.bool_))[landmark]
+    of_part = np.unique(np.column_stack([part[row[counts]], landmark[counts]]), axis=0)[:, 0]
+    shown = np.bincount(of_part, minlength=part[-1] + 1)
+    tied = shown >= 2 if where is not None else np.arange(len(shown)) == np.argmax(np.bincount(part[row], counts))
+    window = min(STRETCH * settings.window, n_seen)
+    fits = np.convolve(outcome.inlier, np.ones(window) / window, "valid")
+    first = np.clip(np.searchsorted(row, np.arange(n_poses)) - window // 2, 0, len(fits) - 1)
+    wrong = ~tied[part] | (fits[first] < settings.inlier)
+    frames = np.arange(len(visit.recording.frames))
+    at = np.searchsorted(visit.prepared.pose_frame, frames)
+    before, after = np.clip(at - 1, 0, n_poses - 1), np.minimum(at, n_poses - 1)
+    seen = visit.prepared.pose_frame[after] == frames
+    return np.asarray(np.where(seen, wrong[after], wrong[before] | wrong[after]))
+
+
+def without(visit: Solved, doubt: BoolArray) -> Recording | None:
+    """Return the recording of a session without doubtful frames (F,); None where that is most of it."""
+    recording = visit.recording
+    if not doubt.any():
+        return recording
+    frames, detections = some_frames(recording.frames, recording.detections, ~doubt)
+    if 2 * len(detections) < len(recording.detections) or len(np.unique(detections.frame)) < 2:
+        return None
+    start_s = recording.frames.stamp_s[0]
+    spans = np.flatnonzero(np.diff(np.concatenate([[False], doubt, [False]])))
+    after_s = recording.frames.stamp_s - start_s
+    told = ", ".join(f"{after_s[a]:.0f} to {after_s[b - 1]:.0f} s" for a, b in spans.reshape(-1, 2)[:3])
+    remark = (
+        f"{int(doubt.sum())} frames left out ({told}{', ...' if len(spans) > 6 else ''} after the first): most of what "
+        "they show contradicts the rest, or the odometry was silent and nothing ties them to it"
+    )
+    return replace(recording, frames=frames, detections=detections, warnings=(*recording.warnings, remark))
+
+
+def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved, near_m: float) -> None:
+    """Sightings too few for a place of their own are of the place that the map has, if they are near it."""
+    living, estimate = entry.living, visit.outcome.estimate
+    names = visit.prepared.landmark_id
+    known = estimate.known[: len(names)]  # a method may have given landmarks further places, behind these
+    row = np.flatnonzero((place_of < 0) & known & np.isin(names, living.members.landmark_id))
+    member = np.searchsorted(living.members.landmark_id, names[row])
+    place = living.place_row(names[row], living.site_of()[member])
+    row, place = row[place >= 0], place[place >= 0]
+    near = np.hypot(*(estimate.landmark[row] - living.places.position_m[place]).T) < near_m
+    place_of[row[near]] = place[near]
+
+
+def _inliers(visit: Solved, least: float) -> tuple[IntArray, IntArray]:
+    """Rows of the detections that fit, and of their landmarks."""
+    good = np.flatnonzero(visit.outcome.inlier >= least)
+    return visit.prepared.used[good], visit.prepared.problem.landmark_row[good]
