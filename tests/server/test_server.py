@@ -696,7 +696,10 @@ def test_many_who_claim_at_once_get_different_sessions(fleet: Fleet, zips: list[
     assert sorted(got)[:4] == sorted(job["id"] for job in fleet("GET", "/jobs").json())[:4]
 
 
-def test_new_revisions_are_events(fleet: Fleet, zips: list[bytes]) -> None:
+def test_new_revisions_are_events(fleet: Fleet, zips: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    """In PostgreSQL because they are announced, from other processes and after an outage too, else by asking."""
+    announced = "postgresql" in fleet.where
+    monkeypatch.setattr("evermap.server.app._ALIVE_S", 1e9)  # else it asks now and then
     fleet.upload(zips[0])
     fleet.worker().step()
     served = uvicorn.Server(uvicorn.Config(create_app(fleet.server), port=0, log_level="warning"))
@@ -713,6 +716,13 @@ def test_new_revisions_are_events(fleet: Fleet, zips: list[bytes]) -> None:
         assert next(line for line in lines if line.startswith("id:")) == "id: 1"
         fleet("POST", "/maps/ward/pin", json={"landmarks": ["1"]})
         assert next(line for line in lines if line.startswith("id:")) == "id: 2"
+        wait_until(lambda: fleet.server.database.announcements.arrive == announced)
+        if announced:
+            end_listener(fleet.where)
+        code = "import sys; from evermap.maps.store import open_store; open_store(sys.argv[1]).revert(1)"
+        subprocess.run([sys.executable, "-c", code, fleet.server.sites.address("ward")], check=True)
+        assert next(line for line in lines if line.startswith("id:")) == "id: 3"
+        wait_until(lambda: fleet.server.database.announcements.arrive == announced)
         for method, path, what in (
             ("PUT", "/robots/upload/maps", []),
             ("PUT", "/robots/upload/maps", [held(1)]),
@@ -722,6 +732,21 @@ def test_new_revisions_are_events(fleet: Fleet, zips: list[bytes]) -> None:
             assert next(line for line in lines if line == "event: beside")
     served.should_exit = True
     thread.join()
+    wait_until(lambda: not fleet.server.database.announcements.arrive)
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    while not holds():
+        time.sleep(0.01)
+
+
+def end_listener(where: str) -> None:
+    import psycopg
+
+    with psycopg.connect(where, autocommit=True) as connection:
+        mine = "datname = current_database() AND query LIKE 'LISTEN%'"
+        ended = f"SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE {mine}"
+        assert connection.execute(ended.encode()).fetchall() == [(True,)]
 
 
 @pytest.mark.parametrize("where", ["sqlite"], indirect=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
@@ -28,7 +29,7 @@ from evermap.errors import EvermapError, InputError, printable
 from evermap.maps.diff import diff as between
 from evermap.maps.living import LivingMap
 from evermap.maps.store import DamagedMapError, Provenance, StaleRevisionError, StoreUnavailableError
-from evermap.maps.store.postgres import SITE
+from evermap.maps.store.postgres import PREFIX, SITE
 from evermap.maps.store.sql import SqlStore
 from evermap.maps.why import why as of_landmark
 from evermap.runs import map_dicts
@@ -40,7 +41,7 @@ from evermap.server.uploads import UploadLimits, checked_digest
 from evermap.types import Landmarks, json_number
 
 _EVERY_S = 1.0
-"""Between two looks for new revisions."""
+"""Between two looks for new revisions, where none are announced."""
 _ALIVE_S = 15.0
 """Between two lines that keep a connection open."""
 _RATE_HZ, _BURST = 50.0, 200.0
@@ -546,19 +547,33 @@ async def events(
 
 
 async def _news(request: Request, server: Server, site: str, told: int) -> AsyncIterator[str]:
+    """Ask for news whenever some are announced, and where nothing arrives, every second."""
     alive, beat = time.monotonic(), await run_in_threadpool(_beat, server, site)
     yield ": following\n\n"
-    while not await request.is_disconnected():
-        if (now := await run_in_threadpool(_beat, server, site)) not in (None, beat):
-            beat = now
-            yield "event: beside\ndata: {}\n\n"
-        for number, text in await run_in_threadpool(_since, server, site, told):
-            yield f"id: {number}\nevent: revision\ndata: {text}\n\n"
-            told = number
-        if time.monotonic() - alive > _ALIVE_S:
-            alive = time.monotonic()
-            yield ": alive\n\n"
-        await asyncio.sleep(_EVERY_S)
+    news, loop, asked = asyncio.Event(), asyncio.get_running_loop(), -math.inf
+
+    def hear(what: str) -> None:
+        if what in ("", PREFIX + site):
+            with suppress(RuntimeError):  # the server has ended
+                loop.call_soon_threadsafe(news.set)
+
+    announced = server.database.announcements
+    with announced.followed(hear):
+        while not await request.is_disconnected():
+            if news.is_set() or not announced.arrive or time.monotonic() - asked > _ALIVE_S:
+                news.clear()
+                asked = time.monotonic()
+                if (now := await run_in_threadpool(_beat, server, site)) not in (None, beat):
+                    beat = now
+                    yield "event: beside\ndata: {}\n\n"
+                for number, text in await run_in_threadpool(_since, server, site, told):
+                    yield f"id: {number}\nevent: revision\ndata: {text}\n\n"
+                    told = number
+            if time.monotonic() - alive > _ALIVE_S:
+                alive = time.monotonic()
+                yield ": alive\n\n"
+            with suppress(TimeoutError):
+                await asyncio.wait_for(news.wait(), _EVERY_S)
 
 
 def _head(server: Server, site: str) -> int:

@@ -46,8 +46,9 @@ from sqlalchemy.schema import CreateSchema
 
 from evermap.errors import ConfigError, InputError, printable
 from evermap.maps.store import is_address
+from evermap.maps.store.postgres import PREFIX, Announcements
 from evermap.maps.store.postgres import engine_of as postgres_engine
-from evermap.maps.store.sql import now_utc
+from evermap.maps.store.sql import announce, now_utc
 from evermap.maps.store.sqlite import engine_of as sqlite_engine
 
 VERSION = 1
@@ -209,6 +210,7 @@ class Database:
             raise InputError(problem, hint="the evermap that wrote them, or an empty store")
         # SQLite has one writer at a time; PostgreSQL locks the rows that are written
         self._writer = self._engine.execution_options(writes=not on_server, shared=True)
+        self.announcements = Announcements(str(where) if on_server else None)
 
     def add_token(self, name: str, role: Role) -> str:
         """Return a new token; only its digest is kept.
@@ -257,6 +259,7 @@ class Database:
                 row = insert(_job).values(**told, created_at=now, changed_at=now).returning(*_SHOWN)
                 job = _job_of(connection.execute(row).one())
                 connection.execute(insert(_payload).values(job=job.id, data=data))
+                announce(connection, PREFIX + site)
                 return job, True
         except IntegrityError:  # sent twice at the same time
             with self._engine.begin() as connection:
@@ -285,6 +288,7 @@ class Database:
             values |= {"tries": row.tries + 1, "changed_at": now_utc()}
             connection.execute(update(_job).where(_job.c.id == row.id).values(values))
             data = connection.execute(select(_payload.c.data).where(_payload.c.job == row.id)).scalar_one()
+            announce(connection, PREFIX + row.site)
         return _job_of(row), data
 
     def renew(self, job: int, worker: str, lease_s: float) -> None:
@@ -306,7 +310,10 @@ class Database:
             values["tries"] = 0
         with self._writer.begin() as connection:
             mine = update(_job).where(_mine(job, worker)).values(**values, lease_s=0.0, changed_at=now_utc())
-            if connection.execute(mine).rowcount and state is JobState.ENTERED:  # the map keeps the recording
+            site = connection.execute(mine.returning(_job.c.site)).scalar()
+            if site is not None:
+                announce(connection, PREFIX + site)
+            if site is not None and state is JobState.ENTERED:  # the map keeps the recording
                 connection.execute(delete(_payload).where(_payload.c.job == job))
 
     def retry(self, job: int) -> bool:
@@ -314,7 +321,10 @@ class Database:
         refused = and_(_job.c.id == job, _job.c.state.in_([JobState.REJECTED.value, JobState.ASIDE.value]))
         values = {"state": JobState.QUEUED.value, "reason": "", "tries": 0, "changed_at": now_utc()}
         with self._writer.begin() as connection:
-            return connection.execute(update(_job).where(refused).values(values)).rowcount > 0
+            site = connection.execute(update(_job).where(refused).values(values).returning(_job.c.site)).scalar()
+            if site is not None:
+                announce(connection, PREFIX + site)
+        return site is not None
 
     def jobs(self, site: str | None = None, state: JobState | None = None, most: int = 100) -> list[Job]:
         """Return the newest sessions that were uploaded."""
@@ -339,6 +349,7 @@ class Database:
         """Make a revision the one that robots are to use."""
         with self._writer.begin() as connection:
             connection.execute(insert(_approval).values(site=site, revision=revision, who=who, at=now_utc()))
+            announce(connection, PREFIX + site)
 
     def approved(self, site: str) -> dict[str, Any] | None:
         """Return the revision that was approved last, by whom and when; None where none was."""
@@ -357,6 +368,7 @@ class Database:
                     changed = update(_robot).where(_robot.c.name == robot).values(**values, told=_robot.c.told + news)
                     if not connection.execute(changed).rowcount:
                         connection.execute(insert(_robot).values(name=robot, **values, told=1))
+                    announce(connection, "")
                 return
             except IntegrityError:
                 continue

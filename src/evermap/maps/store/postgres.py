@@ -11,7 +11,10 @@ from __future__ import annotations
 import functools
 import math
 import re
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from sqlalchemy import Connection, Engine, create_engine, event, inspect
 from sqlalchemy.engine import URL, make_url
@@ -21,7 +24,7 @@ from sqlalchemy.pool import ConnectionPoolEntry
 
 from evermap.errors import ConfigError, InputError, MissingExtraError
 from evermap.maps.store.protocol import DamagedMapError
-from evermap.maps.store.sql import SqlStore
+from evermap.maps.store.sql import CHANNEL, SqlStore
 
 SITE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,47}")
 """Names of sites, which are parts of the names of database schemas (63 bytes) and files."""
@@ -121,6 +124,64 @@ def _engine(database: str) -> Engine:
                 raise DisconnectionError from None
 
     return engine
+
+
+class Announcements:
+    """What commits to a database announce, heard by one thread for all who follow as long as there are any.
+
+    A pool of connections in front of the database may keep announcements from arriving; so the thread announces itself
+    first, and `arrive` tells whether it has heard that. All are told of that, too, as something may have come before.
+
+    Args:
+        database: its address; None where nothing is announced.
+    """
+
+    def __init__(self, database: str | None) -> None:
+        self._database = database
+        self._told: list[Callable[[str], None]] = []
+        self._lock = threading.Lock()
+        self._thread = 0
+        self.arrive = False
+
+    @contextmanager
+    def followed(self, tell: Callable[[str], None]) -> Iterator[None]:
+        """Tell what is announced, by the schema of a site or '' for all, as long as the block runs."""
+        with self._lock:
+            self._told.append(tell)
+            if len(self._told) == 1 and self._database is not None:
+                threading.Thread(target=self._listen, args=(self._database,), daemon=True).start()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._told.remove(tell)
+
+    def _listen(self, database: str) -> None:
+        import psycopg
+
+        myself = threading.get_ident()
+        with self._lock:
+            self._thread = myself
+        while self._goes_on(myself):
+            try:
+                with psycopg.connect(database, autocommit=True) as connection:
+                    connection.execute(f"LISTEN {CHANNEL}; NOTIFY {CHANNEL}".encode())
+                    while self._goes_on(myself):
+                        for heard in connection.notifies(timeout=_FRESH_S, stop_after=1):
+                            self.arrive = True
+                            for tell in list(self._told):
+                                tell(heard.payload)
+            except psycopg.Error:  # it may be back later
+                self.arrive = False
+                time.sleep(_FRESH_S)
+
+    def _goes_on(self, thread: int) -> bool:
+        """Whether anybody follows, and no later thread listens."""
+        with self._lock:
+            if self._told and self._thread == thread:
+                return True
+            self.arrive = self.arrive and self._thread != thread
+            return False
 
 
 _FRESH_S = 1.0

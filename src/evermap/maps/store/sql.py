@@ -40,6 +40,8 @@ from evermap.types import ChangeKind, MapChange
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+CHANNEL = "evermap"
+"""On which commits are announced."""
 _AT_ONCE = 500
 """Names in one question to the database."""
 _LONGEST = 900_000_000
@@ -538,6 +540,7 @@ class SqlStore(Shown):
         listed = row.pruned if pruned is None else pruned_to_text(pruned)
         sealed = schema.checksum(row.schema_version, row.created_at, row.evermap_version, head, record, listed)
         connection.execute(update(schema.store).values(head=head, record=record, pruned=listed, checksum=sealed))
+        announce(connection, connection.get_execution_options().get("schema", ""))
 
     def _chain(self, connection: Connection, since: int = 1) -> tuple[dict[int, Record], dict[int, bytes | None]]:
         """Records from a revision to the newest, each checked against the one after it; and which are lost."""
@@ -730,6 +733,17 @@ def is_anchor(values: Sequence[Any]) -> bool:
         and (pruned is None or isinstance(pruned, str))
         and checksum == schema.checksum(version, created_at, writer, head, record, pruned)
     )
+
+
+def announce(connection: Connection, what: str) -> None:
+    """Tell all who listen (`postgres.Announcements`) once the transaction is committed; nothing in SQLite.
+
+    Args:
+        connection: of the transaction.
+        what: the schema of a site, '' for all.
+    """
+    if connection.dialect.name == "postgresql":
+        connection.execute(select(func.pg_notify(CHANNEL, what)))
 
 
 def now_utc() -> str:
