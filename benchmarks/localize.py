@@ -38,7 +38,7 @@ WARM_UP = 20
 """Frames at the beginning that are not timed: the start pose is searched for."""
 NOISE = Noise(detection=np.array([0.05, 0.02]), odometry=np.array([0.03, 0.02, 0.02, 0.01, 0.03]), outlier_log_odds=7.0)
 SENSOR = Sensor(range_max_m=RANGE_M, p_detect=P_DETECT)
-REPORTED = CalibrationPrior.from_settings(calibrated=False, fix={})
+REPORTED = CalibrationPrior.from_settings(calibrated=False)
 
 METRICS: dict[str, tuple[str, float, str]] = {
     "localize_speed_ratio": (
@@ -111,7 +111,7 @@ def draw(n_landmarks: int, n_frames: int = N_FRAMES, seed: int = 0) -> Drives:
 
 def by_evermap(drives: Drives) -> Answer:
     """`Localizer`, calibration estimated too, from an unknown start."""
-    localizer = Localizer(drives.places, SENSOR, CalibrationPrior.from_settings(calibrated=True, fix={}), NOISE)
+    localizer = Localizer(drives.places, SENSOR, CalibrationPrior.from_settings(calibrated=True), NOISE)
     pose, cpu_s = [], []
     for stamp_s, seen in zip(drives.stamp_s, drives.sightings, strict=True):
         began = time.process_time()

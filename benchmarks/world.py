@@ -66,7 +66,7 @@ def circular_world(n_poses: int, *, calibrated: bool, seed: int = 0) -> World:
         stamp, _disturbed(velocity, noise, rng), stamp[::steps][:n_poses], *_seen(pose, landmark, rng)
     )
     prepared = prepare(recording)
-    prior = CalibrationPrior.from_settings(calibrated=calibrated, fix={}).without_scale()
+    prior = CalibrationPrior.from_settings(calibrated=calibrated).without_scale()
     problem = replace(prepared.problem, prior=prior)
     landmark = landmark[prepared.landmark_id]
     return World(problem, noise, pose, landmark, *_increments(problem, noise))

@@ -193,6 +193,6 @@ def run_localization(
     recording, living = session.admitted(recording, living)
     named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])
     places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))
-    joint, (prior, noise) = living.covariance_m2, intake.beliefs(recording.sensor, config.slam)
-    result = localize(recording, places, prior, noise, joint_m2=joint, realtime=realtime, progress=progress)
+    joint, believed = living.covariance_m2, intake.beliefs(recording.sensor, config.slam)
+    result = localize(recording, places, *believed, config.slam, joint_m2=joint, realtime=realtime, progress=progress)
     return replace(result, warnings=(*remarks, *result.warnings))

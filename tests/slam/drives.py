@@ -24,7 +24,7 @@ SPREAD = np.array([0.05, 0.01, 0.02, 0.05, 0.02, 0.05, 0.02, 0.05, 0.01])
 
 
 def prior() -> CalibrationPrior:
-    default = CalibrationPrior.from_settings(calibrated=True, fix={})
+    default = CalibrationPrior.from_settings(calibrated=True)
     return CalibrationPrior(default.mean, SPREAD, default.free)
 
 

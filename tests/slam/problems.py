@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
+from evermap.config import CalibrationConfig
 from evermap.geometry import se2
 from evermap.slam.calibration import N_STATES, CalibrationPrior
 from evermap.slam.kernels import integrate_odometry
@@ -20,7 +21,7 @@ QUIET = Noise(
 
 
 def default_prior(**fix: float) -> CalibrationPrior:
-    return CalibrationPrior.from_settings(calibrated=True, fix=fix)
+    return CalibrationPrior.from_settings(CalibrationConfig(fix=fix), calibrated=True)
 
 
 def hat(twist: np.ndarray) -> np.ndarray:

@@ -10,13 +10,13 @@ import pytest
 from problems import default_prior, make_world
 from scipy.stats import multivariate_normal
 
-from evermap.config import Config
+from evermap.config import Config, OdometryConfig
 from evermap.errors import ConfigError
 from evermap.geometry import se2
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.pipeline import run_slam
-from evermap.slam.calibration import BEARING, FORWARD, KINDS, NAMES, SLOPE, SPECS, CalibrationPrior, needed
-from evermap.slam.problem import HISTORY_S, Drive, beyond_jitter
+from evermap.slam.calibration import BEARING, FORWARD, NAMES, SLOPE, SPECS, USUAL, CalibrationPrior, needed
+from evermap.slam.problem import SPANS, Drive, beyond_jitter
 from evermap.slam.smoother import Smoother
 from evermap.types import ParameterEstimate, Recording, Sensor, SensorKind
 from evermap_studies.worlds.robots import draw_robot, simulate_robot
@@ -26,9 +26,9 @@ def test_default_prior_is_the_table():
     prior = default_prior()
     assert [spec.name for spec in SPECS] == list(NAMES)
     assert prior.mean.tolist() == [spec.mean for spec in SPECS]
-    assert prior.sigma.tolist() == [spec.sigma for spec in SPECS]
+    assert prior.sigma.tolist() == [USUAL.sigma[name] for name in NAMES]
     assert prior.free.all()
-    assert not CalibrationPrior.from_settings(calibrated=False, fix={}).free.any()
+    assert not CalibrationPrior.from_settings(calibrated=False).free.any()
 
 
 def test_unknown_state_is_an_error_that_names_the_known_ones():
@@ -229,12 +229,12 @@ def test_influence_of_each_residual_on_the_states_is_the_dense_one():
 
 
 def stated(**what) -> CalibrationPrior:
-    return CalibrationPrior.from_settings(calibrated=True, fix={}, sensor=Sensor(**what))
+    return CalibrationPrior.from_settings(calibrated=True, sensor=Sensor(**what))
 
 
 def test_kind_and_data_sheet_narrow_the_priors():
     unknown, laser = stated(), stated(kind=SensorKind.LASER)
-    assert laser.sigma[:4].tolist() == list(KINDS[SensorKind.LASER][:4])
+    assert laser.sigma[:4].tolist() == list(USUAL.kinds[SensorKind.LASER][:4])
     assert (unknown.slope_share, laser.slope_share) == (0.0, None)
     exact = stated(kind=SensorKind.CAMERA, sigma_scale=0.001, sigma_offset_m=0.02, sigma_odometer_scale=0.1)
     assert exact.sigma[[0, 1, FORWARD]].tolist() == [0.02, 0.001, 0.1]
@@ -361,7 +361,7 @@ def test_a_turn_counts_and_the_jitter_of_its_report_does_not():
         assert beyond[turning > 0.0].sum() == pytest.approx(turning.sum(), rel=0.02)
         assert beyond_jitter(stamp, turning) == pytest.approx(turning, rel=0.02)
         # by what was reported until then, and not long before
-        later = stamp > 60.0 - HISTORY_S
+        later = stamp > 60.0 - SPANS * OdometryConfig().turn_s - 1.0
         assert beyond_jitter(stamp[later], reported[later])[stamp[later] > 60.0] == pytest.approx(beyond[stamp > 60.0])
     few = np.array([0.1, -0.2, 0.3])
     for count in range(4):

@@ -11,6 +11,7 @@ import pytest
 from problems import default_prior, slow_detection
 from recordings import building, first_seconds
 
+from evermap.config import SlamConfig
 from evermap.geometry import se2
 from evermap.slam.intake import prepare
 from evermap.slam.motion import Motion
@@ -97,8 +98,7 @@ def solve_both(recording: Recording, *, robust: bool, with_map: bool = False) ->
         NOISE,
         default_prior(),
         prior_map=prepared.prior_map,
-        robust=robust,
-        estimate_noise=False,
+        settings=SlamConfig(robust=robust, estimate_noise=False),
     )
     for _ in prepared.problem.stamp_s:
         slam.step()
@@ -191,7 +191,7 @@ def test_innovations_are_those_of_gtsams_marginals(robust):
     row = 50
     problem = whole.until(row)
     known = np.unique(problem.landmark_row)
-    slam = StreamingSlam(whole, NOISE, default_prior(), robust=robust, estimate_noise=False)
+    slam = StreamingSlam(whole, NOISE, default_prior(), settings=SlamConfig(robust=robust, estimate_noise=False))
     for _ in range(row):
         slam.step()
     optimum = Smoother(problem, NOISE, heavy=robust, robust=robust).optimum(slam._filter.estimate(), tolerance=1e-9)

@@ -32,7 +32,7 @@ from evermap.slam.kernels import (
     outlier_loss,
     sandwich,
 )
-from evermap.slam.problem import SILENCE_S, SILENT_VARIANCE, Drive
+from evermap.slam.problem import USUAL, Drive
 
 ONCE = FLOOR_VARIANCE * np.eye(3)
 """What every window has, however short."""
@@ -320,17 +320,18 @@ def test_without_outliers_the_loss_is_quadratic():
 
 
 def test_silences_become_standing_still_without_knowing():
-    stamps = np.array([0.0, 0.1, 0.2, 5.2, 5.3, 5.3 + SILENCE_S])
+    silence_s, silent = USUAL.silence_s, USUAL.silent_variance
+    stamps = np.array([0.0, 0.1, 0.2, 5.2, 5.3, 5.3 + silence_s])
     velocity = np.arange(18.0).reshape(6, 3) + 1.0
     drive = Drive.from_rows(stamps, velocity)
     assert np.all(np.diff(drive.stamp_s) > 0)
     inside = (
-        np.searchsorted(drive.stamp_s, [0.15, 0.2 + 0.45 * SILENCE_S, 3.0, 5.25, 5.9, 5.9 + SILENCE_S], "right") - 1
+        np.searchsorted(drive.stamp_s, [0.15, 0.2 + 0.45 * silence_s, 3.0, 5.25, 5.9, 5.9 + silence_s], "right") - 1
     )
     expected = [velocity[1], velocity[2], np.zeros(3), velocity[3], velocity[4], np.zeros(3)]
     assert np.array_equal(drive.velocity[inside, :3], expected)
     onwards = (velocity[2] ** 2).sum() * 5.0  # after 5 s: as far as the last speed would have led
-    assert drive.unknown[inside] == pytest.approx([0.0, 0.0, SILENT_VARIANCE + onwards, 0.0, 0.0, SILENT_VARIANCE])
+    assert drive.unknown[inside] == pytest.approx([0.0, 0.0, silent + onwards, 0.0, 0.0, silent])
 
 
 def test_silence_makes_the_covariance_grow_with_its_length():
@@ -338,8 +339,8 @@ def test_silence_makes_the_covariance_grow_with_its_length():
     drive = Drive.from_rows(stamps, np.tile([0.5, 0.0, 0.1], (len(stamps), 1)))
     states = default_prior().mean
     across = integrated(drive, 1.0, 23.0, states)
-    silent = 22.0 - 1.9 - 0.5 * SILENCE_S
-    rate = SILENT_VARIANCE + (0.5**2 + 0.1**2) * (22.0 - 1.9)
+    silent = 22.0 - 1.9 - 0.5 * USUAL.silence_s
+    rate = USUAL.silent_variance + (0.5**2 + 0.1**2) * (22.0 - 1.9)
     assert across.floor[2, 2] == pytest.approx(rate * silent + 22.0 * FLOOR_TURN_RAD**2 + FLOOR_VARIANCE)
     assert across.increment == pytest.approx(slow_increment(drive, 1.0, 23.0, states), abs=1e-9)
     assert across.increment[2] == pytest.approx(0.1 * (22.0 - silent))

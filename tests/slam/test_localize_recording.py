@@ -28,7 +28,7 @@ SIGMA_M = 0.03
 
 
 def prior() -> CalibrationPrior:
-    return CalibrationPrior.from_settings(calibrated=True, fix={})
+    return CalibrationPrior.from_settings(calibrated=True)
 
 
 def noise(recording: Recording) -> Noise:

@@ -26,7 +26,7 @@ from evermap.slam.streaming import StreamingSlam, sighted_at
 from evermap_studies.peers.isam import IncrementalSmoother
 from evermap_studies.sim import WarehouseConfig, simulate_warehouse
 
-KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False, fix={})
+KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False)
 
 
 class OneStep(SessionFilter):
@@ -278,7 +278,7 @@ def test_places_that_are_only_considered_stay_and_the_rest_gets_the_best_gain():
     """Schmidt's update written down densely, where weights are 1 and the frame is nearly linear."""
     rng = np.random.default_rng(3)
     mount, n = np.array([0.2, -0.1, 0.3]), 4
-    prior = CalibrationPrior.from_settings(calibrated=True, fix={})
+    prior = CalibrationPrior.from_settings(calibrated=True)
     place = rng.uniform(2.0, 5.0, (n, 2))
     spread = rng.normal(size=(12 + 2 * n, 12 + 2 * n))
     spread = 1e-6 * (spread @ spread.T + np.eye(12 + 2 * n))

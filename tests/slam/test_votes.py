@@ -9,14 +9,14 @@ import pytest
 from space.halls import hall
 
 from evermap import run_slam
-from evermap.config import Config, SpaceConfig
+from evermap.config import Config, SlamConfig, VotesConfig
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.votes import Read, contradicted, without_contradicted_ids
 from evermap.types import UNKNOWN, AnyRecordingT, IntArray
 from evermap_studies.sim import WarehouseConfig, simulate_warehouse
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
-SPACE = SpaceConfig()
+SLAM = SlamConfig()
 WAREHOUSE = simulate_warehouse(WarehouseConfig(n_landmarks=60, rate_hz=2.0))
 
 
@@ -44,10 +44,10 @@ def misread(recording: AnyRecordingT, rate: float) -> AnyRecordingT:
 def test_ids_that_the_seconds_around_contradict_are_left_out(recording, rate):
     true, wrongly = recording.detections.landmark_id, misread(recording, rate)
     given = wrongly.detections.landmark_id
-    left_out = (without_contradicted_ids(wrongly, SPACE).detections.landmark_id == UNKNOWN) & (given != UNKNOWN)
+    left_out = (without_contradicted_ids(wrongly, SLAM).detections.landmark_id == UNKNOWN) & (given != UNKNOWN)
     assert left_out[given != true].mean() > 0.75
     assert left_out[given == true].mean() < 0.01
-    assert (without_contradicted_ids(recording, SPACE).detections.landmark_id != true).mean() < 0.002
+    assert (without_contradicted_ids(recording, SLAM).detections.landmark_id != true).mean() < 0.002
 
 
 def rmse_m(recording, *config):
@@ -80,7 +80,7 @@ def test_an_id_on_two_landmarks_is_not_used_and_named():
         together[np.ix_(seen, seen)] += 1
     one, other = np.unravel_index(np.triu(together, 1).argmax(), together.shape)
     twins = with_ids(recording, np.where(true == other, one, true))
-    found = without_contradicted_ids(twins, SPACE)
+    found = without_contradicted_ids(twins, SLAM)
     assert np.array_equal(found.detections.landmark_id == UNKNOWN, np.isin(true, (one, other)))
     assert f"landmark_id {one}: on two landmarks" in found.warnings[-1]
     assert recording.truth is not None
@@ -98,7 +98,8 @@ def test_what_is_seen_beside_another_in_one_frame_is_no_misreading_of_it():
     for with_both in (True, False):
         some = second | ((name == 0) & (with_both | ~np.roll(second, -1)))
         view = np.round(10.0 * stamp_s[some]).astype(np.int64)
-        wrong, doubled = contradicted(Read(at[some], np.ones(some.sum()), stamp_s[some], view, name[some]))
+        read = Read(at[some], np.ones(some.sum()), stamp_s[some], view, name[some])
+        wrong, doubled = contradicted(read, VotesConfig())
         assert not wrong[name[some] == 0].any()
         assert wrong[name[some] == 1].mean() >= 0.9 if not with_both else not wrong.any()
         assert not doubled.any()
@@ -107,6 +108,6 @@ def test_what_is_seen_beside_another_in_one_frame_is_no_misreading_of_it():
 def test_without_ids_or_odometry_there_is_no_vote():
     recording = simulate_park(ParkConfig(n_trees=80, drive_m=60.0), seed=3)
     nameless = with_ids(recording, np.full_like(recording.detections.landmark_id, UNKNOWN))
-    assert without_contradicted_ids(nameless, SPACE) is nameless
+    assert without_contradicted_ids(nameless, SLAM) is nameless
     in_space = replace(hall(1, n_points=40, n_frames=50), odometry=None)
-    assert without_contradicted_ids(in_space, SPACE) is in_space
+    assert without_contradicted_ids(in_space, SLAM) is in_space

@@ -36,14 +36,18 @@ from evermap.config.slam import (
     ChangesConfig,
     CheckConfig,
     CleaningConfig,
+    LocalizeConfig,
     ModesConfig,
     NoiseConfig,
+    OdometryConfig,
     OutputConfig,
     SensorConfig,
     SlamConfig,
     SpaceConfig,
+    TrafficConfig,
+    VotesConfig,
 )
-from evermap.config.tables import PersistConfig, SurvivalConfig, TrackConfig, TrackerConfig
+from evermap.config.tables import PersistConfig, StillConfig, SurvivalConfig, TrackConfig, TrackerConfig
 from evermap.errors import ConfigError
 
 
@@ -202,9 +206,11 @@ __all__ = [
     "LifetimeConfig",
     "LiveConfig",
     "LivingConfig",
+    "LocalizeConfig",
     "LooksConfig",
     "ModesConfig",
     "NoiseConfig",
+    "OdometryConfig",
     "OutputConfig",
     "OverlayConfig",
     "PersistConfig",
@@ -213,9 +219,12 @@ __all__ = [
     "SightConfig",
     "SlamConfig",
     "SpaceConfig",
+    "StillConfig",
     "SurvivalConfig",
     "TrackConfig",
     "TrackerConfig",
+    "TrafficConfig",
+    "VotesConfig",
     "load_config",
     "parse_config",
     "to_toml",

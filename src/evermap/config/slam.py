@@ -3,23 +3,137 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from evermap.config.section import Count, NotNegative, Positive, Probability, Section, Share
 from evermap.errors import ConfigError
 from evermap.types import FloatArray, Sensor, SensorKind
 
+SIGMAS = {
+    "range_bias_m": 0.1,
+    "range_slope": 0.02,
+    "range_skew_per_rad": 0.1,
+    "range_curvature_per_rad2": 0.5,
+    "bearing_bias_rad": 0.05,
+    "odometry_delay_s": 0.3,
+    "odometry_forward_scale": 0.05,
+    "odometry_turn_scale": 0.1,
+    "odometry_turn_slip_m": 0.05,
+}
+OfSensor = tuple[Positive, Positive, Positive, Positive, Positive]
+KINDS: dict[SensorKind, OfSensor] = {
+    SensorKind.LASER: (0.05, 0.002, 0.002, 0.002, 0.01),
+    SensorKind.CAMERA: (0.1, 0.02, 0.1, 0.5, 0.05),
+    SensorKind.TAG: (0.05, 0.02, 0.05, 0.1, 0.05),
+    SensorKind.STEREO: (0.05, 0.02, 0.05, 0.1, 0.03),
+    SensorKind.UWB: (0.3, 0.005, 0.02, 0.02, 0.05),
+}
+
 
 class CalibrationConfig(Section):
-    """Which calibration states are estimated."""
+    """Which calibration states are estimated, and what is believed of them before."""
 
     fix: dict[str, float] = Field(
         default_factory=dict,
         description="calibration states held at a value instead of estimated, by name, e.g. odometry_delay_s = 0.0",
     )
+    sigma: dict[str, Positive] = Field(
+        default_factory=lambda: dict(SIGMAS), description="standard deviations of their priors, each in its own unit"
+    )
+    kinds: dict[SensorKind, OfSensor] = Field(
+        default_factory=lambda: dict(KINDS),
+        description="those of the first five, which are the sensor's, where its kind is stated",
+    )
+    sigma_askew_rad: Positive = Field(
+        default=0.03, description="of the direction in which a robot drives, from its front, if unstated [rad]"
+    )
+    p_needed: Share = Field(default=0.5, description="prior probability that a state is not as stated")
+    p_needed_known: Share = Field(
+        default=0.9, description="the same of a sensor that is stated to be of another kind than a laser"
+    )
+    p_spare: Share = Field(default=0.01, description="probability to be needed below which a state is held as stated")
+
+    @field_validator("sigma", "kinds")
+    @classmethod
+    def _all(cls, given: dict[Any, Any], info: ValidationInfo) -> dict[Any, Any]:
+        usual: dict[Any, Any] = SIGMAS if info.field_name == "sigma" else KINDS
+        if unknown := given.keys() - usual.keys():
+            raise ValueError(f"no calibration state is called '{min(unknown)}': {', '.join(usual)}")
+        return usual | given
+
+
+class OdometryConfig(Section):
+    """What is believed of the odometry, beside its noise."""
+
+    silence_s: Positive = Field(
+        default=1.0, description="odometry that says nothing for longer is not believed to go on as before [s]"
+    )
+    silent_variance: Positive = Field(
+        default=0.25, description="variance that such a silence adds every second, at least [m^2/s, rad^2/s]"
+    )
+    longest_silence_s: Positive = Field(
+        default=60.0, description="after a longer silence no more is unknown than after this [s]"
+    )
+    turn_s: Positive = Field(default=2.0, description="span in which a turn stands out of the odometry's jitter [s]")
+    stands_out: Positive = Field(default=3.0, description="standard deviations of the jitter by which it does")
+    loose_rad: Positive = Field(
+        default=0.3, description="heading that a silence leaves unknown, from which a recording is in parts [rad]"
+    )
+
+
+class VotesConfig(Section):
+    """Identities that were read wrongly, by other detections of the seconds around."""
+
+    window_s: Positive = Field(default=5.0, description="before and after a detection, the odometry hardly drifts [s]")
+    sigma_m: Positive = Field(default=0.05, description="error of a detection's place at no distance [m] ...")
+    sigma_share: NotNegative = Field(default=0.05, description="... and as a share of its range")
+    gate: Positive = Field(
+        default=2.0, description="standard deviations within which another detection is of the same place"
+    )
+    fewest: Count = Field(default=2, description="detections with another id that contradict one, at least ...")
+    times: NotNegative = Field(default=3.0, description="... and more than so many times those with its own")
+    fewest_doubles: Count = Field(
+        default=3, description="frames that have an id at two places, from which on it is on two landmarks"
+    )
+    surprising: Positive = Field(
+        default=50.0, description="squared normalised residual from which a sighting disputes where its landmark is"
+    )
+
+
+class LocalizeConfig(Section):
+    """When the place of a robot in a map is known, and when it is lost; landmarks are found by their identity."""
+
+    fewest: Count = Field(default=3, description="landmarks that must stand to each other as in the map")
+    enough: Count = Field(default=5, description="so many do by no accident, even if they are fewer than half")
+    alone_s: NotNegative = Field(
+        default=10.0, description="where no third landmark comes into view for so long, two are enough [s]"
+    )
+    spread_m: Positive = Field(
+        default=1.0, description="how far apart they must be, for a recording that is smoothed afterwards [m]"
+    )
+    spread_online_m: Positive = Field(
+        default=2.0, description="the same for a robot that is followed in the map: farther than on one body [m]"
+    )
+    track_s: Positive = Field(default=30.0, description="age of sightings that odometry still ties to the newest [s]")
+    least_belief: Share = Field(
+        default=0.05, description="that a landmark is where it was known to stand, if it is seen there; at least"
+    )
+    believed: Share = Field(default=0.5, description="belief from which not to be seen is a miss")
+    sure_m: Positive = Field(
+        default=0.5, description="no landmark is expected while the position is less certain than this [m]"
+    )
+    least_p_detect: Share = Field(default=0.01, description="P(detect) from which a landmark is expected in view")
+    doubt: Positive = Field(
+        default=1.0, description="by which a place is doubted for each frame that has its landmark elsewhere [nats] ..."
+    )
+    most_doubt: Positive = Field(default=9.0, description="... and by which in all, at most [nats]")
+    remembered: Count = Field(default=8, description="landmarks, compared last, that judge whether the robot is lost")
+    least_remembered: Count = Field(default=3, description="the same, at least")
+    memory_s: Positive = Field(default=20.0, description="age up to which they do [s]")
+    better_by: float = Field(default=1.5, ge=1.0, description="times that another pose must fit better than this one")
 
 
 class ModesConfig(Section):
@@ -67,9 +181,6 @@ class ChangesConfig(Section):
     )
     usual_softness_m: Positive = Field(
         default=0.02, description="the same while it is decided what was swapped or elsewhere for a while [m]"
-    )
-    fewest_sightings: Count = Field(
-        default=3, description="sightings in a part of the session that tell where a landmark was then, at least"
     )
     most_groups: Count = Field(default=4, description="groups that may have moved, at most")
     most_candidates: Count = Field(default=40, description="landmarks that may have moved, at most: the likeliest")
@@ -154,8 +265,67 @@ class CleaningConfig(Section):
         return around
 
 
+class MapInSpaceConfig(Section):
+    """What of a given map in space stands where it says, and what was moved."""
+
+    sigma: Positive = Field(default=0.02, description="standard deviation of landmarks that state none [m, rad]")
+    loose_m: Positive = Field(
+        default=0.05, description="a map is believed no better than this until it is known what stands [m, rad]"
+    )
+    pseudo_count: Positive = Field(
+        default=6.0, description="residuals that the accuracy which a map states counts for where that is learned"
+    )
+    p_moved: Share = Field(default=0.03, description="probability that a landmark moved since the map was made")
+    moved_m: tuple[Positive, ...] = Field(
+        default=(0.15, 0.5, 2.0), min_length=1, description="standard deviations of how far, all alike [m]"
+    )
+    moved_rad: tuple[Positive, ...] = Field(
+        default=(0.05, 0.5), min_length=1, description="standard deviations of its turn, all alike [rad]"
+    )
+    moved_nats: NotNegative = Field(
+        default=5.0, description="what it costs that a landmark was moved, instead of the robot [nats]"
+    )
+    least_seen: Positive = Field(
+        default=1.0, description="sum of inlier probabilities below which a landmark was not seen at its place"
+    )
+    p_told: Share = Field(default=0.5, description="probability from which a landmark is told to have moved")
+
+
+class RepairConfig(Section):
+    """Other explanations of the same views in space: poses, orientations, and identities that several carry."""
+
+    stretch_nats: Positive = Field(
+        default=6.0, description="by which a stretch of frames must prefer other poses to try them [nats]"
+    )
+    gain_nats: Positive = Field(default=3.0, description="by which all must be more probable in the end [nats]")
+    other_rad: Positive = Field(default=0.3, description="orientations that differ by more are two [rad]")
+    same_rad: Positive = Field(default=0.05, description="orientations that agree to within this are the same [rad]")
+    together_m: Positive = Field(
+        default=0.5, description="outliers of one identity that are this close are another landmark [m]"
+    )
+    fewest: Count = Field(default=5, description="detections that this takes")
+    fewest_frames: Count = Field(default=3, description="frames that it takes")
+
+
+class TrafficConfig(Section):
+    """Boxes without identity around a robot with odometry: errors that repeat themselves, by what stands."""
+
+    sigma_scale: Positive = Field(default=0.05, description="standard deviation of the scale of ranges, a share")
+    sigma_bend: Positive = Field(
+        default=1e-3, description="angle that the odometry turns too little by the metre, standard deviation [rad/m]"
+    )
+    error_log_odds: float = Field(default=-3.0, description="prior log odds that there is such an error [nats]")
+    still_mps: Positive = Field(
+        default=0.1, description="velocity that a detector sees of what stands, standard deviation [m/s]"
+    )
+    moving_mps: Positive = Field(default=3.0, description="the same of what moves [m/s]")
+    witnesses: Count = Field(default=10, description="things that must say that the odometry wanders")
+    better_by: float = Field(default=2.0, ge=1.0, description="factor by which their residuals must become smaller")
+    tilt_rad: Positive = Field(default=0.05, description="boxes are upright to within this [rad]")
+
+
 class SpaceConfig(Section):
-    """What is estimated of sensors in space, beside poses and landmarks."""
+    """What is believed of sensors in space, and estimated beside poses and landmarks."""
 
     mount_sigma_m: float = Field(
         default=0.0,
@@ -178,6 +348,43 @@ class SpaceConfig(Section):
         lt=2.0,
         description="factor on the ranges of boxes without identity; unset: by what stands, the odometry's metre holds",
     )
+    sigma_m: Positive = Field(default=0.005, description="noise of unstated positions at no range [m] ...")
+    sigma_along: NotNegative = Field(default=0.02, description="... along the ray, as a share of the range ...")
+    sigma_across: NotNegative = Field(default=0.01, description="... and across")
+    sigma_rad: Positive = Field(default=0.05, description="noise of an orientation, where none is stated [rad]")
+    sigma_px: Positive = Field(default=2.0, description="noise of a tag's corners in the image, to start from [px]")
+    corner_m: Positive = Field(default=1e-3, description="position of a tag by its corners is no better than this [m]")
+    widest: Positive = Field(
+        default=3.0, description="corners farther off the axis than this, over the depth, are not used"
+    )
+    nearest_m: Positive = Field(default=0.02, description="nothing nearer to a sensor than this is used [m]")
+    range_within_s: Positive = Field(
+        default=15.0, description="views within this time give a detection without range one [s]"
+    )
+    least_parallax: Positive = Field(
+        default=0.25, description="largest standard deviation of such a range, as a share of it"
+    )
+    drift_m: Positive = Field(default=0.05, description="drift of odometry to start from [m/sqrt(s)]")
+    drift_rad: Positive = Field(default=0.02, description="the same of its heading [rad/sqrt(s)]")
+    steady_m: Positive = Field(default=3e-4, description="no odometry drifts less than this [m/sqrt(s)]")
+    steady_rad: Positive = Field(default=1e-5, description="the same of its heading [rad/sqrt(s)]")
+    hand_mps: Positive = Field(default=1.0, description="how fast a camera without odometry may go [m/s]")
+    hand_radps: Positive = Field(default=0.7, description="and turn [rad/s]")
+    tied_s: NotNegative = Field(
+        default=0.25, description="frames without odometry this close are tied by how far it may go between them [s]"
+    )
+    pseudo_count: Positive = Field(
+        default=10.0, description="residuals that noise levels to start from count for in what is learned"
+    )
+    outlier_log_odds: tuple[Positive, Positive, Positive] = Field(
+        default=(10.5, 14.0, 16.0),
+        description="half the squared residual at which positions, poses and corners are as likely outliers",
+    )
+    jump_log_odds: Positive = Field(default=14.0, description="the same of odometry, which may slip")
+    inlier: Share = Field(default=0.5, description="inlier probability, or sum of such, from which something was seen")
+    map: MapInSpaceConfig = Field(default_factory=MapInSpaceConfig, description="a map that is given")
+    repair: RepairConfig = Field(default_factory=RepairConfig, description="other explanations")
+    traffic: TrafficConfig = Field(default_factory=TrafficConfig, description="boxes without identity")
 
 
 class NoiseConfig(Section):
@@ -221,6 +428,9 @@ class SlamConfig(Section):
         le=50,
         description="an outlier is as likely as an inlier at a squared normalised residual of twice this",
     )
+    fewest_sightings: Count = Field(
+        default=3, description="sightings that tell where a landmark is, at least: one or two may be misread"
+    )
     estimate_noise: bool = Field(
         default=True, description="learn noise levels from the recording; off: keep the nominal ones"
     )
@@ -239,6 +449,9 @@ class SlamConfig(Section):
         default_factory=ChangesConfig, description="method 'joint': which landmarks moved together"
     )
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="noise levels to start from")
+    odometry: OdometryConfig = Field(default_factory=OdometryConfig, description="silences and jitter of the odometry")
+    votes: VotesConfig = Field(default_factory=VotesConfig, description="identities that were read wrongly")
+    localize: LocalizeConfig = Field(default_factory=LocalizeConfig, description="where a robot is in a map")
     space: SpaceConfig = Field(default_factory=SpaceConfig, description="sensors in space")
     check: CheckConfig = Field(default_factory=CheckConfig, description="what makes a recording odd")
     cleaning: CleaningConfig = Field(

@@ -66,6 +66,27 @@ class PersistConfig(Section):
         return self.recurrent != NO_RECURRENCE and not self.model
 
 
+class StillConfig(Section):
+    """Which tracks of boxes stand and which move, by all of their detections."""
+
+    sigma_m: Positive = Field(default=0.1, description="error of where a box is detected, at no range [m] ...")
+    sigma_share: NotNegative = Field(default=0.01, description="... and as a share of its range")
+    alike_s: NotNegative = Field(default=0.5, description="for how long such errors are alike [s]")
+    still: Positive = Field(
+        default=0.25, description="standard deviation of the velocity of what stands, over its class's speed limit"
+    )
+    moving: Positive = Field(default=4.8, description="the same of what moves; at the limit both are as probable")
+    window_s: Positive = Field(default=2.0, description="time over which a velocity is told [s]")
+    least_s: Positive = Field(default=0.4, description="time that a track or a stay must last [s] ...")
+    fewest: Count = Field(default=4, description="... and detections that it takes")
+    p_stands: Share = Field(default=0.8, description="probability from which a thing is believed to stand")
+    same_m: Positive = Field(default=0.5, description="stays this close are one [m]")
+    elsewhere_m: Positive = Field(default=2.0, description="what left was farther away than this [m]")
+    when_s: NotNegative = Field(
+        default=0.5, description="when a thing came to rest, or left, is known to within this to both sides [s]"
+    )
+
+
 class TrackerConfig(Section):
     """What the tracker assumes about objects and their detector."""
 
@@ -147,6 +168,8 @@ class TrackerConfig(Section):
     judge_every_s: NotNegative = Field(
         default=1.0, description="time between two looks that are independent evidence about the working set [s]"
     )
+
+    still: StillConfig = Field(default_factory=StillConfig, description="what stands beside a moving robot")
 
     @property
     def order(self) -> int:

@@ -26,7 +26,7 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import aged
 from evermap.runs.sessions import Entered
 from evermap.slam.intake import beliefs
-from evermap.slam.known_places import ENOUGH, KnownPlaces
+from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import FrameSightings, Localizer, Located
 from evermap.slam.mapper import Mapper
 from evermap.slam.problem import Drive
@@ -270,7 +270,7 @@ class Engine:
         rows, start_s = frame.rows, self._inbox.first_s
         seen = FrameSightings(frame.landmark_id, rows[:, 1:3].copy(), rows[:, 4:6].copy())
         if isinstance(self._filter, Localizer):
-            drive = Drive.from_rows(odometry[:, 0] - start_s, odometry[:, 1:])
+            drive = Drive.from_rows(odometry[:, 0] - start_s, odometry[:, 1:], self._config.slam.odometry)
             located = self._filter.step(frame.stamp_s - start_s, drive, seen)
         else:
             assert self._filter is not None
@@ -291,13 +291,17 @@ class Engine:
     def _begin(self, stamp_s: float) -> None:
         """Choose the filter: in a map the robot is localised, a place without one is mapped."""
         self._living = self._living.from_now_on(stamp_s)
-        prior, noise = beliefs(self._sensor, self._config.slam)
         if len(self._living.places):
             places = self._places(self._living, stamp_s)
-            self._filter = Localizer(places, self._sensor, prior, noise, learn=self._mapping)
+            self._filter = self._localizer(places, learn=self._mapping)
             self._judge = Judge(self._living, places, self._sensor, self._config)
         else:
-            self._filter = Mapper(self._sensor, prior, noise, self._config.slam)
+            self._filter = Mapper(self._sensor, *beliefs(self._sensor, self._config.slam), self._config.slam)
+
+    def _localizer(self, places: KnownPlaces, *, learn: bool) -> Localizer:
+        settings = self._config.slam
+        believed = beliefs(self._sensor, settings)
+        return Localizer(places, self._sensor, *believed, settings=settings.localize, learn=learn)
 
     def _places(self, living: LivingMap, stamp_s: float) -> KnownPlaces:
         rows = living.sighted_rows(aged(living, self._config.living, stamp_s).p_here)
@@ -325,7 +329,11 @@ class Engine:
     @property
     def _can_be_found(self) -> bool:
         """Whether the session so far shows enough of the map to be entered; one that explores goes on until it does."""
-        return len(self._met) >= ENOUGH if isinstance(self._filter, Localizer) else self._keeper.n_sessions == 1
+        return (
+            len(self._met) >= self._config.slam.localize.enough
+            if isinstance(self._filter, Localizer)
+            else self._keeper.n_sessions == 1
+        )
 
     def _go_on(self) -> None:
         """Go on in the newest map, from where the robot is."""
@@ -342,7 +350,7 @@ class Engine:
             if isinstance(before, Localizer):
                 self._filter = before.over(places, self._sensor)
             else:
-                self._filter = Localizer(places, self._sensor, *beliefs(self._sensor, config.slam), learn=True)
+                self._filter = self._localizer(places, learn=True)
                 if (here := self._located) is not None and self._last is not None and np.isfinite(here.pose[0]):
                     self._filter.place_at(self._last.stamp_s - self._inbox.first_s, here.pose, here.covariance)
             self._living, self._judge = living, judge
@@ -356,9 +364,8 @@ class Engine:
             pose, covariance = located.pose, located.covariance
             if stamp_s > self._last.stamp_s:
                 driven = self._inbox.window() - [self._inbox.first_s, 0.0, 0.0, 0.0]
-                pose, covariance = filter_.ahead(
-                    stamp_s - self._inbox.first_s, Drive.from_rows(driven[:, 0], driven[:, 1:])
-                )
+                drive = Drive.from_rows(driven[:, 0], driven[:, 1:], self._config.slam.odometry)
+                pose, covariance = filter_.ahead(stamp_s - self._inbox.first_s, drive)
         online, self._online = self._online, []
         changes, warnings = self._told.taken()
         return Now(

@@ -17,7 +17,7 @@ from evermap.maps.sessions.so_far import judged_so_far, lives_of
 from evermap.maps.vicinity import Vicinity, near
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import Located
-from evermap.slam.streaming import MIN_SIGHTINGS, sighted_at
+from evermap.slam.streaming import sighted_at
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, MapChange, Sensor, rows_of
 
 TAKEN_OVER_S = 300.0
@@ -104,7 +104,7 @@ class Judge:
             vicinity = _around(whole, glances, self._sensor, config)
             living = vicinity.part
         after, told = judged_so_far(living, _sighted(living, glances), self._sensor, config, self._classes)
-        changes, judged = _with_moves(told, glances), after.landmarks()
+        changes, judged = _with_moves(told, glances, self._config.slam.fewest_sightings), after.landmarks()
         with self._lock:
             self._after = after, vicinity
             at = np.searchsorted(self._table.landmark_id, judged.landmark_id)
@@ -150,14 +150,14 @@ def _sighted(living: LivingMap, glances: Sequence[_Glance]) -> Sighting:
     return Sighting(stamps, pose, frame[place >= 0], place[place >= 0])
 
 
-def _with_moves(changes: Sequence[MapChange], glances: Sequence[_Glance]) -> list[MapChange]:
+def _with_moves(changes: Sequence[MapChange], glances: Sequence[_Glance], fewest: int) -> list[MapChange]:
     """What has left its place and is seen at another one, which the map does not have yet, has moved."""
     names = np.concatenate([one.elsewhere_id for one in glances])
     away_m = np.concatenate([one.away_m for one in glances])
     told = []
     for change in changes:
         mine = np.isin(names, change.landmark_ids)
-        if change.kind is ChangeKind.VANISHED and np.count_nonzero(mine) >= MIN_SIGHTINGS:
+        if change.kind is ChangeKind.VANISHED and np.count_nonzero(mine) >= fewest:
             x, y = np.median(away_m[mine], axis=0).tolist()
             n_hits = int(np.count_nonzero(mine))
             told.append(replace(change, kind=ChangeKind.MOVED, displacement_m=(x, y), n_hits=n_hits))

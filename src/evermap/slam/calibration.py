@@ -6,7 +6,7 @@ instants shifted by `tau`, with velocities `k_v v - k_s |w|` and `k_w w`; of the
 no jitter of its report (`problem.beyond_jitter`).
 
 All nine states form one vector, in the order of `SPECS`. Priors say what a decent camera, laser or wheel encoder does
-out of the box; a kind of sensor (`KINDS`) or its data sheet (`Sensor`) makes those of the sensor narrower. None was
+out of the box; a kind of sensor (`kinds`) or its data sheet (`Sensor`) makes those of the sensor narrower. None was
 fitted to a recording.
 
 Not all sensors have errors. Each state has a spike at 'as stated' beside its slab, the prior; which of the two holds is
@@ -26,6 +26,7 @@ from itertools import product
 import numpy as np
 from scipy.special import logsumexp
 
+from evermap.config import CalibrationConfig
 from evermap.errors import ConfigError
 from evermap.geometry import se2
 from evermap.types import BoolArray, FloatArray, Sensor, SensorKind
@@ -33,45 +34,31 @@ from evermap.types import BoolArray, FloatArray, Sensor, SensorKind
 
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """Name, prior and meaning of one calibration state."""
+    """Name, usual value and meaning of one calibration state."""
 
     name: str
     mean: float
-    sigma: float
     unit: str
     meaning: str
 
 
 SPECS: tuple[Spec, ...] = (
-    Spec("range_bias_m", 0.0, 0.1, "m", "constant added to every range"),
-    Spec("range_slope", 0.0, 0.02, "1", "ranges are too long by this share"),
-    Spec("range_skew_per_rad", 0.0, 0.1, "1/rad", "range error that grows to one side of the view"),
-    Spec("range_curvature_per_rad2", 0.0, 0.5, "1/rad^2", "-0.5: the sensor reports depth, not distance"),
-    Spec("bearing_bias_rad", 0.0, 0.05, "rad", "constant added to every bearing"),
-    Spec("odometry_delay_s", 0.0, 0.3, "s", "odometry stamps minus the stamps of the motion they describe"),
-    Spec("odometry_forward_scale", 1.0, 0.05, "1", "true over reported forward speed"),
-    Spec("odometry_turn_scale", 1.0, 0.1, "1", "true over reported turn rate"),
-    Spec("odometry_turn_slip_m", 0.0, 0.05, "m", "forward speed lost per turn rate"),
+    Spec("range_bias_m", 0.0, "m", "constant added to every range"),
+    Spec("range_slope", 0.0, "1", "ranges are too long by this share"),
+    Spec("range_skew_per_rad", 0.0, "1/rad", "range error that grows to one side of the view"),
+    Spec("range_curvature_per_rad2", 0.0, "1/rad^2", "-0.5: the sensor reports depth, not distance"),
+    Spec("bearing_bias_rad", 0.0, "rad", "constant added to every bearing"),
+    Spec("odometry_delay_s", 0.0, "s", "odometry stamps minus the stamps of the motion they describe"),
+    Spec("odometry_forward_scale", 1.0, "1", "true over reported forward speed"),
+    Spec("odometry_turn_scale", 1.0, "1", "true over reported turn rate"),
+    Spec("odometry_turn_slip_m", 0.0, "m", "forward speed lost per turn rate"),
 )
+USUAL = CalibrationConfig()
 N_STATES, N_SENSOR = len(SPECS), 5
 NAMES = tuple(spec.name for spec in SPECS)
 BIAS, SLOPE, SKEW, CURVATURE, BEARING, DELAY, FORWARD, SLIP = 0, 1, 2, 3, 4, 5, 6, 8
-KINDS: dict[SensorKind, tuple[float, float, float, float, float]] = {
-    SensorKind.LASER: (0.05, 0.002, 0.002, 0.002, 0.01),
-    SensorKind.CAMERA: (0.1, 0.02, 0.1, 0.5, 0.05),
-    SensorKind.TAG: (0.05, 0.02, 0.05, 0.1, 0.05),
-    SensorKind.STEREO: (0.05, 0.02, 0.05, 0.1, 0.03),
-    SensorKind.UWB: (0.3, 0.005, 0.02, 0.02, 0.05),
-}
-"""Standard deviations of the states of the sensor, the first five, by its kind: data sheets, and mounts by hand."""
-ASKEW_SIGMA_RAD = 0.03
-"""Of the direction in which wheels drive: they, or the axis that is called the robot's front, are not parallel."""
-P_SPARE = 0.01
-"""Probability of a state to be needed below which it is held as stated."""
 LEAST_SIGMA = 1e-6
 """Of a data sheet that says that there is no error: nothing divides by zero."""
-P_NEEDED, P_NEEDED_KNOWN = 0.5, 0.9
-"""Prior probability that a state is not as stated; those of a sensor that is known to be no laser hardly ever are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +72,7 @@ class CalibrationPrior:
         angle_share: of what bearing bias and driving askew show together, that is the sensor's.
         askew_sigma: standard deviation of the latter [rad].
         p_sensor: probability of each of the sensor's states, the first five, to be another than stated.
+        settings: that it is of.
     """
 
     mean: FloatArray
@@ -93,17 +81,18 @@ class CalibrationPrior:
     slope_share: float | None = None
     angle_share: float = 1.0
     askew_sigma: float = 0.0
-    p_sensor: float = P_NEEDED
+    p_sensor: float = USUAL.p_needed
+    settings: CalibrationConfig = USUAL
 
     @classmethod
     def from_settings(
-        cls, *, calibrated: bool, fix: dict[str, float], sensor: Sensor | None = None
+        cls, settings: CalibrationConfig = USUAL, *, calibrated: bool, sensor: Sensor | None = None
     ) -> CalibrationPrior:
         """Return the priors, all states free unless `calibrated` is False, and some fixed by name.
 
         Args:
+            settings: standard deviations, and values of states that are fixed, by their names.
             calibrated: whether any is estimated.
-            fix: values of states that are not, by their names.
             sensor: its kind and data sheet, by which its errors are smaller, and are told from those of the odometry;
                 None: whatever only shows together is the sensor's as much as the odometry's.
 
@@ -111,7 +100,7 @@ class CalibrationPrior:
             ConfigError: `fix` names an unknown state.
         """
         mean, free = np.array([spec.mean for spec in SPECS]), np.full(N_STATES, calibrated)
-        for name, value in fix.items():
+        for name, value in settings.fix.items():
             if name not in NAMES:
                 raise ConfigError(
                     f"no calibration state is called '{name}'",
@@ -120,7 +109,7 @@ class CalibrationPrior:
                 )
             mean[NAMES.index(name)] = value
             free[NAMES.index(name)] = False
-        prior = cls(mean, np.array([spec.sigma for spec in SPECS]), free)
+        prior = cls(mean, np.array([settings.sigma[name] for name in NAMES]), free, settings=settings)
         return prior if sensor is None else prior._as_stated(sensor)
 
     def _as_stated(self, sensor: Sensor) -> CalibrationPrior:
@@ -133,15 +122,21 @@ class CalibrationPrior:
         }
         sigma = self.sigma.copy()
         if sensor.kind is not None:
-            sigma[:N_SENSOR] = KINDS[sensor.kind]
+            sigma[:N_SENSOR] = self.settings.kinds[sensor.kind]
         for state, value in sheet.items():
             if value is not None:
                 sigma[state] = max(value, LEAST_SIGMA)
-        askew = ASKEW_SIGMA_RAD if sensor.sigma_askew_rad is None else max(sensor.sigma_askew_rad, LEAST_SIGMA)
+        askew = (
+            self.settings.sigma_askew_rad
+            if sensor.sigma_askew_rad is None
+            else max(sensor.sigma_askew_rad, LEAST_SIGMA)
+        )
         angle_share = 0.0
         if sensor.sigma_angle_rad is not None or sensor.sigma_askew_rad is not None:
             angle_share = sigma[BEARING] ** 2 / (sigma[BEARING] ** 2 + askew**2)
         sigma[BEARING] = np.hypot(sigma[BEARING], askew)
+        known = sensor.kind not in (None, SensorKind.LASER)
+        p_needed = self.settings.p_needed_known if known else self.settings.p_needed
         scale_as_stated = sensor.kind is None and sheet[SLOPE] is None and sheet[FORWARD] is None
         return replace(
             self,
@@ -149,7 +144,7 @@ class CalibrationPrior:
             slope_share=0.0 if scale_as_stated else None,
             angle_share=angle_share,
             askew_sigma=askew,
-            p_sensor=P_NEEDED if sensor.kind in (None, SensorKind.LASER) else P_NEEDED_KNOWN,
+            p_sensor=p_needed,
         )
 
     def averaged(self, p_needed: FloatArray, variance: FloatArray, worth: FloatArray) -> CalibrationPrior:
@@ -165,7 +160,7 @@ class CalibrationPrior:
             worth: (9,) variances by the errors as they were found, in those of independent errors.
         """
         asked = self.free & ~np.isnan(p_needed)
-        p, before = np.where(asked, np.clip(p_needed, P_SPARE, 1.0), 1.0), 1.0 / self.sigma**2
+        p, before = np.where(asked, np.clip(p_needed, self.settings.p_spare, 1.0), 1.0), 1.0 / self.sigma**2
         data = np.maximum(1.0 / np.where(self.free, variance, self.sigma**2) - before, 1e-9 * before)
         told = data / worth
         information = np.where(asked, data * ((told + before) / (p * told) - 1.0), before)
@@ -173,11 +168,11 @@ class CalibrationPrior:
 
     def spared(self, p_needed: FloatArray) -> CalibrationPrior:
         """Return the prior with those states held as stated that hardly need to be free, by `p_needed` (9,)."""
-        return replace(self, free=self.free & ~(p_needed < P_SPARE))
+        return replace(self, free=self.free & ~(p_needed < self.settings.p_spare))
 
     def doubt(self, p_needed: FloatArray, states: FloatArray) -> FloatArray:
         """Return (9,) variances between 'as stated' and 'drawn from this prior', given their means (9,): `averaged`."""
-        odds = np.where(p_needed >= P_SPARE, 1.0 / np.maximum(p_needed, P_SPARE) - 1.0, 0.0)
+        odds = np.where(p_needed >= self.settings.p_spare, 1.0 / np.maximum(p_needed, self.settings.p_spare) - 1.0, 0.0)
         return odds * (states - self.mean) ** 2
 
     def without_scale(self) -> CalibrationPrior:
@@ -348,7 +343,7 @@ def needed(prior: CalibrationPrior, states: FloatArray, covariance: FloatArray, 
     data = weaker[:, None] * data * weaker
     pull = data @ told
     every = np.array(list(product((False, True), repeat=len(free))))
-    p = np.where(free < N_SENSOR, prior.p_sensor, P_NEEDED)
+    p = np.where(free < N_SENSOR, prior.p_sensor, prior.settings.p_needed)
     log_odds = np.log(p / (1.0 - p))
     weight = np.empty(len(every))
     for k, some in enumerate(every):

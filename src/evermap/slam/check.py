@@ -458,7 +458,7 @@ def screened(
         remarks = odd(recording, identities=settings.unknown_ids is not True, settings=settings.check)
     if settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording):  # the tracker tells who is who
         return recording, remarks
-    voted = without_contradicted_ids(recording, settings.space)
+    voted = without_contradicted_ids(recording, settings)
     return voted, (*remarks, *voted.warnings[len(recording.warnings) :])
 
 

@@ -79,7 +79,7 @@ def solve(
         NumericalError: no finite optimum.
     """
     prior, noise = beliefs(recording.sensor, settings)
-    prepared = prepare(recording, prior_map, remarks)
+    prepared = prepare(recording, prior_map, remarks, settings.odometry)
     in_map = prior_map is not None
     warm_up(search=settings.method == "joint" and may_search(len(prepared.problem.stamp_s), in_map=in_map))
     slam = StreamingSlam(
@@ -87,8 +87,7 @@ def solve(
         noise,
         prior,
         prior_map=prepared.prior_map,
-        robust=settings.robust,
-        estimate_noise=settings.estimate_noise,
+        settings=settings,
         method=_method(prepared, prior, recording.sensor, settings),
     )
     step_s, interrupted = fed(
@@ -146,6 +145,6 @@ def _method(prepared: Prepared, prior: CalibrationPrior, sensor: Sensor, setting
     if settings.method == "nohyp":
         return Static(n_landmarks)
     if settings.method == "joint":
-        return Joint(n_landmarks, prior, prepared.given_map(), settings.changes, robust=settings.robust)
+        return Joint(n_landmarks, prior, prepared.given_map(), settings)
     method: Method = plugins.load("evermap.methods", settings.method)(n_landmarks, settings, sensor)
     return method

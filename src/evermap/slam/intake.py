@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import sparse
 
-from evermap.config import SlamConfig
+from evermap.config import OdometryConfig, SlamConfig
 from evermap.errors import DataError
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.noise import start_noise
-from evermap.slam.problem import Drive, Noise, Problem
+from evermap.slam.problem import USUAL, Drive, Noise, Problem
 from evermap.slam.streaming import PriorMap
 from evermap.types import UNKNOWN, IntArray, Landmarks, Recording, Sensor
 
@@ -54,10 +54,15 @@ class Prepared:
         return GivenMap(self.prior_map.mean, covariance, given)
 
 
-def prepare(recording: Recording, prior_map: Landmarks | None = None, remarks: tuple[str, ...] = ()) -> Prepared:
+def prepare(
+    recording: Recording,
+    prior_map: Landmarks | None = None,
+    remarks: tuple[str, ...] = (),
+    settings: OdometryConfig = USUAL,
+) -> Prepared:
     """Sort out what can be used: detections of known identity, while there is odometry.
 
-    `remarks` on the recording come before those on what was left out.
+    `remarks` on the recording come before those on what was left out; `settings` say what is believed of odometry.
 
     Raises:
         DataError: fewer than two frames with a landmark of known identity.
@@ -86,13 +91,13 @@ def prepare(recording: Recording, prior_map: Landmarks | None = None, remarks: t
     velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
     problem = Problem(
         stamp_s=stamps[pose_frame] - start_s,
-        drive=Drive.from_rows(odometry.stamp_s - start_s, velocity),
+        drive=Drive.from_rows(odometry.stamp_s - start_s, velocity, settings),
         pose_row=pose_row.astype(np.int64),
         landmark_row=landmark_row.astype(np.int64),
         reading=np.column_stack([detections.range_m[used], detections.bearing_rad[used]]),
         sigma_given=np.column_stack([detections.sigma_range_m[used], detections.sigma_bearing_rad[used]]),
         mount=np.array(recording.sensor.mount_robot_sensor, dtype=np.float64),
-        prior=CalibrationPrior.from_settings(calibrated=False, fix={}),
+        prior=CalibrationPrior.from_settings(calibrated=False),
         start_pose=np.zeros(3),
         start_information=FIRST_POSE_INFORMATION,
         landmark_mean=np.zeros((len(landmark_id), 2)),
@@ -105,7 +110,7 @@ def prepare(recording: Recording, prior_map: Landmarks | None = None, remarks: t
 def beliefs(sensor: Sensor, settings: SlamConfig) -> tuple[CalibrationPrior, Noise]:
     """Return the prior of the calibration states and the noise levels before the first frame."""
     prior = CalibrationPrior.from_settings(
-        calibrated=settings.sensor_model == "calibrated", fix=settings.calibration.fix, sensor=sensor
+        settings.calibration, calibrated=settings.sensor_model == "calibrated", sensor=sensor
     )
     start = start_noise(settings.noise, settings.outlier_log_odds)
     nominal = [sensor.sigma_range_m, sensor.sigma_bearing_rad]

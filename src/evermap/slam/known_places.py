@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
+from evermap.config import LocalizeConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
 from evermap.geometry.rigid import AGREE_M, consensus
@@ -127,23 +128,12 @@ class Neighbourhood:
         return near
 
 
-MEMORY_S = 30.0
-"""Sightings that are older have drifted too far from the newest."""
 MOST_LANDMARKS = 40
 """That are kept, the newest: more make no surer."""
 RETRY_S = 1.0
 """Between two attempts where no other landmark has come into view."""
-AGREEING = 3
-ALONE_S = 10.0
-"""Landmarks that must stand to each other as in the map; where no third one comes into view for a while, two do."""
-ENOUGH = 5
-"""So many agree by no accident, even if they are fewer than half."""
-MIN_SPREAD_M = 2.0
-"""Farther apart than what stands on one body, which moves as one."""
 SIGMA_M = 0.5 * AGREE_M
 """Of one landmark of the drive, laid over the map."""
-LEAST_BELIEF = 0.05
-"""What stands where it is known to have stood is there, whatever was believed."""
 
 
 class Placed(NamedTuple):
@@ -167,10 +157,11 @@ class LocalTrack:
 
     Args:
         mount: (3,) pose of the sensor on the robot.
+        settings: when a place in the map is known.
     """
 
-    def __init__(self, mount: FloatArray) -> None:
-        self._mount = mount
+    def __init__(self, mount: FloatArray, settings: LocalizeConfig) -> None:
+        self._mount, self._settings = mount, settings
         self._pose = np.zeros(3)
         self._began_s = np.nan
         self._seen: dict[int, tuple[float, FloatArray]] = {}
@@ -188,26 +179,27 @@ class LocalTrack:
         for name, position in zip(landmark_id.tolist(), at, strict=True):
             self._seen.pop(name, None)
             self._seen[name] = (stamp_s, position)
-        old = [name for name, (seen_s, _) in self._seen.items() if seen_s < stamp_s - MEMORY_S]
+        old = [name for name, (seen_s, _) in self._seen.items() if seen_s < stamp_s - self._settings.track_s]
         for name in [*old, *list(self._seen)[: max(len(self._seen) - len(old) - MOST_LANDMARKS, 0)]]:
             self._seen.pop(name, None)
 
     def placed(self, stamp_s: float, places: KnownPlaces) -> Placed | None:
         """Lay the drive over the map; None where that is not sure, or was tried before with the same landmarks."""
         names = frozenset(self._seen)
-        alone = stamp_s - self._began_s >= ALONE_S
-        least = 2 if alone and len(names) == 2 else AGREEING
+        settings = self._settings
+        alone = stamp_s - self._began_s >= settings.alone_s
+        least = 2 if alone and len(names) == 2 else settings.fewest
         if len(names) < least or (names <= self._tried[1] and stamp_s < self._tried[0] + RETRY_S):
             return None
         self._tried = (stamp_s, names)
         local, row = self._candidates(places)
         landmark = places.landmark_id[row]
-        belief = np.maximum(places.p_here[row], LEAST_BELIEF)
+        belief = np.maximum(places.p_here[row], settings.least_belief)
         motion, agree = consensus(local, places.position_m[row], landmark=landmark, weight=belief)
         count = int(agree.sum())
-        if count < least or not (2 * count > len(names) or count >= ENOUGH):
+        if count < least or not (2 * count > len(names) or count >= settings.enough):
             return None
-        if np.ptp(local[agree], axis=0).max() < MIN_SPREAD_M:
+        if np.ptp(local[agree], axis=0).max() < settings.spread_online_m:
             return None
         return Placed(se2.compose(motion, self._pose), *self._uncertainty(motion[2], local[agree], row[agree]))
 
@@ -234,7 +226,7 @@ class LocalTrack:
     ) -> tuple[FloatArray, IntArray, FloatArray]:
         """Of the pose, the drive having been turned into the map, where landmarks (n, 2) agree; see `Placed`."""
         arm = local - local.mean(axis=0)
-        size = max((arm**2).sum(), MIN_SPREAD_M**2)
+        size = max((arm**2).sum(), self._settings.spread_online_m**2)
         away = se2.rotation(self._pose[2]).T @ (self._pose[:2] - local.mean(axis=0))
         by = np.array([[1.0, 0.0, -away[1]], [0.0, 1.0, away[0]], [0.0, 0.0, 1.0]])
         share = np.full(len(local), 1.0 / len(local))

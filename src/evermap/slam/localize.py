@@ -14,36 +14,23 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evermap.config import LocalizeConfig
 from evermap.geometry import se2
 from evermap.sensing.visibility import RANGE_MARGIN_M, NominalField
 from evermap.show import Shown
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.filter_kernels import BY_OTHERS
 from evermap.slam.kernels import AT_PLACES
-from evermap.slam.known_places import LEAST_BELIEF, KnownPlaces, LocalTrack, Neighbourhood, Placed
+from evermap.slam.known_places import KnownPlaces, LocalTrack, Neighbourhood, Placed
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
 from evermap.slam.motion import Motion
 from evermap.slam.problem import Drive, Noise
 from evermap.slam.streaming import sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
 
+USUAL = LocalizeConfig()
 MOST_CONSIDERED = 256
 """Places whose errors are kept correlated with the pose's: those used last. Of a frame no more are used."""
-EXPECTING_SIGMA_M = 0.5
-"""No landmark is expected while the robot's position is less certain than this, along either axis."""
-HARDLY_EXPECTED = 0.01
-BELIEVED = 0.5
-"""Probability of being there from which not to be seen is a miss."""
-DOUBT = 1.0
-MOST_DOUBT = 9.0
-"""Nats by which a place is believed less for every frame in which its landmark was found elsewhere (and more again for
-every other one), and in all: one that has moved must not mislead where there are few others to contradict it."""
-REMEMBERED = 8
-"""Different landmarks, compared last, by which the filter judges whether it is lost."""
-LEAST_REMEMBERED = 3
-MEMORY_S = 20.0
-BETTER_BY = 1.5
-"""Times by which another pose must fit better than the present one: one that is chosen to fit always fits somewhat."""
 
 
 class FrameSightings(NamedTuple):
@@ -89,6 +76,7 @@ class Localizer(Shown):
         sensor: limits, mounting and detection probability. Where it has no largest range, all of the map is expected.
         prior: of the calibration states.
         noise: standard deviations of detections and odometry; they are not estimated.
+        settings: when its place in the map is known, and when it is lost.
         start: (3,) pose and (3, 3) covariance at the first frame, where these are known.
         learn: hold the pose by landmarks that the map lacks, too, where they were seen first; else they are not used.
     """
@@ -100,18 +88,19 @@ class Localizer(Shown):
         prior: CalibrationPrior,
         noise: Noise,
         *,
+        settings: LocalizeConfig = USUAL,
         start: tuple[FloatArray, FloatArray] | None = None,
         learn: bool = False,
     ) -> None:
-        self.places = places
+        self.places, self._settings = places, settings
         self._field, self._prior, self.noise = NominalField(sensor), prior, noise
         self._mount = np.array(sensor.mount_robot_sensor, dtype=np.float64)
-        self._log_p = np.log(np.maximum(places.p_here, LEAST_BELIEF))
+        self._log_p = np.log(np.maximum(places.p_here, settings.least_belief))
         self._believed = self._log_p.copy()
         self._near = Neighbourhood(places.position_m, sensor.range_max_m + 3.0 * RANGE_MARGIN_M)
         self._believed_there = np.zeros(len(places), dtype=np.bool_)
         self._believed_there[places.most_probable()] = True
-        self._believed_there &= places.p_here >= BELIEVED
+        self._believed_there &= places.p_here >= settings.believed
         self._stamp_s: float | None = None
         self._filter = LocalFilter(self._mount, prior, most=MOST_CONSIDERED, considered=True)
         self._agreed: dict[int, tuple[float, bool]] = {}
@@ -119,7 +108,7 @@ class Localizer(Shown):
         """Whether landmarks that the map lacks are used."""
         self._new: dict[int, int] = {}
         """Rows of landmarks that the map lacks, behind those of its places."""
-        self._track: LocalTrack | None = LocalTrack(self._mount)
+        self._track: LocalTrack | None = LocalTrack(self._mount, settings)
         if start is not None:
             self._place_at(Placed(*start, NO_PLACES, np.zeros((3, 0))))
 
@@ -190,7 +179,7 @@ class Localizer(Shown):
 
     def over(self, places: KnownPlaces, sensor: Sensor) -> Localizer:
         """Return one that goes on from here in another state of the map."""
-        there = Localizer(places, sensor, self._prior, self.noise, learn=self.learn)
+        there = Localizer(places, sensor, self._prior, self.noise, settings=self._settings, learn=self.learn)
         local, before = there._filter, self._filter
         local.states[:] = before.states
         local.covariance[3:, 3:] = before.covariance[3:AT_PLACES, 3:AT_PLACES]
@@ -217,7 +206,8 @@ class Localizer(Shown):
             return
         here, there = self._filter.pose, placed.pose
         if self._is_placed and (
-            self._track.agreement(there, self.places) < BETTER_BY * self._track.agreement(here, self.places)
+            self._track.agreement(there, self.places)
+            < self._settings.better_by * self._track.agreement(here, self.places)
         ):
             self._track = None  # it is the world that differs from the map
             self._agreed.clear()
@@ -258,7 +248,8 @@ class Localizer(Shown):
         nis, weight = self._filter.update(row, reading, sigma, weighing=BY_OTHERS, log_odds=log_odds)
         doubt = self._log_p[row] - self._believed[row]
         agrees = weight * (1.0 + np.exp(doubt)) > 1.0  # would be more likely there than not, if it were not doubted
-        self._believed[row] = self._log_p[row] - np.clip(doubt + np.where(agrees, -DOUBT, DOUBT), 0.0, MOST_DOUBT)
+        step, most = self._settings.doubt, self._settings.most_doubt
+        self._believed[row] = self._log_p[row] - np.clip(doubt + np.where(agrees, -step, step), 0.0, most)
         self._judge(stamp_s, seen.landmark_id[used], agrees[:count])
         if self.learn and self._track is None:
             self._meet(np.setdiff1d(new, met), seen)
@@ -267,7 +258,7 @@ class Localizer(Shown):
     def _meet(self, new: IntArray, seen: FrameSightings) -> None:
         """Remember where landmarks stand that are seen for the first time, or where it was often doubted."""
         filter_, known = self._filter, len(self.places)
-        doubted = self._believed[known:] <= self._log_p[known:] - MOST_DOUBT
+        doubted = self._believed[known:] <= self._log_p[known:] - self._settings.most_doubt
         self._new = {name: row for name, row in self._new.items() if not doubted[row - known]}
         sigma = self.noise.of_detections(seen.sigma_given[new])
         for m, (range_sigma, bearing_sigma) in zip(new.tolist(), sigma.tolist(), strict=True):
@@ -296,15 +287,16 @@ class Localizer(Shown):
 
     def _judge(self, stamp_s: float, landmark_id: IntArray, agrees: BoolArray) -> None:
         """Lost where most of the landmarks compared last were not where they should have been."""
+        settings = self._settings
         for name, good in zip(landmark_id.tolist(), agrees.tolist(), strict=True):
             self._agreed.pop(name, None)
             self._agreed[name] = (stamp_s, good)
-        while len(self._agreed) > max(REMEMBERED, len(landmark_id)):
+        while len(self._agreed) > max(settings.remembered, len(landmark_id)):
             self._agreed.pop(next(iter(self._agreed)))
-        fresh = [good for seen_s, good in self._agreed.values() if seen_s >= stamp_s - MEMORY_S]
-        lost = len(fresh) >= LEAST_REMEMBERED and 2 * sum(fresh) < len(fresh)
+        fresh = [good for seen_s, good in self._agreed.values() if seen_s >= stamp_s - settings.memory_s]
+        lost = len(fresh) >= settings.least_remembered and 2 * sum(fresh) < len(fresh)
         if lost and self._track is None:
-            self._track = LocalTrack(self._mount)
+            self._track = LocalTrack(self._mount, settings)
         elif not lost:
             self._track = None
 
@@ -312,11 +304,12 @@ class Localizer(Shown):
         """Rows of places in view, P(detect) of each, and which are missed."""
         spread, pose = self._filter.covariance, self._filter.pose
         sigma = math.sqrt(max(spread[0, 0], spread[1, 1]))
-        if not self._is_placed or self._track is not None or sigma > EXPECTING_SIGMA_M:
+        if not self._is_placed or self._track is not None or sigma > self._settings.sure_m:
             return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.bool_)
         rows = self._near(se2.compose(pose, self._mount)[:2])
         p = self._field.p_detect(pose[None], self.places.position_m[rows])[0]
-        rows, p = rows[p >= HARDLY_EXPECTED], p[p >= HARDLY_EXPECTED]
+        expected = p >= self._settings.least_p_detect
+        rows, p = rows[expected], p[expected]
         well = self._believed_there[rows] & self._field.worth_a_look(p)
         return rows, p, well & ~np.isin(self.places.landmark_id[rows], seen_id)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from evermap.config import SlamConfig
 from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.geometry.chunked import JointCovariance
@@ -21,6 +22,7 @@ from evermap.slam.localize import FrameSightings, Localizer, Located
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive, Noise
 from evermap.slam.result import described
+from evermap.slam.streaming import USUAL
 from evermap.types import (
     UNKNOWN,
     BoolArray,
@@ -41,6 +43,7 @@ def localize(
     landmarks: Landmarks,
     prior: CalibrationPrior,
     noise: Noise,
+    settings: SlamConfig = USUAL,
     *,
     joint_m2: JointCovariance | None = None,
     realtime: bool = False,
@@ -54,6 +57,7 @@ def localize(
             with `p_exists` the probability of each; those of probability 0 are not looked at.
         prior: of the calibration states.
         noise: standard deviations; they are not estimated.
+        settings: of the estimator.
         joint_m2: covariance of all rows together; None takes `covariance_m2`, and the rows to be independent.
         realtime: process at the recording's pace.
         progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.
@@ -70,10 +74,10 @@ def localize(
         raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
     start_s = float(odometry.stamp_s[0])
     velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
-    drive = Drive.from_rows(odometry.stamp_s - start_s, velocity)
+    drive = Drive.from_rows(odometry.stamp_s - start_s, velocity, settings.odometry)
     landmarks, places = _existing(landmarks, joint_m2)
     warm_up()
-    localizer = Localizer(places, recording.sensor, prior, noise)
+    localizer = Localizer(places, recording.sensor, prior, noise, settings=settings.localize)
     frame = np.flatnonzero((stamps >= start_s) & (stamps <= odometry.stamp_s[-1]))
     run = _feed(localizer, recording, frame, drive, realtime=realtime, progress=progress)
     if not run.placed.any():
@@ -191,7 +195,7 @@ def _result(
     pose[:, 2] = se2.wrap(pose[:, 2])
     spread = np.array([one.covariance for one in run.located])[placed]
     trajectory = Trajectory(stamps[run.frame[placed]], pose, spread, frame="prior_map", clock=recording.clock)
-    reported = CalibrationPrior.from_settings(calibrated=False, fix={}).mean
+    reported = CalibrationPrior.from_settings(calibrated=False).mean
     reckoned, spread = dead_reckoned(trajectory.stamp_s - recording.odometry.stamp_s[0], drive, reported, START)
     misses = run.misses(places)
     noise = localizer.noise
@@ -215,7 +219,7 @@ def warm_up() -> None:
     """Compile all kernels, or load them, so that no frame has to wait: two frames of landmarks, one with two places."""
     at = np.array([[2.0, 0.0], [0.0, 2.0], [2.0, 2.0], [3.0, 3.0]])
     places = KnownPlaces.of(np.array([0, 1, 2, 2]), at, np.tile(np.eye(2), (4, 1, 1)), np.full(4, 0.5))
-    sensor, prior = Sensor(range_max_m=5.0), CalibrationPrior.from_settings(calibrated=True, fix={})
+    sensor, prior = Sensor(range_max_m=5.0), CalibrationPrior.from_settings(calibrated=True)
     localizer = Localizer(places, sensor, prior, START)
     reading = np.column_stack([np.hypot(*at[:3].T), np.arctan2(at[:3, 1], at[:3, 0])])
     seen = FrameSightings(np.arange(3), reading, np.full((3, 2), np.nan))

@@ -16,7 +16,7 @@ from evermap.config import SlamConfig
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import FIRST_POSE_INFORMATION
 from evermap.slam.localize import FrameSightings, Located
-from evermap.slam.problem import HISTORY_S, Drive, Noise, Problem, beyond_jitter, padded
+from evermap.slam.problem import SPANS, Drive, Noise, Problem, beyond_jitter, padded
 from evermap.slam.streaming import StreamingSlam
 from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Sensor
 
@@ -57,7 +57,7 @@ class Mapper:
         sensor: its mount.
         prior: of the calibration states.
         noise: where the noise levels start.
-        settings: `robust` and `estimate_noise`.
+        settings: of the estimator.
     """
 
     def __init__(self, sensor: Sensor, prior: CalibrationPrior, noise: Noise, settings: SlamConfig) -> None:
@@ -79,8 +79,10 @@ class Mapper:
             landmark_mean=np.zeros((0, 2)),
             landmark_information=sparse.csr_array((0, 0)),
         )
-        robust, learns = settings.robust, settings.estimate_noise
-        self._slam = StreamingSlam(self._problem, noise, prior, robust=robust, estimate_noise=learns)
+        self._slam = StreamingSlam(self._problem, noise, prior, settings=settings)
+        self._believed = settings.odometry
+        # what was before that says nothing about a row, nor about the second that is integrated before a frame
+        self._history_s = SPANS * settings.odometry.turn_s + 1.0
         self._later = False
 
     @property
@@ -101,9 +103,9 @@ class Mapper:
         """Take odometry; returns the row of its first."""
         at = int(np.searchsorted(self._odometry.rows[:, 0], odometry[0, 0]))
         rows = self._odometry.rows[:at]
-        before = rows[np.searchsorted(rows[:, 0], odometry[0, 0] - HISTORY_S) :, [0, 3]]
+        before = rows[np.searchsorted(rows[:, 0], odometry[0, 0] - self._history_s) :, [0, 3]]
         stamp_s, turn_radps = np.concatenate([before, odometry[:, [0, 3]]]).T
-        beyond = beyond_jitter(stamp_s, turn_radps)[len(before) :]
+        beyond = beyond_jitter(stamp_s, turn_radps, self._believed)[len(before) :]
         self._odometry.add(np.column_stack([odometry, beyond]), at)
         return at
 
@@ -129,7 +131,7 @@ class Mapper:
             pose, covariance = self._slam.online_pose[at].copy(), self._slam.online_covariance[at].copy()
         else:
             driven = self._odometry.rows[at:]
-            pose, covariance = self.ahead(stamp_s, Drive.from_rows(driven[:, 0], driven[:, 1:]))
+            pose, covariance = self.ahead(stamp_s, Drive.from_rows(driven[:, 0], driven[:, 1:], self._believed))
         none, nothing = np.zeros(0, dtype=np.int64), np.full(len(seen.landmark_id), np.nan)
         place = np.full(len(nothing), UNKNOWN, dtype=np.int64)
         no = none.astype(np.bool_)
@@ -166,7 +168,7 @@ class Mapper:
         self._problem = replace(
             self._problem,
             stamp_s=self._stamps.rows,
-            drive=Drive.from_rows(rows[:, 0], rows[:, 1:]),
+            drive=Drive.from_rows(rows[:, 0], rows[:, 1:], self._believed),
             pose_row=self._pose_row.rows,
             landmark_row=self._landmark_row.rows,
             reading=self._reading.rows,

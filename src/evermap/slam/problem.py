@@ -11,30 +11,20 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from evermap.config import OdometryConfig
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.preintegration import Intervals, Preintegration
 from evermap.slam.sparse.elimination import Spread
 from evermap.slam.sparse.system import Factorised, Slices, exhausted
 from evermap.types import BoolArray, FloatArray, IntArray
 
-SILENCE_S = 1.0
-"""Odometry that says nothing for longer than this is not believed to go on as before."""
-SILENT_VARIANCE = 0.25
-"""Variance per second, (m^2 or rad^2) / s, that is added while the odometry is silent, at least."""
-LONGEST_SILENCE_S = 60.0
-"""After a longer silence no more is unknown than after this: a clock set forward by a day is no drive of one."""
-
-
+USUAL = OdometryConfig()
 FEWEST_ROWS = 20
 """Rows of odometry from which its jitter is estimated."""
-TURN_S, TURN_ROWS = 2.0, 5
-"""Span in which a turn has to stand out of its jitter, and rows in it from which the jitter is told."""
+TURN_ROWS = 5
+"""Rows of odometry in a span from which its jitter is told."""
 SPANS = 2
-"""Such spans until a row, of which the calmest tells the jitter: a turn that begins or ends is none."""
-HISTORY_S = SPANS * TURN_S + 1.0
-"""What was before that says nothing about a row, not even of one in the second that is integrated before a frame."""
-STANDS_OUT = 3.0
-"""Standard deviations by which it does."""
+"""Spans `turn_s` until a row, of which the calmest tells the jitter: a turn that begins or ends is none."""
 TRIMMED = 0.6234
 """Mean of a squared standard normal below its 90 % quantile."""
 
@@ -75,44 +65,47 @@ class Drive:
         return self._preintegration.between(stamp_s, states, (self.stamp_s, self.velocity, self.unknown))
 
     @classmethod
-    def from_rows(cls, stamp_s: FloatArray, velocity: FloatArray) -> Drive:
-        """Return velocities as reported; silences longer than `SILENCE_S` become 'standing still, but who knows'.
+    def from_rows(cls, stamp_s: FloatArray, velocity: FloatArray, settings: OdometryConfig = USUAL) -> Drive:
+        """Return velocities as reported; silences longer than `silence_s` become 'standing still, but who knows'.
 
         What is not known grows over a silence of length T to the way that the last speed would have led, `(v T)^2`, up
-        to that of `LONGEST_SILENCE_S`.
+        to that of `longest_silence_s`.
 
         Args:
             stamp_s: (n,) strictly increasing.
             velocity: (n, 3) forward, lateral, turn; (n, 4) with what is known of the turn's jitter.
+            settings: what is believed of odometry.
         """
         if velocity.shape[1] == 3:
-            velocity = np.column_stack([velocity, beyond_jitter(stamp_s, velocity[:, 2])])
+            velocity = np.column_stack([velocity, beyond_jitter(stamp_s, velocity[:, 2], settings)])
         silence, unknown = np.diff(stamp_s), np.zeros(len(stamp_s))
-        if len(silent := np.flatnonzero(silence > SILENCE_S)):
+        if len(silent := np.flatnonzero(silence > settings.silence_s)):
             at = silent + 1
-            counted = np.minimum(silence[silent], LONGEST_SILENCE_S)
-            rate = (SILENT_VARIANCE + (velocity[silent, :3] ** 2).sum(axis=1) * counted) * counted / silence[silent]
+            counted = np.minimum(silence[silent], settings.longest_silence_s)
+            rate = settings.silent_variance + (velocity[silent, :3] ** 2).sum(axis=1) * counted
+            rate = rate * counted / silence[silent]
             unknown = np.insert(unknown, at, rate)
-            stamp_s = np.insert(stamp_s, at, stamp_s[silent] + 0.5 * SILENCE_S)
+            stamp_s = np.insert(stamp_s, at, stamp_s[silent] + 0.5 * settings.silence_s)
             velocity = np.insert(velocity, at, 0.0, axis=0)
         # after the last row nothing is known either
-        stamps = np.append(stamp_s, stamp_s[-1] + 0.5 * SILENCE_S)
-        return cls(stamps, np.vstack([velocity, np.zeros(4)]), np.append(unknown, SILENT_VARIANCE))
+        stamps = np.append(stamp_s, stamp_s[-1] + 0.5 * settings.silence_s)
+        return cls(stamps, np.vstack([velocity, np.zeros(4)]), np.append(unknown, settings.silent_variance))
 
 
-def beyond_jitter(stamp_s: FloatArray, turn_radps: FloatArray) -> FloatArray:
+def beyond_jitter(stamp_s: FloatArray, turn_radps: FloatArray, settings: OdometryConfig = USUAL) -> FloatArray:
     """Return (n,) turn rates without what may be jitter of their report, each by rows until itself.
 
     A scale that acts on jitter explains it by a scale of zero: where a robot drives straight on, poses do not jitter as
     its gyroscope does, and every row says so (attenuation by errors in variables: Fuller 1987, section 1.1). So a turn
-    counts by the share of its square, on average over `TURN_S`, that stands out of the jitter.
+    counts by the share of its square, on average over `turn_s`, that stands out of the jitter.
 
     Args:
         stamp_s: (n,) strictly increasing.
         turn_radps: (n,) as reported [rad/s].
+        settings: `turn_s` and `stands_out`.
     """
     end = np.arange(1, len(stamp_s) + 1)
-    spans = [end, *(np.searchsorted(stamp_s, stamp_s - k * TURN_S, side="right") for k in range(1, SPANS + 1))]
+    spans = [end, *(np.searchsorted(stamp_s, stamp_s - k * settings.turn_s, side="right") for k in range(1, SPANS + 1))]
     turned = np.append(0.0, np.cumsum(turn_radps))
     changed = np.append(np.zeros(min(len(stamp_s), 2) + 1), np.cumsum(np.diff(turn_radps, n=2) ** 2))
     jitter = np.full(len(stamp_s), np.inf)
@@ -122,7 +115,7 @@ def beyond_jitter(stamp_s: FloatArray, turn_radps: FloatArray) -> FloatArray:
         jitter = np.where(rows >= TURN_ROWS, np.minimum(jitter, variance), jitter)
     rows = end - spans[1]
     mean = (turned[end] - turned[spans[1]]) / rows
-    doubt = STANDS_OUT**2 * np.where(np.isfinite(jitter), jitter, 0.0) / rows
+    doubt = settings.stands_out**2 * np.where(np.isfinite(jitter), jitter, 0.0) / rows
     beyond: FloatArray = turn_radps * np.maximum(1.0 - doubt / np.maximum(mean**2, np.finfo(float).tiny), 0.0)
     return beyond
 

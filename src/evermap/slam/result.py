@@ -283,7 +283,7 @@ def _levels(fit: NoiseFit) -> list[ParameterEstimate]:
 
 def dead_reckoning(prepared: Prepared, trajectory: Trajectory) -> Trajectory:
     """Return odometry alone, believed as reported, from the first pose on."""
-    plain = CalibrationPrior.from_settings(calibrated=False, fix={})
+    plain = CalibrationPrior.from_settings(calibrated=False)
     pose, covariance = dead_reckoned(trajectory.stamp_s - prepared.start_s, prepared.problem.drive, plain.mean, START)
     pose = se2.compose(trajectory.pose_world_robot[0], pose)
     return Trajectory(trajectory.stamp_s, pose, covariance, frame=trajectory.frame, clock=trajectory.clock)

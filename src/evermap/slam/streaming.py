@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from evermap.config import SlamConfig
 from evermap.errors import NumericalError
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
@@ -27,6 +28,7 @@ from evermap.slam.smoother import COST_SLACK, Smoother
 from evermap.slam.sparse.system import Slices, exhausted
 from evermap.types import BoolArray, FloatArray, IntArray
 
+USUAL = SlamConfig()
 FIRST_RELINEARISATION = 40
 """Poses before the batch smoother relinearises for the first time."""
 SHORTEST_SPELL = 5
@@ -34,17 +36,13 @@ LONGEST_SPELL = 1 / 8
 """Poses between two relinearisations: a share of all poses, so that the whole costs a constant factor, but some."""
 SETTLED_AT, SETTLED_SPELL = 2000, 1 / 2
 """Poses from which most of what is new lies where nothing was before, and the share from then on."""
-SURPRISING_NIS = 50.0
 DISPUTED_AT = (2, 4, 8, 16)
 """Comparisons of a landmark after which it is asked whether most of them were surprising."""
-MIN_ALIGN_LANDMARKS = 3
-MIN_ALIGN_SPREAD_M = 1.0
-"""Landmarks of a prior map that must have been seen, and how far apart, before the robot is placed in it."""
 ALIGNED_INFORMATION = 1e-2
 """Once in a prior map the first pose is free: held to 10 m only, so that the linear system stays well conditioned."""
 FINAL_ROUNDS = 12
-LOOSE_RAD, MOST_BREAKS = 0.3, 8
-"""Heading that a silence of the odometry leaves unknown, from which the parts are laid over each other; how many."""
+MOST_BREAKS = 8
+"""Silences of the odometry after which the parts are laid over each other."""
 ELSEWHERE = 0.1
 """Motion (m or rad) of a part that the optimum near it does not take back."""
 SLICES_A_FRAME = 3.0
@@ -117,8 +115,7 @@ class StreamingSlam:
         noise: where the noise levels start.
         prior: calibration priors as the user means them.
         prior_map: where to localise; None maps from scratch.
-        robust: explain outliers instead of believing every identity.
-        estimate_noise: learn noise levels from the recording, else keep `noise`.
+        settings: of the estimator.
         method: how landmarks that moved are explained; None takes the world to be static.
     """
 
@@ -129,18 +126,16 @@ class StreamingSlam:
         prior: CalibrationPrior,
         *,
         prior_map: PriorMap | None = None,
-        robust: bool = True,
-        estimate_noise: bool = True,
+        settings: SlamConfig = USUAL,
         method: Method | None = None,
     ) -> None:
         self._prior = prior
         self._prior_map = prior_map
         self._problem = replace(problem, prior=prior.without_scale())
         self._start_noise = self._noise = noise
-        self._robust = robust
-        self._estimate_noise = estimate_noise
+        self._settings, self._robust, self._estimate_noise = settings, settings.robust, settings.estimate_noise
         self._method = Static(len(problem.landmark_mean)) if method is None else method
-        self._filter = SessionFilter(self._problem, noise, robust=robust)
+        self._filter = SessionFilter(self._problem, noise, robust=settings.robust)
         self._job: Slices[None] | None = None
         self._owed_ms = 0.0
         self._disputed = False
@@ -273,10 +268,12 @@ class StreamingSlam:
         self._job = None
         problem, estimate = self._method.unprejudiced(self._problem.until(self._n_poses), self._filter.estimate())
         if self._robust:  # a landmark whose first sighting was misread may be disputed since the last relinearisation
-            estimate = exhausted(_voted(Smoother(problem, self._noise, heavy=True), estimate))
+            estimate = exhausted(
+                _voted(Smoother(problem, self._noise, heavy=True), estimate, self._settings.fewest_sightings)
+            )
         smoother, estimate, fit = self._converged(problem, estimate, self._noise)
         if self._robust:
-            better = _rejoined(smoother, estimate)
+            better = _rejoined(smoother, estimate, self._settings)
             if better is not estimate:
                 smoother, estimate, fit = self._converged(problem, better, fit.noise)
         problem, estimate = self._ahead(problem, estimate)
@@ -380,7 +377,7 @@ class StreamingSlam:
         nis, _ = self._filter.distances(detections, landmark)
         self.nis[detections] = nis
         np.add.at(self._n_compared, landmark, 1)
-        surprising = nis > SURPRISING_NIS
+        surprising = nis > self._settings.votes.surprising
         if np.count_nonzero(surprising):
             np.add.at(self._n_surprising, landmark[surprising], 1)
 
@@ -416,7 +413,7 @@ class StreamingSlam:
         problem, estimate = self._problem.until(n), self._filter.estimate()
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
         if learn and self._robust:
-            voted = yield from _voted(smoother, estimate)
+            voted = yield from _voted(smoother, estimate, self._settings.fewest_sightings)
             # what was compared with a place that was never the landmark's own says nothing about consistency
             misplaced = np.any(voted.landmark != estimate.landmark, axis=1) & estimate.known
             self.nis[: len(problem.pose_row)][misplaced[problem.landmark_row]] = np.nan
@@ -474,7 +471,8 @@ class StreamingSlam:
         assert self._prior_map is not None
         both = self._prior_map.given & np.isfinite(self._landmark[: len(self._prior_map.given), 0])
         count = int(both.sum())
-        if count < (2 if final else MIN_ALIGN_LANDMARKS):
+        settings = self._settings.localize
+        if count < (2 if final else settings.fewest):
             return False
         if count == self._align_tried and not final:  # nothing new has been seen since
             return False
@@ -483,8 +481,8 @@ class StreamingSlam:
         _, agree = consensus(self._filter.estimate().landmark[: len(both)][both], at)
         if final:
             return bool(agree.sum() >= 2)
-        enough = agree.sum() >= MIN_ALIGN_LANDMARKS and 2 * agree.sum() > count
-        return bool(enough and np.ptp(at[agree], axis=0).max() >= MIN_ALIGN_SPREAD_M)
+        enough = agree.sum() >= settings.fewest and 2 * agree.sum() > count
+        return bool(enough and np.ptp(at[agree], axis=0).max() >= settings.spread_m)
 
     def _enter_map(self) -> None:
         """From the first pose's frame into the prior map's: move all that is known, then hold it by the map."""
@@ -575,10 +573,6 @@ def levels_settled(before: Noise, after: Noise, within: float) -> bool:
     return bool(np.all(np.abs(new / old - 1.0) < within))
 
 
-MIN_SIGHTINGS = 3
-"""Sightings from which a landmark's place may be voted on."""
-
-
 def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount: FloatArray) -> FloatArray:
     """Return positions (..., 2) that readings (..., 2) of range and bearing from poses (..., 3) point to.
 
@@ -591,20 +585,20 @@ def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount:
     return se2.transform(se2.compose(pose, mount), in_sensor)
 
 
-def _voted(smoother: Smoother, estimate: Estimate) -> Slices[Estimate]:
+def _voted(smoother: Smoother, estimate: Estimate, fewest: int) -> Slices[Estimate]:
     """Return what `outvoted` does, by the weights that the detections have there."""
     now = yield from smoother.linearised_in_slices(estimate)
-    return outvoted(smoother.problem, estimate, now.weights)
+    return outvoted(smoother.problem, estimate, now.weights, fewest)
 
 
-def _rejoined(smoother: Smoother, estimate: Estimate) -> Estimate:
+def _rejoined(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> Estimate:
     """Return a better optimum where the odometry was silent, if the landmarks that both sides saw lead to one.
 
     After a silence the robot may be anywhere: sightings that disagree with where it was taken to go on look like
     outliers. Each piece is laid over the rest, and all that follows over all before, as most landmarks have it.
     """
     problem = smoother.problem
-    loose = silent_links(problem, estimate)
+    loose = silent_links(problem, estimate, settings.odometry.loose_rad)
     breaks = np.flatnonzero(loose & ~np.append(loose[1:], False))[:MOST_BREAKS] + 1
     ends = [*breaks.tolist(), len(estimate.pose)]
     tried = {(first, last) for first, end in pairwise(ends) for last in (end, len(estimate.pose))}
@@ -617,7 +611,7 @@ def _rejoined(smoother: Smoother, estimate: Estimate) -> Estimate:
         )
         both = np.flatnonzero(np.isfinite(mine[:, 0]) & np.isfinite(theirs[:, 0]))
         motion, agree = consensus(mine[both], theirs[both])
-        if np.count_nonzero(agree) < MIN_ALIGN_LANDMARKS or not np.any(np.abs(motion) > ELSEWHERE):
+        if np.count_nonzero(agree) < settings.localize.fewest or not np.any(np.abs(motion) > ELSEWHERE):
             continue
         pose, landmark = estimate.pose.copy(), estimate.landmark.copy()
         pose[first:last] = se2.compose(motion, pose[first:last])
@@ -633,10 +627,10 @@ def _rejoined(smoother: Smoother, estimate: Estimate) -> Estimate:
     return estimate
 
 
-def silent_links(problem: Problem, estimate: Estimate) -> BoolArray:
-    """Return (N - 1,) intervals between poses in which the odometry was silent, and leaves the heading unknown."""
+def silent_links(problem: Problem, estimate: Estimate, loose_rad: float) -> BoolArray:
+    """Return (N - 1,) intervals between poses in which the odometry was silent, and leaves a heading unknown."""
     floor = problem.drive.between(problem.stamp_s, estimate.states).floor
-    return np.asarray(floor[:, 2, 2] > LOOSE_RAD**2)
+    return np.asarray(floor[:, 2, 2] > loose_rad**2)
 
 
 def _middles(row: IntArray, at: FloatArray, count: int) -> FloatArray:
@@ -647,7 +641,7 @@ def _middles(row: IntArray, at: FloatArray, count: int) -> FloatArray:
     return middle
 
 
-def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray) -> Estimate:
+def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray, fewest: int) -> Estimate:
     """Move landmarks to the median of their sightings where most sightings disagree with them.
 
     A landmark whose first sighting carried the wrong identity starts in the wrong place, from where all right
@@ -657,11 +651,12 @@ def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray) -> Estim
         problem: the measurements so far.
         estimate: where they put everything.
         weights: (M,) inlier weights of the detections.
+        fewest: sightings that vote, at least.
     """
     sightings = np.bincount(problem.landmark_row, minlength=len(estimate.landmark))
     agreeing = np.bincount(problem.landmark_row, weights=weights > 0.5, minlength=len(estimate.landmark))
     # a vote would only set a landmark of a prior map against that map
-    disputed = (sightings >= MIN_SIGHTINGS) & (agreeing < 0.5 * sightings) & ~problem.mapped
+    disputed = (sightings >= fewest) & (agreeing < 0.5 * sightings) & ~problem.mapped
     lost: IntArray = np.flatnonzero(disputed).astype(np.int64)
     if len(lost) == 0:
         return estimate

@@ -32,7 +32,6 @@ from evermap.slam.streaming import (
     FINAL_GAIN,
     FINAL_ROUNDS,
     FINAL_TOLERANCE,
-    MIN_ALIGN_LANDMARKS,
     NEAR_NOISE,
     NOISE_CONVERGED,
     STEPS_A_ROUND,
@@ -209,7 +208,7 @@ def _placed(members: Sequence[Member], own: Sequence[tuple[Problem, Estimate]], 
             by, agree = consensus(np.concatenate(mine), np.concatenate(there))
             if agree.sum() > best:
                 best, found = int(agree.sum()), (b, by)
-        if found is None or best < MIN_ALIGN_LANDMARKS:
+        if found is None or best < members[0].alone.settings.localize.fewest:
             lost = ", ".join(members[r].alone.recording.name for r in range(len(own)) if r not in placed)
             what = f"nothing ties {lost} to {members[0].alone.recording.name}"
             raise DataError(what, hint="landmarks with the same ids, or sightings of each other, and one clock")

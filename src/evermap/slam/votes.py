@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.config import SpaceConfig
+from evermap.config import SlamConfig, VotesConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.slam.bridge import dead_reckoned
@@ -33,37 +33,27 @@ from evermap.types import (
     SpatialRecording,
 )
 
-VOTE_S = 5.0
-"""Before and after a detection, in which odometry drifts less than detections err."""
-SEEN_M, SEEN_SHARE = 0.05, 0.05
-"""Error of a detection's place at no distance, and as a share of its range, beside that of others."""
 FIRST_QUARTILE = {2: 0.575, 3: 1.213}
 """Of a squared standard normal vector, by its dimension: most ids are right, not all."""
 FEWEST_PAIRS, LEAST_SHARE = 20, 1e-4
 """Detections of one id from which their error is told, and its variance as a share of the above, at least."""
-VOTE_GATE = 2.0
-"""Standard deviations within which another detection is of the same place; twice as many for what speaks for its id."""
-FEWEST_VOTES, VOTES = 2, 3
-"""Detections with another id that contradict one, at least, and more than so many times those with its own."""
-FEWEST_DOUBLES = 3
-"""Frames that have an id at two places, each of which others with that id confirm."""
 
 
-def without_contradicted_ids(recording: AnyRecordingT, settings: SpaceConfig) -> AnyRecordingT:
+def without_contradicted_ids(recording: AnyRecordingT, settings: SlamConfig) -> AnyRecordingT:
     """Return the recording without the landmark ids that the seconds around contradict, with a remark on how many.
 
     In space that takes odometry; boxes, which move, and detections without a range keep their ids.
 
     Args:
         recording: as read.
-        settings: of the estimator in space.
+        settings: of the estimator.
     """
     given = recording.detections
     try:
         used, read = _read(recording, settings)
     except DataError:  # too few ids: the estimator says so, if it needs any
         return recording
-    name, (wrong, doubled) = read.name, contradicted(read)
+    name, (wrong, doubled) = read.name, contradicted(read, settings.votes)
     left_out = wrong | doubled[name]
     if not left_out.any():
         return recording
@@ -96,25 +86,25 @@ class Read(NamedTuple):
     name: IntArray
 
 
-def _read(recording: AnyRecording, settings: SpaceConfig) -> tuple[IntArray, Read]:
-    return _in_space(recording, settings) if isinstance(recording, SpatialRecording) else _in_plane(recording)
+def _read(recording: AnyRecording, settings: SlamConfig) -> tuple[IntArray, Read]:
+    return _in_space(recording, settings) if isinstance(recording, SpatialRecording) else _in_plane(recording, settings)
 
 
-def _in_plane(recording: Recording) -> tuple[IntArray, Read]:
+def _in_plane(recording: Recording, settings: SlamConfig) -> tuple[IntArray, Read]:
     """Rows of detections that vote, and what they say."""
-    prepared = prepare(recording)
+    prepared = prepare(recording, settings=settings.odometry)
     problem = prepared.problem
     pose, _ = dead_reckoned(problem.stamp_s, problem.drive, problem.prior.mean, START)
     at = sighted_at(pose[problem.pose_row], problem.reading, problem.prior.mean, problem.mount)
-    variance = (SEEN_M + SEEN_SHARE * problem.reading[:, 0]) ** 2
+    variance = (settings.votes.sigma_m + settings.votes.sigma_share * problem.reading[:, 0]) ** 2
     return prepared.used, Read(at, variance, problem.stamp_s[problem.pose_row], problem.pose_row, problem.landmark_row)
 
 
-def _in_space(recording: SpatialRecording, settings: SpaceConfig) -> tuple[IntArray, Read]:
+def _in_space(recording: SpatialRecording, settings: SlamConfig) -> tuple[IntArray, Read]:
     """The same in space, with odometry."""
     if recording.odometry is None:
         raise DataError(f"{recording.name}: no odometry")
-    intake = prepare_space(recording, settings)
+    intake = prepare_space(recording, settings.space)
     problem, boxes = intake.problem, np.isfinite(recording.detections.size_m).all(axis=1)
     voting = np.flatnonzero(~(boxes | without_range(recording))[intake.used])
     row, sensor = problem.pose_row[voting], problem.sensor[voting]
@@ -125,17 +115,18 @@ def _in_space(recording: SpatialRecording, settings: SpaceConfig) -> tuple[IntAr
     return intake.used[voting], Read(at, variance, problem.stamp_s[row], view, problem.place[voting])
 
 
-def contradicted(read: Read) -> tuple[BoolArray, BoolArray]:
+def contradicted(read: Read, settings: VotesConfig) -> tuple[BoolArray, BoolArray]:
     """Return which of M detections those of the seconds around contradict, and which of N names are at two places."""
     at, variance, stamp_s, view, name = read
-    near = np.column_stack([np.searchsorted(stamp_s, stamp_s + sign * VOTE_S) for sign in (-1.0, 1.0)])
+    near = np.column_stack([np.searchsorted(stamp_s, stamp_s + sign * settings.window_s) for sign in (-1.0, 1.0)])
     apart = _apart(at, variance, name, near)
     apart = apart[np.isfinite(apart)]
     if len(apart) >= FEWEST_PAIRS:
         variance = variance * np.maximum(np.quantile(apart, 0.25) / FIRST_QUARTILE[at.shape[1]], LEAST_SHARE)
-    own, others = _votes(at, variance, view, name, near)
-    wrong = (others >= FEWEST_VOTES) & (others > VOTES * own)
-    return wrong, _doubles(at, variance, stamp_s, name, ~wrong & (own > 0)) >= FEWEST_DOUBLES
+    own, others = _votes(at, variance, view, name, near, settings.gate)
+    wrong = (others >= settings.fewest) & (others > settings.times * own)
+    doubles = _doubles(at, variance, stamp_s, name, ~wrong & (own > 0), settings.gate)
+    return wrong, doubles >= settings.fewest_doubles
 
 
 @kernel
@@ -161,7 +152,7 @@ def _apart(at: FloatArray, variance: FloatArray, name: IntArray, near: IntArray)
 
 @kernel
 def _votes(
-    at: FloatArray, variance: FloatArray, view: IntArray, name: IntArray, near: IntArray
+    at: FloatArray, variance: FloatArray, view: IntArray, name: IntArray, near: IntArray, gate: float
 ) -> tuple[IntArray, IntArray]:
     """(M,) detections in rows `near` (M, 2) where each is, with its name, and most with one other name.
 
@@ -173,10 +164,10 @@ def _votes(
         for j in range(near[k, 0], near[k, 1]):
             squared = _squared(at, variance, j, k)
             if name[j] == name[k]:
-                own[k] += j != k and squared < 4.0 * VOTE_GATE * VOTE_GATE
+                own[k] += j != k and squared < 4.0 * gate * gate
             elif view[j] == view[k]:
-                count[name[j]] -= len(at) if squared < 4.0 * VOTE_GATE * VOTE_GATE else 0
-            elif squared < VOTE_GATE * VOTE_GATE:
+                count[name[j]] -= len(at) if squared < 4.0 * gate * gate else 0
+            elif squared < gate * gate:
                 count[name[j]] += 1
         for j in range(near[k, 0], near[k, 1]):
             others[k] = max(others[k], count[name[j]])
@@ -185,13 +176,15 @@ def _votes(
 
 
 @kernel
-def _doubles(at: FloatArray, variance: FloatArray, stamp_s: FloatArray, name: IntArray, sure: BoolArray) -> IntArray:
+def _doubles(
+    at: FloatArray, variance: FloatArray, stamp_s: FloatArray, name: IntArray, sure: BoolArray, gate: float
+) -> IntArray:
     """(N,) pairs of detections with each name, both sure (M,), that are at two places at one time."""
     count = np.zeros(name.max() + 1 if len(name) else 0, dtype=np.int64)
     for k in range(len(at)):
         j = k + 1
         while j < len(at) and stamp_s[j] == stamp_s[k]:
             if name[j] == name[k] and sure[j] and sure[k]:
-                count[name[k]] += _squared(at, variance, j, k) > 4.0 * VOTE_GATE * VOTE_GATE
+                count[name[k]] += _squared(at, variance, j, k) > 4.0 * gate * gate
             j += 1
     return count

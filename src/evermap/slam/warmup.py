@@ -39,7 +39,7 @@ def _drive() -> None:
     """Drive past one landmark, through everything that is compiled."""
     count = FIRST_RELINEARISATION + 2
     stamps = np.linspace(0.0, 0.1 * count, count)
-    prior = CalibrationPrior.from_settings(calibrated=True, fix={})
+    prior = CalibrationPrior.from_settings(calibrated=True)
     forward = 0.1 * stamps
     problem = Problem(
         stamp_s=stamps,

@@ -11,25 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evermap.config import StillConfig
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
-STILL, MOVING = 0.25, 4.8
-"""Standard deviations of velocities of what stands and of what moves, each axis, over the speed that tells them apart:
-at that speed both are equally probable."""
-WINDOW_S, STRIDE_S = 2.0, 0.3
-ALIKE_S = 0.5
-"""For how long the errors of a detector are alike."""
-NEAR_M, FAR_SHARE = 0.1, 0.01
-HEAVY = 2.0
-ROUNDS = 5
-LEAST_S, FEWEST = 0.4, 4
-"""What a track or a stay must last, and detections that it takes."""
-SAME_M, ELSEWHERE_M = 0.5, 2.0
-"""Stays this close are one; what left was farther away than that."""
-WHEN_S = 0.5
-"""When a thing came to rest, or left, is known to within this to both sides [s]."""
-SURE = 0.8
-"""Probability to stand from which on a thing is believed to."""
+STRIDE_S = 0.3
+"""From window to window, in time."""
+HEAVY, ROUNDS = 2.0, 5
+"""Standard deviations at which the weight of a detection falls, and reweightings of a line."""
 
 
 class Stood(NamedTuple):
@@ -54,8 +42,9 @@ class Stood(NamedTuple):
 
 
 def standing(
-    stamp_s: FloatArray, position_m: FloatArray, range_m: FloatArray, track: IntArray, speed_mps: FloatArray
-) -> Stood:
+    stamp_s: FloatArray, position_m: FloatArray, range_m: FloatArray, track: IntArray, speed_mps: FloatArray,
+    settings: StillConfig,
+) -> Stood:  # fmt: skip
     """Return what stands, and when.
 
     Args:
@@ -64,88 +53,91 @@ def standing(
         range_m: (M,) how far away they were.
         track: (M,) what they are of, or `UNKNOWN`.
         speed_mps: (M,) above which each moves.
+        settings: of velocities, and how long a stay lasts.
     """
     stay, p_static = np.full(len(track), UNKNOWN), np.full(len(track), np.nan)
     p_still: dict[int, float] = {}
     rows: list[tuple[int, float, float, float]] = []
-    sigma_m = NEAR_M + FAR_SHARE * range_m
+    sigma_m = settings.sigma_m + settings.sigma_share * range_m
     order = np.argsort(track, kind="stable")
     for mine in np.split(order, np.flatnonzero(np.diff(track[order])) + 1):
-        if track[mine[0]] == UNKNOWN or not _enough(stamp_s[mine]):
+        if track[mine[0]] == UNKNOWN or not _enough(stamp_s[mine], settings):
             continue
         name, limit = int(track[mine[0]]), float(np.median(speed_mps[mine]))
         at, when, sigma = position_m[mine, :2], stamp_s[mine], sigma_m[mine]
-        p_still[name] = _p_of(*_way(when, at, sigma), limit)
-        p_static[mine] = _windows(when, at, sigma, limit)
-        parts = _stays(p_static[mine] > 0.5, when, at)
+        p_still[name] = _p_of(*_way(when, at, sigma, settings), limit, settings)
+        p_static[mine] = _windows(when, at, sigma, limit, settings)
+        parts = _stays(p_static[mine] > 0.5, when, at, settings)
         for part in parts:
-            p = _p_static(when[part], at[part], sigma[part], limit) if _enough(when[part]) else 0.0
-            if p > SURE:
+            p = _p_static(when[part], at[part], sigma[part], limit, settings) if _enough(when[part], settings) else 0.0
+            if p > settings.p_stands:
                 stay[mine[part]] = len(rows)
-                rows.append((name, p, *_ends(part, when, at)))
+                rows.append((name, p, *_ends(part, when, at, settings)))
     columns = np.array(rows, dtype=np.float64).reshape(-1, 4)
     return Stood(stay, p_static, p_still, columns[:, 0].astype(np.int64), *columns[:, 1:].T)
 
 
-def long_enough(stamp_s: FloatArray, track: IntArray) -> IntArray:
+def long_enough(stamp_s: FloatArray, track: IntArray, settings: StillConfig) -> IntArray:
     """Return (M,) tracks of detections (M,) in order of time, `UNKNOWN` where one is too short to have a velocity."""
     found = np.full(len(track), UNKNOWN)
     for one in np.unique(track[track != UNKNOWN]):
         mine = np.flatnonzero(track == one)
-        found[mine] = one if _enough(stamp_s[mine]) else UNKNOWN
+        found[mine] = one if _enough(stamp_s[mine], settings) else UNKNOWN
     return found
 
 
-def _enough(stamp_s: FloatArray) -> bool:
-    return len(stamp_s) >= FEWEST and float(stamp_s[-1] - stamp_s[0]) >= LEAST_S
+def _enough(stamp_s: FloatArray, settings: StillConfig) -> bool:
+    return len(stamp_s) >= settings.fewest and float(stamp_s[-1] - stamp_s[0]) >= settings.least_s
 
 
-def _windows(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: float) -> FloatArray:
+def _windows(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: float, settings: StillConfig) -> FloatArray:
     """(K,) probability to stand, by what is seen around each detection."""
-    if stamp_s[-1] - stamp_s[0] <= WINDOW_S:
-        return np.full(len(stamp_s), _p_static(stamp_s, at, sigma, limit))
-    middle = np.clip(STRIDE_S * np.round(stamp_s / STRIDE_S), stamp_s[0] + 0.5 * WINDOW_S, stamp_s[-1] - 0.5 * WINDOW_S)
-    first = np.searchsorted(stamp_s, middle - 0.5 * WINDOW_S - 1e-6)
-    last = np.searchsorted(stamp_s, middle + 0.5 * WINDOW_S + 1e-6)
+    half_s = 0.5 * settings.window_s
+    if stamp_s[-1] - stamp_s[0] <= settings.window_s:
+        return np.full(len(stamp_s), _p_static(stamp_s, at, sigma, limit, settings))
+    middle = np.clip(STRIDE_S * np.round(stamp_s / STRIDE_S), stamp_s[0] + half_s, stamp_s[-1] - half_s)
+    first = np.searchsorted(stamp_s, middle - half_s - 1e-6)
+    last = np.searchsorted(stamp_s, middle + half_s + 1e-6)
     found: dict[tuple[int, int], float] = {}
     for ends in zip(first.tolist(), last.tolist(), strict=True):
         part = slice(*ends)
         if ends not in found:
-            found[ends] = _p_static(stamp_s[part], at[part], sigma[part], limit) if _enough(stamp_s[part]) else 0.5
+            told = _enough(stamp_s[part], settings)
+            found[ends] = 0.5 if not told else (_p_static(stamp_s[part], at[part], sigma[part], limit, settings))
     return np.array([found[ends] for ends in zip(first.tolist(), last.tolist(), strict=True)])
 
 
-def _p_static(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: float) -> float:
+def _p_static(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: float, settings: StillConfig) -> float:
     """Probability that what was seen at (K, 2) stood."""
-    return _p_of(*_line(stamp_s, at, sigma), limit)
+    return _p_of(*_line(stamp_s, at, sigma, settings), limit, settings)
 
 
-def _p_of(velocity: FloatArray, spread: float, limit: float) -> float:
+def _p_of(velocity: FloatArray, spread: float, limit: float, settings: StillConfig) -> float:
     """Probability that a thing of a velocity (2,), known to a variance on each axis, stands; as probable as not
     beforehand.
     """
-    still, moving = (STILL * limit) ** 2 + spread, (MOVING * limit) ** 2 + spread
+    still, moving = (settings.still * limit) ** 2 + spread, (settings.moving * limit) ** 2 + spread
     log_factor = np.log(moving / still) - 0.5 * float(velocity @ velocity) * (1.0 / still - 1.0 / moving)
     return float(1.0 / (1.0 + np.exp(-np.clip(log_factor, -700.0, 700.0))))
 
 
-def _way(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray) -> tuple[FloatArray, float]:
+def _way(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, settings: StillConfig) -> tuple[FloatArray, float]:
     """Velocity (2,) from the beginning of a track to its end, and its variance: what stands in between counts, too."""
     part = max(3, len(at) // 8)
     ends = slice(0, part), slice(-part, None)
     lasted_s = float(np.median(stamp_s[ends[1]]) - np.median(stamp_s[ends[0]]))
     if lasted_s <= 0.0:
-        return _line(stamp_s, at, sigma)
+        return _line(stamp_s, at, sigma, settings)
     velocity = (np.median(at[ends[1]], axis=0) - np.median(at[ends[0]], axis=0)) / lasted_s
     variance = sum(float(np.median(sigma[end])) ** 2 for end in ends)
     return velocity, variance / lasted_s**2
 
 
-def _line(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray) -> tuple[FloatArray, float]:
+def _line(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, settings: StillConfig) -> tuple[FloatArray, float]:
     """Velocity (2,) of detections (K, 2), and its variance on each axis."""
     t = stamp_s - stamp_s[0]
     rate = max((len(t) - 1) / max(float(t[-1]), 1e-6), 1e-6)
-    share = 1.0 / max(1.0, ALIKE_S * rate)
+    share = 1.0 / max(1.0, settings.alike_s * rate)
     weight = 1.0 / sigma**2
     velocity, curve = np.zeros(2), 1.0
     for _ in range(ROUNDS):
@@ -157,25 +149,26 @@ def _line(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray) -> tuple[Float
     return velocity, 1.0 / (share * curve)
 
 
-def _stays(still: BoolArray, stamp_s: FloatArray, at: FloatArray) -> list[IntArray]:
+def _stays(still: BoolArray, stamp_s: FloatArray, at: FloatArray, settings: StillConfig) -> list[IntArray]:
     """Runs of detections (K, 2) that stand; those that follow each other in one place are one."""
     rows = np.flatnonzero(still)
     if not len(rows):
         return []
     found: list[IntArray] = []
     for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
-        if found and np.linalg.norm(np.median(at[part], axis=0) - np.median(at[found[-1]], axis=0)) < SAME_M:
+        if found and np.linalg.norm(np.median(at[part], axis=0) - np.median(at[found[-1]], axis=0)) < settings.same_m:
             found[-1] = np.concatenate([found[-1], part])
-        elif _enough(stamp_s[part]):
+        elif _enough(stamp_s[part], settings):
             found.append(part)
     return found
 
 
-def _ends(part: IntArray, stamp_s: FloatArray, at: FloatArray) -> tuple[float, float]:
+def _ends(part: IntArray, stamp_s: FloatArray, at: FloatArray, settings: StillConfig) -> tuple[float, float]:
     """When a stay began and ended, by a thing that was clearly elsewhere before and after; nan where it was not."""
     here, found = np.median(at[part], axis=0), [np.nan, np.nan]
     for k, (outside, beside) in enumerate(((slice(0, part[0]), part[0] - 1), (slice(part[-1] + 1, None), part[-1]))):
         away = np.linalg.norm(at[outside] - here, axis=1)
-        if len(away) >= FEWEST and float(np.median(np.sort(away)[-FEWEST:])) > ELSEWHERE_M:
+        fewest = settings.fewest
+        if len(away) >= fewest and float(np.median(np.sort(away)[-fewest:])) > settings.elsewhere_m:
             found[k] = 0.5 * float(stamp_s[beside] + stamp_s[beside + 1])
     return found[0], found[1]

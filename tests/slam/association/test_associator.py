@@ -23,7 +23,7 @@ from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, Landmarks
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
-KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False, fix={})
+KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False)
 
 
 def world(seed: int, **settings: float) -> World:
@@ -140,14 +140,14 @@ def test_noise_that_grows_with_range_is_found() -> None:
 @pytest.mark.slow
 def test_a_building_without_ids_and_in_its_map() -> None:
     recording = building(2).sessions[0]
-    found = identified(recording, CalibrationPrior.from_settings(calibrated=True, fix={}), START)
+    found = identified(recording, CalibrationPrior.from_settings(calibrated=True), START)
     scores = identity_scores(found.detections.landmark_id, recording.detections.landmark_id)
     assert scores.purity > 0.98
     assert scores.completeness > 0.9
     assert recording.true_landmarks is not None
     survey = Landmarks.at(recording.true_landmarks.landmark_id, recording.true_landmarks.position_m, sigma_m=0.02)
     inside = identified(
-        recording, CalibrationPrior.from_settings(calibrated=True, fix={}), START, prior_map=survey
+        recording, CalibrationPrior.from_settings(calibrated=True), START, prior_map=survey
     ).detections.landmark_id
     met = np.isin(inside, survey.landmark_id)
     assert met.mean() > 0.5

@@ -22,7 +22,7 @@ from evermap.slam.problem import Estimate
 from evermap.types import UNKNOWN, IntArray, Landmarks, Recording
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
-PRIOR = CalibrationPrior.from_settings(calibrated=True, fix={})
+PRIOR = CalibrationPrior.from_settings(calibrated=True)
 MIXED = Config(slam={"unknown_ids": "empty"})
 
 
@@ -63,7 +63,7 @@ def test_a_name_is_that_of_the_landmark_that_most_say_it_of() -> None:
 
 
 def test_visits_are_landmarks_of_their_own_but_for_names() -> None:
-    made = make_world(0, n_poses=9, n_landmarks=2, prior=CalibrationPrior.from_settings(calibrated=False, fix={}))
+    made = make_world(0, n_poses=9, n_landmarks=2, prior=CalibrationPrior.from_settings(calibrated=False))
     seen = replace(
         made.problem,
         stamp_s=np.array([0.0, 1.0, 2.0, 30.0, 31.0, 60.0, 61.0, 90.0, 91.0]),

@@ -19,7 +19,7 @@ from evermap.slam.association.particles import drawn
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.linearise import detection_residuals
 
-KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False, fix={})
+KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False)
 
 
 def world(seed: int) -> World:

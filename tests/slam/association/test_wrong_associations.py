@@ -22,7 +22,7 @@ from evermap.slam.sparse.system import exhausted
 from evermap.types import UNKNOWN
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
-KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False, fix={})
+KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False)
 TWICE, PAUSE_S = 5, 5.0
 """A landmark that is seen in two visits, and what lies between them."""
 KICK_RAD = 0.6

@@ -135,7 +135,7 @@ def test_misfit_of_a_static_world_is_a_chi_square(n_windows: int) -> None:
         )
         estimate = Smoother(free, world.noise).optimum(world.truth)
         bounds = np.linspace(0, 200, n_windows + 1).astype(int)
-        evidence = landmark_evidence(free, estimate, world.noise, world.problem.prior, bounds, PRIOR.fewest_sightings)
+        evidence = landmark_evidence(free, estimate, world.noise, world.problem.prior, bounds, 3)
         comparison = compare(evidence, given.mean, given.covariance, given.given)
         misfit += comparison.misfit
         freedom += comparison.freedom

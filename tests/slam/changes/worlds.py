@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from problems import World, default_prior, make_world, slow_detection
 
-from evermap.config import ChangesConfig
+from evermap.config import ChangesConfig, SlamConfig
 from evermap.geometry import se2
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.joint import Joint
@@ -58,7 +58,9 @@ class Session:
 
     def method(self, prior: ChangesConfig | None = None) -> Joint:
         """The joint search, before it has seen anything."""
-        return Joint(len(self.before), self.world.problem.prior, self.given, prior or ChangesConfig())
+        return Joint(
+            len(self.before), self.world.problem.prior, self.given, SlamConfig(changes=prior or ChangesConfig())
+        )
 
     def revised(self, prior: ChangesConfig | None = None) -> tuple[Joint, Explanation]:
         """What the method makes of the whole session, as the estimator asks it at the end."""

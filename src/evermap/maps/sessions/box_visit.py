@@ -16,7 +16,7 @@ from evermap.maps.sessions.looks import Watch
 from evermap.maps.sessions.placing import Laid
 from evermap.maps.sessions.spatial import SpatialVisit
 from evermap.slam.space.intake import most_of
-from evermap.slam.space.moving import TILT, TrafficIntake, boxes_of, conclude_in_traffic, mounts_of
+from evermap.slam.space.moving import TrafficIntake, boxes_of, conclude_in_traffic, mounts_of
 from evermap.slam.space.solve import SpatialSolved
 from evermap.tracking.frame import heading_of
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SlamResult, SpatialRecording
@@ -171,9 +171,10 @@ class BoxVisit(SpatialVisit):
         mine = np.isin(found.landmark_id, self.landmark_id[self.boxes.place])
         assert found.rotation is not None
         assert found.rotation_covariance is not None
+        tilt_rad = self.intake.problem.settings.traffic.tilt_rad
         spread = np.where(
             (mine & np.isfinite(found.rotation[:, 0]))[:, None, None],
-            np.diag([TILT**2, TILT**2, HEADING_RAD**2]),
+            np.diag([tilt_rad**2, tilt_rad**2, HEADING_RAD**2]),
             found.rotation_covariance,
         )
         number = np.where(mine, np.arange(len(mine)), UNKNOWN)

@@ -417,7 +417,8 @@ def _visit(
     count = len(identity)
     solved = replace(solved, identity=np.arange(count), number=np.ones(count, dtype=np.int64))
     moving = np.flatnonzero((np.isfinite(seen.since_s) | np.isfinite(seen.until_s)) & kept[seen.place])
-    witnessed = Witnessed(identity[seen.place[moving]], seen.since_s[moving], seen.until_s[moving], seen.p_stay[moving])
+    since_s, until_s, when_s = seen.since_s[moving], seen.until_s[moving], config.track.still.when_s
+    witnessed = Witnessed(identity[seen.place[moving]], since_s, until_s, seen.p_stay[moving], when_s)
     return BoxVisit(
         recording=taken.standing, intake=intake, solved=solved, witnessed=witnessed, taken=taken,
         track=config.track, boxes=seen, kept=kept, tied_m=solved.optimum.estimate.place[at, :2],

@@ -353,7 +353,7 @@ def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> BoolArr
     outcome, settings = visit.outcome, config.fit
     problem, pose, marginals = outcome.problem, outcome.graph_estimate.pose, outcome.graph_marginals
     n_poses, n_seen = len(pose), len(outcome.inlier)
-    loose = silent_links(problem, outcome.graph_estimate)
+    loose = silent_links(problem, outcome.graph_estimate, visit.settings.odometry.loose_rad)
     if loose.any():
         carry = se2.adjoint(se2.between(pose[1:], pose[:-1]))
         across = carry @ marginals.consecutive[:-1]

@@ -13,7 +13,6 @@ import numpy as np
 from evermap.maps.living import Evidence, LivingMap, clique_rows
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Watch
 from evermap.sensing.sightlines import KNOWN
-from evermap.tracking.standing import WHEN_S
 from evermap.types import FloatArray, IntArray, rows_of
 
 WITNESSED_NATS = 50.0
@@ -29,12 +28,14 @@ class Witnessed:
         landmark_id: which.
         since_s, until_s: when it came, and when it left; nan where it was not seen.
         probability: of that.
+        when_s: to within which both are known, to both sides.
     """
 
     landmark_id: IntArray
     since_s: FloatArray
     until_s: FloatArray
     probability: FloatArray
+    when_s: float = 0.0
 
     @classmethod
     def nothing(cls) -> Witnessed:
@@ -52,8 +53,8 @@ class Witnessed:
         """Return what was looked at without the places of these before they came and after they left."""
         since, until = np.full(1 + int(place.max(initial=0)), -np.inf), np.full(1 + int(place.max(initial=0)), np.inf)
         _, mine, at = np.intersect1d(self.landmark_id, landmark_id, return_indices=True)
-        since[place[at]] = np.nan_to_num(self.since_s[mine] + WHEN_S, nan=-np.inf)
-        until[place[at]] = np.nan_to_num(self.until_s[mine] - WHEN_S, nan=np.inf)
+        since[place[at]] = np.nan_to_num(self.since_s[mine] + self.when_s, nan=-np.inf)
+        until[place[at]] = np.nan_to_num(self.until_s[mine] - self.when_s, nan=np.inf)
         listed = watch.listed
         row = np.minimum(listed.landmark, len(since) - 1)
         ours = listed.landmark < len(since)
@@ -87,7 +88,7 @@ def departed(
     log_evidence[clique] = -WITNESSED_NATS
     living = replace(living, sites=replace(sites, p_here=p_here, p_kept=p_kept))
     total = np.bincount(clique_of, p_here, minlength=len(cliques))
-    stamp_s, none, one = what.until_s[left] + WHEN_S, np.zeros(len(left), np.int64), np.ones(len(left), np.int64)
+    stamp_s, none, one = what.until_s[left] + what.when_s, np.zeros(len(left), np.int64), np.ones(len(left), np.int64)
     of_left = Evidence(
         cliques[clique], stamp_s, none, one, np.ones(len(left)), np.log1p(-p_left), np.clip(total[clique], 0.0, 1.0)
     )
@@ -139,9 +140,9 @@ def arrived(came: Arrivals, living: LivingMap, before: LivingMap, what: Witnesse
         site: (W,) rows of the sites of these, -1 for none.
     """
     seen = {
-        int(site[k]): (float(what.since_s[k] - WHEN_S), float(what.probability[k]))
+        int(site[k]): (float(what.since_s[k] - what.when_s), float(what.probability[k]))
         for k in np.flatnonzero(np.isfinite(what.since_s) & (site >= 0))
     }
     new = ~np.isin(living.sites.site_id[site], before.sites.site_id) | np.isfinite(what.since_s)
     left = np.flatnonzero(np.isfinite(what.until_s) & (site >= 0) & new)
-    return replace(came, came=seen, left_s={int(site[k]): float(what.until_s[k] + WHEN_S) for k in left})
+    return replace(came, came=seen, left_s={int(site[k]): float(what.until_s[k] + what.when_s) for k in left})

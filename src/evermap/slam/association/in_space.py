@@ -56,9 +56,8 @@ from evermap.slam.association.revise import CONFIDENCE, lying_together, may_be_o
 from evermap.slam.space.estimate import as_seen, converged, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, prepare_space, without_range
 from evermap.slam.space.linearise import POINT, POSE
-from evermap.slam.space.problem import SpatialEstimate, SpatialProblem
+from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
-from evermap.slam.space.solve import DRIVEN
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Landmarks, SpatialRecording
 
 FOLLOWED = 3.0 * math.log(4.0)
@@ -221,7 +220,9 @@ class SpatialAssociator:
     def __init__(self, intake: SpatialIntake, kind: IntArray) -> None:
         problem = self._problem = _thinned(intake)
         self._kind = kind
-        self._noise = replace(DRIVEN, translation=CAUTION * DRIVEN.translation, rotation=CAUTION * DRIVEN.rotation)
+        settings = problem.settings
+        goes = CAUTION * settings.drift_m, CAUTION * settings.drift_rad
+        self._noise = SpatialNoise(*goes, pixel=settings.sigma_px)
         mount = problem.mount[problem.sensor]
         self._at = se3.transform(mount, problem.measured[:, :3])
         self._root = INFLATION * se3.rotation_of(mount) @ np.linalg.inv(problem.measured_root)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from evermap.config import ChangesConfig
+from evermap.config import SlamConfig
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior
@@ -49,8 +49,7 @@ class Joint(Method):
         n_landmarks: landmarks of the session.
         calibration: priors of the calibration states as the user means them.
         given: the map to compare with; None where there is none.
-        prior: how changes are distributed.
-        robust: explain outliers instead of believing every identity.
+        settings: how changes are distributed, and what is believed of sightings.
     """
 
     def __init__(
@@ -58,15 +57,12 @@ class Joint(Method):
         n_landmarks: int,
         calibration: CalibrationPrior,
         given: GivenMap | None,
-        prior: ChangesConfig,
-        *,
-        robust: bool = True,
+        settings: SlamConfig,
     ) -> None:
         self._count = n_landmarks
         self._calibration = calibration
         self._given = given
-        self._prior = prior
-        self._robust = robust
+        self._prior, self._robust, self._fewest = settings.changes, settings.robust, settings.fewest_sightings
         self._loosened: _Loosened | None = None
         self._concluded: Explanation | None = None
         self._landmark = np.arange(n_landmarks)
@@ -98,7 +94,7 @@ class Joint(Method):
         # what the map puts in the wrong place is where most of its sightings say, whatever the map
         weights = Smoother(free, START, heavy=True, robust=self._robust).inlier_probability(start)
         unmapped = replace(free, landmark_information=sparse.csr_array(free.landmark_information.shape))
-        self._loosened = _Loosened(problem, free, outvoted(unmapped, start, weights))
+        self._loosened = _Loosened(problem, free, outvoted(unmapped, start, weights, self._fewest))
         return free, self._loosened.start
 
     def _where_most_agree(self, estimate: Estimate) -> Estimate:
@@ -128,8 +124,8 @@ class Joint(Method):
             return Explanation(problem, estimate, self._current())
         for _ in range(ROUNDS if final else 1):
             bounds = self._bounds(base)
-            first, fewest = self._first_places(estimate), self._prior.fewest_sightings
-            evidence = landmark_evidence(base, first, noise, self._calibration, bounds, fewest, sized=in_map)
+            first = self._first_places(estimate)
+            evidence = landmark_evidence(base, first, noise, self._calibration, bounds, self._fewest, sized=in_map)
             if len(evidence.landmark) == 0:
                 return Explanation(problem, estimate, self._current())
             before = self.verdict

@@ -16,19 +16,11 @@ from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT, SpatialProblem
 from evermap.types import FloatArray
 
-P_MOVED = 0.03
-"""Probability that a landmark moved since the map was made."""
-MOVED_M, MOVED_RAD = (0.15, 0.5, 2.0), (0.05, 0.5)
-"""How far things are moved and turned: standard deviations, all combinations alike."""
 ROUNDS = 12
 FARTHEST = 0.25
 """Squared distances, as a share of the largest one, of places that are let go together."""
 SETTLED = 0.01
 """Change of all probabilities that ends it."""
-PRIOR_COUNT = 6.0
-"""Numbers that the stated accuracy of the map is worth where it is estimated."""
-LEAST_SEEN = 0.5
-"""Sum of inlier probabilities of detections from which on a session says something of a place."""
 LOOSE = 1.0 / 20.0**2
 """Information of a session by itself in directions of which it says nothing [1/m^2, 1/rad^2]."""
 LEAST_INFORMATION = 1.0 / 25.0
@@ -87,6 +79,7 @@ def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> Fl
 def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
     """Every place as the others and the session have it."""
     problem, prior = optimum.smoother.problem, optimum.smoother.problem.prior
+    settings = problem.settings.map
     spread = optimum.smoother.spread(optimum.now)
     count, n = len(prior.place), len(problem.stamp_s)
     p_stands, off, covariance = np.ones(count), np.zeros((count, 6)), np.zeros((count, 6, 6))
@@ -100,10 +93,10 @@ def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
         alone = np.linalg.inv((vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T)
         mean = alone @ (own @ mean)
         stands = _log_density(mean, alone + np.diag(sigma[k, :dim] ** 2))
-        scales = [(m, rad) for m in MOVED_M for rad in (MOVED_RAD if dim == 6 else MOVED_RAD[:1])]
+        scales = [(m, rad) for m in settings.moved_m for rad in settings.moved_rad[: None if dim == 6 else 1]]
         wide = [np.diag(sigma[k, :dim] ** 2 + np.array([m] * 3 + [rad] * (dim - 3)) ** 2) for m, rad in scales]
         moved = np.logaddexp.reduce([_log_density(mean, alone + extra) for extra in wide]) - np.log(len(scales))
-        odds = moved - stands + np.log(P_MOVED / (1.0 - P_MOVED))
+        odds = moved - stands + np.log(settings.p_moved / (1.0 - settings.p_moved))
         p_stands[k] = 1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0)))
         off[k, :dim], covariance[k, :dim, :dim] = mean, alone
     return MapComparison(p_stands, off, covariance, 1.0)
@@ -127,7 +120,7 @@ def by_itself(optimum: SpatialOptimum) -> Alone:
     """Return what a session says of its places, linearised where the map holds it, which is taken back."""
     problem, place = optimum.smoother.problem, optimum.estimate.place
     count, n = len(place), len(problem.stamp_s)
-    seen = np.flatnonzero(np.bincount(problem.place, optimum.now.weight, minlength=count) > LEAST_SEEN)
+    seen = np.flatnonzero(np.bincount(problem.place, optimum.now.weight, minlength=count) > problem.settings.inlier)
     first = np.full(count + 1, -1, dtype=np.int64)
     first[seen] = np.append(0, np.cumsum(np.where(problem.oriented[seen], 6, 3)))[:-1]
     joint = optimum.smoother.factorised(optimum.now).joint(n + seen)
@@ -167,7 +160,7 @@ def _log_density(off: FloatArray, covariance: FloatArray) -> float:
 
 def _accuracy(found: MapComparison, stated: FloatArray, problem: SpatialProblem) -> float:
     """The factor on the map's stated deviations that fits the places which stand; 1 counts for some."""
-    total, count = PRIOR_COUNT, PRIOR_COUNT
+    total = count = problem.settings.map.pseudo_count
     for k, place in enumerate(problem.prior.place):
         dim = 6 if problem.oriented[place] else 3
         spread = np.diag(found.covariance[k])[:dim]

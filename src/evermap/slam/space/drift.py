@@ -24,10 +24,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import nnls
 
+from evermap.config import SpaceConfig, StillConfig, TrafficConfig
 from evermap.geometry import se3
-from evermap.slam.space.problem import SpatialProblem
+from evermap.slam.space.problem import USUAL, SpatialProblem
 from evermap.types import FloatArray, IntArray
 
+STILL = StillConfig()
 PERSIST_S = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 """Correlation times of detection errors that are tried together; none that is longer than the recording."""
 SIGHTINGS_A_PLACE = 150
@@ -44,8 +46,6 @@ LEVERS = (0.5, 1.0, 1.5, 2.0, 3.0)
 PERSISTS = 2.0
 """Nats a curve by which errors that persist must explain all curves better than white ones: of two numbers more for
 each of them (Akaike 1974)."""
-LEAST_DRIFT = 3e-4
-"""Metres for the square root of a second; no odometry is better."""
 
 
 class Drift(NamedTuple):
@@ -98,7 +98,7 @@ def drift_of(problem: SpatialProblem, driven: FloatArray) -> Drift:
         for place in range(len(problem.oriented)):
             mine = np.flatnonzero(problem.place == place)
             share[mine] = 1.0 / (1.0 + _others(stamp_s[mine], np.array(persist_s)) @ lasting)
-    translation = float(np.sqrt(max(0.5 * growth, LEAST_DRIFT**2)))
+    translation = float(np.sqrt(max(0.5 * growth, problem.settings.steady_m**2)))
     range_m = float(np.median(np.linalg.norm(problem.measured[:, :3], axis=1)))
     return Drift(translation, translation / max(range_m, 1.0), share)
 
@@ -189,19 +189,9 @@ def _others(stamp_s: FloatArray, persist_s: FloatArray) -> FloatArray:
     return found
 
 
-SIGMA_SCALE, SIGMA_BEND = 0.05, 1e-3
-"""What is usual beforehand: a share, and radians by the metre."""
-ERROR_LOG_ODDS = -3.0
-"""That an odometry bends, or has another scale than a detector of known scale, beforehand."""
-NEAR_M, FAR_SHARE = 0.1, 0.01
-"""Deviation of where a box is detected: at no range, and by the range."""
 ROUNDS, HEAVY = 10, 2.0
 FEWEST = 3
 """Things that it takes: one more than there are numbers."""
-STILL_MPS, MOVING_MPS = 0.1, 3.0
-"""Velocities of what stands, by what a detector makes of a changing view, and of what moves."""
-ALIKE_S = 0.5
-"""For how long the errors of a detector are alike."""
 STRETCHES, EVERYWHERE = 10, 3.36
 """What is seen in one stretch of a drive may err for one cause: the odometry drifts at random, a queue creeps. So many
 standard deviations, which Student's t of ten stretches exceeds in one of 100 cases, are found everywhere."""
@@ -223,10 +213,16 @@ class Gauge(NamedTuple):
 
     stated: float | None = None
     scale: float = 0.0
-    scale_sigma: float = SIGMA_SCALE
+    scale_sigma: float = USUAL.traffic.sigma_scale
     bend: float = 0.0
-    bend_sigma: float = SIGMA_BEND
+    bend_sigma: float = USUAL.traffic.sigma_bend
     things: int = 0
+
+    @classmethod
+    def before(cls, settings: SpaceConfig) -> Gauge:
+        """Return what is known before anything is seen."""
+        given = settings.traffic
+        return cls(settings.range_scale, scale_sigma=given.sigma_scale, bend_sigma=given.sigma_bend)
 
     @property
     def range_scale(self) -> float:
@@ -261,7 +257,7 @@ def bent(pose: FloatArray, bend: float) -> FloatArray:
 
 def gauge_of(
     pose: FloatArray, when_s: FloatArray, frame: IntArray, seen: FloatArray, mount_m: FloatArray, thing: IntArray,
-    stated: float | None = None,
+    settings: SpaceConfig = USUAL, still: StillConfig = STILL,
 ) -> Gauge:  # fmt: skip
     """Return scale and bend by which as many things as possible stand still.
 
@@ -272,31 +268,34 @@ def gauge_of(
         seen: (K, 3) where it is from the robot, in its frame.
         mount_m: (K, 3) where the sensor is on the robot.
         thing: (K,) what it is of.
-        stated: factor on ranges that is known; the scale that is left is the odometry's then, if it is there at all.
+        settings: with a factor on ranges that is known the scale that is left is the odometry's, if it is there at all.
+        still: errors of where boxes are detected.
     """
+    stated, given = settings.range_scale, settings.traffic
     _, of = np.unique(thing, return_inverse=True)
     count = int(of.max(initial=-1)) + 1
     if count < FEWEST:
-        return Gauge(stated)
+        return Gauge.before(settings)
     ray = seen - mount_m
     at, by = _directions(pose, frame, mount_m + ray * (stated or 1.0), mount_m)
-    sigma = NEAR_M + FAR_SHARE * np.linalg.norm(ray, axis=1)
-    usual = np.array([SIGMA_SCALE, SIGMA_BEND])
-    still = _still(when_s, at, by, of, count, sigma)
+    sigma = still.sigma_m + still.sigma_share * np.linalg.norm(ray, axis=1)
+    usual = np.array([given.sigma_scale, given.sigma_bend])
+    stands = _still(when_s, at, by, of, sigma, given, still.alike_s)
     prior, found, spread = usual.copy(), np.zeros(2), np.zeros((2, 2))
     stretch = _stretches(when_s, of, count)
     for asked in (1, 0, 1, -1):  # the bend, the scale, and the bend again beside that scale
         if asked >= 0:
             prior[asked] = usual[asked]
-        found, spread = _steady(at, by, of, still, sigma, prior, stretch)
+        found, spread = _steady(at, by, of, stands, sigma, prior, stretch)
         if asked >= 0 and (asked == 1 or stated is not None):
-            odds = _log_odds(found[asked], float(spread[0, asked]), float(usual[asked]), float(still.sum()))
+            odds = _log_odds(found[asked], float(spread[0, asked]), float(usual[asked]), float(stands.sum()))
+            odds += given.error_log_odds
             everywhere = abs(found[asked]) > EVERYWHERE * spread[1, asked]
-            probable = odds > 0.0 and everywhere and still.sum() >= FEWEST
+            probable = odds > 0.0 and everywhere and stands.sum() >= FEWEST
             prior[asked] = usual[asked] if probable else 1e-9 * usual[asked]
     deviation = spread.max(axis=0) + 1e-9 * usual
     return Gauge(
-        stated, float(found[0]), float(deviation[0]), float(found[1]), float(deviation[1]), round(float(still.sum()))
+        stated, float(found[0]), float(deviation[0]), float(found[1]), float(deviation[1]), round(float(stands.sum()))
     )
 
 
@@ -315,32 +314,34 @@ def _directions(
 
 
 def _still(
-    when_s: FloatArray, at: FloatArray, by: FloatArray, of: IntArray, count: int, sigma: FloatArray
-) -> FloatArray:
+    when_s: FloatArray, at: FloatArray, by: FloatArray, of: IntArray, sigma: FloatArray, given: TrafficConfig,
+    alike_s: float,
+) -> FloatArray:  # fmt: skip
     """(count,) probability that each thing stands, by its velocity: a mixture of what stands and what moves.
 
     The scale and the bend are those of its highest optimum (expectation-maximisation from a grid of scales), so that
     traffic which creeps along does not count for what stands.
     """
-    weight = sigma**-2.0
+    weight, count = sigma**-2.0, int(of.max()) + 1
+    moving_mps, usual = given.moving_mps, np.array([given.sigma_scale, given.sigma_bend])
     t = _centred(when_s[:, None], of, count, weight)[:, 0]
     curve = np.maximum(np.bincount(of, weight * t**2, minlength=count), 1e-9)
     velocity = _summed((weight * t)[:, None] * at, of, count) / curve[:, None]
     slope = (_summed((weight * t)[:, None] * by.reshape(-1, 4), of, count) / curve[:, None]).reshape(-1, 2, 2)
-    alike = np.maximum(1.0, ALIKE_S * np.bincount(of) / np.maximum(_spans(when_s, of, count), 1e-3))
-    variance = STILL_MPS**2 + alike / curve
+    alike = np.maximum(1.0, alike_s * np.bincount(of) / np.maximum(_spans(when_s, of, count), 1e-3))
+    variance = given.still_mps**2 + alike / curve
     best, found = -np.inf, np.ones(count)
     for start in np.arange(-MOST_SCALE, MOST_SCALE + 1e-9, SCALE_STEP):
         value, share, total = np.array([start, 0.0]), 0.5, -np.inf
         for _ in range(EM_ROUNDS):
             off = ((velocity + slope @ value) ** 2).sum(axis=1)
             still = np.log(share / variance) - 0.5 * off / variance
-            moving = np.log((1.0 - share) / MOVING_MPS**2) - 0.5 * off / MOVING_MPS**2
-            total = float(np.logaddexp(still, moving).sum() - 0.5 * ((value / [SIGMA_SCALE, SIGMA_BEND]) ** 2).sum())
+            moving = np.log((1.0 - share) / moving_mps**2) - 0.5 * off / moving_mps**2
+            total = float(np.logaddexp(still, moving).sum() - 0.5 * ((value / usual) ** 2).sum())
             p = 1.0 / (1.0 + np.exp(np.clip(moving - still, -700.0, 700.0)))
             share = float(np.clip(p.mean(), 0.05, 0.95))
             square = np.einsum("k,kia,kib->ab", p / variance, slope, slope)
-            square += np.diag([SIGMA_SCALE**-2.0, SIGMA_BEND**-2.0])
+            square += np.diag([given.sigma_scale**-2.0, given.sigma_bend**-2.0])
             value = -np.linalg.solve(square, np.einsum("k,kia,ki->a", p / variance, slope, velocity))
         if total > best:
             best, found = total, p
@@ -391,7 +392,7 @@ def _log_odds(value: float, sigma: float, usual: float, count: float) -> float:
     """That there is an error: Student's density of what `count` things say, over that by chance."""
     sigma = max(sigma, 1e-12)
     fit = 0.5 * count * np.log1p((value / sigma) ** 2 / max(count - 2.0, 1e-3))
-    return float(fit - np.log(np.hypot(usual, sigma) / sigma) + ERROR_LOG_ODDS)
+    return float(fit - np.log(np.hypot(usual, sigma) / sigma))
 
 
 def _centred(values: FloatArray, of: IntArray, count: int, weight: FloatArray) -> FloatArray:

@@ -27,13 +27,9 @@ ROUNDS = 12
 """Optimum and noise levels in turns, at most."""
 CONVERGED = 0.02
 """Relative change of all noise levels that ends it."""
-PRIOR_WEIGHT = 10.0
-"""Numbers that the noise level before the first frame is worth."""
 FLOOR = np.array([1e-4, 1e-5, 0.05, 0.05, 0.05, 0.03])
 """No noise level is lower: nothing is that good for long."""
 MOST_CANDIDATES = 60
-ANGLE_FLOOR = 0.05
-"""Orientations that agree to within this [rad] are the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +70,7 @@ def converged(
 def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, begun: SpatialNoise) -> SpatialNoise:
     """Return noise levels by expectation-maximisation: residuals, and what is not known of them, by inlier weight."""
     problem, kind = smoother.problem, smoother.problem.kind
-    n_steps, spread = len(problem.increment), smoother.spread(now)
+    n_steps, spread, worth = len(problem.increment), smoother.spread(now), problem.settings.pseudo_count
     trace = _traces(smoother, spread.of_factors, spread.of_factors_first)
     levels, before, start = noise.levels.copy(), noise.levels, begun.levels
     # odometry: its whitened residuals are in the right sides of its rows, with the root of their weights
@@ -84,7 +80,7 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
         for level, rows in ((TRANSLATION, slice(0, 3)), (ROTATION, slice(3, 6))):
             total = float((block[:, rows, 12] ** 2).sum() + trace[0][:, rows].sum())
             count = 3.0 * float(weight.sum())
-            levels[level] = _level(before[level], start[level], total, count)
+            levels[level] = _level(before[level], start[level], total, count, worth)
     of_detection = trace[1]
     for level, some, rows in (
         (ACROSS, kind != CORNERS, slice(0, 2)),
@@ -99,13 +95,13 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
             count = float(w.sum()) * (rows.stop - rows.start)
             if level == ORIENTATION:
                 count -= float(w @ problem.about_axis[some])
-            levels[level] = _level(before[level], start[level], total, count)
+            levels[level] = _level(before[level], start[level], total, count, worth)
     return SpatialNoise(*np.maximum(levels, FLOOR).tolist())
 
 
-def _level(before: float, start: float, total: float, count: float) -> float:
-    """A standard deviation: `total` are squares by the one before, `start` counts for some numbers."""
-    return float(np.sqrt((total * before**2 + PRIOR_WEIGHT * start**2) / (count + PRIOR_WEIGHT)))
+def _level(before: float, start: float, total: float, count: float, worth: float) -> float:
+    """A standard deviation: `total` are squares by the one before, `start` counts for `worth` numbers."""
+    return float(np.sqrt((total * before**2 + worth * start**2) / (count + worth)))
 
 
 def _traces(smoother: SpatialSmoother, of_factors: FloatArray, first: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -146,7 +142,7 @@ def oriented(problem: SpatialProblem, estimate: SpatialEstimate, weight: FloatAr
     gives = np.isfinite(problem.measured[:, 3]) & problem.oriented[problem.place]
     first_share = 1.0 / (1.0 + np.exp(-np.minimum(problem.other_log_odds, 50.0)))
     first_share = np.where(has_other, first_share, 1.0)
-    sigma = np.hypot(problem.sigma_rad, ANGLE_FLOOR)
+    sigma = np.hypot(problem.sigma_rad, problem.settings.repair.same_rad)
     for place in np.flatnonzero(problem.oriented):
         mine = np.flatnonzero(gives & (problem.place == place))
         if not len(mine):

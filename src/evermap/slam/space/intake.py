@@ -14,23 +14,9 @@ from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries
 from evermap.slam.space.linearise import CORNERS, POINT, POSE
-from evermap.slam.space.problem import SpatialProblem
+from evermap.slam.space.problem import USUAL, SpatialProblem
 from evermap.types import ANY_RANGE_M2, UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
 
-NEAREST_M = 0.02
-NOMINAL_ALONG, NOMINAL_ACROSS, NOMINAL_RAD = 0.02, 0.01, 0.05
-"""Noise of positions along and across the ray, as shares of the range, and of orientations, where nothing is stated;
-levels are learned."""
-NOMINAL_M = 0.005
-"""Noise of positions at no range."""
-ONE_PX_M = 1e-3
-"""A tag's position from its corners is no better than this."""
-WIDEST = 3.0
-"""Corners beyond this much off the axis (at depth 1) are not used: pixels say little there."""
-SHORTLY_S = 15.0
-"""What is seen within this time of a detection without a range gives it one."""
-LEAST_PARALLAX = 0.25
-"""Standard deviation of a range that makes a first value, as a share of it."""
 HARDLY = 1.0
 """Standard deviation with which it counts, as a share of the range: as good as nothing."""
 
@@ -67,7 +53,7 @@ def prepare_space(
 
     Args:
         recording: as read.
-        settings: what may be wrong with the mounts and stamps of the sensors.
+        settings: what is believed of the sensors.
         remarks: on the recording, before those on what was left out.
         fewest: frames with a landmark that it takes.
 
@@ -75,7 +61,7 @@ def prepare_space(
         DataError: fewer than `fewest` frames with a landmark of known identity.
     """
     detections, stamps = recording.detections, recording.frames.stamp_s
-    where, usable, moving, warnings = _said(recording, remarks)
+    where, usable, moving, warnings = _said(recording, settings, remarks)
     seen_in = np.unique(detections.frame[usable])
     if len(seen_in) < fewest:
         raise _too_little(recording, len(seen_in), fewest)
@@ -111,6 +97,7 @@ def prepare_space(
         symmetries=symmetries,
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
         mount_sigma=np.tile(_mount_sigma(settings), (len(recording.sensors), 1)),
+        settings=settings,
     )
     return SpatialIntake(
         problem, float(stamps[pose_frame[0]]), pose_frame, used, landmark_id, driven_pose, tuple(warnings),
@@ -154,14 +141,16 @@ def _too_little(recording: SpatialRecording, seen: int, fewest: int) -> DataErro
     )
 
 
-def _said(recording: SpatialRecording, remarks: tuple[str, ...]) -> tuple[_Where, BoolArray, BoolArray, list[str]]:
+def _said(
+    recording: SpatialRecording, settings: SpaceConfig, remarks: tuple[str, ...]
+) -> tuple[_Where, BoolArray, BoolArray, list[str]]:
     """What detections say, which (M,) can be used, frames (F,) while there is odometry, and what is left out."""
     usable, moving, warnings = _usable(recording, remarks)
-    where, broken = _where(recording, usable)
+    where, broken = _where(recording, usable, settings)
     if broken.any():
         warnings.append(f"{int(broken.sum())} detections from which no position follows not used")
         usable &= ~broken
-    blind = _with_ranges(recording, where, usable)
+    blind = _with_ranges(recording, where, usable, settings)
     if blind.any():
         warnings.append(f"{int(blind.sum())} detections without a range, seen from too few directions, not used")
         usable &= ~blind
@@ -202,7 +191,7 @@ class _Where:
         return _Where(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
-def _where(recording: SpatialRecording, usable: BoolArray) -> tuple[_Where, BoolArray]:
+def _where(recording: SpatialRecording, usable: BoolArray, settings: SpaceConfig) -> tuple[_Where, BoolArray]:
     """What the detections say, and which of the usable ones say nothing."""
     given = recording.detections
     count = len(given)
@@ -211,8 +200,8 @@ def _where(recording: SpatialRecording, usable: BoolArray) -> tuple[_Where, Bool
         measured=np.hstack(
             [given.position_sensor_m, np.where(np.isfinite(given.rotation), given.rotation, se3.NO_TURN)]
         ),
-        covariance=_covariance(recording),
-        sigma_rad=_sigma_rad(recording),
+        covariance=_covariance(recording, settings),
+        sigma_rad=_sigma_rad(recording, settings.sigma_rad),
         corner=np.zeros((count, 4, 2)),
         corner_root=np.zeros((count, 4, 2, 2)),
         other=np.full((count, 7), np.nan),
@@ -227,13 +216,20 @@ def _where(recording: SpatialRecording, usable: BoolArray) -> tuple[_Where, Bool
         good = (
             np.isfinite(plane).all(axis=(1, 2))
             & (ray[..., 2] > 0.0).all(axis=1)
-            & (np.abs(plane).max(axis=(1, 2)) < WIDEST)
+            & (np.abs(plane).max(axis=(1, 2)) < settings.widest)
         )
         some, plane = some[good], plane[good]
         _, slope = project_each(plane, np.full(len(some), row), recording.sensors)
-        _put(found, some, plane, slope, square_poses(given.corner_px[some], given.tag_size_m[some], sensor))
+        _put(
+            found,
+            some,
+            plane,
+            slope,
+            square_poses(given.corner_px[some], given.tag_size_m[some], sensor),
+            settings.corner_m,
+        )
     broken = usable & ~(np.isfinite(found.measured).all(axis=1) & np.isfinite(found.covariance).all(axis=(1, 2)))
-    near = np.linalg.norm(np.nan_to_num(found.measured[:, :3]), axis=1) < NEAREST_M
+    near = np.linalg.norm(np.nan_to_num(found.measured[:, :3]), axis=1) < settings.nearest_m
     return found, broken | (usable & near)
 
 
@@ -243,7 +239,9 @@ def positions_of(recording: SpatialRecording) -> FloatArray:
     """
     given = recording.detections.position_sensor_m
     absent = np.asarray(np.isnan(given).any(axis=1))
-    return np.where(absent[:, None], _where(recording, absent)[0].measured[:, :3], given) if absent.any() else given
+    return (
+        np.where(absent[:, None], _where(recording, absent, USUAL)[0].measured[:, :3], given) if absent.any() else given
+    )
 
 
 def without_range(recording: SpatialRecording) -> BoolArray:
@@ -253,7 +251,7 @@ def without_range(recording: SpatialRecording) -> BoolArray:
     return np.asarray(along > ANY_RANGE_M2 * (at**2).sum(axis=1))
 
 
-def _with_ranges(recording: SpatialRecording, where: _Where, usable: BoolArray) -> BoolArray:
+def _with_ranges(recording: SpatialRecording, where: _Where, usable: BoolArray, settings: SpaceConfig) -> BoolArray:
     """Give detections without a range one, from where else the same landmark was seen shortly before and after.
 
     The covariance keeps what was seen across; the range itself is hardly believed. Returns (M,) those that could not.
@@ -273,12 +271,13 @@ def _with_ranges(recording: SpatialRecording, where: _Where, usable: BoolArray) 
     across = np.eye(3) - along[:, :, None] * along[:, None, :]
     stamp_s, landmark = recording.frames.stamp_s[given.frame[rays]], given.landmark_id[rays]
     range_m, spread = np.full(len(rays), np.nan), np.full(len(rays), np.inf)
+    soon_s = settings.range_within_s
     for name in np.unique(landmark):
         mine = np.flatnonzero(landmark == name)
         total = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(across[mine], axis=0)])
         pull = np.einsum("mij,mj->mi", across[mine], eye[mine, :3])
         pull = np.concatenate([np.zeros((1, 3)), np.cumsum(pull, axis=0)])
-        first, last = (np.searchsorted(stamp_s[mine], stamp_s[mine] + by) for by in (-SHORTLY_S, SHORTLY_S))
+        first, last = (np.searchsorted(stamp_s[mine], stamp_s[mine] + by) for by in (-soon_s, soon_s))
         seen = total[last] - total[first] + 1e-9 * np.eye(3)
         at = np.linalg.solve(seen, (pull[last] - pull[first])[..., None])[..., 0]
         range_m[mine] = ((at - eye[mine, :3]) * along[mine]).sum(axis=1)
@@ -286,7 +285,7 @@ def _with_ranges(recording: SpatialRecording, where: _Where, usable: BoolArray) 
     out = np.einsum("mi,mij,mj->m", ahead, given.covariance_sensor_m2[rays], ahead)
     own = given.covariance_sensor_m2[rays] - out[:, None, None] * ahead[:, :, None] * ahead[:, None, :]
     sigma2 = np.trace(own, axis1=1, axis2=2) / 2.0 / (given.position_sensor_m[rays] ** 2).sum(axis=1)
-    good = (range_m > NEAREST_M) & (sigma2 * spread < LEAST_PARALLAX**2)
+    good = (range_m > settings.nearest_m) & (sigma2 * spread < settings.least_parallax**2)
     blind[rays[~good]] = True
     r2, n = range_m[good, None, None] ** 2, ahead[good]
     outer = n[:, :, None] * n[:, None, :]
@@ -295,7 +294,9 @@ def _with_ranges(recording: SpatialRecording, where: _Where, usable: BoolArray) 
     return blind
 
 
-def _put(found: _Where, rows: IntArray, plane: FloatArray, slope: FloatArray, poses: SquarePoses) -> None:
+def _put(
+    found: _Where, rows: IntArray, plane: FloatArray, slope: FloatArray, poses: SquarePoses, corner_m: float
+) -> None:
     """Enter tags that are seen by their corners."""
     good = np.isfinite(poses.pose[0]).all(axis=1)
     rows = rows[good]
@@ -305,19 +306,19 @@ def _put(found: _Where, rows: IntArray, plane: FloatArray, slope: FloatArray, po
     covariance = np.linalg.pinv(poses.information[0][good], hermitian=True)
     # in the tag's own axes: turned into the camera's
     turn = se3.rotation_of(poses.pose[0][good])
-    found.covariance[rows] = turn @ covariance[:, :3, :3] @ np.swapaxes(turn, 1, 2) + ONE_PX_M**2 * np.eye(3)
+    found.covariance[rows] = turn @ covariance[:, :3, :3] @ np.swapaxes(turn, 1, 2) + corner_m**2 * np.eye(3)
     found.sigma_rad[rows] = np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
     gap = 4.0 * (np.nan_to_num(poses.error_px[1][good], nan=1e3) ** 2 - poses.error_px[0][good] ** 2)
     found.other_log_odds[rows] = gap
 
 
-def _covariance(recording: SpatialRecording) -> FloatArray:
+def _covariance(recording: SpatialRecording, settings: SpaceConfig) -> FloatArray:
     """(M, 3, 3) of positions: as given, or by what is usual of such sensors."""
     given = recording.detections
     at = given.position_sensor_m
-    range_m = np.maximum(np.linalg.norm(at, axis=1), NEAREST_M)
+    range_m = np.maximum(np.linalg.norm(at, axis=1), settings.nearest_m)
     ray = at / range_m[:, None]
-    along, across = (NOMINAL_M + share * range_m for share in (NOMINAL_ALONG, NOMINAL_ACROSS))
+    along, across = (settings.sigma_m + share * range_m for share in (settings.sigma_along, settings.sigma_across))
     outer = ray[:, :, None] * ray[:, None, :]
     usual = (along**2)[:, None, None] * outer + (across**2)[:, None, None] * (np.eye(3) - outer)
     stated = np.array([np.nan if sensor.sigma_m is None else sensor.sigma_m for sensor in recording.sensors])
@@ -326,9 +327,9 @@ def _covariance(recording: SpatialRecording) -> FloatArray:
     return np.where(np.isfinite(given.covariance_sensor_m2), given.covariance_sensor_m2, usual)
 
 
-def _sigma_rad(recording: SpatialRecording) -> FloatArray:
+def _sigma_rad(recording: SpatialRecording, usual: float) -> FloatArray:
     """(M,) of orientations: as given, by the sensor, or as usual."""
-    stated = np.array([NOMINAL_RAD if sensor.sigma_rad is None else sensor.sigma_rad for sensor in recording.sensors])
+    stated = np.array([usual if sensor.sigma_rad is None else sensor.sigma_rad for sensor in recording.sensors])
     given = recording.detections
     return np.where(np.isfinite(given.sigma_rad), given.sigma_rad, stated[given.sensor])
 

@@ -14,17 +14,17 @@ from typing import TypeGuard
 
 import numpy as np
 
-from evermap.config import SpaceConfig, TrackConfig
+from evermap.config import SpaceConfig, StillConfig, TrackConfig, TrafficConfig
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
-from evermap.slam.space.drift import SIGMA_BEND, SIGMA_SCALE, Gauge, gauge_of
+from evermap.slam.space.drift import Gauge, gauge_of
 from evermap.slam.space.estimate import converged
 from evermap.slam.space.intake import SpatialIntake, prepare_space
 from evermap.slam.space.result import concluded_in_space, numbered
 from evermap.slam.space.solve import SpatialSolved, solve_space
 from evermap.tracking.frame import DetectionTable, Poses, heading_of, in_world, with_empty_frames
 from evermap.tracking.run import TrackResult, run_track
-from evermap.tracking.standing import WHEN_S, Stood, long_enough, standing
+from evermap.tracking.standing import Stood, long_enough, standing
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -47,10 +47,6 @@ SETTLED = 0.2
 """Standard deviations by which the gauge changes in the last round, at most."""
 WANDERS = 0.03, 0.003
 """From where the noise of an odometry that wanders is sought [m/sqrt(s), rad/sqrt(s)]."""
-FEWEST_WITNESSES, FAR_BETTER = 10, 2.0
-"""Things that must say so, and the factor by which their deviations become smaller."""
-TILT = 0.05
-"""Boxes are upright to within this [rad]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +96,7 @@ def run_in_traffic(
         raise ConfigError(problem, field="prior_map", hint="leave it out, or enter the session into a living map")
     taken = take_in_traffic(recording, space, track)
     result, followed = conclude_in_traffic(taken, taken.intake, solve_in_traffic(taken, progress), track)
-    return with_stays(result, taken.traffic, followed, taken.known, taken.rows)
+    return with_stays(result, taken, followed, track)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +169,7 @@ def conclude_in_traffic(
     result = concluded_in_space(taken.standing, intake, solved)
     followed = _followed(taken.recording, result.trajectory.pose_world_robot, taken.traffic.gauge, track)
     if followed is not None:
-        p_still = _stands(taken.recording, followed).p_still
+        p_still = _stands(taken.recording, followed, track.still).p_still
         of_row = [p_still.get(one, np.nan) for one in followed.tracks.track_id.tolist()]
         followed = replace(followed, p_static=np.array(of_row, dtype=np.float64))
     alone = se3.compose(result.trajectory.pose_world_robot[0], taken.driven)
@@ -181,7 +177,7 @@ def conclude_in_traffic(
         result,
         innovations=replace(result.innovations, detection=taken.used[result.innovations.detection]),
         dead_reckoning=replace(result.dead_reckoning, pose_world_robot=alone),
-        parameters=(*result.parameters, *_parameters(taken.traffic.gauge)),
+        parameters=(*result.parameters, *_parameters(taken.traffic.gauge, intake.problem.settings.traffic)),
         followed=followed,
     ), followed
 
@@ -221,19 +217,19 @@ def _driven(recording: SpatialRecording) -> FloatArray:
 
 def _settled(recording: SpatialRecording, driven: FloatArray, space: SpaceConfig, track: TrackConfig) -> Traffic:
     """Identities, what stands, and the errors that repeat themselves: in turns, until the errors are the same."""
-    rows, stamps, gauge = boxes_of(recording), recording.frames.stamp_s, Gauge(space.range_scale)
+    rows, stamps, gauge = boxes_of(recording), recording.frames.stamp_s, Gauge.before(space)
     mount, frame = mounts_of(recording)[rows], recording.detections.frame[rows]
     seen = se3.transform(mount, recording.detections.position_sensor_m[rows])
-    followed, stands = None, _stands(recording, None)
+    followed, stands = None, _stands(recording, None, track.still)
     for _ in range(ROUNDS):
         followed = _followed(recording, gauge.applied(driven), gauge, track)
-        stands = _stands(recording, followed)
+        stands = _stands(recording, followed, track.still)
         if followed is None:
             break
         # nothing is known in the first round: every track may stand
-        thing = stands.stay if gauge.things else long_enough(stamps[frame], followed.track_of_detection)
+        thing = stands.stay if gauge.things else long_enough(stamps[frame], followed.track_of_detection, track.still)
         on = np.flatnonzero(thing != UNKNOWN)
-        found = gauge_of(driven, stamps[frame[on]], frame[on], seen[on], mount[on, :3], thing[on], space.range_scale)
+        found = gauge_of(driven, stamps[frame[on]], frame[on], seen[on], mount[on, :3], thing[on], space, track.still)
         change = abs(found.scale - gauge.scale) / found.scale_sigma + abs(found.bend - gauge.bend) / found.bend_sigma
         gauge = found
         if change < SETTLED:
@@ -277,16 +273,16 @@ def _followed(recording: SpatialRecording, pose: FloatArray, gauge: Gauge, track
         return None
 
 
-def _stands(recording: SpatialRecording, followed: TrackResult | None) -> Stood:
+def _stands(recording: SpatialRecording, followed: TrackResult | None, settings: StillConfig) -> Stood:
     """What of the boxes stands."""
     rows = boxes_of(recording)
     stamp_s = recording.frames.stamp_s[recording.detections.frame[rows]]
     if followed is None:
         nobody = np.full(len(rows), UNKNOWN)
-        return standing(stamp_s, np.zeros((len(rows), 3)), np.ones(len(rows)), nobody, np.ones(len(rows)))
+        return standing(stamp_s, np.zeros((len(rows), 3)), np.ones(len(rows)), nobody, np.ones(len(rows)), settings)
     limit = followed.speeds_mps()[recording.detections.class_id[rows]]
     range_m = np.linalg.norm(recording.detections.position_sensor_m[rows], axis=1)
-    return standing(stamp_s, followed.table.position_m, range_m, followed.track_of_detection, limit)
+    return standing(stamp_s, followed.table.position_m, range_m, followed.track_of_detection, limit, settings)
 
 
 def _identity(recording: SpatialRecording, stands: Stood) -> IntArray:
@@ -323,28 +319,28 @@ def _wandering(solved: SpatialSolved) -> SpatialSolved:
     """
     optimum = solved.optimum
     problem, begun = optimum.smoother.problem, optimum.noise
-    if len(np.unique(problem.place)) < FEWEST_WITNESSES:
+    if len(np.unique(problem.place)) < problem.settings.traffic.witnesses:
         return solved
     noise = replace(begun, translation=WANDERS[0], rotation=WANDERS[1])
     other = converged(replace(problem, steady=False), optimum.estimate, noise, heavy_rounds=0)
-    better = begun.position > FAR_BETTER * other.noise.position
+    better = begun.position > problem.settings.traffic.better_by * other.noise.position
     return replace(solved, optimum=other) if better else solved
 
 
 def with_stays(
-    result: SlamResult, traffic: Traffic, followed: TrackResult | None, known: int, rows: IntArray
+    result: SlamResult, taken: TrafficIntake, followed: TrackResult | None, track: TrackConfig
 ) -> SlamResult:
     """Return the result with what stood under the ids of its tracks.
 
     Args:
-        result: landmarks of ids from `known` on are stays.
-        traffic: by which these were chosen.
+        result: landmarks of ids from `taken.known` on are stays.
+        taken: by which these were chosen.
         followed: the tracks along the estimated poses.
-        known: the first id that is no landmark of the recording.
-        rows: (M,) of the detections in the recording that was given.
+        track: settings of the tracker.
     """
-    landmarks, track = result.landmarks, _tracks(traffic.standing, followed)
-    identities, names = _identities(track, known)
+    traffic, known, tilt_rad = taken.traffic, taken.known, taken.intake.problem.settings.traffic.tilt_rad
+    landmarks, of = result.landmarks, _tracks(traffic.standing, followed)
+    identities, names = _identities(of, known)
     stay = landmarks.landmark_id - known
     ours = np.flatnonzero((stay >= 0) & (stay < len(identities)))
     stay, new = stay[ours], landmarks.landmark_id.copy()
@@ -353,14 +349,14 @@ def with_stays(
     p_exists[ours] = traffic.standing.p_stay[stay]
     told = replace(landmarks, landmark_id=new, p_exists=p_exists, names={**landmarks.names, **names})
     if followed is not None and len(ours):
-        told = _headed(told, ours, track[stay], followed)
+        told = _headed(told, ours, of[stay], followed, tilt_rad)
     renamed = dict(zip(landmarks.landmark_id.tolist(), new.tolist(), strict=True))
     asked = np.array([renamed.get(one, one) for one in result.innovations.landmark_id.tolist()], dtype=np.int64)
     return replace(
         result,
         landmarks=rows_of(told, np.argsort(new, kind="stable")),
-        innovations=replace(result.innovations, landmark_id=asked, detection=rows[result.innovations.detection]),
-        changes=(*result.changes, *_changes(traffic.standing, identities, names)),
+        innovations=replace(result.innovations, landmark_id=asked, detection=taken.rows[result.innovations.detection]),
+        changes=(*result.changes, *_changes(traffic.standing, identities, names, track.still.when_s)),
     )
 
 
@@ -388,7 +384,7 @@ def _identities(track: IntArray, known: int) -> tuple[IntArray, dict[int, str]]:
     return found, names
 
 
-def _headed(landmarks: Landmarks, ours: IntArray, track: IntArray, followed: TrackResult) -> Landmarks:
+def _headed(landmarks: Landmarks, ours: IntArray, track: IntArray, followed: TrackResult, tilt_rad: float) -> Landmarks:
     """Landmarks with the heading and the belief that their tracks had when they were seen there last."""
     count, tracks = len(landmarks), followed.tracks
     rotation = np.full((count, 4), np.nan) if landmarks.rotation is None else landmarks.rotation.copy()
@@ -405,40 +401,40 @@ def _headed(landmarks: Landmarks, ours: IntArray, track: IntArray, followed: Tra
         p_exists[row] *= tracks.p_exists[at]
         half = 0.5 * tracks.box[at, 3]
         rotation[row] = 0.0, 0.0, np.sin(half), np.cos(half)
-        turned[row] = np.diag([TILT**2, TILT**2, tracks.box_variance[at, 3]])
+        turned[row] = np.diag([tilt_rad**2, tilt_rad**2, tracks.box_variance[at, 3]])
     return replace(landmarks, p_exists=p_exists, rotation=rotation, rotation_covariance=turned)
 
 
-def _parameters(gauge: Gauge) -> tuple[ParameterEstimate, ...]:
+def _parameters(gauge: Gauge, settings: TrafficConfig) -> tuple[ParameterEstimate, ...]:
     """What odometry and detector repeat in error."""
     if not gauge.things:
         return ()
-    given, none = gauge.stated is not None, float("nan")
+    given, usual = gauge.stated is not None, settings.sigma_scale
     ranges, driven = (0.0, gauge.scale_sigma) if given else (gauge.scale_sigma, 0.0)
     return (
         ParameterEstimate(
-            "range_scale", gauge.range_scale, ranges, 1.0, SIGMA_SCALE, "1", fixed=given,
+            "range_scale", gauge.range_scale, ranges, 1.0, settings.sigma_scale, "1", fixed=given,
             meaning="factor on ranges of boxes, by the odometry's metre",
         ),
         ParameterEstimate(
-            "odometry_scale", gauge.odometry_scale, driven, 1.0, SIGMA_SCALE if given else none, "1", fixed=not given,
+            "odometry_scale", gauge.odometry_scale, driven, 1.0, usual if given else float("nan"), "1", fixed=not given,
             meaning="factor on the odometry's way",
         ),
         ParameterEstimate(
-            "odometry_bend_radpm", gauge.bend, gauge.bend_sigma, 0.0, SIGMA_BEND, "rad/m",
+            "odometry_bend_radpm", gauge.bend, gauge.bend_sigma, 0.0, settings.sigma_bend, "rad/m",
             meaning="angle that the odometry turns too little by the metre",
         ),
     )  # fmt: skip
 
 
-def _changes(standing: Stood, identities: IntArray, names: Mapping[int, str]) -> tuple[MapChange, ...]:
+def _changes(standing: Stood, identities: IntArray, names: Mapping[int, str], when_s: float) -> tuple[MapChange, ...]:
     """What came to rest in view, and what left."""
     found = []
     for stay, identity in enumerate(identities.tolist()):
         hits = int(np.count_nonzero(standing.stay == stay))
         for kind, when in ((ChangeKind.APPEARED, standing.since_s), (ChangeKind.VANISHED, standing.until_s)):
             if np.isfinite(when[stay]):
-                span, p = (float(when[stay] - WHEN_S), float(when[stay] + WHEN_S)), float(standing.p_stay[stay])
+                span, p = (float(when[stay] - when_s), float(when[stay] + when_s)), float(standing.p_stay[stay])
                 n_hits = hits if kind is ChangeKind.APPEARED else 0
                 change = MapChange((identity,), kind, *span, (np.nan,) * 3, 0.0, p, n_hits)
                 found.append(change.named(names))

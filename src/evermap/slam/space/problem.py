@@ -6,18 +6,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from evermap.config import SpaceConfig
 from evermap.geometry import se3
 from evermap.geometry.symmetry import Symmetries
 from evermap.slam.space.linearise import POINT, POSE, ROWS, SpatialSightings
 from evermap.types import BoolArray, FloatArray, IntArray
 
-OUTLIER_LOG_ODDS = np.array([10.5, 14.0, 16.0])
-"""Half of the squared residual of which a detection with 3, 6 or 8 numbers is as likely an outlier: which one of
-10,000 right detections exceeds."""
-JUMP_LOG_ODDS, NO_JUMP_LOG_ODDS = 14.0, 1e3
-"""The same of odometry, which may slip; without, nothing takes a camera to somewhere else between two frames."""
-
-
+NO_JUMP_LOG_ODDS = 1e3
+"""Without odometry nothing takes a camera to somewhere else between two frames."""
+USUAL = SpaceConfig()
 LEAST_WEIGHT = 1e-6
 """Of a map's word on a landmark that is elsewhere."""
 ANY_RAD = np.pi
@@ -103,6 +100,7 @@ class SpatialProblem:
         mount_sigma: (S, 7) standard deviations of its twist and of the delay of the stamps [s]; 0 where exact.
         prior: on places.
         start_sigma: (6,) how firmly the first pose is held where it is.
+        settings: what is believed of sensors and of a map.
     """
 
     stamp_s: FloatArray
@@ -130,6 +128,7 @@ class SpatialProblem:
     prior: PlacePrior = field(default_factory=PlacePrior.none)
     steady: bool = False
     start_sigma: FloatArray = field(default_factory=lambda: np.full(6, 1e-4))
+    settings: SpaceConfig = USUAL
 
     @property
     def velocity(self) -> FloatArray:
@@ -182,7 +181,8 @@ class SpatialProblem:
         first = np.append(0, np.cumsum(ROWS[self.kind] * width))
         return SpatialSightings(
             self.pose_row, self.place, self.sensor, self.kind, oriented, self.measured, self.measured_root,
-            self.sigma_rad, self.corner, self.corner_root, self.half_m, first, self.share, OUTLIER_LOG_ODDS,
+            self.sigma_rad, self.corner, self.corner_root, self.half_m, first, self.share,
+            np.array(self.settings.outlier_log_odds),
             self.symmetries.of[self.place], np.array([kind.axis for kind in kinds]),
             np.append(0, np.cumsum([len(kind.turns) for kind in kinds])), np.vstack([kind.turns for kind in kinds]),
         )  # fmt: skip

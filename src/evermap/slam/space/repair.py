@@ -18,20 +18,6 @@ from evermap.slam.space.problem import LEAST_WEIGHT, SpatialEstimate, SpatialNoi
 from evermap.types import BoolArray, FloatArray, IntArray
 
 ROUNDS = 3
-BETTER = 6.0
-"""Nats by which the detections of a stretch of frames must prefer other poses."""
-OTHER_RAD = 0.3
-"""Orientations that differ by more are two explanations."""
-GAIN = 3.0
-"""Nats by which all must be more probable in the end."""
-TOGETHER_M = 0.5
-"""Outliers of one identity that are this close are another landmark which carries it."""
-FEWEST, FEWEST_FRAMES = 5, 3
-"""Detections, and frames, that it takes."""
-LEAST_SEEN = 1.0
-"""Sum of inlier probabilities below which a landmark was not seen at its place."""
-MOVED_NATS = 5.0
-"""What it costs that a landmark of the map was moved, instead of the robot."""
 
 
 def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
@@ -44,7 +30,7 @@ def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
         found = converged(problem, start, optimum.noise, heavy_rounds=0)
         # at the same noise, or a level that fits worse would look better
         cost = optimum.smoother.linearised(found.estimate, optimum.noise, heavy=False).cost
-        if cost > optimum.now.cost - GAIN:
+        if cost > optimum.now.cost - problem.settings.repair.gain_nats:
             break
         optimum = found
     return optimum
@@ -65,7 +51,7 @@ def unjumped(optimum: SpatialOptimum) -> SpatialOptimum:
         stretch = np.searchsorted(bounds, np.arange(len(optimum.estimate.pose)), side="right")
         seen = np.zeros((len(bounds) + 1, len(problem.oriented)))
         np.add.at(seen, (stretch[problem.pose_row], problem.place), optimum.now.weight)
-        known = (seen >= LEAST_SEEN) & np.isin(np.arange(seen.shape[1]), problem.prior.place)
+        known = (seen >= problem.settings.map.least_seen) & np.isin(np.arange(seen.shape[1]), problem.prior.place)
         group = connected_components(known.astype(np.int64) @ known.T, directed=False)[1]
         nowhere = ~known.any(axis=1)  # follows what is before it
         asked = [
@@ -73,7 +59,7 @@ def unjumped(optimum: SpatialOptimum) -> SpatialOptimum:
             for one in np.unique(group)
         ]
         cost, best = min((found for found in asked if found is not None), key=lambda one: one[0], default=(0.0, None))
-        if best is None or cost > optimum.now.cost - GAIN:
+        if best is None or cost > optimum.now.cost - problem.settings.repair.gain_nats:
             break
         optimum = best
     return optimum
@@ -106,17 +92,17 @@ def _as_driven(
     prior = replace(problem.prior, weight=np.where(held, LEAST_WEIGHT, problem.prior.weight))
     found = converged(replace(problem, prior=prior), start, optimum.noise, heavy_rounds=1)
     cost = found.smoother.linearised(found.estimate, optimum.noise, heavy=False).cost
-    return cost + MOVED_NATS * float(held.sum()), found
+    return cost + problem.settings.map.moved_nats * float(held.sum()), found
 
 
 def other_explanations(problem: SpatialProblem, optimum: SpatialOptimum) -> tuple[SpatialEstimate, bool]:
     """Return the values with poses and orientations that fit better by themselves, and whether there are any."""
     estimate, noise = optimum.estimate, optimum.noise
     voted = oriented(problem, estimate, optimum.now.weight)
-    turned = problem.symmetries.angle_between(voted, estimate.place)
-    place = np.where((turned > OTHER_RAD)[:, None], voted, estimate.place)
+    other = problem.symmetries.angle_between(voted, estimate.place) > problem.settings.repair.other_rad
+    place = np.where(other[:, None], voted, estimate.place)
     pose, n_better = _better_poses(problem, replace(estimate, place=place), noise)
-    return replace(estimate, pose=pose, place=place), n_better + int((turned > OTHER_RAD).sum()) > 0
+    return replace(estimate, pose=pose, place=place), n_better + int(other.sum()) > 0
 
 
 def _better_poses(problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNoise) -> tuple[FloatArray, int]:
@@ -145,7 +131,7 @@ def _better_poses(problem: SpatialProblem, estimate: SpatialEstimate, noise: Spa
     jumps = (np.linalg.norm(off[:, 3:], axis=1) > 0.1) & (gain[seen_in] > 0.0)
     stretch = np.cumsum(np.diff(jumps.astype(np.int64), prepend=0) != 0)
     total = np.bincount(stretch, gain[seen_in] * jumps, minlength=int(stretch.max(initial=0)) + 1)
-    taken = seen_in[jumps & (total[stretch] > BETTER)]
+    taken = seen_in[jumps & (total[stretch] > problem.settings.repair.stretch_nats)]
     mixed = estimate.pose.copy()
     mixed[taken] = pose[taken]
     return mixed, len(taken)
@@ -172,13 +158,14 @@ def rejoined(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProble
     The same where the first of them is not seen any more, or this one hardly ever.
     """
     problem, estimate = optimum.smoother.problem, optimum.estimate
+    settings, least_seen = problem.settings.repair, problem.settings.map.least_seen
     place, at = problem.place.copy(), estimate.place.copy()
     hits = np.bincount(place, optimum.now.weight, minlength=len(at))
     held = np.isin(np.arange(len(at)), problem.prior.place)
     for row in range(int(identity.max(initial=-1)) + 1, len(identity)):
         own = int(identity[row])
-        near = np.linalg.norm(at[row, :3] - at[own, :3]) < TOGETHER_M
-        if near or hits[row] < FEWEST or (hits[own] < LEAST_SEEN and not held[own]):
+        near = np.linalg.norm(at[row, :3] - at[own, :3]) < settings.together_m
+        if near or hits[row] < settings.fewest or (hits[own] < least_seen and not held[own]):
             at[own] = at[row] if hits[row] > hits[own] else at[own]
             place[place == row] = own
     if np.array_equal(place, problem.place):
@@ -196,6 +183,7 @@ def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, 
         identity: (P,) rows of landmarks that the places are of; grows by that of each new place.
     """
     problem, estimate = optimum.smoother.problem, optimum.estimate
+    settings = problem.settings.repair
     outlier = optimum.now.weight < 0.5
     located = np.zeros(len(estimate.pose), dtype=np.bool_)
     located[problem.pose_row[~outlier]] = True
@@ -204,15 +192,19 @@ def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, 
     at = as_seen(problem, estimate, problem.measured)
     place, places, copied = problem.place.copy(), list[FloatArray](), list[int]()
     at_places, prior = estimate.place.copy(), problem.prior
-    unseen = np.bincount(problem.place, optimum.now.weight, minlength=len(at_places)) < LEAST_SEEN
+    unseen = np.bincount(problem.place, optimum.now.weight, minlength=len(at_places)) < problem.settings.map.least_seen
     for known in np.unique(problem.place[asked]):
         mine = np.flatnonzero(asked & (problem.place == known))
-        while len(mine) >= FEWEST:
+        while len(mine) >= settings.fewest:
             gap = np.linalg.norm(at[mine, None, :3] - at[None, mine, :3], axis=2)
-            centre = int(np.argmax((gap < TOGETHER_M).sum(axis=1)))
-            near = mine[gap[centre] < TOGETHER_M]
+            centre = int(np.argmax((gap < settings.together_m).sum(axis=1)))
+            near = mine[gap[centre] < settings.together_m]
             away = np.linalg.norm(np.median(at[near, :3], axis=0) - estimate.place[known, :3])
-            if len(near) < FEWEST or len(np.unique(problem.pose_row[near])) < FEWEST_FRAMES or away < TOGETHER_M:
+            if (
+                len(near) < settings.fewest
+                or len(np.unique(problem.pose_row[near])) < settings.fewest_frames
+                or away < settings.together_m
+            ):
                 break
             if unseen[known]:
                 at_places[known], unseen[known] = at[mine[centre]], False
@@ -221,7 +213,7 @@ def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, 
                 place[near] = len(estimate.place) + len(places)
                 places.append(at[mine[centre]])
                 copied.append(int(known))
-            mine = mine[gap[centre] >= TOGETHER_M]
+            mine = mine[gap[centre] >= settings.together_m]
     if not places and prior is problem.prior:
         return None
     source = np.append(np.arange(len(problem.oriented)), copied).astype(np.int64)

@@ -32,12 +32,6 @@ from evermap.types import (
     landmark_id_of,
 )
 
-TIED_S = 0.25
-"""Frames this close are tied by how far a robot may go between them, if nothing else says where they are."""
-SEEN = 0.5
-"""A pose without odometry is told where its detections' inlier probabilities sum to this."""
-TOLD = 0.5
-"""Probability from which on a landmark of the map is told to have moved."""
 MOUNT = "correction of the sensor's stated mount, or delay of its stamps"
 _LEVELS = {
     TRANSLATION: ("sigma_odometry_m", "m/sqrt(s)", "noise of the odometry's translation"),
@@ -73,9 +67,10 @@ def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solve
     )  # fmt: skip
     identities, names = identities_of(intake, solved)
     warnings = list(intake.warnings)
+    inlier = optimum.smoother.problem.settings.inlier
     left_out = [
         names.get(int(identities[k]), str(identities[k]))
-        for k in np.setdiff1d(optimum.smoother.problem.place[optimum.now.weight > SEEN], np.flatnonzero(placed))
+        for k in np.setdiff1d(optimum.smoother.problem.place[optimum.now.weight > inlier], np.flatnonzero(placed))
     ]
     if left_out:
         warnings.append(
@@ -83,7 +78,7 @@ def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solve
         )
     if not found.all():
         warnings.append(f"{int((~found).sum())} frames in which the robot could not be located left out")
-    seen = np.bincount(optimum.smoother.problem.place, optimum.now.weight, minlength=len(identities)) > SEEN
+    seen = np.bincount(optimum.smoother.problem.place, optimum.now.weight, minlength=len(identities)) > inlier
     twice = [_called(names, int(identities[k])) for k in np.flatnonzero((solved.number > 1) & seen & placed)]
     if twice:
         warnings.append(f"identities that several landmarks carry, told apart by their places: {', '.join(twice)}")
@@ -138,16 +133,16 @@ def located(problem: SpatialProblem, now: SpatialLinear) -> tuple[BoolArray, Boo
     n, count = len(problem.stamp_s), len(problem.oriented)
     if problem.driven:
         return np.ones(n, dtype=np.bool_), np.ones(count, dtype=np.bool_)
-    good = now.weight > SEEN
-    soon = np.flatnonzero(np.diff(problem.stamp_s) <= TIED_S)
+    good = now.weight > problem.settings.inlier
+    soon = np.flatnonzero(np.diff(problem.stamp_s) <= problem.settings.tied_s)
     one = np.concatenate([problem.pose_row[good], soon])
     other = np.concatenate([n + problem.place[good], soon + 1])
     graph = csr_array((np.ones(len(one)), (one, other)), shape=(n + count, n + count))
     part = connected_components(graph, directed=False)[1]
-    stands = problem.prior.place[problem.prior.weight > SEEN]
+    stands = problem.prior.place[problem.prior.weight > problem.settings.inlier]
     known = part[n + stands] if len(stands) else np.bincount(part[problem.pose_row[good]], minlength=1).argmax()
     tied = np.isin(part, known)
-    seen = np.bincount(problem.pose_row, now.weight, minlength=n) > SEEN
+    seen = np.bincount(problem.pose_row, now.weight, minlength=n) > problem.settings.inlier
     return seen & tied[:n], tied[n:]
 
 
@@ -155,7 +150,7 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
     optimum, recording = told.solved.optimum, told.recording
     problem, place = optimum.smoother.problem, optimum.estimate.place
     count, n = len(place), len(problem.stamp_s)
-    used = optimum.now.weight > SEEN
+    used = optimum.now.weight > problem.settings.inlier
     hits = np.bincount(problem.place[used], minlength=count)
     covariance, turned = np.zeros((count, 3, 3)), np.full((count, 3, 3), np.nan)
     for k in range(count):
@@ -276,10 +271,10 @@ def _changes(told: _Told, identities: IntArray, names: Mapping[int, str]) -> tup
     if found is None:
         return ()
     problem, optimum = told.solved.optimum.smoother.problem, told.solved.optimum
-    used = optimum.now.weight > SEEN
+    used = optimum.now.weight > problem.settings.inlier
     changes = []
     for k in np.argsort(found.p_stands, kind="stable"):
-        if 1.0 - found.p_stands[k] < TOLD:
+        if 1.0 - found.p_stands[k] < problem.settings.map.p_told:
             break
         place = int(problem.prior.place[k])
         identity = int(identities[place])

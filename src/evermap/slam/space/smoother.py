@@ -12,7 +12,7 @@ import numpy as np
 from evermap.errors import NumericalError
 from evermap.geometry import se3
 from evermap.slam.space.linearise import ODOMETRY, ROWS, STATES, linearise_odometry, linearise_sightings
-from evermap.slam.space.problem import JUMP_LOG_ODDS, NO_JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.problem import NO_JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.sparse.elimination import Spread, curvature
 from evermap.slam.sparse.system import Factorised, System, exhausted
 from evermap.slam.sparse.tree import Factors
@@ -106,8 +106,9 @@ class SpatialSmoother:
         odometry_weight, weight, residual = np.ones(n - 1), np.ones(count), np.zeros((count, 8))
         sigma = _odometry_sigma(problem, noise)
         odometry = ODOMETRY * (n - 1)
+        jump = problem.settings.jump_log_odds if problem.driven else NO_JUMP_LOG_ODDS
         cost = linearise_odometry(
-            estimate.pose, problem.increment, sigma, JUMP_LOG_ODDS if problem.driven else NO_JUMP_LOG_ODDS, heavy,
+            estimate.pose, problem.increment, sigma, jump, heavy,
             values[:odometry], odometry_weight,
         )  # fmt: skip
         end = odometry + int(self._seen.first[-1])

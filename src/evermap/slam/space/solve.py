@@ -18,17 +18,9 @@ from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.start import incremental
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
 
-BY_HAND = SpatialNoise(translation=1.0, rotation=0.7, pixel=2.0)
-"""Without odometry: metres and radians that a robot may go a second."""
-DRIVEN = SpatialNoise(pixel=2.0)
-"""With odometry: metres and radians of drift for the square root of a second."""
-STEADY = 3e-4, 1e-5
-"""The same of odometry that is believed."""
 FREE = np.repeat([1e3, ANY_RAD], 3)
 """Deviation by which the first pose is held where a map says where it is [m, rad]. Two points of a map leave it a turn
 about the line between them; one by a thousand radians would drown what the odometry knows in rounding."""
-LOOSE_M = 0.05
-"""A given map is believed no better than this until it is known what stands."""
 MOST_TRIED = 200
 GROSS_M = 1.0
 SPLITS = 2
@@ -59,23 +51,22 @@ class SpatialSolved:
     step_s: FloatArray
 
 
-def solve_space(
-    intake: SpatialIntake, prior_map: Landmarks | None, sigma: float = 0.02, progress: Progress | None = None
-) -> SpatialSolved:
+def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Progress | None = None) -> SpatialSolved:
     """Estimate poses, places and noise of a recording in space.
 
     Args:
         intake: the recording as the estimator wants it.
         prior_map: landmarks to localise in; None maps from scratch, in the frame of the first pose.
-        sigma: deviation [m, rad] of map landmarks that state none.
         progress: told after every frame.
 
     Raises:
         NumericalError: no finite optimum.
     """
-    problem, stated, rows = _with_map(intake, prior_map, sigma)
+    problem, stated, rows = _with_map(intake, prior_map)
     identity = np.arange(len(intake.landmark_id))
-    noise = DRIVEN if problem.driven else BY_HAND
+    settings = problem.settings
+    goes = (settings.drift_m, settings.drift_rad) if problem.driven else (settings.hand_mps, settings.hand_radps)
+    noise = SpatialNoise(*goes, pixel=settings.sigma_px)
     by_corners = (problem.kind == CORNERS) | problem.ray
     if problem.driven and np.sum(~by_corners) > 0.5 * len(
         by_corners
@@ -83,7 +74,7 @@ def solve_space(
         drift = drift_of(problem, intake.driven_pose)
         problem = replace(problem, share=np.where(by_corners, 1.0, drift.share))
         if problem.steady:
-            noise = replace(noise, translation=STEADY[0], rotation=STEADY[1])
+            noise = replace(noise, translation=settings.steady_m, rotation=settings.steady_rad)
         elif drift.translation is not None and drift.rotation is not None:
             noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
@@ -115,11 +106,9 @@ def solve_space(
     return SpatialSolved(optimum, identity, number, from_map, rows, stepwise.pose, spread, step_s)
 
 
-def _with_map(
-    intake: SpatialIntake, prior_map: Landmarks | None, sigma: float
-) -> tuple[SpatialProblem, FloatArray, IntArray]:
+def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[SpatialProblem, FloatArray, IntArray]:
     """The problem with the landmarks of a map, their standard deviations (K, 6) as stated, and their rows there."""
-    problem = intake.problem
+    problem, settings = intake.problem, intake.problem.settings.map
     shared, place, rows = np.intersect1d(
         intake.landmark_id, [] if prior_map is None else prior_map.landmark_id, return_indices=True
     )
@@ -127,21 +116,21 @@ def _with_map(
         return problem, np.zeros((0, 6)), np.zeros(0, dtype=np.int64)
     pose = se3.identity(len(rows))
     pose[:, :3] = prior_map.position_m[rows]
-    stated = np.full((len(rows), 6), sigma)
+    stated = np.full((len(rows), 6), settings.sigma)
     own = np.sqrt(np.einsum("kii->ki", prior_map.covariance_m2[rows]))
-    stated[:, :3] = np.where(own > 0.0, own, sigma)
+    stated[:, :3] = np.where(own > 0.0, own, settings.sigma)
     turned = np.zeros(len(rows), dtype=np.bool_)
     if prior_map.rotation is not None:
         turned = np.isfinite(prior_map.rotation[rows, 0])
         pose[turned, 3:] = prior_map.rotation[rows][turned]
         if prior_map.rotation_covariance is not None:
             own = np.sqrt(np.einsum("kii->ki", np.nan_to_num(prior_map.rotation_covariance[rows])))
-            stated[:, 3:] = np.where(own > 0.0, own, sigma)
+            stated[:, 3:] = np.where(own > 0.0, own, settings.sigma)
     stated[problem.oriented[place] & ~turned, 3:] = ANY_RAD  # a map of points knows no orientation
     stated[:, 3:][problem.symmetries[place].unseen > 0.0] = ANY_RAD
     # positions of a map are in its axes, those of tags in their own: all alike
     stated[:, :3] = stated[:, :3].max(axis=1, keepdims=True)
-    prior = PlacePrior(place.astype(np.int64), pose, np.maximum(stated, LOOSE_M), np.ones(len(rows)))
+    prior = PlacePrior(place.astype(np.int64), pose, np.maximum(stated, settings.loose_m), np.ones(len(rows)))
     return replace(problem, prior=prior, start_sigma=FREE), stated, rows.astype(np.int64)
 
 

@@ -35,7 +35,7 @@ class Robot:
     """What a robot is made of; angles in rad.
 
     Attributes:
-        kind: of its sensor, see `slam.calibration.KINDS`.
+        kind: of its sensor, see `slam.calibration.kinds`.
         states: (9,) its true calibration, in the order of `slam.calibration.SPECS`.
         askew_rad: its wheels drive this much to the left of where its front is.
         range_max_m, field_of_view_rad, rate_hz, p_detect: what the sensor sees.

@@ -9,6 +9,7 @@ import pytest
 from moving import MovingWorld, make_moving_world, model_of
 from problems import default_prior
 
+from evermap.config import SlamConfig
 from evermap.slam.method import Static
 from evermap.slam.streaming import Outcome, StreamingSlam
 from evermap.types import FloatArray, IntArray
@@ -21,7 +22,7 @@ def stream(moving: MovingWorld, method: object, *, told: bool = False) -> Outcom
         problem,
         moving.world.noise,
         default_prior(),
-        estimate_noise=False,
+        settings=SlamConfig(estimate_noise=False),
         method=method,  # type: ignore[arg-type]
     )
     slam._problem = replace(problem, prior=default_prior())  # the map is given, as after entering one
