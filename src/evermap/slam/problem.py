@@ -439,13 +439,8 @@ class Marginals:
         first, last = self._held.of_factors_first[[first, first + self._m]]
         return self._held.of_factors[first:last].reshape(-1, 2, 2)
 
-    def joint(
-        self, landmarks: IntArray, *, poses: IntArray | None = None, states: bool = False, by: FloatArray | None = None
-    ) -> FloatArray:
-        """Return the joint covariance of some poses, some landmarks and, if wanted, the states, in this order.
-
-        With `by` (C, numbers of these, all known) that of what this matrix makes of them, (C, C).
-        """
+    def joint(self, landmarks: IntArray, *, poses: IntArray | None = None, states: bool = False) -> FloatArray:
+        """Return the joint covariance of some poses, some landmarks and, if wanted, the states, in this order."""
         part = self._block
         rank = np.cumsum(self.known) - 1
         rows = np.asarray(landmarks, dtype=np.int64)
@@ -456,7 +451,7 @@ class Marginals:
         ]
         if states:
             every.append(part.border + np.arange(2))
-        found = self._solved.joint(np.concatenate(every), by)
+        found = self._solved.joint(np.concatenate(every))
         if known.all():
             return found
         n_poses = 3 * len(every[0])
@@ -464,6 +459,18 @@ class Marginals:
         joint = np.zeros((len(kept), len(kept)))
         joint[np.ix_(kept, kept)] = found
         return joint
+
+    def each(self, landmarks: IntArray, poses: IntArray, by: FloatArray) -> FloatArray:
+        """Return (V, R, R) the covariances of what each of V matrices makes of some poses, known landmarks and states.
+
+        Args:
+            landmarks: (L,) rows, all known.
+            poses: (P,) rows.
+            by: (V, R, 3 P + 2 L + 9) the matrices.
+        """
+        part, rank = self._block, np.cumsum(self.known) - 1
+        every = [part.first + poses, part.landmarks[rank[landmarks]], part.border + np.arange(2)]
+        return self._solved.each(np.concatenate(every), by)
 
     def product(self, landmarks: IntArray, matrix: FloatArray) -> FloatArray:
         """Return (2 L, K) the joint covariance of known landmarks (L,) times a matrix (2 L, K), without the former."""

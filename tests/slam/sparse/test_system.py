@@ -105,8 +105,8 @@ def test_solution_and_covariances_are_those_of_dense_algebra(dims, seed, n_poses
     some = random.permutation(len(world.dim))[: random.integers(1, 6)]
     at = world.numbers(some)
     assert close(solved.joint(some), covariance[np.ix_(at, at)])
-    by = random.normal(size=(3, len(at)))
-    assert close(solved.joint(some, by), by @ covariance[np.ix_(at, at)] @ by.T)
+    by = random.normal(size=(3, 2, len(at)))
+    assert close(solved.each(some, by), by @ covariance[np.ix_(at, at)] @ by.transpose(0, 2, 1))
     assert close(solved.columns(some), covariance[:, at])
 
 

@@ -74,10 +74,9 @@ def seen_together(
         n_landmarks: how many there are.
     """
     shape = n_frames, n_landmarks
-    each, about = _seen_in(frame, landmark_row, shape), _seen_in(frame - ABOUT, landmark_row, shape)
-    for before in range(1 - ABOUT, ABOUT + 1):
-        about = about + _seen_in(frame + before, landmark_row, shape)
-    about.data[:] = 1.0
+    around = frame + np.arange(-ABOUT, ABOUT + 1)[:, None]
+    each = _seen_in(frame, landmark_row, shape)
+    about = _seen_in(around.ravel(), np.tile(landmark_row, len(around)), shape)
     together, once = sparse.csr_array(each.T @ each), sparse.csr_array(each.T @ about)
     return together, sparse.csr_array(once + once.T - 2.0 * together)
 

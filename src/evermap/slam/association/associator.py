@@ -21,7 +21,7 @@ from evermap.slam.association.merging import FEW_NATS, Differences, Solution, pr
 from evermap.slam.association.relaying import displaced_stretches, laid
 from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
 from evermap.slam.association.splitting import weighed_visits
-from evermap.slam.filter_kernels import GATED
+from evermap.slam.filter_kernels import GATED, spread_of_frame
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
 from evermap.slam.motion import Motion
@@ -319,6 +319,8 @@ class Associator:
         for s in np.flatnonzero(known >= P_MATCH):
             rows = np.flatnonzero(pairings.source == s)
             first = rows[probability[rows].argmax()]
+            if probability[first] >= least[first]:
+                continue  # it is taken anyway
             rivals = rows[(probability[rows] > 1.0 - P_MATCH) & (rows != first)]
             own = pairings.covariance[2 * first : 2 * first + 2, 2 * first : 2 * first + 2]
             area_m2 = math.sqrt(np.linalg.det(own)) * math.exp(pairings.log_density_new[first]) / self._density_m2
@@ -345,11 +347,13 @@ class Associator:
         local.update(target, problem.reading[known], self._sigma[known], weighing=GATED)
         new = detections[frame.p_new >= P_NEW]
         self._doubted += len(detections) - len(known) - len(new)
-        self._row[new] = len(local.position) + np.arange(len(new))
         self._of_kind[target] = np.maximum(self._of_kind[target], self._kind[known])
+        self._seen_s[target] = problem.stamp_s[self._done]
+        if not len(new):
+            return
+        self._row[new] = len(local.position) + np.arange(len(new))
         self._of_kind = np.vstack([self._of_kind, self._kind[new]])
-        self._seen_s = np.append(self._seen_s, np.zeros(len(new)))
-        self._seen_s[np.append(target, self._row[new])] = problem.stamp_s[self._done]
+        self._seen_s = np.append(self._seen_s, np.full(len(new), problem.stamp_s[self._done]))
         at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
         for row, place in zip(self._row[new].tolist(), at, strict=True):
             local.meet(row, place)
@@ -601,12 +605,12 @@ def pairings_of_frame(
     # what is followed has a neighbourhood that is known; elsewhere the gate may hold another landmark by chance
     followed = log_det[inside] <= 2.0 * np.log(sigma[seen[inside]]).sum(axis=1) + FOLLOWED
     source, target, seen, count = source[inside], target[inside], seen[inside], len(inside)
-    rows = np.zeros((count, 2, len(local.covariance)))
-    rows[:, :, :8] = by[inside, :, :8]
-    at = columns(local.bring(target)).reshape(-1, 1, 2)
-    np.put_along_axis(rows, np.repeat(at, 2, axis=1), by[inside, :, 8:], axis=2)
-    h = rows.reshape(2 * count, rows.shape[2])
-    joint = h @ local.covariance @ h.T + np.diag((sigma[seen] ** 2).ravel())
+    at, joint = np.empty((count, 10), dtype=np.int64), np.empty((2 * count, 2 * count))
+    at[:, :8], at[:, 8:] = np.arange(8), columns(local.bring(target)).reshape(-1, 2)
+    if count:
+        scratch = np.empty((2 * count, len(local.covariance)))
+        spread_of_frame(local.covariance, by[inside].reshape(2 * count, 10), at, scratch, joint)
+    joint[np.diag_indices(2 * count)] += (sigma[seen] ** 2).ravel()
     # a square metre has r dr db
     new = np.log(np.where(followed, UNMET, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))
     new -= NAMED_NATS * same_name(kind[0][source], kind[1][target])

@@ -230,8 +230,9 @@ def _pairings(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: B
     gap = place[:, None] - target.place[None]
     s, t = np.nonzero(allowed & (np.linalg.norm(gap, axis=2) < NEAR_M))
     turn, n = se2.rotation(motion[2]), len(s)
-    of_source = _blocks(source.covariance, s)
-    covariance = _blocks(target.covariance, t) + np.einsum("ij,kjml,nl->kimn", turn, of_source, turn)
+    blocks = source.covariance.reshape(len(place), 2, len(place), 2)
+    of_source = np.einsum("ij,kjml,nl->kimn", turn, blocks, turn)
+    covariance = _blocks(target.covariance, t) + of_source[s][:, :, s]
     lever = (place - place.mean(axis=0))[s]
     by_motion = np.zeros((n, 2, 3))
     by_motion[:, :, :2], by_motion[:, 0, 2], by_motion[:, 1, 2] = np.eye(2), -lever[:, 1], lever[:, 0]

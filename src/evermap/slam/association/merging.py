@@ -33,7 +33,7 @@ MIN_SIGHTINGS = 2
 """Detections of a landmark that is compared: one alone may be of nothing."""
 GROUP = 24
 """Landmarks, met one after the other, that are looked up in the rest of the map at the same time."""
-MOST_TOGETHER = 500
+MOST_TOGETHER = 200
 """Landmarks whose joint covariance is held for groups that are looked up one after the other."""
 MOST_PAIRS = 400
 """Pairs of a group that are weighed, those with most evidence by themselves."""
@@ -118,19 +118,18 @@ def propose_merges(
     pairs = np.vstack(
         [_near(solution.place, solution.covariance, sources, targets), _named(solution.kind, sources, targets)]
     )
-    younger, older = np.unique(pairs, axis=0).T
-    kept = np.array([(int(u), int(o)) not in refused for u, o in zip(younger, older, strict=True)], dtype=bool)
-    kept &= alike(solution.kind[younger], solution.kind[older])
+    count = len(solution.place)
+    not_tried = np.array([u * count + o for u, o in refused], dtype=np.int64)
+    younger, older = np.divmod(np.setdiff1d(pairs[:, 0] * count + pairs[:, 1], not_tried), count)
+    kept = alike(solution.kind[younger], solution.kind[older])
     younger, older = younger[kept], older[kept]
     order = sources[np.argsort(solution.last_seen_s[sources], kind="stable")[::-1]]
-    groups = list[IntArray]()
-    for begin in range(0, len(order), GROUP):
-        of = np.isin(younger, order[begin : begin + GROUP])
-        # a pair of two sources is looked at once, with the source that comes first
-        later = order[begin + GROUP :]
-        of |= np.isin(older, order[begin : begin + GROUP]) & np.isin(older, sources) & ~np.isin(younger, later)
-        if of.any():
-            groups.append(np.flatnonzero(of))
+    group = np.full(count, -1)
+    group[order] = np.arange(len(order)) // GROUP
+    one, other = group[younger], group[older]
+    other = np.where(one <= other, other, -1)  # not once more with a source that comes before the younger one
+    groups = [np.flatnonzero((one == k) | (other == k)) for k in range(-(-len(order) // GROUP))]
+    groups = [mine for mine in groups if len(mine)]
     merges = list[tuple[int, int]]()
     for some in _batches(groups, younger, older):
         rows, first = np.concatenate(some), np.cumsum([0, *map(len, some)])

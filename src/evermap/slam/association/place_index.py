@@ -189,26 +189,19 @@ class PlaceIndex:
 
     def _alike(self, corners: IntArray, sides: FloatArray, within: float) -> tuple[IntArray, IntArray]:
         """(K, 3) corners of local triangles and (K, 3) of those of the map that are alike; of the rarest first."""
-        mine: list[IntArray] = []
-        theirs: list[IntArray] = []
-        total = 0
         # spread over the landmarks: what is new here, or gone there, is in none of some
         chosen = np.arange(len(corners))[:: max(1, len(corners) // LOOKED_UP)][:LOOKED_UP]
-        looked: list[Any] = [self._by_sides.query_ball_point(sides[chosen][:, list(turn)], within) for turn in _TURNS]
-        count = np.array([sum(len(each[k]) for each in looked) for k in range(len(chosen))])
-        for k in np.argsort(count, kind="stable").tolist():
-            total += int(count[k])
-            if total > self._most_matches and mine:
-                break
-            for turn, each in zip(_TURNS, looked, strict=True):
-                found = np.asarray(each[k], dtype=np.int64)
-                mine.append(np.tile(corners[chosen[k]][list(turn)], (len(found), 1)))
-                theirs.append(self._corners[found])
-        one = np.concatenate(mine) if mine else np.zeros((0, 3), dtype=np.int64)
-        return one, np.concatenate(theirs) if theirs else one
+        looked: Any = self._by_sides.query_ball_point(sides[chosen][:, _TURNS], within)
+        count = np.vectorize(len, otypes=[np.int64])(looked) if len(chosen) else np.zeros((0, len(_TURNS)), np.int64)
+        order = np.argsort(count.sum(axis=1), kind="stable")
+        fits = np.cumsum(count.sum(axis=1)[order]) <= self._most_matches
+        order = order[: max(int(fits.sum()), 1)]
+        found = np.fromiter(itertools.chain.from_iterable(looked[order].ravel()), dtype=np.int64)
+        mine = corners[chosen[order]][:, _TURNS].reshape(-1, 3)
+        return np.repeat(mine, count[order].ravel(), axis=0), self._corners[found]
 
 
-_TURNS = tuple(itertools.permutations(range(3)))
+_TURNS = np.array(list(itertools.permutations(range(3))))
 """Ways in which corners may correspond: sides of nearly one length may be either."""
 
 

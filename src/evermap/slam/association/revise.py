@@ -9,6 +9,7 @@ enough, are a landmark that was overlooked.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -135,12 +136,15 @@ def lying_together(at: FloatArray, wide: FloatArray, kind: IntArray, frame: IntA
     """
     free, found = np.ones(len(at), dtype=bool), []
     tree = KDTree(at)
-    near = [np.array(tree.query_ball_point(at[k], 3.0 * wide[k]), dtype=np.int64) for k in range(len(at))]
+    found_near: Any = tree.query_ball_point(at, 3.0 * wide, return_sorted=False)
+    near = [np.array(each, dtype=np.int64) for each in found_near]
     for k in np.argsort([-len(each) for each in near], kind="stable").tolist():
+        if not free[k] or np.count_nonzero(free[near[k]]) < MIN_SIGHTINGS:
+            continue
         mine = near[k][free[near[k]] & alike(kind[near[k]], kind[k])]
         mine = mine[alike(kind[mine], _most_frequent(kind[mine]))]
         mine = mine[np.unique(frame[mine], return_index=True)[1]]
-        if not free[k] or len(mine) < MIN_SIGHTINGS:
+        if len(mine) < MIN_SIGHTINGS:
             continue
         off = np.linalg.norm(at[mine] - _middle(at[mine], wide[mine]), axis=1)
         mine = mine[off < 3.0 * wide[mine]]

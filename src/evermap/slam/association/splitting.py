@@ -67,11 +67,12 @@ def weighed_visits(
     every = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
     every = [every[k] for k in np.flatnonzero(wanted[of])]
     landmark = np.array([row[visit[0]] for visit in every], dtype=np.int64)
+    in_time = np.argsort([visit[0] for visit in every], kind="stable")  # what is near in time shares its way
     shared = 2.0 * assignment.shared_variance[landmark]
     gap, own = np.empty((len(every), 2)), np.empty((len(every), 2, 2))
     for at in range(0, len(every), TOGETHER):
-        some = slice(at, at + TOGETHER)
-        gap[some], own[some] = _apart(linear, pose, every[some], landmark[some], marginals)
+        some = in_time[at : at + TOGETHER]
+        gap[some], own[some] = _apart(linear, pose, [every[k] for k in some], landmark[some], marginals)
     own += shared[:, None, None] * np.eye(2)
     squared = np.einsum("va,va->v", gap, np.linalg.solve(own, gap[:, :, None])[:, :, 0])
     evidence = -0.5 * (squared + np.linalg.slogdet(2.0 * np.pi * own)[1]) - math.log(density)
@@ -94,8 +95,7 @@ def _apart(
     for b in range(2):
         through[np.arange(len(visits)), :, n + 2 * which + b] = own[:, :, b]
     through[:, :, n + 2 * len(places) : n + 2 * len(places) + 5] = own[:, :, 2:]
-    joint = marginals.joint(places, poses=poses, states=True, by=through.reshape(2 * len(visits), -1))
-    explained = joint.reshape(len(visits), 2, len(visits), 2)[np.arange(len(visits)), :, np.arange(len(visits))]
+    explained = marginals.each(places, poses, through)
     covariance = np.asarray(np.linalg.inv(own[:, :, :2] - explained + LEAST_M2 * np.eye(2)), dtype=np.float64)
     force = np.zeros((len(visits), 2))
     np.add.at(force, of, np.einsum("kra,kr->ka", tie, linear[rows][:, :, 10]))

@@ -102,19 +102,25 @@ class Factorised:
             yield share
         return room
 
-    def joint(self, variables: IntArray, matrix: FloatArray | None = None) -> FloatArray:
-        """Return the joint covariance of different variables, in their order; the cost is that of their ways up.
-
-        Args:
-            variables: (K,) of them.
-            matrix: (C, numbers) of these: the (C, C) covariance of `matrix x` is returned instead.
-        """
-        ways, rest, _ = self._ways(variables, matrix)
+    def joint(self, variables: IntArray) -> FloatArray:
+        """Return the joint covariance of variables (K,), in their order; the cost is that of their ways up."""
+        ways, rest, _ = self._ways(variables)
         joint = ways @ ways.T
         if rest.size:
             rest = solve_triangular(self._border[0], rest.T, trans="T")
             joint += rest.T @ rest
         return np.asarray(joint)
+
+    def each(self, variables: IntArray, matrices: FloatArray) -> FloatArray:
+        """Return (V, R, R) the covariance of each of the matrices (V, R, numbers) times different variables."""
+        count, rows = matrices.shape[:2]
+        ways, rest, _ = self._ways(variables, matrices.reshape(count * rows, -1))
+        ways = ways.reshape(count, rows, -1)
+        found = ways @ ways.transpose(0, 2, 1)
+        if rest.size:
+            rest = solve_triangular(self._border[0], rest.T, trans="T").T.reshape(count, rows, -1)
+            found += rest @ rest.transpose(0, 2, 1)
+        return np.asarray(found)
 
     def product(self, variables: IntArray, matrix: FloatArray) -> FloatArray:
         """Return (n, K) the joint covariance of different variables, of n numbers, times a matrix (n, K).
