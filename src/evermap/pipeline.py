@@ -194,5 +194,5 @@ def run_localization(
     named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])
     places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))
     joint, believed = living.covariance_m2, intake.beliefs(recording.sensor, config.slam)
-    result = localize(recording, places, *believed, config.slam, joint_m2=joint, realtime=realtime, progress=progress)
+    result = localize(recording, places, *believed, config, joint_m2=joint, realtime=realtime, progress=progress)
     return replace(result, warnings=(*remarks, *result.warnings))

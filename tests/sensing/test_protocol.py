@@ -17,7 +17,7 @@ from evermap.sensing import learned
 from evermap.sensing.kernels import OUT_OF_FIELD
 from evermap.sensing.profile import Assumed
 from evermap.sensing.sightlines import SightLines
-from evermap.sensing.visibility import WORTH_A_LOOK, DetectionModel, NominalField, looks_at
+from evermap.sensing.visibility import USUAL, DetectionModel, NominalField, looks_at
 from evermap.tracking.views import View
 from evermap.types import FloatArray, IntArray, Sensor
 from evermap_studies.worlds.sensors import CAMERA, LIDAR, Fading, InField, SpatialModel, ViewingAngle
@@ -249,5 +249,5 @@ def test_looks_are_what_is_in_view_and_what_is_detected(seed: int, sensor: Senso
     assert told == sorted(set(told))
     assert {pair for pair, hit in zip(told, looks.hit, strict=True) if hit} == hits  # also out of view
     missed = {pair for pair, hit in zip(told, looks.hit, strict=True) if not hit}
-    assert missed == set(map(tuple, np.argwhere(p >= WORTH_A_LOOK * sensor.p_detect).tolist())) - hits
+    assert missed == set(map(tuple, np.argwhere(p >= USUAL.worth_a_look * sensor.p_detect).tolist())) - hits
     np.testing.assert_array_equal(looks.p_detect, p[looks.pose, looks.landmark])

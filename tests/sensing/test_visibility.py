@@ -10,9 +10,7 @@ from scipy import stats
 
 from evermap.sensing import visibility
 from evermap.sensing.visibility import (
-    BEARING_MARGIN_RAD,
-    RANGE_MARGIN_M,
-    WORTH_A_LOOK,
+    USUAL,
     NominalField,
     looks_at,
 )
@@ -48,7 +46,10 @@ def test_probability_is_brute_force_geometry():
         for j in range(30):
             r, b = seen_from(pose[i], position[j], CAMERA.mount_robot_sensor)
             expected = CAMERA.p_detect
-            for value, low, high, margin in ((r, 0.5, 5.0, RANGE_MARGIN_M), (b, -0.4, 0.9, BEARING_MARGIN_RAD)):
+            for value, low, high, margin in (
+                (r, 0.5, 5.0, USUAL.range_margin_m),
+                (b, -0.4, 0.9, USUAL.bearing_margin_rad),
+            ):
                 expected *= stats.norm.cdf((value - low) / margin) * stats.norm.cdf((high - value) / margin)
             assert found[i, j] == pytest.approx(expected, abs=1e-12)
             inside = 0.5 + 0.8 < r < 5.0 - 0.8 and -0.4 + 0.2 < b < 0.9 - 0.2
@@ -106,7 +107,7 @@ def test_beyond_the_edge_of_the_view_nothing_is_looked_at():
     for x, expected in ((3.0 - 8.0 - 0.12, []), (3.0 - 8.0 - 0.09, [(0, 0)])):
         _, misses, looks = looked_at(sensor, np.array([[x, 0.0, 0.0]]), position[:1], [])
         assert misses == expected
-        assert np.all(looks.p_detect >= WORTH_A_LOOK * sensor.p_detect)
+        assert np.all(looks.p_detect >= USUAL.worth_a_look * sensor.p_detect)
 
 
 def test_no_frames_and_no_landmarks_no_looks():

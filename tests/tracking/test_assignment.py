@@ -16,6 +16,8 @@ from evermap.tracking.frame import Frame
 FORBIDDEN = 1e6
 POINTS = (np.empty((0, 0)),) * 3
 """No boxes and no scores."""
+USUAL = (1e-3, 30.66, 16.0, np.log(0.02), 0.25, 0.05)
+"""What follows in a `Likelihood`."""
 
 
 def sparse(cost: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -83,7 +85,9 @@ def test_candidates_are_all_pairs_worth_it_with_their_costs(
     seen_look /= np.linalg.norm(seen_look, axis=1, keepdims=True)
     seen_look[0] = 0.0
     odds, p_detect = rng.uniform(0.0, 2.0, n), rng.uniform(0.05, 0.99, n)
-    likelihood = Likelihood(confusion, np.array([0.2, 0.3, 0.5]), np.log(1e-3), 21.1, 4.0, 0.5, reach_m, np.log(1e-4))
+    likelihood = Likelihood(
+        confusion, np.array([0.2, 0.3, 0.5]), np.log(1e-3), 21.1, 4.0, 0.5, reach_m, np.log(1e-4), *USUAL
+    )
     targets = Targets(mean, covariance, class_p, look, np.zeros((n, 0)), odds, p_detect)
     pairs = candidates(targets, n, Frame(0.0, position, noise, seen_class, seen_look, *POINTS), likelihood)
     expected = {}
@@ -124,7 +128,7 @@ def test_a_young_tracklet_does_not_steal_the_detection_of_an_old_one() -> None:
     mean[1, 0] = 1.0
     covariance = np.array([np.eye(9) * 0.01, np.eye(9) * 4.0])
     z, noise = np.array([[0.6, 0.0, 0.0]]), np.eye(3)[None] * 0.09
-    likelihood = Likelihood(np.ones((1, 1)), np.ones(1), np.log(1e-4), 21.1, 1.0, 0.5, 0.0, -np.inf)
+    likelihood = Likelihood(np.ones((1, 1)), np.ones(1), np.log(1e-4), 21.1, 1.0, 0.5, 0.0, -np.inf, *USUAL)
     none = np.zeros((2, 0))
     targets = Targets(mean, covariance, np.ones((2, 1)), none, none, np.full(2, 1e-6), np.full(2, 0.9))
     pairs = candidates(targets, 2, Frame(0.0, z, noise, np.full(1, -1), np.zeros((1, 0)), *POINTS), likelihood)

@@ -20,6 +20,7 @@ from typing import Any, get_args
 from pydantic import Field, ValidationError
 
 from evermap.config.living import (
+    BoxesConfig,
     DecisionConfig,
     FitConfig,
     GroupingConfig,
@@ -27,6 +28,8 @@ from evermap.config.living import (
     LiveConfig,
     LivingConfig,
     LooksConfig,
+    MetreConfig,
+    NamelessConfig,
     OverlayConfig,
     SightConfig,
 )
@@ -47,7 +50,7 @@ from evermap.config.slam import (
     TrafficConfig,
     VotesConfig,
 )
-from evermap.config.tables import PersistConfig, StillConfig, SurvivalConfig, TrackConfig, TrackerConfig
+from evermap.config.tables import PersistConfig, ShapeConfig, StillConfig, SurvivalConfig, TrackConfig, TrackerConfig
 from evermap.errors import ConfigError
 
 
@@ -195,6 +198,7 @@ def _toml_text(value: Any) -> str:
 
 
 __all__ = [
+    "BoxesConfig",
     "CalibrationConfig",
     "ChangesConfig",
     "CheckConfig",
@@ -208,7 +212,9 @@ __all__ = [
     "LivingConfig",
     "LocalizeConfig",
     "LooksConfig",
+    "MetreConfig",
     "ModesConfig",
+    "NamelessConfig",
     "NoiseConfig",
     "OdometryConfig",
     "OutputConfig",
@@ -216,6 +222,7 @@ __all__ = [
     "PersistConfig",
     "Section",
     "SensorConfig",
+    "ShapeConfig",
     "SightConfig",
     "SlamConfig",
     "SpaceConfig",

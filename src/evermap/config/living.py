@@ -31,6 +31,9 @@ class FitConfig(Section):
     bent_m: Positive = Field(default=0.15, description="bodies that moved alike to within this are a bend [m]")
     bent_cliques: int = Field(default=3, ge=2, description="bodies that must have moved alike for that")
     window: Count = Field(default=12, description="sightings by which each pose of a bent session is placed")
+    bent_windows: Count = Field(
+        default=3, description="so many of these that contradict the rest are wrong poses, not misread identities"
+    )
     placing_m: Positive = Field(default=0.3, description="residual from which sightings count for less in that [m]")
     loose_m: Positive = Field(
         default=0.5, description="a session is in parts where odometry was silent and nothing else ties it so well [m]"
@@ -52,13 +55,134 @@ class OverlayConfig(Section):
         min_length=1,
         description="standard deviations by which landmarks that nobody moved may be off from session to session [m]",
     )
+    free_m: Positive = Field(
+        default=20.0, description="standard deviation of a session's place around the one agreed on, each axis [m]"
+    )
+    free_rad: Positive = Field(default=3.0, description="the same of its heading [rad]")
+    lowest_room_m: Positive = Field(default=1.0, description="height of a room in space, at least [m]")
+    stood_rad: tuple[Positive, ...] = Field(
+        default=(0.02, 0.06, 0.15),
+        min_length=1,
+        description="standard deviations by which landmarks in space that stand seem turned, all alike [rad]",
+    )
+    turned_rad: tuple[Positive, ...] = Field(
+        default=(0.2, 1.0), min_length=1, description="the same of landmarks that were moved [rad]"
+    )
     p_coarser: Share = Field(default=0.5, description="probability of each of these, relative to the one before")
+
+
+class MetreConfig(Section):
+    """What sessions and robots say of the length of a metre, together."""
+
+    walk: Positive = Field(
+        default=0.002, description="standard deviation by which a map's metre wanders in a session, as a share"
+    )
+    contradicts: Positive = Field(
+        default=4.0, description="standard deviations from which a session's metre contradicts the map's"
+    )
+    p_drifted: Share = Field(
+        default=0.05, description="probability that a robot's metre is not what its sensor is said to know"
+    )
+    drifted: float = Field(default=4.0, ge=1.0, description="times by which it is off then, as standard deviation")
+    p_told: Share = Field(default=0.95, description="probability from which a robot is told to have drifted")
+
+
+class NamelessConfig(Section):
+    """Landmarks without identities in a map: by their constellation."""
+
+    fewest: Count = Field(default=4, description="landmarks that must be found in the map together")
+    farthest_m: Positive = Field(default=2.0, description="how far a landmark that is the same may be off [m]")
+    bent_m: Positive = Field(default=2.0, description="the same behind a stretch that is bent [m]")
+    p_found: Share = Field(
+        default=0.9, description="that a landmark which stands beside one that was found is found, too"
+    )
+
+
+class BoxesConfig(Section):
+    """Boxes without identity in a map: which are the same from session to session."""
+
+    drift_m: Positive = Field(
+        default=0.2, description="by which a box that nobody moved seems to be elsewhere, each axis [m]"
+    )
+    height_m: Positive = Field(default=0.5, description="the same of its height over a street that is not flat [m]")
+    far_share: Share = Field(default=0.3, description="share of boxes that are off by more ...")
+    far_factor: float = Field(default=3.0, ge=1.0, description="... namely by so many times that")
+    sigma_size_m: tuple[Positive, Positive, Positive] = Field(
+        default=(0.4, 0.15, 0.15), description="standard deviations of one box's size, session to session [m]"
+    )
+    sigma_class_m: tuple[Positive, Positive, Positive] = Field(
+        default=(0.6, 0.2, 0.25), description="standard deviations of the sizes of boxes of one class [m]"
+    )
+    size_nats: Positive = Field(default=8.0, description="that size, or heading, may say against two boxes being one")
+    heading_rad: Positive = Field(default=0.15, description="standard deviation of headings [rad]")
+    round: Positive = Field(default=1.3, description="boxes less long than this times their width have no heading")
+    density: Positive = Field(default=0.02, description="boxes where things stand, at least [1/m^2]")
+    p_stands: Share = Field(default=0.9, description="that a box which stands is seen at its place again")
+    returns: Share = Field(
+        default=0.5, description="that what comes to where a box of the map had stood is that box, beforehand"
+    )
+    least_gone: Share = Field(default=0.02, description="least probability that a box left, where another one stands")
+    same_share: Positive = Field(
+        default=0.6, description="boxes that stand closer than this share of their widths are one"
+    )
+    at_once_s: NotNegative = Field(
+        default=5.0, description="a box that left, and stands there again so shortly after, had not left [s]"
+    )
+    named_m: Positive = Field(
+        default=0.5, description="a landmark with an identity is where the map has it, if this near [m]"
+    )
+    shared_pairs: int = Field(default=3, ge=2, description="boxes that must agree with the odometry's frame ...")
+    shared_nats: NotNegative = Field(default=4.0, description="... and evidence that it takes [nats]")
+    found_pairs: int = Field(
+        default=4, ge=2, description="boxes that must agree with a place that was searched for ..."
+    )
+    enough_pairs: int = Field(default=8, ge=2, description="... and so many end the search")
+    lead_nats: NotNegative = Field(default=12.0, description="by which that place must beat all others [nats]")
+    metre_sigmas: NotNegative = Field(
+        default=2.0, description="standard deviations by which a session's metre must be off to be corrected"
+    )
+    near_m: Positive = Field(
+        default=30.0, description="how far boxes may be off behind a stretch in which nothing was seen [m]"
+    )
+    largest_turn_rad: Positive = Field(default=0.3, description="how far they may be turned then [rad]")
+    drift_share: NotNegative = Field(
+        default=0.02, description="how far odometry may be off from one box to the next, of the distance"
+    )
+    most_drift_m: Positive = Field(default=0.5, description="the same, at most [m]")
+    misfit: Positive = Field(
+        default=3.0, description="mean squared deviation of boxes from which the odometry is believed less"
+    )
+    among_m: Positive = Field(default=15.0, description="boxes of the map this near: a session was here before [m]")
+    least_share: Share = Field(
+        default=0.3, description="share of the boxes seen among those of the map that must be boxes of it"
+    )
+    perhaps: Share = Field(default=0.2, description="belief from which a box of the map counts for that")
+    tied_m: Positive = Field(
+        default=80.0, description="farther from what ties a session to the map, misses say nothing [m]"
+    )
+    glimpse_m: Positive = Field(
+        default=1.0, description="a detection this near to a box of the map may be of it, at no range [m] ..."
+    )
+    glimpse_share: NotNegative = Field(default=0.01, description="... and farther off by this share of its range")
+    fewest_glimpses: Count = Field(default=2, description="such detections that a session takes")
+    behind_m: Positive = Field(default=1.5, description="what is this much farther than another box is hidden [m] ...")
+    covered: Positive = Field(default=0.4, description="... within this share of that box's length from its middle")
 
 
 class LooksConfig(Section):
     """What counts as having looked at a place of the map."""
 
+    range_margin_m: Positive = Field(
+        default=0.2, description="softness of the edge of a sensor's range, where errors of pose and map decide [m]"
+    )
+    bearing_margin_rad: Positive = Field(default=0.05, description="the same of its field of view [rad]")
+    worth_a_look: Share = Field(
+        default=0.3, description="share of a sensor's detection probability from which a landmark is looked at"
+    )
     settled_s: NotNegative = Field(default=300.0, description="what is seen within this time of a look was there [s]")
+    settled_online_s: NotNegative = Field(
+        default=10.0, description="the same while the robot drives, as long as the session is not over [s]"
+    )
     beside_m: Positive = Field(default=1.0, description="what is seen this close to a place is seen along its line [m]")
     beside_rad: Positive = Field(default=0.15, description="what is seen behind it at this angle is, too [rad]")
     along_m: Positive = Field(default=0.3, description="distance from a line of sight that shows it to be clear [m]")
@@ -90,6 +214,7 @@ class DecisionConfig(Section):
     same_place_m: Positive = Field(
         default=0.3, description="bodies this close to where another one stood have taken its place [m]"
     )
+    same_turn_rad: Positive = Field(default=0.3, description="bodies turned by less than this have not turned [rad]")
     same_spot_m: Positive = Field(default=0.1, description="bodies this close to where they stood have not moved [m]")
     new_clique_p: Share = Field(default=0.9, description="belief in a new body before its sightings are counted")
     surely_away: Probability = Field(default=0.02, description="belief below which a clique may be forgotten")
@@ -211,6 +336,9 @@ class LivingConfig(Section):
     looks: LooksConfig = Field(default_factory=LooksConfig, description="what counts as a look")
     decisions: DecisionConfig = Field(default_factory=DecisionConfig, description="what is told and forgotten")
     grouping: GroupingConfig = Field(default_factory=GroupingConfig, description="which landmarks are on one body")
+    metre: MetreConfig = Field(default_factory=MetreConfig, description="the length of a metre")
+    nameless: NamelessConfig = Field(default_factory=NamelessConfig, description="landmarks without identities")
+    boxes: BoxesConfig = Field(default_factory=BoxesConfig, description="boxes without identities")
     lifetimes: LifetimeConfig = Field(default_factory=LifetimeConfig, description="how lifetimes are learned")
 
 
@@ -230,6 +358,11 @@ class LiveConfig(Section):
     readings_hz: Positive = Field(
         default=300.0,
         description="readings a second that are kept for the map, on average: of more, whole frames are left out",
+    )
+    idle_s: Positive = Field(default=60.0, description="odometry that is kept where nothing is mapped, at least [s]")
+    clocks_s: Positive = Field(default=5.0, description="more than the clocks of one robot are apart [s]")
+    beliefs_s: Positive = Field(
+        default=300.0, description="looks over so long become beliefs, and are not asked again [s]"
     )
     judge_s: Positive = Field(default=5.0, description="how often it is asked what has changed [s]")
     look_s: Positive = Field(default=0.5, description="time between two frames whose looks are asked for that [s]")

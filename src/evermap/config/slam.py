@@ -288,6 +288,9 @@ class MapInSpaceConfig(Section):
     least_seen: Positive = Field(
         default=1.0, description="sum of inlier probabilities below which a landmark was not seen at its place"
     )
+    drift_rad: Positive = Field(
+        default=0.02, description="by which landmarks that nobody moved are turned, session to session [rad]"
+    )
     p_told: Share = Field(default=0.5, description="probability from which a landmark is told to have moved")
 
 
@@ -382,6 +385,21 @@ class SpaceConfig(Section):
     )
     jump_log_odds: Positive = Field(default=14.0, description="the same of odometry, which may slip")
     inlier: Share = Field(default=0.5, description="inlier probability, or sum of such, from which something was seen")
+    field_margin_rad: NotNegative = Field(
+        default=0.02, description="a field of view is as wide as what was seen in it, and this wider [rad]"
+    )
+    range_margin: float = Field(
+        default=1.1, ge=1.0, description="nothing is expected farther than this times the farthest"
+    )
+    usual_range: Share = Field(
+        default=0.9, description="share of sightings that were nearer than what a look at an empty place reaches"
+    )
+    faced: Share = Field(
+        default=0.2, description="median cosine of incidence from which landmarks are taken to have a face"
+    )
+    widest_rad: float = Field(
+        default=1.4835298641951802, gt=0, lt=1.6, description="incidence from which a face is hardly seen [rad]"
+    )
     map: MapInSpaceConfig = Field(default_factory=MapInSpaceConfig, description="a map that is given")
     repair: RepairConfig = Field(default_factory=RepairConfig, description="other explanations")
     traffic: TrafficConfig = Field(default_factory=TrafficConfig, description="boxes without identity")

@@ -43,6 +43,8 @@ class PersistConfig(Section):
     horizon_s: Positive | None = Field(
         default=None, description="how far to forecast beyond the latest look [s]; unset: a share of the looks' span"
     )
+    forecast_steps: Count = Field(default=10, description="steps of a forecast, where step_s is unset")
+    grid_steps: Count = Field(default=200, description="about so many steps of the grid, where step_s is unset")
     horizon_share: Positive = Field(default=0.25, description="horizon as a share of the span, where none is given")
     confidence: float = Field(default=0.9, gt=0.5, lt=1.0, description="belief from which on a change is reported")
     tail: float = Field(
@@ -84,6 +86,32 @@ class StillConfig(Section):
     elsewhere_m: Positive = Field(default=2.0, description="what left was farther away than this [m]")
     when_s: NotNegative = Field(
         default=0.5, description="when a thing came to rest, or left, is known to within this to both sides [s]"
+    )
+
+
+class ShapeConfig(Section):
+    """Sizes and headings of boxes, and what a detector makes of them."""
+
+    misplaced: float = Field(
+        default=16.0, ge=1.0, description="times the variance of its noise, of a box that is found beside its place ..."
+    )
+    p_misplaced: Share = Field(default=0.02, description="... and how often that is")
+    other_size: Positive = Field(default=0.25, description="sizes of other objects differ by this share")
+    p_misshapen: Share = Field(
+        default=0.05, description="share of detections with a size or a heading that says nothing"
+    )
+    turning: NotNegative = Field(
+        default=0.5, description="random walk of a heading: the end of a box moves sideways by this [m/sqrt(s)]"
+    )
+    resizing: NotNegative = Field(default=0.01, description="random walk of a size, as a share of it [1/sqrt(s)]")
+    forward_nats: Positive = Field(
+        default=3.0, description="log odds by which a detection tells front from back: one of 20 is turned around"
+    )
+    most_forward_nats: Positive = Field(
+        default=7.0, description="log odds that this may be sure by: three opposite detections turn it, two do not"
+    )
+    sure_of_way: Positive = Field(
+        default=9.0, description="squared speed ahead over its variance from which the way tells front from back"
     )
 
 
@@ -169,6 +197,26 @@ class TrackerConfig(Section):
         default=1.0, description="time between two looks that are independent evidence about the working set [s]"
     )
 
+    least_p_detect: Share = Field(
+        default=1e-3, description="least probability to detect an object: a model of the view is not exact"
+    )
+    fast_sigmas: Positive = Field(
+        default=2.33, description="standard deviations above its class's speed from which an object is dynamic"
+    )
+    displaced: Positive = Field(
+        default=30.66, description="squared normalised distance at which a position is another place: one in a million"
+    )
+    most_counted: Count = Field(default=50, description="detections beyond which more of them say no more")
+    p_empty: Share = Field(
+        default=1e-3, description="probability of misses in a row at which a place has been seen to be empty"
+    )
+    leave_rates_hz: tuple[Positive, Positive] = Field(
+        default=(1e-8, 1e-2), description="rates of leaving a place, where nothing is known: from, to [1/s]"
+    )
+    slow_step_s: Positive = Field(
+        default=2.0, description="frames farther apart than this say little about motion: a remark says so [s]"
+    )
+    shape: ShapeConfig = Field(default_factory=ShapeConfig, description="sizes and headings of boxes")
     still: StillConfig = Field(default_factory=StillConfig, description="what stands beside a moving robot")
 
     @property

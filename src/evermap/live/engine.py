@@ -34,8 +34,6 @@ from evermap.types import Clock, FloatArray, IntArray, Landmarks, Sensor
 from evermap.valid import check_sensor
 
 Numbers = Sequence[float] | FloatArray
-IDLE_S = 60.0
-"""Odometry that is kept where nothing is mapped, at least."""
 
 
 class Engine:
@@ -77,7 +75,7 @@ class Engine:
         recording = recording_of(sensor, name, clock, tuple(class_names))
         self._sensor = self._config.sensor.applied_to(recording.sensor)
         check_sensor(self._sensor)
-        self._inbox = Inbox(recording, self._config.live.reorder_s, self._config.live.readings_hz)
+        self._inbox = Inbox(recording, self._config)
         self._lock, self._told = threading.RLock(), News()
         path = None if isinstance(map, LivingMap) else Path(map)
         self._keeper = Keeper(path, self._config, self._inbox, self._told, threads=beside)
@@ -299,9 +297,9 @@ class Engine:
             self._filter = Mapper(self._sensor, *beliefs(self._sensor, self._config.slam), self._config.slam)
 
     def _localizer(self, places: KnownPlaces, *, learn: bool) -> Localizer:
-        settings = self._config.slam
+        settings, looks = self._config.slam, self._config.living.looks
         believed = beliefs(self._sensor, settings)
-        return Localizer(places, self._sensor, *believed, settings=settings.localize, learn=learn)
+        return Localizer(places, self._sensor, *believed, settings=settings.localize, looks=looks, learn=learn)
 
     def _places(self, living: LivingMap, stamp_s: float) -> KnownPlaces:
         rows = living.sighted_rows(aged(living, self._config.living, stamp_s).p_here)
@@ -311,7 +309,7 @@ class Engine:
         """Do what is due: a revision, readings to the disk, the question what has changed."""
         live, now_s = self._config.live, self._inbox.settled_s
         if not self._mapping:
-            if now_s - self._session_s >= IDLE_S:
+            if now_s - self._session_s >= live.idle_s:
                 self._inbox.cut(self._inbox.name)
                 self._session_s = now_s
         elif 0.0 < live.revision_s <= now_s - self._session_s and self._can_be_found:

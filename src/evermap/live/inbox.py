@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from evermap.config import Config
 from evermap.errors import InputError
 from evermap.types import (
     UNKNOWN,
@@ -39,12 +40,6 @@ from evermap.valid import (
     STAMP_S,
 )
 
-SILENT_S = 1.0
-"""A frame does not wait longer for odometry."""
-BEFORE_S = 5.0
-"""Odometry before a frame that is given out with it: more than clocks of one robot are apart."""
-STRAY_S = 10.0
-"""A stamp that is so much later than all others is believed when the next one says the same: a clock may hiccup."""
 BURST_S = 10.0
 """Time over which readings are counted where there are too many."""
 ROOM = 1_000
@@ -73,17 +68,19 @@ class Inbox:
 
     Args:
         about: name, sensor, clock and classes of the recording that is made of the readings.
-        reorder_s: how much later than the newest one a reading may come.
-        readings_hz: detections a second that are kept, on average.
+        config: how late and how many readings may be, and for how long odometry may be silent.
     """
 
-    def __init__(self, about: Recording, reorder_s: float, readings_hz: float) -> None:
+    def __init__(self, about: Recording, config: Config) -> None:
+        live = config.live
+        self._before_s, self._silent_s = live.clocks_s, config.slam.odometry.silence_s
+        self._stray_s = config.slam.cleaning.stray_s
         self._lock = threading.Lock()
-        self._about, self._reorder_s, self._readings_hz = about, reorder_s, readings_hz
+        self._about, self._reorder_s, self._readings_hz = about, live.reorder_s, live.readings_hz
         self._odometry, self._n_odometry = np.empty((4, ROOM)), 0
         self._pending: list[LiveFrame] = []
         self._kept: list[LiveFrame] = []
-        self._room = readings_hz * BURST_S
+        self._room = live.readings_hz * BURST_S
         self.newest_s = self.odometry_s = self.settled_s = -np.inf
         """Newest stamp of all, until which the odometry is known, and of the frames that were given out."""
         self.first_s = np.inf
@@ -139,7 +136,7 @@ class Inbox:
             hold_s = max(self._reorder_s, delay_s)
             while self._pending:
                 stamp_s = self._pending[0].stamp_s
-                silent = self.newest_s >= stamp_s + hold_s + SILENT_S
+                silent = self.newest_s >= stamp_s + hold_s + self._silent_s
                 if not (everything or silent or self.odometry_s >= stamp_s + hold_s):
                     break
                 frame = self._pending.pop(0)
@@ -193,8 +190,8 @@ class Inbox:
     def _in_time(self, stamp_s: float, put: Callable[[], None]) -> None:
         """Put a reading in; one whose stamp is far later than all others when the next one says the same."""
         before, self._stray = self._stray, None
-        if stamp_s > self.newest_s + STRAY_S:  # the first one, too
-            if before is None or abs(before[0] - stamp_s) > STRAY_S:
+        if stamp_s > self.newest_s + self._stray_s:  # the first one, too
+            if before is None or abs(before[0] - stamp_s) > self._stray_s:
                 self._stray = stamp_s, put
                 self.n_stray += before is not None
                 return
@@ -226,12 +223,12 @@ class Inbox:
         return int(np.searchsorted(self._odometry[0, : self._n_odometry], stamp_s, side))
 
     def _window(self, stamp_s: float) -> FloatArray:
-        first = max(self._odometry_until(stamp_s - BEFORE_S) - 1, 0)
+        first = max(self._odometry_until(stamp_s - self._before_s) - 1, 0)
         return self._odometry[:, first : self._n_odometry].T.copy()
 
     def _forget(self) -> None:
         """Drop the odometry that was written and that no frame will be given out with."""
-        first = min(max(self._odometry_until(self.settled_s - BEFORE_S) - 1, 0), self._n_written)
+        first = min(max(self._odometry_until(self.settled_s - self._before_s) - 1, 0), self._n_written)
         kept = self._odometry[:, first : self._n_odometry]
         self._odometry = np.hstack([kept, np.empty((4, ROOM))])
         self._n_odometry, self._n_written = kept.shape[1], self._n_written - first

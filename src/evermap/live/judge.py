@@ -20,9 +20,6 @@ from evermap.slam.localize import Located
 from evermap.slam.streaming import sighted_at
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, MapChange, Sensor, rows_of
 
-TAKEN_OVER_S = 300.0
-"""Looks over so long become beliefs, and are forgotten: what is asked of them costs the same at any time."""
-
 REST_S = 2.5e-4
 """Time between two questions for each sighting of the first one, at least: some twenty times what that takes."""
 
@@ -115,7 +112,7 @@ class Judge:
                 if (key := (change.kind, change.landmark_ids)) not in self._known:
                     self._known.add(key)
                     self._found.append(change)
-        if glances[-1].stamp_s - glances[0].stamp_s > TAKEN_OVER_S:
+        if glances[-1].stamp_s - glances[0].stamp_s > self._config.live.beliefs_s:
             whole = self.living
             with self._lock:
                 self._whole, self._after = whole, (whole, None)

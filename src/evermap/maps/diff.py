@@ -27,8 +27,6 @@ from evermap.show import Shown, data_frame
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, MapChange
 
 USUAL = DecisionConfig()
-SAME_TURN_RAD = 0.3
-"""Bodies in space that are turned by less stand as they did."""
 ToldBySession = tuple[Sequence[MapChange], bool]
 """Changes that a session told, and whether they are undone."""
 _COMES = frozenset({ChangeKind.APPEARED, ChangeKind.RETURNED})
@@ -155,7 +153,7 @@ def net(
         if forth and len(path) == 1 and len(names) == len(only.landmark_ids):
             found.append(only)
             continue
-        change = _composed(path, tuple(names), (a, b), settings.same_spot_m)
+        change = _composed(path, tuple(names), (a, b), settings)
         if change is not None and (forth or _possible(change.kind, before, after)):
             found.append(change)
     return with_swaps(found, a, b, settings) if len({one.session for one in told}) > 1 else tuple(found)
@@ -196,9 +194,10 @@ def motion_of(
     return shift, float(se3.angle_between(se3.identity(), rigid(was_m, now_m))) if len(was_m) > 2 else 0.0
 
 
-def elsewhere(shift: FloatArray, turn: float, same_spot_m: float) -> bool:
+def elsewhere(shift: FloatArray, turn: float, settings: DecisionConfig) -> bool:
     """Return whether a body is at another place after a motion, or in space turned at its own."""
-    return bool(math.hypot(*shift) >= same_spot_m or (len(shift) > 2 and abs(turn) >= SAME_TURN_RAD))
+    turned = len(shift) > 2 and abs(turn) >= settings.same_turn_rad
+    return bool(turned or math.hypot(*shift) >= settings.same_spot_m)
 
 
 def with_swaps(
@@ -242,7 +241,7 @@ def _exchanged(change: MapChange, other: MapChange) -> MapChange:
 
 
 def _composed(
-    path: Sequence[Told], names: tuple[int, ...], maps: tuple[LivingMap, LivingMap], same_spot_m: float
+    path: Sequence[Told], names: tuple[int, ...], maps: tuple[LivingMap, LivingMap], settings: DecisionConfig
 ) -> MapChange | None:
     """The net effect of changes of the same landmarks; None for none."""
     first, last = path[0], path[-1]
@@ -260,7 +259,7 @@ def _composed(
             kind = ChangeKind.APPEARED if new else ChangeKind.RETURNED
             shift, turn = (nowhere, 0.0) if new else (shift, turn)
             rests_on = path[came[-1] :]
-        elif not elsewhere(shift, turn, same_spot_m):
+        elif not elsewhere(shift, turn, settings):
             return None
         else:
             kind, rests_on = ChangeKind.MOVED, path

@@ -1,7 +1,7 @@
 """What a look is, what a hit and what a miss, and with what probability landmarks are detected that are there.
 
 A *look* is a landmark, or one of the places where it may stand, in a frame in which it should be detected:
-`P(detect | there)` is at least `WORTH_A_LOOK` of what the sensor does at best. A detection is a look too, wherever the
+`P(detect | there)` is at least `worth_a_look` of what the sensor does at best. A detection is a look too, wherever the
 field of view is said to end. A look with a detection is a *hit*, one without is a *miss*. Whether a miss says anything
 depends on the line of sight (`sightlines`); a model without them takes every line for clear.
 
@@ -17,14 +17,11 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from evermap.config import LooksConfig
 from evermap.geometry import se2
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
-RANGE_MARGIN_M = 0.2
-BEARING_MARGIN_RAD = 0.05
-"""Softness of the field of view's edge, where pose and map errors decide."""
-WORTH_A_LOOK = 0.3
-"""Share of the sensor's detection probability from which on a landmark counts as looked at."""
+USUAL = LooksConfig()
 AT_ONCE = 64
 """Consecutive poses that are compared with the landmarks near any of them."""
 
@@ -50,9 +47,11 @@ class NominalField:
 
     Attributes:
         sensor: limits, mounting and detection probability.
+        settings: how soft its edges are, and what is worth a look.
     """
 
     sensor: Sensor
+    settings: LooksConfig = USUAL
 
     def p_detect(self, pose: FloatArray, position_m: FloatArray) -> FloatArray:
         """Return (F, L) probabilities of landmarks (L, 2) from robot poses (F, 3) in the same frame."""
@@ -72,16 +71,21 @@ class NominalField:
         return LooksAt(*looks(eye, position, self.limits, (least, reach_m, AT_ONCE), first, seen[1][by_pose]))
 
     @property
+    def reach_m(self) -> float:
+        """Return how far away nothing is detected any more."""
+        return self.sensor.range_max_m + 3.0 * self.settings.range_margin_m
+
+    @property
     def limits(self) -> tuple[float, ...]:
         """As `kernels.in_view` takes them; a sensor that sees all around has no limits of the bearing."""
         of, all_around = self.sensor, self.sensor.bearing_max_rad - self.sensor.bearing_min_rad >= 2 * math.pi - 1e-6
         bearing = (-math.inf, math.inf) if all_around else (float(of.bearing_min_rad), float(of.bearing_max_rad))
         ranges = float(of.range_min_m), float(of.range_max_m)
-        return (float(of.p_detect), *ranges, *bearing, RANGE_MARGIN_M, BEARING_MARGIN_RAD)
+        return (float(of.p_detect), *ranges, *bearing, self.settings.range_margin_m, self.settings.bearing_margin_rad)
 
     def worth_a_look(self, p_detect: FloatArray) -> BoolArray:
         """Return which probabilities of any shape are large enough for a look."""
-        return np.asarray(p_detect >= WORTH_A_LOOK * self.sensor.p_detect)
+        return np.asarray(p_detect >= self.settings.worth_a_look * self.sensor.p_detect)
 
 
 class LooksAt(NamedTuple):
@@ -103,7 +107,13 @@ class LooksAt(NamedTuple):
         return LooksAt(self.pose[some], self.landmark[some], self.p_detect[some], self.hit[some])
 
 
-def looks_at(sensor: Sensor, pose: FloatArray, position_m: FloatArray, seen: tuple[IntArray, IntArray]) -> LooksAt:
+def looks_at(
+    sensor: Sensor,
+    pose: FloatArray,
+    position_m: FloatArray,
+    seen: tuple[IntArray, IntArray],
+    settings: LooksConfig = USUAL,
+) -> LooksAt:
     """List the looks at landmarks, hits and misses.
 
     Args:
@@ -111,6 +121,7 @@ def looks_at(sensor: Sensor, pose: FloatArray, position_m: FloatArray, seen: tup
         pose: (F, 3) of the robot.
         position_m: (L, 2) landmarks in the same frame, taken to be there.
         seen: (H,) rows of poses and (H,) rows of landmarks: the detections.
+        settings: of the field's edges, and what is worth a look.
     """
-    reach_m = sensor.range_max_m + 3.0 * RANGE_MARGIN_M
-    return NominalField(sensor).looks(pose, position_m, seen, WORTH_A_LOOK * sensor.p_detect, float(reach_m))
+    field, least = NominalField(sensor, settings), settings.worth_a_look * sensor.p_detect
+    return field.looks(pose, position_m, seen, least, float(field.reach_m))

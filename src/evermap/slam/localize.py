@@ -14,9 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.config import LocalizeConfig
+from evermap.config import LocalizeConfig, LooksConfig
 from evermap.geometry import se2
-from evermap.sensing.visibility import RANGE_MARGIN_M, NominalField
+from evermap.sensing.visibility import USUAL as FIELD
+from evermap.sensing.visibility import NominalField
 from evermap.show import Shown
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.filter_kernels import BY_OTHERS
@@ -77,6 +78,7 @@ class Localizer(Shown):
         prior: of the calibration states.
         noise: standard deviations of detections and odometry; they are not estimated.
         settings: when its place in the map is known, and when it is lost.
+        looks: how soft the edges of the field of view are, and what is worth a look.
         start: (3,) pose and (3, 3) covariance at the first frame, where these are known.
         learn: hold the pose by landmarks that the map lacks, too, where they were seen first; else they are not used.
     """
@@ -89,15 +91,16 @@ class Localizer(Shown):
         noise: Noise,
         *,
         settings: LocalizeConfig = USUAL,
+        looks: LooksConfig = FIELD,
         start: tuple[FloatArray, FloatArray] | None = None,
         learn: bool = False,
     ) -> None:
         self.places, self._settings = places, settings
-        self._field, self._prior, self.noise = NominalField(sensor), prior, noise
+        self._field, self._prior, self.noise = NominalField(sensor, looks), prior, noise
         self._mount = np.array(sensor.mount_robot_sensor, dtype=np.float64)
         self._log_p = np.log(np.maximum(places.p_here, settings.least_belief))
         self._believed = self._log_p.copy()
-        self._near = Neighbourhood(places.position_m, sensor.range_max_m + 3.0 * RANGE_MARGIN_M)
+        self._near = Neighbourhood(places.position_m, self._field.reach_m)
         self._believed_there = np.zeros(len(places), dtype=np.bool_)
         self._believed_there[places.most_probable()] = True
         self._believed_there &= places.p_here >= settings.believed
@@ -179,7 +182,15 @@ class Localizer(Shown):
 
     def over(self, places: KnownPlaces, sensor: Sensor) -> Localizer:
         """Return one that goes on from here in another state of the map."""
-        there = Localizer(places, sensor, self._prior, self.noise, settings=self._settings, learn=self.learn)
+        there = Localizer(
+            places,
+            sensor,
+            self._prior,
+            self.noise,
+            settings=self._settings,
+            looks=self._field.settings,
+            learn=self.learn,
+        )
         local, before = there._filter, self._filter
         local.states[:] = before.states
         local.covariance[3:, 3:] = before.covariance[3:AT_PLACES, 3:AT_PLACES]

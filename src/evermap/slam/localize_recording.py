@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.config import SlamConfig
+from evermap.config import Config
 from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.geometry.chunked import JointCovariance
@@ -22,7 +22,6 @@ from evermap.slam.localize import FrameSightings, Localizer, Located
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive, Noise
 from evermap.slam.result import described
-from evermap.slam.streaming import USUAL
 from evermap.types import (
     UNKNOWN,
     BoolArray,
@@ -37,13 +36,15 @@ from evermap.types import (
     Trajectory,
 )
 
+USUAL = Config()
+
 
 def localize(
     recording: Recording,
     landmarks: Landmarks,
     prior: CalibrationPrior,
     noise: Noise,
-    settings: SlamConfig = USUAL,
+    config: Config = USUAL,
     *,
     joint_m2: JointCovariance | None = None,
     realtime: bool = False,
@@ -57,7 +58,7 @@ def localize(
             with `p_exists` the probability of each; those of probability 0 are not looked at.
         prior: of the calibration states.
         noise: standard deviations; they are not estimated.
-        settings: of the estimator.
+        config: settings.
         joint_m2: covariance of all rows together; None takes `covariance_m2`, and the rows to be independent.
         realtime: process at the recording's pace.
         progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.
@@ -74,10 +75,12 @@ def localize(
         raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
     start_s = float(odometry.stamp_s[0])
     velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
-    drive = Drive.from_rows(odometry.stamp_s - start_s, velocity, settings.odometry)
+    drive = Drive.from_rows(odometry.stamp_s - start_s, velocity, config.slam.odometry)
     landmarks, places = _existing(landmarks, joint_m2)
     warm_up()
-    localizer = Localizer(places, recording.sensor, prior, noise, settings=settings.localize)
+    localizer = Localizer(
+        places, recording.sensor, prior, noise, settings=config.slam.localize, looks=config.living.looks
+    )
     frame = np.flatnonzero((stamps >= start_s) & (stamps <= odometry.stamp_s[-1]))
     run = _feed(localizer, recording, frame, drive, realtime=realtime, progress=progress)
     if not run.placed.any():

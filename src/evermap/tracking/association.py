@@ -36,6 +36,8 @@ class Likelihood(NamedTuple):
         appearance_nats, appearance_neutral: see `TrackerConfig`.
         moved_reach_m: objects may be found this far from where they are expected, 0 if not ...
         log_moved: ... with this log density, 1/m^3.
+        least_p_detect, displaced: see `TrackerConfig`.
+        misplaced, log_p_misplaced, other_size, p_misshapen: see `ShapeConfig`.
     """
 
     confusion: FloatArray
@@ -46,6 +48,12 @@ class Likelihood(NamedTuple):
     appearance_neutral: float
     moved_reach_m: float
     log_moved: float
+    least_p_detect: float
+    displaced: float
+    misplaced: float
+    log_p_misplaced: float
+    other_size: float
+    p_misshapen: float
 
 
 class Targets(NamedTuple):
@@ -86,31 +94,27 @@ class Pairs(NamedTuple):
     log_ratio: FloatArray
 
 
-NEVER_SURE = 1e-3
-"""Least probability to detect an object: what a sensing model rules out is unlikely, but its geometry is not exact."""
 LOG_TWO_PI = math.log(2.0 * math.pi)
-MISPLACED = 16.0
-"""Times the variance of its noise, of a box that is found beside its place: of what is far or half hidden ..."""
-LOG_P_MISPLACED = math.log(0.02)
-"""... and how often."""
 
 
 @inlined
-def blurred(a: FloatArray, noise: FloatArray) -> Symmetric:
+def blurred(a: FloatArray, noise: FloatArray, wide: float) -> Symmetric:
     """Return the covariance of an innovation if a box is misplaced."""
     return (
-        a[0, 0] + MISPLACED * noise[0, 0], a[0, 1] + MISPLACED * noise[0, 1], a[0, 2] + MISPLACED * noise[0, 2],
-        a[1, 1] + MISPLACED * noise[1, 1], a[1, 2] + MISPLACED * noise[1, 2], a[2, 2] + MISPLACED * noise[2, 2],
+        a[0, 0] + wide * noise[0, 0], a[0, 1] + wide * noise[0, 1], a[0, 2] + wide * noise[0, 2],
+        a[1, 1] + wide * noise[1, 1], a[1, 2] + wide * noise[1, 2], a[2, 2] + wide * noise[2, 2],
     )  # fmt: skip
 
 
 @inlined
-def is_misplaced(mean: FloatArray, covariance: FloatArray, position: FloatArray, noise: FloatArray) -> bool:
+def is_misplaced(
+    mean: FloatArray, covariance: FloatArray, position: FloatArray, noise: FloatArray, likelihood: Likelihood
+) -> bool:
     """Return whether a box is rather misplaced than where its noise would have it."""
     offset = position[0] - mean[0], position[1] - mean[1], position[2] - mean[2]
     near, det = distance_and_log_det(offset, sum_of(covariance, noise))
-    far, wide_det = distance_and_log_det(offset, blurred(covariance, noise))
-    return -0.5 * (near + det) < LOG_P_MISPLACED - 0.5 * (far + wide_det)
+    far, wide_det = distance_and_log_det(offset, blurred(covariance, noise, likelihood.misplaced))
+    return -0.5 * (near + det) < likelihood.log_p_misplaced - 0.5 * (far + wide_det)
 
 
 @inlined
@@ -163,7 +167,7 @@ def candidates(targets: Targets, n: int, frame: Frame, likelihood: Likelihood) -
         for a in range(3):
             widest[a] = max(widest[a], noise[j, a, a])
     reach = np.empty((n, 3))
-    wide = MISPLACED if boxes else 1.0
+    wide = likelihood.misplaced if boxes else 1.0
     total = 0.0
     for i in range(n):
         for a in range(3):
@@ -197,7 +201,7 @@ def candidates(targets: Targets, n: int, frame: Frame, likelihood: Likelihood) -
                             if cell[j, 0] == x and cell[j, 1] == y and cell[j, 2] == z:
                                 found[n_found] = j
                                 n_found += 1
-        p_hit = max(p_detect[i], NEVER_SURE) / (1.0 + inverse_odds[i])
+        p_hit = max(p_detect[i], likelihood.least_p_detect) / (1.0 + inverse_odds[i])
         if p_hit > 0.0:
             missed_over_hit = math.log((1.0 - p_hit) / p_hit) if p_hit < 1.0 else -700.0
             for k in range(n_found):
@@ -207,9 +211,10 @@ def candidates(targets: Targets, n: int, frame: Frame, likelihood: Likelihood) -
                 squared, log_det = distance_and_log_det((dx, dy, dz), sum_of(covariance[i], noise[r]))
                 log_density = -0.5 * (squared + log_det + 3.0 * LOG_TWO_PI) if squared <= likelihood.gate else -math.inf
                 if boxes:
-                    far, wide_det = distance_and_log_det((dx, dy, dz), blurred(covariance[i], noise[r]))
+                    far, wide_det = distance_and_log_det((dx, dy, dz), blurred(covariance[i], noise[r], wide))
                     if far <= likelihood.gate:
-                        log_density = max(log_density, LOG_P_MISPLACED - 0.5 * (far + wide_det + 3.0 * LOG_TWO_PI))
+                        beside = likelihood.log_p_misplaced - 0.5 * (far + wide_det + 3.0 * LOG_TWO_PI)
+                        log_density = max(log_density, beside)
                 if dx * dx + dy * dy + dz * dz <= likelihood.moved_reach_m * likelihood.moved_reach_m:
                     log_density = max(log_density, likelihood.log_moved)
                 if log_density == -math.inf:
@@ -220,7 +225,9 @@ def candidates(targets: Targets, n: int, frame: Frame, likelihood: Likelihood) -
                     appearance[i], frame.appearance[j], likelihood.appearance_nats, likelihood.appearance_neutral
                 )
                 if boxes:
-                    ratio += shape_log_ratio(box[i], frame.box[j], frame.box_noise[j])
+                    ratio += shape_log_ratio(
+                        box[i], frame.box[j], frame.box_noise[j], likelihood.other_size, likelihood.p_misshapen
+                    )
                 if missed_over_hit - ratio >= 0.0:
                     continue
                 if e == room:

@@ -14,8 +14,6 @@ import numpy as np
 
 from evermap.existence.kernels import aged, observed
 from evermap.tracking.association import (
-    MISPLACED,
-    NEVER_SURE,
     NOBODY,
     Likelihood,
     Targets,
@@ -26,7 +24,6 @@ from evermap.tracking.association import (
 from evermap.tracking.frame import Frame
 from evermap.tracking.kalman import kernel, update
 from evermap.tracking.rows import (
-    DISPLACED,
     LEAST,
     believed,
     displacement,
@@ -132,17 +129,18 @@ def live(
             j = pairs.column[chosen[i]]
             track_of_detection[j] = t.track_id[i]
             gone = math.exp(-min(max(pairs.log_ratio[chosen[i]], -60.0), 60.0))
-            after, _ = observed(predicted, max(p_detect[i], NEVER_SURE), gone)
+            after, _ = observed(predicted, max(p_detect[i], likelihood.least_p_detect), gone)
             t.inverse_odds[i] = max(after, LEAST)
-            if boxes and is_misplaced(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j)):
-                update(t.mean[i], t.covariance[i], frame.position[j], MISPLACED * noise_of(frame, j))
+            noise = noise_of(frame, j)
+            if boxes and is_misplaced(t.mean[i], t.covariance[i], frame.position[j], noise, likelihood):
+                update(t.mean[i], t.covariance[i], frame.position[j], likelihood.misplaced * noise)
             else:
-                update(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j))
+                update(t.mean[i], t.covariance[i], frame.position[j], noise)
             recognise(t, i, frame, j, likelihood.confusion, rules.appearance_memory)
             t.n_hits[i] += 1
             t.n_missed[i] = 0
             if boxes:
-                update_shape(t.box[i], frame.box[j], frame.box_noise[j], t.mean[i], t.covariance[i])
+                update_shape(t.box[i], frame.box[j], frame.box_noise[j], t.mean[i], t.covariance[i], rules)
             if scored:
                 update_level(t, i, frame.level[j, 0], rules)
             n_spells = settle(t, i, frame, j, rules, spells, n_spells)
@@ -204,7 +202,7 @@ def match(targets: Targets, frame: Frame, likelihood: Likelihood) -> tuple[IntAr
             targets.covariance[found[k]],
             0.0,
         )
-        moved[k] = squared > DISPLACED
+        moved[k] = squared > likelihood.displaced
     return found, detection, pairs.log_ratio[pair], moved
 
 
@@ -251,7 +249,7 @@ def resume(
         t.n_hits[i] += 1
         t.n_missed[i] = 0
         if boxes:
-            update_shape(t.box[i], frame.box[j], frame.box_noise[j], t.mean[i], t.covariance[i])
+            update_shape(t.box[i], frame.box[j], frame.box_noise[j], t.mean[i], t.covariance[i], rules)
         if scored:
             update_level(t, i, frame.level[j, 0], rules)
         t.rest_seen_s[i] = frame.stamp_s

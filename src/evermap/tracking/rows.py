@@ -25,11 +25,6 @@ from evermap.types import FloatArray, IntArray
 BIRTH, ALIVE = int(TrackState.BIRTH), int(TrackState.ALIVE)
 LEAST = 1e-12
 """Bound of inverse odds: however long an object was watched, a dozen misses may undo it."""
-FAST = 2.33
-"""Standard deviations above the threshold from which a speed is above it: one error in a hundred."""
-DISPLACED = 30.66
-"""Squared Mahalanobis distance from which a position is another: chi-square with 3 degrees of freedom at one in a
-million, for the test is done at every detection, and one false alarm would cut a stay of days in two."""
 MIDDLE = 2.366
 """Squared Mahalanobis distance up to which it is still in its place beyond doubt: the median. Whoever drives off is
 outside long before the test of displacement says so, and whoever rests is inside every other time."""
@@ -111,7 +106,7 @@ def settle(t: Tracklets, i: int, frame: Frame, j: int, rules: Rules, spells: Spe
     score = speed_score(t.mean[i], t.covariance[i], rules.class_speed_mps[np.argmax(t.class_p[i])])
     t.slow[i] = 1 if score <= 0.0 else 0
     squared = displacement(t.mean[i], t.covariance[i], t.rest_mean[i], t.rest_covariance[i], rules.place_m2)
-    if score > FAST or squared > DISPLACED:
+    if score > rules.fast_sigmas or squared > rules.displaced:
         if t.static[i] == 1:
             t.rest_seen_s[i] = max(t.rest_since_s[i], min(t.rest_seen_s[i], departure(t, i, stamp_s)))
             n_spells = end_spell(t, i, stamp_s, spells, n_spells)
@@ -144,7 +139,7 @@ def start(t: Tracklets, i: int, track_id: int, frame: Frame, j: int, confusion: 
     t.appearance[i] = 0.0
     reset_filter(t, i, frame, j, rules)
     if t.box.shape[1]:
-        begin_shape(t.box[i], frame.box[j], frame.box_noise[j])
+        begin_shape(t.box[i], frame.box[j], frame.box_noise[j], rules.forward_nats)
     detected = frame.class_id[j]
     if detected >= 0:
         t.class_p[i] *= confusion[:, detected]

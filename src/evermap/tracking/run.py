@@ -28,9 +28,6 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SLOW_STEP_S = 2.0
-"""Frames that are farther apart than this say little about motion."""
-
 
 @dataclass(frozen=True, slots=True, repr=False)
 class TrackResult(Shown):
@@ -163,7 +160,7 @@ def run_track(
     tracks = recorder.tracks() if table.score is None else recorder.at_once(config.p_dead)
     if not (tracks.state != TrackState.BIRTH).any():
         hint = f"fewer detections to be believed: track.warm_up={max(1, config.warm_up - 1)}"
-        if _usual_step_s(table) > _SLOW_STEP_S:
+        if _usual_step_s(table) > config.slow_step_s:
             hint = f"more frames: it takes several in a row, and these are {_usual_step_s(table):g} s apart"
         raise DataError("no object was seen often enough to be told from false alarms", path=table.source, hint=hint)
     spells = _long_enough(tracker.static_spells(), config.rest_for_s)
@@ -300,7 +297,7 @@ def _usual_step_s(table: DetectionTable) -> float:
 def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -> list[str]:
     remarks = said_of(table)
     step_s = _usual_step_s(table)
-    if step_s > _SLOW_STEP_S:
+    if step_s > config.slow_step_s:
         remarks.append(f"frames are {step_s:.3g} s apart: moving objects are hardly tracked at that rate")
     if config.range_m is None and table.sensor_m is not None and table.score is None:
         remarks.append("without `range_m`, a missed detection is no evidence")

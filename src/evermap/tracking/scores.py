@@ -17,8 +17,6 @@ from evermap.tracking.tracklets import Rules, Tracklets
 from evermap.types import FloatArray
 
 LEVEL, WEIGHT, MISSED = 0, 1, 2
-MOST_COUNTED = 50
-"""Detections beyond which more of them say no more."""
 
 
 @inlined
@@ -44,7 +42,7 @@ def update_level(t: Tracklets, i: int, log_odds: float, rules: Rules) -> None:
 @inlined
 def log_odds_real(t: Tracklets, i: int, rules: Rules) -> float:
     """Return the log odds that a tracklet is real, infinite where no detection of it has a score."""
-    again = rules.seen_nats * math.log(min(t.n_hits[i], MOST_COUNTED))
+    again = rules.seen_nats * math.log(min(t.n_hits[i], rules.most_counted))
     return float(t.level[i, LEVEL] + again - t.level[i, MISSED])
 
 

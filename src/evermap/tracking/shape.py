@@ -12,23 +12,8 @@ import math
 import numpy as np
 
 from evermap.tracking.kalman import inlined, kernel
-from evermap.tracking.tracklets import FORWARD, N_DETECTED, VARIANCE, YAW
+from evermap.tracking.tracklets import FORWARD, N_DETECTED, VARIANCE, YAW, Rules
 from evermap.types import FloatArray
-
-MOST_FORWARD = 7.0
-"""Log odds that a heading may be sure by: two opposite detections in a row shall not turn it, three shall."""
-FORWARD_STEP = 3.0
-"""Log odds of a detection: one of twenty is turned around."""
-OTHER_SIZE = 0.25
-"""Sizes of other objects differ by this share."""
-P_MISSHAPEN = 0.05
-"""Share of detections with a size or a heading that says nothing."""
-TURNING_MPS05 = 0.5
-"""Random walk of a heading: what the end of a box moves sideways in the square root of a second [m]."""
-RESIZING = 0.01
-"""Random walk of a size, as a share of it in the square root of a second."""
-SURE_OF_WAY = 9.0
-"""Squared ratio of the speed along a heading to its deviation from which on the way tells front from back."""
 
 
 @inlined
@@ -38,40 +23,42 @@ def wrapped(angle: float, period: float) -> float:
 
 
 @inlined
-def shape_log_ratio(box: FloatArray, detected: FloatArray, noise: FloatArray) -> float:
+def shape_log_ratio(
+    box: FloatArray, detected: FloatArray, noise: FloatArray, other_size: float, p_misshapen: float
+) -> float:
     """Return the log-likelihood ratio of a detected size and heading for this box, over those of any other object."""
     total = 0.0
     for k in range(3):
         v = box[VARIANCE + k] + noise[k]
-        d, other = detected[k] - box[k], (OTHER_SIZE * box[k]) ** 2 + v
+        d, other = detected[k] - box[k], (other_size * box[k]) ** 2 + v
         total += 0.5 * (math.log(other / v) - d * d / v + d * d / other)
     v = box[VARIANCE + YAW] + noise[YAW]
     e = wrapped(detected[YAW] - box[YAW], math.pi)
     total += -0.5 * (e * e / v + math.log(2.0 * math.pi * v)) + math.log(math.pi)
-    return math.log((1.0 - P_MISSHAPEN) * math.exp(min(total, 50.0)) + P_MISSHAPEN)
+    return math.log((1.0 - p_misshapen) * math.exp(min(total, 50.0)) + p_misshapen)
 
 
 @inlined
-def begin_shape(box: FloatArray, detected: FloatArray, noise: FloatArray) -> None:
+def begin_shape(box: FloatArray, detected: FloatArray, noise: FloatArray, forward_nats: float) -> None:
     """Set a box to a detection."""
     for k in range(N_DETECTED):
         box[k], box[VARIANCE + k] = detected[k], noise[k]
-    box[FORWARD] = FORWARD_STEP
+    box[FORWARD] = forward_nats
 
 
 @kernel
-def predict_shapes(box: FloatArray, n: int, gap_s: float) -> None:
+def predict_shapes(box: FloatArray, n: int, gap_s: float, turning: float, resizing: float) -> None:
     """Move sizes and headings of the first `n` boxes (N, 9) on, in place."""
     for i in range(n):
         for k in range(3):
-            box[i, VARIANCE + k] += (RESIZING * box[i, k]) ** 2 * gap_s
-        turn = TURNING_MPS05 / max(box[i, 0], 0.1)
+            box[i, VARIANCE + k] += (resizing * box[i, k]) ** 2 * gap_s
+        turn = turning / max(box[i, 0], 0.1)
         box[i, VARIANCE + YAW] = min(box[i, VARIANCE + YAW] + turn * turn * gap_s, math.pi**2 / 3.0)
 
 
 @inlined
 def update_shape(
-    box: FloatArray, detected: FloatArray, noise: FloatArray, mean: FloatArray, covariance: FloatArray
+    box: FloatArray, detected: FloatArray, noise: FloatArray, mean: FloatArray, covariance: FloatArray, rules: Rules
 ) -> None:
     """Update a box by a detection, and tell its front from its back by the way the object goes."""
     for k in range(3):
@@ -83,12 +70,13 @@ def update_shape(
     gain = box[VARIANCE + YAW] / (box[VARIANCE + YAW] + noise[YAW])
     box[YAW] += gain * wrapped(off, math.pi)
     box[VARIANCE + YAW] *= 1.0 - gain
-    box[FORWARD] = min(box[FORWARD] + (-FORWARD_STEP if around else FORWARD_STEP), MOST_FORWARD)
+    step, most = rules.forward_nats, rules.most_forward_nats
+    box[FORWARD] = min(box[FORWARD] + (-step if around else step), most)
     c, s = math.cos(box[YAW]), math.sin(box[YAW])
     along = c * mean[3] + s * mean[4]
     v = c * c * covariance[3, 3] + 2.0 * c * s * covariance[3, 4] + s * s * covariance[4, 4]
-    if along * along > SURE_OF_WAY * v and abs(along) > box[0] / 4.0:
-        box[FORWARD] = MOST_FORWARD if along > 0.0 else -MOST_FORWARD
+    if along * along > rules.sure_of_way * v and abs(along) > box[0] / 4.0:
+        box[FORWARD] = most if along > 0.0 else -most
     if box[FORWARD] < 0.0:
         box[YAW] += math.pi
         box[FORWARD] = -box[FORWARD]

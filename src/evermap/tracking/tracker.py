@@ -6,6 +6,7 @@ detection that then remains; and let those die that should have been seen and we
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -40,8 +41,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ROOM = 64
-FROM_MINUTES_TO_YEARS = (1e-8, 1e-2)
-"""Rates [1/s] of leaving a place, for objects of which nothing is known."""
 
 
 class Tracker(Shown):
@@ -80,7 +79,7 @@ class Tracker(Shown):
         self.settings = s = settings or TrackerConfig()
         self._n_classes, self._n_appearance = n_classes, n_appearance
         self._boxes, self._scored = boxes, scored
-        lifetimes = _as_priors(priors, n_classes)
+        lifetimes = _as_priors(priors, n_classes, s.leave_rates_hz)
         self._likelihood = association.Likelihood(
             confusion=s.confusion_matrix(n_classes, confusion),
             class_prior=np.full(n_classes, 1.0 / n_classes),
@@ -90,6 +89,12 @@ class Tracker(Shown):
             appearance_neutral=float(s.appearance_neutral),
             moved_reach_m=0.0,
             log_moved=-np.inf,
+            least_p_detect=float(s.least_p_detect),
+            displaced=float(s.displaced),
+            misplaced=float(s.shape.misplaced),
+            log_p_misplaced=math.log(s.shape.p_misplaced),
+            other_size=float(s.shape.other_size),
+            p_misshapen=float(s.shape.p_misshapen),
         )
         self._likelihood_at_rest = self._likelihood
         if s.moved_reach_m > 0.0:
@@ -106,7 +111,7 @@ class Tracker(Shown):
         self.working_set = WorkingSet(
             s.chunk_m, lifetimes, n_classes, n_appearance, n_box=N_FILTERED * boxes, n_level=N_LEVEL * scored
         )
-        self._views = ViewMemory()
+        self._views = ViewMemory(float(np.log(1.0 / s.p_empty)))
         self._spells = SpellLog()
         self._tables(ROOM)
 
@@ -265,7 +270,8 @@ class Tracker(Shown):
         t = self._tracklets
         self._kalman.predict(t.mean, t.covariance, self._n, gap, self.settings.motion_density)
         if self._boxes:
-            self._shape.predict_shapes(t.box, self._n, gap)
+            shape = self.settings.shape
+            self._shape.predict_shapes(t.box, self._n, gap, float(shape.turning), float(shape.resizing))
         self._death_odds = float(np.expm1(min(self.settings.vanish_rate_hz * gap, 600.0)))
 
     def _associate(self, frame: Frame, view: View | None, events: list[Event]) -> IntArray:
@@ -351,7 +357,7 @@ class Tracker(Shown):
         """Copy objects of the working set behind the active tracklets, as they were."""
         t, w = self._tracklets, self.working_set
         into = slice(self._n, self._n + len(rows))
-        gain = np.exp(-np.clip(log_ratio, -60.0, 60.0)) / np.maximum(p_detect, self._association.NEVER_SURE)
+        gain = np.exp(-np.clip(log_ratio, -60.0, 60.0)) / np.maximum(p_detect, self.settings.least_p_detect)
         for name in KEPT:
             getattr(t, name)[into] = getattr(w.stored, name)[rows]
         t.class_p[into] = w.class_p(rows)
@@ -434,13 +440,21 @@ def _rules(s: TrackerConfig, n_classes: int, *, boxes: bool) -> Rules:
         score_memory=float(s.score_memory),
         seen_nats=float(s.seen_nats),
         missed_nats=float(s.missed_nats),
+        most_counted=int(s.most_counted),
+        fast_sigmas=float(s.fast_sigmas),
+        displaced=float(s.displaced),
+        forward_nats=float(s.shape.forward_nats),
+        most_forward_nats=float(s.shape.most_forward_nats),
+        sure_of_way=float(s.shape.sure_of_way),
         log_odds_believed=float(np.log(s.p_believed / (1.0 - s.p_believed))),
     )
 
 
-def _as_priors(priors: LifetimePrior | Sequence[LifetimePrior] | None, n_classes: int) -> tuple[LifetimePrior, ...]:
+def _as_priors(
+    priors: LifetimePrior | Sequence[LifetimePrior] | None, n_classes: int, rates_hz: tuple[float, float]
+) -> tuple[LifetimePrior, ...]:
     if priors is None:
-        return (GeneralPurpose(*FROM_MINUTES_TO_YEARS),)
+        return (GeneralPurpose(*rates_hz),)
     several = tuple(priors) if isinstance(priors, Sequence) else (priors,)
     if len(several) not in {1, n_classes}:
         raise ConfigError(f"{len(several)} lifetime priors for {n_classes} classes", field="priors")

@@ -65,6 +65,12 @@ class Rules(NamedTuple):
     score_memory: float
     seen_nats: float
     missed_nats: float
+    most_counted: int
+    fast_sigmas: float
+    displaced: float
+    forward_nats: float
+    most_forward_nats: float
+    sure_of_way: float
 
 
 class Tracklets(NamedTuple):

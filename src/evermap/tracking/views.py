@@ -15,9 +15,6 @@ from evermap.types import FloatArray
 if TYPE_CHECKING:
     from evermap.sensing.visibility import DetectionModel
 
-SURE_NATS = float(np.log(1e3))
-"""Misses that make a place empty: together they happen to one object in a thousand."""
-
 
 @dataclass(frozen=True, slots=True)
 class View:
@@ -81,15 +78,18 @@ class ViewMemory:
     """Views of the past: every one of the last frames, and of those before a few from time to time or place to place.
 
     Args:
+        sure_nats: log odds of misses that make a place empty.
         n_recent: frames of which all views are kept.
         n_burst: of older views so many in a row are kept, enough together to tell that a place was empty ...
         every_s: ... whenever this time has passed ...
         every_m: ... or the sensor has moved so far.
     """
 
-    def __init__(self, n_recent: int = 32, n_burst: int = 4, every_s: float = 60.0, every_m: float = 5.0) -> None:
+    def __init__(
+        self, sure_nats: float, n_recent: int = 32, n_burst: int = 4, every_s: float = 60.0, every_m: float = 5.0
+    ) -> None:
         self._recent: deque[tuple[float, View]] = deque()
-        self._n_recent = n_recent
+        self._n_recent, self._sure_nats = n_recent, sure_nats
         self._n_burst, self._every_s, self._every_m = n_burst, every_s, every_m
         self._n_in_burst = n_burst
         self._kept: dict[tuple[int, int], list[tuple[float, View]]] = {}
@@ -130,7 +130,7 @@ class ViewMemory:
                 continue
             p = float(view.probability(position_m[None])[0])
             nats -= np.log(max(1.0 - p, 1e-12))
-            if nats >= SURE_NATS:
+            if nats >= self._sure_nats:
                 return stamp
         return -np.inf
 

@@ -11,20 +11,19 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
+from evermap.config import MetreConfig
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap, Metres
 from evermap.maps.sessions.gaussian import (
     AS_GOOD,
-    CONTRADICTS,
-    DRIFTED,
-    P_DRIFTED,
-    WALK,
     agreed,
     log_ratio,
     settled,
     settled_by,
 )
 from evermap.types import FloatArray, landmark_id_of
+
+METRE = MetreConfig()
 
 
 def _by_all_sessions(ratio: list[float], shown: list[float], sigma: list[float]) -> FloatArray:
@@ -37,7 +36,7 @@ def _by_all_sessions(ratio: list[float], shown: list[float], sigma: list[float])
     weight = np.zeros(len(sigma))
     weight[0] = 1.0
     for k in range(1, len(sigma)):
-        before, after = 1.0 / (1.0 / information + WALK**2), 1.0 / (sigma[k] ** 2 + shown[k] ** 2)
+        before, after = 1.0 / (1.0 / information + METRE.walk**2), 1.0 / (sigma[k] ** 2 + shown[k] ** 2)
         weight *= before / (before + after)
         weight[k] = after / (before + after)
         information = before + after
@@ -68,9 +67,9 @@ def test_the_metre_of_a_map_is_the_weighted_mean_of_those_of_its_sessions(
         # the session says by its priors that its metre is `own` short of the true one
         found = settled(metre - true[k], shown[k] ** 2, (own[k], sigma[k]), variance, information)
         innovation = metre - true[k] - own[k]
-        total = sigma[k] ** 2 + shown[k] ** 2 + 1.0 / information + WALK**2
+        total = sigma[k] ** 2 + shown[k] ** 2 + 1.0 / information + METRE.walk**2
         assert found.off == pytest.approx(abs(innovation) / np.sqrt(total))
-        assume(found.off <= CONTRADICTS)
+        assume(found.off <= METRE.contradicts)
         weight = _by_all_sessions(true[: k + 1], shown[: k + 1], sigma[: k + 1])
         metre += np.log(found.map_factor)
         ours = np.array([true[0], *(true[j] + own[j] for j in range(1, k + 1))])
@@ -96,7 +95,7 @@ def test_sessions_of_one_robot_do_not_make_the_metre_surer(sigma: float, session
         assert 0.0 < -np.log(found.map_factor) / (2.0 * sigma) <= gain + 1e-12
         gain = -np.log(found.map_factor) / (2.0 * sigma)
         variance, information = found.variance, found.information
-    assert gain >= WALK / (sigma + WALK) * 0.5
+    assert gain >= METRE.walk / (sigma + METRE.walk) * 0.5
 
 
 @pytest.mark.parametrize("liar", [0, 2])
@@ -112,8 +111,8 @@ def test_a_robot_whose_metre_contradicts_the_others_does_not_make_the_map_longer
         found = settled(metre - own, 1e-6, (0.0, sigma), variance, information)
         metre += np.log(found.map_factor)
         variance, information = found.variance, found.information
-        contradicted.append(turn % 5 if found.off > CONTRADICTS else -1)
-        if found.off > CONTRADICTS:
+        contradicted.append(turn % 5 if found.off > METRE.contradicts else -1)
+        if found.off > METRE.contradicts:
             assert np.log(found.session_factor) == pytest.approx(metre - own)
     assert abs(metre) < sigma
     assert set(contradicted[10:]) == {-1, liar}
@@ -125,12 +124,12 @@ def _by_all_assignments(log_metre: FloatArray, sigma: FloatArray) -> tuple[float
     for share in AS_GOOD:
         for has in product([False, True], repeat=len(sigma)):
             which = np.array(has)
-            variance = np.where(which, (DRIFTED * sigma) ** 2, (share * sigma) ** 2 + WALK**2)
+            variance = np.where(which, (METRE.drifted * sigma) ** 2, (share * sigma) ** 2 + METRE.walk**2)
             weight = 1.0 / variance
             middle = float(weight @ log_metre / weight.sum())
             chi2 = float(weight @ (log_metre - middle) ** 2)
             likelihood = np.exp(-0.5 * chi2) / np.sqrt(np.prod(variance) * weight.sum())
-            mass.append(likelihood * np.prod(np.where(which, P_DRIFTED, 1.0 - P_DRIFTED)))
+            mass.append(likelihood * np.prod(np.where(which, METRE.p_drifted, 1.0 - METRE.p_drifted)))
             mean.append(middle)
             drifted.append(which)
     share_of = np.array(mass) / np.sum(mass)
@@ -231,12 +230,12 @@ def test_a_session_that_knows_the_metre_settles_it(sigma: float) -> None:
     known = 1e-4
     found = settled(1.5 * sigma, 1e-10, (0.0, known), variance, information)
     # weight of all that was known before: a walk's worth of information at the most
-    rest = known**2 / WALK**2
+    rest = known**2 / METRE.walk**2
     assert found.map_factor == pytest.approx(np.exp(-1.5 * sigma), rel=1.5 * sigma * 2.0 * rest)
     assert np.sqrt(found.variance) <= known + rest * sigma + 1e-5
     # and the next that knows little does not spoil it by more than the walk
     after = settled(0.05, 1e-10, (0.0, sigma), found.variance, found.information)
-    assert abs(np.log(after.map_factor)) <= 0.05 * 2.0 * (known**2 + WALK**2) / sigma**2
+    assert abs(np.log(after.map_factor)) <= 0.05 * 2.0 * (known**2 + METRE.walk**2) / sigma**2
     assert np.sqrt(after.variance) < 0.3 * sigma
 
 

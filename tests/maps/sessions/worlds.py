@@ -13,8 +13,6 @@ from scipy.spatial.transform import Rotation
 from evermap.geometry.group import PLANE, SPACE
 from evermap.maps.sessions.overlay import (
     ELSEWHERE,
-    FREE_M,
-    FREE_RAD,
     USUAL,
     Known,
     Overlay,
@@ -130,7 +128,7 @@ class Densely:
         def moved(step: FloatArray) -> FloatArray:
             return np.asarray((middle + step[:dim] + (self.at - middle) @ _turn(step[dim:]).T).ravel())
 
-        free = np.array([FREE_M] * dim + [FREE_RAD] * (3 if dim == 3 else 1))
+        free = np.array([USUAL.free_m] * dim + [USUAL.free_rad] * (3 if dim == 3 else 1))
         slope = np.column_stack([(moved(h) - moved(-h)) / 2e-6 for h in 1e-6 * np.eye(len(free))])
         self.spread = turn @ sighted.covariance_m2 @ turn.T + slope @ np.diag(free**2) @ slope.T
         both = np.vstack([self.at, known.position_m])

@@ -13,44 +13,26 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
+from evermap.config import BoxesConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.box_visit import HEADING_RAD, SeenBoxes
+from evermap.maps.sessions.box_visit import SeenBoxes
 from evermap.slam.association.constellation import CERTAIN_NATS, LocalMap, agreed_pairs
 from evermap.slam.association.identify import ALL_TRIED
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.tracking.frame import heading_of
 from evermap.types import BoolArray, FloatArray, IntArray
 
-DRIFT_M = 0.2
-"""By which a box that nobody moved seems to be elsewhere, each axis: another side of it is seen."""
-SIZE_M, SIZES_M = (0.4, 0.15, 0.15), (0.6, 0.2, 0.25)
-"""Standard deviations of the size of one box from session to session, and of boxes of a class."""
 GATE = 18.4
 """Squared distance of two dimensions that one of 10,000 exceeds."""
-LEAST_DENSITY = 0.02
-"""Boxes a square metre that are expected where things stand."""
-SHARED_PAIRS, FOUND_PAIRS, ENOUGH_PAIRS = 3, 4, 8
-"""Boxes that must agree with the odometry's frame, and with a place that was searched for; so many are not searched
-for again.
-"""
-SHARED_NATS = 4.0
-"""Evidence that it takes for the odometry's frame, which is asked once."""
-LEAD_NATS = 12.0
-"""By how much the constellation of a place must beat all others: rows of parked cars resemble each other."""
 WINDOWS = 12, 6
 """Boxes, one after the other on the way, that are searched for in the map together; fewer where it is known about."""
 TESTED_M2 = 157.0
 """Area that one trial of the search covers: what agrees by chance in a large map is that much more probable."""
 FACTORS = 1.0, 0.99, 1.01, 0.98, 1.02
 """On the lengths of a session, that are tried where its metre is its odometry's."""
-TOLD = 2.0
-"""Standard deviations by which such a factor must differ from 1."""
-PROBABLE = 0.9
-NEAR_M, LARGEST_TURN = 30.0, 0.3
-"""How far boxes may be off behind a stretch in which nothing was seen [m, rad]."""
 
 
 class MapBoxes(NamedTuple):
@@ -62,6 +44,7 @@ class MapBoxes(NamedTuple):
         position_m, covariance_m2: (M, 3), (M, 3, 3).
         heading_rad, size_m: (M,), nan where there is none, and (M, 3).
         p: probability that it stands there when the session begins.
+        settings: which boxes are the same.
     """
 
     place: IntArray
@@ -72,9 +55,10 @@ class MapBoxes(NamedTuple):
     heading_rad: FloatArray
     size_m: FloatArray
     p: FloatArray
+    settings: BoxesConfig
 
     @classmethod
-    def of(cls, living: LivingMap, p_site: FloatArray) -> MapBoxes:
+    def of(cls, living: LivingMap, p_site: FloatArray, settings: BoxesConfig) -> MapBoxes:
         """Return those of a map, by beliefs (S,) in its sites."""
         places, members = living.places, living.members
         row = np.flatnonzero(np.isin(places.landmark_id, living.boxes.landmark_id))
@@ -87,7 +71,7 @@ class MapBoxes(NamedTuple):
             row, name, members.class_id[member], places.position_m[row],
             blocks(living.covariance_m2, 3)[row].reshape(-1, 3, 3),
             np.where(known[:, 0], heading_of(pose), np.nan), living.boxes.of(name),
-            np.where(members.deleted[member], PROBABLE, p),
+            np.where(members.deleted[member], settings.p_stands, p), settings,
         )  # fmt: skip
 
 
@@ -105,12 +89,13 @@ def placed(seen: SeenBoxes, known: MapBoxes, *, metre: bool) -> tuple[FloatArray
     every, sized = np.ones(len(known.place), dtype=np.bool_), np.flatnonzero(np.isfinite(seen.size_m[:, 0]))
     windows = _windows(sized, seen, WINDOWS[0])
     best = max((_agreed(seen, known, some, every, np.zeros(3)) for some in windows), key=len, default=[])
-    if len(best) < SHARED_PAIRS:
+    settings = known.settings
+    if len(best) < settings.shared_pairs:
         best = _searched(seen, known, windows, (1.0,) if metre else FACTORS)
-        if len(best) < FOUND_PAIRS:
+        if len(best) < settings.found_pairs:
             return None
     mine, theirs = (np.array(part) for part in zip(*best, strict=True))
-    factor = 1.0 if metre else _factor(seen.position_m[mine, :2], known.position_m[theirs, :2])
+    factor = 1.0 if metre else _factor(seen.position_m[mine, :2], known.position_m[theirs, :2], settings)
     own = np.column_stack([factor * seen.position_m[mine, :2], seen.position_m[mine, 2]])
     return in_space(rigid(own[:, :2], known.position_m[theirs, :2]), own, known.position_m[theirs]), factor
 
@@ -124,19 +109,19 @@ def _searched(
         scaled = replace(seen, position_m=factor * seen.position_m)
         for some in windows:
             best = max(best, _agreed(scaled, known, some, every), key=len)
-            if len(best) >= ENOUGH_PAIRS:
+            if len(best) >= known.settings.enough_pairs:
                 return best
-        if len(best) >= FOUND_PAIRS:
+        if len(best) >= known.settings.found_pairs:
             return best
     return best
 
 
-def _factor(own_m: FloatArray, there_m: FloatArray) -> float:
+def _factor(own_m: FloatArray, there_m: FloatArray, settings: BoxesConfig) -> float:
     """How much longer distances between points (K, 2) are in the map; 1 where they hardly tell."""
     own, there = (np.linalg.norm(at[:, None] - at[None], axis=2) for at in (own_m, there_m))
     factor = float((own * there).sum() / max(float((own**2).sum()), 1e-9))
     spread_m = float(np.linalg.norm(own_m - own_m.mean(axis=0)))
-    return factor if abs(factor - 1.0) * spread_m > TOLD * math.sqrt(2.0) * DRIFT_M else 1.0
+    return factor if abs(factor - 1.0) * spread_m > settings.metre_sigmas * math.sqrt(2.0) * settings.drift_m else 1.0
 
 
 def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArray, IntArray]:
@@ -152,13 +137,13 @@ def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArra
     for some in [window for size in WINDOWS for window in _windows(left, seen, size)]:
         free = ~np.isin(known.place, place)
         away = np.linalg.norm(known.position_m[:, None, :2] - seen.position_m[some, :2], axis=2).min(axis=1)
-        pairs = _agreed(seen, known, some, free & (away < NEAR_M))
-        if len(pairs) < FOUND_PAIRS:
+        pairs = _agreed(seen, known, some, free & (away < known.settings.near_m))
+        if len(pairs) < known.settings.found_pairs:
             continue
         mine, theirs = (np.array(part) for part in zip(*pairs, strict=True))
         motion = rigid(seen.position_m[mine, :2], known.position_m[theirs, :2])
         off = np.linalg.norm(se2.transform(motion, seen.position_m[mine, :2]) - seen.position_m[mine, :2], axis=1)
-        if abs(motion[2]) < LARGEST_TURN and off.max() < NEAR_M:
+        if abs(motion[2]) < known.settings.largest_turn_rad and off.max() < known.settings.near_m:
             taken = set(found.values())
             found |= {one: other for one, other in pairs if one not in found and other not in taken}
     return np.array(list(found), dtype=np.int64), np.array(list(found.values()), dtype=np.int64)
@@ -177,33 +162,35 @@ def _agreed(
 
     Of a covariance only what neighbours do not share matters: those next to each other drift alike.
     """
-    row = np.flatnonzero(among)
+    row, settings = np.flatnonzero(among), known.settings
     if len(row) < 2 or len(some) < 2:
         return []
     at, area_m2 = known.position_m[row, :2], float(np.prod(np.ptp(known.position_m[row, :2], axis=0) + 10.0))
-    source = LocalMap(seen.position_m[some, :2], block_diag(*_floor(seen.covariance_m2[some])))
+    source = LocalMap(seen.position_m[some, :2], block_diag(*_floor(seen.covariance_m2[some], settings.drift_m)))
     motions = None if motion is None else [motion]
     if motion is None and len(row) > ALL_TRIED:
         sigma_m = math.sqrt(float(np.trace(source.covariance)) / len(some))
-        motions = list(PlaceIndex(at, _floor(known.covariance_m2[row])).motions(source.place, sigma_m))
+        motions = list(
+            PlaceIndex(at, _floor(known.covariance_m2[row], settings.drift_m)).motions(source.place, sigma_m)
+        )
     found = agreed_pairs(
         source,
-        LocalMap(at, block_diag(*_floor(known.covariance_m2[row]))),
+        LocalMap(at, block_diag(*_floor(known.covariance_m2[row], settings.drift_m))),
         _alike(seen, known)[np.ix_(some, row)],
-        density=max(len(row) / area_m2, LEAST_DENSITY),
-        probability=PROBABLE,
+        density=max(len(row) / area_m2, settings.density),
+        probability=settings.p_stands,
         motions=motions,
-        least_nats=CERTAIN_NATS + max(math.log(area_m2 / TESTED_M2), 0.0) if motion is None else SHARED_NATS,
-        lead_nats=LEAD_NATS,
+        least_nats=CERTAIN_NATS + max(math.log(area_m2 / TESTED_M2), 0.0) if motion is None else settings.shared_nats,
+        lead_nats=settings.lead_nats,
     )
     pairs = [(int(some[k]), int(row[m])) for k, m in found]
     return pairs if not pairs or _headings_agree(seen, known, pairs) else []
 
 
-def _floor(covariance_m2: FloatArray) -> FloatArray:
+def _floor(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
     """(K, 2, 2) of positions on the floor."""
-    own = np.minimum(np.diagonal(covariance_m2[:, :2, :2], axis1=1, axis2=2), DRIFT_M**2)
-    return np.asarray((own + DRIFT_M**2)[:, :, None] * np.eye(2))
+    own = np.minimum(np.diagonal(covariance_m2[:, :2, :2], axis1=1, axis2=2), drift_m**2)
+    return np.asarray((own + drift_m**2)[:, :, None] * np.eye(2))
 
 
 def in_space(motion: FloatArray, own_m: FloatArray, there_m: FloatArray) -> FloatArray:
@@ -215,7 +202,7 @@ def in_space(motion: FloatArray, own_m: FloatArray, there_m: FloatArray) -> Floa
 
 def _alike(seen: SeenBoxes, known: MapBoxes) -> BoolArray:
     """(K, M) boxes that may be one by their class, and by their size about."""
-    off = (seen.size_m[:, None] - known.size_m[None]) / np.array(SIZES_M)
+    off = (seen.size_m[:, None] - known.size_m[None]) / np.array(known.settings.sigma_class_m)
     return np.asarray((seen.class_id[:, None] == known.class_id) & ~((off**2).sum(axis=2) > GATE))
 
 
@@ -225,7 +212,7 @@ def _headings_agree(seen: SeenBoxes, known: MapBoxes, pairs: list[tuple[int, int
     turn = rigid(seen.position_m[mine, :2], known.position_m[theirs, :2])[2]
     off = half_turn(known.heading_rad[theirs] - seen.heading_rad[mine] - turn)
     off = off[np.isfinite(off)]
-    return not len(off) or float(np.median(np.abs(off))) < 3.0 * HEADING_RAD
+    return not len(off) or float(np.median(np.abs(off))) < 3.0 * known.settings.heading_rad
 
 
 def half_turn(angle_rad: FloatArray) -> FloatArray:

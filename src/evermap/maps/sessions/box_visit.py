@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from evermap.config import LivingConfig, TrackConfig
+from evermap.config import BoxesConfig, LivingConfig, TrackConfig
 from evermap.geometry import se3
 from evermap.maps.living import Boxes, LivingMap
 from evermap.maps.sessions.extend import Extended, Found
@@ -20,18 +20,6 @@ from evermap.slam.space.moving import TrafficIntake, boxes_of, conclude_in_traff
 from evermap.slam.space.solve import SpatialSolved
 from evermap.tracking.frame import heading_of
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SlamResult, SpatialRecording
-
-SEEN = 0.5
-"""Inlier probability from which on a detection shows a box."""
-HEADING_RAD, ROUND = 0.15, 1.3
-"""Deviation of headings; boxes less long than this times their width have none."""
-GLIMPSE_M, GLIMPSE_SHARE = 1.0, 0.01
-"""A detection that no stay has is one of a box that stands so near, and farther off by this share of the range."""
-FEWEST_GLIMPSES = 2
-TIED_M = 80.0
-"""Farther from all boxes that tie a session to the map, it may be beside where it is said to be: misses say nothing."""
-BEHIND_M, COVERED = 1.5, 0.4
-"""What is this much farther than another box, and within this share of its length of its middle, is hidden by it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +51,14 @@ class SeenBoxes:
     p_stay: FloatArray
 
 
-def seen_boxes(taken: TrafficIntake, solved: SpatialSolved) -> SeenBoxes:
+def seen_boxes(taken: TrafficIntake, solved: SpatialSolved, settings: BoxesConfig) -> SeenBoxes:
     """Return the boxes of a session that stood, where its solution has them."""
     optimum, stands = solved.optimum, taken.traffic.standing
     problem, estimate, count = optimum.smoother.problem, optimum.estimate, len(optimum.estimate.place)
     row = taken.used[taken.intake.used]
     given, stay_of = taken.recording.detections, np.full(len(taken.recording.detections), UNKNOWN)
     stay_of[boxes_of(taken.recording)] = stands.stay
-    good = np.flatnonzero((optimum.now.weight > SEEN) & (stay_of[row] != UNKNOWN))
+    good = np.flatnonzero((optimum.now.weight > problem.settings.inlier) & (stay_of[row] != UNKNOWN))
     place, stay, stamp_s = problem.place[good], stay_of[row[good]], problem.stamp_s[problem.pose_row[good]]
     found, first = np.unique(place, return_index=True)  # detections are in order of time
     last = len(place) - 1 - np.unique(place[::-1], return_index=True)[1]
@@ -83,7 +71,7 @@ def seen_boxes(taken: TrafficIntake, solved: SpatialSolved) -> SeenBoxes:
     for one in found.tolist():
         mine = np.flatnonzero(place == one)
         size[one] = np.nanmedian(given.size_m[row[good[mine]]], axis=0)
-        heading[one] = _heading(ahead[mine]) if size[one, 0] > ROUND * size[one, 1] else np.nan
+        heading[one] = _heading(ahead[mine]) if size[one, 0] > settings.round * size[one, 1] else np.nan
     spread = optimum.smoother.spread(optimum.now)
     at = spread.own_first[len(problem.stamp_s) + found]
     own = spread.own[at[:, None] + np.arange(9)].reshape(-1, 3, 3)
@@ -174,7 +162,7 @@ class BoxVisit(SpatialVisit):
         tilt_rad = self.intake.problem.settings.traffic.tilt_rad
         spread = np.where(
             (mine & np.isfinite(found.rotation[:, 0]))[:, None, None],
-            np.diag([tilt_rad**2, tilt_rad**2, HEADING_RAD**2]),
+            np.diag([tilt_rad**2, tilt_rad**2, config.boxes.heading_rad**2]),
             found.rotation_covariance,
         )
         number = np.where(mine, np.arange(len(mine)), UNKNOWN)
@@ -184,14 +172,15 @@ class BoxVisit(SpatialVisit):
         """Return what was looked at: a detection that is of no stay may show a box of the map all the same, and what
         another box hides was not looked at.
         """
+        settings = config.boxes
         watch = self.witnessed.unlooked(super().watched(entry, config), entry.landmark_id, entry.place)
         recording, listed = self.taken.recording, watch.listed
         frame = np.searchsorted(recording.frames.stamp_s, watch.stamp_s - 1e-3)
         rows, at = self._detected()
         of = recording.detections.frame[rows]
         looks = frame[listed.pose] * len(entry.living.places) + listed.landmark
-        glimpsed = self._glimpsed(entry, looks, rows, at) & ~listed.hit
-        often = np.bincount(listed.landmark[glimpsed], minlength=len(entry.living.places)) >= FEWEST_GLIMPSES
+        glimpsed = self._glimpsed(entry, looks, rows, at, settings) & ~listed.hit
+        often = np.bincount(listed.landmark[glimpsed], minlength=len(entry.living.places)) >= settings.fewest_glimpses
         hit = listed.hit | (glimpsed & often[listed.landmark])
         shown = hit | ~glimpsed  # one alone may be a wrong box
         place = entry.living.places.position_m[:, :2]
@@ -203,11 +192,12 @@ class BoxVisit(SpatialVisit):
             mine = np.arange(begin[view], begin[view + 1])
             mine, other = mine[~hit[mine]], order[first[k] : first[k + 1]]
             if len(mine) and len(other):
-                eye = watch.eye[view, :2]
-                shown[mine] &= ~_hidden_by(place[listed.landmark[mine]] - eye, at[other, :2] - eye, length[other])
+                eye, far = watch.eye[view, :2], settings.behind_m
+                box, half_m = at[other, :2] - eye, settings.covered * length[other]
+                shown[mine] &= ~_hidden_by(place[listed.landmark[mine]] - eye, box, half_m, far)
         if len(self.tied_m):
             away = np.linalg.norm(watch.eye[:, None, :2] - self.tied_m, axis=2).min(axis=1)
-            shown &= hit | (away <= TIED_M)[listed.pose]
+            shown &= hit | (away <= settings.tied_m)[listed.pose]
         return watch._replace(listed=listed._replace(hit=hit).rows(shown))
 
     def _detected(self) -> tuple[IntArray, FloatArray]:
@@ -223,12 +213,14 @@ class BoxVisit(SpatialVisit):
         )
         return rows, se3.transform(eye, seen)
 
-    def _glimpsed(self, entry: Extended, looks: IntArray, rows: IntArray, at: FloatArray) -> BoolArray:
+    def _glimpsed(
+        self, entry: Extended, looks: IntArray, rows: IntArray, at: FloatArray, settings: BoxesConfig
+    ) -> BoolArray:
         """Looks, by frame and place, at boxes of the map that a detection shows which no stay has."""
         living, recording = entry.living, self.taken.recording
         box = np.flatnonzero(np.isin(living.places.landmark_id, living.boxes.landmark_id))
         stands = self.taken.traffic.standing
-        spare = np.isin(rows, boxes_of(recording)[(stands.stay == UNKNOWN) & ~(stands.p_static < SEEN)])
+        spare = np.isin(rows, boxes_of(recording)[(stands.stay == UNKNOWN) & ~(stands.p_static < 0.5)])
         rows, at = rows[spare], at[spare]
         if not len(box) or not len(rows):
             return np.zeros(len(looks), dtype=np.bool_)
@@ -236,16 +228,16 @@ class BoxVisit(SpatialVisit):
         away, nearest = np.asarray(found[0]), np.asarray(found[1], dtype=np.int64)
         member = np.searchsorted(living.members.landmark_id, living.places.landmark_id[box[nearest]])
         range_m = np.linalg.norm(recording.detections.position_sensor_m[rows], axis=1)
-        here = away < GLIMPSE_M + GLIMPSE_SHARE * range_m
+        here = away < settings.glimpse_m + settings.glimpse_share * range_m
         here &= living.members.class_id[member] == recording.detections.class_id[rows]
         return np.isin(looks, recording.detections.frame[rows[here]] * len(living.places) + box[nearest[here]])
 
 
-def _hidden_by(place: FloatArray, box: FloatArray, length_m: FloatArray) -> BoolArray:
+def _hidden_by(place: FloatArray, box: FloatArray, half_m: FloatArray, behind_m: float) -> BoolArray:
     """(P,) whether places (P, 2) are behind any of some boxes (B, 2), as seen from the origin."""
     range_m, near_m = np.linalg.norm(place, axis=1), np.maximum(np.linalg.norm(box, axis=1), 0.1)
     along = place / np.maximum(range_m, 0.1)[:, None]
     across = np.abs(along[:, :1] * box[:, 1] - along[:, 1:] * box[:, 0])
     ahead = along @ box.T
-    hides = (across < COVERED * length_m) & (ahead > 0.0) & (near_m < range_m[:, None] - BEHIND_M)
+    hides = (across < half_m) & (ahead > 0.0) & (near_m < range_m[:, None] - behind_m)
     return np.asarray(hides.any(axis=1))

@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from evermap.config import Config
+from evermap.config import BoxesConfig, Config
 from evermap.errors import NumericalError
 from evermap.geometry import se3
 from evermap.geometry.chunked import blocks
@@ -26,19 +26,14 @@ from evermap.geometry.rigid import consensus
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import aged
 from evermap.maps.sessions.box_search import (
-    DRIFT_M,
     GATE,
-    LEAST_DENSITY,
-    SHARED_PAIRS,
-    SIZE_M,
-    SIZES_M,
     MapBoxes,
     half_turn,
     in_space,
     placed,
     regained,
 )
-from evermap.maps.sessions.box_visit import HEADING_RAD, TIED_M, BoxVisit, SeenBoxes, seen_boxes
+from evermap.maps.sessions.box_visit import BoxVisit, SeenBoxes, seen_boxes
 from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, around
 from evermap.maps.sessions.spatial import SpatialVisit, localised_in_space
 from evermap.maps.sessions.witnessed import Witnessed
@@ -49,36 +44,15 @@ from evermap.slam.space.result import identities_of, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved
 from evermap.types import BoolArray, FloatArray, IntArray, Progress, SpatialRecording, landmark_id_of, rows_of
 
-HEIGHT_M = 0.5
-"""The same of its height over a street that is not flat."""
-SIZE_FLOOR = -8.0
-"""Nats that a size may say against two boxes being one."""
-SAME_SHARE = 0.6
-"""Boxes that stand closer than this share of their widths are one."""
-AT_ONCE_S = 5.0
-"""A box that left, and stands there again so shortly after, had not left."""
 ROUNDS = 30
-DRIFT_SHARE, MOST_DRIFT_M = 0.02, 0.5
-"""How far the odometry may be off from one box to the next: a share of the distance, and at most."""
-MISFIT, STRETCH = 3.0, 8
-"""Mean square of deviations of so many boxes from the map, by what is expected, from which the odometry is believed
-less.
-"""
+STRETCH = 8
+"""Boxes, one after the other, whose deviations from the map are averaged."""
 WANDERS = (0.003, 0.0003), (0.01, 0.001), (0.03, 0.003)
 """How much less, one after the other [m/sqrt(s), rad/sqrt(s)]."""
 TILTED = 0.9
 """Cosine of the tilt up to which the frame of an odometry is upright."""
-AMONG_M = 15.0
-"""Boxes of the map this near show that a session was here before."""
-LEAST_SHARE, PERHAPS = 0.3, 0.2
-"""Of the boxes that stand among those of the map, how many must be boxes of it; what probably left does not count."""
-NAMED_M = 0.5
-"""A landmark with an identity stands where the map has it if it is this near."""
-LEAST_P, LEAST_GONE = 1e-6, 0.02
-TAILS = (0.7, 1.0), (0.3, 3.0)
-"""Shares of deviations, and how much wider they are than expected."""
-RETURNS = 0.5
-"""Probability beforehand that what is seen to come to where a box of the map had stood is that box."""
+LEAST_P = 1e-6
+"""No box is believed to stand less, or its logarithm would be infinite."""
 
 
 def localised(
@@ -122,11 +96,12 @@ def visited_in_traffic(
     Raises:
         NumericalError: no finite optimum.
     """
-    solved, known = _by_itself(taken, progress), MapBoxes.of(living, p_site)
+    settings = config.living.boxes
+    solved, known = _by_itself(taken, progress, settings), MapBoxes.of(living, p_site, settings)
     found = _placed(taken, solved, living, known) if len(living.places) else None
     if found is not None and found[1] != 1.0:
         taken = rescaled(taken, found[1], config.slam.space)
-        solved = _by_itself(taken, None)
+        solved = _by_itself(taken, None, settings)
         found = _placed(taken, solved, living, known)
     if found is None:
         return _visit(taken, solved, _Matched.nothing(solved), living, config), None
@@ -139,7 +114,8 @@ def visited_in_traffic(
     visit = _visit(taken, held, matched, living, config)
     order = np.argsort(visit.landmark_id, kind="stable")
     laid = Laid(
-        visit.landmark_id[order], se3.identity(), matched.place[order], matched.probability[order], DRIFT_M,
+        visit.landmark_id[order], se3.identity(), matched.place[order], matched.probability[order],
+        settings.drift_m,
         np.zeros(len(order), dtype=np.bool_),
     )  # fmt: skip
     return visit, laid
@@ -162,19 +138,20 @@ def _agrees(taken: TrafficIntake, held: SpatialSolved, matched: _Matched, living
     """Whether enough of what stands is where the map has it: of the boxes that stand among those of the map a share."""
     if len(_named(taken, held, living)[0]) > 1:
         return True
-    seen = seen_boxes(taken, held)
+    settings = known.settings
+    seen = seen_boxes(taken, held, settings)
     there = matched.place[seen.place] >= 0
-    off = seen.position_m[:, None, :2] - known.position_m[known.p >= PERHAPS, :2]
+    off = seen.position_m[:, None, :2] - known.position_m[known.p >= settings.perhaps, :2]
     away = np.linalg.norm(off, axis=2).min(axis=1, initial=np.inf)
-    among = np.count_nonzero(there | (away <= AMONG_M))
-    return bool(np.count_nonzero(there) >= max(SHARED_PAIRS, LEAST_SHARE * among))
+    among = np.count_nonzero(there | (away <= settings.among_m))
+    return bool(np.count_nonzero(there) >= max(settings.shared_pairs, settings.least_share * among))
 
 
-def _by_itself(taken: TrafficIntake, progress: Progress | None) -> SpatialSolved:
+def _by_itself(taken: TrafficIntake, progress: Progress | None, settings: BoxesConfig) -> SpatialSolved:
     """The session alone, in the frame of its odometry, with boxes put together that are one."""
     solved = solve_in_traffic(taken, progress)
     solved = replace(solved, optimum=_moved(solved.optimum, _frame_of(taken.recording)))
-    return _together(taken, solved, np.arange(len(solved.identity)))
+    return _together(taken, solved, np.arange(len(solved.identity)), settings)
 
 
 def _frame_of(recording: SpatialRecording) -> FloatArray:
@@ -194,13 +171,13 @@ def _moved(optimum: SpatialOptimum, motion: FloatArray) -> SpatialOptimum:
     return converged(optimum.smoother.problem, estimate, optimum.noise, heavy_rounds=0)
 
 
-def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray) -> SpatialSolved:
+def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, settings: BoxesConfig) -> SpatialSolved:
     """The session with places put together that are one: those of one `label` (P,), and boxes that stand in each
     other.
     """
-    seen, count = seen_boxes(taken, solved), len(label)
+    seen, count = seen_boxes(taken, solved, settings), len(label)
     first = np.unique(label, return_index=True)[1][np.unique(label, return_inverse=True)[1].ravel()]
-    i, j = _same(seen)
+    i, j = _same(seen, settings)
     one, other = np.concatenate([np.arange(count), seen.place[i]]), np.concatenate([first, seen.place[j]])
     part = connected_components(csr_array((np.ones(len(one)), (one, other)), shape=(count, count)))[1]
     if part.max(initial=-1) + 1 == count:
@@ -228,13 +205,13 @@ def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray) -> S
     return replace(solved, optimum=optimum, identity=solved.identity[head], number=solved.number[head])
 
 
-def _same(seen: SeenBoxes) -> tuple[IntArray, IntArray]:
+def _same(seen: SeenBoxes, settings: BoxesConfig) -> tuple[IntArray, IntArray]:
     """Pairs of boxes that are one: of a class, standing in each other, and neither came when the other had left."""
     away = np.linalg.norm(seen.position_m[:, None, :2] - seen.position_m[None, :, :2], axis=2)
     width = np.nan_to_num(seen.size_m[:, 1], nan=0.5)
-    near = (away < SAME_SHARE * 0.5 * (width[:, None] + width)) & (seen.class_id[:, None] == seen.class_id)
+    near = (away < settings.same_share * 0.5 * (width[:, None] + width)) & (seen.class_id[:, None] == seen.class_id)
     earlier = (seen.first_s[:, None] < seen.first_s) | np.triu(seen.first_s[:, None] == seen.first_s, 1)
-    left = seen.first_s - seen.until_s[:, None] > AT_ONCE_S  # never where it was not seen to leave
+    left = seen.first_s - seen.until_s[:, None] > settings.at_once_s  # never where it was not seen to leave
     came = seen.since_s > seen.last_s[:, None]
     one, other = np.nonzero(near & earlier & ~left & ~came)
     return one, other
@@ -263,7 +240,8 @@ def _placed(
         motion, agree = consensus(own[:, :2], there[:, :2])
         if agree.sum() > 1:
             return in_space(motion, own[agree], there[agree]), 1.0
-    return placed(seen_boxes(taken, solved), known, metre=taken.known > 0 or taken.traffic.gauge.stated is not None)
+    metre = taken.known > 0 or taken.traffic.gauge.stated is not None
+    return placed(seen_boxes(taken, solved, known.settings), known, metre=metre)
 
 
 def _settled(
@@ -276,12 +254,12 @@ def _settled(
     matched, most = _matched(taken, solved, living, known, np.zeros(0)), -1
     for _ in range(ROUNDS):
         held_m = solved.optimum.estimate.place[matched.place >= 0, :2]
-        held = _together(taken, _held(solved, living, matched), _labels(matched))
+        held = _together(taken, _held(solved, living, matched, known.settings), _labels(matched), known.settings)
         following = _matched(taken, held, living, known, held_m)
         settled = np.array_equal(following.place, matched.place)
         solved, matched = held, following
         if settled:
-            seen = seen_boxes(taken, solved)
+            seen = seen_boxes(taken, solved, known.settings)
             mine, theirs = regained(seen, known, matched.place[seen.place])
             count = int(np.count_nonzero(matched.place >= 0))
             if not len(mine) or count <= most:  # what was regained last did not hold
@@ -297,7 +275,7 @@ def _labels(matched: _Matched) -> IntArray:
     return np.where(matched.place >= 0, count + matched.place, np.arange(count))
 
 
-def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched) -> SpatialSolved:
+def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched, settings: BoxesConfig) -> SpatialSolved:
     """The session solved with its places held where they stand in the map."""
     optimum, row = solved.optimum, np.flatnonzero(matched.place >= 0)
     place = matched.place[row]
@@ -305,8 +283,8 @@ def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched) -> Spatia
     pose[:, :3] = living.places.position_m[place]
     own = np.trace(blocks(living.covariance_m2, 3)[place].reshape(-1, 3, 3)[:, :2, :2], axis1=1, axis2=2) / 2.0
     sigma = np.full((len(row), 6), np.pi)
-    sigma[:, :3] = np.sqrt(own + DRIFT_M**2)[:, None]
-    sigma[:, 2] = np.hypot(sigma[:, 2], HEIGHT_M)
+    sigma[:, :3] = np.sqrt(own + settings.drift_m**2)[:, None]
+    sigma[:, 2] = np.hypot(sigma[:, 2], settings.height_m)
     prior = PlacePrior(row, pose, sigma, matched.probability[row])
     problem = replace(optimum.smoother.problem, prior=prior, start_sigma=FREE, steady=True)
     noise, found = optimum.noise, optimum
@@ -316,7 +294,10 @@ def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched) -> Spatia
         noise = replace(noise, translation=max(translation, noise.translation), rotation=max(rotation, noise.rotation))
         found = converged(problem, optimum.estimate, noise, heavy_rounds=0)
         off = ((found.estimate.place[row, :2] - pose[:, :2]) / sigma[:, :2]) ** 2
-        if max((float(off[k : k + STRETCH].mean()) for k in range(0, len(off), STRETCH)), default=0.0) < MISFIT:
+        if (
+            max((float(off[k : k + STRETCH].mean()) for k in range(0, len(off), STRETCH)), default=0.0)
+            < settings.misfit
+        ):
             break
     return replace(solved, optimum=found)
 
@@ -327,15 +308,16 @@ def _matched(
     """Which boxes of the map those of the session are, one to one; parts of one that was lost in between are the
     same. The farther from those that are held at (H, 2), the farther off a box may be.
     """
-    seen, count = seen_boxes(taken, solved), len(solved.identity)
+    settings = known.settings
+    seen, count = seen_boxes(taken, solved, settings), len(solved.identity)
     found = _Matched.nothing(solved)
     row, place = _named(taken, solved, living)
     near = np.linalg.norm(solved.optimum.estimate.place[row, :3] - living.places.position_m[place], axis=1)
-    found.place[row[near < NAMED_M]] = place[near < NAMED_M]
+    found.place[row[near < settings.named_m]] = place[near < settings.named_m]
     loose_m = np.zeros(len(seen.place))
     if len(held_m):
         away = np.linalg.norm(seen.position_m[:, None, :2] - held_m, axis=2).min(axis=1)
-        loose_m = np.minimum(DRIFT_SHARE * away, MOST_DRIFT_M)
+        loose_m = np.minimum(settings.drift_share * away, settings.most_drift_m)
     odds = _log_odds(seen, known, loose_m)
     mine, theirs = linear_sum_assignment(np.minimum(-odds, 0.0))
     good = odds[mine, theirs] > 0.0
@@ -364,32 +346,40 @@ def _log_odds(seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> FloatArr
 
     Each may be off by `loose_m` (K,) beside what is known.
     """
-    off = seen.position_m[:, None, :2] - known.position_m[None, :, :2]
-    spread = seen.covariance_m2[:, None, :2, :2] + known.covariance_m2[None, :, :2, :2] + DRIFT_M**2 * np.eye(2)
+    settings, off = known.settings, seen.position_m[:, None, :2] - known.position_m[None, :, :2]
+    spread = (
+        seen.covariance_m2[:, None, :2, :2] + known.covariance_m2[None, :, :2, :2] + settings.drift_m**2 * np.eye(2)
+    )
     spread = spread + (loose_m**2)[:, None, None, None] * np.eye(2)
     squared = np.einsum("kmi,kmi->km", off, np.linalg.solve(spread, off[..., None])[..., 0])
-    near, far = (math.log(share) - 0.5 * squared / wide**2 - 2.0 * math.log(wide) for share, wide in TAILS)
-    odds = np.logaddexp(near, far) - 0.5 * np.linalg.slogdet(spread)[1] - math.log(2.0 * math.pi * LEAST_DENSITY)
+    tails = (1.0 - settings.far_share, 1.0), (settings.far_share, settings.far_factor)
+    near, far = (math.log(share) - 0.5 * squared / wide**2 - 2.0 * math.log(wide) for share, wide in tails)
+    odds = np.logaddexp(near, far) - 0.5 * np.linalg.slogdet(spread)[1] - math.log(2.0 * math.pi * settings.density)
     size = seen.size_m[:, None] - known.size_m[None]
-    like, unlike = (-0.5 * (size / np.array(sigma)) ** 2 - np.log(sigma) for sigma in (SIZE_M, SIZES_M))
-    odds += np.maximum(np.nan_to_num((like - unlike).sum(axis=2)), SIZE_FLOOR)
+    sizes = settings.sigma_size_m, settings.sigma_class_m
+    like, unlike = (-0.5 * (size / np.array(sigma)) ** 2 - np.log(sigma) for sigma in sizes)
+    odds += np.maximum(np.nan_to_num((like - unlike).sum(axis=2)), -settings.size_nats)
     turn = half_turn(seen.heading_rad[:, None] - known.heading_rad[None])
-    of_turn = -0.5 * (turn / HEADING_RAD) ** 2 - math.log(math.sqrt(2.0 * math.pi) * HEADING_RAD / math.pi)
-    odds += np.maximum(np.nan_to_num(of_turn), SIZE_FLOOR)
+    sigma_rad = settings.heading_rad
+    of_turn = -0.5 * (turn / sigma_rad) ** 2 - math.log(math.sqrt(2.0 * math.pi) * sigma_rad / math.pi)
+    odds += np.maximum(np.nan_to_num(of_turn), -settings.size_nats)
     # what was seen to come did not stand there, but may have come back
-    p = np.clip(np.where(np.isfinite(seen.since_s)[:, None], RETURNS * (1.0 - known.p), known.p), LEAST_P, 1.0)
+    p = np.clip(np.where(np.isfinite(seen.since_s)[:, None], settings.returns * (1.0 - known.p), known.p), LEAST_P, 1.0)
     # and where a box stands there is no room for another one: it must have left
     width = np.nan_to_num(0.5 * (seen.size_m[:, None, 1] + known.size_m[None, :, 1]), nan=0.5)
-    full = np.linalg.norm(off, axis=2) < SAME_SHARE * width
-    odds += np.log(p) - np.where(full, np.log(np.clip(1.0 - p, LEAST_GONE, 1.0)), 0.0)
-    return np.where((squared < GATE * TAILS[1][1] ** 2) & (seen.class_id[:, None] == known.class_id), odds, -np.inf)
+    full = np.linalg.norm(off, axis=2) < settings.same_share * width
+    odds += np.log(p) - np.where(full, np.log(np.clip(1.0 - p, settings.least_gone, 1.0)), 0.0)
+    return np.where(
+        (squared < GATE * settings.far_factor**2) & (seen.class_id[:, None] == known.class_id), odds, -np.inf
+    )
 
 
 def _visit(
     taken: TrafficIntake, solved: SpatialSolved, matched: _Matched, living: LivingMap, config: Config
 ) -> BoxVisit:
     """The session with ids of the map: its own where a box stands, new ones for the others."""
-    seen = seen_boxes(taken, solved)
+    settings = config.living.boxes
+    seen = seen_boxes(taken, solved, settings)
     identity, names = identities_of(taken.intake, solved)
     kept = np.ones(len(identity), dtype=np.bool_)
     start = f"{taken.recording.frames.stamp_s[0]:.3f}".rstrip("0").rstrip(".")
@@ -410,7 +400,7 @@ def _visit(
     kept &= ~np.isin(identity, members.landmark_id[members.deleted])
     brief = seen.until_s - np.where(np.isfinite(seen.since_s), seen.since_s, seen.first_s) < config.track.rest_for_s
     kept[seen.place[brief & (matched.place[seen.place] < 0)]] = False
-    kept[seen.place[_doubtful(seen, matched, living)]] = False
+    kept[seen.place[_doubtful(seen, matched, living, settings)]] = False
     of_places = taken.intake.landmark_id[solved.identity] >= taken.known
     kept &= ~of_places | np.isin(np.arange(len(kept)), seen.place)
     intake = replace(taken.intake, landmark_id=identity, problem=solved.optimum.smoother.problem, names=names)
@@ -425,7 +415,7 @@ def _visit(
     )  # fmt: skip
 
 
-def _doubtful(seen: SeenBoxes, matched: _Matched, living: LivingMap) -> BoolArray:
+def _doubtful(seen: SeenBoxes, matched: _Matched, living: LivingMap, settings: BoxesConfig) -> BoolArray:
     """(K,) boxes far from all that ties the session to the map, among boxes that the map has there: one of the two is
     elsewhere.
     """
@@ -435,6 +425,6 @@ def _doubtful(seen: SeenBoxes, matched: _Matched, living: LivingMap) -> BoolArra
     box = np.isin(living.places.landmark_id, living.boxes.landmark_id)
     box &= ~np.isin(np.arange(len(box)), matched.place)
     at, known = seen.position_m[:, :2], living.places.position_m[box, :2]
-    tied = np.linalg.norm(at[:, None] - at[held], axis=2).min(axis=1) <= TIED_M
-    among = np.linalg.norm(at[:, None] - known, axis=2).min(axis=1, initial=np.inf) <= AMONG_M
+    tied = np.linalg.norm(at[:, None] - at[held], axis=2).min(axis=1) <= settings.tied_m
+    among = np.linalg.norm(at[:, None] - known, axis=2).min(axis=1, initial=np.inf) <= settings.among_m
     return np.asarray(~held & ~tied & among)

@@ -96,7 +96,7 @@ class _Session:
         hits, misses: (S,) by site; was_hit: (C,) whether it was seen at any of its sites.
         newest: row of the last stay by clique.
         last_s, gone_s, p_gone: (K,) of the stays; p_kept: (S,) of the sites.
-        same_spot_m: how close to where it stood a clique has not moved.
+        settings: of decisions.
         hidden, shown: (3,) expected numbers of cliques that were there and not seen, and seen, by `PlaceLooks.sight`.
         begun: clique, site, not there before, first and last sighting of new stays; when they ended, and how probably.
         found: changes.
@@ -113,7 +113,7 @@ class _Session:
     log_evidence: FloatArray
     least: FloatArray
     least_evidence: float
-    same_spot_m: float
+    settings: DecisionConfig
     hits: IntArray
     misses: IntArray
     was_hit: BoolArray
@@ -166,7 +166,7 @@ class _Session:
             log_evidence=log_evidence,
             least=least,
             least_evidence=settings.least_evidence,
-            same_spot_m=settings.same_spot_m,
+            settings=settings,
             hits=hits,
             misses=misses,
             was_hit=np.bincount(row, hits, minlength=count) > 0,
@@ -284,7 +284,7 @@ class _Session:
         left_s = self._ends(old, stay, 1.0)
         since = self._begins(int(self.cliques[row]), site, left_s)
         self.p_kept[site] = p_moved = float(self.after.sites.p_here[site])
-        if elsewhere(*_motion(self.after, old, site), self.same_spot_m):
+        if elsewhere(*_motion(self.after, old, site), self.settings):
             n_hits, n_misses = int(self.hits[site]), int(self.misses[old])
             self._tell(ChangeKind.MOVED, old, site, left_s, since, p_moved, n_hits, n_misses)
 

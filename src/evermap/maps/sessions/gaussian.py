@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import softmax
 
-from evermap.config import FitConfig
+from evermap.config import FitConfig, MetreConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, of_places
 from evermap.geometry.group import PLANE, SPACE
@@ -216,16 +216,9 @@ def of_unknown_size(own: OwnLandmarks, log_sigma: float) -> FloatArray:
 
 
 ITERATIONS = 5
-WALK = 0.002
-"""Standard deviation by which the log of a map's metre wanders in a session, as its landmarks are replaced."""
-CONTRADICTS = 4.0
-"""Standard deviations by which the metre of a sound robot is not off that of many others: 1 in 16,000."""
-P_DRIFTED, DRIFTED = 0.05, 4.0
-"""Robots whose metre is not what their sensor is said to know, and by how many times that, as standard deviation."""
+USUAL_METRE = MetreConfig()
 AS_GOOD = np.geomspace(0.05, 1.0, 9)
 """Robots of one map may know their metre better than is said, all by one factor, each of these as likely."""
-P_TOLD = 0.95
-"""Probability of a robot to have drifted from which on it is told."""
 UNHEARD = 1e-9
 """Information on the metre of a robot of which the map has no session."""
 
@@ -239,7 +232,7 @@ class Size:
         session_factor: metres of that map for one of the session's own.
         variance: of the log of the map's metre, after the session.
         information: sum of the inverse variances of all sessions that the map's metre is the mean of.
-        off: standard deviations by which they differ; beyond `CONTRADICTS`, the session has the map's size.
+        off: standard deviations by which they differ; beyond `contradicts`, the session has the map's size.
         apart: log of the robot's metre over that of the robots together, where it has probably drifted; else 0.
     """
 
@@ -252,8 +245,9 @@ class Size:
 
 
 def settled(
-    log_ratio: float, ratio_variance: float, session: tuple[float, float], map_variance: float, information: float
-) -> Size:
+    log_ratio: float, ratio_variance: float, session: tuple[float, float], map_variance: float, information: float,
+    settings: MetreConfig = USUAL_METRE,
+) -> Size:  # fmt: skip
     """Return both sizes after they were compared.
 
     The map's metre is the mean of those of all sessions. What one robot gets wrong about the metre it gets wrong in
@@ -266,14 +260,15 @@ def settled(
         session: log of the true metre over the session's, by its own priors, and the standard deviation of that.
         map_variance: of the log of the map's metre over the true one.
         information: of the map so far, see `Size`.
+        settings: of metres.
     """
     own, sigma = session
-    before = 1.0 / (1.0 / information + WALK**2)
+    before = 1.0 / (1.0 / information + settings.walk**2)
     after = 1.0 / (sigma**2 + ratio_variance)
     gain = after / (before + after)
     innovation = log_ratio - own
     off = abs(innovation) / float(np.sqrt(1.0 / before + sigma**2 + ratio_variance))
-    if off > CONTRADICTS:
+    if off > settings.contradicts:
         return Size(1.0, float(np.exp(log_ratio)), map_variance, before / 2.0, off)
     return Size(
         map_factor=float(np.exp(-gain * innovation)),
@@ -285,8 +280,9 @@ def settled(
 
 
 def settled_by(
-    shown: tuple[float, float], session: tuple[float, float], living: LivingMap, robot: str
-) -> tuple[Size, Metres]:
+    shown: tuple[float, float], session: tuple[float, float], living: LivingMap, robot: str,
+    settings: MetreConfig = USUAL_METRE,
+) -> tuple[Size, Metres]:  # fmt: skip
     """Return both sizes after a session of a robot was compared with the map, and what each robot says since.
 
     Errors of the metre are a robot's, alike in all its sessions. So each robot has the mean of its sessions, as
@@ -297,10 +293,11 @@ def settled_by(
         session: as of `settled`.
         living: the map.
         robot: whose session it is; '' where nobody said.
+        settings: of metres.
     """
     metres, name = living.metres, landmark_id_of(robot) if robot else 0
     if not robot and not len(metres):
-        return settled(*shown, session, living.log_size_variance, living.log_size_information), metres
+        return settled(*shown, session, living.log_size_variance, living.log_size_information, settings), metres
     if not len(metres):  # sessions without a name, or a survey
         metres = Metres(*map(np.array, ([0], [0.0], [living.log_size_variance], [living.log_size_information])))
     if name not in metres.robot_id:
@@ -309,22 +306,22 @@ def settled_by(
     log_metre, variance, information = (
         column.copy() for column in (metres.log_metre, metres.log_variance, metres.information)
     )
-    own = settled(shown[0] + log_metre[row], shown[1], session, variance[row], information[row])
+    own = settled(shown[0] + log_metre[row], shown[1], session, variance[row], information[row], settings)
     log_metre[row] += np.log(own.map_factor)
     variance[row], information[row] = own.variance, own.information
-    middle, p_drifted = agreed(log_metre, np.sqrt(variance))
+    middle, p_drifted = agreed(log_metre, np.sqrt(variance), settings)
     size = Size(
         map_factor=float(np.exp(middle)),
         session_factor=float(own.session_factor * np.exp(middle - log_metre[row])),
-        variance=float(np.average(np.sqrt(variance), weights=1.0 / np.maximum(variance, WALK**2))) ** 2,
+        variance=float(np.average(np.sqrt(variance), weights=1.0 / np.maximum(variance, settings.walk**2))) ** 2,
         information=own.information,
         off=own.off,
-        apart=float(log_metre[row] - middle) if p_drifted[row] > P_TOLD else 0.0,
+        apart=float(log_metre[row] - middle) if p_drifted[row] > settings.p_told else 0.0,
     )
     return size, Metres(metres.robot_id, log_metre - middle, variance, information)
 
 
-def agreed(log_metre: FloatArray, sigma: FloatArray) -> tuple[float, FloatArray]:
+def agreed(log_metre: FloatArray, sigma: FloatArray, settings: MetreConfig = USUAL_METRE) -> tuple[float, FloatArray]:
     """Return the metre that robots have together, and for each of them the probability that its own has drifted.
 
     The metre of a robot is off by what its priors say, or, as robots of one make may agree better than that, by a
@@ -335,17 +332,18 @@ def agreed(log_metre: FloatArray, sigma: FloatArray) -> tuple[float, FloatArray]
     Args:
         log_metre: (R,) what each robot says.
         sigma: (R,) standard deviations by its priors.
+        settings: of metres.
     """
     if len(log_metre) == 1:
         return float(log_metre[0]), np.zeros(1)
-    sigma = np.maximum(sigma, WALK)
+    sigma = np.maximum(sigma, settings.walk)
     beyond = 2.0 * sigma.max()
     metre = np.linspace(log_metre.min() - beyond, log_metre.max() + beyond, 1201)
     squared = (log_metre - metre[:, None]) ** 2
-    variance = (AS_GOOD[:, None, None] * sigma) ** 2 + WALK**2
-    sound = np.log(1.0 - P_DRIFTED) - 0.5 * (np.log(variance) + squared / variance)
-    variance = (DRIFTED * sigma) ** 2
-    drifted = np.log(P_DRIFTED) - 0.5 * (np.log(variance) + squared / variance)
+    variance = (AS_GOOD[:, None, None] * sigma) ** 2 + settings.walk**2
+    sound = np.log(1.0 - settings.p_drifted) - 0.5 * (np.log(variance) + squared / variance)
+    variance = (settings.drifted * sigma) ** 2
+    drifted = np.log(settings.p_drifted) - 0.5 * (np.log(variance) + squared / variance)
     either = np.logaddexp(sound, drifted)
     weight = softmax(either.sum(axis=2))
     return float(weight.sum(axis=0) @ metre), np.einsum("sm,smr->r", weight, np.exp(drifted - either))

@@ -62,9 +62,9 @@ class Watch(NamedTuple):
     eye: FloatArray
 
     @classmethod
-    def of(cls, sighting: Sighting, position_m: FloatArray, sensor: Sensor) -> Watch:
+    def of(cls, sighting: Sighting, position_m: FloatArray, sensor: Sensor, settings: LooksConfig = USUAL) -> Watch:
         """Return what a sensor in the plane looked at, by its nominal field of view, of places (P, 2)."""
-        listed = looks_at(sensor, sighting.pose_map_robot, position_m, (sighting.frame, sighting.place))
+        listed = looks_at(sensor, sighting.pose_map_robot, position_m, (sighting.frame, sighting.place), settings)
         return cls(sighting.stamp_s, listed, sensor_poses(sighting, sensor))
 
 
@@ -357,7 +357,7 @@ def _empty_looks(
     near = near <= settings.near_m
     near |= rays.pass_by(pose[:, :2], place_m, settings)
     pose = pose[near]
-    half, field = np.pi / HEADINGS, NominalField(sensor)
+    half, field = np.pi / HEADINGS, NominalField(sensor, settings)
     rate = np.min(
         [field.p_detect(pose + np.array([0, 0, turn]), place_m[None])[:, 0] for turn in (-half, half)],
         axis=0,

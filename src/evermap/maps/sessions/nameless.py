@@ -26,7 +26,6 @@ from evermap.maps.living import EXISTS, LivingMap
 from evermap.maps.sessions.believe import aged
 from evermap.maps.sessions.box_search import TESTED_M2
 from evermap.maps.sessions.gaussian import drifted
-from evermap.maps.sessions.overlay import FREE_M, FREE_RAD
 from evermap.maps.sessions.placing import SMALLEST_P
 from evermap.slam.association.assignment import alike
 from evermap.slam.association.associator import P_MERGE, density_of_unmet
@@ -38,10 +37,8 @@ from evermap.slam.association.place_index import LEAD_NATS, PlaceIndex
 from evermap.slam.intake import beliefs
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Recording, landmark_id_of
 
-WINDOW, FEWEST = 12, 4
-"""Landmarks, met one after the other, that are looked for in the map together, and how many of them must be found."""
-FARTHEST_M, BENT_M = 2.0, 2.0
-"""How far a landmark that is the same may be off, and how far behind a stretch that is bent."""
+WINDOW = 12
+"""Landmarks, met one after the other, that are looked for in the map together."""
 GROUP, MOST_HELD, MOST_PAIRS = 24, 100, 400
 """Landmarks that are assigned together, those near them that hold them, and pairs that are weighed, at most."""
 HELD_NATS = 100.0
@@ -50,8 +47,6 @@ GATE = float(gates(1, 0.9999)[1])
 """Squared distance beyond which a landmark does not stand at a place."""
 CERTAIN = math.log(P_MERGE / (1.0 - P_MERGE))
 """By how much a landmark must more probably be one of the map than anything else, to hold the session there [nats]."""
-P_FOUND = 0.9
-"""That a landmark which stands beside another one that was found is found, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +153,9 @@ def held_at(
     motion = rigid(local.place[held], position_m)
     at, count = se2.transform(motion, local.place), len(local.place)
     turn = np.kron(np.eye(count), se2.rotation(motion[2]))
-    freedom = se2.rigid_directions(at - at[held].mean(axis=0)) * np.array([FREE_M, FREE_M, FREE_RAD])
+    freedom = se2.rigid_directions(at - at[held].mean(axis=0)) * np.array(
+        [config.free_m, config.free_m, config.free_rad]
+    )
     spread = turn @ local.covariance @ turn.T + freedom @ freedom.T
     rows, error = se2.xy_rows(held), (at[held] - position_m).ravel()
     drift_m, inverse = _drifted(spread[np.ix_(rows, rows)] + covariance_m2, error, config)
@@ -188,6 +185,7 @@ class _Assigned:
 
     def __init__(self, found: Associated, living: LivingMap, stood: _Stood, config: LivingConfig) -> None:
         self._found, self._living, self._stood, self._overlay = found, living, stood, config.overlay
+        self._settings = config.nameless
         self._local, self._beside_m = found.in_metres, config.looks.beside_m
         name, known = found.assignment.name, living.members.landmark_id[stood.landmark]
         # what has a name is the landmark with that name, and nothing else is
@@ -264,11 +262,11 @@ class _Assigned:
         stands, every = np.flatnonzero(self._stood.p >= EXISTS), np.arange(len(self._local.place))
         place, named = np.full(len(every), -1, dtype=np.int64), self._named[:MOST_HELD]
         best = self._overlaid(named, stands[self._alike[named][:, stands].any(axis=0)], None, self._alike, fewest=2)
-        if not best and len(stands) >= FEWEST:
+        if not best and len(stands) >= self._settings.fewest:
             index = PlaceIndex(*self._about(stands)) if len(stands) > ALL_TRIED else None
             for some in _windows(every):
                 best = max(best, self._overlaid(some, stands, index, self._alike), key=len)
-            best = best if len(best) >= FEWEST else []
+            best = best if len(best) >= self._settings.fewest else []
         if best:
             mine, theirs = np.array(best).T
             place[mine] = theirs
@@ -285,12 +283,12 @@ class _Assigned:
         apart = (together[:, held] @ of.astype(np.float64)) > 0.0
         for some in _windows(left):
             off = np.linalg.norm(where.position_m[some][:, None] - stood.position_m[stands], axis=2)
-            near = stands[off.min(axis=0, initial=np.inf) < BENT_M]
+            near = stands[off.min(axis=0, initial=np.inf) < self._settings.bent_m]
             pairs = self._overlaid(some, near, None, self._alike & ~apart)
-            if len(pairs) < FEWEST:
+            if len(pairs) < self._settings.fewest:
                 continue
             mine, theirs = np.array(pairs).T
-            if np.linalg.norm(where.position_m[mine] - stood.position_m[theirs], axis=1).max() < BENT_M:
+            if np.linalg.norm(where.position_m[mine] - stood.position_m[theirs], axis=1).max() < self._settings.bent_m:
                 found[mine] = theirs
         return found
 
@@ -300,9 +298,10 @@ class _Assigned:
         return self._stood.position_m[stands], self._stood.covariance_m2[stands] + drift_m**2 * np.eye(2)
 
     def _overlaid(
-        self, some: IntArray, stands: IntArray, index: PlaceIndex | None, allowed: BoolArray, *, fewest: int = FEWEST
+        self, some: IntArray, stands: IntArray, index: PlaceIndex | None, allowed: BoolArray, *, fewest: int = 0
     ) -> list[tuple[int, int]]:
         """Some landmarks of the session with places at which they surely stand, among some (S,) of all."""
+        fewest = fewest or self._settings.fewest
         if len(some) < fewest or len(stands) < fewest:
             return []
         (at, spread), local, motions = self._about(stands), self._local.part(some), None
@@ -332,12 +331,14 @@ class _Assigned:
         stood, nudge_m2 = self._stood, self._overlay.nudge_m**2 * np.eye(2)
         off = where.position_m[: len(some), None] - stood.position_m[None]
         away = np.linalg.norm(off, axis=2)
-        k, m = np.nonzero(self._alike[some] & free & (away < FARTHEST_M))
+        k, m = np.nonzero(self._alike[some] & free & (away < self._settings.farthest_m))
         step, spread = off[k, m], where.covariance_m2[k] + stood.covariance_m2[m] + where.drift_m**2 * np.eye(2)
         stands = np.log(stood.p[m]) + _log_density(step, spread)
         moved = np.log(stood.p_away[m] * self._overlay.share_nudged) + _log_density(step, spread + nudge_m2)
         # beside what was found it would have been found
-        missed = np.log1p(-P_FOUND * (1.0 - stood.p_away)) * (away.min(axis=0, initial=np.inf) < self._beside_m)
+        missed = np.log1p(-self._settings.p_found * (1.0 - stood.p_away)) * (
+            away.min(axis=0, initial=np.inf) < self._beside_m
+        )
         stands, moved = (odds - math.log(self._density) - missed[m] for odds in (stands, moved))
         stands[_squared(step, spread) > GATE] = -np.inf
         return k, m, stands, moved

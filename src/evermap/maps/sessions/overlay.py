@@ -24,10 +24,6 @@ from evermap.types import FloatArray, IntArray
 
 ELSEWHERE = -1
 """Option of a clique that stands at no known site."""
-FREE_M, FREE_RAD = 20.0, 3.0
-"""Standard deviations of the motion between session and map, around the one that was agreed on."""
-LOWEST_ROOM_M = 1.0
-"""Of a room in space, at least."""
 FAR_M = 2.0
 HOPELESS = -200.0
 """Who lies farther than this from a site, where most agree, with less than this log density, is not asked again."""
@@ -167,13 +163,13 @@ class _Options:
         turn = np.kron(np.eye(len(self.landmark_m)), group.rotation_of(motion))
         # the session turned with the map, and the motion's own freedom
         middle = self.landmark_m - self.landmark_m.mean(axis=0)
-        free = np.repeat([FREE_M, FREE_RAD], [group.point_dim, group.dim - group.point_dim])
+        free = np.repeat([settings.free_m, settings.free_rad], [group.point_dim, group.dim - group.point_dim])
         freedom = group.rigid_directions(middle) * free
         self._session = turn @ sighted.covariance_m2 @ turn.T
         self._freedom = freedom @ freedom.T
         self.drift_m = settings.drifts_m[0]
         spread = np.ptp(np.vstack([self.landmark_m, known.position_m]), axis=0)
-        height_m = float(np.prod(np.maximum(spread[2:], LOWEST_ROOM_M)))
+        height_m = float(np.prod(np.maximum(spread[2:], settings.lowest_room_m)))
         self._log_room = -math.log(max(float(np.prod(spread[:2])), settings.smallest_room_m2) * height_m)
         self._log_site = known.log_p_site + known.log_turned
         self.sites: list[list[int]] = [[] for _ in known.log_p_elsewhere]

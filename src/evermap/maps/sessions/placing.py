@@ -8,7 +8,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from scipy import sparse
 
-from evermap.config import FitConfig, LivingConfig
+from evermap.config import FitConfig, LivingConfig, OverlayConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import consensus, rigid
@@ -34,8 +34,6 @@ CONTRADICTED = (
 )
 """Why a session cannot be localised in a map, and what to try."""
 SMALLEST_P = 1e-6
-STOOD_RAD, MOVED_RAD = (0.02, 0.06, 0.15), (0.2, 1.0)
-"""How far landmarks in space seem turned from session to session: standard deviations, of a group all alike."""
 BENT_ROUNDS = 5
 """Refits of that motion to the bodies that agree with it."""
 
@@ -105,7 +103,7 @@ class Turned(NamedTuple):
     covariance: FloatArray
     symmetries: Symmetries
 
-    def log_odds(self, landmark: IntArray, places: Places) -> FloatArray:
+    def log_odds(self, landmark: IntArray, places: Places, settings: OverlayConfig) -> FloatArray:
         """Return (P,) log likelihood ratio of landmarks (P,) being turned as at places, for 'stands' over 'moved'."""
         turn = se3.compose(self.pose_map_session, _turns(self.rotation[landmark]))
         known_turn = self.symmetries[landmark].nearest(_turns(places.rotation), turn)
@@ -121,7 +119,7 @@ class Turned(NamedTuple):
                 each.append(-0.5 * squared - 0.5 * np.linalg.slogdet(wide)[1])
             return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(each)))
 
-        return np.where(known, log_density(STOOD_RAD) - log_density(MOVED_RAD), 0.0)
+        return np.where(known, log_density(settings.stood_rad) - log_density(settings.turned_rad), 0.0)
 
 
 def _turns(rotation: FloatArray) -> FloatArray:
@@ -163,7 +161,7 @@ def laid_over(
     site_rows = np.searchsorted(sites.site_id, used_sites)
     log_turned = np.zeros(len(used_sites))
     if turned is not None:
-        np.add.at(log_turned, site.ravel(), turned.log_odds(seen[landmark], places[used]))
+        np.add.at(log_turned, site.ravel(), turned.log_odds(seen[landmark], places[used], config.overlay))
     total = np.zeros(len(clique_ids))
     of_known = np.isin(sites.clique_id, clique_ids)
     np.add.at(total, np.searchsorted(clique_ids, sites.clique_id[of_known]), p_site[of_known])

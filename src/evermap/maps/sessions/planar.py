@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from evermap.config import Config, LivingConfig
+from evermap.config import Config, LivingConfig, MetreConfig
 from evermap.errors import DataError, NumericalError
 from evermap.geometry import se2
 from evermap.geometry.chunked import of_places
@@ -16,7 +16,6 @@ from evermap.maps.living import LivingMap, Metres
 from evermap.maps.sessions import believe
 from evermap.maps.sessions.extend import Extended, Found
 from evermap.maps.sessions.gaussian import (
-    CONTRADICTS,
     Size,
     drifted,
     log_ratio,
@@ -57,9 +56,6 @@ from evermap.types import (
     SlamResult,
     landmark_id_of,
 )
-
-STRETCH = 3
-"""Windows of sightings that contradict the rest where poses are wrong: a few misread ones are outliers, and no more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +158,7 @@ class PlanarVisit:
         hit = place_of[landmark]
         frame = np.searchsorted(frames, recording.detections.frame[detection])
         sighting = Sighting(stamps[frames], pose, frame[hit >= 0], hit[hit >= 0])
-        return Watch.of(sighting, entry.living.places.position_m, recording.sensor)
+        return Watch.of(sighting, entry.living.places.position_m, recording.sensor, config.looks)
 
 
 def solve_session(
@@ -279,12 +275,12 @@ def refit(
         )
         own_metre = 0.0, outcome.log_scale_sigma
         if part:  # it does not change the metre of the rest
-            found = settled(*shown, own_metre, living.log_size_variance, np.inf)
+            found = settled(*shown, own_metre, living.log_size_variance, np.inf, config.metre)
         else:
-            found, metres = settled_by(shown, own_metre, living, alone.recording.robot)
+            found, metres = settled_by(shown, own_metre, living, alone.recording.robot, config.metre)
             living = resized(living, found, metres)
         size *= found.session_factor
-        alone = _remarked(alone, shown[0], found)
+        alone = _remarked(alone, shown[0], found, config.metre)
 
     def in_map(where: Laid) -> tuple[Outcome, bool]:
         stand = np.flatnonzero(where.place >= 0)
@@ -317,9 +313,9 @@ def refit(
     return living, where, replace(alone, outcome=solved)
 
 
-def _remarked(alone: Solved, log_ratio: float, found: Size) -> Solved:
+def _remarked(alone: Solved, log_ratio: float, found: Size, settings: MetreConfig) -> Solved:
     """A session with a remark where its metre contradicts the map's, or its robot's those of the others."""
-    contradicts = found.off > CONTRADICTS
+    contradicts = found.off > settings.contradicts
     if not (contradicts or found.apart):
         return alone
     off, than = (-log_ratio, "the map's") if contradicts else (found.apart, "that of all robots of the map together")
@@ -370,7 +366,7 @@ def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> BoolArr
     of_part = np.unique(np.column_stack([part[row[counts]], landmark[counts]]), axis=0)[:, 0]
     shown = np.bincount(of_part, minlength=part[-1] + 1)
     tied = shown >= 2 if where is not None else np.arange(len(shown)) == np.argmax(np.bincount(part[row], counts))
-    window = min(STRETCH * settings.window, n_seen)
+    window = min(settings.bent_windows * settings.window, n_seen)
     fits = np.convolve(outcome.inlier, np.ones(window) / window, "valid")
     first = np.clip(np.searchsorted(row, np.arange(n_poses)) - window // 2, 0, len(fits) - 1)
     wrong = ~tied[part] | (fits[first] < settings.inlier)

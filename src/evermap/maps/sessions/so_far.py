@@ -19,10 +19,6 @@ from evermap.maps.sessions.looks import Arrivals, Sighting, Watch, looked_at
 from evermap.maps.sessions.session import believed
 from evermap.types import MapChange, Sensor
 
-SETTLED_S = 10.0
-"""What is missed so shortly before or after a sighting is hidden, not gone, and teaches lines of sight: twice as long
-as something stands before a clique. A whole session takes much longer, for it knows what was seen again."""
-
 
 def judged_so_far(
     living: LivingMap, sighting: Sighting, sensor: Sensor, config: LivingConfig, classes: ClassLives | None = None
@@ -40,9 +36,9 @@ def judged_so_far(
     living = replace(living, sightlines=replace(living.sightlines, rules=config.sight))
     aged = believe.aged(living, config, start_s)
     living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
-    looks = config.looks.model_copy(update={"settled_s": min(SETTLED_S, config.looks.settled_s)})
+    looks = config.looks.model_copy(update={"settled_s": min(config.looks.settled_online_s, config.looks.settled_s)})
     config = config.model_copy(update={"looks": looks})
-    seen = looked_at(living, aged.p_here, Watch.of(sighting, living.places.position_m, sensor), config)
+    seen = looked_at(living, aged.p_here, Watch.of(sighting, living.places.position_m, sensor, looks), config)
     none = np.zeros(0, dtype=np.int64)
     entry = Extended(living, living, none, none, aged.p_here, np.zeros(len(living.sites), dtype=np.bool_))
     now = believed(entry, seen, sensor, (start_s, end_s), config)

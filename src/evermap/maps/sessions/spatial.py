@@ -26,7 +26,7 @@ from evermap.maps.sessions.witnessed import Witnessed
 from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.sensing import learned
 from evermap.sensing.profile import Assumed, Field, Projection
-from evermap.sensing.visibility import WORTH_A_LOOK, LooksAt
+from evermap.sensing.visibility import LooksAt
 from evermap.slam.space.against_map import by_itself
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.intake import SpatialIntake, most_of, prepare_space
@@ -48,21 +48,10 @@ from evermap.types import (
 
 AXES_OF_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Columns are ahead, left and up of a sensor that looks along its z, with y down."""
-FIELD_MARGIN_RAD = 0.02
-RANGE_MARGIN = 1.1
-"""Nothing is expected farther than the farthest sighting times this."""
-USUAL_RANGE = 0.9
-"""Share of sightings that were nearer than what an earlier look at an empty place reaches."""
-FACED = 0.2
-"""Median cosine of incidence from which on landmarks are taken to have a face."""
-WIDEST_RAD = np.radians(85.0)
-"""Angle of incidence from which landmarks with a face are detected hardly at all."""
 MOST_OF_ONE_IDENTITY = 4
 """Landmarks that a map tells apart."""
 MOST_VIEWS = 2000
 """Looks that detection is learned from."""
-DRIFT_RAD = 0.02
-"""By which orientations of landmarks that nobody moved are off from session to session."""
 
 
 @dataclass(frozen=True)
@@ -138,11 +127,12 @@ class SpatialVisit:
     def floor_sensor(self) -> Sensor:
         """How far and how widely the sensors saw, as one on the floor: what earlier looks are asked by."""
         direction, range_m = self._directions(np.flatnonzero(self.inlier >= EXISTS))
-        half = float(np.abs(np.arctan2(direction[:, 1], direction[:, 0])).max(initial=0.0)) + FIELD_MARGIN_RAD
+        settings = self.intake.problem.settings
+        half = float(np.abs(np.arctan2(direction[:, 1], direction[:, 0])).max(initial=0.0)) + settings.field_margin_rad
         told = self.recording.sensors[0]
         return Sensor(
             range_min_m=told.range_min_m,
-            range_max_m=float(np.quantile(range_m, USUAL_RANGE)) if len(range_m) else told.range_max_m,
+            range_max_m=float(np.quantile(range_m, settings.usual_range)) if len(range_m) else told.range_max_m,
             bearing_min_rad=max(-half, -np.pi),
             bearing_max_rad=min(half, np.pi),
             p_detect=told.p_detect,
@@ -246,7 +236,7 @@ class SpatialVisit:
             chosen = np.isin(mine, some)
             model = learned.watched(model, stamp_s[some], pose[some], detected[some], there[chosen])
             p[mine] = model.p_detect(pose[mine], places.position_m)
-        looked = detected | (p >= WORTH_A_LOOK * p.max(initial=0.0))
+        looked = detected | (p >= config.looks.worth_a_look * p.max(initial=0.0))
         view, place = np.nonzero(looked)
         listed = LooksAt(view, place, p[view, place], detected[view, place])
         heading = np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
@@ -277,11 +267,12 @@ class SpatialVisit:
     ) -> learned.LearnedDetection:
         """The detection model of a sensor before the session: its field is where it has seen anything."""
         problem, told = self.optimum.smoother.problem, self.recording.sensors[sensor]
+        settings = problem.settings
         direction, range_m = self._directions(np.flatnonzero((problem.sensor == sensor) & (self.inlier >= EXISTS)))
         camera = told.intrinsics is not None or not np.array_equal(self._axes[sensor], np.eye(3))
         across = direction[:, 0] if camera else np.hypot(direction[:, 0], direction[:, 1])
-        azimuth = np.abs(np.arctan2(direction[:, 1], direction[:, 0])).max(initial=0.1) + FIELD_MARGIN_RAD
-        elevation = np.abs(np.arctan2(direction[:, 2], across)).max(initial=0.1) + FIELD_MARGIN_RAD
+        azimuth = np.abs(np.arctan2(direction[:, 1], direction[:, 0])).max(initial=0.1) + settings.field_margin_rad
+        elevation = np.abs(np.arctan2(direction[:, 2], across)).max(initial=0.1) + settings.field_margin_rad
         widest = np.pi / 2 if camera else np.pi
         view, place = np.nonzero(detected)
         outward = np.zeros_like(position_m)
@@ -290,16 +281,16 @@ class SpatialVisit:
         to_eye = pose[view, :3, 3] - position_m[place]
         cosine = (to_eye * outward[place]).sum(axis=1) / np.maximum(np.linalg.norm(to_eye, axis=1), 1e-9)
         middle = float(np.median(cosine[turned[place]])) if turned[place].any() else 0.0
-        faced = abs(middle) > FACED
+        faced = abs(middle) > settings.faced
         assumed = Assumed(
             Field(
-                min(told.range_max_m, RANGE_MARGIN * float(range_m.max(initial=1.0))),
+                min(told.range_max_m, settings.range_margin * float(range_m.max(initial=1.0))),
                 float(min(azimuth, widest)),
                 float(min(elevation, np.pi / 2)),
                 Projection.PINHOLE if camera else Projection.SPHERICAL,
             ),
             fading_m=np.inf,
-            viewing_angle_rad=WIDEST_RAD if faced else np.pi,
+            viewing_angle_rad=settings.widest_rad if faced else np.pi,
         )
         model = learned.init(position_m, np.arange(len(position_m)), assumed)
         return replace(model, outward=np.sign(middle) * outward if faced else 0.0 * outward)
@@ -433,7 +424,7 @@ def _held(visit: SpatialVisit, living: LivingMap, where: Laid) -> SpatialOptimum
     sigma[:, :3] = np.sqrt(np.trace(own, axis1=1, axis2=2) / 3.0 + where.drift_m**2)[:, None]
     unseen = problem.symmetries[row].unseen
     spread = np.einsum("kii,ki->k", places.rotation_covariance[place], 1.0 - unseen) / (3.0 - unseen.sum(axis=1))
-    sigma[turned, 3:] = np.sqrt(spread[turned] + DRIFT_RAD**2)[:, None]
+    sigma[turned, 3:] = np.sqrt(spread[turned] + problem.settings.map.drift_rad**2)[:, None]
     sigma[:, 3:][unseen > 0.0] = ANY_RAD
     prior = PlacePrior(row.astype(np.int64), pose, sigma, np.ones(len(row)))
     problem = replace(problem, prior=prior, start_sigma=FREE)

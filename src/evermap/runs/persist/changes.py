@@ -137,7 +137,6 @@ def _log_ratio(looks: Looks) -> FloatArray:
     return np.where(np.isnan(ratio), 0.0, np.clip(ratio, -_CERTAIN, _CERTAIN))
 
 
-STEPS = 10
 MOST_STEPS = 10_000
 
 
@@ -168,7 +167,7 @@ def forecast_stamps(looks: Looks, now_s: float, config: PersistConfig) -> FloatA
         ConfigError: so many steps that one of them must be wrong.
     """
     horizon_s = config.horizon_s or config.horizon_share * (now_s - float(looks.stamp_s.min())) or 1.0
-    step_s = config.step_s or horizon_s / STEPS
+    step_s = config.step_s or horizon_s / config.forecast_steps
     count = int(np.floor(horizon_s / step_s * (1.0 + 1e-12)))
     if count > MOST_STEPS:
         raise ConfigError(f"{horizon_s:g} s in steps of {step_s:g} s", field="horizon_s", hint="a longer `step_s`")

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 MOST_ROWS = 100_000_000
 """More beliefs than this are a mistake in the step, not a wish."""
-_GRID_STEPS = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +162,7 @@ def _grid(table: LookTable, config: PersistConfig) -> tuple[IntArray, FloatArray
         ConfigError: so many that the step must be wrong.
     """
     start_s, stop_s = float(table.stamp_s.min()), float(table.stamp_s.max())
-    step_s = config.step_s or nice_step((stop_s - start_s) / _GRID_STEPS)
+    step_s = config.step_s or nice_step((stop_s - start_s) / config.grid_steps)
     count = int(np.floor((stop_s - start_s) / step_s * (1.0 + 1e-12))) + 1
     if count * table.n_features > MOST_ROWS:
         problem = f"{step_s:g} s make {count} instants of {table.n_features} features"

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from evermap.errors import InputError
-from evermap.sensing.visibility import BEARING_MARGIN_RAD, RANGE_MARGIN_M
+from evermap.sensing.visibility import USUAL
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 MOST_CERTAIN = 1.0 - 1e-6
@@ -186,8 +186,8 @@ def log_in_view(
     bearing_rad: FloatArray,
     sensor: Sensor,
     *,
-    range_margin_m: FloatArray | float = RANGE_MARGIN_M,
-    bearing_margin_rad: FloatArray | float = BEARING_MARGIN_RAD,
+    range_margin_m: FloatArray | float = USUAL.range_margin_m,
+    bearing_margin_rad: FloatArray | float = USUAL.bearing_margin_rad,
 ) -> FloatArray:
     """Return `log P(inside the limits of the sensor)` of landmarks whose range and bearing are known to some margin.
 
