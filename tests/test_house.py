@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -48,6 +49,35 @@ VERBS = frozenset(
 )
 """First words of docstrings, in the imperative. Add a verb where it is missing."""
 
+
+SETTLED = ("live", "maps.sessions", "runs.persist", "sensing", "slam.changes", "slam.space", "tracking")
+"""Packages whose beliefs and thresholds are keys of the configuration: see docs/architecture.md."""
+SETTLED_MODULES = ("calibration", "known_places", "localize", "problem", "streaming", "votes")
+BELIEF = re.compile(
+    r"_(M|M2|S|RAD|HZ|MPS|PX|NATS|P|ODDS)$|^_?(P|SIGMA|FEWEST|LEAST|GATE|CONFIDENCE|MIN|SEEN|SURE|NEAR|FAR)(_|$)"
+)
+"""Names by which constants state a probability, a distance, a time, evidence, a gate or a count of sightings."""
+OF_THE_CODE = frozenset(
+    """
+    live.inbox.BURST_S live.judge.REST_S live.ros.GUESS_S live.ros.TOLD_S live.ros.SEEN_P live.ros.WAIT_S
+    maps.sessions.box_search.GATE maps.sessions.box_search.TESTED_M2 maps.sessions.boxes.LEAST_P
+    maps.sessions.nameless.HELD_NATS maps.sessions.nameless.GATE maps.sessions.overlay.FAR_M
+    maps.sessions.placing.SMALLEST_P maps.sessions.witnessed.WITNESSED_NATS maps.sessions.witnessed.LEAST_P
+    maps.sessions.witnessed.MOST_P runs.persist.changes._SHORTEST_GAP_S sensing.kernels.FAR_OUT
+    slam.calibration.LEAST_SIGMA slam.changes.explain.HELD_M slam.changes.search.NEAR
+    slam.known_places.LEAST_VARIANCE slam.known_places.RETRY_S slam.known_places.SIGMA_M slam.problem.FEWEST_ROWS
+    slam.space.against_map.LEAST_INFORMATION slam.space.drift.FEWEST slam.space.drift.FEWEST_BINS
+    slam.space.drift.FEWEST_OF_BOTH slam.space.drift.FEWEST_PAIRS slam.space.drift.LEAST_OF_SQUARE
+    slam.space.drift.PERSIST_S slam.space.drift.SEEN_TOGETHER slam.space.problem.LEAST_WEIGHT
+    slam.space.problem.NO_JUMP_LOG_ODDS slam.space.solve.GROSS_M slam.space.start.SLACK_M slam.space.start.SLACK_RAD
+    slam.space.start.STILL_M slam.space.start.STILL_RAD slam.streaming.NEAR slam.streaming.NEAR_NOISE
+    slam.streaming.NEAR_NOISE_GAIN slam.votes.FEWEST_PAIRS slam.votes.LEAST_SHARE tracking.frame._NEAR_S
+    tracking.grid.FAR tracking.rows.LEAST tracking.standing.STRIDE_S
+    """.split()  # noqa: SIM905
+)
+"""Of these names, those that are tolerances, limits of an iteration, first values or the pace of messages."""
+MOST_NUMBERS = 228
+"""Numeric constants in those packages."""
 
 BACKWARDS = {("evermap.maps.living", "evermap.maps.sessions.believe")}
 """Imports inside a function against the order of modules: a map that is asked for another time asks its beliefs."""
@@ -125,3 +155,31 @@ def test_public_docstrings_begin_with_a_verb() -> None:
         if first not in VERBS:
             other.append(f"{name}.{node.name}: {text.splitlines()[0]}")
     assert not other
+
+
+def numbers() -> Iterator[tuple[str, bool]]:
+    """Numeric constants of the settled packages, and whether their definition says what they are."""
+    settled = (*(f"evermap.{name}." for name in SETTLED), *(f"evermap.slam.{name}." for name in SETTLED_MODULES))
+    for module, tree in TREES.items():
+        if not f"{module}.".startswith(settled):
+            continue
+        for row, node in enumerate(tree.body):
+            if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+                continue
+            kinds = {type(one.value) for one in ast.walk(node.value) if isinstance(one, ast.Constant)}
+            if not kinds & {int, float} or str in kinds:
+                continue
+            rest = (one for one in tree.body[row:] if not isinstance(one, ast.Assign | ast.AnnAssign))
+            told = isinstance(after := next(rest, None), ast.Expr) and isinstance(after.value, ast.Constant)
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            for one in target.elts if isinstance(target, ast.Tuple) else [target]:
+                if isinstance(one, ast.Name) and one.id.isupper():
+                    yield f"{module.removeprefix('evermap.')}.{one.id}", told
+
+
+def test_beliefs_and_thresholds_are_keys_of_the_configuration() -> None:
+    found = dict(numbers())
+    stated = {name for name in found if BELIEF.search(name.rpartition(".")[2])}
+    assert stated == OF_THE_CODE
+    assert [name for name, told in found.items() if not told] == []
+    assert len(found) <= MOST_NUMBERS

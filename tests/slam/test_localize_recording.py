@@ -14,7 +14,7 @@ from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.io.mrclam import read_mrclam
 from evermap.pipeline import run_slam
-from evermap.sensing.visibility import WORTH_A_LOOK
+from evermap.sensing.visibility import USUAL
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import FrameSightings, Localizer
@@ -121,7 +121,7 @@ def test_every_detection_and_every_miss_is_accounted_for():
     in_map = np.isin(detections.landmark_id, result.landmarks.landmark_id)
     assert len(innovations) == (used & in_map).sum()
     # where nothing is hidden by walls, the sensor's own probability of detection says how many misses to expect
-    assert misses.p_detect.min() >= WORTH_A_LOOK * recording.sensor.p_detect
+    assert misses.p_detect.min() >= USUAL.worth_a_look * recording.sensor.p_detect
 
 
 @pytest.mark.slow

@@ -379,6 +379,10 @@ class SpaceConfig(Section):
     pseudo_count: Positive = Field(
         default=10.0, description="residuals that noise levels to start from count for in what is learned"
     )
+    least_noise: tuple[Positive, Positive, Positive, Positive, Positive, Positive] = Field(
+        default=(1e-4, 1e-5, 0.05, 0.05, 0.05, 0.03),
+        description="least noise levels that are learned: drift [m, rad by sqrt(s)], across, along, turn, corners [px]",
+    )
     outlier_log_odds: tuple[Positive, Positive, Positive] = Field(
         default=(10.5, 14.0, 16.0),
         description="half the squared residual at which positions, poses and corners are as likely outliers",

@@ -37,11 +37,6 @@ FACES = 6
 """Directions that a landmark's own detectability is learned for: the faces of a cube around it."""
 SUMS = ("range_hits", "range_expected", "facing_hits", "facing_expected", "false_hits", "false_looks")
 """What the profile sums up, in the order of the kernels."""
-SURELY_THERE = 0.99
-SURELY_GONE = 0.001
-"""Beliefs at which what pends of a clique is taken for what it is."""
-MOSTLY_FREE = 0.1
-"""Probability of being occluded above which a clique has not been seen again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,13 +219,22 @@ def look(
     )
 
 
-def confirm(model: LearnedDetection, seen: CliqueLook, probability: FloatArray) -> LearnedDetection:
+def confirm(
+    model: LearnedDetection,
+    seen: CliqueLook,
+    probability: FloatArray,
+    *,
+    sure: tuple[float, float] = (0.001, 0.99),
+    p_occluded: float = 0.1,
+) -> LearnedDetection:
     """Learn the profile from the cliques whose presence the last look has made certain.
 
     Args:
         model: after `look`.
         seen: what `look` returned with it.
         probability: (C,) that each clique exists, after that look.
+        sure: beliefs up to which, and from which on, what pends of a clique is taken for what it is.
+        p_occluded: of being occluded, above which a clique has not been seen again.
 
     Raises:
         InputError: probabilities of another shape.
@@ -246,8 +250,8 @@ def confirm(model: LearnedDetection, seen: CliqueLook, probability: FloatArray) 
     if wrong.size:
         problem = f"row {wrong[0]}: not a probability: {belief[wrong[0]]}"
         raise DataError(problem, field="probability", hint="0 to 1")
-    there = in_view & (belief > SURELY_THERE) & (seen.p_occluded < MOSTLY_FREE)
-    gone = in_view & (belief < SURELY_GONE)
+    there = in_view & (belief > sure[1]) & (seen.p_occluded < p_occluded)
+    gone = in_view & (belief < sure[0])
     profile = model.profile
     before = {name: np.atleast_1d(getattr(profile, name)) for name in SUMS}
     sums = np.concatenate([*before.values(), np.zeros(2)])

@@ -20,8 +20,6 @@ RANGE_BINS = 16
 FACING_BINS = 16
 SMALLEST_RATE = 1e-3
 """Assumed detection of a landmark from behind: impossible for a solid body, but bodies have holes."""
-FACING_EDGE = 0.1
-"""Scale of the logistic edge of the assumed detection by incidence, in units of the cosine."""
 
 
 class Projection(StrEnum):
@@ -70,6 +68,7 @@ class Assumed:
         p_false: probability of a detection of a landmark that is not there, or cannot be seen.
         p_false_looks: number of looks that this is worth.
         hits: expected hits that detection by range, by incidence, and of each landmark by direction are worth.
+        facing_edge: scale of the logistic edge of detection by incidence, in units of the cosine.
         sigma_position_m, sigma_attitude_rad: of the poses.
         p_never_occluded: that nobody ever stands in the way, here.
         occlusion_rates_hz: otherwise, how often somebody comes (one of these, equally likely) ...
@@ -82,6 +81,7 @@ class Assumed:
     p_false: float = 0.005
     p_false_looks: float = 400.0
     hits: float = 3.0
+    facing_edge: float = 0.1
     sigma_position_m: float = 0.05
     sigma_attitude_rad: float = math.radians(1.0)
     p_never_occluded: float = 0.5
@@ -122,7 +122,7 @@ class Assumed:
     @property
     def facing_rate(self) -> FloatArray:
         """(16,) detection by incidence: a logistic edge at the viewing angle."""
-        beyond = (facing_middles() - math.cos(self.viewing_angle_rad)) / FACING_EDGE
+        beyond = (facing_middles() - math.cos(self.viewing_angle_rad)) / self.facing_edge
         return np.maximum(1.0 / (1.0 + np.exp(-beyond)), SMALLEST_RATE)
 
 

@@ -31,6 +31,7 @@ HEADINGS = 24
 _REACH = 1 << 12
 _SPAN = 1 << 24
 _AROUND = tuple((dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1))
+"""Cells that a key holds, and those around one."""
 
 
 class Lines(NamedTuple):

@@ -95,6 +95,7 @@ class Pairs(NamedTuple):
 
 
 LOG_TWO_PI = math.log(2.0 * math.pi)
+"""Of Gaussian densities."""
 
 
 @inlined
@@ -242,6 +243,7 @@ def candidates(targets: Targets, n: int, frame: Frame, likelihood: Likelihood) -
 
 
 NOBODY = -1
+"""No partner in an assignment."""
 
 
 @kernel

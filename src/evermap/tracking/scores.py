@@ -17,6 +17,7 @@ from evermap.tracking.tracklets import Rules, Tracklets
 from evermap.types import FloatArray
 
 LEVEL, WEIGHT, MISSED = 0, 1, 2
+"""Columns of a level."""
 
 
 @inlined

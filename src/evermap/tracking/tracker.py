@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ROOM = 64
+"""Rows of a table at first."""
 
 
 class Tracker(Shown):

@@ -30,6 +30,7 @@ from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 USUAL = LooksConfig()
 ROUNDS = 5
+"""Of expectation and maximisation, at most."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ HOPELESS = -200.0
 """Who lies farther than this from a site, where most agree, with less than this log density, is not asked again."""
 USUAL = OverlayConfig()
 MOST_FLIPS = 400
+"""Steps of one ascent, at most: it ends long before."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from evermap.types import FloatArray, IntArray, rows_of
 WITNESSED_NATS = 50.0
 """Log likelihood ratio of having been seen to leave: more than any lifetime outweighs."""
 LEAST_P, MOST_P = 1e-6, 1.0 - 1e-6
+"""Bounds of a probability whose logarithm is taken."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from evermap.types import BoolArray, FloatArray, IntArray
 _SHORTEST_GAP_S = 1e-9
 """Looks at one time are no time apart, but a change between them can be all that is left."""
 _CERTAIN = 700.0
+"""Log odds that a double still tells from certainty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +139,7 @@ def _log_ratio(looks: Looks) -> FloatArray:
 
 
 MOST_STEPS = 10_000
+"""More steps of a forecast than this are a mistake."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from evermap.viz.style import NamedFigure
 from evermap.viz.time_axis import guess_clock
 
 _MOST_ROWS = 100
+"""Of a table on the page."""
 
 
 def render_report(

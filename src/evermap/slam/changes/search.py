@@ -143,6 +143,7 @@ WORTH_KEEPING = 25.0
 """Hypotheses that are further below the best [nats] weigh nothing."""
 MOST_KEPT = 20_000
 SLOTS = 1 << 17
+"""Room of the tables."""
 
 
 class Weighed(NamedTuple):

@@ -196,6 +196,7 @@ STRETCHES, EVERYWHERE = 10, 3.36
 """What is seen in one stretch of a drive may err for one cause: the odometry drifts at random, a queue creeps. So many
 standard deviations, which Student's t of ten stretches exceeds in one of 100 cases, are found everywhere."""
 MOST_SCALE, SCALE_STEP, EM_ROUNDS = 0.1, 0.01, 12
+"""Grid of scales from which expectation-maximisation begins, and its rounds."""
 
 
 class Gauge(NamedTuple):

@@ -27,9 +27,8 @@ ROUNDS = 12
 """Optimum and noise levels in turns, at most."""
 CONVERGED = 0.02
 """Relative change of all noise levels that ends it."""
-FLOOR = np.array([1e-4, 1e-5, 0.05, 0.05, 0.05, 0.03])
-"""No noise level is lower: nothing is that good for long."""
 MOST_CANDIDATES = 60
+"""Detections whose orientations are asked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +95,7 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
             if level == ORIENTATION:
                 count -= float(w @ problem.about_axis[some])
             levels[level] = _level(before[level], start[level], total, count, worth)
-    return SpatialNoise(*np.maximum(levels, FLOOR).tolist())
+    return SpatialNoise(*np.maximum(levels, problem.settings.least_noise).tolist())
 
 
 def _level(before: float, start: float, total: float, count: float, worth: float) -> float:

@@ -18,6 +18,7 @@ from evermap.slam.space.problem import LEAST_WEIGHT, SpatialEstimate, SpatialNoi
 from evermap.types import BoolArray, FloatArray, IntArray
 
 ROUNDS = 3
+"""Times that other explanations are tried, at most."""
 
 
 def repaired(optimum: SpatialOptimum) -> SpatialOptimum:

@@ -24,6 +24,7 @@ about the line between them; one by a thousand radians would drown what the odom
 MOST_TRIED = 200
 GROSS_M = 1.0
 SPLITS = 2
+"""Poses tried for a start, the scale of its loss [m], and times that landmarks are split."""
 
 
 @dataclass(frozen=True, slots=True)
