@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,7 +14,11 @@ from typer.testing import CliRunner
 from evermap.cli.main import app
 from evermap.config import Config, Section, SensorConfig, load_config, to_toml, with_overrides
 from evermap.errors import ConfigError
+from evermap.slam.calibration import NAMES, CalibrationPrior
 from evermap.types import Sensor
+
+UNBOUNDED = {"score_midpoint", "min_score"}
+"""Scores of detectors, of any scale."""
 
 
 def sections(kind: type[BaseModel] = Config) -> list[type[BaseModel]]:
@@ -26,6 +32,64 @@ def test_every_field_has_a_default_and_a_meaning(kind: type[BaseModel]) -> None:
     for name, info in kind.model_fields.items():
         assert info.description, f"{kind.__name__}.{name} has no description"
         assert not info.is_required()
+
+
+@pytest.mark.parametrize("kind", sections(), ids=lambda kind: kind.__name__)
+def test_every_number_has_bounds(kind: type[BaseModel]) -> None:
+    for name, info in kind.model_fields.items():
+        alone = {float, int, float | None, int | None} & {info.annotation}
+        assert not alone or info.metadata or "Gt(" in str(info.annotation) or name in UNBOUNDED, (
+            f"{kind.__name__}.{name}"
+        )
+
+
+def leaves(section: Section, prefix: str = "") -> Iterator[tuple[str, object]]:
+    for name in type(section).model_fields:
+        value = getattr(section, name)
+        yield from leaves(value, f"{prefix}{name}.") if isinstance(value, Section) else [(prefix + name, value)]
+
+
+@pytest.mark.parametrize("name", Config.model_fields)
+def test_every_key_is_set_by_its_name_and_written_as_it_is(name: str) -> None:
+    """One by one, as `--set` and `summary.json` name them; the printed file has each with its meaning."""
+    config, shown = Config(), to_toml(Config())
+    for key, value in leaves(getattr(config, name), f"{name}."):
+        *path, last = key.split(".")
+        of_run = config.to_dict()
+        for part in path:
+            of_run = of_run[part]
+        assert of_run[last] == json.loads(json.dumps(value))
+        assert f"{last} =" in shown
+        if value is not None and not isinstance(value, dict):
+            assert with_overrides(config, [f"{key}={json.dumps(value)}"]) == config
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "slam.calibration.sigma.range_slop=0.1",
+        "slam.calibration.kinds.sonar=[1, 1, 1, 1, 1]",
+        "slam.changes.most_groups=0",
+        "slam.votes.gate=0",
+        "slam.space.map.p_moved=1",
+        "living.boxes.found_pairs=1",
+        "track.shape.misplaced=0.5",
+        "live.beliefs_s=0",
+    ],
+)
+def test_values_out_of_bounds_are_refused(override: str) -> None:
+    with pytest.raises(ConfigError):
+        load_config(None, [override])
+
+
+def test_priors_of_calibration_are_set_one_by_one() -> None:
+    config = load_config(None, ["slam.calibration.sigma.range_slope=0.5", "slam.calibration.kinds.laser=[1,1,1,1,1]"])
+    prior = CalibrationPrior.from_settings(config.slam.calibration, calibrated=True)
+    usual = CalibrationPrior.from_settings(calibrated=True)
+    assert [name for name, one, other in zip(NAMES, prior.sigma, usual.sigma, strict=True) if one != other] == [
+        "range_slope"
+    ]
+    assert config.slam.calibration.kinds["camera"] == Config().slam.calibration.kinds["camera"]
 
 
 def test_configuration_is_frozen() -> None:

@@ -169,7 +169,10 @@ class ChangesConfig(Section):
     rigid_m: Positive = Field(default=0.005, description="members of a group keep their distances to within this [m]")
     p_swapped: Share = Field(default=1e-5, description="probability that any two landmarks of a map were mixed up")
     displaced_log_odds: float = Field(
-        default=7.0, description="prior log odds against a landmark being elsewhere for a part of the session [nats]"
+        default=7.0,
+        gt=0,
+        le=50,
+        description="prior log odds against a landmark being elsewhere for a part of the session [nats]",
     )
     map_factor_spread: Positive = Field(
         default=0.35, description="by how much the sigmas of a map may be wrong: standard deviation of their logarithm"
@@ -317,7 +320,9 @@ class TrafficConfig(Section):
     sigma_bend: Positive = Field(
         default=1e-3, description="angle that the odometry turns too little by the metre, standard deviation [rad/m]"
     )
-    error_log_odds: float = Field(default=-3.0, description="prior log odds that there is such an error [nats]")
+    error_log_odds: float = Field(
+        default=-3.0, ge=-50, le=50, description="prior log odds that there is such an error [nats]"
+    )
     still_mps: Positive = Field(
         default=0.1, description="velocity that a detector sees of what stands, standard deviation [m/s]"
     )
