@@ -27,6 +27,7 @@ from scipy.optimize import nnls
 from evermap.config import SpaceConfig, StillConfig, TrafficConfig
 from evermap.geometry import se3
 from evermap.slam.space.problem import USUAL, SpatialProblem
+from evermap.tracking.standing import HEAVY
 from evermap.types import FloatArray, IntArray
 
 STILL = StillConfig()
@@ -189,7 +190,7 @@ def _others(stamp_s: FloatArray, persist_s: FloatArray) -> FloatArray:
     return found
 
 
-ROUNDS, HEAVY = 10, 2.0
+ROUNDS = 10
 FEWEST = 3
 """Things that it takes: one more than there are numbers."""
 STRETCHES, EVERYWHERE = 10, 3.36

@@ -33,7 +33,7 @@ BEHIND = 0.02
 """A corner must be this far ahead of the camera [m]; of one that is not nothing can be said."""
 JUMP_SHARE = 1e-4
 """Information of odometry that jumped, as a share of what it has else: it may be wrong by a hundred times as much."""
-HEAVY = 3.0
+TAIL_SIGMAS = 3.0
 """Scale of the Cauchy's tails, in standard deviations a number, while the estimate may be far off."""
 
 kernel = kept(effort=1, error_model="numpy")
@@ -87,7 +87,7 @@ def weighed(squared: float, log_odds: float, n_rows: int, share: float, heavy: b
     It is a mixture of what the noise levels say and of an outlier, whose information is `share` of that.
     """
     if heavy:
-        scale = HEAVY * HEAVY * n_rows
+        scale = TAIL_SIGMAS * TAIL_SIGMAS * n_rows
         return 1.0 / (1.0 + squared / scale), 0.5 * scale * math.log1p(squared / scale)
     d = 0.5 * squared * (1.0 - share) - log_odds
     log_sum = math.log1p(math.exp(d)) if d < 0 else d + math.log1p(math.exp(-d))
