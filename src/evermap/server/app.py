@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 from uuid import uuid4
 
 import numpy as np
-from fastapi import APIRouter, Body, Depends, FastAPI, Header, HTTPException, Query, Request, Response
+from fastapi import APIRouter, Body, Depends, FastAPI, Header, HTTPException, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
@@ -202,6 +202,8 @@ Uploader = Annotated[str, _may(Role.UPLOAD)]
 Approver = Annotated[str, _may(Role.APPROVE)]
 Administrator = Annotated[str, _may(Role.ADMIN)]
 RobotName = Annotated[str, Field(pattern=r"^[^\x00-\x1f]{1,100}$")]
+Site = Annotated[str, Path(json_schema_extra={"pattern": f"^{SITE.pattern}$"})]
+"""A name that is none is told like a site that is not there, so the pattern only describes it."""
 OfSite = Annotated[str | None, Query(pattern=f"^{SITE.pattern}$")]
 AtRevision = Annotated[int | None, Query(ge=0, le=2**31 - 1)]
 Number = Annotated[float | None, Query(allow_inf_nan=False)]
@@ -289,7 +291,7 @@ def list_maps(server: Answering, _: Reader, site: OfSite = None) -> list[dict[st
 
 
 @router.post("/maps/{site}/sessions", status_code=202)
-async def upload(request: Request, response: Response, site: str, server: Answering, who: Uploader) -> dict[str, Any]:
+async def upload(request: Request, response: Response, site: Site, server: Answering, who: Uploader) -> dict[str, Any]:
     """Queue a session: the body is a zip of a native folder or of a bag, or a bag. Sent twice, it is entered once."""
     server.sites.address(site)
     most, body = server.limits.n_bytes, bytearray()
@@ -344,19 +346,19 @@ def _job(server: Server, number: int) -> Job:
 
 
 @router.get("/maps/{site}/revisions")
-def list_revisions(request: Request, site: str, _: Reader) -> Response:
+def list_revisions(request: Request, site: Site, _: Reader) -> Response:
     """List the revisions, the oldest first."""
     return _told(request, site, lambda store: [map_dicts.revision_dict(item) for item in store.log()])
 
 
 @router.get("/maps/{site}/diff")
-def diff(request: Request, site: str, _: Reader, a: AtRevision = 0, b: AtRevision = None) -> Response:
+def diff(request: Request, site: Site, _: Reader, a: AtRevision = 0, b: AtRevision = None) -> Response:
     """Tell what changed between two revisions."""
     return _told(request, site, lambda store: map_dicts.diff_dict(between(store, a or 0, b)))
 
 
 @router.get("/maps/{site}/changes")
-def changes(request: Request, site: str, _: Reader, since: AtRevision = 0) -> Response:
+def changes(request: Request, site: Site, _: Reader, since: AtRevision = 0) -> Response:
     """List the changes that revisions after `since` told, one by one."""
 
     def listed(store: SqlStore) -> list[dict[str, Any]]:
@@ -385,7 +387,7 @@ class LandmarkQuery(BaseModel):
 
 
 @router.get("/maps/{site}/landmarks")
-def landmarks(request: Request, site: str, _: Reader, asked: Annotated[LandmarkQuery, Query()]) -> Response:
+def landmarks(request: Request, site: Site, _: Reader, asked: Annotated[LandmarkQuery, Query()]) -> Response:
     """List landmarks within a region; `p_ahead` is the probability that each is there at `at_s`."""
 
     def listed(store: SqlStore) -> dict[str, Any]:
@@ -403,13 +405,13 @@ def landmarks(request: Request, site: str, _: Reader, asked: Annotated[LandmarkQ
 
 
 @router.get("/maps/{site}/landmarks/{landmark}/why")
-def why(request: Request, site: str, landmark: str, _: Reader, revision: AtRevision = None) -> Response:
+def why(request: Request, site: Site, landmark: str, _: Reader, revision: AtRevision = None) -> Response:
     """Tell why a landmark is believed to be there, or gone."""
     return _told(request, site, lambda store: map_dicts.answer_dict(of_landmark(store, landmark, revision)))
 
 
 @router.get("/maps/{site}/lifetimes")
-def lifetimes(request: Request, site: str, _: Reader, revision: AtRevision = None) -> Response:
+def lifetimes(request: Request, site: Site, _: Reader, revision: AtRevision = None) -> Response:
     """Tell how long things stay, by class and place."""
 
     def told(store: SqlStore) -> dict[str, Any]:
@@ -421,7 +423,7 @@ def lifetimes(request: Request, site: str, _: Reader, revision: AtRevision = Non
 
 @router.get("/maps/{site}/file", **_as("application/vnd.sqlite3"))
 def map_file(
-    request: Request, site: str, server: Answering, _: Reader, revision: AtRevision = None, approved: bool = False,
+    request: Request, site: Site, server: Answering, _: Reader, revision: AtRevision = None, approved: bool = False,
 ) -> Response:  # fmt: skip
     """Return the map as one file, of a revision, of the approved one, or of the newest."""
     if approved:
@@ -440,7 +442,7 @@ def _approved(server: Server, site: str) -> int:
 
 
 @router.post("/maps/{site}/approve")
-def approve(request: Request, site: str, chosen: Chosen, server: Answering, who: Approver) -> dict[str, Any]:
+def approve(request: Request, site: Site, chosen: Chosen, server: Answering, who: Approver) -> dict[str, Any]:
     """Approve a revision for the robots of this site."""
     with server.sites.store(site) as store:
         if not 1 <= chosen.revision <= store.head():
@@ -451,7 +453,7 @@ def approve(request: Request, site: str, chosen: Chosen, server: Answering, who:
 
 
 @router.get("/maps/{site}/actions")
-def actions(request: Request, site: str, server: Answering, _: Reader, robot: RobotName | None = None) -> Response:
+def actions(request: Request, site: Site, server: Answering, _: Reader, robot: RobotName | None = None) -> Response:
     """List the instant actions of VDA 5050 by which a robot comes to use the approved revision, in their order.
 
     Of a robot that is named, only what it still lacks, by the maps that it said it holds.
@@ -498,7 +500,7 @@ def hold(
 
 
 @router.post("/maps/{site}/revert")
-def revert(request: Request, site: str, chosen: Chosen, server: Answering, who: Approver) -> dict[str, Any]:
+def revert(request: Request, site: Site, chosen: Chosen, server: Answering, who: Approver) -> dict[str, Any]:
     """Go back to an older revision, by a new one."""
     request.state.said = f"to revision {chosen.revision}"
     with server.sites.store(site) as store:
@@ -509,7 +511,7 @@ def revert(request: Request, site: str, chosen: Chosen, server: Answering, who: 
 def _word(action: str, word: str) -> None:
     """The answer to an operator who says this of landmarks."""
 
-    def say(request: Request, site: str, said: Said, server: Answering, who: Approver) -> dict[str, Any]:
+    def say(request: Request, site: Site, said: Said, server: Answering, who: Approver) -> dict[str, Any]:
         request.state.said = ", ".join(said.landmarks)
         with server.sites.store(site) as store:
             number, changed, told = edit_landmarks(
@@ -534,7 +536,7 @@ def audit(
 
 @router.get("/maps/{site}/events", **_as("text/event-stream"))
 async def events(
-    request: Request, site: str, server: Answering, _: Reader, since: AtRevision = None,
+    request: Request, site: Site, server: Answering, _: Reader, since: AtRevision = None,
     last_event_id: Annotated[str, Header()] = "",
 ) -> StreamingResponse:  # fmt: skip
     """Send events (Server-Sent Events): `revision` for every new one, after `Last-Event-ID` or `since`, and `beside`
