@@ -1,28 +1,37 @@
 """How much memory a contender needs, measured in a process of its own.
 
-python -m benchmarks.memory isam2 evermap 2000
+    python -m benchmarks.memory isam2 evermap 2000
+
+And how much `evermap persist` needs of a folder of Parquet files with so many looks at 20,000 features, in parts of a
+million rows and in one piece, with CPU time and the checksum of all beliefs:
+
+    python -m benchmarks.memory persist parts 8000000
+    python -m benchmarks.memory persist one 8000000
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import resource
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 _WARM_UP_POSES = 50
+_FEATURES, _FILE_ROWS, _PART_ROWS = 20_000, 500_000, 1_000_000
 
 
 def measure(race: str, contender: str, n_poses: int) -> dict[str, float]:
     """Peak resident memory [MB] of a fresh process that runs one contender once, and what it had before the run.
 
     Args:
-        race: one of `contenders.CONTENDERS`, or 'scale'.
-        contender: 'evermap' or 'gtsam'.
-        n_poses: size of the world; of 'scale', in landmarks.
+        race: one of `contenders.CONTENDERS`, 'scale', or 'persist'.
+        contender: 'evermap' or 'gtsam'; of 'persist', 'parts' or 'one'.
+        n_poses: size of the world; of 'scale', in landmarks, of 'persist', in looks.
     """
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.memory", race, contender, str(n_poses)],
@@ -66,6 +75,8 @@ def _run(race: str, contender: str, n_poses: int) -> dict[str, float]:
         before_mb = peak_mb()
         scale.once(contender, n_poses)
         return {"before_mb": before_mb, "peak_mb": peak_mb()}
+    if race == "persist":
+        return _persist(contender == "parts", n_poses)
     from benchmarks.contenders import CONTENDERS
     from benchmarks.world import circular_world
 
@@ -76,6 +87,40 @@ def _run(race: str, contender: str, n_poses: int) -> dict[str, float]:
     before_mb = peak_mb()
     compete(world)
     return {"before_mb": before_mb, "peak_mb": peak_mb()}
+
+
+def _persist(in_parts: bool, rows: int) -> dict[str, float]:
+    """`evermap persist` of simulated looks, 500,000 a file."""
+    import numpy as np
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    from typer.testing import CliRunner
+
+    from evermap.cli.main import app
+
+    rng = np.random.default_rng(0)
+    with tempfile.TemporaryDirectory() as folder:
+        looks, out = Path(folder) / "looks", Path(folder) / "out"
+        looks.mkdir()
+        for number, start in enumerate(range(0, rows, _FILE_ROWS)):
+            size = min(_FILE_ROWS, rows - start)
+            who, stamp_s = rng.integers(0, _FEATURES, size), 1.7e9 + start + np.sort(rng.uniform(0, size, size))
+            there = stamp_s < 1.7e9 + rows * (who + 1) / _FEATURES
+            detected = rng.random(size) < np.where(there, 0.9, 0.1)
+            table = pa.table({"stamp_s": stamp_s, "feature_id": who, "detected": detected.astype(np.int8)})
+            pq.write_table(table, looks / f"{number:04}.parquet")
+        CliRunner().invoke(app, ["persist", "--init", str(Path(folder) / "small.csv")])
+        CliRunner().invoke(app, ["persist", str(Path(folder) / "small.csv"), "--out", str(out)])
+        before_mb, before = peak_mb(), os.times()
+        words = ["persist", str(looks), "--out", str(out), "--figures", "2"]
+        words += ["--set", f"persist.rows_at_once={_PART_ROWS if in_parts else rows}"]
+        assert CliRunner().invoke(app, words).exit_code == 0
+        after = os.times()
+        with (out / "beliefs.csv").open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    print(f"beliefs: {digest}", file=sys.stderr)
+    cpu_s = after.user + after.system - before.user - before.system
+    return {"before_mb": before_mb, "peak_mb": peak_mb(), "cpu_s": cpu_s}
 
 
 if __name__ == "__main__":

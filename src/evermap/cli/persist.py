@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evermap.cli.learn import Cluster, Workers, one_of
 from evermap.cli.options import (
     AsJson,
     ConfigFile,
@@ -40,7 +41,10 @@ class StampsCount(StrEnum):
 
 
 Looks = Annotated[
-    Path | None, typer.Argument(metavar="INPUT", help="Table of looks: .csv, .csv.gz or .parquet.", show_default=False)
+    Path | None,
+    typer.Argument(
+        metavar="INPUT", help="Table of looks: .csv, .csv.gz or .parquet, or a folder of .parquet.", show_default=False
+    ),
 ]
 Recurrent = Annotated[
     str | None,
@@ -114,6 +118,7 @@ Examples:
   evermap persist looks.csv --out out/looks
   evermap persist looks.csv --prior unknown:1h..1y --prior cart=exponential:half-life=1d --horizon 2d
   evermap persist looks.csv --recurrent auto
+  evermap persist a-year-of-looks/ --workers 4
 """
 
 
@@ -134,6 +139,8 @@ def persist(
     truth: TruthTable = None,
     figures: Figures = None,
     clock: ShownClock = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     config: ConfigFile = None,
     settings: Settings = None,
     show_config: ShowConfig = False,
@@ -163,7 +170,9 @@ def persist(
     out = out or default_out(input.name)
     inputs: list[str | Path | None] = [input, chosen.model, truth, config]
     counts = None if clock is None else Clock(clock.value)
-    summary = _run(input, truth, chosen, out, clock=counts, force=force, inputs=inputs)
+    one_of(workers, cluster)
+    spread: dict[str, Any] = {"workers": workers or 1, "cluster": cluster}
+    summary = _run(input, truth, chosen, out, clock=counts, force=force, inputs=inputs, spread=spread)
     if as_json:
         print_json(summary)
     else:
@@ -179,16 +188,30 @@ def _run(
     clock: Clock | None,
     force: bool,
     inputs: Sequence[str | Path | None],
+    spread: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Read, run, write; return the summary."""
-    from evermap.runs.folder import check_replaceable
+    from evermap.io.columns import is_parted
+    from evermap.runs.folder import RunFolder, check_replaceable
     from evermap.runs.persist.run import run_persist
     from evermap.runs.persist.run import warm_up as compile_kernels
     from evermap.runs.persist.table import read_looks, read_truth
-    from evermap.runs.persist.write import write_persist
+    from evermap.runs.persist.write import persist_in_parts, write_persist
     from evermap.runs.summary import RunInfo
 
     check_replaceable(out, force=force, inputs=inputs)  # better now than after the run
+    if truth_path is None and is_parted(path, config.rows_at_once, but="present"):  # that is scored in one piece
+        path, out = (path.absolute(), out.absolute()) if spread["cluster"] else (path, out)
+        warm_up(compile_kernels)
+        info = RunInfo(command=command_line())
+        with (
+            RunFolder(out, force=force, inputs=inputs) as folder,
+            progress_bar(f"{path.name}: filtering parts", speed=False) as progress,
+        ):
+            summary = persist_in_parts(folder, path, config, clock=clock, info=info, progress=progress, **spread)
+        for remark in summary["warnings"]:
+            warn(remark)
+        return summary
     start = time.perf_counter()
     table = read_looks(path, p_miss=config.p_miss, p_false=config.p_false)
     truth, remarks = (None, ()) if truth_path is None else read_truth(truth_path, table)

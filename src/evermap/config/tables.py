@@ -56,6 +56,9 @@ class PersistConfig(Section):
     p_miss: Probability = Field(default=0.1, description="P(no detection | there) where the table does not say")
     p_false: Probability = Field(default=0.1, description="P(detection | not there) where the table does not say")
     figures: int = Field(default=12, ge=0, description="how many features get a figure of their own")
+    rows_at_once: int = Field(
+        default=5_000_000, ge=1, description="rows that are held in memory; a larger Parquet table is done in parts"
+    )
 
     @property
     def stays_once(self) -> bool:

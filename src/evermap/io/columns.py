@@ -7,7 +7,7 @@ line and cell at fault; both take the same files and give the same values.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from evermap.io.text import quote, reason
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
 from evermap.valid import Quantity
 
+_BATCH_ROWS = 1 << 18
 _FLAGS = {"1": 1.0, "0": 0.0, "true": 1.0, "false": 0.0, "1.0": 1.0, "0.0": 0.0, "": np.nan, "nan": np.nan}
 
 
@@ -164,12 +165,15 @@ class Columns:
 
 
 def read_columns(path: str | Path, warnings: list[str]) -> Columns:
-    """Return a `.csv`, `.csv.gz` or `.parquet` file; `warnings` gets a remark on an unfinished last line.
+    """Return a `.csv`, `.csv.gz` or `.parquet` file, or a folder of the latter; `warnings` gets a remark on an
+    unfinished last line.
 
     Raises:
         InputError: it is missing, damaged, or no table.
     """
     path = Path(path)
+    if path.is_dir() and parquet_files(path):
+        return _joined(list(parquet_batches(path)))
     data = _content(path)
     if data[:4] == b"PAR1":
         table = read_parquet(data, path)
@@ -178,32 +182,101 @@ def read_columns(path: str | Path, warnings: list[str]) -> Columns:
     return _fast_csv(data, path) or _careful_csv(data, path, warnings)
 
 
+def _joined(parts: Sequence[Columns]) -> Columns:
+    import pyarrow as pa
+
+    cells = {name: pa.concat_arrays([part.cells[name] for part in parts]) for name in parts[0].cells} if parts else {}
+    line = np.concatenate([part.line for part in parts]) if parts else np.zeros(0, dtype=np.int64)
+    return Columns(parts[0].path if parts else Path(), cells, line, None)
+
+
+def parquet_files(path: Path) -> list[Path]:
+    """Return the Parquet files of a folder and the folders in it, by name; the path itself where it is a file."""
+    return sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
+
+
+def parquet_batches(path: Path, columns: Sequence[str] | None = None) -> Iterator[Columns]:
+    """Yield a Parquet file, or all in a folder as one table, some rows at a time; rows count through all files.
+
+    Args:
+        path: the file or folder.
+        columns: names of those to read; None for all.
+
+    Raises:
+        InputError: none is there, one is damaged, or files have different columns.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    files, start, schema = parquet_files(path), 1, None
+    for file in files:
+        try:
+            with pq.ParquetFile(file, page_checksum_verification=True) as source:
+                schema = schema or source.schema_arrow
+                if not source.schema_arrow.equals(schema):
+                    hint = f"the columns of {files[0].name}, of the same types"
+                    raise InputError("has other columns than the files before it", path=file, hint=hint)
+                wanted = None if columns is None else [name for name in columns if name in schema.names]
+                for batch in source.iter_batches(_BATCH_ROWS, columns=wanted, use_threads=False):
+                    cells = dict(zip(batch.schema.names, map(_plain, batch.columns), strict=True))
+                    yield Columns(path, cells, np.arange(start, start + batch.num_rows), None)
+                    start += batch.num_rows
+        except (pa.ArrowException, OSError, ValueError) as error:
+            raise InputError(
+                f"not a readable Parquet file: {reason(error)}", path=file, hint="write it again"
+            ) from error
+    if schema is None:
+        raise InputError("holds no Parquet file", path=path, hint="a folder of .parquet files, or one file")
+
+
+def is_parted(path: Path, most: int, but: str = "") -> bool:
+    """Return whether a Parquet file, or all in a folder together, have more rows than `most`, and no column `but`."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        about = [pq.read_metadata(file) for file in parquet_files(path)]
+    except (pa.ArrowException, OSError):  # none, or reading it will tell
+        return False
+    return sum(one.num_rows for one in about) > most and but not in about[0].schema.names
+
+
+def natural_order(names: Sequence[str]) -> list[int]:
+    """Return the order of names: by size where all are whole numbers, else by alphabet."""
+    return sorted(range(len(names)), key=_natural(list(names)))
+
+
 def named(names: Sequence[str], index: IntArray) -> Any:
     """Return a column of names for `csv_bytes`: which of `names` each row has."""
     return arrow_cells(list(names)).take(arrow_cells(index))
 
 
-def csv_bytes(columns: Mapping[str, Any]) -> bytes:
+def csv_bytes(columns: Mapping[str, Any], *, quoted: bool = False, header: bool = True) -> bytes:
     """Return a CSV file of arrays of numbers and of `named` columns; floats in the shortest form that reads back the
     same.
 
-    Missing numbers (nan) are empty cells.
+    Missing numbers (nan) are empty cells. Of a file in pieces, all have `quoted` where one needs it, and the first has
+    the `header`.
     """
     import pyarrow as pa
-    import pyarrow.compute as pc
     from pyarrow import csv
 
     arrays = {name: _cells(column) for name, column in columns.items()}
-    marks = any(
-        _is_text(cells.type) and pc.any(pc.match_substring_regex(cells, r'[",\r\n#]|^\s|\s$')).as_py()
-        for cells in arrays.values()
-    )
+    marks = quoted or any(_is_text(cells.type) and needs_quotes(cells) for cells in arrays.values())
     options = csv.WriteOptions(include_header=False, quoting_style="needed" if marks else "none")
     sink = pa.BufferOutputStream()
-    sink.write((",".join(columns) + "\n").encode())
+    if header:
+        sink.write((",".join(columns) + "\n").encode())
     if len(next(iter(arrays.values()))):
         csv.write_csv(pa.table(arrays), sink, options)
     return bytes(sink.getvalue())
+
+
+def needs_quotes(cells: Any) -> bool:
+    """Return whether a pyarrow array of text has a cell that a CSV file must quote."""
+    import pyarrow.compute as pc
+
+    return bool(pc.any(pc.match_substring_regex(cells, r'[",\r\n#]|^\s|\s$')).as_py())
 
 
 def _cells(column: Any) -> Any:

@@ -17,6 +17,7 @@ from evermap.existence.one_stay import OneStay, births
 from evermap.existence.protocol import Looks, PresenceModel
 from evermap.existence.run_length import RunLength
 from evermap.runs.persist.models import ModelOfEach
+from evermap.runs.persist.table import Span
 from evermap.types import BoolArray, FloatArray, IntArray
 
 _SHORTEST_GAP_S = 1e-9
@@ -162,13 +163,14 @@ class Forecasts:
     mean_absence_s: FloatArray
 
 
-def forecast_stamps(looks: Looks, now_s: float, config: PersistConfig) -> FloatArray:
+def forecast_stamps(span: Span, config: PersistConfig) -> FloatArray:
     """Return (N,) instants from the latest look on, `horizon_s` far.
 
     Raises:
         ConfigError: so many steps that one of them must be wrong.
     """
-    horizon_s = config.horizon_s or config.horizon_share * (now_s - float(looks.stamp_s.min())) or 1.0
+    now_s = span.last_look_s
+    horizon_s = config.horizon_s or config.horizon_share * (now_s - span.first_look_s) or 1.0
     step_s = config.step_s or horizon_s / config.forecast_steps
     count = int(np.floor(horizon_s / step_s * (1.0 + 1e-12)))
     if count > MOST_STEPS:

@@ -18,7 +18,7 @@ from evermap.existence.one_stay import OneStay
 from evermap.existence.protocol import Instants, Looks, PresenceFilter, PresenceModel, Track, firsts_of
 from evermap.existence.rhythm import BIN_S
 from evermap.io.text import quote
-from evermap.runs.persist.table import LookTable
+from evermap.runs.persist.table import LookTable, PartedLooks
 from evermap.types import UNKNOWN, FloatArray, IntArray, json_number
 
 
@@ -128,15 +128,21 @@ def some_looks(looks: Looks, features: IntArray, most: int) -> tuple[Looks, IntA
 
     Of a single feature with more looks its latest are returned.
     """
-    part, rows = looks.at(features)
-    if len(rows) <= most:
-        return part, rows
-    drawn = np.random.default_rng(0).permutation(part.n_features)
-    enough = int(np.searchsorted(np.cumsum(np.diff(part.first)[drawn]), most, side="right"))
-    part, rows = looks.at(features[np.sort(drawn[: max(enough, 1)])])
+    part, rows = looks.at(features[drawn_features(np.diff(looks.first)[features], most)])
     if len(rows) <= most:
         return part, rows
     return looks.taken(rows[-most:], np.array([0, most])), rows[-most:]
+
+
+def drawn_features(counts: IntArray, most: int) -> IntArray:
+    """Return which features, with so many looks each, to learn from: all, or so many at random as have at most `most`
+    looks together, but at least one.
+    """
+    if counts.sum() <= most:
+        return np.arange(len(counts))
+    drawn = np.random.default_rng(0).permutation(len(counts))
+    enough = int(np.searchsorted(np.cumsum(counts[drawn]), most, side="right"))
+    return np.sort(drawn[: max(enough, 1)])
 
 
 AUTO = "auto"
@@ -202,8 +208,8 @@ def learn_models(
     kind = config.recurrent
     if kind != AUTO and kind not in KINDS:
         raise ConfigError(f"unknown kind of model '{kind}'", field="recurrent", hint=", ".join((AUTO, *KINDS)))
-    grouping = _grouping(table, looks, config) if config.per == AUTO else config.per
-    groups = list(_groups(table, grouping))
+    grouping = grouping_of(table, np.diff(looks.first), config)
+    groups = list(groups_of(table, grouping))
     of_feature = np.zeros(table.n_features, dtype=np.int64)
     choices: list[Choice] = []
     tell = progress or (lambda _: None)
@@ -244,16 +250,24 @@ def _check_span(looks: Looks, kind: str) -> None:
         raise DataError(problem, field="stamp_s", hint=hint)
 
 
-def _grouping(table: LookTable, looks: Looks, config: PersistConfig) -> str:
-    """By class where there are classes, by feature where each has a lot to say, else all together."""
+def grouping_of(table: LookTable | PartedLooks, counts: IntArray, config: PersistConfig) -> str:
+    """Return what is said; else by class where there are classes, by feature where each has a lot to say, else all.
+
+    Args:
+        table: of the features.
+        counts: (F,) looks of each.
+        config: choices.
+    """
+    if config.per != AUTO:
+        return config.per
     if table.class_names:
         return "class"
-    plenty = np.diff(looks.first).min() >= config.fewest_looks_alone
+    plenty = counts.min() >= config.fewest_looks_alone
     return "feature" if table.n_features <= config.most_features_alone and plenty else "all"
 
 
-def _groups(table: LookTable, per: str) -> Iterator[tuple[str, IntArray]]:
-    """Names and features of the groups; '' names all, or those without a class."""
+def groups_of(table: LookTable | PartedLooks, per: str) -> Iterator[tuple[str, IntArray]]:
+    """Yield names and features of the groups; '' names all, or those without a class."""
     if per == "feature":
         for feature, name in enumerate(table.names):
             yield name, np.array([feature])

@@ -20,7 +20,7 @@ from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, 
 from evermap.viz.style import NamedFigure
 from evermap.viz.time_axis import guess_clock
 
-_MOST_ROWS = 100
+MOST_ROWS = 100
 """Of a table on the page."""
 
 
@@ -93,11 +93,11 @@ def _changes(result: PersistResult, clock: Clock) -> str:
             ),
             f"{changes.confidence[k]:.3f}",
         )
-        for k in range(len(changes) - 1, max(-1, len(changes) - 1 - _MOST_ROWS), -1)
+        for k in range(len(changes) - 1, max(-1, len(changes) - 1 - MOST_ROWS), -1)
     ]
     zone = "since the start" if clock is Clock.RECORDING else "UTC" if clock is Clock.UNIX else "local clock"
     head = ("feature", "change", f"when ({zone})", "not before", "not after", "decided", "confidence")
-    more = len(changes) - len(rows)
+    more = result.totals.vanished + result.totals.returned - len(rows)
     note = f"<p>{more:,} earlier ones are in <code>changes.jsonl</code>.</p>" if more > 0 else ""
     return f"<h2>Changes, latest first</h2>{table(head, rows, numbers=(2, 3, 4, 5, 6))}{note}"
 
@@ -121,10 +121,10 @@ def _forecasts(result: PersistResult) -> str:
             f"{forecasts.p_exists[k, -1]:.3f}",
             *(_time(float(times_s[k])) for times_s in outlooks.values()),
         )
-        for k in believed[:_MOST_ROWS].tolist()
+        for k in believed[:MOST_ROWS].tolist()
     ]
     head = ("feature", "P(exists) now", f"in {horizon}", *outlooks)
-    more = believed.size - len(rows)
+    more = int((~np.isnan(result.totals.p_now)).sum()) - len(rows)
     note = f"<p>{more:,} more are in <code>forecasts.csv</code>.</p>" if more > 0 else ""
     return f"<h2>Forecasts</h2>{table(head, rows, numbers=range(1, len(head)))}{note}"
 
@@ -170,9 +170,12 @@ def draw_run(result: PersistResult, *, figures: int, clock: Clock | None = None)
 
 def most_interesting(result: PersistResult, n: int) -> IntArray:
     """Return the `n` features that changed most, of equals those looked at more often; in natural order."""
-    changes = result.changes.per_feature(result.table.n_features)
-    order = np.lexsort((-np.diff(result.looks.first), -changes))
-    return np.sort(order[:n])
+    return most_changed(result.changes.per_feature(result.table.n_features), np.diff(result.looks.first), n)
+
+
+def most_changed(changes: IntArray, looks: IntArray, n: int) -> IntArray:
+    """Return `most_interesting`, given the changes and the looks of each feature."""
+    return np.sort(np.lexsort((-looks, -changes))[:n])
 
 
 def _overview(result: PersistResult, clock: Clock) -> NamedFigure:
@@ -202,7 +205,7 @@ def _overview(result: PersistResult, clock: Clock) -> NamedFigure:
         forecast_from_s=result.table.now_s,
         clock=clock,
     )
-    total = result.table.n_features
+    total = len(result.totals.p_now)
     which = "All features" if len(features) == total else f"The {len(features)} of {total:,} features that changed most"
     caption = f"{which}: blue is there, orange is not, pale is undecided, hatched is not yet seen."
     return NamedFigure("overview", figure, "Beliefs of all features", caption)
@@ -264,5 +267,5 @@ def _extremes(pixel: FloatArray, belief: FloatArray) -> IntArray:
 
 def _span(result: PersistResult) -> tuple[float, float]:
     """From the first row to the end of the forecast."""
-    stamps = result.table.stamp_s
-    return float(stamps.min()), max(float(stamps.max()), float(result.forecasts.stamp_s[-1]))
+    start_s, stop_s = result.table.span[:2]
+    return start_s, max(stop_s, float(result.forecasts.stamp_s[-1]))

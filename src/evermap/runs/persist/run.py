@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -47,6 +48,86 @@ class Beliefs:
 
 
 @dataclass(frozen=True, slots=True)
+class Totals:
+    """What a run counts; of a table in parts, over all of them.
+
+    Attributes:
+        rows, looks, detections: of the table.
+        features_detected: features with a detection.
+        beliefs, unborn: instants with a belief, and without one.
+        vanished, returned: changes of each kind.
+        features_back: features that returned.
+        p_now: (F,) probability of presence at the latest look.
+        merged_mass: largest probability that a filter of limited memory moved about within one feature.
+        p_miss, p_false: least and largest of the looks.
+        repeated, contradicted: looks that repeat or contradict another at the same feature and time, and when first.
+    """
+
+    rows: int
+    looks: int
+    detections: int
+    features_detected: int
+    beliefs: int
+    unborn: int
+    vanished: int
+    returned: int
+    features_back: int
+    p_now: FloatArray
+    merged_mass: float
+    p_miss: tuple[float, float]
+    p_false: tuple[float, float]
+    repeated: tuple[int, float]
+    contradicted: tuple[int, float]
+
+    @classmethod
+    def of(
+        cls, table: LookTable, looks: Looks, beliefs: Beliefs, changes: Changes, forecasts: Forecasts, merged: float
+    ) -> Totals:
+        """Count."""
+        born, looked = int((~np.isnan(beliefs.p_exists)).sum()), table.looked
+        again = (np.diff(looks.feature) == 0) & (np.diff(looks.stamp_s) == 0.0)
+        other = again & (np.diff(looks.detected) != 0.0)
+        twice = [
+            (int(k.sum()), float(looks.stamp_s[np.argmax(k)]) if k.any() else np.nan) for k in (again & ~other, other)
+        ]
+        errors = [(float(v.min(initial=np.inf)), float(v.max(initial=-np.inf)))
+                  for v in (table.p_miss[looked], table.p_false[looked])]  # fmt: skip
+        return cls(
+            rows=len(table),
+            looks=int(looked.sum()),
+            detections=int((table.detected == 1.0).sum()),
+            features_detected=len(np.unique(table.feature[table.detected == 1.0])),
+            beliefs=born,
+            unborn=len(beliefs) - born,
+            vanished=int((~changes.returned).sum()),
+            returned=int(changes.returned.sum()),
+            features_back=len(np.unique(changes.feature[changes.returned])),
+            p_now=forecasts.p_exists[:, 0],
+            merged_mass=merged,
+            p_miss=errors[0],
+            p_false=errors[1],
+            repeated=twice[0],
+            contradicted=twice[1],
+        )
+
+    @classmethod
+    def merged(cls, parts: Sequence[Totals]) -> Totals:
+        """Return those of all parts."""
+        values: dict[str, Any] = {}
+        for item in fields(cls):
+            each = [getattr(part, item.name) for part in parts]
+            if item.name == "p_now":
+                values[item.name] = np.concatenate(each)
+            elif item.name in ("p_miss", "p_false"):
+                values[item.name] = min(one[0] for one in each), max(one[1] for one in each)
+            elif item.name in ("repeated", "contradicted"):
+                values[item.name] = sum(one[0] for one in each), next((one[1] for one in each if one[0]), np.nan)
+            else:
+                values[item.name] = max(each) if item.name == "merged_mass" else sum(each)
+        return cls(**values)
+
+
+@dataclass(frozen=True, slots=True)
 class PersistResult:
     """Everything a run found.
 
@@ -62,7 +143,7 @@ class PersistResult:
         forecasts: presence after the latest look.
         truth: None where unknown.
         scores, reliability: beliefs against truth; None where unknown.
-        merged_mass: largest probability that a filter of limited memory moved about within one feature.
+        totals: what is counted.
         step_s: wall time of each step by name.
         warnings: remarks.
     """
@@ -79,7 +160,7 @@ class PersistResult:
     truth: Truth | None
     scores: BeliefScores | None
     reliability: Reliability | None
-    merged_mass: float
+    totals: Totals
     step_s: dict[str, float]
     warnings: tuple[str, ...]
 
@@ -124,10 +205,10 @@ def run_persist(
     truth = truth or table.truth(order)
     scores, bins = _score(table, beliefs, truth, at_rows)
     clock.done("score")
-    warnings = (*table.warnings, *_remarks(config, models, looks, beliefs, changes))
+    totals = Totals.of(table, looks, beliefs, changes, forecasts, merged_mass)
     return PersistResult(
         table, config, models, learned, looks, p_at_looks, beliefs, changes, forecasts, truth, scores, bins,
-        merged_mass, clock.step_s, warnings,
+        totals, clock.step_s, (*table.warnings, *remarks(config, models, totals)),
     )  # fmt: skip
 
 
@@ -143,7 +224,7 @@ def _filter(
     """Beliefs at the instants asked for and at the looks, forecasts, and the mass that was moved about."""
     at_rows = config.query == "times"
     feature, stamp_s = (table.feature, table.stamp_s) if at_rows else _grid(table, config)
-    later_s = forecast_stamps(looks, table.now_s, config)
+    later_s = forecast_stamps(table.span, config)
     ahead = np.repeat(np.arange(looks.n_features), len(later_s)), np.tile(later_s, looks.n_features)
     if at_rows:
         (p_ahead, p_exists), track = ask(models, looks, ahead, (feature, stamp_s))
@@ -161,7 +242,7 @@ def _grid(table: LookTable, config: PersistConfig) -> tuple[IntArray, FloatArray
     Raises:
         ConfigError: so many that the step must be wrong.
     """
-    start_s, stop_s = float(table.stamp_s.min()), float(table.stamp_s.max())
+    start_s, stop_s = table.span[:2]
     step_s = config.step_s or nice_step((stop_s - start_s) / config.grid_steps)
     count = int(np.floor((stop_s - start_s) / step_s * (1.0 + 1e-12))) + 1
     if count * table.n_features > MOST_ROWS:
@@ -194,49 +275,44 @@ def _score(
     return belief_scores(belief, there), reliability(belief, there)
 
 
-def _remarks(config: PersistConfig, models: ModelOfEach, looks: Looks, beliefs: Beliefs, changes: Changes) -> list[str]:
-    remarks = _odd_looks(looks)
-    if config.learns and len(looks.stamp_s) > config.learn_from:
-        remarks.append(
-            f"the model learned from at most {config.learn_from:,} of {len(looks.stamp_s):,} looks (`learn_from`)"
-        )
+def remarks(config: PersistConfig, models: ModelOfEach, totals: Totals) -> list[str]:
+    """Return what is odd about a table or a run."""
+    told = _odd_looks(totals)
+    if config.learns and totals.looks > config.learn_from:
+        told.append(f"the model learned from at most {config.learn_from:,} of {totals.looks:,} looks (`learn_from`)")
     for name, model in zip(models.names, models.models, strict=True):
         stay = getattr(getattr(model, "prior", None), "p_never_leaves", 0.0)
         if stay > 0.0:
             whose = f"class {quote(name)}: " if name else ""
-            remarks.append(f"{whose}{100.0 * stay:.3g} % of the features never leave, by the prior")
-    unborn = int(np.isnan(beliefs.p_exists).sum())
-    if unborn and config.stays_once:
-        remarks.append(f"{counted(unborn, 'belief')} left empty: a feature has no belief before its first detection")
-    back = len(np.unique(changes.feature[changes.returned]))
-    if back and config.stays_once:
-        remarks.append(f"{counted(back, 'feature')} came back, which lifetimes of one stay rule out: try `recurrent`")
-    return remarks
-
-
-def _odd_looks(looks: Looks) -> list[str]:
-    """What makes beliefs wrong without being impossible: no miss or no hit at all, and looks that came twice."""
-    remarks = []
-    count = len(looks.stamp_s)
-    hits = int(looks.detected.sum())
-    if hits == count and count > looks.n_features:
-        remarks.append(
-            f"not one of {count:,} looks is a miss, so nothing can vanish: a row with detected 0 is needed wherever a "
-            "feature was looked at and not detected"
+            told.append(f"{whose}{100.0 * stay:.3g} % of the features never leave, by the prior")
+    if totals.unborn and config.stays_once:
+        told.append(
+            f"{counted(totals.unborn, 'belief')} left empty: a feature has no belief before its first detection"
         )
-    elif hits == 0 and count > looks.n_features:
-        remarks.append(f"not one of {count:,} looks is a detection: is the column 'detected' inverted?")
-    of_look = looks.feature
-    again = (np.diff(of_look) == 0) & (np.diff(looks.stamp_s) == 0.0)
-    other = again & (np.diff(looks.detected) != 0.0)
-    for what, many in (("repeat", again & ~other), ("contradict", other)):
-        if many.any():
-            row = int(np.argmax(many))
-            remarks.append(
-                f"{counted(int(many.sum()), 'look')} that {what} another at the same feature and time, each taken as "
-                f"evidence of its own (first at {looks.stamp_s[row]:.15g} s): one row a look is meant"
+    if totals.features_back and config.stays_once:
+        back = counted(totals.features_back, "feature")
+        told.append(f"{back} came back, which lifetimes of one stay rule out: try `recurrent`")
+    return told
+
+
+def _odd_looks(totals: Totals) -> list[str]:
+    """What makes beliefs wrong without being impossible: no miss or no hit at all, and looks that came twice."""
+    told = []
+    several = totals.looks > len(totals.p_now)
+    if totals.detections == totals.looks and several:
+        told.append(
+            f"not one of {totals.looks:,} looks is a miss, so nothing can vanish: a row with detected 0 is needed "
+            "wherever a feature was looked at and not detected"
+        )
+    elif totals.detections == 0 and several:
+        told.append(f"not one of {totals.looks:,} looks is a detection: is the column 'detected' inverted?")
+    for what, (count, first_s) in (("repeat", totals.repeated), ("contradict", totals.contradicted)):
+        if count:
+            told.append(
+                f"{counted(count, 'look')} that {what} another at the same feature and time, each taken as evidence of "
+                f"its own (first at {first_s:.15g} s): one row a look is meant"
             )
-    return remarks
+    return told
 
 
 def _named(error: NumericalError, table: LookTable, order: IntArray) -> Exception:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from evermap.config import PersistConfig
 from evermap.errors import ConfigError, InputError
 from evermap.existence.protocol import Looks, feature_of, firsts_of
-from evermap.io.columns import Columns, read_columns
+from evermap.io.columns import Columns, natural_order, parquet_batches, read_columns
+from evermap.io.table import arrow_cells
 from evermap.io.text import counted, quote
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
 from evermap.valid import STAMP_S, Quantity
@@ -19,6 +24,15 @@ _OPTIONAL = ("p_miss", "p_false", "class_id", "present")
 _P_MISS = Quantity("p_miss", 0.0, 1.0, optional=True, hint="the probability of no detection of a feature that is there")
 _P_FALSE = Quantity("p_false", 0.0, 1.0, optional=True, hint="the probability of a detection of one that is not there")
 _FLAG_HINT = "1 or true, 0 or false"
+
+
+class Span(NamedTuple):
+    """Times between which a table has rows, and looks."""
+
+    start_s: float
+    stop_s: float
+    first_look_s: float
+    last_look_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +53,7 @@ class LookTable:
         line: (R,) line of each row in that file.
         warnings: remarks of the reader.
         clock: what stamps count, where they were dates; None where the table does not say.
+        whole: times of the whole table, where this is a part of it.
 
     Raises:
         InputError: columns of different lengths, a value that the reader would refuse, or error rates under which a
@@ -58,6 +73,7 @@ class LookTable:
     line: IntArray
     warnings: tuple[str, ...] = ()
     clock: Clock | None = None
+    whole: Span | None = None
 
     def __post_init__(self) -> None:
         if self.class_of_feature.shape != (self.n_features,):
@@ -111,9 +127,18 @@ class LookTable:
         return ~np.isnan(self.detected)
 
     @property
+    def span(self) -> Span:
+        """Times of all rows, of the whole table where this is a part."""
+        if self.whole is not None:
+            return self.whole
+        looked_s = self.stamp_s[self.looked]
+        times_s = (self.stamp_s.min(), self.stamp_s.max(), looked_s.min(), looked_s.max())
+        return Span(*map(float, times_s))
+
+    @property
     def now_s(self) -> float:
         """Time of the latest look."""
-        return float(self.stamp_s[self.looked].max())
+        return self.span.last_look_s
 
     def order(self) -> IntArray:
         """Return (R,) the rows by feature and time."""
@@ -124,6 +149,17 @@ class LookTable:
         rows = order[self.looked[order]]
         columns = (self.stamp_s, self.detected, self.p_miss, self.p_false)
         return Looks(firsts_of(self.feature[rows], self.n_features), *(column[rows] for column in columns))
+
+    def only(self, features: IntArray) -> LookTable:
+        """Return the rows of some features, which are given in their order."""
+        number = np.full(self.n_features, UNKNOWN)
+        number[features] = np.arange(len(features))
+        rows = np.flatnonzero(number[self.feature] != UNKNOWN)
+        columns = {name: getattr(self, name)[rows] for name in ("stamp_s", "detected", "p_miss", "p_false", "line")}
+        return replace(
+            self, **columns, names=tuple(self.names[k] for k in features), feature=number[self.feature[rows]],
+            class_of_feature=self.class_of_feature[features], present=None, whole=self.span,
+        )  # fmt: skip
 
     def truth(self, order: IntArray) -> Truth | None:
         """Return what the column `present` says; None without any. `order` is `self.order()`."""
@@ -168,7 +204,7 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
     """Return a table with `stamp_s, feature_id, detected` and perhaps `p_miss, p_false, class_id, present`.
 
     Args:
-        path: a `.csv`, `.csv.gz` or `.parquet` file; rows in any order.
+        path: a `.csv`, `.csv.gz` or `.parquet` file, or a folder of the latter; rows in any order.
         p_miss: `P(no detection | there)` where the table does not say.
         p_false: `P(detection | not there)` where the table does not say.
 
@@ -176,6 +212,20 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
         InputError: anything wrong in the file, by line and column.
         ConfigError: a default that is not a probability.
     """
+    _check_defaults(p_miss, p_false)
+    warnings: list[str] = []
+    table = read_columns(path, warnings)
+    _explain_missing(table)
+    table.expect(_REQUIRED, _OPTIONAL)
+    if len(table) == 0:
+        raise InputError("has no rows below its header", path=path, hint="one row a look")
+    found = _looks_of(table, p_miss, p_false)
+    if np.isnan(found.detected).all():
+        raise _no_look(Path(path))
+    return replace(found, source=str(path), warnings=tuple(warnings))
+
+
+def _check_defaults(p_miss: float, p_false: float) -> None:
     for name, value in (("p_miss", p_miss), ("p_false", p_false)):
         if not 0.0 <= value <= 1.0:
             raise ConfigError(f"{value} is not a probability", field=name, hint="a number between 0 and 1")
@@ -183,17 +233,16 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
         problem = f"{p_miss:g} and `p_false` {p_false:g} make 1 or more: a detection would speak against the feature"
         hint = "both below 0.5; P(detection | there) is 1 - p_miss"
         raise ConfigError(problem, field="p_miss", hint=hint)
-    warnings: list[str] = []
-    table = read_columns(path, warnings)
-    _explain_missing(table)
-    table.expect(_REQUIRED, _OPTIONAL)
-    if len(table) == 0:
-        raise InputError("has no rows below its header", path=path, hint="one row a look")
+
+
+def _no_look(path: Path) -> InputError:
+    hint = "1 where it was detected, 0 where it was looked at and not detected"
+    return InputError("no row is a look: the whole column is empty", path=path, field="detected", hint=hint)
+
+
+def _looks_of(table: Columns, p_miss: float, p_false: float) -> LookTable:
     names, feature = _features(table)
-    detected = table.flags("detected", hint=_FLAG_HINT + ", empty where the sensor did not look")
-    if np.isnan(detected).all():
-        hint = "1 where it was detected, 0 where it was looked at and not detected"
-        raise InputError("no row is a look: the whole column is empty", path=path, field="detected", hint=hint)
+    detected = _detected(table)
     class_names, class_of_feature = _classes(table, feature, names)
     present = table.flags("present", hint=_FLAG_HINT + ", empty where unknown") if "present" in table else None
     return LookTable(
@@ -206,11 +255,14 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
         class_names=class_names,
         class_of_feature=class_of_feature,
         present=None if present is None or np.isnan(present).all() else present,
-        source=str(path),
+        source=str(table.path),
         line=table.line,
-        warnings=tuple(warnings),
         clock=table.clock(),
     )
+
+
+def _detected(table: Columns) -> FloatArray:
+    return table.flags("detected", hint=_FLAG_HINT + ", empty where the sensor did not look")
 
 
 def read_truth(path: str | Path, looks: LookTable) -> tuple[Truth, tuple[str, ...]]:
@@ -276,3 +328,169 @@ def _classes(table: Columns, feature: IntArray, names: tuple[str, ...]) -> tuple
         )
         raise table.error(problem, row=row, field="class_id", hint="one class a feature")
     return tuple(class_names), of_feature
+
+
+@dataclass(frozen=True, slots=True)
+class PartedLooks:
+    """A Parquet table of looks that is too large for memory, in files of so many features each as memory holds.
+
+    Attributes:
+        path: the table, a file or a folder.
+        names: F feature ids, in natural order, as `LookTable` has them.
+        class_names: classes in use.
+        class_of_feature: (F,) index into them, `UNKNOWN` where none was given.
+        looks: (F,) number of looks of each feature.
+        edges: (P + 1,) features `edges[k]` to `edges[k + 1]` are in `files[k]`, rows in the order of the table.
+        files: of the parts.
+        rows: of the table.
+        span: times of all rows.
+        clock: what stamps count, where they were dates.
+        p_miss, p_false: where the table does not say.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    class_names: tuple[str, ...]
+    class_of_feature: IntArray
+    looks: IntArray
+    edges: IntArray
+    files: tuple[Path, ...]
+    rows: int
+    span: Span
+    clock: Clock | None
+    p_miss: float
+    p_false: float
+
+    @property
+    def n_features(self) -> int:
+        """F."""
+        return len(self.names)
+
+    @classmethod
+    def split(cls, path: Path, folder: Path, config: PersistConfig) -> PartedLooks:
+        """Read a table twice, some rows at a time: what features there are, then which part each row belongs to.
+
+        Args:
+            path: the table.
+            folder: for the parts.
+            config: of it `rows_at_once`, at most, unless one feature has more, `p_miss` and `p_false`.
+
+        Raises:
+            InputError, ConfigError: as `read_looks`; a table with truth, which is scored in one piece only.
+        """
+        _check_defaults(config.p_miss, config.p_false)
+        found = _surveyed(path)
+        order = natural_order(list(found.features))
+        names = tuple(np.array(list(found.features), dtype=object)[order].tolist())
+        rows, looks, classes = (np.array(column)[order] for column in zip(*found.features.values(), strict=True))
+        kinds = [name for name in found.classes if name]
+        class_names = tuple(kinds[k] for k in natural_order(kinds))
+        number = {name: k for k, name in enumerate(class_names)}
+        before = np.concatenate([[0], np.cumsum(rows)])
+        edges = [0]
+        while edges[-1] < len(names):
+            fits = int(np.searchsorted(before, before[edges[-1]] + config.rows_at_once, side="right")) - 1
+            edges.append(max(fits, edges[-1] + 1))
+        files = tuple(folder / f"part{k}.parquet" for k in range(len(edges) - 1))
+        _route(path, {name: k for k, name in enumerate(names)}, np.array(edges), files)
+        return cls(
+            path, names, class_names, np.array([number.get(found.classes[k], UNKNOWN) for k in classes]), looks,
+            np.array(edges), files, int(rows.sum()), found.span, found.clock, config.p_miss, config.p_false,
+        )  # fmt: skip
+
+    def part(self, number: int) -> tuple[LookTable, IntArray]:
+        """Return a part, and which row of the whole table each of its rows is, counted from 0."""
+        import pyarrow.parquet as pq
+
+        read = pq.read_table(self.files[number], use_threads=False)
+        cells = {name: read[name].combine_chunks() for name in read.column_names}
+        row, rank = (cells.pop(name).to_numpy() for name in ("row", "rank"))
+        table = _looks_of(Columns(self.path, cells, row + 1, None), self.p_miss, self.p_false)
+        place = np.empty(table.n_features, dtype=np.int64)  # among all names, natural order may be another
+        place[table.feature] = rank - self.edges[number]
+        names = np.array(table.names, dtype=object)
+        classes = np.array([*map(self.class_names.index, table.class_names), UNKNOWN])[table.class_of_feature]
+        back = np.argsort(place)
+        return replace(
+            table, names=tuple(names[back].tolist()), feature=place[table.feature], class_names=self.class_names,
+            class_of_feature=classes[back], whole=self.span, clock=self.clock,
+        ), row  # fmt: skip
+
+    def alone(self) -> PartedLooks:
+        """Return the same without what a part does without, to be sent to a process."""
+        none = np.zeros(0, dtype=np.int64)
+        return replace(self, names=(), class_of_feature=none, looks=none)
+
+    def of(self, features: IntArray) -> LookTable:
+        """Return the rows of some features (in their order), which memory holds."""
+        parts = []
+        for number in np.unique(np.searchsorted(self.edges, features, side="right") - 1):
+            first, end = self.edges[number : number + 2]
+            parts.append(self.part(number)[0].only(features[(features >= first) & (features < end)] - first))
+        start = np.cumsum([0, *(part.n_features for part in parts)])
+        names = ("stamp_s", "detected", "p_miss", "p_false", "line", "class_of_feature")
+        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        feature = np.concatenate([part.feature + at for part, at in zip(parts, start, strict=False)])
+        return replace(parts[0], **columns, feature=feature, names=tuple(name for part in parts for name in part.names))
+
+
+@dataclass(slots=True)
+class _Surveyed:
+    """What the first reading of a table finds: rows, looks and class of each feature."""
+
+    features: dict[str, tuple[int, int, int]]
+    classes: list[str]
+    span: Span
+    clock: Clock | None
+
+
+def _surveyed(path: Path) -> _Surveyed:
+    found = _Surveyed({}, [""], Span(np.inf, -np.inf, np.inf, -np.inf), None)
+    for table in parquet_batches(path):
+        _explain_missing(table)
+        table.expect(_REQUIRED, _OPTIONAL)
+        if "present" in table:
+            hint = "without that column, or with `rows_at_once` as many as it has"
+            raise InputError("truth is scored in one piece only", path=path, field="present", hint=hint)
+        names, feature = _features(table)
+        class_names, classes = _classes(table, feature, names)
+        stamp_s, looked = table.numbers(STAMP_S), ~np.isnan(_detected(table))
+        found.clock = found.clock or (table.clock() if len(table) else None)
+        looked_s = stamp_s[looked]
+        here = [stamp_s.min(initial=np.inf), stamp_s.max(initial=-np.inf)]
+        here += [looked_s.min(initial=np.inf), looked_s.max(initial=-np.inf)]
+        least = zip(found.span, map(float, here), (min, max, min, max), strict=True)
+        found.span = Span(*(choose(a, b) for a, b, choose in least))
+        found.classes += [name for name in class_names if name not in found.classes]
+        counts = np.bincount(feature, minlength=len(names)), np.bincount(feature[looked], minlength=len(names))
+        for name, rows, looks, kind in zip(names, *counts, classes, strict=True):
+            had = found.features.get(name, (0, 0, 0))
+            of = 0 if kind == UNKNOWN else found.classes.index(class_names[kind])
+            found.features[name] = (had[0] + int(rows), had[1] + int(looks), had[2] or of)
+    if not found.features:
+        raise InputError("has no rows below its header", path=path, hint="one row a look")
+    if not np.isfinite(found.span.last_look_s):
+        raise _no_look(path)
+    return found
+
+
+def _route(path: Path, rank: Mapping[str, int], edges: IntArray, files: Sequence[Path]) -> None:
+    """Write each row to the file of its feature."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    with ExitStack() as stack:
+        writers: dict[int, Any] = {}
+        for table in parquet_batches(path):
+            names, feature = _features(table)
+            ranks = np.array([rank[name] for name in names])[feature]
+            part = np.searchsorted(edges, ranks, side="right") - 1
+            order = np.argsort(part, kind="stable")
+            numbers = {"row": arrow_cells(table.line - 1), "rank": arrow_cells(ranks)}
+            batch = pa.table({**table.cells, **numbers}).take(arrow_cells(order))
+            start = np.searchsorted(part[order], np.arange(len(files) + 1))
+            for number in np.unique(part):
+                if number not in writers:
+                    made = pq.ParquetWriter(files[number], batch.schema, compression="zstd")
+                    writers[number] = stack.enter_context(made)
+                writers[number].write_table(batch.slice(start[number], start[number + 1] - start[number]))

@@ -2,21 +2,40 @@
 
 from __future__ import annotations
 
+import heapq
+import json
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import asdict
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.io.columns import csv_bytes, named
+from evermap.config import PersistConfig
+from evermap.config.tables import NO_RECURRENCE
+from evermap.errors import ConfigError, EvermapError
+from evermap.io.columns import csv_bytes, named, needs_quotes
+from evermap.io.table import arrow_cells
 from evermap.runs.folder import RunFolder
-from evermap.runs.persist.report import clock_of, draw_run, render_report
-from evermap.runs.persist.run import PersistResult
+from evermap.runs.persist.models import (
+    LearnedModels,
+    drawn_features,
+    grouping_of,
+    groups_of,
+    learn_models,
+    save_models,
+)
+from evermap.runs.persist.report import MOST_ROWS, RASTER_ROWS, clock_of, draw_run, most_changed, render_report
+from evermap.runs.persist.run import PersistResult, Totals, remarks, run_persist
+from evermap.runs.persist.table import PartedLooks
 from evermap.runs.summary import RunInfo, change_dict, changes_text, summary_head
-from evermap.types import ChangeKind, Clock, MapChange, json_number, landmark_id_of
+from evermap.types import ChangeKind, Clock, FloatArray, IntArray, MapChange, json_number, landmark_id_of
 from evermap.viz.style import NamedFigure, save_png, save_svg
 
 
@@ -48,95 +67,256 @@ def write_persist(
         start = perf_counter()
         folder.path("beliefs.csv").write_bytes(_beliefs(result))
         folder.path("forecasts.csv").write_bytes(_forecasts(result))
-        folder.path("changes.jsonl").write_text(_changes(result), encoding="utf-8")
+        folder.path("changes.jsonl").write_text(_changes(result, _numbered(result.table.names)), encoding="utf-8")
         if result.learned is not None:
-            from evermap.runs.persist.models import save_models
-
             save_models(result.models, result.learned.per, folder.path("model.json"))
-        written = perf_counter()
-        drawn: list[NamedFigure] = []
-        total = min(result.config.figures, result.table.n_features) + 1 + (result.scores is not None)
-        for figure in draw_run(result, figures=result.config.figures, clock=clock):
-            save_png(figure.figure, folder.path(f"figures/{figure.name}.png"))
-            save_svg(figure.figure, folder.path(f"figures/{figure.name}.svg"))
-            drawn.append(figure)
-            if progress:
-                progress(len(drawn), total)
         timing = {
             **{f"{name}_s": seconds for name, seconds in result.step_s.items()},
-            "write_s": written - start,
-            "draw_s": perf_counter() - written,
+            "write_s": perf_counter() - start,
         }
-        summary = folder.finish(persist_summary(result, info=info or RunInfo(), timing=timing), "report.html")
-        page = render_report(result, summary, drawn, clock or clock_of(result))
-        folder.path("report.html").write_text(page, encoding="utf-8")
+        return _finished(folder, result, clock, info or RunInfo(), timing, progress)
+
+
+def _finished(
+    folder: RunFolder,
+    result: PersistResult,
+    clock: Clock | None,
+    info: RunInfo,
+    timing: dict[str, float],
+    progress: Callable[[float, float], None] | None,
+) -> dict[str, Any]:
+    """Draw, and write summary and report."""
+    start = perf_counter()
+    drawn: list[NamedFigure] = []
+    total = min(result.config.figures, result.table.n_features) + 1 + (result.scores is not None)
+    for figure in draw_run(result, figures=result.config.figures, clock=clock):
+        save_png(figure.figure, folder.path(f"figures/{figure.name}.png"))
+        save_svg(figure.figure, folder.path(f"figures/{figure.name}.svg"))
+        drawn.append(figure)
+        if progress:
+            progress(len(drawn), total)
+    timing = {**timing, "draw_s": perf_counter() - start}
+    summary = folder.finish(persist_summary(result, info=info, timing=timing), "report.html")
+    page = render_report(result, summary, drawn, clock or clock_of(result))
+    folder.path("report.html").write_text(page, encoding="utf-8")
     return summary
+
+
+def persist_in_parts(
+    folder: RunFolder,
+    path: str | Path,
+    config: PersistConfig,
+    *,
+    clock: Clock | None = None,
+    info: RunInfo | None = None,
+    workers: int | None = 1,
+    cluster: str | None = None,
+    progress: Callable[[float, float], None] | None = None,
+) -> dict[str, Any]:
+    """Write what `run_persist` and `write_persist` make of a Parquet table, but in parts of `config.rows_at_once` rows;
+    returns the summary.
+
+    In memory there are a part for each worker, and a few hundred bytes a feature. A part has all rows of its features.
+
+    Args:
+        folder: of the run.
+        path: the table, a file or a folder of files.
+        config: choices.
+        clock: of the stamps, for the figures; None guesses.
+        info: command and measured times.
+        workers: and `cluster`, as `runs.company.spread_over`; a cluster reaches `path` and the folder under the same
+            names.
+        cluster: address of a Dask scheduler.
+        progress: told after each part.
+
+    Raises:
+        ConfigError, InputError, DataError: as `read_looks`, `run_persist` and `write_persist`; a model for each feature
+            of its own, and a table with truth, are for one piece only.
+    """
+    from evermap.runs.company import spread_over
+
+    start = perf_counter()
+    with TemporaryDirectory(prefix="parts-", dir=folder.path(".")) as name:
+        scratch = Path(name)
+        parted = PartedLooks.split(Path(path), scratch, config)
+        learned, with_model = _learned(folder, parted, config)
+        quoted, numbered = needs_quotes(arrow_cells(list(parted.names))), _numbered(parted.names)
+        work = partial(
+            _worked_on, parted=parted.alone(), config=with_model, quoted=quoted, numbered=numbered, folder=scratch
+        )
+        items = list(map(str, range(len(parted.files))))
+        done = spread_over(items, work, workers=workers, cluster=cluster, progress=progress)
+        for one in done:
+            if isinstance(one, EvermapError):
+                raise one
+        _join(folder, scratch, parted, config, quoted)
+        totals = Totals.merged([part.totals for part in done])
+        shown = run_persist(parted.of(_shown(parted, done, totals, config)), with_model)
+    told = tuple(remarks(config, shown.models, totals))
+    result = replace(shown, config=config, learned=learned, totals=totals, warnings=told)
+    return _finished(folder, result, clock, info or RunInfo(), {"parts_s": perf_counter() - start}, None)
+
+
+class _Part(NamedTuple):
+    """What is kept of a part in memory: what is counted, changes of each feature, and the latest of them."""
+
+    totals: Totals
+    changes: IntArray
+    latest: FloatArray
+
+
+def _worked_on(
+    number: str, parted: PartedLooks, config: PersistConfig, quoted: bool, numbered: bool, folder: Path
+) -> _Part:
+    """Run a part, and write its pieces of the files."""
+    table, row = parted.part(int(number))
+    result, first = run_persist(table, config), parted.edges[int(number)]
+    beliefs, changes = result.beliefs, result.changes
+    if config.query == "times":
+        columns = {"row": row, "stamp_s": beliefs.stamp_s, "feature": beliefs.feature + first, "p": beliefs.p_exists}
+        for name, column in columns.items():
+            np.save(folder / f"{name}-{number}.npy", column)
+    else:
+        (folder / f"beliefs-{number}").write_bytes(_beliefs(result, quoted=quoted, header=False))
+    (folder / f"forecasts-{number}").write_bytes(_forecasts(result, quoted=quoted, header=False))
+    (folder / f"changes-{number}").write_text(_changes(result, numbered), encoding="utf-8")
+    latest = np.array([changes.decided_s, changes.stamp_s, changes.feature + first])[:, -MOST_ROWS:]
+    return _Part(result.totals, changes.per_feature(table.n_features), latest)
+
+
+def _learned(
+    folder: RunFolder, parted: PartedLooks, config: PersistConfig
+) -> tuple[LearnedModels | None, PersistConfig]:
+    """Learn as from the table in one piece, and return settings that read what was learned."""
+    if not config.learns:
+        return None, config
+    per = grouping_of(parted, parted.looks, config)
+    if per == "feature":
+        problem, hint = "a model for each feature is learned in one piece", "all or class, or `rows_at_once` larger"
+        raise ConfigError(problem, field="per", hint=hint)
+    groups = [features for _, features in groups_of(parted, per)]
+    most = max(config.learn_from // len(groups), 2)
+    chosen = [features[drawn_features(parted.looks[features], most)] for features in groups]
+    table = parted.of(np.sort(np.concatenate(chosen)))
+    learned = learn_models(table, table.looks(table.order()), config.model_copy(update={"per": per}))
+    save_models(learned.models, learned.per, folder.path("model.json"))
+    return learned, config.model_copy(update={"recurrent": NO_RECURRENCE, "model": str(folder.path("model.json"))})
+
+
+def _join(folder: RunFolder, scratch: Path, parted: PartedLooks, config: PersistConfig, quoted: bool) -> None:
+    """Put the pieces of all parts together, as one piece would have them."""
+    numbers = range(len(parted.files))
+    for name in ("forecasts",) if config.query == "times" else ("forecasts", "beliefs"):
+        with folder.path(f"{name}.csv").open("wb") as file:
+            file.write((",".join(_BELIEFS if name == "beliefs" else (*_BELIEFS, *_OUTLOOK)) + "\n").encode())
+            for number in numbers:
+                with (scratch / f"{name}-{number}").open("rb") as piece:
+                    shutil.copyfileobj(piece, file)
+    if config.query == "times":
+        _join_rows(folder.path("beliefs.csv"), scratch, parted, quoted)
+    with ExitStack() as stack, folder.path("changes.jsonl").open("w", encoding="utf-8") as file:
+        pieces = [stack.enter_context((scratch / f"changes-{k}").open(encoding="utf-8")) for k in numbers]
+        file.writelines(heapq.merge(*pieces, key=_when))  # of equal times, the first part's comes first
+
+
+def _when(line: str) -> tuple[float, float]:
+    told = json.loads(line)
+    return told["decided_s"], told["stamp_s"]
+
+
+def _join_rows(path: Path, scratch: Path, parted: PartedLooks, quoted: bool) -> None:
+    """Write beliefs in the order of the table, some rows at a time."""
+    names = arrow_cells(list(parted.names))
+    with path.open("wb") as file:
+        for start in range(0, parted.rows, _ROWS):
+            size = min(_ROWS, parted.rows - start)
+            stamp_s, p, feature = np.empty(size), np.empty(size), np.empty(size, dtype=np.int64)
+            for number in range(len(parted.files)):
+                row, *columns = (
+                    np.load(scratch / f"{name}-{number}.npy", mmap_mode="r")
+                    for name in ("row", "stamp_s", "p", "feature")
+                )
+                a, b = np.searchsorted(row, (start, start + size))
+                for into, column in zip((stamp_s, p, feature), columns, strict=True):
+                    into[row[a:b] - start] = column[a:b]
+            cells = dict(zip(_BELIEFS, (stamp_s, names.take(arrow_cells(feature)), p), strict=True))
+            file.write(csv_bytes(cells, quoted=quoted, header=start == 0))
+
+
+def _shown(parted: PartedLooks, done: Sequence[_Part], totals: Totals, config: PersistConfig) -> IntArray:
+    """The features of which figures and report tell."""
+    changed = most_changed(
+        np.concatenate([part.changes for part in done]), parted.looks, max(RASTER_ROWS, config.figures)
+    )
+    decided_s, stamp_s, feature = np.concatenate([part.latest for part in done], axis=1)
+    latest = feature[np.lexsort((feature, stamp_s, decided_s))][-MOST_ROWS:].astype(np.int64)
+    return np.unique(np.concatenate([changed, latest, np.flatnonzero(~np.isnan(totals.p_now))[:MOST_ROWS]]))
 
 
 def persist_summary(result: PersistResult, *, info: RunInfo, timing: dict[str, float]) -> dict[str, Any]:
     """Return the content of `summary.json`; outside of `timing` and `versions` a function of input and choices."""
-    table, changes = result.table, result.changes
-    looked = table.looked
+    table, totals = result.table, result.totals
     config = {"persist": result.config.to_dict()}
     return {
         **summary_head(info, config=config, source=table.source, timing=timing, warnings=result.warnings),
         "model": {name: model["kind"] for name, model in result.models.to_dict().items()},
         "learning": None if result.learned is None else result.learned.to_dict(),
         "counts": {
-            "rows": len(table),
-            "looks": int(looked.sum()),
-            "detections": int((table.detected == 1.0).sum()),
-            "features": table.n_features,
-            "features_detected": len(np.unique(table.feature[table.detected == 1.0])),
+            "rows": totals.rows,
+            "looks": totals.looks,
+            "detections": totals.detections,
+            "features": len(totals.p_now),
+            "features_detected": totals.features_detected,
             "classes": len(table.class_names),
-            "beliefs": int((~np.isnan(result.beliefs.p_exists)).sum()),
-            "vanished": int((~changes.returned).sum()),
-            "returned": int(changes.returned.sum()),
-            "duration_s": float(table.stamp_s.max() - table.stamp_s.min()),
+            "beliefs": totals.beliefs,
+            "vanished": totals.vanished,
+            "returned": totals.returned,
+            "duration_s": table.span.stop_s - table.span.start_s,
         },
         "detector": {
-            name: {"least": float(values[looked].min()), "most": float(values[looked].max())}
-            for name, values in (("p_miss", table.p_miss), ("p_false", table.p_false))
+            name: dict(zip(("least", "most"), getattr(totals, name), strict=True)) for name in ("p_miss", "p_false")
         },
         "never_leave_share": _never_leave(result),
-        "expected_present_now": json_number(float(np.nansum(result.forecasts.p_exists[:, 0]))),
-        "merged_mass": json_number(result.merged_mass),
+        "expected_present_now": json_number(float(np.nansum(totals.p_now))),
+        "merged_mass": json_number(totals.merged_mass),
         "metrics": None if result.scores is None else {k: json_number(v) for k, v in asdict(result.scores).items()},
         "reliability": None if result.reliability is None else _reliability(result),
     }
 
 
-def _beliefs(result: PersistResult) -> bytes:
+_BELIEFS = ("stamp_s", "feature_id", "p_exists")
+_OUTLOOK = ("median_stay_s", "mean_stay_s", "mean_absence_s")
+_ROWS = 1 << 18
+"""That are written at a time."""
+
+
+def _beliefs(result: PersistResult, **how: bool) -> bytes:
     beliefs = result.beliefs
-    return csv_bytes(
-        {
-            "stamp_s": beliefs.stamp_s,
-            "feature_id": named(result.table.names, beliefs.feature),
-            "p_exists": beliefs.p_exists,
-        }
-    )
+    cells = beliefs.stamp_s, named(result.table.names, beliefs.feature), beliefs.p_exists
+    return csv_bytes(dict(zip(_BELIEFS, cells, strict=True)), **how)
 
 
-def _forecasts(result: PersistResult) -> bytes:
+def _forecasts(result: PersistResult, **how: bool) -> bytes:
     """By feature and time; what is expected from now on stands where the forecast begins."""
     stamp_s, p_exists = result.forecasts.stamp_s, result.forecasts.p_exists
     features, steps = p_exists.shape
-    columns = {
-        "stamp_s": np.tile(stamp_s, features),
-        "feature_id": named(result.table.names, np.repeat(np.arange(features), steps)),
-        "p_exists": p_exists.ravel(),
-    }
-    for name in ("median_stay_s", "mean_stay_s", "mean_absence_s"):
+    names = named(result.table.names, np.repeat(np.arange(features), steps))
+    columns = dict(zip(_BELIEFS, (np.tile(stamp_s, features), names, p_exists.ravel()), strict=True))
+    for name in _OUTLOOK:
         column = np.full((features, steps), np.nan)
         column[:, 0] = getattr(result.forecasts, name)
         columns[name] = column.ravel()
-    return csv_bytes(columns)
+    return csv_bytes(columns, **how)
 
 
-def _changes(result: PersistResult) -> str:
+def _numbered(names: Sequence[str]) -> bool:
+    """Whether all features are called by whole numbers."""
+    return all(name.lstrip("-").isdigit() and str(int(name)) == name for name in names)
+
+
+def _changes(result: PersistResult, numbers: bool) -> str:
     """What vanished and returned, as every verb writes changes."""
     changes, names = result.changes, result.table.names
-    numbers = all(name.lstrip("-").isdigit() and str(int(name)) == name for name in names)
     rows = []
     for k, feature in enumerate(changes.feature.tolist()):
         name = names[feature]
