@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,12 +12,14 @@ import pytest
 from pydantic import BaseModel, ValidationError
 from typer.testing import CliRunner
 
+import evermap
 from evermap.cli.main import app
 from evermap.config import Config, Section, SensorConfig, load_config, to_toml, with_overrides
 from evermap.errors import ConfigError
 from evermap.slam.calibration import NAMES, CalibrationPrior
 from evermap.types import Sensor
 
+SOURCE = Path(evermap.__file__).parent
 UNBOUNDED = {"score_midpoint", "min_score"}
 """Scores of detectors, of any scale."""
 
@@ -62,6 +65,15 @@ def test_every_key_is_set_by_its_name_and_written_as_it_is(name: str) -> None:
         assert f"{last} =" in shown
         if value is not None and not isinstance(value, dict):
             assert with_overrides(config, [f"{key}={json.dumps(value)}"]) == config
+
+
+def test_every_key_is_read_by_the_code() -> None:
+    modules = [path for path in SOURCE.rglob("*.py") if path.parent.name != "config"]
+    of_itself = re.findall(r"self\.\w+", "".join(path.read_text("utf-8") for path in (SOURCE / "config").glob("*.py")))
+    read = set(re.findall(r"(?:\.|getattr\(\w+, \")(\w+)", "".join(path.read_text("utf-8") for path in modules)))
+    read |= {name.removeprefix("self.") for name in of_itself}
+    keys = [key for key, _ in leaves(Config()) if not key.startswith("slam.modes.")]  # of methods in other packages
+    assert [key for key in keys if key.rpartition(".")[2] not in read] == []
 
 
 @pytest.mark.parametrize(
