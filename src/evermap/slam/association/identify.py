@@ -143,10 +143,12 @@ def searched(associator: Associator, assignment: Assignment, again: Callable[[Fl
             against = associator.against(trial)
         gained = cost - against
         if gained > 0.0:
-            assignment, cost, odometry = trial, against, associator.learned_odometry(trial)
+            assignment, cost = trial, against
         in_vain = 0 if gained > little else in_vain + 1
         if in_vain == MOST_IN_VAIN or 0.0 < gained <= little:
             break
+        if gained > 0.0 and k + 1 < MOST_ROUNDS:
+            odometry = associator.learned_odometry(trial)
     return assignment
 
 

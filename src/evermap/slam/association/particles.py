@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.jcbb import gates
+from evermap.slam.filter_kernels import vectorised
 from evermap.slam.kernels import composed, kernel, wrapped
 from evermap.slam.problem import Estimate
 from evermap.types import UNKNOWN, FloatArray, IntArray
@@ -36,6 +37,8 @@ BENT = 0.3
 """Standard deviation of landmarks that are known at the start, relative to the way to the next: a group of them may be
 beside where it belongs, by less than what takes one for another."""
 GATE = float(gates(1, 1.0 - 1e-4)[1])
+WIDE_GATE = GATE * (1.0 + 1e-6)
+"""By more than is rounded where part of it is tested ahead."""
 SEEN, FORGET_S = 3, 20.0
 """Detections that make a landmark; what has less after so long is forgotten."""
 ROOM = 2, 64
@@ -64,7 +67,9 @@ class _Sensor(NamedTuple):
 
 
 class _Cloud(NamedTuple):
-    """P particles with room for L landmarks each; `of` is which landmark a slot is of, -1 for none."""
+    """P particles with room for L landmarks each: place (P, 2, L) and spread (P, 3, L), in columns to be compared fast;
+    `of` is which landmark a slot is of, -1 for none.
+    """
 
     pose: FloatArray
     place: FloatArray
@@ -78,7 +83,9 @@ class _Cloud(NamedTuple):
 
 
 class _Options(NamedTuple):
-    """Landmarks that a detection may be of: slots, log likelihoods, innovations, their covariances and derivatives."""
+    """Landmarks that a detection may be of: slots, log likelihoods, innovations, their covariances and derivatives; and
+    room for what is taken, and out of reach.
+    """
 
     slot: IntArray
     score: FloatArray
@@ -86,6 +93,7 @@ class _Options(NamedTuple):
     covariance: FloatArray
     by_pose: FloatArray
     taken_at: IntArray
+    beyond: FloatArray
 
 
 def drawn(
@@ -130,14 +138,14 @@ def _begun(place: FloatArray, label: IntArray, count: int) -> _Cloud:
     n = len(place)
     room = ROOM[0] * n + ROOM[1]
     cloud = _Cloud(
-        np.zeros((count, 3)), np.zeros((count, room, 2)), np.zeros((count, room, 3)),
+        np.zeros((count, 3)), np.zeros((count, 2, room)), np.zeros((count, 3, room)),
         np.full((count, room, 2), UNKNOWN), np.zeros((count, room), dtype=np.int64), np.zeros((count, room)),
         np.full((count, room), NOBODY), np.full(count, n), np.full(count, n),
     )  # fmt: skip
     if n:
         away = np.ravel(KDTree(place).query(place, [2])[0]) if n > 1 else np.ones(1)
-        cloud.place[:, :n], cloud.label[:, :n], cloud.of[:, :n] = place, label, np.arange(n)
-        cloud.spread[:, :n, 0] = cloud.spread[:, :n, 2] = (BENT * away) ** 2
+        cloud.place[:, :, :n], cloud.label[:, :n], cloud.of[:, :n] = place.T, label, np.arange(n)
+        cloud.spread[:, 0, :n] = cloud.spread[:, 2, :n] = (BENT * away) ** 2
         cloud.sightings[:, :n] = SEEN
     return cloud
 
@@ -154,7 +162,7 @@ def _run(
     weight, evidence = np.zeros(count), 0.0
     options = _Options(
         np.zeros(room, dtype=np.int64), np.zeros(room + 2), np.zeros((room, 2)), np.zeros((room, 3)),
-        np.zeros((room, 2, 3)), np.full(room, -1),
+        np.zeros((room, 2, 3)), np.full(room, -1), np.zeros(room),
     )  # fmt: skip
     most = 1
     for t in range(frames):
@@ -206,17 +214,21 @@ def _weigh(
     mount, states, label = sensor.mount, sensor.states, seen.label[d]
     c, s, cm, sm = math.cos(pose[2]), math.sin(pose[2]), math.cos(mount[2]), math.sin(mount[2])
     bearing = seen.reading[d, 1] - states[4]
+    cb, sb = math.cos(bearing), math.sin(bearing)
     range_m = (seen.reading[d, 0] - states[0]) / (1.0 + states[1] + states[2] * bearing + states[3] * bearing**2)
     own = seen.variance[d, 0] + covariance[0, 0] + covariance[1, 1] + (mount[0] ** 2 + mount[1] ** 2) * covariance[2, 2]
     x, y, n = pose[0] + c * mount[0] - s * mount[1], pose[1] + s * mount[0] + c * mount[1], 0
+    place, spreads, beyond = cloud.place[i], cloud.spread[i], options.beyond
+    _in_gate(place, spreads, cloud.slots[i], x, y, range_m, own, beyond)
     for k in range(cloud.slots[i]):
-        if cloud.of[i, k] < 0 or options.taken_at[k] == now:
+        if beyond[k] > 0.0 or options.taken_at[k] == now:
             continue
-        dx, dy = cloud.place[i, k, 0] - x, cloud.place[i, k, 1] - y
+        dx, dy = place[0, k] - x, place[1, k] - y
         r = math.sqrt(dx * dx + dy * dy) + 1e-9
-        if (r - range_m) ** 2 > 2.0 * GATE * (own + cloud.spread[i, k, 0] + cloud.spread[i, k, 2]):
+        s0, s1, s2 = spreads[0, k], spreads[1, k], spreads[2, k]
+        if (r - range_m) ** 2 > 2.0 * GATE * (own + s0 + s2):
             continue
-        known, spread = cloud.label[i, k], cloud.spread[i, k]
+        known = cloud.label[i, k]
         differs, named = False, label[1] != UNKNOWN and label[1] == known[1]
         for q in range(2):
             differs |= label[q] != UNKNOWN and known[q] != UNKNOWN and label[q] != known[q]
@@ -225,22 +237,28 @@ def _weigh(
         ax, ay = c * dx + s * dy, -s * dx + c * dy  # from the sensor, in the robot's axes
         rx, ry = mount[0] + ax, mount[1] + ay
         ux, uy = (cm * ax + sm * ay) / r, (-sm * ax + cm * ay) / r
+        g = options.by_pose[n]
+        b0, b1 = -ay / (r * r), ax / (r * r)
+        g[1, 0], g[1, 1], g[1, 2] = -b0, -b1, b0 * ry - b1 * rx
+        b0, b1 = c * b0 - s * b1, s * b0 + c * b1
+        v11 = b0 * b0 * s0 + 2.0 * b0 * b1 * s1 + b1 * b1 * s2 + seen.variance[d, 1]
+        for p in range(3):
+            for q in range(3):
+                v11 += g[1, p] * covariance[p, q] * g[1, q]
+        if (sb * ux - cb * uy) ** 2 > WIDE_GATE * v11:
+            continue  # no angle is less than its sine
         expected = math.atan2(uy, ux)
         gain = 1.0 + states[1] + states[2] * expected + states[3] * expected**2
         e0, e1 = seen.reading[d, 0] - states[0] - gain * r, wrapped(bearing - expected)
-        g = options.by_pose[n]
-        a0, a1, b0, b1 = gain * ax / r, gain * ay / r, -ay / (r * r), ax / (r * r)
+        a0, a1 = gain * ax / r, gain * ay / r
         g[0, 0], g[0, 1], g[0, 2] = -a0, -a1, a0 * ry - a1 * rx
-        g[1, 0], g[1, 1], g[1, 2] = -b0, -b1, b0 * ry - b1 * rx
-        a0, a1, b0, b1 = c * a0 - s * a1, s * a0 + c * a1, c * b0 - s * b1, s * b0 + c * b1
-        v00 = a0 * a0 * spread[0] + 2.0 * a0 * a1 * spread[1] + a1 * a1 * spread[2] + seen.variance[d, 0]
-        v01 = a0 * b0 * spread[0] + (a0 * b1 + a1 * b0) * spread[1] + a1 * b1 * spread[2]
-        v11 = b0 * b0 * spread[0] + 2.0 * b0 * b1 * spread[1] + b1 * b1 * spread[2] + seen.variance[d, 1]
+        a0, a1 = c * a0 - s * a1, s * a0 + c * a1
+        v00 = a0 * a0 * s0 + 2.0 * a0 * a1 * s1 + a1 * a1 * s2 + seen.variance[d, 0]
+        v01 = a0 * b0 * s0 + (a0 * b1 + a1 * b0) * s1 + a1 * b1 * s2
         for p in range(3):
             for q in range(3):
                 v00 += g[0, p] * covariance[p, q] * g[0, q]
                 v01 += g[0, p] * covariance[p, q] * g[1, q]
-                v11 += g[1, p] * covariance[p, q] * g[1, q]
         det = v00 * v11 - v01 * v01
         distance = (v11 * e0 * e0 - 2.0 * v01 * e0 * e1 + v00 * e1 * e1) / det
         if distance > GATE:
@@ -252,6 +270,19 @@ def _weigh(
         options.covariance[n, 0], options.covariance[n, 1], options.covariance[n, 2] = v00, v01, v11
         n += 1
     return n
+
+
+@vectorised
+def _in_gate(
+    place: FloatArray, spread: FloatArray, count: int, x: float, y: float, range_m: float, own: float, out: FloatArray
+) -> None:
+    """Positive for landmarks whose distance cannot be what was measured: the gate of `_weigh`, a millionth wider."""
+    squared, width = range_m * range_m, 2.0 * WIDE_GATE
+    for k in range(count):
+        dx, dy = place[0, k] - x, place[1, k] - y
+        away = dx * dx + dy * dy
+        gap = away + squared - width * (own + spread[0, k] + spread[2, k]) - 1e-6
+        out[k] = min(gap, gap * gap - 4.0 * squared * away)
 
 
 @kernel
@@ -333,14 +364,15 @@ def _place(seen: Any, d: int, stamp_s: float, sensor: Any, cloud: Any, i: int, s
         r, angle = (seen.reading[d, 0] - states[0]) / gain, bearing + at[2]
         c, s = math.cos(angle), math.sin(angle)
         along, aside = variance[0] / gain**2, variance[1] * r * r
-        cloud.place[i, slot, 0], cloud.place[i, slot, 1] = at[0] + r * c, at[1] + r * s
-        spread = cloud.spread[i, slot]
+        cloud.place[i, 0, slot], cloud.place[i, 1, slot] = at[0] + r * c, at[1] + r * s
+        spread = cloud.spread[i, :, slot]
         spread[0], spread[1] = c * c * along + s * s * aside, c * s * (along - aside)
         spread[2] = s * s * along + c * c * aside
         cloud.of[i, slot], cloud.sightings[i, slot], cloud.label[i, slot] = cloud.met[i], 0, seen.label[d]
         cloud.met[i] += 1
     else:
-        dx, dy, spread = cloud.place[i, slot, 0] - at[0], cloud.place[i, slot, 1] - at[1], cloud.spread[i, slot]
+        place, spread = cloud.place[i, :, slot], cloud.spread[i, :, slot]
+        dx, dy = place[0] - at[0], place[1] - at[1]
         r = math.sqrt(dx * dx + dy * dy) + 1e-9
         expected = wrapped(math.atan2(dy, dx) - at[2])
         gain = 1.0 + states[1] + states[2] * expected + states[3] * expected**2
@@ -352,8 +384,8 @@ def _place(seen: Any, d: int, stamp_s: float, sensor: Any, cloud: Any, i: int, s
         det = v00 * v11 - v01 * v01
         k00, k01 = (p00 * v11 - p10 * v01) / det, (p10 * v00 - p00 * v01) / det
         k10, k11 = (p01 * v11 - p11 * v01) / det, (p11 * v00 - p01 * v01) / det
-        cloud.place[i, slot, 0] += k00 * e0 + k01 * e1
-        cloud.place[i, slot, 1] += k10 * e0 + k11 * e1
+        place[0] += k00 * e0 + k01 * e1
+        place[1] += k10 * e0 + k11 * e1
         spread[0] -= k00 * p00 + k01 * p10
         spread[1] -= k00 * p01 + k01 * p11
         spread[2] -= k10 * p01 + k11 * p11
@@ -394,6 +426,6 @@ def _resample(cloud: Any, share: FloatArray, parent: IntArray) -> None:
                 free += 1
             copies[free], parent[free], n = 1, j, cloud.slots[j]
             cloud.pose[free], cloud.slots[free], cloud.met[free] = cloud.pose[j], n, cloud.met[j]
-            cloud.place[free, :n], cloud.spread[free, :n] = cloud.place[j, :n], cloud.spread[j, :n]
+            cloud.place[free, :, :n], cloud.spread[free, :, :n] = cloud.place[j, :, :n], cloud.spread[j, :, :n]
             cloud.label[free, :n], cloud.sightings[free, :n] = cloud.label[j, :n], cloud.sightings[j, :n]
             cloud.last_s[free, :n], cloud.of[free, :n] = cloud.last_s[j, :n], cloud.of[j, :n]
