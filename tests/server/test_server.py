@@ -363,6 +363,26 @@ def test_a_robot_is_led_to_the_approved_revision(fleet: Fleet, zips: list[bytes]
     assert fleet("GET", "/robots").json()[1]["maps"] == [held(1, "DISABLED"), held(2)]
 
 
+def test_no_lease_looks_at_sessions_that_are_entered(fleet: Fleet, zips: list[bytes]) -> None:
+    """Also where the tables are older than their index."""
+    with fleet.server.database._writer.begin() as connection:
+        connection.execute(text("DROP INDEX ix_job_open"))
+    database = Database(fleet.where)
+    for k in range(3):
+        database.enqueue(f"site-{k}", "same", zips[0], "r")
+    claimed = database.claim("w", 60.0)
+    assert claimed is not None
+    assert claimed[0].site == "site-0"
+    asked = "SELECT id FROM job WHERE state IN ('queued', 'working', 'aside') ORDER BY id LIMIT 1"
+    with database._writer.begin() as connection:
+        lite = connection.dialect.name == "sqlite"
+        if not lite:
+            connection.execute(text("SET LOCAL enable_seqscan = off"))
+        plan = connection.execute(text(f"EXPLAIN {'QUERY PLAN ' if lite else ''}{asked}")).all()
+    assert ("SEARCH job USING" if lite else "ix_job_open") in str(plan)
+    database.close()
+
+
 def test_a_store_of_before_there_were_robots_is_read(tmp_path: Path) -> None:
     import sqlite3
 

@@ -22,6 +22,7 @@ from sqlalchemy import (
     Column,
     Connection,
     Float,
+    Index,
     Integer,
     LargeBinary,
     MetaData,
@@ -42,7 +43,7 @@ from sqlalchemy import (
     update,
 )
 from sqlalchemy.exc import IntegrityError, InterfaceError, OperationalError
-from sqlalchemy.schema import CreateSchema
+from sqlalchemy.schema import CreateIndex, CreateSchema
 
 from evermap.errors import ConfigError, InputError, printable
 from evermap.maps.store import is_address
@@ -92,6 +93,9 @@ _job = Table(
     Column("changed_at", Text, nullable=False),
     UniqueConstraint("site", "digest"),
 )
+_open_job = _job.c.state.in_(["queued", "working", "aside"])
+_open_jobs = Index("ix_job_open", _job.c.id, postgresql_where=_open_job, sqlite_where=_open_job)
+"""Those that may be leased: of a million sessions that are entered, no lease looks at one."""
 _payload = Table(
     "payload", metadata, Column("job", Integer, primary_key=True), Column("data", LargeBinary, nullable=False)
 )
@@ -202,6 +206,7 @@ class Database:
                 connection.execute(CreateSchema(SCHEMA, if_not_exists=True))
             begun = inspect(connection).has_table("server")
             metadata.create_all(connection)  # an older evermap does without the tables that it does not know
+            connection.execute(CreateIndex(_open_jobs, if_not_exists=True))
             if not begun:
                 connection.execute(insert(_server).values(version=VERSION))
             version = connection.execute(select(_server.c.version)).scalar()
@@ -279,7 +284,7 @@ class Database:
         )
         lapsed = and_(_job.c.state == JobState.WORKING.value, _job.c.lease_s < now)
         waiting = or_(_job.c.state == JobState.QUEUED.value, lapsed, _grown())
-        oldest = select(*_SHOWN).where(waiting, not_(busy)).order_by(_job.c.id).limit(1)
+        oldest = select(*_SHOWN).where(_open_job, waiting, not_(busy)).order_by(_job.c.id).limit(1)
         with self._writer.begin() as connection:
             row = connection.execute(oldest.with_for_update(skip_locked=True, of=_job)).one_or_none()
             if row is None:
