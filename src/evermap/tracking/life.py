@@ -131,11 +131,10 @@ def live(
             gone = math.exp(-min(max(pairs.log_ratio[chosen[i]], -60.0), 60.0))
             after, _ = observed(predicted, max(p_detect[i], likelihood.least_p_detect), gone)
             t.inverse_odds[i] = max(after, LEAST)
-            noise = noise_of(frame, j)
-            if boxes and is_misplaced(t.mean[i], t.covariance[i], frame.position[j], noise, likelihood):
-                update(t.mean[i], t.covariance[i], frame.position[j], likelihood.misplaced * noise)
+            if boxes and is_misplaced(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j), likelihood):
+                update(t.mean[i], t.covariance[i], frame.position[j], likelihood.misplaced * noise_of(frame, j))
             else:
-                update(t.mean[i], t.covariance[i], frame.position[j], noise)
+                update(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j))
             recognise(t, i, frame, j, likelihood.confusion, rules.appearance_memory)
             t.n_hits[i] += 1
             t.n_missed[i] = 0
