@@ -191,13 +191,12 @@ def _motions(source: LocalMap, target: LocalMap, allowed: BoolArray) -> list[Flo
                 continue
             fits = np.abs(between - span) < 3.0 * _sigma_of_span(source, i, j) + SPAN_SLACK_M
             fits &= allowed[i][:, None] & allowed[j][None, :]
-            for a, b in np.argwhere(fits & (between > 0.0)):
-                motion = rigid(source.place[[i, j]], target.place[[a, b]])
-                gap = np.linalg.norm(se2.transform(motion, source.place)[:, None] - target.place[None], axis=2)
-                gap[~allowed] = np.inf
-                nearest, at = gap.argmin(axis=1), gap.min(axis=1)
+            motions = rigid(source.place[[i, j]], target.place[np.argwhere(fits & (between > 0.0))])
+            gap = np.linalg.norm(se2.transform(motions[:, None], source.place)[:, :, None] - target.place, axis=3)
+            gap[:, ~allowed] = np.inf
+            for motion, nearest, at in zip(motions, gap.argmin(axis=2), gap.min(axis=2), strict=True):
                 near = np.flatnonzero(at < NEAR_M)
-                key = tuple((int(k), int(nearest[k])) for k in near)
+                key = tuple(zip(near.tolist(), nearest[near].tolist(), strict=True))
                 if key not in seen:
                     seen.add(key)
                     scored.append((-len(np.unique(nearest[near])), float(at[near].sum()), motion))
