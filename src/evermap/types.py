@@ -187,6 +187,9 @@ class Detections(_Columns):
         class_id: (M,) row of `Recording.class_names`, or `UNKNOWN`.
         sigma_range_m, sigma_bearing_rad: (M,) standard deviations given for this very detection, nan where none is.
         source_line: (M,) line in the input file, for messages; 0 where there is none.
+        features: (M, D) what was measured of the landmark itself, as its radius or colour, nan where it was not; None
+            where nothing ever was.
+        feature_names: (D,) what the columns of `features` are called.
     """
 
     frame: IntArray
@@ -197,6 +200,8 @@ class Detections(_Columns):
     sigma_range_m: FloatArray
     sigma_bearing_rad: FloatArray
     source_line: IntArray
+    features: FloatArray | None = None
+    feature_names: tuple[str, ...] = ()
 
     def _facts(self) -> dict[str, Any]:
         known = self.landmark_id[self.landmark_id != UNKNOWN]
@@ -549,6 +554,7 @@ class SpatialDetections(_Columns):
         class_id: (M,) row of `SpatialRecording.class_names`, or `UNKNOWN`.
         score: (M,) as the detector gives it.
         source_line: (M,) line in the input file, for messages; 0 where there is none.
+        features, feature_names: as of `Detections`.
     """
 
     frame: IntArray
@@ -564,6 +570,8 @@ class SpatialDetections(_Columns):
     class_id: IntArray
     score: FloatArray
     source_line: IntArray
+    features: FloatArray | None = None
+    feature_names: tuple[str, ...] = ()
 
     def _facts(self) -> dict[str, Any]:
         known = self.landmark_id[self.landmark_id != UNKNOWN]

@@ -17,6 +17,7 @@ from evermap.errors import DataError, InputError
 from evermap.types import (
     UNKNOWN,
     BoolArray,
+    Detections,
     FloatArray,
     IntArray,
     Landmarks,
@@ -103,6 +104,14 @@ SIGMA_RANGE_M = Quantity("sigma_range_m", 0.0, 1e6, positive=True, optional=True
 SIGMA_BEARING_RAD = Quantity(
     "sigma_bearing_rad", 0.0, 1e6, positive=True, optional=True, hint="leave empty where unknown"
 )
+FEATURES = (
+    Quantity("radius_m", 0.0, 1e3, positive=True, optional=True, hint="metres; leave empty where it was not measured"),
+    *(
+        Quantity(f"colour_{one}", -1e6, 1e6, optional=True, hint="leave empty where it was not measured")
+        for one in "rgb"
+    ),
+)
+"""Of a landmark itself; beside these `descriptor_0`, `descriptor_1` ... may be any numbers."""
 CAMERA_MODELS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
 """How many numbers of distortion each model of a camera has."""
 P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
@@ -134,6 +143,7 @@ def validate(recording: Any) -> None:
     _check_frames(detections.frame, len(frames))
     for name in ("landmark_id", "class_id"):
         _check_ids(getattr(detections, name), f"detections.{name}")
+    _check_features(detections)
     check_sensor(recording.sensor)
     if recording.truth is not None:
         _check_trajectory(recording.truth, "truth")
@@ -177,6 +187,7 @@ def _check_spatial_detections(detections: SpatialDetections, frames: int, sensor
     _require((row >= 0) & (row < sensors), row, f"{field}.sensor", f"is not one of {sensors} sensors", "count from 0")
     for name in ("landmark_id", "class_id"):
         _check_ids(getattr(detections, name), f"{field}.{name}")
+    _check_features(detections)
     position, corner = detections.position_sensor_m, detections.corner_px.reshape(len(row), -1)
     placed, cornered = np.isfinite(position).all(axis=1), np.isfinite(corner).all(axis=1)
     hint = "a position in the sensor's frame, or the four corners of a tag"
@@ -193,6 +204,17 @@ def _check_spatial_detections(detections: SpatialDetections, frames: int, sensor
         _require(np.isnan(value) | (value > 0.0), value, f"{field}.{name}", "is not positive", "nan where unknown")
     size = detections.size_m
     _require(~(size <= 0.0).any(axis=1), size, f"{field}.size_m", "is not positive", "nan where there is no box")
+
+
+def _check_features(detections: Detections | SpatialDetections) -> None:
+    features, field = detections.features, "detections.features"
+    wanted = (len(detections), len(detections.feature_names))
+    if features is None and not wanted[1]:
+        return
+    if features is None or features.shape != wanted:
+        given = None if features is None else features.shape
+        raise InputError(f"shape {given} instead of {wanted}", field=field, hint="a column for each of feature_names")
+    _require(~np.isinf(features).any(axis=1), features, field, "is not finite", "nan where it was not measured")
 
 
 def _check_spatial_sensor(sensor: SpatialSensor) -> None:

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,6 +19,7 @@ from scipy.linalg import expm
 
 from evermap.errors import ConfigError, DataError, InputError
 from evermap.io import read_native, read_recording, write_native
+from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap.types import (
     Clock,
     Detections,
@@ -28,7 +30,9 @@ from evermap.types import (
     RobotSightings,
     Sensor,
     Trajectory,
+    rows_of,
 )
+from evermap.valid import validate
 
 Files = dict[str, str]
 NOT_WRITTEN = frozenset({"source", "warnings", "source_line"})
@@ -73,6 +77,57 @@ def test_two_files_are_enough(native: Files, lay_out: Callable, check_recording:
     assert recording.sensor == Sensor()
     assert recording.truth is None
     assert any("no sensor.toml" in remark for remark in recording.warnings)
+
+
+LIKE = """stamp_s,landmark_id,range_m,bearing_rad,colour_g,radius_m,descriptor_1,descriptor_0,colour_r
+0.5,1,2,0.1,,0.25,-3,7,
+1.0,2,2,0.2,0.5,,,1e3,
+"""
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_what_landmarks_are_like_arrives_and_is_written(
+    form: Any, native: Files, lay_out: Callable, tmp_path: Path, assert_same: Callable
+) -> None:
+    native["detections.csv"] = LIKE
+    recording = read_recording(lay_out(native))
+    seen = recording.detections
+    assert seen.feature_names == ("radius_m", "colour_g", "descriptor_0", "descriptor_1")  # nothing is red
+    nan = np.nan
+    np.testing.assert_array_equal(seen.features, [[0.25, nan, 7.0, -3.0], [nan, 0.5, 1e3, nan]])
+    again = read_recording(write_native(recording, tmp_path / "again", format=form))
+    assert_same(again.detections, seen, frozenset({"source_line"}))
+    assert_same(unpack_recording(pack_recording(recording)).detections, seen)
+    np.testing.assert_array_equal(rows_of(seen, [1]).features, seen.features[1:])
+
+
+@pytest.mark.parametrize(
+    ("cells", "field", "line"),
+    [
+        (("radius_m", "0.2", "-1"), "radius_m", 3),
+        (("colour_b", "", "red"), "colour_b", 3),
+        (("descriptor_1", "1", "2"), "descriptor_0", 1),
+        (("descriptor_x", "1", "2"), "descriptor_x", 1),
+        (("radius", "1", "2"), "radius", 1),
+    ],
+)
+def test_what_landmarks_cannot_be_like_is_refused(
+    cells: tuple[str, str, str], field: str, line: int, native: Files, lay_out: Callable
+) -> None:
+    name, one, other = cells
+    native["detections.csv"] = f"stamp_s,landmark_id,range_m,bearing_rad,{name}\n0.5,1,2,0.1,{one}\n1.0,2,2,0,{other}\n"
+    with pytest.raises(InputError) as caught:
+        read_recording(lay_out(native))
+    assert (caught.value.path.name, caught.value.line, caught.value.field) == ("detections.csv", line, field)
+
+
+def test_features_of_another_shape_are_refused(native: Files, lay_out: Callable) -> None:
+    recording = read_recording(lay_out(native))
+    features = np.zeros((len(recording.detections), 2))
+    for names, values in ((("radius_m",), features), (("a", "b"), features + np.inf), (("a", "b"), None)):
+        wrong = replace(recording.detections, features=values, feature_names=names)
+        with pytest.raises(InputError, match="detections.features"):
+            validate(replace(recording, detections=wrong))
 
 
 @pytest.mark.parametrize("with_frames", [True, False])

@@ -27,6 +27,7 @@ from evermap.io import (
     write_tum,
 )
 from evermap.io.landmarks import write_map_csv
+from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap.types import ANY_RANGE_M2, UNKNOWN, Landmarks, Recording, SpatialRecording, landmark_id_of
 from evermap.valid import validate_spatial
 
@@ -216,6 +217,19 @@ def test_points_of_a_stereo_pair_have_a_depth_and_its_covariance(lay_out: Callab
     cloud = np.column_stack([(u + noise[:, 0] - 320) / 400 * depth, (v + noise[:, 1] - 240) / 410 * depth, depth])
     expected = np.cov(cloud.T) * (0.5 / 1e-3) ** 2
     np.testing.assert_allclose(recording.detections.covariance_sensor_m2[0], expected, rtol=0.05, atol=1e-5)
+
+
+def test_what_landmarks_are_like(lay_out: Callable, space: Files, tmp_path: Path, assert_same: Callable) -> None:
+    head, *rows = space["detections.csv"].splitlines()
+    more = [",radius_m,descriptor_0", ",0.25,-1.5", ",,3", ",,"]
+    space["detections.csv"] = "".join(f"{a}{b}\n" for a, b in zip([head, *rows], more, strict=True))
+    recording = read_recording(lay_out(space))
+    seen = recording.detections
+    assert seen.feature_names == ("radius_m", "descriptor_0")
+    np.testing.assert_array_equal(seen.features, [[0.25, -1.5], [np.nan, 3.0], [np.nan, np.nan]])
+    again = read_recording(write_native(recording, tmp_path / "again"))
+    np.testing.assert_array_equal(again.detections.features, seen.features)
+    assert_same(unpack_recording(pack_recording(recording)).detections, seen)
 
 
 def test_full_covariances(lay_out: Callable, space: Files) -> None:

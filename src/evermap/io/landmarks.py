@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +30,7 @@ from evermap.io.table import Table, csv_text, parquet_bytes, parse_csv, parse_pa
 from evermap.io.tag_maps import is_wpilib, map_of_survey, tags_of_fiducials, tags_of_tagslam, tags_of_wpilib
 from evermap.io.text import decode_text, reason
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, rows_of
-from evermap.valid import STAMP_S, X_M, Y_M, Quantity
+from evermap.valid import FEATURES, STAMP_S, X_M, Y_M, Quantity
 
 MAP_SCHEMA_VERSION = 1
 
@@ -55,6 +56,8 @@ _MAP_FILES = (
 _SIGMA_M = Quantity("sigma_m", 0.0, 1e6, optional=True, hint="standard deviation in metres, empty where unknown")
 _SIGMA_RAD = Quantity("sigma_rad", 0.0, 1e3, optional=True, hint="standard deviation in radians")
 _P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
+_FEATURES = {quantity.name: quantity for quantity in FEATURES}
+_DESCRIPTOR, _NUMBERED = "descriptor_", re.compile(r"descriptor_(0|[1-9]\d{0,4})")
 
 
 def read_prior_map(path: str | Path, sigma_m: float = 0.02, sigma_rad: float = 0.05) -> Landmarks:
@@ -280,6 +283,32 @@ def distinct_labels(*tables: Table | None) -> tuple[str, ...]:
     labels = {label for table in tables if table is not None and "class_id" in table
               for label in table.labels("class_id")}  # fmt: skip
     return tuple(sorted(labels - {""}))
+
+
+def feature_columns(table: Table) -> tuple[str, ...]:
+    """Return the names of the columns that may describe landmarks themselves: radius, colour, a descriptor as long as
+    the table has it.
+
+    Raises:
+        InputError: one of the descriptor's numbers is missing.
+    """
+    numbers = sorted(int(name.removeprefix(_DESCRIPTOR)) for name in table.columns if _NUMBERED.fullmatch(name))
+    if missing := [k for k, number in enumerate(numbers) if k != number][:1]:
+        problem = f"{_DESCRIPTOR}{numbers[-1]} is given, and no {_DESCRIPTOR}{missing[0]}"
+        raise table.error(problem, row=None, field=f"{_DESCRIPTOR}{missing[0]}", hint="count from 0 without a gap")
+    return (*_FEATURES, *(f"{_DESCRIPTOR}{k}" for k in numbers))
+
+
+def features_of(table: Table) -> dict[str, Any]:
+    """Return `features` and `feature_names` of detections, of the columns that hold anything.
+
+    Raises:
+        InputError: a value that cannot be.
+    """
+    wanted = [_FEATURES.get(name, Quantity(name, optional=True)) for name in feature_columns(table) if name in table]
+    found = {quantity.name: table.numbers(quantity) for quantity in wanted}
+    found = {name: column for name, column in found.items() if not np.isnan(column).all()}
+    return {"features": np.column_stack(list(found.values())), "feature_names": tuple(found)} if found else {}
 
 
 def class_ids(table: Table, class_names: tuple[str, ...]) -> IntArray:

@@ -13,7 +13,7 @@ from evermap.errors import DataError, InputError, similar
 from evermap.geometry import se2
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal, wrap_far
 from evermap.io.files import FileSet, Reader, find_file_set
-from evermap.io.landmarks import class_ids, distinct_labels, landmarks_from_table
+from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, landmarks_from_table
 from evermap.io.native_space import in_space, spatial_recording
 from evermap.io.rig_toml import CAMERA_FILE, SENSOR_FILE, read_rig
 from evermap.io.sensor_toml import Settings, parse_sensor_toml
@@ -289,7 +289,8 @@ def frames_and_detections(
         InputError: a value is malformed, or a detection lies in no frame.
     """
     given = table.one_form(POLAR, _CARTESIAN)
-    table.expect(("stamp_s", "landmark_id", *given), ("class_id", *_POLAR_SIGMAS, *_ROUND_SIGMAS))
+    optional = ("class_id", *_POLAR_SIGMAS, *_ROUND_SIGMAS, *feature_columns(table))
+    table.expect(("stamp_s", "landmark_id", *given), optional)
     if frame_table is not None:
         frame_table.expect(("stamp_s",))
     frames, frame = frames_of(
@@ -306,6 +307,7 @@ def frames_and_detections(
         sigma_range_m=sigma_range_m,
         sigma_bearing_rad=sigma_bearing_rad,
         source_line=np.asarray(table.line, dtype=np.int64),
+        **features_of(table),
     )
     return frames, detections
 

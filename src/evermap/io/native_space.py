@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from evermap.errors import DataError
 from evermap.geometry.camera import unproject
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal
 from evermap.io.files import FileSet
-from evermap.io.landmarks import class_ids, distinct_labels, landmarks_from_table
+from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, landmarks_from_table
 from evermap.io.rig_toml import CAMERA_FILE, Rig
 from evermap.io.spatial import (
     AT,
@@ -207,9 +208,10 @@ def _detections(
     form = _form(table)
     optional = (
         "landmark_id", "sensor", "class_id", "score", "sigma_rad", "sigma_m", *COVARIANCE, *BOX, *IMAGE_BOX,
+        *feature_columns(table),
     )  # fmt: skip
     table.expect(("stamp_s", *form), (*optional, *_also(form)))
-    columns: dict[str, FloatArray | IntArray] = {
+    columns: dict[str, Any] = {
         "sensor": _sensor_rows(table, rig),
         "class_id": class_ids(table, class_names),
         "source_line": np.asarray(table.line, dtype=np.int64),
@@ -223,10 +225,10 @@ def _detections(
     if table.has_any(BOX):
         columns["size_m"] = boxes(table)
     if form is POINT:
-        columns |= _points(table, columns["sensor"], rig)  # type: ignore[arg-type]
+        columns |= _points(table, columns["sensor"], rig)
     else:
         columns |= _placed(table)
-    detections = spatial_detections(frame, **columns)
+    detections = spatial_detections(frame, **columns, **features_of(table))
     if table.has_any(CORNERS):
         detections = _cornered(table, detections, rig)
     detections = with_tag_poses(detections, rig.sensors, warnings)

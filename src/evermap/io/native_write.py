@@ -16,7 +16,17 @@ from evermap.io.rig_toml import SENSOR_FILE, rig_toml
 from evermap.io.sensor_toml import Settings, sensor_toml
 from evermap.io.spatial import AT, BOX, COVARIANCE, QUATERNION, upper_triangle
 from evermap.io.table import csv_text, parquet_bytes
-from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Recording, Sensor, SpatialRecording
+from evermap.types import (
+    UNKNOWN,
+    Detections,
+    FloatArray,
+    IntArray,
+    Landmarks,
+    Recording,
+    Sensor,
+    SpatialDetections,
+    SpatialRecording,
+)
 
 
 def write_native(
@@ -75,6 +85,7 @@ def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
     }
     if np.any(detections.class_id != UNKNOWN):
         tables["detections"]["class_id"] = labels_of(detections.class_id, names)
+    tables["detections"] |= _features(detections)
     for name in ("sigma_range_m", "sigma_bearing_rad"):
         sigma = getattr(detections, name)
         if not np.all(np.isnan(sigma)):
@@ -121,6 +132,7 @@ def spatial_tables(recording: SpatialRecording) -> dict[str, dict[str, Any]]:
     }
     if np.any(detections.class_id != UNKNOWN):
         tables["detections"]["class_id"] = labels_of(detections.class_id, names)
+    tables["detections"] |= _features(detections)
     tables["frames"] = {"stamp_s": recording.frames.stamp_s}
     if recording.truth is not None:
         tables["truth"] = {"stamp_s": recording.truth.stamp_s, **_pose(recording.truth.pose_world_robot)}
@@ -136,6 +148,12 @@ def _pose(pose: FloatArray) -> dict[str, FloatArray]:
 def _given(columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
     """The columns in which anything is known."""
     return {name: column for name, column in columns.items() if not np.all(np.isnan(column))}
+
+
+def _features(detections: Detections | SpatialDetections) -> dict[str, FloatArray]:
+    return (
+        {} if detections.features is None else dict(zip(detections.feature_names, detections.features.T, strict=True))
+    )
 
 
 def _survey(landmarks: Landmarks, names: Mapping[int, str], class_names: tuple[str, ...]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -111,7 +112,7 @@ def boxes(table: Table, *, flat: bool = False) -> FloatArray:
     return np.stack([table.numbers(side) for side in sides], axis=1)
 
 
-def spatial_detections(frame: IntArray, **given: FloatArray | IntArray) -> SpatialDetections:
+def spatial_detections(frame: IntArray, **given: Any) -> SpatialDetections:
     """Return detections of which only some columns are known: ids are `UNKNOWN` and numbers nan in all others.
 
     Args:
@@ -123,14 +124,14 @@ def spatial_detections(frame: IntArray, **given: FloatArray | IntArray) -> Spati
         "position_sensor_m": (3,), "rotation": (4,), "covariance_sensor_m2": (3, 3), "sigma_rad": (),
         "corner_px": (4, 2), "tag_size_m": (), "size_m": (3,), "score": (),
     }  # fmt: skip
-    columns: dict[str, FloatArray | IntArray] = {
+    columns: dict[str, Any] = {
         "sensor": np.zeros(count, dtype=np.int64),
         "landmark_id": np.full(count, UNKNOWN),
         "class_id": np.full(count, UNKNOWN),
         "source_line": np.zeros(count, dtype=np.int64),
         **{name: np.full((count, *shape), np.nan) for name, shape in shapes.items()},
     }
-    return SpatialDetections(frame=frame, **{**columns, **given})  # type: ignore[arg-type]
+    return SpatialDetections(frame=frame, **{**columns, **given})
 
 
 def with_tag_poses(

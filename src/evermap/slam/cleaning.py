@@ -7,6 +7,7 @@ never, its clocks are set, its drivers send invalid values. A valid recording is
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -122,7 +123,8 @@ def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]
         bad = ~np.isnan(sigma) & ~((sigma > 0.0) & (sigma < np.inf))
         _remark(remarks, f"values of {name} that are none taken as not given", int(np.sum(bad)))
         if bad.any():
-            detections = replace(detections, **{name: np.where(bad, np.nan, sigma)})
+            mended: dict[str, Any] = {name: np.where(bad, np.nan, sigma)}
+            detections = replace(detections, **mended)
     return detections
 
 

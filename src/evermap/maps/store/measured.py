@@ -36,6 +36,8 @@ RECORDING = "recording"
 """Name of the attachment."""
 _TABLES: dict[str, Any] = {"odometry": Odometry, "frames": Frames, "detections": Detections, "sensor": Sensor}
 _IN_SPACE: dict[str, Any] = {"odometry": SpatialOdometry, "frames": Frames, "detections": SpatialDetections}
+_LATER = ("features", "feature_names")
+"""What is kept only where there is any: equal recordings have the bytes that they had before there was."""
 _PLAIN = ("name", "source", "class_names", "clock")
 
 
@@ -56,6 +58,8 @@ def pack_recording(recording: AnyRecording) -> bytes:
     for table, part in tables.items():
         for item in fields(part) if part is not None else ():
             value = getattr(part, item.name)
+            if item.name in _LATER and isinstance(value, tuple | None) and not value:
+                continue
             (arrays if isinstance(value, np.ndarray) else values)[f"{table}.{item.name}"] = value
     arrays["values"] = np.frombuffer(json.dumps(values).encode(), np.uint8)
     buffer = io.BytesIO()
@@ -96,7 +100,10 @@ def unpack_recording(data: bytes) -> AnyRecording:
 
 
 def _table(table: str, kind: Any, arrays: dict[str, Any], values: dict[str, Any]) -> Any:
-    return kind(**{item.name: _part(f"{table}.{item.name}", item.name, arrays, values) for item in fields(kind)})
+    names = [
+        item.name for item in fields(kind) if item.name not in _LATER or f"{table}.{item.name}" in {*arrays, *values}
+    ]
+    return kind(**{name: _part(f"{table}.{name}", name, arrays, values) for name in names})
 
 
 def _part(column: str, name: str, arrays: dict[str, Any], values: dict[str, Any]) -> Any:
