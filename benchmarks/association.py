@@ -11,6 +11,10 @@ does the same in space,
 
 in worlds that are harsher than those that constants were set on (`benchmarks/harsh.py`),
 
+    python -m benchmarks.association columns
+
+where detections say what landmarks are like (`COLUMNS` of `benchmarks/harsh.py`),
+
     python -m benchmarks.association mixed
 
 where some have identities: a share of the landmarks, or of the detections of each,
@@ -40,7 +44,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 import evermap as em
-from benchmarks.harsh import harsh_worlds
+from benchmarks.harsh import COLUMNS, harsh_worlds, simulate_copied_aisles, with_columns
 from benchmarks.scale_maps import MAP_POSE, SESSION, living_map
 from evermap.config import Config, load_config
 from evermap.errors import EvermapError
@@ -398,6 +402,12 @@ def main(names: Sequence[str] = ()) -> None:
                 row = lived_through(world, unknown_ids=unknown_ids)
                 cells = [f"{value:.3f}" if value < 10.0 else f"{value:.0f}" for value in row.values()]
                 print(f"| {world.name} | {'without' if unknown_ids else 'with'} | {' | '.join(cells)} |", flush=True)
+        return
+    if names and names[0] == "columns":
+        for recording in itertools.chain(recordings(parks=1), (simulate_copied_aisles(0),)):
+            for name in COLUMNS if not names[1:] or recording.name.startswith(tuple(names[1:])) else ():
+                row = score(with_columns(recording, name))
+                print(_line(replace(row, name=f"{row.name}, {name}")), flush=True)
         return
     if names and names[0] == "mixed":
         for recording in itertools.chain(recordings(), recordings_in_space()):

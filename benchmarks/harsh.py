@@ -1,6 +1,8 @@
 """Worlds in which landmarks without identities are hard to tell apart, harsher than those that constants were set on.
 
 python -m benchmarks.association harsh
+
+And columns that say what landmarks are like, good ones and bad ones (`python -m benchmarks.association columns`).
 """
 
 from __future__ import annotations
@@ -110,3 +112,42 @@ def _drive() -> tuple[FloatArray, FloatArray, FloatArray]:
     found = np.array(made)
     found[:, 2] = se2.wrap(found[:, 2])
     return found[:, :3], found[:, 3], found[:, 4]
+
+
+COLUMNS = {
+    "none": {},
+    "radius": {"spread": [0.08], "reading": [0.02], "visit": [0.01], "misread": 0.05},
+    "colour": {"spread": [0.15] * 3, "reading": [0.05] * 3, "visit": [0.03] * 3, "misread": 0.05},
+    "descriptor of 8": {"spread": [1.0] * 8, "reading": [0.5] * 8, "visit": [0.4] * 8, "misread": 0.05},
+    "descriptor of 32": {"spread": [1.0] * 32, "reading": [0.5] * 32, "visit": [0.4] * 32, "misread": 0.05},
+    "useless": {"spread": [0.0], "reading": [1.0], "visit": [0.0], "misread": 0.0},
+    "radius biased by range": {"spread": [0.08], "reading": [0.02], "visit": [0.01], "by_range": 0.02, "misread": 0.05},
+    "colour by the light": {"spread": [0.15] * 3, "reading": [0.05] * 3, "visit": [0.03] * 3, "light": 0.3},
+}
+"""What columns are like: standard deviations of landmarks, readings and visits; share of readings that are of anything;
+growth of a radius with range; light that changes once a minute, the same in all three."""
+LIGHT_S, PAUSE_S = 60.0, 20.0
+
+
+def with_columns(recording: Recording, name: str, seed: int = 0) -> Recording:
+    """Return a recording whose detections have columns of `COLUMNS`, by their own identities."""
+    kind: dict[str, Any] = COLUMNS[name]
+    if not kind:
+        return recording
+    rng, seen = np.random.default_rng([seed, 11]), recording.detections
+    stamp_s, count = recording.frames.stamp_s[seen.frame], len(kind["spread"])
+    _, of = np.unique(seen.landmark_id, return_inverse=True)
+    order = np.lexsort((stamp_s, of))
+    begins = (np.diff(of[order], prepend=-1) != 0) | (np.diff(stamp_s[order], prepend=-np.inf) > PAUSE_S)
+    visit = np.empty(len(order), dtype=np.int64)
+    visit[order] = np.cumsum(begins) - 1
+    value = rng.normal(size=(of.max() + 1, count))[of] * kind["spread"]
+    value += rng.normal(size=(visit.max() + 1, count))[visit] * kind["visit"]
+    value += rng.normal(size=(len(of), count)) * kind["reading"]
+    value += kind.get("by_range", 0.0) * seen.range_m[:, None]
+    minute = ((stamp_s - stamp_s[0]) // LIGHT_S).astype(np.int64)
+    value += kind.get("light", 0.0) * rng.normal(size=minute.max() + 1)[minute, None]
+    wrong = rng.random(len(of)) < kind.get("misread", 0.0)
+    value[wrong] = rng.normal(size=(int(wrong.sum()), count)) * 3.0 * np.maximum(kind["spread"], kind["reading"])
+    names = tuple(f"descriptor_{k}" for k in range(count))
+    return replace(recording, detections=replace(seen, features=value, feature_names=names))

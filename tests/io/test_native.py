@@ -126,7 +126,7 @@ def test_features_of_another_shape_are_refused(native: Files, lay_out: Callable)
     features = np.zeros((len(recording.detections), 2))
     for names, values in ((("radius_m",), features), (("a", "b"), features + np.inf), (("a", "b"), None)):
         wrong = replace(recording.detections, features=values, feature_names=names)
-        with pytest.raises(InputError, match="detections.features"):
+        with pytest.raises(InputError, match=r"detections\.features"):
             validate(replace(recording, detections=wrong))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
+from evermap.slam.association.features import Group, Traits
 from evermap.slam.problem import Estimate, Problem
 from evermap.slam.streaming import sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
@@ -14,6 +15,8 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 NOBODY = -1
 """Landmark row of a detection that belongs to none."""
 
+FORGET_S = 20.0
+"""Time without a detection that ends a visit; what has too few detections by then is forgotten."""
 SHARED_M, SHARED_SHARE = 0.02, 0.5
 """Error [m] that no landmark's sightings average out, and the share of a typical sighting's range noise beside it."""
 
@@ -99,12 +102,14 @@ class Assignment:
         estimate: where everything is; every landmark has a position.
         kind: (M, 2) class and name of every detection, `UNKNOWN` where it has none; different ones are never one
             landmark's.
+        traits: what was read of the landmarks themselves; None for nothing that tells.
     """
 
     measured: Problem
     landmark_row: IntArray
     estimate: Estimate
     kind: IntArray
+    traits: Traits | None = None
 
     @property
     def n_landmarks(self) -> int:
@@ -236,6 +241,20 @@ class Assignment:
         found[order] = np.cumsum(np.append(0, ~again)[: len(order)])
         return found
 
+    def of_visits(self, pause_s: float = FORGET_S) -> tuple[IntArray, IntArray]:
+        """Return `visits`, and (V,) the landmark of each."""
+        visit = self.visits(pause_s)
+        first = np.flatnonzero(visit >= 0)
+        _, at = np.unique(visit[first], return_index=True)
+        return visit, self.landmark_row[first[at]]
+
+    def like(self) -> Group | None:
+        """Return what each landmark (L,) is like; None where nothing tells."""
+        if self.traits is None:
+            return None
+        visit, landmark = self.of_visits()
+        return self.traits.of_landmarks(self.traits.of_visits(visit, len(landmark)), landmark, self.n_landmarks)
+
     def in_visits(self, pause_s: float) -> IntArray:
         """Return (M,) landmarks as if each were another one in every visit, but for those with a name; see `visits`."""
         found = self.visits(pause_s)
@@ -254,4 +273,4 @@ class Assignment:
         seen = self.landmark_row >= 0
         row[seen] = rank[self.landmark_row[seen]]
         estimate = Estimate(self.estimate.pose, self.estimate.landmark[kept], self.estimate.states)
-        return Assignment(self.measured, row, estimate, self.kind)
+        return replace(self, landmark_row=row, estimate=estimate)

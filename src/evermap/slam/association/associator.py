@@ -7,6 +7,7 @@ at the end every detection is compared once more with the whole map (`revise`).
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.slam.association.assignment import NOBODY, Assignment, alike, same_name
+from evermap.slam.association.assignment import FORGET_S, NOBODY, Assignment, alike, same_name
 from evermap.slam.association.constellation import MOST_LAID, propose_constellation
+from evermap.slam.association.features import MISREAD_NATS, Group, Traits
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.association.merging import FEW_NATS, Differences, Solution, propose_merges
 from evermap.slam.association.relaying import displaced_stretches, laid
@@ -62,8 +64,6 @@ FEWEST, SMALLEST_M2 = 2.0, 20.0
 """Landmarks, and the area that they span, at least, where their density is measured."""
 MIN_SIGHTINGS = 3
 """Detections that make a landmark."""
-FORGET_S = 20.0
-"""What has less by then is forgotten."""
 FIRST_STOCK = 40
 """Poses before the first batch solution; the next come after as many, or as their number grew by this share."""
 STOCK_SHARE = 0.05
@@ -130,14 +130,22 @@ class Associator:
         noise: where the noise levels start.
         kind: (M, 2) class and name of every detection, `UNKNOWN` for none; None where there are none.
         odometry: (5,) noise levels of the odometry, where they are known; None for `CAUTION` times those of `noise`.
+        traits: what was read of the landmarks themselves; None for nothing that tells.
     """
 
     def __init__(
-        self, problem: Problem, noise: Noise, kind: IntArray | None = None, odometry: FloatArray | None = None
+        self,
+        problem: Problem,
+        noise: Noise,
+        kind: IntArray | None = None,
+        odometry: FloatArray | None = None,
+        traits: Traits | None = None,
     ) -> None:
         self._problem = problem
         self._kind = np.full((len(problem.pose_row), 2), UNKNOWN) if kind is None else kind
         self._of_kind: IntArray = np.zeros((0, 2), dtype=np.int64)
+        self._traits = traits
+        self._like = None if traits is None else traits.nothing(0)
         self._seen_s = np.zeros(0)
         self._start_noise = noise
         self.noise = replace(noise, odometry=CAUTION * noise.odometry if odometry is None else odometry)
@@ -193,6 +201,12 @@ class Associator:
         """Have the landmarks around a pose in the filter: all, if they are few."""
         away = np.hypot(*(self._filter.position - pose[:2]).T)
         self._filter.bring(np.argsort(away, kind="stable")[:MOST_COMPARED])
+
+    def having(self, traits: Traits) -> Associator:
+        """Return one that has seen the same frames and knows what was read of the landmarks, too."""
+        other = copy.copy(self)
+        other._traits = traits
+        return other
 
     def heed_names(self, pose: Callable[[], FloatArray]) -> None:
         """Begin again from poses that names alone lead to, if landmarks with one name lie apart and it is better so.
@@ -301,6 +315,10 @@ class Associator:
         pairings = pairings_of_frame(
             self._filter, self._problem, self._sigma, detections, density=self._density_m2, kind=kind
         )
+        if self._traits is not None and self._like is not None:
+            read = self._traits.singly(detections[pairings.source])
+            told = self._traits.same(read, self._like.part(pairings.target))
+            pairings = replace(pairings, log_density_new=pairings.log_density_new - told)
         probability, evidence, _ = pairing_probability(pairings, confidence=GATE)
         known = np.zeros(len(detections))
         np.add.at(known, pairings.source, probability)
@@ -349,10 +367,15 @@ class Associator:
         self._doubted += len(detections) - len(known) - len(new)
         self._of_kind[target] = np.maximum(self._of_kind[target], self._kind[known])
         self._seen_s[target] = problem.stamp_s[self._done]
+        if self._traits is not None and self._like is not None:
+            self._like = self._traits.followed(self._like, target, known)
         if not len(new):
             return
         self._row[new] = len(local.position) + np.arange(len(new))
         self._of_kind = np.vstack([self._of_kind, self._kind[new]])
+        if self._traits is not None and self._like is not None:
+            more = Group(*map(np.concatenate, zip(self._like, self._traits.nothing(len(new)), strict=True)))
+            self._like = self._traits.followed(more, self._row[new], new)
         self._seen_s = np.append(self._seen_s, np.full(len(new), problem.stamp_s[self._done]))
         at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
         for row, place in zip(self._row[new].tolist(), at, strict=True):
@@ -367,7 +390,7 @@ class Associator:
         assignment = solved.assignment
         self._row[: len(assignment.landmark_row)] = assignment.landmark_row
         self._pose[: self._done] = assignment.estimate.pose
-        self._of_kind, self._seen_s = assignment.of_kind, assignment.last_seen_s
+        self._of_kind, self._seen_s, self._like = assignment.of_kind, assignment.last_seen_s, assignment.like()
         place = assignment.estimate.landmark
         near = np.argsort(np.hypot(*(place - assignment.estimate.pose[-1, :2]).T), kind="stable")[:MOST_COMPARED]
         self._filter.begin(assignment.estimate, solved.marginals, self._done - 1, near)
@@ -376,7 +399,8 @@ class Associator:
         measured = self._problem.until(self._done)
         estimate = Estimate(self._pose[: self._done].copy(), self._filter.position.copy(), self._filter.states.copy())
         count = len(measured.pose_row)
-        return Assignment(measured, self._row[:count].copy(), estimate, self._kind[:count])
+        traits = None if self._traits is None else self._traits.until(count)
+        return Assignment(measured, self._row[:count].copy(), estimate, self._kind[:count], traits)
 
     def _with_sigma(self, measured: Problem) -> Problem:
         """Detections with the noise that has been learned."""
@@ -436,7 +460,8 @@ class Associator:
                 now, solved.marginals, linear, density=self._density_m2, pause_s=FORGET_S,
                 among=_latest(now, recent),
             )  # fmt: skip
-            doubtful = (visits.evidence < math.log(P_MERGE / (1.0 - P_MERGE))) & (visits.squared > CONTRADICTS)
+            doubtful = visits.evidence < math.log(P_MERGE / (1.0 - P_MERGE))
+            doubtful &= (visits.squared > CONTRADICTS) | (visits.told < -MISREAD_NATS)
             order = np.flatnonzero(doubtful)[np.argsort(visits.evidence[doubtful], kind="stable")]
             _, first = np.unique(visits.landmark[order], return_index=True)  # one of each landmark
             parts = [visits.rows[k] for k in order[np.sort(first)] if _key(visits.rows[k]) not in refused]
@@ -501,12 +526,15 @@ class Associator:
         noise_of = fit_sighting_noise(unknown, estimate, NOISE_FLOOR * self._start_noise.detection, left)
         self._sigma = INFLATION * noise_of.of_detections(self._problem)
         cost = smoother.under(noise, heavy=False).cost(estimate)
+        if assignment.traits is not None:
+            cost -= assignment.traits.told(*assignment.of_visits())
         return _Solved(replace(assignment, estimate=estimate), marginals, cost, smoother)
 
 
 def compared(assignment: Assignment, marginals: Marginals, density: float) -> Solution:
     """Return the landmarks of an assignment at its optimum, as `propose_merges` wants them."""
     place, kind, told = assignment.estimate.landmark, assignment.of_kind, assignment.told
+    like = assignment.like()
 
     def differences(younger: IntArray, older: IntArray) -> Differences:
         rows, both = np.unique(np.concatenate([younger, older]), return_inverse=True)
@@ -523,6 +551,8 @@ def compared(assignment: Assignment, marginals: Marginals, density: float) -> So
             return difference[se2.xy_rows(u[some])] - difference[se2.xy_rows(o[some])]
 
         new = math.log(density) - by_name(kind[younger], kind[older], np.minimum(told[younger], told[older]))
+        if assignment.traits is not None and like is not None:
+            new -= assignment.traits.same(like.part(younger), like.part(older))
         return Differences(place[younger] - place[older], own, new, together)
 
     return Solution(

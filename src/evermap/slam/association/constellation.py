@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.slam.association.assignment import Assignment, alike, same_name
+from evermap.slam.association.features import MISREAD_NATS
 from evermap.slam.association.jcbb import Pairings, most_pairings
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -278,6 +279,10 @@ def propose_constellation(
     near = np.einsum("ijk,ijk->ij", gap, np.linalg.solve(spread, gap[..., None])[..., 0]) < LOOSE_GATE
     one, other = assignment.of_kind[loose][:, None], assignment.of_kind[root][None]
     allowed &= (near | same_name(one, other)) & alike(one, other)
+    like = assignment.like()
+    if assignment.traits is not None and like is not None:
+        k, m = np.nonzero(allowed)
+        allowed[k, m] = assignment.traits.same(like.part(loose[k]), like.part(root[m])) >= -MISREAD_NATS
     for k, m in np.argwhere(allowed):
         allowed[k, m] = _ordered(loose[k], root[m]) not in refused
     source, target = _local(place, joint, loose), _local(place, joint, root)

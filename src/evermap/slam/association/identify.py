@@ -17,6 +17,7 @@ from scipy.linalg import block_diag
 from evermap.slam.association.assignment import NOBODY, Assignment, alike
 from evermap.slam.association.associator import P_MERGE, Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
+from evermap.slam.association.features import Traits, learned
 from evermap.slam.association.particles import WIDER, drawn
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.slam.calibration import CalibrationPrior
@@ -39,6 +40,8 @@ SETTLED = 120
 LITTLE_NATS = 0.035
 """A 200th of what a detection of no landmark costs: by which all detections are explained better, for each of them,
 before it is worth while to draw again."""
+MOST_LEARNED = 3
+"""Times that it is learned what landmarks are like, from who is who by what was known of that before."""
 MAP_FLOOR_M = 1e-3
 """A prior map without uncertainty is taken to be known to a millimetre."""
 
@@ -106,14 +109,64 @@ def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, k
             associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior))
         return associator.finish()
 
-    cautious = Associator(problem, noise, kind)
-    assignment = finished(cautious)
-    if cautious.doubtful > FEW_DOUBTFUL:
-        again = lambda odometry: finished(Associator(problem, noise, kind, odometry))  # noqa: E731
-        assignment = searched(cautious, assignment, again)
+    def found(traits: Traits | None) -> tuple[Associator, Assignment]:
+        first = Associator(problem, noise, kind, traits=traits)
+        assignment = finished(first)
+        if first.doubtful > FEW_DOUBTFUL:
+            again = lambda odometry: finished(Associator(problem, noise, kind, odometry, traits))  # noqa: E731
+            assignment = searched(first, assignment, again)
+        return first, assignment
+
+    cautious, assignment = found(None)
+    if given.features is not None:
+        assignment, cautious = _told_apart(assignment, cautious, given.features[prepared.used], found)
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
     return Associated(row, name, assignment, cautious.noise, prior)
+
+
+def _told_apart(
+    plain: Assignment,
+    associator: Associator,
+    features: FloatArray,
+    found: Callable[[Traits], tuple[Associator, Assignment]],
+) -> tuple[Assignment, Associator]:
+    """Return the assignment that explains all detections best by what landmarks are like, too, and what solved it.
+
+    How much that tells is learned from who is who without it, where that may be wrong: first as much as readings within
+    visits say, then what revisits do. Each is only a proposal; what explains most is kept, by its own spreads.
+
+    Args:
+        plain: who is who without.
+        associator: which found it.
+        features: (M, D) of the detections.
+        found: returns what another one finds with given traits.
+    """
+
+    def explained(assignment: Assignment) -> tuple[float, Assignment]:
+        own = replace(assignment, traits=learned(features, *assignment.of_visits()))
+        return associator.against(own), own
+
+    traits = learned(features, *plain.of_visits(), revisits=False)
+    if traits is None:
+        return plain, associator
+    cost, best = explained(plain)
+    for _ in range(MOST_LEARNED):
+        known = replace(best, traits=traits)
+        if traits.told(*known.of_visits()) > 0.0:
+            cautious = associator.having(traits)
+            trial = cautious.finish(known)
+        else:  # most of it is wrong
+            cautious, trial = found(traits)
+        against, trial = explained(trial)
+        if against >= cost and best.traits is None:
+            break
+        if against < cost:
+            cost, best, associator = against, trial, cautious
+        if best.traits is None or best.traits.close_to(traits):
+            break
+        traits = best.traits
+    return replace(best, traits=None), associator
 
 
 def searched(associator: Associator, assignment: Assignment, again: Callable[[FloatArray], Assignment]) -> Assignment:

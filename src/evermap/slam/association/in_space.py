@@ -19,6 +19,7 @@ from evermap.config import SpaceConfig
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se2, se3
 from evermap.slam.association.assignment import (
+    FORGET_S,
     NOBODY,
     SHARED_M,
     SHARED_SHARE,
@@ -30,7 +31,6 @@ from evermap.slam.association.assignment import (
 )
 from evermap.slam.association.associator import (
     CAUTION,
-    FORGET_S,
     GATE,
     INFLATION,
     LAST_ROUNDS,

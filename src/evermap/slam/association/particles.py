@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from evermap.slam.association.assignment import NOBODY, Assignment
+from evermap.slam.association.features import MOST_READINGS, Group, Spread, Traits, same_nats
 from evermap.slam.association.jcbb import gates
 from evermap.slam.filter_kernels import vectorised
 from evermap.slam.kernels import composed, kernel, wrapped
@@ -50,13 +51,18 @@ NAMED_NATS = math.log(100.0)
 
 
 class _Seen(NamedTuple):
-    """Detections: rows of each frame (N + 1,), readings, variances and labels (M, 2), stamps of frames (N,)."""
+    """Detections: rows of each frame (N + 1,), readings, variances and labels (M, 2), stamps of frames (N,); what they
+    are like (M, C), variances of that by readings (K, C), and how it spreads.
+    """
 
     first: IntArray
     reading: FloatArray
     variance: FloatArray
     label: IntArray
     stamp_s: FloatArray
+    like: FloatArray
+    errors: FloatArray
+    spread: Spread
 
 
 class _Sensor(NamedTuple):
@@ -68,7 +74,7 @@ class _Sensor(NamedTuple):
 
 class _Cloud(NamedTuple):
     """P particles with room for L landmarks each: place (P, 2, L) and spread (P, 3, L), in columns to be compared fast;
-    `of` is which landmark a slot is of, -1 for none.
+    `of` is which landmark a slot is of, -1 for none; `like` (P, L, C) what it is like, by as many readings as `read`.
     """
 
     pose: FloatArray
@@ -80,6 +86,8 @@ class _Cloud(NamedTuple):
     of: IntArray
     slots: IntArray
     met: IntArray
+    like: FloatArray
+    read: FloatArray
 
 
 class _Options(NamedTuple):
@@ -114,11 +122,17 @@ def drawn(
     noise = np.concatenate([np.eye(3)[None] / problem.start_information, spread])
     steps = np.vstack([problem.start_pose, motion.increment])
     first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
-    seen = _Seen(first, problem.reading, (wider * problem.sigma_given) ** 2, assignment.kind, problem.stamp_s)
-    cloud = _begun(assignment.estimate.landmark, assignment.of_kind, int(count))
+    traits = assignment.traits or Traits.none(len(problem.reading))
+    variance = (wider * problem.sigma_given) ** 2
+    seen = _Seen(
+        first, problem.reading, variance, assignment.kind, problem.stamp_s, traits.value, traits.errors, traits.spread
+    )
+    like = assignment.like() or traits.nothing(assignment.n_landmarks)
+    cloud = _begun(assignment.estimate.landmark, assignment.of_kind, like, int(count))
     row, pose, evidence = _run(seen, _Sensor(problem.mount, states), steps, noise, cloud, seed)
     met, row[row >= 0] = np.unique(row[row >= 0], return_inverse=True)
-    found = Assignment(problem, row, Estimate(pose, np.zeros((len(met), 2)), states.copy()), assignment.kind)
+    estimate = Estimate(pose, np.zeros((len(met), 2)), states.copy())
+    found = replace(assignment, landmark_row=row, estimate=estimate)
     order = np.argsort(row, kind="stable")[np.count_nonzero(row == NOBODY) :]
     of_each = np.split(found.points()[order], np.flatnonzero(np.diff(row[order])) + 1)[: len(met)]
     place = np.array([np.median(points, axis=0) for points in of_each]).reshape(-1, 2)
@@ -128,12 +142,15 @@ def drawn(
 def warm_up() -> None:
     """Compile what `drawn` needs."""
     one, two = np.zeros((1, 2)), np.ones((2, 2))
-    seen = _Seen(np.arange(3), two, two, np.full((2, 2), UNKNOWN), np.arange(2.0))
-    cloud = _begun(one, np.full((1, 2), UNKNOWN), 2)
+    traits = Traits.none(2)
+    seen = _Seen(
+        np.arange(3), two, two, np.full((2, 2), UNKNOWN), np.arange(2.0), traits.value, traits.errors, traits.spread
+    )
+    cloud = _begun(one, np.full((1, 2), UNKNOWN), traits.nothing(1), 2)
     _run(seen, _Sensor(np.zeros(3), np.zeros(9)), np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), cloud, 0)
 
 
-def _begun(place: FloatArray, label: IntArray, count: int) -> _Cloud:
+def _begun(place: FloatArray, label: IntArray, like: Group, count: int) -> _Cloud:
     """Particles that know landmarks (L, 2), each about where it is."""
     n = len(place)
     room = ROOM[0] * n + ROOM[1]
@@ -141,12 +158,14 @@ def _begun(place: FloatArray, label: IntArray, count: int) -> _Cloud:
         np.zeros((count, 3)), np.zeros((count, 2, room)), np.zeros((count, 3, room)),
         np.full((count, room, 2), UNKNOWN), np.zeros((count, room), dtype=np.int64), np.zeros((count, room)),
         np.full((count, room), NOBODY), np.full(count, n), np.full(count, n),
+        np.full((count, room, like.value.shape[1]), np.nan), np.zeros((count, room)),
     )  # fmt: skip
     if n:
         away = np.ravel(KDTree(place).query(place, [2])[0]) if n > 1 else np.ones(1)
         cloud.place[:, :, :n], cloud.label[:, :n], cloud.of[:, :n] = place.T, label, np.arange(n)
         cloud.spread[:, 0, :n] = cloud.spread[:, 2, :n] = (BENT * away) ** 2
         cloud.sightings[:, :n] = SEEN
+        cloud.like[:, :n], cloud.read[:, :n] = like.value, np.minimum(like.readings, MOST_READINGS)
     return cloud
 
 
@@ -265,6 +284,16 @@ def _weigh(
             continue
         sightings = cloud.sightings[i, k]
         score = math.log(sightings / (sightings + 1.0)) - 0.5 * (distance + math.log(det))
+        if seen.like.shape[1] > 0:
+            read = min(int(cloud.read[i, k]), MOST_READINGS)
+            score += same_nats(
+                seen.like[d],
+                seen.errors[1],
+                cloud.like[i, k],
+                seen.errors[read],
+                min(1.0, cloud.read[i, k]),
+                seen.spread,
+            )
         options.slot[n], options.score[n] = k, score + (NAMED_NATS if named else 0.0)
         options.innovation[n, 0], options.innovation[n, 1] = e0, e1
         options.covariance[n, 0], options.covariance[n, 1], options.covariance[n, 2] = v00, v01, v11
@@ -369,6 +398,7 @@ def _place(seen: Any, d: int, stamp_s: float, sensor: Any, cloud: Any, i: int, s
         spread[0], spread[1] = c * c * along + s * s * aside, c * s * (along - aside)
         spread[2] = s * s * along + c * c * aside
         cloud.of[i, slot], cloud.sightings[i, slot], cloud.label[i, slot] = cloud.met[i], 0, seen.label[d]
+        cloud.like[i, slot], cloud.read[i, slot] = np.nan, 0.0
         cloud.met[i] += 1
     else:
         place, spread = cloud.place[i, :, slot], cloud.spread[i, :, slot]
@@ -391,6 +421,15 @@ def _place(seen: Any, d: int, stamp_s: float, sensor: Any, cloud: Any, i: int, s
         spread[2] -= k10 * p01 + k11 * p11
         for q in range(2):
             cloud.label[i, slot, q] = max(cloud.label[i, slot, q], seen.label[d, q])
+    if seen.like.shape[1] > 0:
+        read = False
+        for c in range(seen.like.shape[1]):
+            value = seen.like[d, c]
+            if np.isfinite(value):
+                known, read = cloud.like[i, slot, c], True
+                away = (value - known) / (1.0 + cloud.read[i, slot])
+                cloud.like[i, slot, c] = known + away if np.isfinite(known) else value
+        cloud.read[i, slot] += 1.0 if read else 0.0
     cloud.sightings[i, slot] += 1
     cloud.last_s[i, slot] = stamp_s
     return int(cloud.of[i, slot])
@@ -429,3 +468,4 @@ def _resample(cloud: Any, share: FloatArray, parent: IntArray) -> None:
             cloud.place[free, :, :n], cloud.spread[free, :, :n] = cloud.place[j, :, :n], cloud.spread[j, :, :n]
             cloud.label[free, :n], cloud.sightings[free, :n] = cloud.label[j, :n], cloud.sightings[j, :n]
             cloud.last_s[free, :n], cloud.of[free, :n] = cloud.last_s[j, :n], cloud.of[j, :n]
+            cloud.like[free, :n], cloud.read[free, :n] = cloud.like[j, :n], cloud.read[j, :n]

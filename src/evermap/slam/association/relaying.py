@@ -18,6 +18,7 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.slam.association.assignment import Assignment, alike
 from evermap.slam.association.constellation import LocalMap
+from evermap.slam.association.features import MISREAD_NATS
 from evermap.slam.association.merging import entries
 from evermap.slam.association.place_index import PATCH, PlaceIndex
 from evermap.slam.problem import Marginals
@@ -64,7 +65,7 @@ def displaced_stretches(
     place, first_s, found = assignment.estimate.landmark, assignment.first_seen_s, list[Displaced]()
     order = np.flatnonzero(trusted)[np.argsort(first_s[trusted], kind="stable")]
     shared, together, kind = assignment.shared_variance, assignment.together, assignment.of_kind
-    indexed = 0
+    like, indexed = assignment.like(), 0
 
     def local(rows: IntArray) -> LocalMap:
         joint = marginals.joint(rows)
@@ -81,6 +82,9 @@ def displaced_stretches(
         younger, older = some[mine], order[theirs]
         apart = (entries(together, younger, older) == 0) & alike(kind[younger], kind[older])
         younger, older = younger[apart], older[apart]
+        if assignment.traits is not None and like is not None:
+            alike_too = assignment.traits.same(like.part(younger), like.part(older)) >= -MISREAD_NATS
+            younger, older = younger[alike_too], older[alike_too]
         if len(younger) >= FEWEST:
             motion = rigid(place[younger], place[older])
             found.append(Displaced(younger, older, first_s[some[0]], first_s[some[-1]], motion))

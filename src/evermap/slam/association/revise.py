@@ -65,6 +65,9 @@ def reassigned(assignment: Assignment, explained: FloatArray, *, density: float)
     # a square metre has r dr db
     new = np.log(density * np.maximum(problem.reading[seen, 0], 0.1))
     score = -0.5 * (squared + np.log(variance).sum(axis=1)) - np.log(2.0 * np.pi) - new
+    like = assignment.like()
+    if assignment.traits is not None and like is not None:
+        score += assignment.traits.same(assignment.traits.singly(seen), like.part(row))
     inside = (squared < gate) & (score > 0.0)
     seen, row, score = seen[inside], row[inside], score[inside]
     found = most_probable(seen, row, score, problem.pose_row, assignment.n_landmarks)

@@ -14,12 +14,15 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.slam.association.assignment import Assignment
+from evermap.slam.association.features import Group
 from evermap.slam.problem import Marginals
 from evermap.types import BoolArray, FloatArray, IntArray
 
 LEAST_M2 = 1e-6
 """Information [1/m^2] of what ties a visit to nothing else."""
 
+LEAST_SHARE = 1e-6
+"""Share of what is known of a landmark by other visits, at least."""
 TOGETHER = 32
 """Visits that are weighed at a time."""
 
@@ -31,12 +34,14 @@ class Visits(NamedTuple):
         rows: (V,) of the detections of each.
         landmark: (V,) that they were given to.
         squared: (V,) normalised squared distance from where the others put it.
-        evidence: (V,) that both are one, over being two [nats].
+        told: (V,) by what they are like, that both are one [nats].
+        evidence: (V,) that both are one, over being two [nats], with that.
     """
 
     rows: list[IntArray]
     landmark: IntArray
     squared: FloatArray
+    told: FloatArray
     evidence: FloatArray
 
 
@@ -76,7 +81,23 @@ def weighed_visits(
     own += shared[:, None, None] * np.eye(2)
     squared = np.einsum("va,va->v", gap, np.linalg.solve(own, gap[:, :, None])[:, :, 0])
     evidence = -0.5 * (squared + np.linalg.slogdet(2.0 * np.pi * own)[1]) - math.log(density)
-    return Visits([used[visit] for visit in every], landmark, squared, evidence)
+    told = _told(assignment, pause_s)[wanted[of]]
+    return Visits([used[visit] for visit in every], landmark, squared, told, evidence + told)
+
+
+def _told(assignment: Assignment, pause_s: float) -> FloatArray:
+    """(W,) by what each visit is like, that it is to the landmark of the others [nats]; 0 where there are none."""
+    visit, landmark = assignment.of_visits(pause_s)
+    if assignment.traits is None:
+        return np.zeros(len(landmark))
+    one = assignment.traits.of_visits(visit, len(landmark))
+    every = assignment.traits.of_landmarks(one, landmark, assignment.n_landmarks).part(landmark)
+    known = np.isfinite(one.value)
+    weight = 1.0 / every.variance - np.where(known, 1.0 / one.variance, 0.0)
+    weight = np.where(weight > LEAST_SHARE / every.variance, weight, np.nan)
+    rest = every.value / every.variance - np.where(known, one.value / one.variance, 0.0)
+    others = Group(rest / weight, 1.0 / weight, every.readings - one.readings)
+    return assignment.traits.same(one, others)
 
 
 def _apart(
