@@ -6,17 +6,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from identity_scores import identity_scores
+from problems import make_world
+from recordings import building
 from scipy.stats import multivariate_normal, norm
 
+from evermap.config import Config
+from evermap.slam.association.assignment import NOBODY, Assignment
+from evermap.slam.association.associator import Associator
 from evermap.slam.association.features import (
     MISREAD_NATS,
     MOST_READINGS,
-    Group,
-    Spread,
+    Likeness,
     Traits,
+    Variances,
     learned,
     medians,
 )
+from evermap.slam.association.identify import identified
+from evermap.slam.association.particles import drawn as drawn_anew
+from evermap.slam.association.splitting import told_by_others
+from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.intake import beliefs
+from evermap.types import UNKNOWN
 
 
 def brute_force(a: float, va: float, b: float, vb: float, between: float) -> float:
@@ -27,7 +39,7 @@ def brute_force(a: float, va: float, b: float, vb: float, between: float) -> flo
 
 
 def drawn(
-    rng: np.random.Generator, spread: Spread, *, landmarks: int = 40, visits: int = 4, readings: int = 6
+    rng: np.random.Generator, spread: Variances, *, landmarks: int = 40, visits: int = 4, readings: int = 6
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Readings, their visits, and the landmarks of visits."""
     landmark = np.repeat(np.arange(landmarks), visits)
@@ -40,12 +52,12 @@ def drawn(
 
 def test_the_ratio_is_that_of_gaussians() -> None:
     rng = np.random.default_rng(0)
-    spread = Spread(np.ones(3), np.ones(3), np.array([4.0, 0.5, 25.0]), 0.7)
+    spread = Variances(np.ones(3), np.ones(3), np.array([4.0, 0.5, 25.0]), 0.7)
     one, other = rng.normal(size=(2, 20, 3)) * np.sqrt(spread.landmark + 1.0)
     va, vb = rng.uniform(0.1, 2.0, (2, 20, 3))
     one[3, 1] = other[4] = np.nan
     many = np.full(20, 1e9)  # no limit
-    found = Traits(one, spread).same(Group(one, va, many), Group(other, vb, many))
+    found = Traits(one, spread).same(Likeness(one, va, many), Likeness(other, vb, many))
     for k in range(20):
         each = [brute_force(one[k, c], va[k, c], other[k, c], vb[k, c], spread.landmark[c]) for c in range(3)]
         assert found[k] == pytest.approx(0.7 * np.nansum(each), abs=1e-9)
@@ -54,7 +66,7 @@ def test_the_ratio_is_that_of_gaussians() -> None:
 
 def test_readings_of_visits_and_landmarks_are_those_of_a_joint_gaussian() -> None:
     """Two visits with a reading each, against a third: as the Gaussian of all three readings has it."""
-    spread = Spread(np.array([0.3]), np.array([0.2]), np.array([5.0]), 1.0)
+    spread = Variances(np.array([0.3]), np.array([0.2]), np.array([5.0]), 1.0)
     value = np.array([[1.0], [1.8], [0.4]])
     traits = Traits(value, spread)
     visits = traits.of_visits(np.arange(3), 3)
@@ -68,7 +80,7 @@ def test_readings_of_visits_and_landmarks_are_those_of_a_joint_gaussian() -> Non
 
 
 def test_a_misread_one_tells_little_and_moves_no_median() -> None:
-    spread = Spread(np.full(1, 0.01), np.full(1, 0.01), np.ones(1), 1.0)
+    spread = Variances(np.full(1, 0.01), np.full(1, 0.01), np.ones(1), 1.0)
     value = np.zeros((12, 1))
     value[3] = 1e6
     traits, visit = Traits(value, spread), np.repeat([0, 1], 6)
@@ -95,7 +107,7 @@ def test_medians_are_those_of_numpy() -> None:
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 255.0])
 def test_spreads_are_learned_in_any_unit(unit: float) -> None:
-    true = Spread(np.array([0.04, 0.01]), np.array([0.02, 0.09]), np.array([1.0, 0.8]), 1.0)
+    true = Variances(np.array([0.04, 0.01]), np.array([0.02, 0.09]), np.array([1.0, 0.8]), 1.0)
     value, visit, landmark = drawn(np.random.default_rng(2), true, landmarks=100)
     wrong = np.random.default_rng(3).random(len(value)) < 0.05
     value[wrong] += 30.0
@@ -109,11 +121,11 @@ def test_spreads_are_learned_in_any_unit(unit: float) -> None:
 
 def test_what_tells_nothing_is_not_used() -> None:
     rng = np.random.default_rng(4)
-    noise = Spread(np.ones(20), np.zeros(20), np.zeros(20), 1.0)
+    noise = Variances(np.ones(20), np.zeros(20), np.zeros(20), 1.0)
     assert learned(*drawn(rng, noise)) is None
-    fickle = Spread(np.array([0.01]), np.array([1.0]), np.zeros(1), 1.0)  # another value in every visit
+    fickle = Variances(np.array([0.01]), np.array([1.0]), np.zeros(1), 1.0)  # another value in every visit
     assert learned(*drawn(rng, fickle)) is None
-    value, visit, landmark = drawn(rng, Spread(np.array([0.01]), np.array([0.01]), np.ones(1), 1.0))
+    value, visit, landmark = drawn(rng, Variances(np.array([0.01]), np.array([0.01]), np.ones(1), 1.0))
     for none in (np.full_like(value, np.nan), np.full_like(value, 3.0)):
         assert learned(none, visit, landmark) is None
     both = np.hstack([rng.normal(size=value.shape), value])
@@ -124,7 +136,7 @@ def test_what_tells_nothing_is_not_used() -> None:
 
 def test_visits_given_to_wrong_landmarks_do_not_hide_what_tells() -> None:
     rng = np.random.default_rng(5)
-    true = Spread(np.full(4, 0.04), np.full(4, 0.02), np.ones(4), 1.0)
+    true = Variances(np.full(4, 0.04), np.full(4, 0.02), np.ones(4), 1.0)
     value, visit, landmark = drawn(rng, true, landmarks=100)
     some = rng.random(len(landmark)) < 0.3
     wrong = landmark.copy()
@@ -137,7 +149,7 @@ def test_visits_given_to_wrong_landmarks_do_not_hide_what_tells() -> None:
 
 def test_columns_that_say_the_same_count_once() -> None:
     rng = np.random.default_rng(6)
-    value, visit, landmark = drawn(rng, Spread(np.array([0.01]), np.array([0.01]), np.ones(1), 1.0))
+    value, visit, landmark = drawn(rng, Variances(np.array([0.01]), np.array([0.01]), np.ones(1), 1.0))
     one, four = learned(value, visit, landmark), learned(np.tile(value, 4), visit, landmark)
     assert one is not None
     assert four is not None
@@ -148,3 +160,59 @@ def test_nothing_read_is_no_evidence() -> None:
     traits = replace(Traits.none(5), value=np.zeros((5, 0)))
     visits = traits.of_visits(np.array([0, 0, 1, -1, 1]), 2)
     np.testing.assert_array_equal(traits.same(visits, visits), [0.0, 0.0])
+
+
+def radii(rng: np.random.Generator, row: np.ndarray) -> Traits:
+    """Radii of landmarks (M,), one in twenty misread."""
+    value = np.linspace(-0.2, 0.2, int(row.max()) + 1)[row] + rng.normal(0.0, 0.01, len(row))
+    value = np.where(rng.random(len(row)) < 0.05, rng.uniform(-5.0, 5.0, len(row)), value)
+    return Traits(value[:, None], Variances(np.full(1, 1e-4), np.full(1, 1e-4), np.full(1, 0.02), 1.0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_misread_radii_split_nothing(seed: int) -> None:
+    made = make_world(seed, n_poses=60, n_landmarks=8, prior=CalibrationPrior.from_settings(calibrated=False))
+    true = made.problem.landmark_row
+    associator = Associator(made.problem, made.noise, traits=radii(np.random.default_rng(seed), true))
+    for _ in made.problem.stamp_s:
+        associator.step()
+    found = associator.finish()
+    scores = identity_scores(found.landmark_row, true)
+    assert (scores.n_landmarks, scores.purity) == (8, 1.0)
+    assert np.mean(found.landmark_row == NOBODY) < 0.02
+    again = identity_scores(drawn_anew(found, np.full(5, 0.1), 0)[0].landmark_row, true)
+    assert again.purity > 0.98
+
+
+def test_an_exchange_of_two_landmarks_is_seen() -> None:
+    """Where landmarks 0 and 1 stood, the other one stands when the robot comes back; places tell nothing."""
+    made = make_world(1, n_poses=60, n_landmarks=8, prior=CalibrationPrior.from_settings(calibrated=False))
+    place, back = made.problem.landmark_row, made.problem.pose_row >= 30
+    is_there = np.where(back & (place < 2), 1 - place, place)
+    traits = radii(np.random.default_rng(1), 7 * is_there % 8)
+    later = replace(made.problem, stamp_s=made.problem.stamp_s + 100.0 * (np.arange(60) >= 30))
+    found = Assignment(later, place, made.truth, np.full((len(place), 2), UNKNOWN), traits)
+    told, landmark = told_by_others(found, 20.0), np.repeat(np.arange(8), 2)
+    assert np.all(told[landmark < 2] < -2.0 * MISREAD_NATS)
+    assert np.all(told[landmark >= 2] > 0.0)
+    gained = traits.told(*replace(found, landmark_row=is_there).of_visits()) - traits.told(*found.of_visits())
+    assert gained > 2.0 * MOST_READINGS * MISREAD_NATS
+
+
+def test_a_useless_column_changes_nothing_and_a_good_one_no_identity() -> None:
+    recording = building(1).sessions[0]
+    seen, rng = recording.detections, np.random.default_rng(7)
+    beliefs_of = beliefs(recording.sensor, Config().slam)
+    plain = identified(recording, *beliefs_of).detections.landmark_id
+    noise = rng.normal(size=(len(seen), 2))
+    good = 0.1 * rng.normal(size=int(seen.landmark_id.max()) + 1)[seen.landmark_id, None] + 0.02 * noise[:, :1]
+    for features, same in ((noise, True), (good, False)):
+        names = tuple(f"descriptor_{k}" for k in range(features.shape[1]))
+        given = replace(recording, detections=replace(seen, features=features, feature_names=names))
+        found = identified(given, *beliefs_of).detections.landmark_id
+        if same:
+            np.testing.assert_array_equal(found, plain)
+        else:
+            before, after = (identity_scores(one, seen.landmark_id) for one in (plain, found))
+            assert after.purity >= before.purity - 0.002
+            assert after.completeness >= before.completeness - 0.002

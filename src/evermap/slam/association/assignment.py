@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from evermap.slam.association.features import Group, Traits
+from evermap.slam.association.features import Likeness, Traits
 from evermap.slam.problem import Estimate, Problem
 from evermap.slam.streaming import sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
@@ -248,7 +248,7 @@ class Assignment:
         _, at = np.unique(visit[first], return_index=True)
         return visit, self.landmark_row[first[at]]
 
-    def like(self) -> Group | None:
+    def like(self) -> Likeness | None:
         """Return what each landmark (L,) is like; None where nothing tells."""
         if self.traits is None:
             return None

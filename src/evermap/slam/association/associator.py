@@ -17,7 +17,7 @@ import numpy as np
 from evermap.geometry import se2
 from evermap.slam.association.assignment import FORGET_S, NOBODY, Assignment, alike, same_name
 from evermap.slam.association.constellation import MOST_LAID, propose_constellation
-from evermap.slam.association.features import MISREAD_NATS, Group, Traits
+from evermap.slam.association.features import MISREAD_NATS, Likeness, Traits
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.association.merging import FEW_NATS, Differences, Solution, propose_merges
 from evermap.slam.association.relaying import displaced_stretches, laid
@@ -374,7 +374,7 @@ class Associator:
         self._row[new] = len(local.position) + np.arange(len(new))
         self._of_kind = np.vstack([self._of_kind, self._kind[new]])
         if self._traits is not None and self._like is not None:
-            more = Group(*map(np.concatenate, zip(self._like, self._traits.nothing(len(new)), strict=True)))
+            more = Likeness(*map(np.concatenate, zip(self._like, self._traits.nothing(len(new)), strict=True)))
             self._like = self._traits.followed(more, self._row[new], new)
         self._seen_s = np.append(self._seen_s, np.full(len(new), problem.stamp_s[self._done]))
         at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)

@@ -48,7 +48,7 @@ MOST_COMPARED = 1_000_000
 ROUNDS = 12
 
 
-class Spread(NamedTuple):
+class Variances(NamedTuple):
     """Variances (C,) of columns: of readings in a visit, of visits to a landmark, of landmarks; and the share of the
     columns that tell something of their own.
     """
@@ -59,7 +59,7 @@ class Spread(NamedTuple):
     share: float
 
 
-class Group(NamedTuple):
+class Likeness(NamedTuple):
     """G groups of readings: value and variance of its error (G, C), nan where nothing was read, and (G,) how many
     readings each counts as.
     """
@@ -68,9 +68,9 @@ class Group(NamedTuple):
     variance: FloatArray
     readings: FloatArray
 
-    def part(self, rows: Any) -> Group:
+    def part(self, rows: Any) -> Likeness:
         """Return some groups."""
-        return Group(self.value[rows], self.variance[rows], self.readings[rows])
+        return Likeness(self.value[rows], self.variance[rows], self.readings[rows])
 
 
 @kernel
@@ -88,7 +88,7 @@ def same_nats(
         other: (C,) values of the other one.
         of_other: (C,) variances of their errors.
         readings: how many the lesser of the two counts as.
-        spread: a `Spread`.
+        spread: a `Variances`.
     """
     total = 0.0
     for c in range(len(one)):
@@ -117,12 +117,12 @@ class Traits:
     """Readings (M, C) of detections about the mean of all, in the columns that are used, and how these spread."""
 
     value: FloatArray
-    spread: Spread
+    spread: Variances
 
     @classmethod
     def none(cls, count: int) -> Traits:
         """Return those of detections of which nothing was read."""
-        return cls(np.zeros((count, 0)), Spread(np.zeros(0), np.zeros(0), np.zeros(0), 1.0))
+        return cls(np.zeros((count, 0)), Variances(np.zeros(0), np.zeros(0), np.zeros(0), 1.0))
 
     @property
     def errors(self) -> FloatArray:
@@ -139,17 +139,17 @@ class Traits:
         """Return those of the first detections."""
         return replace(self, value=self.value[:count])
 
-    def singly(self, rows: IntArray) -> Group:
+    def singly(self, rows: IntArray) -> Likeness:
         """Return detections each by itself."""
         value = self.value[rows]
-        return Group(value, np.tile(self.errors[1], (len(value), 1)), np.isfinite(value).any(axis=1).astype(float))
+        return Likeness(value, np.tile(self.errors[1], (len(value), 1)), np.isfinite(value).any(axis=1).astype(float))
 
-    def nothing(self, count: int) -> Group:
+    def nothing(self, count: int) -> Likeness:
         """Return landmarks of which nothing was read."""
         nothing = np.full((count, self.value.shape[1]), np.nan)
-        return Group(nothing, nothing.copy(), np.zeros(count))
+        return Likeness(nothing, nothing.copy(), np.zeros(count))
 
-    def followed(self, known: Group, landmark: IntArray, rows: IntArray) -> Group:
+    def followed(self, known: Likeness, landmark: IntArray, rows: IntArray) -> Likeness:
         """Return landmarks with readings more, each of another one: a running mean, until medians are taken."""
         value, variance, readings = (each.copy() for each in known)
         old, now = value[landmark], self.value[rows]
@@ -159,15 +159,15 @@ class Traits:
         readings[landmark] += np.isfinite(now).any(axis=1)
         counts = np.minimum(readings[landmark], MOST_READINGS).astype(np.int64)
         variance[landmark] = np.fmin(variance[landmark], self.errors[counts])
-        return Group(value, variance, readings)
+        return Likeness(value, variance, readings)
 
-    def of_visits(self, visit: IntArray, count: int) -> Group:
+    def of_visits(self, visit: IntArray, count: int) -> Likeness:
         """Return visits by the medians of their readings; visit (M,) of each detection, negative for none."""
         value, read = medians(self.value, visit, count)
         variance = self.spread.visit + self.spread.reading / np.clip(read, 1, MOST_READINGS)
-        return Group(value, variance, np.minimum(read.max(axis=1, initial=0), MOST_READINGS).astype(float))
+        return Likeness(value, variance, np.minimum(read.max(axis=1, initial=0), MOST_READINGS).astype(float))
 
-    def of_landmarks(self, visits: Group, landmark: IntArray, count: int) -> Group:
+    def of_landmarks(self, visits: Likeness, landmark: IntArray, count: int) -> Likeness:
         """Return landmarks by their visits; landmark (V,) of each."""
         known = np.isfinite(visits.value)
         weight = np.where(known, 1.0 / visits.variance, 0.0)
@@ -177,9 +177,9 @@ class Traits:
         np.add.at(middle, landmark, weight * np.where(known, visits.value, 0.0))
         np.add.at(readings, landmark, visits.readings)
         some = np.where(total > 0.0, total, np.nan)
-        return Group(middle / some, 1.0 / some, readings)
+        return Likeness(middle / some, 1.0 / some, readings)
 
-    def same(self, one: Group, other: Group) -> FloatArray:
+    def same(self, one: Likeness, other: Likeness) -> FloatArray:
         """Return (K,) nats by which groups are more probable if each is of one landmark with the other one."""
         return _each_same(one, other, self.spread)
 
@@ -247,7 +247,7 @@ def learned(value: FloatArray, visit: IntArray, landmark: IntArray, *, revisits:
     alone = _alone(middle[:, used])
     if alone * told[used].sum() < LEAST_NATS:
         return None
-    spread = Spread(reading[used], error[used], between[used], alone)
+    spread = Variances(reading[used], error[used], between[used], alone)
     return Traits(np.ascontiguousarray(value[:, used]), spread)
 
 
@@ -317,14 +317,14 @@ def _visit_share(
     alone = _alone(middle)
 
     def nats(share: FloatArray) -> FloatArray:
-        """(2, K, D) of differences, of one landmark and of two."""
+        """Give (2, K, D) log likelihoods of differences, of one landmark and of two."""
         right = 2.0 * (least + share * free) + chance + 1e-300
         wrong = right + 2.0 * (1.0 - share) * free
         told = np.stack([-0.5 * (np.log(variance) + gap**2 / variance) for variance in (right, wrong)])
         return alone * np.where(np.isfinite(gap), told, 0.0)
 
     def fit(told: FloatArray) -> float:
-        """Log likelihood of (2, K) at the best share of wrong ones."""
+        """Fit the share of wrong ones to (2, K) log likelihoods; returns that of all."""
         wrong = WRONG
         for _ in range(ROUNDS):
             odds = told[1] - told[0] + math.log(wrong / (1.0 - wrong))

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from evermap.slam.association.assignment import NOBODY, Assignment
-from evermap.slam.association.features import MOST_READINGS, Group, Spread, Traits, same_nats
+from evermap.slam.association.features import MOST_READINGS, Likeness, Traits, Variances, same_nats
 from evermap.slam.association.jcbb import gates
 from evermap.slam.filter_kernels import vectorised
 from evermap.slam.kernels import composed, kernel, wrapped
@@ -62,7 +62,7 @@ class _Seen(NamedTuple):
     stamp_s: FloatArray
     like: FloatArray
     errors: FloatArray
-    spread: Spread
+    spread: Variances
 
 
 class _Sensor(NamedTuple):
@@ -150,7 +150,7 @@ def warm_up() -> None:
     _run(seen, _Sensor(np.zeros(3), np.zeros(9)), np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), cloud, 0)
 
 
-def _begun(place: FloatArray, label: IntArray, like: Group, count: int) -> _Cloud:
+def _begun(place: FloatArray, label: IntArray, like: Likeness, count: int) -> _Cloud:
     """Particles that know landmarks (L, 2), each about where it is."""
     n = len(place)
     room = ROOM[0] * n + ROOM[1]

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.slam.association.assignment import Assignment
-from evermap.slam.association.features import Group
+from evermap.slam.association.features import Likeness
 from evermap.slam.problem import Marginals
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -81,12 +81,12 @@ def weighed_visits(
     own += shared[:, None, None] * np.eye(2)
     squared = np.einsum("va,va->v", gap, np.linalg.solve(own, gap[:, :, None])[:, :, 0])
     evidence = -0.5 * (squared + np.linalg.slogdet(2.0 * np.pi * own)[1]) - math.log(density)
-    told = _told(assignment, pause_s)[wanted[of]]
+    told = told_by_others(assignment, pause_s)[wanted[of]]
     return Visits([used[visit] for visit in every], landmark, squared, told, evidence + told)
 
 
-def _told(assignment: Assignment, pause_s: float) -> FloatArray:
-    """(W,) by what each visit is like, that it is to the landmark of the others [nats]; 0 where there are none."""
+def told_by_others(assignment: Assignment, pause_s: float) -> FloatArray:
+    """Return (W,) nats for each visit to be to the landmark of its others, by what it is like; 0 where it has none."""
     visit, landmark = assignment.of_visits(pause_s)
     if assignment.traits is None:
         return np.zeros(len(landmark))
@@ -96,7 +96,7 @@ def _told(assignment: Assignment, pause_s: float) -> FloatArray:
     weight = 1.0 / every.variance - np.where(known, 1.0 / one.variance, 0.0)
     weight = np.where(weight > LEAST_SHARE / every.variance, weight, np.nan)
     rest = every.value / every.variance - np.where(known, one.value / one.variance, 0.0)
-    others = Group(rest / weight, 1.0 / weight, every.readings - one.readings)
+    others = Likeness(rest / weight, 1.0 / weight, every.readings - one.readings)
     return assignment.traits.same(one, others)
 
 
