@@ -404,7 +404,8 @@ def main(names: Sequence[str] = ()) -> None:
                 print(f"| {world.name} | {'without' if unknown_ids else 'with'} | {' | '.join(cells)} |", flush=True)
         return
     if names and names[0] == "columns":
-        for recording in itertools.chain(recordings(parks=1), (simulate_copied_aisles(0),)):
+        rooms = (replace(one, name="rooms") for one in simulated_world(1, 0).recordings[:1])
+        for recording in itertools.chain(rooms, (simulate_copied_aisles(0),), recordings(parks=1)):
             for name in COLUMNS if not names[1:] or recording.name.startswith(tuple(names[1:])) else ():
                 row = score(with_columns(recording, name))
                 print(_line(replace(row, name=f"{row.name}, {name}")), flush=True)
