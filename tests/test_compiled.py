@@ -193,7 +193,7 @@ print(twice(2), *(sum(twice.stats[k].values()) for k in (1, 2)))
     for done, hits in ((first, "0 1"), (second, "1 0")):
         assert done.stderr == ""
         said, result = done.stdout.splitlines()
-        assert said.startswith("EvermapWarning compiled kernels are kept in a temporary folder")
+        assert said.startswith("EvermapWarning compiled kernels are cached in a temporary folder")
         assert str(tmp_path / "temporary") in said
         assert result == f"4 {hits}"
     (kept_in,) = (tmp_path / "temporary").iterdir()
@@ -231,5 +231,5 @@ run()
     done = run(code)
     assert done.returncode == 2
     said, ended = done.stderr.splitlines()
-    assert said.startswith("evermap: warning: compiled kernels are kept in a temporary folder")
+    assert said.startswith("evermap: warning: compiled kernels are cached in a temporary folder")
     assert ended == "evermap: error: nothing.csv: no such file"

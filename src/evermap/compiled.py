@@ -34,10 +34,10 @@ def single_threaded() -> Iterator[None]:
 
 
 UNREADABLE = (AttributeError, ImportError, EOFError, pickle.UnpicklingError)
-"""Raised by an index of kept code that names types which this evermap does not have any more, or that was cut off."""
+"""Errors of a cache index that names types missing in this evermap, or that is truncated."""
 
 OBJECTS_BEFORE_COLLECTION = 100_000
-"""While a kernel is compiled, garbage is looked for after so many new objects."""
+"""Threshold of the garbage collector while a kernel is compiled."""
 
 
 def kept(*, effort: int = 3, **options: Any) -> Callable[[_Function], _Function]:
@@ -134,7 +134,7 @@ def _keeper() -> Callable[[Any], Any]:
     class OneProcessAtATime(FunctionCache):
         _impl_class = NamedWithoutLine
         of: Any = None
-        """The dispatcher that it keeps code for."""
+        """The dispatcher whose code is cached."""
 
         def load_overload(self, sig: Any, target_context: Any) -> Any:
             with _locked(Path(self.cache_path)):
@@ -191,7 +191,7 @@ def temporary_folder() -> str:
             raise PermissionError
     except OSError:
         folder = Path(tempfile.mkdtemp(prefix=f"{name}-"))
-    problem = "compiled kernels are kept in a temporary folder: neither the installation nor a home folder is writable"
+    problem = "compiled kernels are cached in a temporary folder: the installation and the home folder are read-only"
     warnings.warn(f"{problem} ({folder}; try: NUMBA_CACHE_DIR=FOLDER)", EvermapWarning, stacklevel=2)
     os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))  # processes that this one starts need not say it again
     os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))  # which would say the same of its fonts

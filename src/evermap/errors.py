@@ -11,9 +11,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 _UNSHOWN = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-"""Control characters, line ends, marks that reverse what follows, and surrogates, which cannot be encoded."""
+"""Control characters, line ends, direction marks, and surrogates, which cannot be encoded."""
 _MOST = 400
-"""Characters of each part of a message: enough for a sentence and a path, not for a file that was taken for one."""
+"""Maximum characters of each part of a message: enough for a sentence and a path."""
 
 
 def printable(text: str, most: int | None = None) -> str:

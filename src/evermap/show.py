@@ -13,7 +13,7 @@ import numpy as np
 from evermap.errors import MissingExtraError, printable
 
 LONGEST = 900
-"""Characters of a text; the rest is left out."""
+"""Maximum characters of a text; the rest is omitted."""
 _TEXT, _ITEMS = 60, 4
 """Characters of a name, and items of a list, that are shown in full."""
 _AXES = {(2, 2): "xy", (3, 3): ("x", "y", "{t}"), (6, 6): ("x", "y", "z", "rx", "ry", "rz")}
@@ -29,7 +29,7 @@ _PARTS: Mapping[tuple[int, ...], tuple[tuple[str, tuple[int, ...]], ...]] = {
         for shape, on in _AXES.items()
     },
 }
-"""Columns of a data frame that positions, poses and their covariances become, by their shape after the first axis."""
+"""Data frame columns of positions, poses and their covariances, by their shape after the first axis."""
 _PLAIN = ("position", "pose", "covariance", "rotation", "corner")
 
 

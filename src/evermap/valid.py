@@ -89,7 +89,7 @@ ANGULAR_RADPS = Quantity("angular_radps", -1e3, 1e3, hint="radians per second")
 DX_M = Quantity("dx_m", -1e5, 1e5, hint="metres since the previous row")
 DY_M = Quantity("dy_m", -1e5, 1e5, hint="metres since the previous row")
 DTHETA_RAD = Quantity("dtheta_rad", -pi, pi, hint="radians since the previous row, at most half a turn")
-RANGE_M = Quantity("range_m", 0.0, 1e6, positive=True, hint="metres; leave out readings that mean 'no return'")
+RANGE_M = Quantity("range_m", 0.0, 1e6, positive=True, hint="metres; drop readings that mean 'no return'")
 BEARING_RAD = Quantity("bearing_rad", -2 * pi, 2 * pi, hint="radians, not degrees")
 X_M = Quantity("x_m", -1e8, 1e8, hint="metres")
 Y_M = Quantity("y_m", -1e8, 1e8, hint="metres")
@@ -113,7 +113,7 @@ FEATURES = (
 )
 """Of a landmark itself; beside these `descriptor_0`, `descriptor_1` ... may be any numbers."""
 CAMERA_MODELS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
-"""How many numbers of distortion each model of a camera has."""
+"""Number of distortion coefficients per camera model."""
 P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
 
 
@@ -191,14 +191,14 @@ def _check_spatial_detections(detections: SpatialDetections, frames: int, sensor
     position, corner = detections.position_sensor_m, detections.corner_px.reshape(len(row), -1)
     placed, cornered = np.isfinite(position).all(axis=1), np.isfinite(corner).all(axis=1)
     hint = "a position in the sensor's frame, or the four corners of a tag"
-    _require(placed | cornered, position, f"{field}.position_sensor_m", "is nowhere", hint)
+    _require(placed | cornered, position, f"{field}.position_sensor_m", "has no position", hint)
     turned = ~np.isnan(detections.rotation).all(axis=1)
     _require(~turned | _is_unit(detections.rotation), detections.rotation, f"{field}.rotation",
              "is not a unit quaternion", "x, y, z, w; nan of points")  # fmt: skip
     covariance = detections.covariance_sensor_m2
     given = ~np.isnan(covariance).all(axis=(1, 2))
-    _require(~given | is_covariance(covariance), row, f"{field}.covariance_sensor_m2", "has no covariance: not positive"
-             " semidefinite", "square metres; nan where unknown")  # fmt: skip
+    _require(~given | is_covariance(covariance), row, f"{field}.covariance_sensor_m2",
+             "is not a covariance: not positive semidefinite", "square metres; nan where unknown")  # fmt: skip
     for name in ("sigma_rad", "tag_size_m"):
         value = getattr(detections, name)
         _require(np.isnan(value) | (value > 0.0), value, f"{field}.{name}", "is not positive", "nan where unknown")
@@ -291,7 +291,7 @@ def check_landmarks(landmarks: Any, field: str) -> None:
     ids, covariance = landmarks.landmark_id, landmarks.covariance_m2
     again = np.ones(len(ids), dtype=bool)
     again[np.unique(ids, return_index=True)[1]] = False
-    _require(~again, ids, f"{field}.landmark_id", "is listed twice", "one row a landmark")
+    _require(~again, ids, f"{field}.landmark_id", "is listed twice", "one row per landmark")
     _require(
         is_covariance(covariance),
         ids,
@@ -344,9 +344,9 @@ def _check_stamps(stamp_s: FloatArray, field: str) -> None:
     if np.any(step_s <= 0.0):
         row = int(np.argmax(step_s <= 0.0)) + 1
         problem = (
-            "repeats the one before" if step_s[row - 1] == 0.0 else f"time runs backwards by {-step_s[row - 1]:.6g} s"
+            "repeats the previous one" if step_s[row - 1] == 0.0 else f"time runs backwards by {-step_s[row - 1]:.6g} s"
         )
-        raise InputError(f"row {row}: {problem}", field=field, hint="sort by time, one row a stamp")
+        raise InputError(f"row {row}: {problem}", field=field, hint="sort by time, one row per stamp")
 
 
 def _require(fine: Any, values: Any, field: str, problem: str, hint: str) -> None:

@@ -216,7 +216,7 @@ def of_files() -> Iterator[Case]:
         ("detection", "p_detect = 1.5", "outside"),
         ("detection", "p_false = -0.1", "outside"),
         ("detection", "p_detect = true", "must be a number"),
-        ("recording", 'clock = "gps"', "no clock"),
+        ("recording", 'clock = "gps"', "unknown clock"),
         ("recording", "format_version = 99", "newer evermap"),
         ("recording", 'frames_complete = "yes"', "must be a bool"),
         ("recording", "class_names = [1]", "list of names"),
@@ -243,7 +243,7 @@ def of_units() -> Iterator[Case]:
         ("mm/s", speeds, 1e3 - 1, "millimetres per second"),
         ("cm/s", speeds, 1e2, "centimetres per second"),
         ("mph", speeds, 2.23694, "miles an hour"),
-        ("flipped speeds", speeds, -1.0, "drive the other way"),
+        ("flipped speeds", speeds, -1.0, "drive in the opposite direction"),
         ("deg/s", turns, 57.29578, "turn rates seem to be in deg"),
         ("flipped turns", turns, -1.0, "wrong sign"),
     ):
@@ -253,16 +253,20 @@ def of_units() -> Iterator[Case]:
     own = iter(range(10_000))
     own_ids = column("detections.csv", "landmark_id", lambda _: str(next(own)))
     for command in ("check", "slam"):
-        yield Case(command, "every detection its own id", own_ids, 2, "has to name the thing that was seen")
+        yield Case(command, "every detection its own id", own_ids, 2, "must identify the landmark")
     stopped, straight = column(*speeds, lambda _: "0"), column(*turns, lambda _: "0")
     yield Case("check", "zero odometry", both(stopped, straight), 2, "zero throughout")
     yield Case("check", "turn rates of zero", straight, 2, "seem")
     yield Case("check", "beyond the limits", toml("limits", "range_max_m = 3.0"), 0, r"\d+ of \d+ ranges lie beyond")
     yield Case("check", "out of view", toml("limits", "bearing_max_rad = 0.5"), 0, r"\d+ of \d+ bearings lie outside")
     yield Case(
-        "check", "a text as identity", column("detections.csv", "landmark_id", lambda c: f"tag:{c}"), 0, "nothing odd"
+        "check",
+        "a text as identity",
+        column("detections.csv", "landmark_id", lambda c: f"tag:{c}"),
+        0,
+        "no problems found",
     )
-    yield Case("check", "nothing", lambda _: None, 0, "nothing odd found")
+    yield Case("check", "nothing", lambda _: None, 0, "no problems found")
 
 
 def both(*spoils: Spoil) -> Spoil:

@@ -113,6 +113,6 @@ def test_a_model_that_lacks_a_feature_says_which(table: Path, tmp_path: Path) ->
 
 
 def test_help_of_persist_lists_every_kind() -> None:
-    shown = run("persist", "--help").stdout.partition("Features that come back")[2].partition("Examples")[0]
+    shown = run("persist", "--help").stdout.partition("Features that return")[2].partition("Examples")[0]
     listed = {word.rstrip(",") for line in shown.splitlines() for word in line.split("  ")[1:] for word in word.split()}
     assert {*KINDS, "auto"} <= listed

@@ -74,8 +74,8 @@ def test_a_replay_enters_what_slam_enters_and_tells_poses_and_changes(tmp_path: 
         (["--map", "m.evermap", "--zenoh", "z.json5", "--sensor", "{0}/sensor.toml"], "z.json5: 1:"),
         (["--map", "m.evermap", "--zenoh", "none.json5", "--sensor", "{0}/sensor.toml"], "none.json5: No such file"),
         (["--replay", "{0}", "--map", "m.evermap", "--sensor", "none.toml"], "leave --sensor out"),
-        (["--replay", "{0}", "--map", "m.evermap", "--topics", "none.toml"], "leave --topics out"),
-        (["--replay", "{0}", "--map", "z.json5"], "z.json5: is no evermap map"),
+        (["--replay", "{0}", "--map", "m.evermap", "--topics", "none.toml"], "omit --topics"),
+        (["--replay", "{0}", "--map", "z.json5"], "z.json5: is not an evermap map"),
         (["--map", "m.evermap", "--foxglove", "nonsense", "--sensor", "{0}/sensor.toml"], "no server at nonsense"),
         (["--map", "m.evermap", "--foxglove", "0", "--sensor", "none.toml"], "none.toml"),
         (
@@ -123,7 +123,7 @@ def test_a_robot_over_zenoh_and_the_end_of_the_bridge(tmp_path: Path, sessions: 
     assert robot.wait(timeout=20) == 0
     assert bridge.returncode == (0 if end == signal.SIGTERM else -end)
     if end == signal.SIGTERM:
-        assert "entering what was driven" in said
+        assert "entering the drive" in said
     else:
         with open_store(path) as store:
             assert store.head() == 2

@@ -202,7 +202,10 @@ def broken(tmp_path: Path) -> Path:
         (lambda path: [path, "--horizon", "3"], "field '--horizon': '3' has no unit"),
         (lambda path: [path, "--recurrent", "often"], "field '--recurrent': unknown kind of model 'often'"),
         (lambda path: [path, "--p-miss", "1.2"], "field '--p-miss': input should be less than or equal to 1, not 1.2"),
-        (lambda path: [path, "--model", "m.json", "--prior", "never-leaves"], "field '--prior': a lifetime is for"),
+        (
+            lambda path: [path, "--model", "m.json", "--prior", "never-leaves"],
+            "field '--prior': a lifetime prior is for",
+        ),
         (lambda path: ["--init", path], "looks.csv: exists already (try: another name)"),
     ],
 )
@@ -218,7 +221,7 @@ def test_mistakes_are_one_line(
 def test_a_folder_that_is_not_ours_is_left_alone(example: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("precious")
-    assert "holds 'thesis.tex', which no evermap run wrote" in refuse(run(example, "--out", tmp_path / "out"))
+    assert "contains 'thesis.tex', which no evermap run wrote" in refuse(run(example, "--out", tmp_path / "out"))
     assert run(example, "--out", tmp_path / "out", "--force", "--figures", "0").exit_code == 0
     refuse(run(example, "--out", tmp_path / "out", "--figures", "0"))
     assert run(example, "--out", tmp_path / "out", "--figures", "0", "--force").exit_code == 0

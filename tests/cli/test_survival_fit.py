@@ -142,7 +142,7 @@ def test_one_sample_and_nobody_gone_have_defined_answers(tmp_path: Path) -> None
     result = run(path, "--json")
     endless = json.loads(result.stdout)
     assert (endless["loglik"], endless["p_never_leaves"]) == (0.0, 1.0)
-    assert "nothing was seen to leave" in result.stderr
+    assert "no end was observed" in result.stderr
 
 
 def test_help_lists_every_estimator() -> None:
@@ -155,7 +155,7 @@ def test_help_lists_every_estimator() -> None:
     ("content", "options", "named"),
     [
         ("left,right\n5,7\n9,3\n", (), ":3: field 'right': ends at 3 s, before its left at 9 s"),
-        ("left,right,entry\n5,7,8\n", (), ":2: field 'entry': known only because it was there at 8 s, but gone by 7 s"),
+        ("left,right,entry\n5,7,8\n", (), ":2: field 'entry': first observed at age 8 s, but gone by 7 s"),
         ("left,right,weight\n5,7,0\n5,8,0\n", (), "field 'weight': all weights are 0"),
         ("left,right,weight\n5,7,-1\n", (), ":2: field 'weight': -1 is outside"),
         ("left,entry\n5,7\n", (), "field 'right': missing column"),
@@ -174,7 +174,7 @@ def test_help_lists_every_estimator() -> None:
         ("left,right\n5,7\n", ("--estimator", "kaplan-meier"), "neither exact nor right censored"),
         ("left,right\n5,\n", ("--estimator", "weibull"), "no lifetime has an end"),
         ("left,right\n5,7\n", ("--figure", "a.gif"), "cannot draw a '.gif' file"),
-        ("left,right,x_m,y_m\n5,7,1,1\n", ("--by", "chunk", "--out", "a.json"), "a model file knows no places"),
+        ("left,right,x_m,y_m\n5,7,1,1\n", ("--by", "chunk", "--out", "a.json"), "a model file has no places"),
         ("left,right\n5,7\n", ("--by", "class", "--chunk-m", "0"), "field '--chunk-m': input should be greater than 0"),
     ],
 )

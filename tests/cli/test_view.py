@@ -149,8 +149,8 @@ def test_without_rerun_it_says_what_to_install(
     ("what", "out", "words"),
     [
         ("nope", "a.rrd", "no such map or run"),
-        ("rec", "a.rrd", "is no run of `slam`"),
-        ("rec/odometry.csv", "a.rrd", "is no evermap map"),
+        ("rec", "a.rrd", "is not a run of `slam`"),
+        ("rec/odometry.csv", "a.rrd", "is not an evermap map"),
         ("run-rec", "a.png", "cannot write a '.png' file"),
     ],
 )

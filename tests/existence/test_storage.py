@@ -50,7 +50,7 @@ def damaged(**fields: object) -> str:
     ("content", "message"),
     [
         ("no json", "is not JSON"),
-        ("[1]", "holds no model"),
+        ("[1]", "contains no model"),
         ('{"schema_version": 99}', "version 99"),
         ('{"schema_version": 1, "kind": "crystal ball"}', "unknown kind of model 'crystal ball'"),
         ('{"schema_version": 1, "kind": "phase-type", "present": [true, false]}', "'rates_hz': is missing"),

@@ -38,12 +38,12 @@ def test_generators_make_the_groups_that_scipy_lists(generators, group):
         ("axis:w", "unknown symmetry 'axis:w'"),
         ("half:z", "unknown symmetry"),
         ("180", "unknown symmetry"),
-        ("50:z", "no whole part of a full turn"),
-        ("-90:z", "no whole part"),
-        ("nan:z", "no whole part"),
+        ("50:z", "not an integer fraction of a full turn"),
+        ("-90:z", "not an integer fraction"),
+        ("nan:z", "not an integer fraction"),
         (("axis:z", "axis:x"), "'any'"),
         (("axis:z", "90:x"), "'any'"),
-        (("72:z", "90:x"), "no finite group"),
+        (("72:z", "90:x"), "do not generate a finite group"),
     ],
 )
 def test_other_texts_are_refused(generators, problem):

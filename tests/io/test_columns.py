@@ -125,7 +125,7 @@ def test_bad_flags_names_and_files(tmp_path: Path) -> None:
     table = read(tmp_path, "a,flag\nx\u0007,1\ny,2\n")
     with pytest.raises(InputError, match=r"t\.csv:3: field 'flag': '2' is neither 1 nor 0 \(try: so\)"):
         table.flags("flag", hint="so")
-    with pytest.raises(InputError, match=r"t\.csv:2: field 'a': holds a character that cannot be printed"):
+    with pytest.raises(InputError, match=r"t\.csv:2: field 'a': contains a character that cannot be printed"):
         table.labels("a")
     with pytest.raises(InputError, match="no such file"):
         read_columns(tmp_path / "none.csv", [])
@@ -143,7 +143,7 @@ def test_bad_flags_names_and_files(tmp_path: Path) -> None:
     table = read_columns(tmp_path / "t.parquet", [])
     with pytest.raises(InputError, match=r"t\.parquet:1: field 'a': 1\.5 is not a name"):
         table.labels("a")
-    with pytest.raises(InputError, match=r"field 's': holds list<.*>, not numbers"):
+    with pytest.raises(InputError, match=r"field 's': contains list<.*>, not numbers"):
         table.numbers(Quantity("s"))
 
 

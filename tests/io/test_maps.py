@@ -134,7 +134,7 @@ BAD = {
     "cov.csv": ("landmark_id,x_m,y_m,cov_xx_m2,cov_xy_m2,cov_yy_m2\n1,2,3,1,2,1\n", r"cov\.csv:2: .*semidefinite"),
     "part.csv": ("landmark_id,x_m,y_m,cov_xx_m2\n1,2,3,1\n", r"part\.csv:1: field 'cov_xy_m2': missing column"),
     "p.csv": ("landmark_id,x_m,y_m,p_exists\n1,2,3,1.5\n", r"p\.csv:2: field 'p_exists': 1.5 is outside"),
-    "map.xlsx": ("", "no map format ends in '.xlsx'"),
+    "map.xlsx": ("", "unknown map format '.xlsx'"),
     "a.geojson": ("{", r"a\.geojson:1: not valid JSON"),
     "b.geojson": ('{"features": []}', "local frame"),
     "c.geojson": (

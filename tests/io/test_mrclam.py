@@ -276,5 +276,5 @@ def test_a_robot_that_is_not_there(mrclam: Files, lay_out: Callable, robot: int)
 
 def test_two_recordings_in_one_zip(mrclam: Files, lay_out: Callable) -> None:
     files = {f"{folder}/{name}": text for folder in ("first", "second") for name, text in mrclam.items()}
-    with pytest.raises(EvermapError, match="holds 2 recordings: first, second"):
+    with pytest.raises(EvermapError, match="contains 2 recordings: first, second"):
         read_recording(lay_out(files, zipped=True))

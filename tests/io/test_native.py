@@ -172,7 +172,7 @@ def test_increments_become_the_twists_that_make_them(native: Files, lay_out: Cal
         np.testing.assert_allclose(moved[:2, 2], increments[i, :2], atol=1e-12)
         np.testing.assert_allclose(moved[:2, 0], [np.cos(increments[i, 2]), np.sin(increments[i, 2])], atol=1e-12)
     assert odometry.forward_mps[-1] == odometry.forward_mps[-2]
-    assert any("the first increment is left out" in remark for remark in recording.warnings)
+    assert any("the first increment is ignored" in remark for remark in recording.warnings)
 
 
 def test_tables_as_pandas_and_spreadsheets_write_them(native: Files, lay_out: Callable, assert_same: Callable) -> None:
@@ -366,20 +366,20 @@ BAD = {
     "toml degrees": (edit(TOML, "bearing_max_rad = 2.0", "bearing_max_rad = 120"), [f"{TOML}:9", "radians"]),
     "unknown kind": (
         edit(TOML, "[recording]\n", '[sensor]\nkind = "lazer"\n[recording]\n'),
-        [f"{TOML}:2", "'sensor.kind'", "no kind of sensor 'lazer'", "laser"],
+        [f"{TOML}:2", "'sensor.kind'", "unknown kind of sensor 'lazer'", "laser"],
     ),
     "kind as a number": (
         edit(TOML, "[recording]\n", "[sensor]\nkind = 3\n[recording]\n"),
-        [f"{TOML}:2", "'sensor.kind'", "no kind of sensor '3'"],
+        [f"{TOML}:2", "'sensor.kind'", "unknown kind of sensor '3'"],
     ),
     "data sheet": (
         edit(TOML, "[recording]\n", "[odometry]\nsigma_odometer_scale = 5\n[recording]\n"),
         [f"{TOML}:2", "'odometry.sigma_odometer_scale'", "outside [0, 1]"],
     ),
-    "unknown clock": (edit(TOML, '"unix"', '"gps"'), [f"{TOML}:3", "'recording.clock'", "no clock 'gps'"]),
+    "unknown clock": (edit(TOML, '"unix"', '"gps"'), [f"{TOML}:3", "'recording.clock'", "unknown clock 'gps'"]),
     "newer version": (
         edit(TOML, "[recording]\n", "[recording]\nformat_version = 2\n"),
-        [f"{TOML}:2", "2 is not a version"],
+        [f"{TOML}:2", "2 is not the version"],
     ),
     "unlisted class": (
         edit(TOML, "[recording]\n", '[recording]\nclass_names = ["door"]\n'),
@@ -453,7 +453,7 @@ def test_parquet_is_refused_with_its_row(native: Files, lay_out: Callable) -> No
     with pytest.raises(InputError, match=r"frames\.parquet:3: field 'stamp_s': nan"):
         read_recording(path)
     pq.write_table(pa.table({"stamp_s": pa.array([0, 1], pa.duration("ns"))}), path / "frames.parquet")
-    with pytest.raises(InputError, match=r"frames\.parquet: field 'stamp_s': holds duration.*float64"):
+    with pytest.raises(InputError, match=r"frames\.parquet: field 'stamp_s': contains duration.*float64"):
         read_recording(path)
     (path / "frames.parquet").write_bytes(b"PAR1 but not really PAR1")
     with pytest.raises(InputError, match=r"frames\.parquet: not a readable Parquet file"):

@@ -51,13 +51,14 @@ def test_unknown_paths_say_what_was_looked_for(tmp_path: Path, mrclam: dict[str,
         read_recording(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     with pytest.raises(
-        InputError, match=r"holds no files; looked for mrclam: .*Barcodes\.dat; tagslam: .*; native: .*detections\.csv"
+        InputError,
+        match=r"contains no files; looked for mrclam: .*Barcodes\.dat; tagslam: .*; native: .*detections\.csv",
     ):
         read_recording(tmp_path / "empty")
     (tmp_path / "photos").mkdir()
     for number in range(7):
         (tmp_path / "photos" / f"{number}.jpg").touch()
-    with pytest.raises(InputError, match=r"holds 0\.jpg, .* and 2 more; looked for"):
+    with pytest.raises(InputError, match=r"contains 0\.jpg, .* and 2 more; looked for"):
         read_recording(tmp_path / "photos")
     with pytest.raises(InputError, match=r"its folder .*MRCLAM_Test"):
         read_recording(lay_out(mrclam) / "Robot1_Odometry.dat")

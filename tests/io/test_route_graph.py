@@ -108,9 +108,9 @@ def test_near_is_near_the_body_of_a_landmark(tmp_path: Path) -> None:
         ([1], r"features\[0\]': is neither a node nor an edge"),
         ([{"type": "Feature", "properties": {}, "geometry": None}], r"features\[0\]': is neither"),
         ([node(0, ("a", 1.0))], r"features\[0\]': has no coordinates"),  # type: ignore[arg-type]
-        ([node(0, (1e300, 1.0))], "farther than any robot"),
+        ([node(0, (1e300, 1.0))], "implausibly far away"),
         ([node(0, NODES[0]), node(0, NODES[1])], r"features\[1\]': has the id 0 of another node"),
-        ([node(0, NODES[0]), edge(3, 0, 1)], r"features\[1\]': endid 1 is no node"),
+        ([node(0, NODES[0]), edge(3, 0, 1)], r"features\[1\]': endid 1 is not a node"),
         (
             [node(0, NODES[0]), node(1, NODES[1]), edge(3, 0, 1) | {"properties": {"startid": 0, "endid": 1}}],
             "properties.id",

@@ -46,7 +46,7 @@ def test_the_text_is_ids_and_one_to_three_numbers(text: str, shift: Shift) -> No
         ("11:1:2", "'1:2' is not a number"),
         ("11:nan", "'nan' is not finite"),
         ("11:1,inf", "'inf' is not finite"),
-        ("11:0,0,20", "turns a single landmark"),
+        ("11:0,0,20", "rotates a single landmark"),
     ],
 )
 def test_anything_else_is_one_line(text: str, problem: str) -> None:

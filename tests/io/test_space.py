@@ -332,9 +332,9 @@ BAD: dict[str, tuple[Files, str]] = {
         {"detections.csv": f"{DETECTIONS},sensor\n0.5,7,1,1,1,right\n", "camera.toml": CAMERA},
         r"detections\.csv:2: field 'sensor': no sensor 'right'.*one of left, lidar",
     ),
-    "which sensor": (
+    "name its sensor": (
         {"detections.csv": f"{DETECTIONS}\n0.5,7,1,1,1\n", "camera.toml": CAMERA},
-        r"detections\.csv:1: field 'sensor': does not say which",
+        r"detections\.csv:1: field 'sensor': does not name its sensor",
     ),
     "sensor and camera": (
         {"detections.csv": f"{DETECTIONS},sensor,camera\n0.5,7,1,1,1,a,b\n", "camera.toml": CAMERA},
@@ -345,14 +345,14 @@ BAD: dict[str, tuple[Files, str]] = {
             "detections.csv": "stamp_s,landmark_id,sensor,u_px,v_px,u_right_px\n0.5,7,lidar,1,1,0\n",
             "camera.toml": CAMERA,
         },
-        r"detections\.csv:2: field 'u_px': pixels of a sensor that is no camera \(lidar\)",
+        r"detections\.csv:2: field 'u_px': pixels of a sensor without intrinsics \(lidar\)",
     ),
     "no baseline": (
         {
             "detections.csv": "stamp_s,landmark_id,sensor,u_px,v_px,u_right_px\n0.5,7,left,1,1,0\n",
             "camera.toml": CAMERA.replace("baseline_m = 0.2\n", ""),
         },
-        r"detections\.csv:2: field 'u_right_px': the baseline is not known.*baseline_m",
+        r"detections\.csv:2: field 'u_right_px': the baseline is unknown.*baseline_m",
     ),
     "seven corners": (
         {"detections.csv": f"{CORNERED}0.5,7,left,1,1,2,1,2,2,1,\n", "camera.toml": CAMERA},
@@ -360,14 +360,14 @@ BAD: dict[str, tuple[Files, str]] = {
     ),
     "corners without a camera": (
         {"detections.csv": f"{CORNERED}0.5,7,sensor,1,1,2,1,2,2,1,2\n"},
-        r"detections\.csv:2: field 'u0_px': pixels of a sensor that is no camera.*camera\.toml",
+        r"detections\.csv:2: field 'u0_px': pixels of a sensor without intrinsics.*camera\.toml",
     ),
     "unknown size": (
         {
             "detections.csv": f"{CORNERED}0.5,7,left,1,2,2,2,2,1,1,1\n",
             "camera.toml": CAMERA.split("[tags]", maxsplit=1)[0],
         },
-        r"detections\.csv:2: field 'tag_size_m': the size of this tag is not known.*\[tags\]",
+        r"detections\.csv:2: field 'tag_size_m': the size of this tag is unknown.*\[tags\]",
     ),
     "odometry": ({"odometry.csv": POSES + "0,0,0,0,0,0,0,0\n"}, r"odometry\.csv:2: .*not a unit quaternion"),
     "two odometries": (
@@ -417,7 +417,7 @@ BAD: dict[str, tuple[Files, str]] = {
     ),
     "symmetry": (
         {"sensor.toml": '[symmetries]\ncan = "axis:z"\nbox = ["180:z", "50:x"]\n'},
-        r"sensor\.toml:3: field 'symmetries\.box': '50:x': 50 degrees are no whole part .*\(try: axis:z",
+        r"sensor\.toml:3: field 'symmetries\.box': '50:x': 50 degrees are not an integer fraction .*\(try: axis:z",
     ),
     "kind of symmetry": (
         {"sensor.toml": "[symmetries]\ncan = 180\n"},
@@ -463,7 +463,7 @@ def test_symmetries_of_classes(lay_out: Callable, space: Files, tmp_path: Path) 
     recording = read(lay_out, space, detections__csv=table, sensor__toml=said)
     expected = {"can": ("axis:z",), "the box": ("180:z", "180:x"), "spoon": ("any",)}
     assert recording.symmetries == expected
-    assert any("symmetries of classes that nothing has: spoon" in warning for warning in recording.warnings)
+    assert any("symmetries of unused classes: spoon" in warning for warning in recording.warnings)
     write_native(recording, tmp_path / "again")
     del expected["spoon"]
     assert read_recording(tmp_path / "again").symmetries == expected
@@ -534,7 +534,7 @@ def test_maps_may_be_gzipped(lay_out: Callable, space: Files, tmp_path: Path) ->
 
 NOWHERE = np.full((3, 3), np.nan)
 WRONG: dict[str, tuple[str, dict[str, Any], str]] = {
-    "position": ("detections", {"position_sensor_m": NOWHERE}, "detections.position_sensor_m.*is nowhere"),
+    "position": ("detections", {"position_sensor_m": NOWHERE}, "detections.position_sensor_m.*has no position"),
     "rotation": ("detections", {"rotation": np.ones((3, 4))}, "detections.rotation.*not a unit quaternion"),
     "sensor": ("detections", {"sensor": np.array([0, 1, 0])}, "detections.sensor.*row 1: 1 is not one of 1 sensors"),
     "frame": ("detections", {"frame": np.array([0, 1, 9])}, "detections.frame.*row 2: 9 is not a row of 4 frames"),

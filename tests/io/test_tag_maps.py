@@ -125,7 +125,7 @@ def test_tags_of_fiducial_slam(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "match"),
     [
-        ("a.yaml", "cameras: 3\n", r"a\.yaml: field 'bodies': holds no bodies"),
+        ("a.yaml", "cameras: 3\n", r"a\.yaml: field 'bodies': contains no bodies"),
         ("a.yaml", TAGSLAM.replace("{pose}", " 3"), r"field 'floor\.pose': needs position and rotation"),
         ("a.yaml", TAGSLAM.replace("{pose}", XYZ).replace("id: 4", "id: four"), r"'floor\.tags': must be numbers"),
         ("a.json", json.dumps(WPILIB), r"field 'tags\[0\]': has no ID, translation"),
@@ -133,7 +133,7 @@ def test_tags_of_fiducial_slam(tmp_path: Path) -> None:
         ("a.txt", "301 0 0 0 180 0 0 0 1\n302 0 0 zero 180 0 0 0 1\n", r"a\.txt:2: is not a tag of fiducial_slam"),
         ("a.txt", "1.5 0 0 0 180 0 0 0 1\n", r"a\.txt:1: is not a tag"),
         ("a.txt", "3 0 0 0 180 0 0 0 1\n3 0 0 0 180 0 0 0 1\n", r"a\.txt:2: field 'landmark_id': landmark 3 is listed"),
-        ("a.doc", "", r"no map format ends in '\.doc'.*TagSLAM"),
+        ("a.doc", "", r"unknown map format '\.doc'.*TagSLAM"),
     ],
 )
 def test_what_is_no_map_of_tags(name: str, text: str, match: str, tmp_path: Path) -> None:

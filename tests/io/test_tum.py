@@ -51,7 +51,7 @@ BAD = {
     "0 0 0 0 0 0 0\n1 0 0 0 0 0 0 1\n": (InputError, "t.tum:1: 7 columns"),
     "0 0 0 0 0 0 0 1\n-1 0 0 0 0 0 0 1\n": (InputError, "t.tum:2: field 'stamp_s': time runs backwards"),
     "0 0 0 0 0 0 0 0.5\n": (InputError, "t.tum:1: field 'qx qy qz qw': is not a unit quaternion"),
-    "# nothing\n": (DataError, "holds no pose"),
+    "# nothing\n": (DataError, "contains no pose"),
 }
 
 

@@ -336,8 +336,8 @@ def test_more_readings_than_the_map_needs_are_thinned(tmp_path: Path, two_sessio
         (lambda live: live.detections(1.0, [1, 2], [1.0], [0.0, 0.0]), "1 values for 2 detections"),
         (lambda live: live.detections(1.0, [1.5], [1.0], [0.0]), "1.5 is not an identity"),
         (lambda live: live.detections(1.0, [-2], [1.0], [0.0]), "-2 is not an identity"),
-        (lambda live: setattr(live, "mapping", True), "a map in memory stays as it is"),
-        (lambda live: live.save(), "a map in memory stays as it is"),
+        (lambda live: setattr(live, "mapping", True), "a map in memory cannot be changed"),
+        (lambda live: live.save(), "a map in memory cannot be changed"),
     ],
 )
 def test_mistakes_are_one_line(say, told: str) -> None:

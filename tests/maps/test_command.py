@@ -189,7 +189,7 @@ def test_an_edit_is_a_revision_that_can_be_reverted(site: Path) -> None:
     assert again.exit_code == 0
     assert "nothing to do: already deleted" in again.stderr
     assert store.head() == 4
-    assert f"revision 5: undeleted landmark {one}; back with: evermap map revert" in run("undelete", site, one).stderr
+    assert f"revision 5: undeleted landmark {one}; undo with: evermap map revert" in run("undelete", site, one).stderr
     assert said("revert", site, 3)["restores"] == 3
     assert np.isin([one, two], store.load().landmarks().landmark_id).all()
     assert store.head() == 6

@@ -151,7 +151,7 @@ def test_changes_read_back(store: MapStore, dim: int) -> None:
 
 def test_a_writer_that_comes_late_is_refused(store: MapStore) -> None:
     store.commit(random_map(1), SESSION, parent=0)
-    with pytest.raises(StaleRevisionError, match="revision 1 came in after revision 0 was read"):
+    with pytest.raises(StaleRevisionError, match="revision 1 was committed after revision 0 was read"):
         store.commit(random_map(2), SESSION, parent=0)
     with pytest.raises(StaleRevisionError):
         store.commit(random_map(2), SESSION, parent=5)
@@ -468,7 +468,7 @@ def test_a_database_that_cannot_be_reached_is_one_line(tmp_path: Path) -> None:
 def test_sites_of_a_database_do_not_see_one_another(postgres: str, site_address: str) -> None:
     from evermap.maps.store.postgres import sites_in
 
-    with pytest.raises(InputError, match="holds no map"):
+    with pytest.raises(InputError, match="contains no map"):
         open_store(site_address)
     other = site_address.replace("/site-", "/Other-")
     with open_store(site_address, create=True) as one, open_store(other, create=True) as two:

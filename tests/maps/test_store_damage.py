@@ -68,7 +68,7 @@ def test_flipped_bytes_give_the_truth_or_a_line(path: Path, seed: int) -> None:
 def test_a_file_that_was_cut_off_is_damaged(path: Path, share: float) -> None:
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(InputError, match=r"damaged|is no evermap map"):
+    with pytest.raises(InputError, match=r"damaged|is not an evermap map"):
         use_all(path)
 
 
@@ -199,7 +199,7 @@ def test_another_file_is_no_map(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "photo.jpg"
     path.write_bytes(content)
     for create in (False, True):
-        with pytest.raises(InputError, match=r"photo.jpg: is no evermap map \(try: another file\)"):
+        with pytest.raises(InputError, match=r"photo.jpg: is not an evermap map \(try: another file\)"):
             open_store(path, create=create)
     assert path.read_bytes() == content
 
@@ -209,7 +209,7 @@ def test_another_database_is_no_map(tmp_path: Path) -> None:
     with sqlite3.connect(path) as database:
         database.execute("CREATE TABLE store (name TEXT)")
     database.close()
-    with pytest.raises(InputError, match="is a database, but no evermap map"):
+    with pytest.raises(InputError, match="is a database, but not an evermap map"):
         open_store(path, create=True)
 
 
@@ -218,7 +218,7 @@ def test_another_database_is_no_map(tmp_path: Path) -> None:
     [
         (lambda p: None, r"no such map \(try: evermap slam INPUT --map .*m\.evermap starts one\)"),
         (lambda p: p.mkdir(), r"is a folder; a map is one file \(try: .*m\.evermap"),
-        (lambda p: p.touch(), r"holds no map \(try: evermap slam INPUT --map FILE writes one\)"),
+        (lambda p: p.touch(), r"contains no map \(try: evermap slam INPUT --map FILE writes one\)"),
     ],
 )
 def test_no_map_at_all(tmp_path: Path, make: Callable[[Path], None], line: str) -> None:
@@ -291,6 +291,6 @@ def test_a_full_disk_loses_nothing(path: Path) -> None:
         def full(connection: sqlite3.Connection, _: object) -> None:
             connection.execute(f"PRAGMA max_page_count = {pages + 2}")
 
-        with pytest.raises(InputError, match=r"cannot be written: the disk is full \(try: make room\)"):
+        with pytest.raises(InputError, match=r"cannot be written: the disk is full \(try: free some space\)"):
             store.commit(random_map(5, cliques=100), Provenance(), parent=3)
     use_all(path)

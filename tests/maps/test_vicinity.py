@@ -163,7 +163,7 @@ def test_damage_of_a_covariance_is_told_where_it_is_read(tmp_path: Path) -> None
     with open_store(path) as store:
         loaded = store.load()
         assert isinstance(loaded.covariance_m2, ChunkedCovariance)
-        with pytest.raises(InputError, match="of what it holds of its places is damaged"):
+        with pytest.raises(InputError, match="of the data of its places is damaged"):
             loaded.covariance_m2.of(np.flatnonzero(loaded.covariance_m2.chunk == 0))
 
 

@@ -118,7 +118,7 @@ def test_a_late_session_with_which_a_later_one_is_lost_stays_out(tmp_path: Path)
     days = simulate_building(BuildingConfig(days=8, patrol_s=35.0), 10).sessions
     with open_store(tmp_path / "site.evermap", create=True) as store:
         fed(store, days[5])
-        with pytest.raises(UnbridgedError, match="revision 1 cannot be brought in again: too few"):
+        with pytest.raises(UnbridgedError, match="revision 1 cannot be replayed: too few"):
             em.enter_session(store, days[2])
         assert store.head() == 1
 
@@ -214,7 +214,7 @@ def test_a_revision_without_its_recording_is_named(tmp_path: Path) -> None:
     with open_store(tmp_path / "site.evermap", create=True) as store:
         living = em.run_session(SESSIONS[1]).living
         store.commit(living, Provenance(stamp_from_s=float(SESSIONS[1].frames.stamp_s[0])), parent=0)
-        with pytest.raises(InputError, match="revision 1 keeps no recording"):
+        with pytest.raises(InputError, match="revision 1 has no stored recording"):
             em.enter_session(store, SESSIONS[0])
 
 

@@ -402,7 +402,7 @@ def test_files_of_the_user_stay_beside_a_forced_run(tmp_path):
     (out / "dangling").symlink_to("nowhere")
     (out / "empty").mkdir()
     inode = out.stat().st_ino
-    with pytest.raises(ConfigError, match="`force` to write beside it"):
+    with pytest.raises(ConfigError, match="`force` to keep it and write into the folder"):
         write(out, {"map.csv": "2"})
     new = {"summary.json": "2", "map.csv": "2", "figures/b.png": "2"}
     write(out, new, force=True)
@@ -528,7 +528,7 @@ def test_a_single_output_file_is_no_input_and_no_map(tmp_path):
     (tmp_path / "looks.csv").write_text("mine")
     (tmp_path / "link.csv").symlink_to(tmp_path / "looks.csv")
     for path in ("looks.csv", "link.csv"):
-        with pytest.raises(ConfigError, match="is what this command reads"):
+        with pytest.raises(ConfigError, match="is the input of this command"):
             check_output_file(tmp_path / path, inputs=[tmp_path / "looks.csv"])
     (tmp_path / "site.png").write_bytes(b"SQLite format 3\0...")
     with pytest.raises(ConfigError, match="living map"):

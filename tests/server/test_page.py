@@ -301,7 +301,7 @@ def test_an_operator_deletes_with_the_evidence_before_them(site: Site, browser: 
     browser.value("document.querySelector('#candidates li:last-child button').click()")
     browser.wait("document.getElementById('number').textContent === '3'")
     browser.value("document.getElementById('reverts').click()")
-    browser.wait("document.getElementById('said').textContent === 'revision 7 is as revision 3 was'")
+    browser.wait("document.getElementById('said').textContent === 'revision 7 restores revision 3 was'")
 
 
 def test_who_only_reads_has_no_buttons_that_change(site: Site, browser: Browser) -> None:
@@ -399,7 +399,7 @@ def test_a_server_that_comes_back_is_followed_again(site: Site, browser: Browser
     browser.show(*LOOKS["light"])
     browser.log_in(site.address, site.tokens["read"])
     site.stop()
-    browser.wait("document.getElementById('state').textContent.startsWith('the server is away')")
+    browser.wait("document.getElementById('state').textContent.startsWith('the server does not answer')")
     site.start()
     site("POST", "/maps/ward/approve", json={"revision": 4})
     browser.wait("document.getElementById('state').textContent === 'live'")

@@ -172,7 +172,7 @@ def test_a_role_may_what_those_below_it_may(fleet: Fleet, method: str, path: str
 
 def test_tokens_are_kept_as_digests_and_can_be_revoked(fleet: Fleet) -> None:
     database = fleet.server.database
-    with pytest.raises(ConfigError, match="there is a token"):
+    with pytest.raises(ConfigError, match="a token named"):
         database.add_token("read", Role.ADMIN)
     assert database.revoke_token("read")
     assert not database.revoke_token("read")
@@ -548,7 +548,7 @@ def test_a_bag_is_uploaded_with_the_settings_of_its_robot(fleet: Fleet, bags: di
         pass
     told = fleet("GET", f"/jobs/{alone}").json()
     assert told["state"] == "rejected"
-    assert "does not say how large its tags are" in told["reason"]
+    assert "does not state the size of its tags" in told["reason"]
     assert "evermap-upload" not in told["reason"]
     assert fleet("GET", f"/jobs/{whole}").json()["state"] == "entered", fleet("GET", f"/jobs/{whole}").text
     assert {one["label"] for one in fleet("GET", "/maps/ward/landmarks").json()["landmarks"]} == {"3", "7"}
@@ -665,7 +665,7 @@ def test_a_session_that_kills_its_workers_is_refused_in_the_end(fleet: Fleet, zi
         assert fleet.server.database.claim("killed", 0.0) is not None
     fleet.worker().step()
     told = fleet("GET", f"/jobs/{number}").json()
-    assert (told["state"], told["reason"]) == ("rejected", f"{MOST_TRIES} workers died of it")
+    assert (told["state"], told["reason"]) == ("rejected", f"{MOST_TRIES} workers crashed on it")
 
 
 def test_what_does_not_fit_is_tried_again_as_the_map_grows(fleet: Fleet, zips: list[bytes]) -> None:

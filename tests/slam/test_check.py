@@ -50,7 +50,7 @@ MISTAKES = {
     "bearings from the left": (readings(bearing_rad=lambda b: b - np.pi / 2), "bearing-axis", "another axis"),
     "speeds in km/h": (odometry(forward_mps=lambda v: 3.6 * v), "length-unit", "km/h"),
     "speeds in mm/s": (odometry(forward_mps=lambda v: 1e3 * v), "length-unit", "millimetres per second"),
-    "speeds flipped": (odometry(forward_mps=lambda v: -v), "forward-sign", "the other way"),
+    "speeds flipped": (odometry(forward_mps=lambda v: -v), "forward-sign", "in the opposite direction"),
     "turn rates in deg/s": (odometry(angular_radps=np.rad2deg), "turn-unit", "degrees"),
     "turn rates flipped": (odometry(angular_radps=lambda w: -w), "turn-sign bearing-sign", "wrong sign"),
     "zero odometry": (odometry(forward_mps=np.zeros_like, angular_radps=np.zeros_like), "no-odometry", "is zero"),
@@ -136,7 +136,7 @@ def test_an_identity_for_every_detection_is_refused_before_it_costs() -> None:
     assert [finding.code for finding in check_recording(own).findings] == ["own-identities"]
     assert not check_recording(own).usable
     for run in (run_slam, run_session):
-        with pytest.raises(DataError, match="has to name the thing that was seen"):
+        with pytest.raises(DataError, match="must identify the landmark"):
             run(own)
 
 
@@ -183,7 +183,7 @@ def test_a_calibration_state_far_outside_of_its_prior_is_told() -> None:
 
 VALID = {
     "unsorted odometry": (odometry(stamp_s=lambda t: t[::-1]), "odometry.stamp_s.*row 1: time runs backwards"),
-    "equal odometry stamps": (odometry(stamp_s=lambda t: np.repeat(t[::2], 2)[: len(t)]), "repeats the one before"),
+    "equal odometry stamps": (odometry(stamp_s=lambda t: np.repeat(t[::2], 2)[: len(t)]), "repeats the previous one"),
     "nan stamp": (odometry(stamp_s=lambda t: np.where(t == t[5], np.nan, t)), "odometry.stamp_s.*row 5: nan"),
     "milliseconds": (odometry(stamp_s=lambda t: 1e12 + t), "milli"),
     "nan speed": (odometry(forward_mps=lambda v: np.full_like(v, np.nan)), "odometry.forward_mps.*row 0: nan"),

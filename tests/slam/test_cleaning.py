@@ -196,7 +196,7 @@ def test_impossible_values_are_left_out_and_counted() -> None:
         cleaned = clean(with_rows(patrol(), "detections", **{name: values}))
         kept = np.delete(np.arange(len(detections)), [3, 17])
         np.testing.assert_array_equal(cleaned.detections.range_m, detections.range_m[kept])
-        assert cleaned.warnings == ("readings that no sensor can make left out: 2",)
+        assert cleaned.warnings == ("impossible readings dropped: 2",)
         check_valid(cleaned)
 
 
@@ -331,5 +331,5 @@ def test_a_sensor_that_hangs_with_a_single_reading() -> None:
     shown = {name: getattr(detections, name)[rows][order] for name in detections.__dataclass_fields__}
     shown["frame"] = frame[order]
     mended = clean(replace(recording, detections=replace(detections, **shown)))
-    assert any("repeat the one before" in warning for warning in mended.warnings)
+    assert any("repeat the previous one" in warning for warning in mended.warnings)
     assert len(mended.frames) < len(frames) - 15

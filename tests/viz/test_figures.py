@@ -57,7 +57,7 @@ def test_odometry_that_runs_away_does_not_shrink_the_map(run):
     drawn = draw_figures(recording, far, compare_with_truth(recording, far))
     axes = by_name(drawn, "map").axes[0]
     assert np.ptp(axes.get_xlim()) < 25
-    assert line(axes, "odometry alone").get_label().endswith("(leaves the picture)")
+    assert line(axes, "odometry alone").get_label().endswith("(leaves the figure)")
 
 
 def test_ellipses_are_two_sigma_times_the_stated_factor(figures, run, evaluation):

@@ -176,7 +176,7 @@ def test_the_report_tells_orientations_and_three_coordinates(drawn, spatial):
     assert summary["counts"]["odometry_rows"] == len(recording.odometry)
     assert summary["changes"][0]["displacement_m"] == [0.2, 0.1, 0.9]
     assert summary["changes"][2]["displacement_m"] == [None, None, None]
-    assert "axes as they were" in summary["frames"]["world"]
+    assert "axes as at that pose" in summary["frames"]["world"]
 
 
 @pytest.fixture(scope="module")

@@ -107,9 +107,9 @@ def test_landmarks_have_the_look_of_their_class_and_fade_with_their_probability(
     looks = class_looks(("chair", "door"))
     dots = [c for c in axes.collections if isinstance(c, PathCollection)]
     shown = {str(c.get_label()): (c.get_offsets().tolist(), tuple(c.get_facecolor()[0])) for c in dots}
-    opacity = {"door": 0.3, "chair": 0.65, "class not known": 1.0}
-    at = {"door": [[0.0, 0.0]], "chair": [[9.0, 1.0]], "class not known": [[6.0, 3.0]]}
-    for name, look in {"door": looks["door"], "chair": looks["chair"], "class not known": NO_CLASS}.items():
+    opacity = {"door": 0.3, "chair": 0.65, "class unknown": 1.0}
+    at = {"door": [[0.0, 0.0]], "chair": [[9.0, 1.0]], "class unknown": [[6.0, 3.0]]}
+    for name, look in {"door": looks["door"], "chair": looks["chair"], "class unknown": NO_CLASS}.items():
         found, colour = shown[name]
         assert found == at[name]
         assert colour == pytest.approx(to_rgba(look.colour, opacity[name]))
@@ -141,14 +141,14 @@ def test_uncertainty_walls_floor_and_other_places_are_drawn() -> None:
 
 def test_the_legend_explains_every_mark() -> None:
     assert set(legend_texts(plot_living_map(view(), title="site"))) == {
-        "chair", "door", "class not known", "looked from here", "wall", "2σ of its position",
+        "chair", "door", "class unknown", "sensor positions", "wall", "2σ of its position",
         "other known place", "gone: P(exists) below 50 %", "pinned",
         "faint: P(exists) from 50 % upwards",
     }  # fmt: skip
     bare = dataclasses.replace(view().landmarks, p_exists=np.ones(4))
     few = plot_living_map(MapView(bare, np.zeros(4, dtype=bool)), title="site")
     assert set(legend_texts(few)) == {
-        "chair", "door", "class not known", "2σ of its position",
+        "chair", "door", "class unknown", "2σ of its position",
         "faint: P(exists) from 50 % upwards",
     }  # fmt: skip
 

@@ -73,8 +73,8 @@ def test_classes_have_their_look_and_what_left_is_crossed_out() -> None:
         "b",
         "has left again",
         "seen at rest",
-        "came or left in between",
-        "beginning or end not known",
+        "arrived or left in between",
+        "beginning or end unknown",
     } <= words
 
 

@@ -29,11 +29,11 @@ def bench(
     ] = None,
     sizes: Annotated[
         str | None,
-        typer.Option(help="Landmarks of the worlds of 'scale', with commas; with it DLR and maps are measured too."),
+        typer.Option(help="Numbers of landmarks for 'scale', separated by commas; also measures DLR and maps."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder to write tables and figures of 'scale', 'kitti' or 'space' into, as its results."),
+        typer.Option(help="Folder for the tables and figures of 'scale', 'kitti' or 'space'."),
     ] = None,
 ) -> None:
     """Compare speed and memory with the baseline.

@@ -48,7 +48,7 @@ def check(
     if not found.usable:
         raise typer.Exit(EXIT_NOT_USABLE)
     if not found.warnings and not found.findings:
-        say("nothing odd found")
+        say("no problems found")
 
 
 def content_rows(contents: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
@@ -61,7 +61,7 @@ def content_rows(contents: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
         driven = f"{odometry['rows']:,} rows in {odometry['duration_s']:,.1f} s at {odometry['rate_hz']:.3g} Hz"
         way = f"{odometry['way_m']:,.1f} m, up to {odometry['fastest_mps']:.3g} m/s; {odometry['turned_rad']:.1f} rad"
         rows = [("odometry", driven), ("longest gap", f"{odometry['longest_gap_s']:.3g} s"), ("way", way)]
-    unlisted = "" if frames["complete"] else "; those without are not listed"
+    unlisted = "" if frames["complete"] else "; frames without are not listed"
     rows += [
         ("frames", f"{frames['count']:,}{rate}, {frames['with_detections']:,} with detections{unlisted}"),
         ("blind for", f"at most {frames['longest_blind_s']:.3g} s"),

@@ -27,10 +27,10 @@ def convert(
     ] = None,
     topics: Topics = None,
     table_format: Annotated[TableFormat, typer.Option("--format", help="Format of the tables.")] = TableFormat.CSV,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
     force: Annotated[
         bool,
-        typer.Option("--force", help="Write into OUT even if it is not empty; other files stay."),
+        typer.Option("--force", help="Write into OUT even if it is not empty; other files are kept."),
     ] = False,
 ) -> None:
     """Write any readable recording in the native format.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from evermap.types import Landmarks
 
 MOST_LETTERS = 150
-"""Of a command line that is shown; `--json` has all of it."""
+"""Longest command line that is shown; `--json` has all of it."""
 _TABLES = {
     ("feature_id", "detected"): "looks, as `evermap persist` reads them",
     ("left", "right"): "lifetimes, as `evermap survival fit` reads them",
@@ -27,7 +27,7 @@ _TABLES = {
     ("track_id",): "tracks",
     ("stamp_s", "x_m", "y_m", "z_m"): "detections, as `evermap track` reads them",
 }
-"""What tables are, by columns that only they have; the first that fits."""
+"""Kinds of tables with their characteristic columns; the first match counts."""
 _KNOWN = "a recording, ROS bag, living map, run folder, landmarks, trajectory (.tum), table or file of lifetimes"
 
 
@@ -41,7 +41,7 @@ class Described(NamedTuple):
 
 
 def info(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help=f"What evermap reads or writes: {_KNOWN}.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help=f"Files that evermap reads or writes: {_KNOWN}.")],
     robot: Robot = None,
     as_json: AsJson = False,
 ) -> None:
@@ -96,9 +96,9 @@ def _summary(path: Path) -> dict[str, Any] | None:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"is no summary of a run: {error}", path=file) from None
+        raise InputError(f"is not the summary of a run: {error}", path=file) from None
     if not isinstance(content, dict) or not {"evermap", "outputs"} <= content.keys():
-        raise InputError("is no summary that evermap wrote", path=file)
+        raise InputError("is not a summary written by evermap", path=file)
     return content
 
 
@@ -137,7 +137,7 @@ def _recording(path: Path, robot: int | None) -> Described:
         reader = reader_for(path)
     except InputError as error:
         if path.is_file():
-            raise InputError("is nothing that evermap reads", path=path, hint=_KNOWN) from error
+            raise InputError("is not a file that evermap reads", path=path, hint=_KNOWN) from error
         raise
     topics = _topics(path) if reader.name == "bag" else {}
     robots = list_robots(path)
@@ -194,7 +194,7 @@ def _map(path: Path) -> Described:
         ("revisions", f"{len(revisions)}, {sessions} of them sessions"),
         ("newest", f"{head}: {', '.join(lines[1:4])}" if revisions else "-"),
         ("seen until", stamp_text(living.stamp_s, living.clock)),
-        ("landmarks", f"{len(living.members):,} known, {len(landmarks):,} believed to be there"),
+        ("landmarks", f"{len(living.members):,} known, {len(landmarks):,} believed to exist"),
         *_landmark_rows(landmarks),
         *((f"stay of {life['class'] or 'all'}", _half(life["half_gone_s"], life["stays"])) for life in everywhere),
     ]
@@ -323,7 +323,7 @@ def _json(path: Path) -> Described:
 def _half(half_gone_s: float | None, stays: int | None = None) -> str:
     from evermap.survival.durations import duration_text
 
-    told = "half are never gone" if half_gone_s is None else f"half are gone after {duration_text(half_gone_s)}"
+    told = "half never leave" if half_gone_s is None else f"half are gone after {duration_text(half_gone_s)}"
     return told if stays is None else f"{told}, by {stays:g} stays"
 
 
@@ -333,7 +333,7 @@ def _document(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(unpacked(path.read_bytes(), path))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"is no JSON: {' '.join(str(error).split())[:100]}", path=path) from None
+        raise InputError(f"is not JSON: {' '.join(str(error).split())[:100]}", path=path) from None
     return document if isinstance(document, dict) else {}
 
 

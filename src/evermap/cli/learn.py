@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from evermap.runs.folder import RunFolder
 
 HELP = """\
-Learn how long things stay, over the maps of many sites.
+Learn lifetimes over the maps of many sites.
 
-A class has a lifetime in the company, and each site one of its own, near it: nearer, the fewer stays the site has seen,
-and the more alike the sites are. Both are learned from the histories of the maps, which stay as they are.
+Each class has one lifetime for the company, and each site its own, drawn towards it: the more so the fewer stays the
+site has, and the more alike the sites are. Both are learned from the histories of the maps, which are not changed.
 
 \b
-In --out there are company.json, for sites without a map, and sites/NAME.json, for each: files for --prior of
+--out gets company.json, for sites without a map, and sites/NAME.json, for each site: files for --prior of
 `evermap slam --map`, and for `evermap persist --model`.
 
 \b
@@ -73,7 +73,7 @@ def learn(
     show_config: ShowConfig = False,
     as_json: AsJson = False,
 ) -> None:
-    """Learn how long things stay, over the maps of many sites."""
+    """Learn lifetimes over the maps of many sites."""
     chosen = configured(config, settings, show=show_config)
     from evermap.runs.company import Company, collect
     from evermap.runs.folder import RunFolder
@@ -111,11 +111,13 @@ def sites_of(maps: list[str], store: str | None, cluster: str | None = None) -> 
     for where in maps:
         name = where.rstrip("/").rpartition("/")[2] if "://" in where else Path(where).stem
         if name in found:
-            raise ConfigError(f"two maps are called '{name}'", field="MAP", hint="another name for one of the files")
+            raise ConfigError(f"two maps are named '{name}'", field="MAP", hint="rename one of the files")
         found[name] = where
     for name, where in [] if store is None else _stored(store):
         if name in found:
-            raise ConfigError(f"a site of it is called '{name}', as a map", field="store", hint="leave out that map")
+            raise ConfigError(
+                f"one of its sites is named '{name}', like a map", field="store", hint="leave out that map"
+            )
         found[name] = where
     if not found:
         raise ConfigError("there is no map", path=store, hint="files of maps, or --store WHERE")
@@ -133,7 +135,9 @@ def _stored(store: str) -> list[tuple[str, str]]:
     try:
         return [(name, stores.address(name)) for name in stores.names()]
     except (ArgumentError, ValueError):
-        raise ConfigError("is no address of a database", field="store", hint="postgresql://user@host/base") from None
+        raise ConfigError(
+            "is not the address of a database", field="store", hint="postgresql://user@host/base"
+        ) from None
     except DBAPIError as error:
         hint = "check the address, the rights of the user, and that the server runs"
         raise ConfigError(f"the database cannot be used: {error.orig}", field="store", hint=hint) from None

@@ -31,22 +31,22 @@ if TYPE_CHECKING:
     from evermap.types import AnyRecording, MapChange, Sensor
 
 EVERY_S = 0.5
-"""Time between two lines of progress."""
+"""Time between two progress lines."""
 OBJECTS = 20_000
-"""Those after which garbage is looked for: one message of a hundred detections is more than the usual 700."""
+"""Allocations between garbage collections: one message of a hundred detections exceeds the usual 700."""
 MMAP_THRESHOLD, LARGE = -3, 2**18
-"""A parameter of glibc's `mallopt`, and the size [bytes] from which on blocks are returned when they are freed."""
+"""A parameter of glibc's `mallopt`, and the size [bytes] above which freed blocks are returned to the system."""
 
 
 MapFile = Annotated[
     str | None,
     typer.Option(
-        "--map", metavar="FILE", help="Living map, made where there is none; without it, only --replay is sent."
+        "--map", metavar="FILE", help="Living map, created if it does not exist; without it, only --replay is sent."
     ),
 ]
-Replay = Annotated[Path | None, typer.Option(metavar="INPUT", help="A recording or bag, as a robot that is not there.")]
+Replay = Annotated[Path | None, typer.Option(metavar="INPUT", help="A recording or bag to replay in place of a robot.")]
 SensorFile = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="What sees landmarks, as in the sensor.toml of a recording.")
+    Path | None, typer.Option(metavar="FILE", help="Sensor description, as the sensor.toml of a recording.")
 ]
 ZenohEndpoint = Annotated[
     str | None,
@@ -55,11 +55,11 @@ ZenohEndpoint = Annotated[
     ),
 ]
 FoxglovePort = Annotated[
-    str | None, typer.Option(metavar="[HOST:]PORT", help="Serve Foxglove's WebSocket there, as 8765.")
+    str | None, typer.Option(metavar="[HOST:]PORT", help="Serve Foxglove's WebSocket at this port, as 8765.")
 ]
-OnlyLocalize = Annotated[bool, typer.Option("--localize", help="Only localise; the map stays as it is.")]
+OnlyLocalize = Annotated[bool, typer.Option("--localize", help="Only localise; the map is not changed.")]
 Paced = Annotated[bool, typer.Option("--realtime", help="Replay at the pace of the recording.")]
-Lines = Annotated[bool, typer.Option("--json", help="Print poses and changes as they come, one JSON object a line.")]
+Lines = Annotated[bool, typer.Option("--json", help="Print poses and changes at once, one JSON object per line.")]
 
 
 def live(
@@ -96,7 +96,7 @@ def live(
     chosen = configured(config, settings, within="live")
     if map_file is not None and is_address(map_file):
         hint = "--map FILE, and send its recordings to the server"
-        raise ConfigError("must be a file here: readings are kept beside it", field="map", hint=hint)
+        raise ConfigError("must be a local file: readings are stored next to it", field="map", hint=hint)
     connected = zenoh is not None or foxglove is not None
     if map_file is None and (replay is None or not connected):
         raise ConfigError("a living map is needed", field="map", hint="--map FILE; or --replay INPUT --zenoh ENDPOINT")
@@ -105,7 +105,7 @@ def live(
             "no robot", field="zenoh", hint="--zenoh tcp/localhost:7447, --foxglove 8765, or --replay INPUT"
         )
     if map_file is not None and replay is None and sensor is None:
-        raise ConfigError("it is not known what the sensor sees", field="sensor", hint="--sensor sensor.toml")
+        raise ConfigError("the sensor is not described", field="sensor", hint="--sensor sensor.toml")
     recording = None if replay is None else _recording(replay, robot)
     _check_needed(recording, sensor, topics)
     mailbox = Mailbox() if replay is None else None
@@ -134,8 +134,8 @@ def _check_needed(recording: AnyRecording | None, sensor: Path | None, topics: P
 
     for name, path in (("sensor", sensor), ("topics", topics)):
         if path is not None and isinstance(recording, Recording):
-            problem = f"'{recording.name}' says itself what was seen by what"
-            raise ConfigError(problem, field=name, hint=f"leave --{name} out; it is for messages and for bags")
+            problem = f"'{recording.name}' describes its topics and sensors itself"
+            raise ConfigError(problem, field=name, hint=f"omit --{name}; it is for messages and bags")
 
 
 def _be_the_robot(recording: AnyRecording, wires: Sequence[Wire]) -> None:
@@ -143,7 +143,7 @@ def _be_the_robot(recording: AnyRecording, wires: Sequence[Wire]) -> None:
     from evermap.live.ros import play
 
     with watched(signal.SIGTERM) as watch:
-        say(f"{recording.name}: /odom, /detections and /tf_static as they came; Ctrl-C ends it")
+        say(f"{recording.name}: /odom, /detections and /tf_static as recorded; Ctrl-C ends it")
         try:
             count = play(recording, wires, watch.stop_if_asked)
         except KeyboardInterrupt:
@@ -194,7 +194,7 @@ class _Drive:
             gc.collect()
             gc.freeze()  # what is loaded by now stays: to look it through again would take a tenth of a second
             gc.set_threshold(OBJECTS)
-            kept(self._map_file, f"what was driven enters {self._map_file} when it is fed again")
+            kept(self._map_file, f"the drive enters {self._map_file} at the next start")
             with self._teller(engine, wires) as tell:
 
                 def told(now: Now) -> None:
@@ -205,7 +205,7 @@ class _Drive:
                     try:
                         run_live(engine, _until_stopped(readings, watch), told, shown.refused)
                     except KeyboardInterrupt:
-                        say("stopped" if localize else "stopped; entering what was driven")
+                        say("stopped" if localize else "stopped; entering the drive")
                 if not localize:
                     engine.save()
                 told(engine.step())
@@ -222,7 +222,7 @@ class _Drive:
             about = {"clock": recording.clock, "class_names": recording.class_names, "name": recording.name}
             sensor = recording.sensor
         elif sensor is None:
-            problem = "is in space, where a session is solved when it ends"
+            problem = "is in space; sessions in space are solved when they end"
             raise ConfigError(problem, field="replay", hint="evermap slam --map; in the plane with --sensor FILE")
         return Engine(self._map_file, sensor, self._config, mapping=mapping, beside=beside, **about)
 
@@ -314,11 +314,11 @@ class _Shown:
             ("changes", str(self._n_changes)),
             ("map", f"{map_file}, revision {self._now.revision}"),
         ]
-        rows += [("readings that were refused", str(self._n_refused))] if self._n_refused else []
-        rows += [("messages that were lost", str(self._n_lost))] if self._n_lost else []
+        rows += [("refused readings", str(self._n_refused))] if self._n_refused else []
+        rows += [("lost messages", str(self._n_lost))] if self._n_lost else []
         print_table("live", rows)
         if self._now.lost:
-            say("where the robot is was not known at the end")
+            say("the pose of the robot was unknown at the end")
 
     @property
     def _n_lost(self) -> int:

@@ -74,7 +74,7 @@ class Verbs(TyperGroup):
             if ctx.params.get("debug"):
                 raise
             fail(
-                f"a defect of evermap, not yours: {type(error).__name__}: {' '.join(str(error).split())} "
+                f"a bug in evermap, not a mistake of yours: {type(error).__name__}: {' '.join(str(error).split())} "
                 "(please report it with the output of: evermap --debug ...)"
             )
             raise typer.Exit(EXIT_DEFECT) from None
@@ -139,7 +139,7 @@ def options(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a defect.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a bug.")] = False,
 ) -> None:
     """Take the options of all verbs; they are read in `Verbs.invoke`."""
 

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="map",
-    help="Living maps: history, differences, reasons, orders.",
+    help="Living maps: history, differences, reasons, edits.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
 
 _AtRevision = Annotated[
-    int | None, typer.Option("--revision", metavar="N", help="Look at this one.", show_default="newest")
+    int | None, typer.Option("--revision", metavar="N", help="Use this revision.", show_default="newest")
 ]
 
 
@@ -64,8 +64,8 @@ def log(file: MapFile, as_json: AsJson = False) -> None:
 def show(
     file: MapFile,
     revision: _AtRevision = None,
-    ahead: Annotated[str, typer.Option(help="How far to look ahead, as 12h or 3d.")] = "1d",
-    everything: Annotated[bool, typer.Option("--all", help="List what is believed gone, too.")] = False,
+    ahead: Annotated[str, typer.Option(help="Time of the forecast, as 12h or 3d.")] = "1d",
+    everything: Annotated[bool, typer.Option("--all", help="Also list landmarks that are believed gone.")] = False,
     figure: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the map.", show_default="none")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -158,14 +158,14 @@ _ExportOut = Annotated[
 ]
 _ExportLifetimes = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.json", help="Where to write how long things stay, by class.", show_default=False),
+    typer.Option(metavar="FILE.json", help="Where to write the lifetimes by class.", show_default=False),
 ]
 _PLeast = Annotated[
     float | None,
     typer.Option(
         min=0.0,
         max=1.0,
-        help="Leave out what exists with a smaller probability.",
+        help="Leave out landmarks with a smaller P(exists).",
         show_default="0.5; 0 for Nav2's speed mask and route graph",
     ),
 ]
@@ -176,11 +176,11 @@ _RouteGraph = Annotated[
     Path | None,
     typer.Option(
         metavar="IN.geojson",
-        help="Write this route graph of Nav2 to --out, without edges that are blocked.",
+        help="Write this route graph of Nav2 to --out, without blocked edges.",
         show_default=False,
     ),
 ]
-_MapAge = Annotated[str, typer.Option(help="With --speed-mask: how old the map will be when it is used.")]
+_MapAge = Annotated[str, typer.Option(help="With --speed-mask: age of the map when it is used.")]
 _CellM = Annotated[float, typer.Option(min=1e-3, max=1e3, help="Edge of a cell of the grid [m].")]
 _RadiusM = Annotated[
     float | None,

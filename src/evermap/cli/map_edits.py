@@ -18,12 +18,12 @@ from evermap.errors import ConfigError, EvermapError
 MapFile = Annotated[str, typer.Argument(metavar="FILE", help="The map, as `evermap slam --map FILE` writes it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
 _Ids = Annotated[list[str], typer.Argument(metavar="LANDMARK...", help="Ids of landmarks, or their names.")]
-_Note = Annotated[str, typer.Option(help="A word for the log.")]
+_Note = Annotated[str, typer.Option(help="A note for the log.")]
 
 
 def revert(
     file: MapFile,
-    revision: Annotated[int, typer.Argument(metavar="N", help="Whose content to bring back; 0 is the empty map.")],
+    revision: Annotated[int, typer.Argument(metavar="N", help="Revision to restore; 0 is the empty map.")],
     note: _Note = "",
     as_json: AsJson = False,
 ) -> None:
@@ -44,9 +44,9 @@ def revert(
         print_json({"map": file, "revision": now, "restores": revision, "parent": now - 1, "damaged_file": aside})
         return
     if damaged is None:
-        back = f"; back again with: evermap map revert {file} {now - 1}"
+        back = f"; undo with: evermap map revert {file} {now - 1}"
     else:
-        back = f"; the file was damaged: what was intact is kept, the damaged file is {damaged} now"
+        back = f"; the file was damaged: its intact revisions are kept, the damaged file is now {damaged}"
     say(f"revision {now} has the content of revision {revision}{back}")
 
 
@@ -89,8 +89,8 @@ def verify(file: MapFile, as_json: AsJson = False) -> None:
 
 def gc(
     file: MapFile,
-    keep: Annotated[int, typer.Option(min=1, metavar="N", help="Newest revisions that stay whole.")] = 10,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what would be deleted.")] = False,
+    keep: Annotated[int, typer.Option(min=1, metavar="N", help="Newest revisions to keep complete.")] = 10,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would be deleted.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Prune old revisions: delete their content, and shrink the file.
@@ -221,6 +221,6 @@ def _edit(file: str, landmarks: list[str], word: str, note: str, as_json: bool) 
     if as_json:
         print_json({"map": file, "revision": number, "parent": parent, word: changed})
     elif changed:
-        say(f"revision {number}: {said}; back with: evermap map revert {file} {parent}")
+        say(f"revision {number}: {said}; undo with: evermap map revert {file} {parent}")
     else:
         say(f"nothing to do: {said}")

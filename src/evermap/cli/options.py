@@ -27,24 +27,24 @@ ShowConfig = Annotated[
     bool, typer.Option("--show-config", help="Print the configuration in force as commented TOML and exit.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
-Force = Annotated[bool, typer.Option("--force", help="Write into --out even if it holds other files; they stay.")]
+Force = Annotated[bool, typer.Option("--force", help="Write into --out even if it holds other files; these are kept.")]
 Robot = Annotated[int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)]
 Topics = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Which topics are what, as slam --init-bag writes it.", show_default=False),
+    typer.Option(metavar="FILE", help="Settings file of the topics, as slam --init-bag writes it.", show_default=False),
 ]
 TableOut = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<input>")]
 Priors = Annotated[
     list[str] | None,
     typer.Option(
         metavar="[CLASS=]PRIOR",
-        help="How long they stay, as in `evermap survival plot --help`; repeatable for classes.",
+        help="Prior of the lifetimes, as in `evermap survival plot --help`; repeatable for classes.",
         show_default="unknown:1min..10y",
     ),
 ]
 
 _OTHER_NAMES = {"class_priors": "prior", "class_speed_mps": "speed", "speeds_mps": "speed", "living": "map_file"}
-"""Arguments of the core that are given by an option of another name."""
+"""Arguments of the core whose option has another name."""
 
 
 def configured(

@@ -49,20 +49,24 @@ Looks = Annotated[
 Recurrent = Annotated[
     str | None,
     typer.Option(
-        metavar="KIND", help="How features come back: none, auto, or a kind of model to learn.", show_default="none"
+        metavar="KIND", help="How features return: none, auto, or a kind of model to learn.", show_default="none"
     ),
 ]
 Per = Annotated[
     str | None,
     typer.Option(
-        metavar="all|class|feature", help="Whose looks are put together to learn.", show_default="by the table"
+        metavar="all|class|feature", help="Which features share a learned model.", show_default="by the table"
     ),
 ]
 Model = Annotated[Path | None, typer.Option(metavar="FILE", help="Model learned by an earlier run (its model.json).")]
-LearnFrom = Annotated[int | None, typer.Option(help="Most looks that --recurrent learns from.", show_default="100000")]
+LearnFrom = Annotated[
+    int | None, typer.Option(help="Maximum number of looks that --recurrent learns from.", show_default="100000")
+]
 Query = Annotated[
     str | None,
-    typer.Option(metavar="times|grid", help="Beliefs at the rows' times, or regularly.", show_default="times"),
+    typer.Option(
+        metavar="times|grid", help="Beliefs at the times of the rows, or at regular times.", show_default="times"
+    ),
 ]
 Step = Annotated[float | None, typer.Option(help="Step of the grid and of the forecasts [s].", show_default="chosen")]
 Horizon = Annotated[
@@ -75,22 +79,20 @@ Horizon = Annotated[
     ),
 ]
 PMiss = Annotated[
-    float | None, typer.Option(help="P(no detection | there) where the table does not say.", show_default="0.1")
+    float | None, typer.Option(help="P(no detection | there) if the table has no p_miss.", show_default="0.1")
 ]
 PFalse = Annotated[
-    float | None, typer.Option(help="P(detection | not there) where the table does not say.", show_default="0.1")
+    float | None, typer.Option(help="P(detection | not there) if the table has no p_false.", show_default="0.1")
 ]
-Confidence = Annotated[
-    float | None, typer.Option(help="Belief from which on a change is reported.", show_default="0.9")
-]
+Confidence = Annotated[float | None, typer.Option(help="Belief above which a change is reported.", show_default="0.9")]
 TruthTable = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Table with stamp_s, feature_id, present, to score the beliefs.")
 ]
 Figures = Annotated[
-    int | None, typer.Option(min=0, help="How many features get a figure of their own.", show_default="12")
+    int | None, typer.Option(min=0, help="Number of features with an individual figure.", show_default="12")
 ]
 ShownClock = Annotated[
-    StampsCount | None, typer.Option(help="What stamps count, for the figures.", show_default="by their size")
+    StampsCount | None, typer.Option(help="Clock of the stamps, for the figures.", show_default="by their size")
 ]
 Example = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Write a commented example table and exit.", show_default=False)
@@ -98,19 +100,19 @@ Example = Annotated[
 
 
 HELP = """\
-Tell what is still there, from detections and misses.
+Estimate which features still exist, from detections and misses.
 
 \b
-The table has a row a look: stamp_s, feature_id, and detected (1, 0, or empty where there was no look); it may have
+The table has one row per look: stamp_s, feature_id, and detected (1, 0, or empty without a look); optionally
 p_miss, p_false, class_id, and the truth as present. The folder gets beliefs.csv, changes.jsonl, forecasts.csv,
 summary.json, figures and report.html.
 
 \b
-Features that come back need --recurrent:
+Features that return need --recurrent:
   two-state                               stays and absences without typical duration
   phase-type, phase-type-rhythm           brief and long ones; with the hours of the local week
   run-length, run-length-rhythm           any typical duration; with the hours of the local week
-  auto                                    whichever predicts looks that were held out
+  auto                                    the one that predicts held-out looks best
 
 \b
 Examples:
@@ -162,7 +164,7 @@ def persist(
              "figures": figures}  # fmt: skip
     chosen = configured(config, settings, given, within="persist", show=show_config).persist
     if prior and not chosen.stays_once:
-        raise ConfigError("a lifetime is for features that stay once", field="prior", hint="without --recurrent")
+        raise ConfigError("a lifetime prior is for features that stay once", field="prior", hint="without --recurrent")
     if input is None:
         raise ConfigError("a table is needed", field="input", hint="--init looks.csv writes an example")
     from evermap.types import Clock

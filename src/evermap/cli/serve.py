@@ -42,9 +42,9 @@ Store = Annotated[
 ]
 _DEFAULT = "evermap-maps"
 _PATIENCE_S = 600.0
-"""A session that waits longer says that there are too few workers."""
+"""Waiting time of a session that indicates too few workers."""
 _MOST_UPLOADS = 10
-"""As many of the largest uploads have to fit on the disk."""
+"""Number of the largest uploads that must fit on the disk."""
 _ASK_S = 5.0
 
 
@@ -52,10 +52,10 @@ _ASK_S = 5.0
 def serve(
     ctx: typer.Context,
     store: Store = _DEFAULT,
-    host: Annotated[str, typer.Option(help="Address to listen at; 0.0.0.0 for all.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen at.")] = 8080,
+    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for all.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on.")] = 8080,
     workers: Annotated[
-        int, typer.Option(min=0, max=64, help="Processes beside it that enter sessions, see evermap work.")
+        int, typer.Option(min=0, max=64, help="Worker processes that enter sessions, see evermap work.")
     ] = 1,
     certificate: Annotated[
         Path | None, typer.Option("--tls-cert", metavar="FILE", help="TLS certificate chain.", show_default="no TLS")
@@ -89,7 +89,7 @@ def serve(
 
     if not database.tokens():
         typer.echo(database.add_token("admin", Role.ADMIN))
-        say("this token of an administrator is shown once; more of them: evermap serve token NAME --role ROLE")
+        say("this administrator token is shown once; more tokens: evermap serve token NAME --role ROLE")
     server = Server(database, SiteStores(store))
     prepare(server)
     scheme = "http" if certificate is None else "https"
@@ -110,10 +110,10 @@ def serve(
 @app.command("token")
 def token(
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="Of the robot or person.", show_default=False)
+        str | None, typer.Argument(metavar="NAME", help="Name of the robot or person.", show_default=False)
     ] = None,
-    role: Annotated[str, typer.Option(metavar="read|upload|approve|admin", help="What it may do.")] = "upload",
-    revoke: Annotated[bool, typer.Option("--revoke", help="Take the token of this name back.")] = False,
+    role: Annotated[str, typer.Option(metavar="read|upload|approve|admin", help="Its permissions.")] = "upload",
+    revoke: Annotated[bool, typer.Option("--revoke", help="Revoke the token of this name.")] = False,
     store: Store = _DEFAULT,
     as_json: AsJson = False,
 ) -> None:
@@ -142,11 +142,11 @@ def token(
         if not database.revoke_token(name):
             known = [row["name"] for row in database.tokens()]
             raise ConfigError(f"no token '{name}'", field="name", hint=suggestion(name, known))
-        say(f"the token of {name} is no longer valid")
+        say(f"the token of {name} is revoked")
         return
     roles = {item.name.lower(): item for item in Role}
     if role not in roles:
-        raise ConfigError(f"no role '{role}'", field="role", hint=suggestion(role, roles))
+        raise ConfigError(f"unknown role '{role}'", field="role", hint=suggestion(role, roles))
     text = database.add_token(name, roles[role])
     if as_json:
         print_json({"name": name, "role": role, "token": text})
@@ -159,7 +159,7 @@ def token(
 def doctor(
     store: Store = _DEFAULT,
     url: Annotated[
-        str, typer.Option(metavar="URL", help="Where robots reach the server; '' to leave that out.")
+        str, typer.Option(metavar="URL", help="Address at which robots reach the server; '' to skip this check.")
     ] = "http://127.0.0.1:8080",
     as_json: AsJson = False,
 ) -> None:
@@ -192,7 +192,7 @@ def _of_database(store: str) -> Iterator[tuple[str, bool, str]]:
 
     try:
         if not is_address(store) and not Path(store, "server.db").is_file():
-            raise ConfigError("holds no server yet", field="store", hint=f"evermap serve --store {store}")
+            raise ConfigError("contains no server yet", field="store", hint=f"evermap serve --store {store}")
         database = _database(store)
     except EvermapError as error:
         yield "database", False, error.one_line()
@@ -212,16 +212,16 @@ def _of_database(store: str) -> Iterator[tuple[str, bool, str]]:
     yield "maps", not broken, "; ".join(broken) or f"{len(names)}, each with a newest revision"
     by_state, waits_s, working = database.queue()
     told = ", ".join(f"{count} {state}" for state, count in sorted(by_state.items())) or "no session yet"
-    yield "queue", waits_s < _PATIENCE_S, f"{told}; the oldest that waits has done so for {waits_s:.0f} s"
+    yield "queue", waits_s < _PATIENCE_S, f"{told}; the oldest has waited for {waits_s:.0f} s"
     idle = waits_s > LEASE_S and not working
-    yield "workers", not idle, "nobody works on what waits: evermap work" if idle else f"{working} busy"
+    yield "workers", not idle, "sessions wait, and no worker runs: evermap work" if idle else f"{working} busy"
     limits, size = UploadLimits(), database.n_bytes()
-    yield "limits", True, f"{limits.n_bytes / 1e6:.0f} MB an upload, {limits.unpacked_bytes / 1e6:.0f} MB unpacked"
+    yield "limits", True, f"{limits.n_bytes / 1e6:.0f} MB per upload, {limits.unpacked_bytes / 1e6:.0f} MB unpacked"
     if size is None:
         free = shutil.disk_usage(store).free
         yield "disk", free > _MOST_UPLOADS * limits.n_bytes, f"{free / 1e9:.1f} GB free"
     else:
-        yield "disk", True, f"the database has {size / 1e9:.2f} GB; what is free is known where it runs"
+        yield "disk", True, f"the database has {size / 1e9:.2f} GB; check the free space on its machine"
 
 
 def _of_address(url: str) -> tuple[str, bool, str]:
@@ -230,7 +230,7 @@ def _of_address(url: str) -> tuple[str, bool, str]:
 
     host, scheme = urlsplit(url).hostname or "", urlsplit(url).scheme
     if scheme not in ("http", "https"):
-        return "address", False, f"'{printable(url, 100)}' is no address of a server: https://maps.example.com"
+        return "address", False, f"'{printable(url, 100)}' is not the address of a server: https://maps.example.com"
     local = host in ("localhost", "127.0.0.1", "::1")
     try:
         with urlopen(f"{url.rstrip('/')}/healthz", timeout=_ASK_S) as answer:  # nosec  # B310: http or https, see above
@@ -238,7 +238,7 @@ def _of_address(url: str) -> tuple[str, bool, str]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         return "address", False, f"no server answers at {url}: {printable(str(error), 100)}"
     if scheme != "https" and not local:
-        return "address", False, f"{url} is not TLS, so tokens can be read on the way: --tls-cert, or a proxy"
+        return "address", False, f"{url} does not use TLS, so tokens can be read in transit: --tls-cert, or a proxy"
     return "address", True, f"evermap {told} answers at {url}{'' if not local else ', seen from this machine'}"
 
 
@@ -246,11 +246,13 @@ def work(
     store: Store = _DEFAULT,
     config: ConfigFile = None,
     settings: Settings = None,
-    drain: Annotated[bool, typer.Option("--drain", help="End as soon as no session waits.")] = False,
+    drain: Annotated[bool, typer.Option("--drain", help="Exit as soon as no session waits.")] = False,
     lease_s: Annotated[
-        float, typer.Option(min=1.0, max=3600.0, help="Time after which another worker takes a session over [s].")
+        float, typer.Option(min=1.0, max=3600.0, help="Time after which another worker takes over a session [s].")
     ] = 60.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what became of each, one JSON object a line.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the result of each, one JSON object per line.")
+    ] = False,
 ) -> None:
     """Enter the sessions that were uploaded to a server.
 

@@ -54,14 +54,14 @@ Recorded = Annotated[
     typer.Argument(
         metavar="INPUT...",
         help="Folder in the native format, zip or ROS bag; with --map also several, in the order of their sessions, "
-        "and with --together one for each robot.",
+        "and with --together one per robot.",
         show_default=False,
     ),
 ]
 Out = Annotated[
     Path | None,
     typer.Option(
-        help="Folder for the results, of several recordings for one folder each.",
+        help="Folder for the results; for several recordings, one subfolder each.",
         show_default="evermap-out/<recording>",
     ),
 ]
@@ -69,7 +69,7 @@ SensorModel = Annotated[
     str | None,
     typer.Option(
         metavar="calibrated|plain",
-        help="Estimate sensor and odometry errors, or believe the readings.",
+        help="Estimate sensor and odometry errors, or trust the readings.",
         show_default="calibrated",
     ),
 ]
@@ -77,7 +77,7 @@ HowMoved = Annotated[
     str | None,
     typer.Option(
         metavar="joint|nohyp|max-mixture|nn|em|mcts|viterbi",
-        help="How landmarks that moved are explained; nohyp: the world is static.",
+        help="Method that finds moved landmarks; nohyp: the world is static.",
         show_default="joint",
     ),
 ]
@@ -94,14 +94,14 @@ PriorMap = Annotated[
 ]
 PriorSigma = Annotated[
     float,
-    typer.Option(min=1e-6, help="Standard deviation of the surveyed map, or of one without sigmas of its own [m]."),
+    typer.Option(min=1e-6, help="Standard deviation of the surveyed map, or of a map without sigmas [m]."),
 ]
 LivingMapFile = Annotated[
     str | None,
     typer.Option(
         "--map",
         metavar="FILE",
-        help="Continue this living map, or begin it: localise in it, find what changed, extend it. A file, or "
+        help="Continue or begin this living map: localise in it, find what changed, extend it. A file, or "
         "postgresql://user@host/database/SITE.",
         show_default=False,
     ),
@@ -110,12 +110,13 @@ MapPriors = Annotated[
     list[str] | None,
     typer.Option(
         metavar="[CLASS=]PRIOR|FILE.json",
-        help="With --map: how long things stay, as 'cart=weibull:scale=3d,shape=1.5', or a file of survival fit, "
+        help="With --map: lifetimes, as 'cart=weibull:scale=3d,shape=1.5', or a file of survival fit, "
         "survival learn or map export --lifetimes; worth living.prior_stays stays; repeatable.",
     ),
 ]
 Localize = Annotated[
-    bool, typer.Option("--localize", help="With --map: only localise, at a fixed cost per frame; the map stays.")
+    bool,
+    typer.Option("--localize", help="With --map: only localise, at a fixed cost per frame; the map is not changed."),
 ]
 Shifts = Annotated[
     list[str] | None,
@@ -128,7 +129,8 @@ Together = Annotated[
     bool,
     typer.Option(
         "--together",
-        help="The inputs are robots 1, 2, ... of one time, or one input has several robots: solve them as one problem.",
+        help="The inputs are simultaneous recordings of robots 1, 2, ..., or one input has several robots: solve them "
+        "as one problem.",
     ),
 ]
 Realtime = Annotated[bool, typer.Option("--realtime", help="Process at the pace of the recording.")]
@@ -141,14 +143,14 @@ InitBag = Annotated[
     Path | None,
     typer.Option(
         metavar="BAG",
-        help="Write BAG.toml, which topics of a ROS bag are read and how, to be edited, and exit.",
+        help="Write the topics that are read from a ROS bag, and how, to BAG.toml for editing, and exit.",
         show_default=False,
     ),
 ]
 InSpace = Annotated[bool, typer.Option("--3d", help="With --init: a recording in space, of a camera that sees tags.")]
 
 HELP = """\
-Estimate where the robot was and where the landmarks are.
+Estimate the trajectory of the robot and the map of the landmarks.
 
 \b
 Examples:
@@ -199,7 +201,7 @@ def slam(
     given = {"sensor_model": sensor_model, "method": method, "unknown_ids": _associated(unknown_ids, empty_ids)}
     chosen = configured(config, settings, given, within="slam", show=show_config)
     if not (paths := input or []):
-        hint = "a folder, zip or ROS bag; --init DIR shows what to put in"
+        hint = "a folder, zip or ROS bag; --init DIR writes an example"
         raise ConfigError("a recording is needed", field="input", hint=hint)
     if together:
         _check_together(map_file=map_file, prior_map=prior_map, robot=robot, realtime=realtime or None, topics=topics)
@@ -221,8 +223,8 @@ def slam(
     if len(paths) == 1:
         work(paths[0], out)
     elif map_file is None:
-        hint = "--map FILE, --together for robots of one time, or one of them"
-        raise ConfigError("several recordings are sessions of a map", field="input", hint=hint)
+        hint = "--map FILE, --together for simultaneous recordings, or a single input"
+        raise ConfigError("several recordings need a map", field="input", hint=hint)
     else:
         _each(paths, out, work)
 
@@ -320,7 +322,7 @@ def _each_together(paths: Sequence[Path], out: Path | None, config: Config, how:
     else:
         recordings = {number: read_planar(paths[0], robot=number) for number in list_robots(paths[0])}
     if len(recordings) < 2:
-        raise ConfigError("there is one robot", field="together", hint="name the recordings of the others, too")
+        raise ConfigError("there is one robot", field="together", hint="give the recordings of the other robots, too")
     folders = {number: default_out(recording.name) for number, recording in recordings.items()}
     if len(set(folders.values())) < len(folders):
         folders = {number: Path(f"{folder}-{number}") for number, folder in folders.items()}
@@ -410,7 +412,9 @@ def _check_map_options(
             raise ConfigError("needs a map", field="localize", hint="--map FILE")
         return
     if prior_map is not None and localize:
-        raise ConfigError("a living map takes no other one", field="prior_map", hint="either --map or --prior-map")
+        raise ConfigError(
+            "a living map cannot be combined with a prior map", field="prior_map", hint="either --map or --prior-map"
+        )
     if method is not None:
         raise ConfigError(
             "a living map finds changes by itself", field="method", hint="--set living.search=gate, for example"
@@ -421,7 +425,7 @@ def _check_together(**given: object) -> None:
     """Refuse what is for one robot."""
     for field, value in given.items():
         if value is not None:
-            raise ConfigError("is for one robot at a time", field=field, hint="leave it or --together out")
+            raise ConfigError("is for one robot at a time", field=field, hint="omit it or --together")
 
 
 def _write_what_is_to_edit(folder: Path | None, bag: Path | None, *, in_space: bool) -> None:
@@ -447,7 +451,7 @@ def _write_bag_settings(bag: Path) -> None:
     text = bag_settings(bag)
     write_atomic(path, text)
     typer.echo(text)
-    say(f"wrote this to {path}; edit it where it is wrong, then: evermap slam {bag}")
+    say(f"wrote this to {path}; correct it where needed, then: evermap slam {bag}")
 
 
 def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) -> Landmarks:
@@ -523,7 +527,7 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
     warm_up(lambda: compile_kernels(unknown_ids=unknown, sessions=not localize, localize=localize, in_space=in_space))
     with held():  # a map without its tables is none
         opened = open_store(map_file, create=not localize)
-    kept(map_file, f"the map {map_file} stays as it was")
+    kept(map_file, f"the map {map_file} is unchanged")
     with opened as store:
         start = time.perf_counter()
         entered: Entered | None = None
@@ -540,9 +544,7 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
         elapsed_s = time.perf_counter() - start
         _write(out, recording, result, config, _info(config, elapsed_s, realtime=realtime, entered=entered), **how)
         if result.interrupted:
-            raise KeyboardInterrupt(
-                f"the part of the recording that was processed is in {out}; the map stays as it was"
-            )
+            raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}; the map is unchanged")
         if entered is not None:
             _commit(entered, store, map_file, config, elapsed_s)
 
@@ -552,11 +554,11 @@ def _commit(entered: Entered, store: MapStore, map_file: str | Path, config: Con
     if not entered.session.found:
         problem, hint = entered.session.set_aside
         raise ConfigError(
-            f"the session was not found in this map, which stays as it was: {problem}", path=map_file, hint=hint
+            f"the session could not be localised in this map, which is unchanged: {problem}", path=map_file, hint=hint
         )
     with held():
         revision = entered.commit(store, config, command=command_line(), wall_s=elapsed_s)
         kept(map_file, f"the session is revision {revision} of {map_file}")
     if entered.replayed:
         again = ", ".join(entered.replayed)
-        say(f"a late session: entered at its time, and {len(entered.replayed)} later brought in again ({again})")
+        say(f"a late session: entered at its time, and {len(entered.replayed)} later ones replayed ({again})")

@@ -31,7 +31,7 @@ A prior is one of:
   unknown:1h..30d                                     the mean stay is unknown, between 1 hour and 30 days
   general-purpose:low=0.001/s,high=1/s                the same by its rates, as in Rosen 2016
   uniform:limit=3d                                    any stay up to 3 days, none longer
-  weibull:scale=2d,shape=0.7                          shape < 1: what has stayed stays longer; > 1: it wears out
+  weibull:scale=2d,shape=0.7                          shape < 1: the hazard falls with age; > 1: it rises
   lognormal:median=2d,spread=1.5                      half are gone after 2 days, the logarithms spread by 1.5
   gamma:scale=2d,shape=2                              two exponential stages of 2 days one after the other
   never-leaves                                        walls
@@ -48,26 +48,26 @@ Example:
   evermap survival plot unknown:1h..30d exponential:half-life=2d --out priors.png
 """
 FIT = """\
-Estimate lifetimes of which only bounds are known.
+Estimate lifetime distributions from censored lifetimes.
 
 \b
-The table has a row a lifetime, in seconds: left, for how long it was seen to stay, and right, when it was found
-gone (equal: the end was watched; empty: never seen gone). It may have entry (known only because it was still
-there by then), weight, class_id, x_m, y_m. `evermap track` writes such tables.
+The table has one row per lifetime, in seconds: left, the age at the last sighting, and right, when it was found gone
+(equal: the end was observed; empty: never seen gone). Optionally entry (age at its first observation, left truncation),
+weight, class_id, x_m, y_m. `evermap track` writes such tables.
 
 \b
 Estimators:
-  npmle                                   the most probable distribution of all (Turnbull), for any bounds
-  kaplan-meier                            the same with bands, where each end was watched or never seen
-  exponential, weibull, lognormal, gamma  the most probable of a family; extrapolates
-  general-purpose                         the rate is unknown between two limits
-  two-exponentials, some-never-leave      some stay briefly, others long; or for ever
-  best                                    the family with the least AIC
+  npmle                                   maximum likelihood without a family (Turnbull), for any bounds
+  kaplan-meier                            the same with bands, if each end was observed or never seen
+  exponential, weibull, lognormal, gamma  maximum likelihood within a family; extrapolates
+  general-purpose                         an unknown rate between two limits
+  two-exponentials, some-never-leave      some stay briefly, others long; or permanently
+  best                                    the family with the smallest AIC
   gp                                      a Gaussian process hazard with credible bands; groups learn from all
 
 \b
 Every result is a prior: --json gives its text for `evermap persist --prior`, --out a file for --model.
-In JSON, null stands for infinity: in support_right, for mass that was never seen to end.
+In JSON, null stands for infinity: in support_right, for mass without an observed end.
 
 \b
 Examples:
@@ -76,10 +76,10 @@ Examples:
   evermap persist looks.csv --model priors.json
 """
 LEARN = """\
-Learn how long things stay and stay away.
+Learn the durations of stays and absences.
 
-From looks alone: no truth, no list of changes. Every kind of model is learned without the last part of the looks
-and asked to predict it; the best is learned again from all of them.
+From looks alone, without truth or a list of changes. Every kind of model is learned without the last part of the looks
+and scored on predicting it; the best is learned again from all looks.
 
 \b
 Example:
@@ -92,7 +92,7 @@ app = typer.Typer(name="survival", help="How long features stay.", no_args_is_he
 
 @app.command("plot", help=PLOT)
 def plot(
-    priors: Annotated[list[str], typer.Argument(metavar="PRIOR...", help="Lifetimes, written as below.")],
+    priors: Annotated[list[str], typer.Argument(metavar="PRIOR...", help="Lifetime priors, in the forms below.")],
     out: Annotated[Path, typer.Option(help="Figure to write, .png or .svg.")] = Path("lifetimes.png"),
     until: Annotated[
         str | None, typer.Option(help="End of the time axis, as 30d.", show_default="when nearly all have left")
@@ -128,12 +128,12 @@ By = Annotated[
     typer.Option(metavar="class,chunk", help="Estimate classes, places or both separately.", show_default="all as one"),
 ]
 Estimator = Annotated[
-    str | None, typer.Option(metavar="NAME", help="How to estimate: one of the list below.", show_default="npmle")
+    str | None, typer.Option(metavar="NAME", help="Estimator, one of the list below.", show_default="npmle")
 ]
 ChunkSide = Annotated[float | None, typer.Option(help="Side of the squares of --by chunk [m].", show_default="10")]
 PriorsFile = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.json", help="Keep the priors for `evermap persist --model`.", show_default="none"),
+    typer.Option(metavar="FILE.json", help="File for the priors, for `evermap persist --model`.", show_default="none"),
 ]
 Curves = Annotated[
     Path | None, typer.Option(metavar="FILE.png", help="Draw the survival functions.", show_default="none")
@@ -153,7 +153,7 @@ def fit(
     show_config: ShowConfig = False,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate lifetimes of which only bounds are known."""
+    """Estimate lifetime distributions from censored lifetimes."""
     given = {"by": by, "estimator": estimator, "chunk_m": chunk_m}
     chosen = configured(config, settings, given, within="survival", show=show_config).survival
     from evermap.runs.folder import check_output_file
@@ -166,7 +166,7 @@ def fit(
     if out is not None:
         check_output_file(out, inputs=[input], ending=".json")
     if out is not None and BY_CHUNK in words:
-        raise ConfigError("a model file knows no places", field="out", hint="--by class, or the texts of --json")
+        raise ConfigError("a model file has no places", field="out", hint="--by class, or the texts of --json")
     table = read_lifetimes(input)
     groups = groups_of(table, words, chosen.chunk_m)
     found: list[LifetimeEstimate] = []
@@ -201,7 +201,7 @@ def learn(
     ],
     out: Annotated[Path, typer.Option(help="File for the model.")] = Path("model.json"),
     figure: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Draw what the model predicts.", show_default="none")
+        Path | None, typer.Option(metavar="FILE.png", help="Figure of the model's predictions.", show_default="none")
     ] = None,
     recurrent: Recurrent = None,
     per: Per = None,
@@ -212,7 +212,7 @@ def learn(
     show_config: ShowConfig = False,
     as_json: AsJson = False,
 ) -> None:
-    """Learn how long things stay and stay away."""
+    """Learn the durations of stays and absences."""
     given = {"recurrent": recurrent, "per": per, "p_miss": p_miss, "p_false": p_false}
     chosen = configured(config, settings, given, within="persist", show=show_config).persist
     if recurrent is None and chosen.stays_once:  # there is nothing to learn of one stay
@@ -265,7 +265,7 @@ def _remarks(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> list[str]
     import numpy as np
 
     endless = [g.label for g in groups if not np.isfinite(table.data.right_s[g.rows]).any()]
-    return [f"{label}: nothing was seen to leave, so the estimate says that nothing ever does" for label in endless]
+    return [f"{label}: no end was observed, so the estimate never ends" for label in endless]
 
 
 def _counts(table: LifetimeTable, group: LifetimeGroup) -> dict[str, Any]:
@@ -304,7 +304,7 @@ def _content(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate
 def _lines(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) -> list[tuple[str, str]]:
     """What a person wants to know."""
     counts = _counts(table, group)
-    ends = f"{counts['exact']:,} watched, {counts['intervals']:,} between two looks"
+    ends = f"{counts['exact']:,} observed, {counts['intervals']:,} between two looks"
     lines = [
         ("lifetimes", f"{counts['samples']:,}"),
         ("their ends", f"{ends}, {counts['never_seen_gone']:,} never seen"),

@@ -32,9 +32,9 @@ PATIENCE_S = 4.0
 """Loading compiled kernels takes about a second, compiling them much longer."""
 
 remark_as: ContextVar[Callable[[str], str]] = ContextVar("remark_as", default=lambda line: line)
-"""What the command that runs makes of a remark: options instead of the core's arguments."""
+"""Translates a remark of the core for the running command: options instead of arguments."""
 _MOST = 2000
-"""Characters of an error: of every part of a message there are fewer, so this cuts only what is not made of parts."""
+"""Maximum characters of an error; parts of a message have lower limits, so this cuts only other texts."""
 
 
 def echo(line: str) -> None:

@@ -37,7 +37,7 @@ Seen = Annotated[
 ]
 Reach = Annotated[
     float | None,
-    typer.Option(help="The sensor's reach [m]: what is missed within it may be gone.", show_default="unknown"),
+    typer.Option(help="Range of the sensor [m]: misses within it are evidence.", show_default="unknown"),
 ]
 Speeds = Annotated[
     list[str] | None,
@@ -51,15 +51,15 @@ Confusion = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="Table of P(detected class | true class): class_id, and a column a class.",
+        help="Table of P(detected class | true class): class_id, and one column per class.",
         show_default="5 % mistakes",
     ),
 ]
-MinScore = Annotated[float | None, typer.Option(help="Leave out detections of a lower score.", show_default="none")]
+MinScore = Annotated[float | None, typer.Option(help="Ignore detections with a lower score.", show_default="none")]
 Gap = Annotated[
     float | None,
     typer.Option(
-        help="A longer time between two frames is one without any look [s].", show_default="ten times the usual"
+        help="A longer time between two frames counts as a gap without looks [s].", show_default="ten times the usual"
     ),
 ]
 Scene = Annotated[bool, typer.Option("--scene/--no-scene", help="Write scene.rrd for the rerun viewer.")]
@@ -68,10 +68,10 @@ Example = Annotated[
 ]
 
 HELP = """\
-Follow objects in space, and learn how long they stay.
+Track objects in space, and learn how long they stay.
 
 \b
-The table has a row a detection: stamp_s, x_m, y_m, z_m in the world; it may have class_id, a box (length_m,
+The table has one row per detection: stamp_s, x_m, y_m, z_m in the world; optionally class_id, a box (length_m,
 width_m, height_m, yaw_rad), a covariance (cov_xx_m2 ... or sigma_m), score, appearance_0 ..., and sensor_x_m,
 sensor_y_m, sensor_z_m. A row without a position is a frame in which nothing was detected. A folder has such a
 table, detections, in the frame of a moving sensor, and its poses, odometry (stamp_s, x_m, y_m, z_m, qx, qy, qz,
@@ -80,17 +80,17 @@ events.jsonl, spells.csv, lifetimes.csv (for `evermap survival fit`), summary.js
 
 \b
 Most useful with --set:
-  sigma_position_m=0.3    noise of a detection where the table does not say [m]
+  sigma_position_m=0.3    noise of a detection without a covariance [m]
   p_detect=0.9            share of objects in view that are detected
-  clutter_per_m3=1e-4     false and first detections, a frame and cubic metre
-  motion=acceleration     or velocity: what is constant while nothing is seen
-  warm_up=3               detections before an object is believed
-  max_missed=10           frames without a detection until it is kept in mind, or given up if it moved
+  clutter_per_m3=1e-4     false and first detections per frame and cubic metre
+  motion=acceleration     or velocity: constant in the motion model
+  warm_up=3               detections before a track is confirmed
+  max_missed=10           frames without a detection until a track is stored, or deleted if it moved
   rest_for_s=2            time without motion before an object counts as resting [s]
-  place_sigma_m=0.2       how exactly a resting object is found again in its place, beside the noise [m]
-  fov_deg=80              what the sensor sees to both sides of ahead; with --range-m and poses [deg]
-  score_midpoint=3.7      score of a detection that is as likely real as false; score_scale=1.2 how steep
-  moved_reach_m=0         how far objects may be moved between looks; wants appearances [m]
+  place_sigma_m=0.2       position tolerance of re-identification at rest, in addition to the noise [m]
+  fov_deg=80              horizontal field of view; with --range-m and poses [deg]
+  score_midpoint=3.7      score of a detection that is as likely real as false; score_scale=1.2 its slope
+  moved_reach_m=0         how far objects may be moved between looks; needs appearances [m]
 
 \b
 Examples:

@@ -24,14 +24,14 @@ def view(
         str,
         typer.Argument(
             metavar="MAP|RUN|LIVE",
-            help="A living map, the folder of a run of slam, or a drive: where `evermap live` meets Zenoh.",
+            help="A living map, the folder of a run of slam, or the Zenoh endpoint of `evermap live`.",
         ),
     ],
     save: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Write what would be shown, as .rrd for rerun or .mcap for Foxglove, and open nothing.",
+            help="Save as .rrd for rerun or .mcap for Foxglove instead of opening a viewer.",
             show_default=False,
         ),
     ] = None,
@@ -70,7 +70,7 @@ def _look_on(where: str, save: Path | None) -> None:
         check_output_file(save, ending=".rrd")
     mailbox = Mailbox(ours=True)
     zenoh, scene = Zenoh(where, mailbox), LiveScene(save)
-    say("showing what evermap live tells there; Ctrl-C ends it")
+    say("showing the drive of evermap live; Ctrl-C ends it")
     with watched(signal.SIGTERM) as watch:
         look_on(mailbox, scene, watch.stop_if_asked)
     scene.close()

@@ -25,7 +25,7 @@ from evermap.types import (
 )
 
 FRAMES = 24
-"""So many that a cell of the lines of sight is looked along more than once."""
+"""Enough for more than one look along a cell of the lines of sight."""
 PLACES = np.array([[2.0, 1.0], [3.0, -1.5], [5.0, 1.5], [4.0, 0.5]])
 """[m], beside a drive of 2.3 m along x."""
 

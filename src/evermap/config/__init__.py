@@ -58,13 +58,13 @@ class Config(Section):
     """The whole configuration, one section a table of the TOML file."""
 
     slam: SlamConfig = Field(default_factory=SlamConfig, description="the estimator")
-    living: LivingConfig = Field(default_factory=LivingConfig, description="a map that lives on between sessions")
-    sensor: SensorConfig = Field(default_factory=SensorConfig, description="corrections of the recording's sensor")
-    output: OutputConfig = Field(default_factory=OutputConfig, description="what is written beside the numbers")
+    living: LivingConfig = Field(default_factory=LivingConfig, description="a living map")
+    sensor: SensorConfig = Field(default_factory=SensorConfig, description="overrides of the recording's sensor")
+    output: OutputConfig = Field(default_factory=OutputConfig, description="additional outputs")
     persist: PersistConfig = Field(default_factory=PersistConfig, description="a table of looks")
     track: TrackConfig = Field(default_factory=TrackConfig, description="a table of detections")
     survival: SurvivalConfig = Field(default_factory=SurvivalConfig, description="a table of lifetimes")
-    live: LiveConfig = Field(default_factory=LiveConfig, description="a session that is fed while the robot drives")
+    live: LiveConfig = Field(default_factory=LiveConfig, description="a live session")
 
 
 def load_config(
@@ -114,9 +114,7 @@ def _read_toml(path: Path | None) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ConfigError(
-            "no such file", path=path, hint="print one to start from with: evermap slam --show-config"
-        ) from None
+        raise ConfigError("no such file", path=path, hint="print a template with: evermap slam --show-config") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot be read: {error}", path=path) from None
     except RecursionError:

@@ -13,19 +13,21 @@ class FitConfig(Section):
     """When a session is believed to lie in the map, and which of its landmarks are believed."""
 
     least_fit: Share = Field(
-        default=0.75, description="share of the sightings that fit in a session by itself that must fit in the map, too"
+        default=0.75, description="share of the sightings consistent within the session that must also fit the map"
     )
     most_lost: Share = Field(
-        default=0.03, description="a session whose sightings fit less often in the map by this share was bent"
+        default=0.03,
+        description="if this larger share of sightings fits within the session than with the map, the "
+        "session is distorted",
     )
-    inlier: Share = Field(default=0.5, description="inlier probability from which on a sighting counts")
-    sightings: Positive = Field(default=1.5, description="inliers that a landmark needs to be believed")
-    sightings_in_place: Positive = Field(default=0.5, description="the same where it stands as in the map")
+    inlier: Share = Field(default=0.5, description="inlier probability above which a sighting counts")
+    sightings: Positive = Field(default=1.5, description="inliers that a landmark needs to be accepted")
+    sightings_in_place: Positive = Field(default=0.5, description="the same for a landmark at its place in the map")
     misread_m: Positive = Field(
-        default=0.3, description="a landmark this close to another one may be that one, its identity misread [m]"
+        default=0.3, description="distance within which a landmark may be another one with a misread identity [m]"
     )
     misread_share: Share = Field(
-        default=0.2, description="it is, if it was seen so seldom beside it, and never in one frame with it"
+        default=0.2, description="maximum share of sightings for that, with none in a frame with the other one"
     )
     glimpse_m: Positive = Field(default=0.4, description="a landmark seen once this close to its place is there [m]")
     bent_m: Positive = Field(default=0.15, description="bodies that moved alike to within this are a bend [m]")
@@ -36,7 +38,7 @@ class FitConfig(Section):
     )
     placing_m: Positive = Field(default=0.3, description="residual from which sightings count for less in that [m]")
     loose_m: Positive = Field(
-        default=0.5, description="a session is in parts where odometry was silent and nothing else ties it so well [m]"
+        default=0.5, description="position uncertainty above which silent odometry splits a session into parts [m]"
     )
     loose_rad: Positive = Field(default=0.1, description="the same for the heading [rad]")
 
@@ -45,15 +47,19 @@ class OverlayConfig(Section):
     """Priors of the search for what stands where the map has it."""
 
     nudge_m: Positive = Field(default=0.7, description="standard deviation of a small move, each axis [m]")
-    share_nudged: Share = Field(default=0.5, description="share of moves that are small; the others lead anywhere")
-    turn_m: Positive = Field(default=0.35, description="standard deviation of how members of a moved body turn [m]")
-    p_split: Share = Field(default=1e-3, description="probability that landmarks taken for one body are not")
-    p_another_place: Share = Field(default=1e-3, description="probability that a session is of another place")
-    smallest_room_m2: Positive = Field(default=50.0, description="least area that moved bodies may be found in [m^2]")
+    share_nudged: Share = Field(default=0.5, description="share of moves that are small; the others are unbounded")
+    turn_m: Positive = Field(
+        default=0.35, description="standard deviation of the rotation of a moved body, at its members [m]"
+    )
+    p_split: Share = Field(default=1e-3, description="probability that landmarks assigned to one body are not")
+    p_another_place: Share = Field(default=1e-3, description="probability that a session is from another place")
+    smallest_room_m2: Positive = Field(
+        default=50.0, description="minimum area in which moved bodies may be found [m^2]"
+    )
     drifts_m: tuple[Positive, ...] = Field(
         default=(0.01, 0.02, 0.04, 0.08),
         min_length=1,
-        description="standard deviations by which landmarks that nobody moved may be off from session to session [m]",
+        description="candidate standard deviations of unmoved landmarks from session to session [m]",
     )
     free_m: Positive = Field(
         default=20.0, description="standard deviation of a session's place around the one agreed on, each axis [m]"
@@ -190,29 +196,27 @@ class LooksConfig(Section):
     sides: Count = Field(default=6, description="sectors around a place that count as sides of it")
     most_sides: Count = Field(default=3, description="sides that count for having been seen all around")
     together_m: NotNegative = Field(
-        default=2.0, description="cliques missed from places this close may be hidden by the same thing [m]"
+        default=2.0, description="cliques missed from places this close may be hidden by one object [m]"
     )
     near_m: NotNegative = Field(
-        default=0.6, description="positions this close to one from which a place was seen see it, too [m]"
+        default=0.6, description="a place is visible from positions this close to one from which it was seen [m]"
     )
-    least_expected: Positive = Field(
-        default=2.0, description="detections that earlier looks must be expected to have given to count as looks"
-    )
-    sticky: float = Field(default=2.0, ge=1.0, description="frames in a row that say as much as an independent one")
+    least_expected: Positive = Field(default=2.0, description="minimum expected detections of earlier looks")
+    sticky: float = Field(default=2.0, ge=1.0, description="consecutive frames that count as one independent one")
 
 
 class DecisionConfig(Section):
     """What is told of a session, and what a map forgets."""
 
     least_evidence: NotNegative = Field(
-        default=1.5, description="log likelihood ratio of looks against a clique before it is told to have left"
+        default=1.5, description="log likelihood ratio of looks against a clique before it is reported as vanished"
     )
     credible: Share = Field(
         default=0.6,
-        description="what is missed is gone if it is for the upper bound of this lifetime interval, too",
+        description="a missed clique is gone only if it also is under the upper bound of this lifetime interval",
     )
     same_place_m: Positive = Field(
-        default=0.3, description="bodies this close to where another one stood have taken its place [m]"
+        default=0.3, description="bodies this close to the former place of another one have taken its place [m]"
     )
     same_turn_rad: Positive = Field(default=0.3, description="bodies turned by less than this have not turned [rad]")
     same_spot_m: Positive = Field(default=0.1, description="bodies this close to where they stood have not moved [m]")
@@ -220,70 +224,71 @@ class DecisionConfig(Section):
     surely_away: Probability = Field(default=0.02, description="belief below which a clique may be forgotten")
     forgotten_p: Probability = Field(default=0.05, description="probability of a return below which it is forgotten")
     most_away: int = Field(
-        default=20, ge=0, description="cliques that are away and remembered, beside as many as stand"
+        default=20, ge=0, description="absent cliques that are kept, in addition to the number of present ones"
     )
-    most_stays: Count = Field(default=5000, description="newest stays that lifetimes are learned from")
+    most_stays: Count = Field(default=5000, description="newest stays from which lifetimes are learned")
 
 
 class GroupingConfig(Section):
     """Which landmarks are on one body, by how they moved."""
 
-    p_one_body: Share = Field(default=0.9, description="that two landmarks of a clique are on one body")
-    p_split_before: Share = Field(default=0.05, description="that two near ones of different cliques are")
-    p_other_class: Share = Field(default=0.001, description="that two near ones of different classes are")
-    p_moved: Share = Field(default=0.1, description="that a body moves between two sessions")
+    p_one_body: Share = Field(default=0.9, description="probability that two landmarks of a clique are on one body")
+    p_split_before: Share = Field(default=0.05, description="the same for two nearby ones of different cliques")
+    p_other_class: Share = Field(default=0.001, description="the same for two nearby ones of different classes")
+    p_moved: Share = Field(default=0.1, description="probability that a body moves between two sessions")
     move_sigma_m: Positive = Field(default=2.0, description="standard deviation of displacements, each axis [m]")
     misses_in_a_row: float = Field(
-        default=4.0, ge=1.0, description="misses of one session that say as much as an independent one"
+        default=4.0, ge=1.0, description="misses of one session that count as one independent one"
     )
-    p_wrong: Share = Field(default=1e-3, description="that detections of a landmark are of another, a session long")
+    p_wrong: Share = Field(
+        default=1e-3, description="probability that a landmark's identity is misread for a whole session"
+    )
 
 
 class LifetimeConfig(Section):
     """How lifetimes are learned from the history of a map."""
 
-    newest: Count = Field(default=300, description="stays of a class that are learned from: the last that began")
-    strength: Positive = Field(default=2.0, description="events that the average over classes counts for in each")
-    least_ended: Count = Field(default=5, description="ends in a chunk before it has lifetimes of its own")
-    sure: Share = Field(default=0.999, description="ends of stays that are more probable count as certain")
+    newest: Count = Field(default=300, description="newest stays of a class from which its lifetime is learned")
+    strength: Positive = Field(default=2.0, description="pseudo-events of the average over classes in each class")
+    least_ended: Count = Field(default=5, description="ends in a chunk before it has its own lifetimes")
+    sure: Share = Field(default=0.999, description="probability above which an end of a stay counts as certain")
     firmness: tuple[Positive, ...] = Field(
         default=(1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0),
         min_length=1,
-        description="ends that the lifetimes of a class may count for in those of a chunk; how many is learned",
+        description="candidate numbers of pseudo-ends of a class in its chunks; learned",
     )
-    prior_quantiles: Count = Field(default=64, description="lengths of stays that stand for a prior that a user gives")
-    prior_shortest_s: Positive = Field(default=60.0, description="shorter ones of these count as this long [s]")
-    prior_longest_s: Positive = Field(default=1.5e9, description="of longer ones of these no more is known [s]")
+    prior_quantiles: Count = Field(default=64, description="number of stay lengths that represent a given prior")
+    prior_shortest_s: Positive = Field(default=60.0, description="minimum of these lengths [s]")
+    prior_longest_s: Positive = Field(default=1.5e9, description="length at which these are censored [s]")
 
 
 class SightConfig(Section):
     """What is believed of lines of sight, and how it is learned."""
 
     most_looks: Positive = Field(
-        default=200.0, description="looks along one line; with more, old ones fade, so that a moved wall is learned"
+        default=200.0,
+        description="maximum looks along one line; beyond it, old ones fade, so that a moved wall is learned",
     )
-    strength: Positive = Field(
-        default=4.0, description="looks along one line that the rate of all clear lines of its length is worth"
-    )
-    nominal_looks: Positive = Field(
-        default=20.0, description="looks that the nominal rate is worth against those along all lines of a length"
-    )
+    strength: Positive = Field(default=4.0, description="pseudo-looks of the rate of all clear lines of that length")
+    nominal_looks: Positive = Field(default=20.0, description="pseudo-looks of the nominal rate")
     p_blocked_detect: Share = Field(default=0.03, description="detection rate along blocked lines")
-    least_rate: Share = Field(default=0.002, description="no kind of line has a lower detection rate")
-    highest_rate: Share = Field(default=0.98, description="no kind of line has a higher detection rate")
+    least_rate: Share = Field(default=0.002, description="minimum detection rate of any kind of line")
+    highest_rate: Share = Field(default=0.98, description="maximum detection rate of any kind of line")
     neighbour: Probability = Field(
-        default=0.35, description="what looks from the eight cells around say of a line, in looks along it"
+        default=0.35, description="weight of looks from the eight cells around, in looks along the line"
     )
-    clear: Share = Field(default=0.9, description="a line is known to be clear from this probability on")
-    blocked: Share = Field(default=0.25, description="a line is known to be blocked up to this probability")
+    clear: Share = Field(default=0.9, description="probability above which a line is known to be clear")
+    blocked: Share = Field(default=0.25, description="probability below which a line is known to be blocked")
     p_hidden_unseen: Share = Field(
-        default=0.1, description="that a place is hidden a session long (a shut door) if its lines were clear before"
+        default=0.1,
+        description="probability that a place is hidden for a whole session (a shut door) if its lines "
+        "were clear before",
     )
-    p_hidden_beside: Share = Field(default=0.03, description="the same if something else is seen along them now")
+    p_hidden_beside: Share = Field(default=0.03, description="the same if another landmark is seen along them now")
     p_hidden_unknown: Share = Field(
-        default=0.2, description="the same if they were unknown, but something close to them and behind is seen"
+        default=0.2, description="the same if they were unknown, but a landmark close to them and behind is seen"
     )
-    hidden_looks: Positive = Field(default=5.0, description="sessions that these are worth against what is learned")
+    hidden_looks: Positive = Field(default=5.0, description="pseudo-sessions of these probabilities")
     most_sessions: Positive = Field(default=2000.0, description="sessions of cliques after which old ones fade")
 
     @property
@@ -302,36 +307,36 @@ class LivingConfig(Section):
 
     search: Literal["joint", "gate", "none"] = Field(
         default="joint",
-        description="how a session is laid over the map: 'joint' weighs all that may have moved together, with the "
-        "trajectory marginalised; 'gate' one clique after the other, at the aligned poses; 'none' nothing moves",
+        description="how a session is aligned with the map: 'joint' searches over all moves together, with the "
+        "trajectory marginalised; 'gate' tests one clique after the other, at the aligned poses; 'none': "
+        "nothing moves",
     )
-    existence: bool = Field(default=True, description="believe less in what is not seen; off: all exists for ever")
-    returns: bool = Field(default=True, description="what is away may come back; off: gone is for ever (Rosen 2016)")
-    misses: bool = Field(default=True, description="learn from expected detections that did not come")
-    cliques: bool = Field(default=True, description="landmarks on one body share their fate")
+    existence: bool = Field(default=True, description="misses lower P(exists); off: landmarks exist permanently")
+    returns: bool = Field(default=True, description="absent landmarks may return; off: they never do (Rosen 2016)")
+    misses: bool = Field(default=True, description="use misses as evidence")
+    cliques: bool = Field(default=True, description="landmarks on one body share one belief")
     clique_reach_m: Positive = Field(default=1.6, description="largest extent of a body that landmarks may share [m]")
     learn_lifetimes: bool = Field(
-        default=True, description="learn from this map's history how long things stay; off: anything is possible"
+        default=True, description="learn lifetimes from this map's history; off: a wide prior"
     )
     prior_stays: int = Field(
         default=20,
         ge=1,
         le=100_000,
-        description="stays that a given prior of a lifetime is worth, beside those that the map sees",
+        description="pseudo-stays of a given lifetime prior, in addition to those of the map",
     )
-    learn_sight: bool = Field(
-        default=True, description="learn from where to where the sensor sees; off: its nominal field of view"
-    )
+    learn_sight: bool = Field(default=True, description="learn lines of sight; off: the nominal field of view")
     whole_places: Count = Field(
         default=600,
-        description="places up to which a map is updated as one; of a larger one a session touches what is near",
+        description="maximum places of a map that is updated as a whole; in a larger one a session updates only its "
+        "surroundings",
     )
     near_m: Positive = Field(
-        default=10.0, description="beyond the sensor's range, what is near a session: all that it may move with [m]"
+        default=10.0, description="margin beyond the sensor's range of the surroundings of a session [m]"
     )
-    most_sites: int = Field(default=3, ge=1, le=100, description="sites that are remembered of one clique, at most")
-    fit: FitConfig = Field(default_factory=FitConfig, description="whether a session lies in the map")
-    overlay: OverlayConfig = Field(default_factory=OverlayConfig, description="priors of what moved")
+    most_sites: int = Field(default=3, ge=1, le=100, description="maximum sites of one clique")
+    fit: FitConfig = Field(default_factory=FitConfig, description="acceptance of a session")
+    overlay: OverlayConfig = Field(default_factory=OverlayConfig, description="priors of moves")
     sight: SightConfig = Field(default_factory=SightConfig, description="lines of sight")
     looks: LooksConfig = Field(default_factory=LooksConfig, description="what counts as a look")
     decisions: DecisionConfig = Field(default_factory=DecisionConfig, description="what is told and forgotten")
@@ -346,18 +351,20 @@ class LiveConfig(Section):
     """A session that is fed while the robot drives."""
 
     reorder_s: NotNegative = Field(
-        default=0.1, description="how much later than the newest one a reading may come, by their stamps [s]"
+        default=0.1, description="maximum delay of a reading behind the newest one, by their stamps [s]"
     )
     checkpoint_s: Positive = Field(
-        default=5.0, description="readings go to the disk this often: a crash costs so much, and some tenths more [s]"
+        default=5.0,
+        description="interval at which readings are written to the disk: a crash loses so much, and some "
+        "tenths more [s]",
     )
     revision_s: NotNegative = Field(
         default=300.0,
-        description="while it maps, what was driven enters the map as a revision this often; 0: only at the end [s]",
+        description="interval at which the drive enters the map as a revision; 0: only at the end [s]",
     )
     readings_hz: Positive = Field(
         default=300.0,
-        description="readings a second that are kept for the map, on average: of more, whole frames are left out",
+        description="maximum mean rate of readings that enter the map; above it, whole frames are left out",
     )
     idle_s: Positive = Field(default=60.0, description="odometry that is kept where nothing is mapped, at least [s]")
     clocks_s: Positive = Field(default=5.0, description="more than the clocks of one robot are apart [s]")

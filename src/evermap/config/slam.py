@@ -143,7 +143,8 @@ class ModesConfig(Section):
         default=0.95, description="a detection outside this confidence region of all modes starts a new mode"
     )
     switch_probability: Probability = Field(
-        default=1e-4, description="of a landmark to be in another mode at the next look; ignored with a lifetime"
+        default=1e-4,
+        description="probability of a landmark to be in another mode at the next look; ignored with a lifetime",
     )
     births: Literal["evidence", "gate"] = Field(
         default="evidence",
@@ -152,10 +153,10 @@ class ModesConfig(Section):
     lifetime: str | None = Field(
         default=None, description="prior of how long a mode lasts, e.g. 'exponential:half-life=30d'; unset: constant"
     )
-    rounds: int = Field(default=10, ge=1, le=100, description="of selecting modes and relinearising, at most")
+    rounds: int = Field(default=10, ge=1, le=100, description="maximum rounds of selecting modes and relinearising")
     mcts_budget: int = Field(default=200, ge=1, description="iterations of the tree search for every decision")
     mcts_window_s: Positive | None = Field(
-        default=40.0, description="the tree search looks back this far [s]; unset: to the start"
+        default=40.0, description="window of the tree search [s]; unset: from the start"
     )
 
 
@@ -164,8 +165,8 @@ class ChangesConfig(Section):
 
     p_moved: float = Field(default=0.01, gt=0, lt=1, description="prior probability that anything moved at all")
     move_sigma_m: Positive = Field(default=0.7, description="standard deviation of a displacement, each axis [m]")
-    p_rotated: Probability = Field(default=0.1, description="share of moves that also turn the group")
-    turn_sigma_rad: Positive = Field(default=0.5, description="standard deviation of such a turn [rad]")
+    p_rotated: Probability = Field(default=0.1, description="share of moves with a rotation")
+    turn_sigma_rad: Positive = Field(default=0.5, description="standard deviation of such a rotation [rad]")
     rigid_m: Positive = Field(default=0.005, description="members of a group keep their distances to within this [m]")
     p_swapped: Share = Field(default=1e-5, description="probability that any two landmarks of a map were mixed up")
     displaced_log_odds: float = Field(
@@ -175,15 +176,16 @@ class ChangesConfig(Section):
         description="prior log odds against a landmark being elsewhere for a part of the session [nats]",
     )
     map_factor_spread: Positive = Field(
-        default=0.35, description="by how much the sigmas of a map may be wrong: standard deviation of their logarithm"
+        default=0.35, description="standard deviation of the logarithm of a factor on the sigmas of a map"
     )
     softness_m: tuple[Positive, ...] = Field(
         default=(0.005, 0.01, 0.02, 0.04),
         min_length=1,
-        description="errors that the sightings of a landmark in a part of the session may share; evidence chooses [m]",
+        description="candidate common errors of the sightings of a landmark in a part of the session; chosen by "
+        "evidence [m]",
     )
     usual_softness_m: Positive = Field(
-        default=0.02, description="the same while it is decided what was swapped or elsewhere for a while [m]"
+        default=0.02, description="the same during the search for swaps and temporary displacements [m]"
     )
     most_groups: Count = Field(default=4, description="groups that may have moved, at most")
     most_candidates: Count = Field(default=40, description="landmarks that may have moved, at most: the likeliest")
@@ -192,14 +194,14 @@ class ChangesConfig(Section):
     )
     interval: Share = Field(default=0.95, description="probability of the interval in which a change is told to be")
     rival_nats: NotNegative = Field(
-        default=5.0, description="explanations less probable than the best by up to this are reported beside it [nats]"
+        default=5.0, description="maximum distance of a reported alternative from the best explanation [nats]"
     )
-    most_rivals: int = Field(default=2, ge=0, description="explanations reported beside the best, at most")
+    most_rivals: int = Field(default=2, ge=0, description="maximum number of reported alternatives")
     disagreement: Positive = Field(
-        default=4.0, description="chi-square a degree of freedom above which a map without changes explains nothing"
+        default=4.0, description="chi-square per degree of freedom above which a map without changes does not fit"
     )
     loose_map_m: Positive = Field(
-        default=1.0, description="standard deviation of a map that must not bend what is seen [m]"
+        default=1.0, description="standard deviation of a map that must not distort the session [m]"
     )
 
     @property
@@ -214,25 +216,22 @@ class CheckConfig(Section):
     lags_s: tuple[Positive, ...] = Field(
         default=(1.0, 4.0),
         min_length=1,
-        description="sightings that are compared are at least so far apart, and at most twice as far [s]",
+        description="minimum time between compared sightings; the maximum is twice as long [s]",
     )
     most_pairs: Count = Field(default=1000, description="pairs of sightings compared for each lag, at most")
     fits: Positive = Field(
-        default=0.03, description="difference between two readings that is usual: share of the range, and rad"
+        default=0.03, description="usual difference between two readings: share of the range, and rad"
     )
     apart: Positive = Field(
-        default=3.0, description="a pair distinguishes two explanations that differ by so many median residuals"
+        default=3.0, description="difference in median residuals by which a pair distinguishes two explanations"
     )
-    agreed: Share = Field(
-        default=0.8, description="share of those pairs that a mistake has to explain before it is reported"
-    )
-    fewest: Count = Field(default=20, description="pairs that decide, at least")
-    gain: Positive = Field(default=20.0, description="log likelihood of all pairs that a mistake must raise by")
-    off: Positive = Field(
-        default=0.3, description="median residual beyond which readings and odometry have nothing to do with each other"
-    )
+    agreed: Share = Field(default=0.8, description="share of those pairs that a mistake must explain to be reported")
+    fewest: Count = Field(default=20, description="minimum number of such pairs")
+    gain: Positive = Field(default=20.0, description="minimum gain in log likelihood of a mistake over all pairs")
+    off: Positive = Field(default=0.3, description="median residual above which readings and odometry are unrelated")
     own_ids: Count = Field(
-        default=50, description="landmarks, hardly any seen twice, from which on it is no recording of landmarks"
+        default=50,
+        description="number of landmarks above which hardly any second sighting indicates that ids name detections",
     )
     far_off: Positive = Field(
         default=5.0, description="standard deviations of its prior beyond which a calibration state is reported"
@@ -242,20 +241,21 @@ class CheckConfig(Section):
 class CleaningConfig(Section):
     """What is left out of the recording of a session as impossible; see `slam.cleaning`."""
 
-    fastest: Positive = Field(default=100.0, description="speed beyond which odometry is left out [m/s, rad/s]")
-    hardest: Positive = Field(default=20.0, description="acceleration that makes a spike of odometry [m/s^2, rad/s^2]")
+    fastest: Positive = Field(default=100.0, description="speed above which odometry is dropped [m/s, rad/s]")
+    hardest: Positive = Field(default=20.0, description="acceleration above which odometry is a spike [m/s^2, rad/s^2]")
     sharpest: Positive = Field(default=2.0, description="change of speed that is never a spike [m/s, rad/s]")
     too_far: float = Field(
-        default=2.0, ge=1.0, description="factor on the largest range beyond which a reading is left out"
+        default=2.0, ge=1.0, description="factor on the maximum range above which a reading is dropped"
     )
     far_from_median: float = Field(
-        default=100.0, ge=1.0, description="the same on the median range, for a sensor without a largest range"
+        default=100.0, ge=1.0, description="the same on the median range, for a sensor without a maximum range"
     )
     moved: Positive = Field(
-        default=0.1, description="motion after which no sensor gives the very same readings again [m, rad]"
+        default=0.1, description="motion after which identical readings indicate stale data [m, rad]"
     )
     stray_s: Positive = Field(
-        default=10.0, description="stamps farther from those around, and frames from odometry, are left out [s]"
+        default=10.0,
+        description="distance from neighbouring stamps, and of frames from odometry, above which they are dropped [s]",
     )
     step_s: Positive = Field(default=1.0, description="smallest step of a clock that is repaired [s]")
     around: int = Field(default=9, ge=3, le=999, description="messages that a stamp is compared with; an odd number")
@@ -339,22 +339,26 @@ class SpaceConfig(Section):
         default=0.0,
         ge=0,
         le=10,
-        description="how far sensors may be from their mounts as stated [m]; 0: exactly there",
+        description="standard deviation of the mounts' positions [m]; 0: exactly as stated",
     )
     mount_sigma_rad: float = Field(
-        default=0.0, ge=0, le=3, description="how far they may be turned from there [rad]; 0: not at all"
+        default=0.0,
+        ge=0,
+        le=3,
+        description="standard deviation of the mounts' orientations [rad]; 0: exactly as stated",
     )
     delay_sigma_s: float = Field(
         default=0.0,
         ge=0,
         le=10,
-        description="how late the stamps of sensors may be [s]; 0: not at all",
+        description="standard deviation of the delay of the sensors' stamps [s]; 0: no delay",
     )
     range_scale: float | None = Field(
         default=None,
         gt=0.5,
         lt=2.0,
-        description="factor on the ranges of boxes without identity; unset: by what stands, the odometry's metre holds",
+        description="factor on the ranges of boxes without identity; unset: estimated from static objects, in the "
+        "odometry's scale",
     )
     sigma_m: Positive = Field(default=0.005, description="noise of unstated positions at no range [m] ...")
     sigma_along: NotNegative = Field(default=0.02, description="... along the ray, as a share of the range ...")
@@ -424,31 +428,33 @@ class NoiseConfig(Section):
     sideways_by_distance: Positive = Field(default=0.03, description="of sideways motion, by distance [m/sqrt(m)]")
     turn_by_time: Positive = Field(default=0.01, description="of turning, by time [rad/sqrt(s)]")
     turn_by_turn: Positive = Field(default=0.05, description="of turning, by angle turned [rad/sqrt(rad)]")
-    pseudo_count: Positive = Field(default=1.0, description="residuals that these levels count for in what is learned")
+    pseudo_count: Positive = Field(default=1.0, description="pseudo-residuals of these levels")
 
 
 class SlamConfig(Section):
     """The estimator."""
 
     method: Literal["nohyp", "max-mixture", "nn", "em", "mcts", "viterbi", "joint"] = Field(
-        default="joint", description="how landmarks that moved are explained; 'nohyp' takes the world to be static"
+        default="joint", description="method that finds moved landmarks; 'nohyp' assumes a static world"
     )
 
     sensor_model: Literal["calibrated", "plain"] = Field(
         default="calibrated",
-        description="'calibrated' estimates sensor and odometry errors with the map, 'plain' believes all readings",
+        description="'calibrated' estimates sensor and odometry errors with the map, 'plain' trusts all readings",
     )
     unknown_ids: bool | Literal["empty"] = Field(
         default=False,
-        description="associate by geometry: true ignores the identities that detections carry, 'empty' is for those "
-        "without one only",
+        description="associate by geometry: true ignores all identities, 'empty' associates only detections without "
+        "one",
     )
     vote_ids: bool = Field(
         default=True,
-        description="leave out identities that other detections at the same place within seconds contradict, and those "
-        "that are on two landmarks",
+        description="remove identities that other detections at the same place within seconds contradict, and those on "
+        "two landmarks",
     )
-    robust: bool = Field(default=True, description="down-weight detections of wrong identity; off only for comparison")
+    robust: bool = Field(
+        default=True, description="down-weight detections with a wrong identity; off only for comparison"
+    )
     outlier_log_odds: float = Field(
         default=7.0,
         gt=0,
@@ -463,34 +469,32 @@ class SlamConfig(Section):
     )
     odometry_noise_factor: Positive = Field(
         default=1.0,
-        description="factor on the odometry noise that a run starts from, and keeps where estimate_noise is off",
+        description="factor on the initial odometry noise, kept if estimate_noise is off",
     )
-    seed: int = Field(default=0, ge=0, description="seed of everything random")
-    calibration: CalibrationConfig = Field(
-        default_factory=CalibrationConfig, description="which calibration states are estimated"
-    )
+    seed: int = Field(default=0, ge=0, description="random seed")
+    calibration: CalibrationConfig = Field(default_factory=CalibrationConfig, description="calibration states")
     modes: ModesConfig = Field(
         default_factory=ModesConfig, description="methods 'max-mixture' to 'viterbi': landmarks with several positions"
     )
     changes: ChangesConfig = Field(
-        default_factory=ChangesConfig, description="method 'joint': which landmarks moved together"
+        default_factory=ChangesConfig, description="method 'joint': groups of moved landmarks"
     )
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="noise levels to start from")
     odometry: OdometryConfig = Field(default_factory=OdometryConfig, description="silences and jitter of the odometry")
     votes: VotesConfig = Field(default_factory=VotesConfig, description="identities that were read wrongly")
     localize: LocalizeConfig = Field(default_factory=LocalizeConfig, description="where a robot is in a map")
     space: SpaceConfig = Field(default_factory=SpaceConfig, description="sensors in space")
-    check: CheckConfig = Field(default_factory=CheckConfig, description="what makes a recording odd")
+    check: CheckConfig = Field(default_factory=CheckConfig, description="thresholds of the recording check")
     cleaning: CleaningConfig = Field(
-        default_factory=CleaningConfig, description="what is impossible in the recording of a session"
+        default_factory=CleaningConfig, description="limits for dropping defects of a recording"
     )
 
 
 class SensorConfig(Section):
     """Corrections of what the recording says about its sensor; unset fields keep the recording's value."""
 
-    range_min_m: float | None = Field(default=None, ge=0, description="smallest range that is reported [m]")
-    range_max_m: Positive | None = Field(default=None, description="largest range that is reported [m]")
+    range_min_m: float | None = Field(default=None, ge=0, description="minimum range [m]")
+    range_max_m: Positive | None = Field(default=None, description="maximum range [m]")
     bearing_min_rad: float | None = Field(
         default=None, ge=-3.2, le=3.2, description="right edge of the field of view [rad]"
     )
@@ -506,23 +510,24 @@ class SensorConfig(Section):
     mount_robot_sensor: tuple[float, float, float] | None = Field(
         default=None, description="pose of the sensor on the robot: x [m], y [m], theta [rad]"
     )
-    kind: SensorKind | None = Field(
-        default=None, description="kind of sensor, by which its errors are as usual, not larger"
-    )
+    kind: SensorKind | None = Field(default=None, description="kind of sensor, which sets the priors of its errors")
     sigma_scale: float | None = Field(
-        default=None, ge=0, le=1, description="standard deviation of the scale of its ranges, a share"
+        default=None, ge=0, le=1, description="relative standard deviation of the scale of its ranges"
     )
     sigma_offset_m: float | None = Field(
-        default=None, ge=0, description="standard deviation of what is added to all its ranges [m]"
+        default=None, ge=0, description="standard deviation of the offset of its ranges [m]"
     )
     sigma_angle_rad: float | None = Field(
-        default=None, ge=0, le=6.3, description="standard deviation of its angle in the mount [rad]"
+        default=None, ge=0, le=6.3, description="standard deviation of its mounting angle [rad]"
     )
     sigma_odometer_scale: float | None = Field(
-        default=None, ge=0, le=1, description="standard deviation of the scale of the odometer, a share"
+        default=None, ge=0, le=1, description="relative standard deviation of the scale of the odometer"
     )
     sigma_askew_rad: float | None = Field(
-        default=None, ge=0, le=6.3, description="standard deviation of the direction of driving, from the front [rad]"
+        default=None,
+        ge=0,
+        le=6.3,
+        description="standard deviation of the driving direction relative to the front [rad]",
     )
 
     def applied_to(self, sensor: Sensor) -> Sensor:
@@ -542,7 +547,7 @@ class OutputConfig(Section):
 
     figures: bool = Field(default=True, description="draw the figures")
     report: bool = Field(default=True, description="write report.html")
-    rerun: bool = Field(default=False, description="write scene.rrd for the rerun viewer, where rerun-sdk is installed")
+    rerun: bool = Field(default=False, description="write scene.rrd for the rerun viewer, if rerun-sdk is installed")
     mcap: bool = Field(default=False, description="write run.mcap for Foxglove and ROS 2, which needs rosbags")
     score_rate_hz: float = Field(
         default=2.0, gt=0, le=1000, description="rate at which a trajectory is compared with truth"

@@ -23,18 +23,20 @@ class PersistConfig(Section):
     class_priors: dict[str, str] = Field(default_factory=dict, description="the same for single classes, by name")
     recurrent: str = Field(
         default=NO_RECURRENCE,
-        description="how features come back: 'none' for one stay, a kind of model to learn, or 'auto'",
+        description="how features return: 'none' for one stay, a kind of model to learn, or 'auto'",
     )
     per: Literal["auto", "all", "class", "feature"] = Field(
-        default="auto", description="whose looks are put together to learn"
+        default="auto", description="which features share a learned model"
     )
-    model: str = Field(default="", description="file of a model that was learned before; '' learns it from the table")
+    model: str = Field(default="", description="file of a learned model; '' learns it from the table")
     learn_from: int = Field(
-        default=100_000, ge=2, description="looks to learn from, at most: all those at some of the features, at random"
+        default=100_000,
+        ge=2,
+        description="maximum number of looks to learn from: all looks at a random subset of features",
     )
     most_features_alone: Count = Field(default=32, description="with more features, 'auto' learns one model for all")
     fewest_looks_alone: Count = Field(
-        default=200, description="looks at each feature from which on 'auto' learns a model for each"
+        default=200, description="looks per feature above which 'auto' learns a model for each"
     )
     query: Literal["times", "grid"] = Field(
         default="times", description="'times' asks for the belief at the time of every row, 'grid' at regular times"
@@ -46,7 +48,7 @@ class PersistConfig(Section):
     forecast_steps: Count = Field(default=10, description="steps of a forecast, where step_s is unset")
     grid_steps: Count = Field(default=200, description="about so many steps of the grid, where step_s is unset")
     horizon_share: Positive = Field(default=0.25, description="horizon as a share of the span, where none is given")
-    confidence: float = Field(default=0.9, gt=0.5, lt=1.0, description="belief from which on a change is reported")
+    confidence: float = Field(default=0.9, gt=0.5, lt=1.0, description="belief above which a change is reported")
     tail: float = Field(
         default=0.025,
         gt=0.0,
@@ -122,7 +124,7 @@ class TrackerConfig(Section):
     """What the tracker assumes about objects and their detector."""
 
     motion: Literal["acceleration", "velocity"] = Field(
-        default="acceleration", description="what is constant while nothing is seen: nine states, or six"
+        default="acceleration", description="constant quantity of the motion model: nine states, or six"
     )
     motion_density: Positive = Field(
         default=0.1, description="spectral density, each axis, of white jerk [m^2/s^5] or white acceleration [m^2/s^3]"
@@ -130,52 +132,56 @@ class TrackerConfig(Section):
     sigma_velocity_mps: Positive = Field(
         default=1.0, description="standard deviation of a new object's velocity, each axis [m/s]"
     )
-    sigma_acceleration_mps2: Positive = Field(default=0.5, description="the same of its acceleration [m/s^2]")
+    sigma_acceleration_mps2: Positive = Field(default=0.5, description="the same for its acceleration [m/s^2]")
     sigma_position_m: Positive = Field(
-        default=0.3, description="noise of a detection, each axis, where none is given with it [m]"
+        default=0.3, description="noise of a detection without a covariance, each axis [m]"
     )
-    gate_probability: Share = Field(
-        default=0.9999, description="share of an object's own detections that its gate lets through"
-    )
+    gate_probability: Share = Field(default=0.9999, description="share of an object's own detections within its gate")
     p_detect: Share = Field(
-        default=0.9, description="probability to detect an object in view, where no view says better"
+        default=0.9, description="probability to detect an object in view, without a detection model"
     )
     clutter_per_m3: Positive = Field(
-        default=1e-4, description="false detections and first sightings, a frame and cubic metre"
+        default=1e-4, description="false detections and first sightings per frame and cubic metre"
     )
     p_real: Share = Field(
-        default=0.5, description="probability that a detection of no known object is an object, not a false alarm"
+        default=0.5, description="probability that an unassigned detection is an object, not a false alarm"
     )
-    sigma_face_m: NotNegative = Field(default=0.05, description="noise of where a face of a detected box is [m] ...")
+    sigma_face_m: NotNegative = Field(
+        default=0.05, description="noise of the position of a face of a detected box [m] ..."
+    )
     sigma_face_share: NotNegative = Field(default=0.035, description="... and as a share of the box's size")
     speed_per_length_hz: NotNegative = Field(
         default=3.0,
-        description="standard deviation of a new box's speed along its heading, in its lengths a second [Hz]",
+        description="standard deviation of a new box's speed along its heading, in its lengths per second [Hz]",
     )
     score_midpoint: float = Field(
         default=3.7, description="score at which a first detection is as likely real as false, unless all are in [0, 1]"
     )
-    score_scale: Positive = Field(default=1.2, description="score by which the log odds of that grow by one")
+    score_scale: Positive = Field(
+        default=1.2, description="increase of the score that adds one to the log odds of that"
+    )
     score_memory: float = Field(
-        default=0.85, gt=0.0, le=1.0, description="weight of an object's older scores for each newer one"
+        default=0.85, gt=0.0, le=1.0, description="weight of an object's older scores after each newer one"
     )
     seen_nats: NotNegative = Field(
-        default=0.4, description="log odds to be real, beside the scores, times the log of the number of detections"
+        default=0.4, description="factor on the log of the number of detections in the log odds of being real"
     )
-    missed_nats: NotNegative = Field(default=1.0, description="log odds to be real that every frame without one takes")
+    missed_nats: NotNegative = Field(
+        default=1.0, description="reduction of the log odds of being real by every frame without a detection"
+    )
     p_believed: Share = Field(
-        default=0.5, description="belief by its scores from which on a tracklet is ALIVE, where detections have scores"
+        default=0.5, description="belief by scores above which a tracklet is ALIVE, for detections with scores"
     )
-    p_confirm: Share = Field(default=0.999, description="belief from which on a tracklet is ALIVE")
+    p_confirm: Share = Field(default=0.999, description="belief above which a tracklet is ALIVE")
     p_dead: Share = Field(default=0.01, description="belief below which a tracklet is DEAD")
     warm_up: Count = Field(default=3, description="detections that a tracklet needs to be ALIVE")
-    lost_after: Count = Field(default=3, description="frames without a detection in a row until a tracklet is LOST")
+    lost_after: Count = Field(default=3, description="consecutive frames without a detection until a tracklet is LOST")
     max_missed: Count = Field(
-        default=10, description="frames without a detection in a row until it is given up: kept in mind if it rests"
+        default=10, description="consecutive frames without a detection until it is deleted, or stored if it is at rest"
     )
     vanish_rate_hz: NotNegative = Field(default=1e-3, description="rate at which objects in view cease to exist [1/s]")
     class_speed_mps: Positive | tuple[Positive, ...] = Field(
-        default=0.5, description="speed above which an object is dynamic [m/s]: one for all, or one a class"
+        default=0.5, description="speed above which an object is dynamic [m/s]: one for all, or one per class"
     )
     rest_for_s: NotNegative = Field(default=2.0, description="time without motion before an object is static [s]")
     p_off_class: Share = Field(default=0.05, description="probability of a wrong class, without a confusion matrix")
@@ -183,16 +189,16 @@ class TrackerConfig(Section):
         default=20.0, description="log likelihood ratio between equal appearances and unrelated ones"
     )
     appearance_neutral: float = Field(
-        default=0.7, ge=-1.0, lt=1.0, description="cosine of two appearances that says nothing"
+        default=0.7, ge=-1.0, lt=1.0, description="cosine of two appearances that is no evidence"
     )
     appearance_memory: float = Field(
-        default=0.9, ge=0.0, lt=1.0, description="share of the old appearance that a new detection leaves"
+        default=0.9, ge=0.0, lt=1.0, description="weight of the old appearance after a new detection"
     )
     place_sigma_m: Positive = Field(
-        default=0.2, description="how exactly a static object is found again in its place, beside the noise [m]"
+        default=0.2, description="position tolerance of re-identification at rest, in addition to the noise [m]"
     )
     moved_reach_m: NotNegative = Field(
-        default=0.0, description="how far objects may be moved while out of view, 0 if never; wants appearances [m]"
+        default=0.0, description="how far objects may be moved while out of view, 0 if never; needs appearances [m]"
     )
     p_moved: Share = Field(default=0.01, description="probability of that")
     chunk_m: Positive = Field(default=10.0, description="side of the working set's square chunks [m]")
@@ -272,25 +278,25 @@ class TrackConfig(TrackerConfig):
     )
     prior: str = Field(default=DEFAULT_PRIOR, description="lifetime of objects at rest")
     class_priors: dict[str, str] = Field(default_factory=dict, description="the same for single classes, by name")
-    range_m: Positive | None = Field(
-        default=None, description="the sensor's reach [m]; unset: nothing is known of what should be seen"
-    )
+    range_m: Positive | None = Field(default=None, description="range of the sensor [m]; unset: misses are no evidence")
     fov_deg: float | None = Field(
         default=None,
         gt=0.0,
         le=360.0,
         description="horizontal field of view, ahead of the sensor [deg], with `range_m` and poses; unset: all around",
     )
-    min_score: float | None = Field(default=None, description="detections of a lower score are left out; unset: none")
+    min_score: float | None = Field(default=None, description="minimum score of detections; unset: none")
     gap_s: Positive | None = Field(
-        default=None, description="a longer time between two frames is one without any look [s]; unset: chosen"
+        default=None, description="a longer time between two frames counts as a gap without looks [s]; unset: chosen"
     )
-    gap_steps: float = Field(default=10.0, gt=1.0, description="that time in usual steps, where gap_s is unset")
+    gap_steps: float = Field(default=10.0, gt=1.0, description="that time in usual steps, if gap_s is unset")
 
 
 class SurvivalConfig(Section):
     """Lifetimes estimated from a table of which only bounds are known."""
 
-    estimator: str = Field(default="npmle", description="how to estimate, as `evermap survival fit --help` lists them")
-    by: str = Field(default="", description="what is estimated separately: '', 'class', 'chunk', or 'class,chunk'")
+    estimator: str = Field(default="npmle", description="estimator, as listed by `evermap survival fit --help`")
+    by: str = Field(
+        default="", description="groups that are estimated separately: '', 'class', 'chunk', or 'class,chunk'"
+    )
     chunk_m: Positive = Field(default=10.0, description="side of the square chunks [m]")

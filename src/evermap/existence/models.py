@@ -190,7 +190,7 @@ def load_model(path: str | Path) -> PresenceModel:
     """
     models = load_models(path).models
     if set(models) != {""}:
-        raise InputError("holds several models, not one", path=path, hint="load_models(), which reads all")
+        raise InputError("contains several models, not one", path=path, hint="load_models(), which reads all")
     return models[""]
 
 
@@ -256,7 +256,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"is not JSON of a model: {error}", path=path) from error
     if not isinstance(data, dict):
-        raise InputError("holds no model of presence", path=path)
+        raise InputError("contains no model of presence", path=path)
     version = data.get("schema_version")
     if version != SCHEMA_VERSION:
         raise InputError(

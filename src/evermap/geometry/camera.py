@@ -58,7 +58,7 @@ def unproject(pixel: FloatArray, sensor: SpatialSensor) -> FloatArray:
 
 def _intrinsics(sensor: SpatialSensor) -> tuple[FloatArray, FloatArray]:
     """Focal lengths (2,) and principal point (2,) [px]."""
-    assert sensor.intrinsics is not None, f"{sensor.name} is no camera"
+    assert sensor.intrinsics is not None, f"{sensor.name} is not a camera"
     fx, fy, cx, cy = sensor.intrinsics
     return np.array([fx, fy]), np.array([cx, cy])
 

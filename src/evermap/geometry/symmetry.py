@@ -20,7 +20,7 @@ MOST_TURNS = 360
 SAME, ROUNDED = 1e-9, 1e-3
 """Cosines that are equal; parts of a full turn that are a whole number, of degrees with few digits."""
 AXES = "xyz"
-HINT = "axis:z (any turn about z), 180:z (half a turn about z, or another whole part of 360 degrees), or any"
+HINT = "axis:z (any rotation about z), 180:z (half a turn about z, or another integer fraction of 360 degrees), or any"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Symmetry:
             else:
                 turns.append(_part(text, kind, AXES.index(name)))
         if len(axes) > 1:
-            raise ValueError("two axes make every turn; that is 'any'")
+            raise ValueError("two axes generate all rotations; that is 'any'")
         axis = axes.pop() if axes else -1
         return cls(axis, _closed(turns, axis))
 
@@ -179,7 +179,7 @@ def _part(text: str, degrees: str, axis: int) -> FloatArray:
         raise ValueError(f"unknown symmetry '{text}'") from None
     parts = 360.0 / angle if 1.0 <= angle <= 180.0 else 0.5
     if abs(parts - round(parts)) > ROUNDED:
-        raise ValueError(f"'{text}': {degrees} degrees are no whole part of a full turn")
+        raise ValueError(f"'{text}': {degrees} degrees are not an integer fraction of a full turn")
     return se3.exp(np.eye(6)[3 + axis] * 2.0 * np.pi / round(parts))[3:]
 
 
@@ -189,7 +189,7 @@ def _closed(generators: list[FloatArray], axis: int) -> FloatArray:
     if axis >= 0:
         up = [abs(se3.rotation_of(_poses(one))[axis, axis]) for one in generators]
         if any(cosine < 1.0 - SAME for cosine in up):
-            raise ValueError("an axis that is turned makes every turn; that is 'any'")
+            raise ValueError("a rotated axis generates all rotations; that is 'any'")
     group = Symmetry(axis)
     while len(new):
         products = [se3.compose(one, _poses(turn)) for one in new for turn in generators]
@@ -198,7 +198,7 @@ def _closed(generators: list[FloatArray], axis: int) -> FloatArray:
             if group.angle_between(found, one).min() > 1e-6:
                 found, new = np.vstack([found, one]), np.vstack([new, one])
         if len(found) > MOST_TURNS:
-            raise ValueError("the turns together generate no finite group")
+            raise ValueError("the rotations do not generate a finite group")
     return found[:, 3:]
 
 

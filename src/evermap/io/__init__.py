@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 READERS: tuple[Reader, ...] = (MRCLAM, TAGSLAM, YCBV, BAG, NATIVE)
-"""All formats, in the order in which they are asked. A new reader is added here and nowhere else."""
+"""All readers, in the order in which they are tried. Add a new reader here and nowhere else."""
 
 
 def reader_for(path: str | Path) -> Reader:
@@ -61,7 +61,7 @@ def reader_for(path: str | Path) -> Reader:
     names = sorted(name for files in found for name in files.members)
     holds = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "") if names else "no files"
     wanted = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in READERS)
-    raise InputError(f"no recording found, it holds {holds}; looked for {wanted}", path=path)
+    raise InputError(f"no recording found, it contains {holds}; looked for {wanted}", path=path)
 
 
 def read_recording(
@@ -82,7 +82,7 @@ def read_recording(
     if topics is None:
         return reader.read(Path(path), robot)
     if reader is not BAG:
-        raise InputError("has no topics", path=path, hint="leave --topics out; it is for bags")
+        raise InputError("has no topics", path=path, hint="omit --topics; it is for bags")
     return read_bag(path, robot, topics)
 
 
@@ -95,7 +95,7 @@ def read_planar(path: str | Path, robot: int | None = None) -> Recording:
     """
     recording = read_recording(path, robot)
     if not isinstance(recording, Recording):
-        raise InputError("the recording is in space; this works in the plane", path=path)
+        raise InputError("the recording is in space; this works in the plane only", path=path)
     return recording
 
 

@@ -30,10 +30,10 @@ from evermap.types import (
 from evermap.valid import STAMP_S, validate, validate_spatial
 
 SAME_STAMP_S: float = 1e-6
-"""Stamps closer than this are the same instant when detections are put into frames."""
+"""Stamps closer than this are the same instant when detections are assigned to frames."""
 
 ODOMETRY_GAP_S: float = 10.0
-"""Pauses of the odometry beyond this are reported, and frames farther than this from any odometry are left out."""
+"""Longer pauses of the odometry are reported, and frames farther than this from any odometry are dropped."""
 
 
 _Seen = TypeVar("_Seen", Detections, SpatialDetections)
@@ -132,7 +132,7 @@ def finish_recording(recording: _Recorded, *, warnings: list[str]) -> _Recorded:
         frames, detections = _without_far_frames(odometry, recording.frames, recording.detections, source, warnings)
         recording = replace(recording, frames=frames, detections=detections)
     if len(recording.detections) == 0:
-        raise DataError("no landmark was seen while there was odometry", path=source)
+        raise DataError("no landmark was detected during the odometry", path=source)
     _warn_of_repeats(recording.detections, warnings)
     return replace(recording, warnings=tuple(warnings))
 
@@ -199,6 +199,6 @@ def _nearest_look(stamp_s: FloatArray, looked_s: FloatArray, table: Table, frame
         row, file = int(lost[0]), frame_table.path.name
         near = f"; the nearest is {float(padded_s[nearest[row]])!r}" if len(looked_s) else ""
         problem = f"{float(stamp_s[row])!r} and {len(lost) - 1} more have no row in {file}{near}"
-        hint = f"list every instant at which the sensor looked, or leave {file} out"
+        hint = f"list every instant at which the sensor looked, or omit {file}"
         raise table.error(problem, row=row, field="stamp_s", hint=hint)
     return np.asarray(nearest - 1, dtype=np.int64)

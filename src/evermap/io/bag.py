@@ -50,17 +50,17 @@ from evermap.types import (
 from evermap.valid import CAMERA_MODELS, is_covariance
 
 METADATA = "metadata.yaml"
-"""Of a folder that is a bag of ROS 2."""
+"""Metadata file of a folder that is a ROS 2 bag."""
 FEWEST_LOOKS = 20
-"""From so many messages on, none of them empty, a detector says nothing where it sees nothing."""
+"""Messages above which a detector without any empty one is assumed to publish only detections."""
 LATE_S = 0.5
-"""By so much more than another's do a topic's messages arrive after their stamps where the two clocks differ."""
+"""Difference between the delays of two topics from stamp to arrival that indicates different clocks."""
 SINCE_1970_S = 1e8
-"""Stamps above count from 1970; those below from the start of a simulation."""
+"""Larger stamps count from 1970; smaller ones from the start of a simulation."""
 _TRUTH = re.compile(r"(^|[/_])(gt|truth|ground_?truth|mocap|vicon|vrpn|optitrack|qualisys)([/_]|$)")
 _NO_ODOMETRY = re.compile(r"amcl|goal|initialpose|target|plan|cmd|map_|landmark")
 _PICTURES = ("MarkerArray", "SceneUpdate")
-"""Messages that draw what others detected: read only where there is nothing else."""
+"""Visualisation messages: read only without other detections."""
 _MODELS = {"plumb_bob": "radtan", "radtan": "radtan", "equidistant": "equidistant", "": "pinhole"}
 
 
@@ -128,7 +128,7 @@ def read_bag(path: str | Path, robot: int | None = None, topics: str | Path | No
     """
     path = Path(path)
     if robot is not None:
-        raise InputError(f"there is no robot {robot}: a bag is of one", path=path, hint="leave it out")
+        raise InputError(f"there is no robot {robot}: a bag has one robot", path=path, hint="omit the robot")
     content, stated = scanned(path), settings_path(path) if topics is None else Path(topics)
     settings = guessed_settings(content)
     if topics is None and not stated.is_file():
@@ -156,12 +156,12 @@ def bag_settings(path: str | Path) -> str:
 _TEXTS = ("odometry", "truth", "base_frame", "clock")
 _OF_SENSOR = {"topic": str, "frame": str, "camera_info": str, "identity": str, "rectified": bool}
 _HEAD = """\
-# What evermap reads of this bag. It is guessed from the types of the messages: edit it, and it is read with the bag.
-# clock = "receive": the times at which messages were recorded, instead of their own stamps.
-# identity = "id", "class" or "none": what tells a landmark from others.
-# A section [camera.NAME] takes all that it may hold in a camera.toml, too, which goes before what the bag says:
+# What evermap reads from this bag, guessed from the message types. Edit it; it is read with the bag.
+# clock = "receive": recording times of the messages instead of their own stamps.
+# identity = "id", "class" or "none": the field that identifies a landmark.
+# A section [camera.NAME] takes all keys of a camera.toml, too, which override the bag:
 #   intrinsics = [fx, fy, cx, cy], model, distortion; [camera.NAME.mount] with x_m, y_m, z_m, roll_rad, ...
-# Tags of which messages hold only the corners need a size:
+# Tags need a size if the messages contain only their corners:
 # [tags]
 # size_m = 0.16
 
@@ -236,7 +236,7 @@ def stated_settings(path: Path, content: BagContent, guessed: BagSettings, *, wh
         if not isinstance(value, str):
             raise reader.error("bag", key, f"must be a text, not {type(value).__name__}")
     if given.get("clock", "header") not in ("header", "receive"):
-        raise reader.error("bag", "clock", f"no clock '{given['clock']}'", hint='"header" or "receive"')
+        raise reader.error("bag", "clock", f"unknown clock '{given['clock']}'", hint='"header" or "receive"')
     for key in ("odometry", "truth"):
         if given.get(key) and whole:
             _check_topic(reader, "bag", key, given[key], content.motion, "poses or velocities")
@@ -280,12 +280,12 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     if not settings.sensors:
         kinds = ", ".join(sorted({one.kind for one in content.topics.values()})) or "no topics"
         hint = "detections of apriltag_msgs, vision_msgs, aruco or fiducial_msgs, or markers in a frame of the robot"
-        raise InputError(f"holds no detections of landmarks; it holds {kinds}", path=path, hint=hint)
+        raise InputError(f"contains no detections of landmarks; it contains {kinds}", path=path, hint=hint)
     warnings: list[str] = []
     if guessed:
         read = ", ".join(one.topic for one in settings.sensors.values())
         moved = f"odometry {settings.odometry}" if settings.odometry else "no odometry"
-        warnings.append(f"topics as guessed: detections {read}; {moved} (`--init-bag` writes them to be edited)")
+        warnings.append(f"topics as guessed: detections {read}; {moved} (`--init-bag` writes them for editing)")
     sensors = tuple(mounted_sensor(path, content, settings, name, warnings) for name in settings.sensors)
     _tell_late(content, settings, warnings)
     stamps = [stamps_of(content, one.topic, settings.clock) for one in settings.sensors.values()]
@@ -368,8 +368,8 @@ def _tell_late(content: BagContent, settings: BagSettings, warnings: list[str]) 
     if late and max(late.values()) - min(late.values()) > LATE_S:
         slow, fast = max(late, key=lambda one: late[one]), min(late, key=lambda one: late[one])
         warnings.append(
-            f"messages of {slow} were recorded {late[slow] - late[fast]:.3g} s later after their stamps than those of "
-            f'{fast}: if their clocks differ, set clock = "receive" (`--init-bag`)'
+            f"messages of {slow} were recorded {late[slow] - late[fast]:.3g} s later, relative to their stamps, than "
+            f'those of {fast}: if their clocks differ, set clock = "receive" (`--init-bag`)'
         )
 
 
@@ -387,8 +387,8 @@ def mounted_sensor(
         mount = content.mount(settings.base_frame, one.frame)
         if mount is None:
             warnings.append(
-                f"no fixed transform from '{settings.base_frame}' to '{one.frame}': '{name}' is taken to be at the "
-                "robot's centre; state its mount (`--init-bag`)"
+                f"no fixed transform from '{settings.base_frame}' to '{one.frame}': '{name}' is assumed at the robot's "
+                f"centre; state its mount (`--init-bag`)"
             )
         sensor = replace(sensor, mount_robot_sensor=tuple((se3.identity() if mount is None else mount).tolist()))
     if sensor.intrinsics is not None or not one.camera_info:
@@ -402,7 +402,7 @@ def mounted_sensor(
     if not len(used):
         model = "pinhole"
     if model is None or len(used) > max(CAMERA_MODELS[model]) or not (k[0, 0] > 0.0 and k[1, 1] > 0.0):
-        problem = f"{one.camera_info} is of no camera model that is known: '{info.distortion_model}'"
+        problem = f"{one.camera_info} has an unknown camera model: '{info.distortion_model}'"
         raise InputError(
             problem, path=path, hint="plumb_bob or equidistant; rectified = true; or state it (`--init-bag`)"
         )
@@ -449,12 +449,12 @@ def _placed(
     size = settings.rig.size_of(found.landmark_id)
     if (cornered & np.isnan(size)).all() and cornered.any():
         hint = f"`evermap slam --init-bag {path}`, then [tags] with size_m in {settings_path(path).name}"
-        raise DataError("does not say how large its tags are", path=path, hint=hint)
+        raise DataError("does not state the size of its tags", path=path, hint=hint)
     blind = np.array([one.intrinsics is None for one in sensors])[found.sensor] & (cornered | aimed)
     if blind.any():
         name = sensors[int(found.sensor[blind][0])].name
         hint = "record its CameraInfo, or state its intrinsics (`--init-bag`)"
-        raise DataError(f"holds no calibration of the camera '{name}'", path=path, hint=hint)
+        raise DataError(f"contains no calibration of the camera '{name}'", path=path, hint=hint)
     unturned = np.isnan(pose).any(axis=1) | ~(np.linalg.norm(pose[:, 3:], axis=1) > 1e-6)
     pose[unturned, 3:] = np.nan
     position, covariance = pose[:, :3].copy(), found.covariance_sensor_m2.copy()

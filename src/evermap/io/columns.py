@@ -137,12 +137,12 @@ class Columns:
                 raise self.error(problem, row=int(wrong[0]), field=name, hint="text or whole numbers")
             cells = arrow_cells(values, ~np.isnan(values)).cast(pa.int64())
         elif not _is_text(cells.type) and not pa.types.is_integer(cells.type) and not pa.types.is_null(cells.type):
-            raise self.error(f"holds {cells.type}, not names", row=None, field=name, hint="text or whole numbers")
+            raise self.error(f"contains {cells.type}, not names", row=None, field=name, hint="text or whole numbers")
         row_name, names = _coded(pc.utf8_trim_whitespace(cells.cast(pa.string())))
         for code, text in enumerate(names):
             if not text.isprintable():
                 row = int(np.argmax(row_name == code))
-                raise self.error("holds a character that cannot be printed", row=row, field=name)
+                raise self.error("contains a character that cannot be printed", row=row, field=name)
         order = sorted((code for code, text in enumerate(names) if text), key=_natural(names))
         rank = np.full(len(names) + 1, UNKNOWN, dtype=np.int64)  # one more for the code -1 of a missing cell
         rank[order] = np.arange(len(order))
@@ -160,7 +160,7 @@ class Columns:
             return self._table({name: dates_as_text(cells)}).numbers(Quantity(name, optional=True, dates=True))
         fits = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean, pa.types.is_null)
         if not any(is_kind(kind) for is_kind in fits):
-            raise self.error(f"holds {kind}, not numbers", row=None, field=name, hint="cast the column to float64")
+            raise self.error(f"contains {kind}, not numbers", row=None, field=name, hint="cast the column to float64")
         return _as_float(cells)
 
 

@@ -76,7 +76,9 @@ class FileSet:
             raise InputError(f"cannot be read: {error.strerror or error}", path=self.path_of(name)) from error
         except (*_ZIP_ERRORS, KeyError) as error:
             raise InputError(
-                f"damaged inside the zip: {reason(error)}", path=self.path_of(name), hint="fetch or pack the zip again"
+                f"damaged inside the zip: {reason(error)}",
+                path=self.path_of(name),
+                hint="download or create the zip again",
             ) from error
 
 
@@ -116,7 +118,7 @@ def find_file_set(path: str | Path, wanted: Callable[[FileSet], bool]) -> FileSe
     outermost = [files for files in found if _depth(files) == depth]
     if len(outermost) > 1:
         names = ", ".join(sorted(files.folder for files in outermost))
-        raise InputError(f"holds {len(outermost)} recordings: {names}", path=path, hint="give one of them")
+        raise InputError(f"contains {len(outermost)} recordings: {names}", path=path, hint="name one of them")
     return outermost[0]
 
 
@@ -146,7 +148,7 @@ def _zip_sets(path: Path) -> list[FileSet]:
             names = [info.filename for info in archive.infolist() if not info.is_dir()]
     except _ZIP_ERRORS as error:
         raise InputError(
-            f"not a readable zip: {reason(error)}", path=path, hint="fetch or pack the zip again"
+            f"not a readable zip: {reason(error)}", path=path, hint="download or create the zip again"
         ) from error
     folders: dict[str, dict[str, str]] = {}
     for name in names:
@@ -170,7 +172,9 @@ def unpacked(data: bytes, path: Path) -> bytes:
     try:
         return gzip.decompress(data)
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"damaged gzip file: {reason(error)}", path=path, hint="fetch or pack it again") from error
+        raise InputError(
+            f"damaged gzip file: {reason(error)}", path=path, hint="download or create it again"
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,9 +15,9 @@ from evermap.types import FloatArray, Landmarks
 
 MOST_CELLS = 50_000_000
 MARGIN_M = 1.0
-"""Of free space around all landmarks."""
+"""Margin of free space around all landmarks."""
 LEAST_SPEED = 0.1
-"""Nothing is slower than this share of the greatest speed: to Nav2 a limit of 0 is none at all."""
+"""Minimum share of the maximum speed: Nav2 reads a limit of 0 as no limit."""
 
 
 class Footprints(NamedTuple):

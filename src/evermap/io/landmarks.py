@@ -81,7 +81,7 @@ def read_prior_map(path: str | Path, sigma_m: float = 0.02, sigma_rad: float = 0
         raise InputError(f"sigma of its orientations must be a positive number of radians, not {sigma_rad}")
     landmarks = read_landmarks(path, sigma_m=sigma_m, sigma_rad=sigma_rad)
     if len(landmarks) == 0:
-        raise DataError("the map holds no landmark", path=path)
+        raise DataError("the map contains no landmark", path=path)
     return replace(landmarks, frame="prior_map")
 
 
@@ -110,7 +110,7 @@ def read_landmarks(path: str | Path, *, sigma_m: float = 0.0, sigma_rad: float =
         table = tags_of_fiducials(data, path)
     else:
         hint = ".csv, .parquet, .geojson; of tags .yaml (TagSLAM), .json (WPILib), .txt (fiducial_slam)"
-        raise InputError(f"no map format ends in '{ending}'", path=path, hint=hint)
+        raise InputError(f"unknown map format '{ending}'", path=path, hint=hint)
     return landmarks_from_table(
         map_of_survey(table) if "tag_id" in table and "landmark_id" not in table else table,
         sigma_m=sigma_m,
@@ -437,7 +437,7 @@ def parse_geojson(data: bytes, path: Path) -> tuple[Table, dict[str, Any]]:
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError("no GeoJSON feature collection", path=path, field="features")
     if "evermap" not in document:
-        problem = "does not say that its coordinates are metres in a local frame"
+        problem = "does not state that its coordinates are metres in a local frame"
         hint = 'a top-level member "evermap": {"frame": "prior_map"}'
         raise InputError(problem, path=path, field="evermap", hint=hint)
     about = checked_about(document["evermap"], path)

@@ -58,11 +58,12 @@ CAMERA = Sensor(
     p_detect=0.4,
     p_false=0.001,
 )
-"""The robots' forward camera. Rounded outwards from what all robots report (0.8 to 9.6 m, -0.59 to 0.57 rad); no truth
-is used. Of the barcodes in view it decodes less than half. Noise is left to be estimated from the recording."""
+"""The robots' forward camera. Rounded outwards from the readings of all robots (0.8 to 9.6 m, -0.59 to 0.57 rad),
+without the truth. It decodes less than half of the barcodes in view. Noise is estimated from the recording.
+"""
 
 MOST_STRAY = 1e-3
-"""Share of rows that may be out of order in a file that is put in order."""
+"""Maximum share of rows out of order in a file that is sorted."""
 
 _NAME = re.compile(r"Robot(\d{1,6})_(Odometry|Measurement)\.dat", re.ASCII)
 _SUBJECT = Quantity("subject", 1, 1e6, hint="subjects count from 1")
@@ -146,7 +147,7 @@ def _read_odometry(files: FileSet, robot: int, warnings: list[str]) -> Odometry:
     name = f"Robot{robot}_Odometry.dat"
     rows = _parse(files, name, (STAMP_S, FORWARD_MPS, ANGULAR_RADPS), warnings)
     if len(rows) == 0:
-        raise DataError("holds no odometry", path=rows.path)
+        raise DataError("contains no odometry", path=rows.path)
     rows = _forward_in_time(rows, warnings)
     return Odometry(
         stamp_s=rows.column(0),
@@ -164,7 +165,7 @@ def _read_measurements(
     # the file's second column is headed 'Subject #' but holds barcodes
     rows = _parse(files, name, (STAMP_S, _BARCODE, RANGE_M, BEARING_RAD), warnings)
     if len(rows) == 0:
-        raise DataError("holds no measurement", path=rows.path)
+        raise DataError("contains no measurement", path=rows.path)
     rows = _sorted(rows, warnings)
     subject = _subjects(files, _whole(rows, 1, "barcode"), name, warnings)
     stamps, frame = np.unique(rows.column(0), return_inverse=True)
@@ -214,7 +215,7 @@ def _read_truth(files: FileSet, robot: int, warnings: list[str]) -> Trajectory |
         return None
     rows = _parse(files, name, (STAMP_S, X_M, Y_M, THETA_RAD), warnings)
     if len(rows) == 0:
-        warnings.append(f"{name}: holds no pose, taken as missing")
+        warnings.append(f"{name}: contains no pose, treated as missing")
         return None
     rows = _forward_in_time(rows, warnings)
     pose = rows.values[:, 1:].copy()
@@ -229,7 +230,7 @@ def _read_landmarks(files: FileSet, warnings: list[str]) -> Landmarks | None:
     sigmas = tuple(Quantity(f"{axis}_std_m", 0.0, 1e6, hint=_VARIANCE_HINT) for axis in "xy")
     rows = _parse(files, name, (_SUBJECT, X_M, Y_M, *sigmas), warnings)
     if len(rows) == 0:
-        warnings.append(f"{name}: holds no landmark, taken as missing")
+        warnings.append(f"{name}: contains no landmark, treated as missing")
         return None
     ids = _whole(rows, 0, "subject")
     _refuse_repeats(rows, ids, "subject")
@@ -261,7 +262,7 @@ def _sorted(rows: Rows, warnings: list[str]) -> Rows:
         check_forward(stamp_s, path=rows.path, line=rows.line)
     row = int(np.argmax(np.diff(stamp_s) < 0.0)) + 1
     where = f"time runs backwards at line {rows.line[row]}"
-    warnings.append(f"{rows.path.name}: {counted(stray, 'row')} out of order sorted in ({where})")
+    warnings.append(f"{rows.path.name}: {counted(stray, 'row')} out of order sorted ({where})")
     order = np.argsort(stamp_s, kind="stable")
     return Rows(rows.path, rows.values[order], rows.line[order])
 

@@ -60,8 +60,8 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
     if files is None:
         raise InputError("no native recording here", path=path, hint=NATIVE.looks_for)
     if robot is not None:
-        problem = f"there is no robot {robot}: a native recording is of one robot"
-        raise InputError(problem, path=path, hint="leave the robot out")
+        problem = f"there is no robot {robot}: a native recording has one robot"
+        raise InputError(problem, path=path, hint="omit the robot")
     warnings: list[str] = []
     _warn_of_similar_names(files, warnings)
     tables = {name: _read_table(files, name, warnings) for name in TABLES}
@@ -135,7 +135,7 @@ NATIVE = Reader("native", "folder or zip with odometry.csv and detections.csv (o
 
 def _read_settings(files: FileSet, warnings: list[str]) -> Settings:
     if SENSOR_FILE not in files:
-        warnings.append(f"no {SENSOR_FILE}: the sensor is assumed to see all around, from the robot's centre")
+        warnings.append(f"no {SENSOR_FILE}: the sensor is assumed to see in all directions, from the robot's centre")
         return Settings()
     return parse_sensor_toml(files.read(SENSOR_FILE), files.path_of(SENSOR_FILE))
 
@@ -145,7 +145,9 @@ def _read_table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
     if not present:
         return None
     if len(present) > 1:
-        raise InputError(f"lies beside {present[1]}", path=files.path_of(present[0]), hint="remove one of them")
+        raise InputError(
+            f"exists together with {present[1]}", path=files.path_of(present[0]), hint="remove one of them"
+        )
     file = present[0]
     data, path = files.read(file), files.path_of(file)
     return parse_parquet(data, path) if file.endswith(".parquet") else parse_csv(data, path, warnings)
@@ -158,7 +160,7 @@ def _odometry(table: Table, clock: Clock, warnings: list[str]) -> Odometry:
     else:
         table.expect(("stamp_s", *_INCREMENTS))
     if len(table) == 0:
-        raise DataError("holds no odometry", path=table.path)
+        raise DataError("contains no odometry", path=table.path)
     stamp_s = forward_stamps(table)
     if given is _VELOCITIES:
         keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
@@ -179,13 +181,13 @@ def _from_increments(
 ) -> Odometry:
     """Body velocities that hold from one stamp to the next and move by the increment given at the next."""
     if np.any(increments[0] != 0.0):
-        warnings.append(f"{table.path.name}: the first increment is left out, since its start is not known")
+        warnings.append(f"{table.path.name}: the first increment is ignored, since its start is unknown")
     step = np.diff(stamp_s)
     twice = np.flatnonzero(step == 0.0)
     if len(twice):
         # unlike of a velocity, neither of two increments can be dropped without losing motion
         row, problem = int(twice[0]) + 1, "two increments with the same stamp"
-        raise table.error(problem, row=row, field="stamp_s", hint="compose them into one row")
+        raise table.error(problem, row=row, field="stamp_s", hint="combine them into one row")
     if len(stamp_s) < 2:
         raise DataError("increments need at least two rows", path=table.path)
     twist = se2.log(increments[1:]) / step[:, None]
@@ -199,7 +201,7 @@ def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory
         return None
     table.expect(("stamp_s", "x_m", "y_m", "theta_rad"))
     if len(table) == 0:
-        warnings.append(f"{table.path.name}: holds no pose, taken as missing")
+        warnings.append(f"{table.path.name}: contains no pose, treated as missing")
         return None
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
@@ -225,9 +227,7 @@ def _clock(settings: Settings, tables: dict[str, Table | None], files: FileSet) 
     for clock, table in said.items():
         assert clock is not None
         if settings.clock not in (Clock.RECORDING, clock):
-            problem = (
-                f'dates that count {clock.value} seconds where {SENSOR_FILE} says clock = "{settings.clock.value}"'
-            )
+            problem = f'dates on the clock {clock.value}, but {SENSOR_FILE} has clock = "{settings.clock.value}"'
             hint = "dates with a zone are unix, dates without one local_wall"
             raise table.error(problem, row=0, field="stamp_s", hint=hint)
         return clock

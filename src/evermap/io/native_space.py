@@ -55,7 +55,7 @@ CORNERS = tuple(f"{axis}{corner}_px" for corner in range(4) for axis in "uv")
 POINT = ("u_px", "v_px")
 RIGHT = ("u_right_px", "v_right_px")
 IMAGE_BOX = ("left_px", "top_px", "right_px", "bottom_px")
-"""A box in the image, as object detectors give it beside a box in space; not used."""
+"""A box in the image, as object detectors give it in addition to a box in space; not used."""
 _WHERE = ("sensor", "camera")
 
 _IN_SPACE = {
@@ -133,7 +133,7 @@ def spatial_recording(
     )
     unknown = [name for name in rig.symmetries if name not in class_names]
     if unknown:
-        warnings.append(f"symmetries of classes that nothing has: {', '.join(unknown)}")
+        warnings.append(f"symmetries of unused classes: {', '.join(unknown)}")
     return finish_recording(recording, warnings=warnings)
 
 
@@ -155,7 +155,7 @@ def _odometry(table: Table | None, clock: Clock, warnings: list[str]) -> Spatial
     else:
         table.expect(("stamp_s", *given), VARIANCES)
     if len(table) == 0:
-        raise DataError("holds no odometry", path=table.path)
+        raise DataError("contains no odometry", path=table.path)
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
     if given is TWIST:
@@ -181,7 +181,7 @@ def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory
         return None
     table.expect(("stamp_s", *AT, *QUATERNION))
     if len(table) == 0:
-        warnings.append(f"{table.path.name}: holds no pose, taken as missing")
+        warnings.append(f"{table.path.name}: contains no pose, treated as missing")
         return None
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
@@ -244,9 +244,7 @@ def _form(table: Table) -> tuple[str, ...]:
     """The columns that say where a detection is, of the three ways to say it."""
     forms = [form for form in (AT, CORNERS, POINT) if table.has_any(form)]
     if not forms:
-        raise table.error(
-            "says nowhere where a landmark was seen", row=None, hint="x_m, y_m, z_m in the sensor's frame"
-        )
+        raise table.error("contains no position of a landmark", row=None, hint="x_m, y_m, z_m in the sensor's frame")
     if POINT in forms and len(forms) > 1:
         raise table.error(f"mixes u_px, v_px with {forms[0][0]}", row=None, hint="keep one form")
     return forms[0]
@@ -262,7 +260,7 @@ def _sensor_rows(table: Table, rig: Rig) -> IntArray:
     hint = "one of " + ", ".join(known)
     if "sensor" not in table:
         if len(known) > 1:
-            raise table.error("does not say which sensor saw it", row=None, field="sensor", hint=hint)
+            raise table.error("does not name its sensor", row=None, field="sensor", hint=hint)
         return np.zeros(len(table), dtype=np.int64)
     labels = table.labels("sensor")
     unknown = next((row for row, label in enumerate(labels) if label not in known), None)
@@ -319,7 +317,7 @@ def _cornered(table: Table, detections: SpatialDetections, rig: Rig) -> SpatialD
     sizeless = np.flatnonzero(given[:, 0] & np.isnan(size) & np.isnan(detections.position_sensor_m).any(axis=1))
     if len(sizeless):
         hint = f"a column tag_size_m, or size_m under [tags] of {CAMERA_FILE}"
-        raise table.error("the size of this tag is not known", row=int(sizeless[0]), field="tag_size_m", hint=hint)
+        raise table.error("the size of this tag is unknown", row=int(sizeless[0]), field="tag_size_m", hint=hint)
     nowhere = np.flatnonzero(~given[:, 0] & np.isnan(detections.position_sensor_m).any(axis=1))
     if len(nowhere):
         raise table.error("has neither corners nor a position", row=int(nowhere[0]), field=CORNERS[0])
@@ -342,7 +340,7 @@ def _points(table: Table, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
     lone = np.flatnonzero(np.isnan(baseline))
     if len(lone):
         hint = f"baseline_m of the left camera in {CAMERA_FILE}"
-        raise table.error("the baseline is not known", row=int(lone[0]), field=RIGHT[0], hint=hint)
+        raise table.error("the baseline is unknown", row=int(lone[0]), field=RIGHT[0], hint=hint)
     right = left.copy()
     right[:, 0] = table.numbers(replace(_pixel(RIGHT[0]), optional=False))
     if RIGHT[1] in table:
@@ -379,4 +377,4 @@ def _need_camera(table: Table, lacking: BoolArray, column: str, rig: Rig) -> Non
     if len(rows):
         names = ", ".join(sensor.name for sensor in rig.sensors if sensor.intrinsics is None)
         hint = f"intrinsics = [fx, fy, cx, cy] under [camera.NAME] of {CAMERA_FILE}"
-        raise table.error(f"pixels of a sensor that is no camera ({names})", row=int(rows[0]), field=column, hint=hint)
+        raise table.error(f"pixels of a sensor without intrinsics ({names})", row=int(rows[0]), field=column, hint=hint)

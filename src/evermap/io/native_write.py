@@ -50,7 +50,7 @@ def write_native(
         InputError: the folder holds something, or cannot be written; nothing is changed then.
     """
     if format not in ("csv", "parquet"):
-        raise ConfigError(f"there is no native format '{format}'", field="format", hint="csv or parquet")
+        raise ConfigError(f"unknown native format '{format}'", field="format", hint="csv or parquet")
     with staged_folder(folder) as staging:
         settings = _settings(recording)
         if isinstance(recording, Recording):

@@ -27,7 +27,7 @@ _LIMITS: dict[str, dict[str, tuple[float, float]]] = {
     "noise": {"sigma_m": (1e-9, 1e6), "sigma_rad": (1e-9, 1e3), "sigma_px": (1e-6, 1e4)},
     "detection": {"p_detect": (0.0, 1.0), "p_false": (0.0, 1.0)},
 }
-"""Of `sensor.toml`; the keys of all sections are those of a camera, too."""
+"""Sections of `sensor.toml`; their keys are valid for a camera, too."""
 _OF_CAMERA = {key: limits for section in _LIMITS.values() for key, limits in section.items()}
 _ANGLES = ("roll_rad", "pitch_rad", "yaw_rad")
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
@@ -83,7 +83,9 @@ def read_rig(files: FileSet, warnings: list[str]) -> Rig:
         _check_range(reader, "limits", common)
     if CAMERA_FILE not in files:
         if SENSOR_FILE not in files:
-            warnings.append(f"no {SENSOR_FILE}: the sensor is assumed to see all around, from the robot's centre")
+            warnings.append(
+                f"no {SENSOR_FILE}: the sensor is assumed to see in all directions, from the robot's centre"
+            )
         return Rig(settings, (common,), symmetries=symmetries)
     reader = TomlReader(files.read(CAMERA_FILE), files.path_of(CAMERA_FILE))
     reader.expect(("camera", "tags"), reader.document, section=None)
@@ -171,7 +173,9 @@ def _lens(reader: TomlReader, section: str, content: dict[str, Any]) -> dict[str
         raise reader.error(section, "intrinsics", "focal lengths must be positive", hint="[fx, fy, cx, cy] in pixels")
     model = content.get("model", "pinhole")
     if model not in CAMERA_MODELS:
-        raise reader.error(section, "model", f"no camera model '{model}'", hint="one of " + ", ".join(CAMERA_MODELS))
+        raise reader.error(
+            section, "model", f"unknown camera model '{model}'", hint="one of " + ", ".join(CAMERA_MODELS)
+        )
     distortion = reader.numbers(section, "distortion", content.get("distortion", []), (0, *CAMERA_MODELS[model]))
     found: dict[str, Any] = {"intrinsics": intrinsics, "distortion": distortion, "distortion_model": model}
     if "resolution_px" in content:

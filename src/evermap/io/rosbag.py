@@ -18,7 +18,7 @@ from evermap.types import Clock, FloatArray, IntArray, SpatialOdometry
 Handler: TypeAlias = Callable[[Any, float], None]
 BAG_ENDINGS = (".bag", ".bag.bz2", ".mcap", ".db3")
 MOST_HAMMING = 2
-"""Tags of which the detector had to correct more bits are left out: most of them are no tags."""
+"""Tags with more corrected bits are dropped: most of them are false detections."""
 
 
 class Topic(NamedTuple):
@@ -90,7 +90,7 @@ def read_tag_bag(
     def handlers(topics: Mapping[str, Topic]) -> dict[str, Handler]:
         if not topics.keys() & camera_of.keys():
             wanted, found = ", ".join(camera_of), ", ".join(sorted(topics))
-            raise InputError(f"holds none of the topics {wanted}", path=path, hint=f"tagtopic: one of {found}")
+            raise InputError(f"contains none of the topics {wanted}", path=path, hint=f"tagtopic: one of {found}")
         return {odometry_topic: driven} | {topic: seen_by(camera) for topic, camera in camera_of.items()}
 
     scan(path, handlers)
@@ -140,14 +140,14 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
                 try:
                     message = bag.deserialize(raw, one.msgtype)
                 except KeyError as error:
-                    problem = f"holds no definition of the messages of {one.topic}, {one.msgtype}"
-                    hint = "record it as MCAP, which holds the types of its messages"
+                    problem = f"contains no definition of the messages of {one.topic}, {one.msgtype}"
+                    hint = "record it as MCAP, which contains the message definitions"
                     raise InputError(problem, path=path, hint=hint) from error
                 wanted[one.topic](message, 1e-9 * received_ns)
     except InputError:
         raise
     except Exception as error:  # the package has no error that all of its errors are
-        hint = "ros2 bag info, or rosbag check, says more"
+        hint = "check it with ros2 bag info, or rosbag check"
         raise InputError(f"cannot be read as a bag: {reason(error)}", path=path, hint=hint) from error
     return topics
 
@@ -162,7 +162,7 @@ def ros2_types() -> Any:
     try:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
-        problem = "messages of ROS need the package rosbags, which is not installed"
+        problem = "ROS messages need the package rosbags, which is not installed"
         raise MissingExtraError(problem, hint="pip install 'evermap[ros]'") from None
     types = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in UNSTATED.items():
@@ -274,6 +274,6 @@ UNSTATED = {
         for size in ("2D", "3D")
     },
 }
-"""Messages beyond ROS 2's own, for bags in SQLite, which do not hold their types: apriltag_msgs 2, vision_msgs 4,
-foxglove_msgs.
+"""Definitions of messages beyond ROS 2's own, for SQLite bags, which do not contain them: apriltag_msgs 2,
+vision_msgs 4, foxglove_msgs.
 """

@@ -21,9 +21,9 @@ from evermap.io.text import decode_text, reason
 from evermap.types import FloatArray, Landmarks
 
 CLOSED = 0.5
-"""From this probability on an edge is closed: something more probably stands in its way than not."""
+"""Probability of an obstacle above which an edge is closed."""
 SAMPLES = 201
-"""Points of an edge, nearest to a landmark, that are compared with what it covers."""
+"""Points of an edge, nearest to a landmark, that are compared with its footprint."""
 FARTHEST_M = 1e8
 _HINT = "a route graph of Nav2: points with properties.id, lines with id, startid and endid"
 
@@ -109,7 +109,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _refuse(word: str) -> None:
-    raise ValueError(f"{word} is no number in JSON")
+    raise ValueError(f"{word} is not a number in JSON")
 
 
 def _nodes(document: Mapping[str, Any], path: Path) -> dict[int, tuple[float, float]]:
@@ -123,7 +123,7 @@ def _nodes(document: Mapping[str, Any], path: Path) -> dict[int, tuple[float, fl
         if not isinstance(at, list) or len(at) < 2 or not all(map(_is_number, at[:2])):
             raise _wrong("has no coordinates x, y", path, number)
         if max(map(abs, at[:2])) > FARTHEST_M:
-            raise _wrong("is farther than any robot drives", path, number)
+            raise _wrong("is implausibly far away", path, number)
         if properties.get("frame", "map") != "map":
             raise _wrong(f"is in the frame '{properties['frame']}', not in that of the map", path, number)
         identity = _whole(properties, "id", path, number)
@@ -147,7 +147,7 @@ def _edge(
     for name in ("startid", "endid"):
         node = _whole(properties, name, path, number)
         if node not in nodes:
-            raise _wrong(f"{name} {node} is no node", path, number)
+            raise _wrong(f"{name} {node} is not a node", path, number)
         ends.append(nodes[node])
     way = np.array(ends)
     step = way[1] - way[0]

@@ -99,7 +99,7 @@ def _sensor(values: dict[str, dict[str, float]], reader: TomlReader) -> Sensor:
     mount = values.pop("mount")
     x_m, y_m, theta_rad = (mount.get(key, 0.0) for key in _LIMITS["mount"])
     numbers: dict[str, Any] = {k: v for part in values.values() for k, v in part.items()}
-    kind = reader.choice("sensor", "kind", SensorKind, "no kind of sensor")
+    kind = reader.choice("sensor", "kind", SensorKind, "unknown kind of sensor")
     sensor = Sensor(**numbers, kind=kind, mount_robot_sensor=(x_m, y_m, theta_rad))
     if sensor.range_min_m >= sensor.range_max_m:
         raise reader.error("limits", "range_max_m", "must be greater than range_min_m")
@@ -175,7 +175,7 @@ class TomlReader:
             if not isinstance(value, types[key]):
                 raise self.error("recording", key, f"must be a {types[key].__name__}, not {type(value).__name__}")
         if content.get("format_version", FORMAT_VERSION) != FORMAT_VERSION:
-            problem = f"{content['format_version']} is not a version this evermap reads, which is {FORMAT_VERSION}"
+            problem = f"{content['format_version']} is not the version that this evermap reads, {FORMAT_VERSION}"
             raise self.error("recording", "format_version", problem, hint="a newer evermap")
         names = content.get("class_names")
         if names is not None and not all(isinstance(name, str) and name.strip() == name and name for name in names):
@@ -185,7 +185,7 @@ class TomlReader:
         return Settings(
             name=content.get("name"),
             robot=content.get("robot", ""),
-            clock=self.choice("recording", "clock", Clock, "no clock") or Clock.RECORDING,
+            clock=self.choice("recording", "clock", Clock, "unknown clock") or Clock.RECORDING,
             frames_complete=content.get("frames_complete"),
             class_names=None if names is None else tuple(names),
             sensor=sensor,

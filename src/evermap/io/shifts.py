@@ -62,7 +62,7 @@ def parse_shift(text: str) -> Shift:
         raise _wrong(text, f"needs one to three numbers after ':', not {len(numbers)}")
     x, y, turn_deg = [*numbers, 0.0, 0.0][:3]
     if turn_deg and len(ids) == 1:
-        raise _wrong(text, "turns a single landmark about itself, which changes nothing")
+        raise _wrong(text, "rotates a single landmark about itself, which has no effect")
     return Shift(tuple(ids), (x, y), math.radians(turn_deg))
 
 

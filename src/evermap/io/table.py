@@ -122,7 +122,7 @@ class Table:
         if not isinstance(cells, np.ndarray):
             broken = [row for row, cell in enumerate(cells) if not cell.isprintable()]
             if broken:
-                raise self.error("holds a character that cannot be printed", row=broken[0], field=name)
+                raise self.error("contains a character that cannot be printed", row=broken[0], field=name)
             return [cell.strip() for cell in cells]
         return ["" if np.isnan(value) else f"{value:.17g}" for value in cells.tolist()]
 
@@ -365,7 +365,7 @@ def _arrow_column(column: Any, path: Path, name: str) -> list[str] | FloatArray:
             return np.where(known, values, np.nan)
     except (pa.ArrowException, ValueError) as error:
         raise InputError(f"damaged column: {reason(error)}", path=path, field=name) from error
-    raise InputError(f"holds {kind}, not numbers", path=path, field=name, hint="cast the column to float64")
+    raise InputError(f"contains {kind}, not numbers", path=path, field=name, hint="cast the column to float64")
 
 
 def dates_as_text(column: Any) -> list[str]:

@@ -24,7 +24,7 @@ from evermap.types import FloatArray
 from evermap.valid import Quantity
 
 _VIEWED = np.array([0.0, 0.0, 0.0, 0.5, 0.5, 0.5, 0.5])
-"""The frame of a tag in WPILib's: its x is their y, its y their z, its z their x."""
+"""Rotation of the frame of a tag to WPILib's: its x is their y, its y their z, its z their x."""
 _FIDUCIAL = ("id", "x", "y", "z", "roll", "pitch", "yaw", "variance")
 
 
@@ -54,7 +54,7 @@ def tags_of_tagslam(data: bytes, path: Path) -> Table:
     document = parse_yaml(data, path)
     listed = document.get("bodies") if isinstance(document, dict) else None
     if not isinstance(listed, list):
-        raise InputError("holds no bodies with tags", path=path, field="bodies", hint="TagSLAM's tagslam.yaml")
+        raise InputError("contains no bodies with tags", path=path, field="bodies", hint="TagSLAM's tagslam.yaml")
     rows: list[tuple[float, ...]] = []
     for entry in listed:
         for name, body in entry.items() if isinstance(entry, dict) else ():

@@ -41,7 +41,7 @@ from evermap.types import (
 from evermap.valid import CAMERA_MODELS, Quantity
 
 _MOST_TAGS = 100_000
-"""On a board: no tag family has more."""
+"""Maximum tags of a board: no tag family has more."""
 
 CAMERAS, CAMERA_POSES, SETTINGS = "cameras.yaml", "camera_poses.yaml", "tagslam.yaml"
 _ENDINGS = (".csv", ".csv.gz", ".parquet")
@@ -86,7 +86,7 @@ def read_tagslam(path: str | Path, robot: int | None = None) -> SpatialRecording
     """
     path = Path(path)
     if robot is not None:
-        raise InputError(f"there is no robot {robot}: the recording is of one rig", path=path, hint="leave it out")
+        raise InputError(f"there is no robot {robot}: the recording has one rig", path=path, hint="omit the robot")
     bag = path if path.is_file() and path.name.endswith(BAG_ENDINGS) else None
     files = find_file_set(path if bag is None else path.parent, is_tagslam if bag is None else _is_calibrated)
     if files is None:
@@ -121,7 +121,7 @@ def _only_bag(files: FileSet) -> Path | None:
     if _has_detections(files) or not bags:
         return None
     if len(bags) > 1:
-        raise InputError(f"holds {len(bags)} bags: {', '.join(bags)}", path=files.root, hint="give one of them")
+        raise InputError(f"contains {len(bags)} bags: {', '.join(bags)}", path=files.root, hint="name one of them")
     if files.zipped:
         raise InputError("a bag inside a zip is not read", path=files.path_of(bags[0]), hint="unpack the zip")
     return files.path_of(bags[0])
@@ -133,7 +133,7 @@ def _is_calibrated(files: FileSet) -> bool:
 
 TAGSLAM = Reader(
     "tagslam",
-    "folder with cameras.yaml, camera_poses.yaml, tagslam.yaml and detections.csv, or a .bag beside them",
+    "folder with cameras.yaml, camera_poses.yaml, tagslam.yaml and detections.csv, or a .bag with them",
     is_tagslam,
     read_tagslam,
     endings=BAG_ENDINGS,
@@ -249,7 +249,7 @@ def _sizes(files: FileSet, bodies: Mapping[str, dict[str, Any]], default_body: A
             raise InputError(problem, path=files.path_of(SETTINGS), field=name, hint=hint) from None
     wrong = next((size for size in (*sizes.values(), *defaults.values()) if not 0.0 < size < 1e3), None)
     if wrong is not None:
-        problem = f"{wrong:g} is not the edge of a tag"
+        problem = f"{wrong:g} is not the edge length of a tag"
         raise InputError(problem, path=files.path_of(SETTINGS), field="size", hint="metres")
     if str(default_body) in defaults:
         return sizes, defaults[str(default_body)]
@@ -292,7 +292,7 @@ def _odometry(files: FileSet, warnings: list[str]) -> SpatialOdometry | None:
     if table is None:
         return None
     if len(table) == 0:
-        raise DataError("holds no odometry", path=table.path)
+        raise DataError("contains no odometry", path=table.path)
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
     unknown = np.full(len(table), np.nan)

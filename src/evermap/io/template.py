@@ -29,20 +29,20 @@ _LANDMARK_M = np.array([[2.5, -0.6], [2.2, 3.6], [-2.3, 2.0], [-0.6, 4.2], [0.3,
 _CLASSES = ("pillar", "door", "pillar", "cart", "pillar", "door")
 _DURATION_S = 60.0
 _SURVEYED_M = np.where(np.array(_CLASSES)[:, None] == "cart", _LANDMARK_M - [0.3, 1.1], _LANDMARK_M)
-"""Where they were when somebody measured them: the cart has been moved since then."""
+"""Positions in an older survey: the cart has been moved since then."""
 _SPEED_READS, _TURN_READS = 1.02, 0.97
-"""Of the true ones: a wheel that is worn and a wheelbase that is a few per cent off, as on real robots."""
+"""Factors on the true velocities: a worn wheel and a wheelbase that is a few per cent off, as on real robots."""
 _SPEED_NOISE_MPS, _TURN_NOISE_RADPS = 0.02, 0.02
 
 _SENSOR_TOML = """\
-# A recording for evermap: this folder. Replace the example rows by your own; docs/formats.md explains everything.
-# Every section and every key of this file may be left out.
+# A recording for evermap: this folder. Replace the example rows with your own; docs/formats.md explains everything.
+# Every section and every key of this file is optional.
 
 [recording]
 format_version = 1
 name = "template"
-clock = "recording"        # what stamps count: "recording" (from any start), "unix", or "local_wall"
-frames_complete = true     # false where the recording leaves out instants at which nothing was seen
+clock = "recording"        # clock of the stamps: "recording" (arbitrary start), "unix", or "local_wall"
+frames_complete = true     # false if frames without a detection are missing
 
 [limits]                   # what the sensor can see, in its own frame: x ahead, y to the left
 range_min_m = 0.1
@@ -50,11 +50,11 @@ range_max_m = 6.0
 bearing_min_rad = -2.2     # counter-clockwise is positive
 bearing_max_rad = 2.2
 
-[noise]                    # standard deviations; leave them out where unknown, they are estimated
+[noise]                    # standard deviations; omit them if unknown, they are estimated
 sigma_range_m = 0.03
 sigma_bearing_rad = 0.02
 
-[mount]                    # where the sensor sits on the robot: x ahead, y to the left, turned counter-clockwise
+[mount]                    # pose of the sensor on the robot: x ahead, y to the left, counter-clockwise
 x_m = 0.2
 y_m = 0.0
 theta_rad = 0.0
@@ -66,21 +66,21 @@ p_false = 0.001            # probability of a false detection in a frame
 
 _COMMENTS = {
     "odometry": """\
-Needed. Velocities of the robot; each row holds until the next stamp. Lines that start with '#' are comments.
+Required. Velocities of the robot; each row holds until the next stamp. Lines that start with '#' are comments.
 Optional: lateral_mps, to the left. Instead of velocities: stamp_s,dx_m,dy_m,dtheta_rad, the motion since the row
 before, in the robot's frame at that row.""",
     "detections": """\
-Needed. What the sensor saw. An empty landmark_id means: seen, but not recognised.
+Required. Detections. An empty landmark_id means: detected, but not identified.
 Instead of range_m,bearing_rad: x_m,y_m in the sensor's frame. Optional: class_id (any name), and standard deviations
 of single detections: sigma_range_m,sigma_bearing_rad or sigma_m.""",
     "frames": """\
-Optional, but worth having: every instant at which the sensor looked, also when it saw nothing.""",
+Optional, but recommended: the stamp of every sensor frame, including frames without a detection.""",
     "truth": """\
-Optional: the robot's true poses, used only to say how large the errors are.""",
+Optional: the robot's true poses, used only to compute errors.""",
     "landmarks": """\
 Optional: the landmarks' true positions, for errors or with '--prior-map truth'. More columns: sigma_m, class_id.""",
     "survey": """\
-No part of the recording: an older map, for '--prior-map survey.csv'. The cart, 4, has been moved since then.""",
+Not part of the recording: an older map, for '--prior-map survey.csv'. The cart, 4, has been moved since then.""",
 }
 
 

@@ -32,33 +32,33 @@ _CAMERA = SpatialSensor(
 
 SPATIAL_FILES = {
     "sensor.toml": """\
-# A recording in space for evermap: this folder. Replace the example rows by your own; docs/formats.md explains
-# everything. Every section and every key of this file may be left out.
+# A recording in space for evermap: this folder. Replace the example rows with your own; docs/formats.md explains
+# everything. Every section and every key of this file is optional.
 
 [recording]
 format_version = 1
 name = "template"
-clock = "recording"        # what stamps count: "recording" (from any start), "unix", or "local_wall"
-frames_complete = true     # false where the recording leaves out instants at which nothing was seen
+clock = "recording"        # clock of the stamps: "recording" (arbitrary start), "unix", or "local_wall"
+frames_complete = true     # false if frames without a detection are missing
 
 [limits]
 range_max_m = 5.0
 
-[noise]                    # standard deviations; leave them out where unknown, they are estimated
-sigma_px = 0.3             # of pixels; sigma_m of positions and sigma_rad of orientations, where those are given
+[noise]                    # standard deviations; omit them if unknown, they are estimated
+sigma_px = 0.3             # of pixels; sigma_m of positions and sigma_rad of orientations, if those are given
 
 [detection]
 p_detect = 0.9             # probability that a landmark in view is detected
 p_false = 0.001            # probability of a false detection in a frame
 
-# [symmetries]             # turns after which objects look the same, by class_id; x, y, z are the object's own axes
-# can = "axis:z"           # any turn about z
+# [symmetries]             # rotations after which objects look the same, by class_id; x, y, z are the object's own axes
+# can = "axis:z"           # any rotation about z
 # box = ["180:z", "180:x"] # half a turn about z or x; "90:z" a quarter; "any" for a ball
 """,
     "camera.toml": """\
-# The cameras, and the sizes of tags. Needed where detections are pixels, or where there are several sensors. A sensor
-# that is no camera has a section without intrinsics. The keys of [limits], [noise] and [detection] of sensor.toml may
-# stand here, too, for one camera.
+# The cameras, and the sizes of tags. Required for pixels, or for several sensors. A sensor
+# other than a camera has a section without intrinsics. The keys of [limits], [noise] and [detection] of sensor.toml are
+# valid here, too, for one camera.
 
 [camera.front]
 model = "radtan"                                # "pinhole", "radtan" or "equidistant" (fisheye)
@@ -92,14 +92,14 @@ Optional: var_x_m2,var_y_m2,var_z_m2,var_rx_rad2,var_ry_rad2,var_rz_rad2. Instea
 stamp_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps, the robot's velocities. Without odometry, leave
 this file out.""",
     "detections": """\
-Needed. What the cameras saw: here the corners of tags, counter-clockwise from the lower left of the tag. Instead of
-corners: x_m,y_m,z_m in the sensor's frame, with qx,qy,qz,qw of things with an orientation; or u_px,v_px,u_right_px of
-points in a stereo pair; or x_m,y_m,z_m,yaw_rad,length_m,width_m,height_m of boxes. An empty landmark_id means: seen,
-but not recognised. Optional: class_id, score, sigma_m, sigma_rad; sensor, which saw it, where there are several.""",
+Required. Detections: here the corners of tags, counter-clockwise from the lower left of the tag. Instead of corners:
+x_m,y_m,z_m in the sensor's frame, with qx,qy,qz,qw for objects with an orientation; or u_px,v_px,u_right_px of points
+in a stereo pair; or x_m,y_m,z_m,yaw_rad,length_m,width_m,height_m of boxes. An empty landmark_id means: detected, but
+not identified. Optional: class_id, score, sigma_m, sigma_rad; sensor, if there are several.""",
     "frames": """\
-Optional, but worth having: every instant at which the camera looked, also when it saw nothing.""",
+Optional, but recommended: the stamp of every camera frame, including frames without a detection.""",
     "truth": """\
-Optional: the robot's true poses, used only to say how large the errors are.""",
+Optional: the robot's true poses, used only to compute errors.""",
     "landmarks": """\
 Optional: the landmarks' true poses, for errors or with '--prior-map truth'. More columns: sigma_m, sigma_rad,
 class_id.""",

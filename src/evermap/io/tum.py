@@ -59,7 +59,7 @@ def read_tum(
         raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
     rows = pose_rows(data, path, [])
     if len(rows) == 0:
-        raise DataError("holds no pose", path=path)
+        raise DataError("contains no pose", path=path)
     check_forward(rows.column(0), path=path, line=rows.line)
     values = rows.values[last_of_equal(rows.column(0), path=path, warnings=[])]
     stamps = np.ascontiguousarray(values[:, 0])

@@ -43,7 +43,7 @@ def parse_yaml(data: bytes, path: Path) -> Any:
     except RecursionError:
         raise InputError("is nested too deeply", path=path) from None
     if after < len(lines):
-        raise _error(lines[after], "is indented less than what it belongs to", path)
+        raise _error(lines[after], "is indented less than its parent", path)
     return value
 
 
@@ -57,7 +57,7 @@ def _lines(text: str, path: Path) -> list[_Line]:
         if not content.strip() or (content.strip() == "---" and not found):
             continue
         if "\t" in content:
-            raise InputError("holds a tab", path=path, line=number, hint="indent by blanks")
+            raise InputError("contains a tab", path=path, line=number, hint="indent by spaces")
         if open_since is not None:
             open_since = open_since._replace(content=f"{open_since.content} {content.strip()}")
         else:
@@ -143,13 +143,13 @@ def _inside(lines: list[_Line], start: int, indent: int, path: Path) -> tuple[An
 
 def _refuse_deeper(lines: list[_Line], at: int, indent: int, path: Path) -> None:
     if at < len(lines) and lines[at].indent > indent:
-        raise _error(lines[at], "is indented more than the lines that it goes with", path)
+        raise _error(lines[at], "is indented more than its siblings", path)
 
 
 def _value(text: str, line: _Line, path: Path) -> Any:
     """A scalar, or a list in brackets."""
     if text.startswith(_UNREAD):
-        raise _error(line, f"{quote(text)} is YAML that is not read here", path)
+        raise _error(line, f"{quote(text)} is unsupported YAML", path)
     if not text.startswith("["):
         return _scalar(text)
     if not text.endswith("]"):
@@ -181,4 +181,4 @@ def _scalar(text: str) -> Any:
 
 
 def _error(line: _Line, problem: str, path: Path) -> InputError:
-    return InputError(problem, path=path, line=line.number, hint="plain maps and lists, indented by blanks")
+    return InputError(problem, path=path, line=line.number, hint="plain maps and lists, indented by spaces")

@@ -54,7 +54,7 @@ def read_ycbv(path: str | Path, robot: int | None = None) -> SpatialRecording:
     if files is None:
         raise InputError("no recording of objects here", path=path, hint=YCBV.looks_for)
     if robot is not None:
-        raise InputError(f"there is no robot {robot}: the recording is of one camera", path=path, hint="leave it out")
+        raise InputError(f"there is no robot {robot}: the recording has one camera", path=path, hint="omit the robot")
     warnings: list[str] = []
     names = sorted(match[1] for name in files.members if (match := _DETECTIONS.fullmatch(name)))
     rows = pose_rows(*_file(files, "odometry"), warnings)
@@ -94,7 +94,7 @@ def _file(files: FileSet, name: str) -> tuple[bytes, Path]:
 def _in_order(rows: Rows, warnings: list[str]) -> tuple[FloatArray, FloatArray]:
     """Stamps (N,) and poses (N, 7)."""
     if len(rows) == 0:
-        raise DataError("holds no pose", path=rows.path)
+        raise DataError("contains no pose", path=rows.path)
     check_forward(rows.column(0), path=rows.path, line=rows.line)
     values = rows.values[last_of_equal(rows.column(0), path=rows.path, warnings=warnings)]
     return np.ascontiguousarray(values[:, 0]), np.ascontiguousarray(values[:, 1:])

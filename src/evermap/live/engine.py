@@ -70,7 +70,7 @@ class Engine:
     ) -> None:
         self._config = config or Config()
         if self._config.slam.unknown_ids:
-            problem = "landmarks without identity are told by what is seen later"
+            problem = "association of landmarks without identity needs later detections"
             raise ConfigError(problem, field="slam.unknown_ids", hint="a recording: evermap slam --unknown-ids")
         recording = recording_of(sensor, name, clock, tuple(class_names))
         self._sensor = self._config.sensor.applied_to(recording.sensor)

@@ -41,9 +41,9 @@ from evermap.valid import (
 )
 
 BURST_S = 10.0
-"""Time over which readings are counted where there are too many."""
+"""Time over which readings are counted against the maximum rate."""
 ROOM = 1_000
-"""Rows of odometry for which there is room at first."""
+"""Initial capacity for odometry rows."""
 
 
 class LiveFrame(NamedTuple):
@@ -82,13 +82,14 @@ class Inbox:
         self._kept: list[LiveFrame] = []
         self._room = live.readings_hz * BURST_S
         self.newest_s = self.odometry_s = self.settled_s = -np.inf
-        """Newest stamp of all, until which the odometry is known, and of the frames that were given out."""
+        """Newest stamp of all readings, of the odometry, and of the returned frames."""
         self.first_s = np.inf
         """First stamp of the odometry."""
         self._stray: tuple[float, Callable[[], None]] | None = None
         self.n_late = self.n_repeated = self.n_thinned = self.n_stray = 0
-        """Readings that came too late, odometry of a stamp that was there, frames that are not kept for the map, and
-        readings whose stamps were of no time."""
+        """Counts of late readings, odometry with a repeated stamp, frames not kept for the map, and readings with
+        implausible stamps.
+        """
         self._classes: list[str] = list(about.class_names)
         self._texts: dict[int, str] = dict(about.landmark_names)
         self._n_kept = self._n_written = 0
@@ -364,5 +365,5 @@ def _check(quantity: Any, value: Any) -> None:
 
 def _column(values: Any, count: int, field: str) -> Any:
     if len(values) != count:
-        raise InputError(f"{len(values)} values for {count} detections", field=field, hint="one for each detection")
+        raise InputError(f"{len(values)} values for {count} detections", field=field, hint="one per detection")
     return values

@@ -21,7 +21,7 @@ from evermap.slam.streaming import sighted_at
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, MapChange, Sensor, rows_of
 
 REST_S = 2.5e-4
-"""Time between two questions for each sighting of the first one, at least: some twenty times what that takes."""
+"""Minimum time between two updates per sighting: some twenty times what an update takes."""
 
 
 class _Glance(NamedTuple):
@@ -66,7 +66,7 @@ class Judge:
         self._found: list[MapChange] = []
         self._after: tuple[LivingMap, Vicinity | None] = living, None
         self.rest_s = 0.0
-        """How long to wait until the next question, at least."""
+        """Minimum time until the next update."""
 
     @property
     def living(self) -> LivingMap:

@@ -66,7 +66,7 @@ class Keeper:
         self._written_s = time.monotonic()
         self._name, self.n_sessions = inbox.name, 1
         self.revision = 0
-        """Newest one that was read."""
+        """Newest revision that was read."""
 
     @property
     def file(self) -> Path:
@@ -76,7 +76,7 @@ class Keeper:
             InputError: it is in memory.
         """
         if self._path is None:
-            raise InputError("a map in memory stays as it is", field="map", hint="a file, or mapping=False")
+            raise InputError("a map in memory cannot be changed", field="map", hint="a file, or mapping=False")
         return self._path
 
     def begin(self, living: LivingMap | None, clock: Clock, *, mapping: bool) -> LivingMap:
@@ -132,9 +132,7 @@ class Keeper:
             del self._jobs[name]
             if (error := job.exception()) is not None:
                 defect = (
-                    ""
-                    if isinstance(error, EvermapError | OSError)
-                    else f"a defect of evermap: {type(error).__name__}: "
+                    "" if isinstance(error, EvermapError | OSError) else f"a bug in evermap: {type(error).__name__}: "
                 )
                 self._told.warnings.append(f"{name}: {defect}{error}")
         if self._child is None or self._child.poll() is None:
@@ -143,7 +141,7 @@ class Keeper:
         for line in child.communicate()[0].splitlines():
             self._take(Brought(**json.loads(line)))
         if child.returncode:
-            self._told.warnings.append(f"entering a session ended with code {child.returncode}; its readings wait")
+            self._told.warnings.append(f"entering a session ended with code {child.returncode}; its readings are kept")
         return True
 
     def write_if_due(self) -> None:

@@ -75,7 +75,9 @@ def recording_of(sensor: object, name: str, clock: Clock, class_names: tuple[str
 def check_fits(living: LivingMap, clock: Clock) -> None:
     """Raise `InputError` for a map in space, or of another clock."""
     if living.dim != 2:
-        raise InputError("a map in space", field="map", hint="a session in space is solved when it ends: enter_session")
+        raise InputError(
+            "a map in space", field="map", hint="sessions in space are solved when they end: enter_session"
+        )
     if len(living.places) and living.clock != clock:
-        problem = f"stamps count '{clock}', the map's '{living.clock}'"
+        problem = f"stamps are on the clock '{clock}', those of the map on '{living.clock}'"
         raise InputError(problem, field="clock", hint=f"evermap.Engine(..., clock='{living.clock}')")

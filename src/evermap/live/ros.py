@@ -58,19 +58,19 @@ from evermap.types import (
 )
 
 GUESS_S = 1.0
-"""Topics are guessed when messages of odometry and detections have come for so long: others may be better."""
+"""Time of receiving odometry and detections after which topics are guessed."""
 MOST_KEPT = 2_000
-"""Messages of a topic that are kept until it is known what is read."""
+"""Messages of a topic that are kept until the topics are chosen."""
 TOLD_S = 0.1
 """Time between two messages that repeat a part of the map."""
 PART = 20
-"""Landmarks of such a part: those who come late have all of the map after some of them; few hold no pose up."""
+"""Landmarks of such a part: late clients have the whole map after some of them; few delay no pose."""
 SEEN_P = 0.02
-"""A landmark in view is told again when the probability that it exists, or its place [m], has changed by so much."""
+"""Change of P(exists), or of the position [m], after which a landmark in view is published again."""
 WAIT_S = 0.2
-"""Time after which it is asked at the latest whether to go on."""
+"""Maximum time between two checks for the end."""
 REMEMBERED = 2_000
-"""Poses of the odometry that are kept, to say where its origin is in the map."""
+"""Poses of the odometry that are kept, to locate its origin in the map."""
 TELLS = {
     f"{OURS}pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "/tf": "tf2_msgs/msg/TFMessage",
@@ -106,7 +106,7 @@ class Listener:
         self._driven: tuple[object, float, FloatArray] | None = None
         self._odometry: deque[tuple[float, FloatArray]] = deque(maxlen=REMEMBERED)
         self.settings: BagSettings | None = None
-        """What is read, once it is known."""
+        """Chosen topics, once they are known."""
         if stated is not None:
             guessed = guessed_settings(self._content)
             self.settings = stated_settings(stated, self._content, guessed, whole=False)
@@ -132,10 +132,10 @@ class Listener:
         try:
             handler(self._types.decode(message.raw, message.kind), message.received_s)
         except KeyError:
-            self._once(f"the type {message.kind} of {message.topic} is not known: it is not read")
+            self._once(f"the type {message.kind} of {message.topic} is unknown: it is not read")
             return []
         except Exception as error:  # the package has no error that all of its errors are
-            raise InputError(f"a message of {message.topic} is no {message.kind}: {error}") from None
+            raise InputError(f"a message of {message.topic} is not a {message.kind}: {error}") from None
         if self.settings is None and not self._guess(message.received_s):
             return []
         found: list[Reading] = []
@@ -241,7 +241,7 @@ class Listener:
         ranged = np.isfinite(range_m) & (range_m > 0.0)
         ranged &= ~(np.trace(found.covariance_sensor_m2, axis1=1, axis2=2) > ANY_RANGE_M2)
         if not ranged.all():
-            self._once(f"{topic}: detections without a range are left out")
+            self._once(f"{topic}: detections without a range are dropped")
         angle = bearing_rad + self._mount[2]
         along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         across = np.stack([-along[:, 1], along[:, 0]], axis=1)

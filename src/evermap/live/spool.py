@@ -27,7 +27,7 @@ from evermap.runs.sessions import Entered, TwiceError, enter_session
 from evermap.types import Recording
 
 TRIES = 3
-"""Times that a session is entered where another process changes the map meanwhile."""
+"""Attempts to enter a session while another process changes the map."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,11 +26,11 @@ from evermap.io.bag_messages import FRAMES, KINDS
 from evermap.io.rosbag import ros2_types
 
 OURS = "/evermap/"
-"""What the topics of the engine begin with; they are not listened to."""
+"""Prefix of the engine's own topics, which are not subscribed."""
 LATCHED = "/tf_static"
-"""Kept for those who come later."""
+"""Topics that are latched for late subscribers."""
 MOST_WAITING = 20_000
-"""Messages that wait to be read; of more the oldest are dropped, and counted."""
+"""Maximum queued messages; beyond it the oldest are dropped and counted."""
 HINT = "pip install 'evermap[live]'"
 
 
@@ -64,7 +64,7 @@ class Mailbox:
         self._waiting: deque[Message] = deque(maxlen=MOST_WAITING)
         self._came = threading.Event()
         self.n_lost = 0
-        """Messages that did not arrive, or were dropped."""
+        """Messages that were lost or dropped."""
 
     def put(self, topic: str, kind: str, raw: bytes, source: object) -> None:
         """Take a message, from any thread."""

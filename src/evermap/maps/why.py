@@ -172,7 +172,7 @@ def _with_words(answer: Answer, living: LivingMap) -> Answer:
     what = f"landmark {answer.label}{kind}"
     belief = f"P(exists) {_belief(answer.p_exists)}"
     if answer.deleted:
-        headline = f"{what} is not used: an operator deleted it; by what was seen, {belief}"
+        headline = f"{what} is not used: an operator deleted it; by its looks, {belief}"
     elif answer.p_exists >= EXISTS:
         headline = f"{what} is believed to be there: {belief}"
     else:
@@ -184,7 +184,7 @@ def _with_words(answer: Answer, living: LivingMap) -> Answer:
         word = "landmarks" if len(answer.companions) > 1 else "landmark"
         reasons.append(f"it shares a body with {word} {others}: hits and misses of all of them count")
     if answer.pinned:
-        reasons.append("it is pinned: it is never taken out of the map")
+        reasons.append("it is pinned: it is never removed from the map")
     return replace(answer, headline=headline, reasons=tuple(reasons))
 
 
@@ -192,10 +192,10 @@ def _on_sightings(answer: Answer, living: LivingMap) -> list[str]:
     """When it was seen last, and what the looks since then and the passing of time say."""
     seen, clock = answer.evidence, answer.clock
     if not len(seen):
-        return ["no session looked at it, as far as this map remembers"]
+        return ["no session in this map's history looked at it"]
     hits = np.flatnonzero(seen.n_hits > 0)
     if not len(hits):
-        return [f"it was never detected where it is expected, in {_looks(seen)}"]
+        return [f"it was never detected at its expected place, in {_looks(seen)}"]
     last = int(hits[-1])
     last_s, p_then = float(seen.stamp_s[last]), float(seen.p_exists[last])
     reasons = [f"it was last detected {_when(last_s, clock)}; then P(exists) {_belief(p_then)}"]
@@ -204,7 +204,7 @@ def _on_sightings(answer: Answer, living: LivingMap) -> list[str]:
     if newest.n_hits and (answer.p_exists >= EXISTS or not len(after)):
         reasons.append(
             f"in its newest session it was detected {newest.n_hits} times, where {newest.expected:.1f} detections were "
-            f"expected; {newest.n_misses} misses fit the range, the field of view and what blocks it"
+            f"expected; {newest.n_misses} misses are explained by range, field of view and occlusions"
         )
         if answer.p_exists >= EXISTS:
             return reasons
@@ -212,11 +212,11 @@ def _on_sightings(answer: Answer, living: LivingMap) -> list[str]:
         said = float(after.log_odds.sum())
         reasons.append(
             f"since then it was looked for in {_looks(after)}: {int(after.n_misses.sum())} misses and no detection, "
-            f"where {after.expected.sum():.1f} detections were expected had it stood there; that is {abs(said):.1f} "
+            f"where {after.expected.sum():.1f} detections would be expected if it were there; that is {abs(said):.1f} "
             f"nats {'against' if said < 0 else 'for'} it"
         )
     else:
-        reasons.append("nobody has looked for it since; time has made it improbable")
+        reasons.append("there were no looks since; its age has made it improbable")
     return [*reasons, *_on_time(answer, living, last_s)]
 
 
@@ -231,9 +231,9 @@ def _on_time(answer: Answer, living: LivingMap, last_s: float) -> list[str]:
     at = answer.stays[answer.stays.first_s <= last_s]
     age_s = last_s - float(at.first_s[-1]) if len(at) else 0.0
     stay = float(np.exp(life.stay.log_conditional_survival(age_s, age_s + waited_s)))
-    known = f"learned from {life.n_stays} stays" if life.n_stays else "nothing was learned of its kind yet"
-    like = f"of its kind, {stay:.0%} of those that have stood for {duration_text(age_s)}"
-    return [f"{like} stand for another {duration_text(waited_s)} ({known})"]
+    known = f"learned from {life.n_stays} stays" if life.n_stays else "nothing was learned for its class yet"
+    like = f"of its class, {stay:.0%} of those that have stayed for {duration_text(age_s)}"
+    return [f"{like} stay for another {duration_text(waited_s)} ({known})"]
 
 
 def _looks(seen: Evidence) -> str:

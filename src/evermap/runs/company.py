@@ -244,7 +244,7 @@ def _on_dask(client: Client, apply: Callable[[str], Any], items: Sequence[str]) 
         try:
             yield number, future.result()
         except (KilledWorker, ModuleNotFoundError) as error:
-            problem = f"a worker died of it, or has no evermap: {error}"
+            problem = f"a worker crashed, or has no evermap: {error}"
             raise ConfigError(
                 problem, path=items[number], hint="more memory; the same evermap on all workers"
             ) from error

@@ -28,11 +28,11 @@ _THERE_DAYS: dict[str, tuple[str, tuple[tuple[float, float], ...]]] = {
     "cart-3": ("cart", ((0.0, 1.1), (1.9, 3.4), (4.5, 6.1))),
 }
 _ABOUT_LOOKS = """\
-Looks of a detector at things that come and go: replace these rows by your own, in any order.
+Looks of a detector at objects that leave and return: replace these rows with your own, in any order.
 stamp_s     seconds, of any clock
 feature_id  any name or number
-detected    1: detected, 0: looked at and not detected; empty: no look, but the belief is wanted
-optional    p_miss, p_false: of this look, where --p-miss and --p-false do not fit
+detected    1: detected, 0: looked at and not detected; empty: no look, only the belief is requested
+optional    p_miss, p_false: of this look, if they differ from --p-miss and --p-false
 optional    class_id: any name, for lifetimes of classes, as in --prior cart=exponential:half-life=1d
 optional    present: the truth, 1 or 0, empty where unknown; it only scores the result"""
 
@@ -71,7 +71,7 @@ def _append(columns: dict[str, list[str]], stamp_s: float, *cells: str) -> None:
 # ------------------------------------------- detections: a robot passes through a yard seven times a day
 
 RANGE_M = 12.0
-"""How far the example's sensor sees, for `--range-m`."""
+"""Range of the example's sensor, for `--range-m`."""
 _DAYS, _PATROL_HOURS = 4, range(8, 21, 2)
 _STEP_S, _FRAMES, _SPEED_MPS = 0.5, 40, 1.5
 _P_DETECT, _P_CLUTTER, _SIGMA_M = 0.95, 0.05, 0.1
@@ -79,15 +79,15 @@ _PLACES = tuple((x, y) for y in (-5.0, 5.0) for x in (3.0, 9.0, 15.0, 21.0, 27.0
 _MEAN_STAY_H = {"pallet": 20.0, "cart": 5.0}
 _PILLARS = ((0.0, 8.0), (30.0, 8.0))
 _ABOUT_DETECTIONS = """\
-Detections of objects in space: replace these rows by your own, in any order.
+Detections of objects in space: replace these rows with your own, in any order.
 stamp_s   seconds, of any clock; rows of one stamp are a frame
-x_m, y_m, z_m  where in the world; a row without is a frame in which nothing was detected, and as important
+x_m, y_m, z_m  position in the world; a row without one is a frame in which nothing was detected, which is evidence
 optional  class_id: any name or number
-optional  cov_xx_m2, cov_xy_m2, cov_xz_m2, cov_yy_m2, cov_yz_m2, cov_zz_m2, or sigma_m: how exact
-optional  score: how sure the detector is, on any scale; from 0 to 1 it is the probability to be real
+optional  cov_xx_m2, cov_xy_m2, cov_xz_m2, cov_yy_m2, cov_yz_m2, cov_zz_m2, or sigma_m: uncertainty
+optional  score: the detector's confidence, on any scale; from 0 to 1 it is the probability of being real
 optional  length_m, width_m, height_m, yaw_rad: a box around the position
-optional  appearance_0, appearance_1, ...: any vector that looks alike for things that do
-optional  sensor_x_m, sensor_y_m, sensor_z_m: where the sensor was; with --range-m, what is missed in view is gone"""
+optional  appearance_0, appearance_1, ...: any feature vector, similar for similar objects
+optional  sensor_x_m, sensor_y_m, sensor_z_m: position of the sensor; with --range-m, misses in view are evidence"""
 
 
 class _Stay(NamedTuple):

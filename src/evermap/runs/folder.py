@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "summary.json"
 MANIFEST = ".evermap-run.json"
-"""In every folder that evermap wrote: the names of its files, with their sizes and checksums."""
+"""Manifest in every folder that evermap wrote: its files with sizes and checksums."""
 _IGNORED = {".DS_Store", "Thumbs.db"}
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
 
@@ -209,7 +209,7 @@ def check_replaceable(
     for path in (one for one in inputs if one):
         if any(_is_within(place, folder) for place in _real_places(Path(path)) for folder in (out, shown.absolute())):
             raise ConfigError(
-                f"holds '{path}', which this command reads", path=out, field="out", hint="a folder of its own"
+                f"contains '{path}', which this command reads", path=out, field="out", hint="a separate folder"
             )
     if not out.exists():
         return
@@ -221,8 +221,8 @@ def check_replaceable(
     if in_the_way:
         name = in_the_way[0]
         what = "which was changed since evermap wrote it" if name in listed else "which no evermap run wrote"
-        hint = "another folder" if force else "another folder, or `force` to write beside it"
-        raise ConfigError(f"holds '{name}', {what}", path=out, field="out", hint=hint)
+        hint = "another folder" if force else "another folder, or `force` to keep it and write into the folder"
+        raise ConfigError(f"contains '{name}', {what}", path=out, field="out", hint=hint)
 
 
 def check_output_file(path: str | Path, *, inputs: Iterable[str | Path | None] = (), ending: str = "") -> None:
@@ -239,11 +239,11 @@ def check_output_file(path: str | Path, *, inputs: Iterable[str | Path | None] =
     path = Path(path)
     for read in (one for one in inputs if one):
         if any(_is_within(place, path) for place in _real_places(Path(read))):
-            raise ConfigError("is what this command reads", path=path, hint="another name")
+            raise ConfigError("is the input of this command", path=path, hint="another name")
     if not path.name.endswith(ending) and os.path.lexists(path):
         raise ConfigError(f"exists, and is not a {ending} file", path=path, hint=f"a name ending in {ending}")
     if _is_living_map(path):
-        raise ConfigError("is a living map, which is not replaced", path=path, hint="another name")
+        raise ConfigError("is a living map, which is never replaced", path=path, hint="another name")
 
 
 def _is_living_map(path: Path) -> bool:
@@ -327,7 +327,7 @@ def _check_free(folder: Path, ours: Mapping[str, str], new: Iterable[str]) -> No
         if name not in ours and os.path.lexists(path):
             blocked.append(path)
         if blocked:
-            problem = f"holds '{blocked[0].relative_to(folder).as_posix()}', which evermap did not write"
+            problem = f"contains '{blocked[0].relative_to(folder).as_posix()}', which evermap did not write"
             raise ConfigError(problem, path=folder, field="out", hint="another folder, or rename it")
 
 

@@ -41,11 +41,11 @@ TOPICS = {
     "/scene": "foxglove_msgs/msg/SceneUpdate",
     "/changes": "std_msgs/msg/String",
 }
-"""What is in the file. Frames are `map`, `odom`, `base_link`, and those of the sensors by their names."""
+"""Topics of the file. Frames are `map`, `odom`, `base_link`, and those of the sensors by their names."""
 POINT_M, PLATE_M = 0.1, 0.005
-"""Edge of what stands for a landmark without a size, and the thickness of a tag."""
+"""Edge of the marker of a landmark without a size, and the thickness of a tag."""
 MARKER_ID = 2**31 - 1
-"""Largest number of a marker: of a landmark's the last bits."""
+"""Largest id of a marker: the last bits of a landmark's id."""
 CUBE, SPHERE = 1, 2
 """Types of `visualization_msgs/Marker`."""
 

@@ -23,9 +23,9 @@ COLUMNS = (
     "probability", "p_exists", "hits", "misses",
 )  # fmt: skip
 _FORMULAS = ("=", "+", "-", "@", "\t", "\r")
-"""Cells that begin so are formulas to a spreadsheet."""
+"""First characters of cells that a spreadsheet reads as formulas."""
 _PLACES = {ChangeKind.APPEARED: (AFTER,), ChangeKind.RETURNED: (AFTER,), ChangeKind.VANISHED: (BEFORE,)}
-"""Which places a change is of; both where it is not listed."""
+"""Places of a change by its kind; both if it is not listed."""
 
 
 def object_changes_text(result: SlamResult) -> str:

@@ -207,7 +207,7 @@ def begin_map(store: MapStore, landmarks: Landmarks, recording: AnyRecording, so
             "this map has landmarks already",
             field="prior_map",
             path=store.where,
-            hint="only a new map begins with some",
+            hint="only a new map can begin with a prior map",
         )
     living = replace(LivingMap.begun(landmarks), clock=recording.clock)
     said = Provenance(kind=RevisionKind.EDIT, source=source, note=f"{len(landmarks)} surveyed landmarks")
@@ -218,7 +218,7 @@ WORDS: Mapping[str, Mapping[str, bool]] = {
     "pinned": {"pinned": True}, "unpinned": {"pinned": False},
     "deleted": {"deleted": True}, "undeleted": {"deleted": False},
 }  # fmt: skip
-"""What operators say of landmarks."""
+"""Edits of landmarks by operators."""
 
 
 def edit_landmarks(
@@ -281,7 +281,7 @@ def _enter_late(
         base = store.load(parent)
     except PrunedRevisionError as error:
         problem = f"{recording.name}: begins before the session of revision {parent + 1}, but {error.problem}"
-        hint = "an older copy of the file; this map can only be continued without that session"
+        hint = "an older copy of the file; otherwise continue the map without that session"
         raise InputError(problem, path=store.where, hint=hint) from None
     later = sorted(steps[first:], key=lambda step: step.start_s)
     # ids that were given since are not given again
@@ -348,7 +348,7 @@ def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, rec
             twice = TwiceError(
                 f"{recording.name}: is in the map already, as revision {number}",
                 path=store.where,
-                hint="a session is evidence once; the map stays as it was",
+                hint="a session counts once; the map is unchanged",
             )
             twice.revision = number
             raise twice
@@ -365,7 +365,7 @@ def _history(store: MapStore, kept: dict[int, Attachment]) -> list[_Step]:
         if revision.provenance.kind is RevisionKind.SESSION:
             if revision.number not in kept:
                 raise InputError(
-                    f"revision {revision.number} keeps no recording, so that no session can be entered before it",
+                    f"revision {revision.number} has no stored recording, so that no session can be entered before it",
                     path=store.where,
                     hint=f"evermap map revert {store.where} {revision.parent}, then the sessions in order of time",
                 )
@@ -407,7 +407,7 @@ def _session_again(store: MapStore, step: _Step, living: LivingMap, config: Conf
     except DataError as error:
         raise UnbridgedError(f"{problem}: {error}") from None
     if session.slam.interrupted:  # half of a session must not take the place of the whole
-        raise KeyboardInterrupt("the map is as it was")
+        raise KeyboardInterrupt("the map is unchanged")
     if not session.found:  # what is in the map is not dropped
         problem = f"{problem}: {session.set_aside[0]}"
         raise UnbridgedError(problem, path=store.where, hint="sessions that overlap with both, then this one again")

@@ -24,12 +24,12 @@ SUMMARY_SCHEMA_VERSION = "2"
 """Of `summary.json` of all verbs and studies. 2: `config` holds sections; `version` and `input` for all."""
 
 _FRAME_MEANING = {
-    "first_pose": "the robot's first pose: origin where it stood, {axes}; metres",
-    "first_robot": "the first robot's first pose: origin where it stood, {axes}; metres",
-    "prior_map": "the frame of the map that was given; metres",
+    "first_pose": "the robot's first pose: origin at its position, {axes}; metres",
+    "first_robot": "the first robot's first pose: origin at its position, {axes}; metres",
+    "prior_map": "the frame of the given map; metres",
     "truth": "the frame of the recording's own reference; metres",
 }
-_AXES = {3: "x ahead of it, y to its left", 7: "axes as they were"}
+_AXES = {3: "x ahead of it, y to its left", 7: "axes as at that pose"}
 _ROBOT = {
     3: "x forward, y left, angles counter-clockwise; pose covariances are in this frame",
     7: "the frame of the odometry and of the sensors' mounts; pose covariances are in this frame: translation along "

@@ -31,7 +31,7 @@ from evermap.types import (
 )
 
 WRITTEN = {".rrd": "scene.rrd", ".mcap": "run.mcap"}
-"""What is written, by its ending, and the name under which a run folder has it already."""
+"""Output formats by file ending, with the name of the same file in a run folder."""
 
 
 def write_view(path: str | Path, out: str | Path) -> tuple[str, ...]:
@@ -87,7 +87,7 @@ def _of_run(folder: Path) -> tuple[AnyRecording, SlamResult]:
     """A run as its files have it.
 
     Raises:
-        ConfigError: it is no run of `slam`.
+        ConfigError: it is not a run of `slam`.
     """
     from evermap.io import read_landmarks, read_tum
 
@@ -98,9 +98,9 @@ def _of_run(folder: Path) -> tuple[AnyRecording, SlamResult]:
         files = ("trajectory.tum", "online.tum", "map.parquet", "innovations.parquet")
         missing = [name for name in files if not (folder / name).is_file()]
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise ConfigError("is no run of `slam`", path=folder, hint="a folder with its summary.json") from error
+        raise ConfigError("is not a run of `slam`", path=folder, hint="a folder with its summary.json") from error
     if missing:
-        raise ConfigError(f"holds no {missing[0]}", path=folder, hint="a folder that `slam` wrote, whole")
+        raise ConfigError(f"contains no {missing[0]}", path=folder, hint="a complete folder written by `slam`")
     landmarks = read_landmarks(folder / "map.parquet")
     in_space = landmarks.position_m.shape[1] == 3
     path, online = (
@@ -123,9 +123,7 @@ def _recording(about: Mapping[str, Any], clock: Clock) -> tuple[AnyRecording, tu
                 return recording, ()
     except EvermapError:
         pass
-    return _nothing(name, clock), (
-        f"{source} is not there, or is another recording: shown without detections and truth",
-    )
+    return _nothing(name, clock), (f"{source} is missing, or is another recording: shown without detections and truth",)
 
 
 def _innovations(path: Path) -> Innovations:

@@ -43,11 +43,11 @@ from evermap.types import Landmarks, json_number
 _EVERY_S = 1.0
 """Between two looks for new revisions, where none are announced."""
 _ALIVE_S = 15.0
-"""Between two lines that keep a connection open."""
+"""Interval between two keep-alive lines."""
 _RATE_HZ, _BURST = 50.0, 200.0
-"""Requests of one token, over time and at once."""
+"""Rate and burst of requests per token."""
 _WARM = 16
-"""Maps that are read before the first request."""
+"""Maps that are loaded before the first request."""
 _POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; frame-ancestors 'none'"
 _PAGE = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
 
@@ -218,11 +218,11 @@ class Detail(BaseModel):
 _MISTAKES = {
     400: "the body cannot be read",
     401: "a token is needed",
-    403: "the token has not the role",
-    404: "there is no such thing",
-    409: "not as things are now",
-    413: "more bytes than an upload may have",
-    422: "a value is not valid",
+    403: "the token does not have the role",
+    404: "not found",
+    409: "conflict with the present state",
+    413: "the upload is too large",
+    422: "a value is invalid",
     429: "too many requests",
     503: "the database does not answer",
 }
@@ -437,7 +437,7 @@ def _approved(server: Server, site: str) -> int:
     server.sites.address(site)  # PostgreSQL takes no zero bytes, as what is no name may hold
     chosen = server.database.approved(site)
     if chosen is None:
-        raise HTTPException(404, "no revision of it is approved")
+        raise HTTPException(404, "none of its revisions is approved")
     return int(chosen["revision"])
 
 
@@ -490,7 +490,7 @@ def hold(
 ) -> dict[str, Any]:  # fmt: skip
     """Say which maps a robot holds, the `maps` of its state in VDA 5050: by the robot itself, or by an approver."""
     if robot != who and request.state.role < Role.APPROVE:
-        raise HTTPException(403, f"the token is of {who}: another robot is spoken for with the role approve")
+        raise HTTPException(403, f"the token belongs to {who}: reporting for another robot needs the role approve")
     enabled = [one.map_id for one in maps if one.status == "ENABLED"]
     if len(set(enabled)) < len(enabled):
         raise HTTPException(422, "two versions of one map are enabled")

@@ -53,17 +53,19 @@ from evermap.maps.store.sql import announce, now_utc
 from evermap.maps.store.sqlite import engine_of as sqlite_engine
 
 VERSION = 1
-"""Of the tables; there is no older one to bring up to date."""
+"""Schema version of the tables; there is no older one to migrate."""
 SCHEMA = "evermap_server"
 AWAY = (OperationalError, InterfaceError)
-"""What a database that does not answer raises."""
+"""Errors raised by a database that does not answer."""
 MOST_TRIES = 10
-"""Workers that may die of a session before it is refused: more than chance has at the same one."""
+"""Number of workers that may crash on a session before it is refused."""
 SHOWN = 20
-"""Newest sessions of a site, of which followers are told what becomes of them."""
+"""Newest sessions of a site whose state is sent to followers."""
 
 _GROWTH = 4
-"""A session that never fits is tried a number of times that grows as the logarithm of the map's revisions."""
+"""Growth of the map between retries: a session that never fits is tried a number of times logarithmic in its
+revisions.
+"""
 
 metadata = MetaData()
 _server = Table("server", metadata, Column("version", Integer, nullable=False))
@@ -212,7 +214,7 @@ class Database:
             version = connection.execute(select(_server.c.version)).scalar()
         if version != VERSION:
             problem = f"the server's tables are of version {version}, this evermap has {VERSION}"
-            raise InputError(problem, hint="the evermap that wrote them, or an empty store")
+            raise InputError(problem, hint="the evermap version that wrote them, or an empty store")
         # SQLite has one writer at a time; PostgreSQL locks the rows that are written
         self._writer = self._engine.execution_options(writes=not on_server, shared=True)
         self.announcements = Announcements(str(where) if on_server else None)
@@ -230,7 +232,7 @@ class Database:
                 connection.execute(insert(_token).values(row))
         except IntegrityError:
             hint = "another name, or revoke that one first"
-            raise ConfigError(f"there is a token of the name '{name}'", field="name", hint=hint) from None
+            raise ConfigError(f"a token named '{name}' exists", field="name", hint=hint) from None
         return text
 
     def revoke_token(self, name: str) -> bool:

@@ -56,7 +56,7 @@ function table(id, heads, rows) {
 const minute = (stamp) => stamp.slice(0, 16).replace("T", " ");
 
 function duration(s) {
-  if (s === null) return "not known";
+  if (s === null) return "unknown";
   const [size, unit] = [[31557600, "years"], [86400, "days"], [3600, "h"], [60, "min"], [1, "s"]].find(([one]) => s >= one) || [1, "s"];
   return `${(s / size).toPrecision(2).replace(/e.*/, "")} ${unit}`;
 }
@@ -283,7 +283,7 @@ function candidates() {
   if (focused >= 0) $("candidates").querySelectorAll("button")[focused]?.focus();
   $("approves").textContent = number === approved ? `Revision ${number} is approved` : `Approve revision ${number} for the robots`;
   $("approves").disabled = number === approved;
-  $("reverts").textContent = `Go back to revision ${number}`;
+  $("reverts").textContent = `Revert to revision ${number}`;
   $("reverts").disabled = number === revisions.at(-1)?.revision;
 }
 
@@ -334,8 +334,8 @@ async function beside() {
     return { ...one, used, held: held.map((item) => item.mapVersion).filter((version) => version !== used) };
   }).filter((one) => one.used || one.held.length).sort((a, b) => Number(b.used) - Number(a.used));
   const right = rows.filter((one) => one.used === String(approved)).length;
-  $("holders").textContent = !rows.length ? "None has said that it holds this map." : approved ? `${right} of ${rows.length} use revision ${approved}, which is approved.` : "";
-  table("robots", ["Robot", "Uses", "Also holds", "Said at (UTC)"], rows.map((one) =>
+  $("holders").textContent = !rows.length ? "No robot has reported that it holds this map." : approved ? `${right} of ${rows.length} use revision ${approved}, which is approved.` : "";
+  table("robots", ["Robot", "Uses", "Also holds", "Reported (UTC)"], rows.map((one) =>
     [one.robot, one.used ? `${one.used} ${one.used === String(approved) ? "✓ approved" : "△ another"}` : "none", one.held.join(", ") || "–", minute(one.at)]));
 }
 
@@ -357,7 +357,7 @@ async function follow() {
         if (end > 1) text = text.slice(end);
       }
     } catch (error) { if (signal.aborted) return; }
-    say("the server is away; trying again");
+    say("the server does not answer; retrying");
     await new Promise((wake) => setTimeout(wake, 3000));
   }
 }
@@ -399,7 +399,7 @@ $("approve").addEventListener("submit", async (event) => {
 });
 $("reverts").addEventListener("click", async () => {
   const body = { revision: number(), note: $("approve-note").value };
-  if (await act("revert", body, (answer) => `revision ${answer.revision} is as revision ${answer.restores} was`)) $("approve-note").value = "";
+  if (await act("revert", body, (answer) => `revision ${answer.revision} restores revision ${answer.restores}`)) $("approve-note").value = "";
 });
 $("pins").addEventListener("click", () => tell(chosen.pinned ? "unpin" : "pin"));
 $("deletes").addEventListener("click", () => tell(chosen.deleted ? "undelete" : "delete"));

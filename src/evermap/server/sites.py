@@ -24,7 +24,7 @@ ENDING = ".evermap"
 _MOST_OPEN = 200
 _MOST_FILES, _MOST_MAPS, _MOST_ANSWERS = 8, 16, 500
 _LONGEST_ANSWER = 500_000
-"""Bytes of an answer that is kept."""
+"""Maximum bytes of a cached answer."""
 
 
 class NoSuchSiteError(InputError):
@@ -69,7 +69,7 @@ class SiteStores:
         """
         if not SITE.fullmatch(site):
             hint = "up to 48 letters, digits, - and _, a letter or digit first"
-            raise ConfigError("is no name of a site", field="site", hint=hint)
+            raise ConfigError("is not a valid site name", field="site", hint=hint)
         return address_of(str(self._where), site) if is_address(self._where) else str(Path(self._where, site + ENDING))
 
     def names(self) -> list[str]:

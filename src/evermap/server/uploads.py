@@ -24,13 +24,13 @@ from evermap.errors import EvermapError, InputError
 from evermap.types import AnyRecording
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. ()+-]{0,119}")
-"""Parts of paths: nothing hidden, no '..', no drive, no control character."""
+"""Allowed parts of paths: nothing hidden, no '..', no drive, no control character."""
 _READ = (".csv", ".parquet", ".toml")
 _BAGS = {".mcap": b"\x89MCAP0\r\n", ".bag": b"#ROSBAG V", ".db3": b"SQLite format 3\0"}
-"""Endings of bags, and how they begin."""
+"""File endings of bags, and their first bytes."""
 _BAG_READ = (*_BAGS, "metadata.yaml", ".toml")
 _BAG_CPU_S, _BAG_BYTES = 600, 4_000_000_000
-"""Of the process that reads a bag; 17 MB of messages take it 3 s and 0.14 GB."""
+"""Limits of the process that reads a bag; 17 MB of messages take it 3 s and 0.14 GB."""
 _CONVERT = f"""
 import resource
 resource.setrlimit(resource.RLIMIT_CPU, ({_BAG_CPU_S}, {_BAG_CPU_S}))
@@ -87,7 +87,7 @@ def _parts(data: bytes, limits: UploadLimits) -> dict[str, bytes]:
         if data.startswith(start):
             return {f"session{ending}": data}
     if data.count(b"PK\x01\x02") > 2 * limits.n_files:  # before millions of entries are listed
-        raise InputError(f"holds more than {limits.n_files} files")
+        raise InputError(f"contains more than {limits.n_files} files")
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             wanted = _members(archive.infolist(), limits)
@@ -96,12 +96,12 @@ def _parts(data: bytes, limits: UploadLimits) -> dict[str, bytes]:
         raise
     except _ROTTEN as error:
         hint = "zip -r session.zip FOLDER, or a bag: .mcap, .bag, .db3"
-        raise InputError(f"is no readable zip: {str(error)[:120]}", hint=hint) from None
+        raise InputError(f"is not a readable zip: {str(error)[:120]}", hint=hint) from None
     bags = [name for name in parts if name.endswith((*_BAGS,))]
     if not bags or "metadata.yaml" in parts:
         return parts
     if len(bags) > 1:
-        raise InputError(f"holds {len(bags)} bags", hint="one, or the folder with its metadata.yaml")
+        raise InputError(f"contains {len(bags)} bags", hint="one, or the folder with its metadata.yaml")
     return {f"session{Path(name).suffix}": content for name, content in parts.items()}
 
 
@@ -109,7 +109,7 @@ def _members(infos: list[zipfile.ZipInfo], limits: UploadLimits) -> dict[str, zi
     """The files that a recording is read from, by name."""
     files = [info for info in infos if not info.is_dir()]
     if len(infos) > limits.n_files:
-        raise InputError(f"holds {len(infos)} files, more than {limits.n_files}")
+        raise InputError(f"contains {len(infos)} files, more than {limits.n_files}")
     # what a file claims to be is all that is ever read of it
     size = sum(info.file_size for info in files)
     if size > limits.unpacked_bytes:
@@ -118,23 +118,23 @@ def _members(infos: list[zipfile.ZipInfo], limits: UploadLimits) -> dict[str, zi
     for info in files:
         parts = PurePosixPath(info.filename.replace("\\", "/")).parts
         if info.filename.startswith(("/", "\\")) or not all(map(_NAME.fullmatch, parts)) or len(parts) > 2:
-            raise InputError("holds a path that no recording has", field=info.filename[:80])
+            raise InputError("contains a path that is not part of a recording", field=info.filename[:80])
         kind = stat.S_IFMT(info.external_attr >> 16)
         if info.flag_bits & _ENCRYPTED or kind not in (0, stat.S_IFREG):
-            raise InputError("holds a link, or a file that is encrypted", field=info.filename[:80])
+            raise InputError("contains a link, or a file that is encrypted", field=info.filename[:80])
         if parts[-1].endswith(".gz"):
             raise InputError("is compressed twice", field=info.filename[:80], hint="plain CSV or Parquet in the zip")
         if parts[-1].endswith((*_READ, *_BAG_READ)):
             if parts[-1] in found:
-                raise InputError("holds two files of that name", field=info.filename[:80])
+                raise InputError("contains two files of that name", field=info.filename[:80])
             found[parts[-1]] = info
     if {"detections.csv", "detections.parquet"} & found.keys():
         return {name: info for name, info in found.items() if name.endswith(_READ)}
     if not any(name.endswith((*_BAGS,)) for name in found):
-        raise InputError("holds no detections and no bag", hint="a zip of a folder as docs/formats.md describes it")
+        raise InputError("contains no detections and no bag", hint="a zip of a folder as docs/formats.md describes it")
     found = {name: info for name, info in found.items() if name.endswith(_BAG_READ)}
     if sum(name.endswith(".toml") for name in found) > 1:
-        raise InputError("holds two settings files", hint="one that says which topics of the bag are what")
+        raise InputError("contains two settings files", hint="one that states the topics of the bag")
     return found
 
 
@@ -144,7 +144,7 @@ def _content(archive: zipfile.ZipFile, info: zipfile.ZipInfo, limits: UploadLimi
         raise InputError("is compressed twice", field=info.filename[:80], hint="plain CSV or Parquet in the zip")
     start = _BAGS.get(Path(info.filename).suffix, b"")
     if not content.startswith(start):
-        raise InputError("is no bag", field=info.filename[:80], hint="record it again, or leave it out")
+        raise InputError("is not a bag", field=info.filename[:80], hint="record it again, or leave it out")
     if info.filename.endswith(".parquet"):
         _check_parquet(content, info.filename, limits)
     return content
@@ -159,7 +159,7 @@ def _check_parquet(content: bytes, name: str, limits: UploadLimits) -> None:
         about = parquet.ParquetFile(io.BytesIO(content)).metadata
         packed = sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups))
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise InputError(f"is no Parquet file: {str(error)[:120]}", field=name[:80]) from None
+        raise InputError(f"is not a Parquet file: {str(error)[:120]}", field=name[:80]) from None
     if max(packed, about.num_rows * about.num_columns * _VALUE_BYTES) > limits.unpacked_bytes:
         raise InputError(f"unpacks to more than {limits.unpacked_bytes} bytes", field=name[:80])
 
@@ -215,5 +215,5 @@ def _convert(parts: dict[str, bytes], out: Path) -> tuple[str, ...]:
         told = done.stderr.strip().rpartition("\n")[2].replace(f"{bag.parent}/", "")
         raise InputError(told.removeprefix("evermap: error: "))
     if done.returncode:
-        raise InputError(f"cannot be read as a bag within {_BAG_CPU_S} s of computing and {_BAG_BYTES / 1e9:.0f} GB")
+        raise InputError(f"cannot be read as a bag within {_BAG_CPU_S} s of CPU time and {_BAG_BYTES / 1e9:.0f} GB")
     return tuple(json.loads(done.stdout)["warnings"])

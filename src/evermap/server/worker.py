@@ -79,7 +79,7 @@ class Worker:
         job, data = claimed
         with self._leased(job):
             if job.tries >= MOST_TRIES:
-                outcome = JobOutcome(JobState.REJECTED, f"{job.tries} workers died of it")
+                outcome = JobOutcome(JobState.REJECTED, f"{job.tries} workers crashed on it")
             else:
                 outcome = self._enter(job, data)
         self._database.finish(job.id, self.name, outcome.state, outcome.reason, outcome.revision)
@@ -113,7 +113,7 @@ class Worker:
         except EvermapError as error:
             return JobOutcome(JobState.REJECTED, error.one_line())
         except Exception as error:  # a defect of ours must not stop those who wait behind it
-            return JobOutcome(JobState.REJECTED, f"a defect of evermap: {type(error).__name__}: {error}")
+            return JobOutcome(JobState.REJECTED, f"a bug in evermap: {type(error).__name__}: {error}")
 
     @contextmanager
     def _leased(self, job: Job) -> Iterator[None]:

@@ -103,7 +103,7 @@ class CalibrationPrior:
         for name, value in settings.fix.items():
             if name not in NAMES:
                 raise ConfigError(
-                    f"no calibration state is called '{name}'",
+                    f"unknown calibration state '{name}'",
                     field="slam.calibration.fix",
                     hint=", ".join(NAMES),
                 )

@@ -37,7 +37,7 @@ from evermap.types import (
 from evermap.valid import check_landmarks, validate, validate_spatial
 
 OUTSIDE = 0.05
-"""Corners of tags at the edge may be outside of the image, where distortion is taken off, by this share of its size."""
+"""Share of the image size by which undistorted corners of tags may lie outside of the image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,13 +143,13 @@ def far_off(parameters: Sequence[ParameterEstimate], settings: CheckConfig = USU
         if away > settings.far_off:
             told.append(
                 f"{state.name} = {state.value:.3g} {state.unit}".removesuffix(" 1")
-                + f" is {away:.0f} standard deviations from what sensors do: {_CAUSES[state.name]}"
+                + f" is {away:.0f} standard deviations from the prior of sensors: {_CAUSES[state.name]}"
             )
     return tuple(told)
 
 
 _CAUSES = {
-    "range_bias_m": "ranges in another unit, or counted from another place than the sensor's origin",
+    "range_bias_m": "ranges in another unit, or from another origin than the sensor's",
     "range_slope": "ranges or speeds in another unit",
     "range_skew_per_rad": "bearings from another axis, or with the wrong sign",
     "range_curvature_per_rad2": "bearings in another unit",
@@ -157,8 +157,9 @@ _CAUSES = {
     "odometry_delay_s": "two clocks: odometry and detections are stamped differently",
     "odometry_forward_scale": "speeds or ranges in another unit, or a wrong wheel radius",
     "odometry_turn_scale": "turn rates in another unit or with the wrong sign, or a wrong wheel base",
-    "odometry_askew_rad": "the sensor is turned otherwise than [mount] theta_rad says, or the robot drives askew",
-    "odometry_turn_slip_m": "the sensor sits elsewhere than [mount] x_m, y_m say, or bearings have the wrong sign",
+    "odometry_askew_rad": "the sensor's angle differs from [mount] theta_rad, or the robot drives at an angle to its "
+    "front",
+    "odometry_turn_slip_m": "the sensor's position differs from [mount] x_m, y_m, or bearings have the wrong sign",
 }
 
 
@@ -284,7 +285,7 @@ def _limits_in_space(recording: SpatialRecording) -> list[Finding]:
             Finding("beyond-range", f"{int(far.sum())} of {len(far)} detections are beyond range_max_m, {most}: {why}")
         )
     if aside.any():
-        why = "the calibration is of another resolution" if np.mean(aside) > 0.05 else "outliers"
+        why = "the calibration is for another resolution" if np.mean(aside) > 0.05 else "outliers"
         found.append(
             Finding("beyond-view", f"{int(aside.sum())} of {len(aside)} tags have corners outside of the image: {why}")
         )
@@ -370,8 +371,8 @@ def _identities(recording: AnyRecording, settings: CheckConfig) -> list[Finding]
     if count < settings.fewest or again > 0.1 * count:
         return []
     message = (
-        f"{count} landmarks in {int(known.sum())} detections, {again} of them seen more than once: landmark_id has to "
-        "name the thing that was seen, the same each time, not the detection"
+        f"{count} landmarks in {int(known.sum())} detections, {again} of them seen more than once: landmark_id must "
+        f"identify the landmark, the same each time, not the detection"
     )
     return [Finding("own-identities", message, usable=count < settings.own_ids)]
 
@@ -401,8 +402,8 @@ def _motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]:
     usual = float(np.median(off(pairs.residual(undone))))
     if usual > settings.off:
         message = (
-            "landmarks do not stand still: seen again within seconds, half of them are over "
-            f"{usual:.2g} rad or {usual:.0%} of their range from where odometry says; mixed identities, or "
+            f"landmarks are not static: seen again within seconds, half of them are over {usual:.2g} rad or "
+            f"{usual:.0%} of their range from the prediction by odometry; mixed identities, or "
             "mistakes in several units, signs or frames at once"
         )
         return [Finding("landmarks-move", message)]

@@ -19,10 +19,10 @@ from evermap.valid import LATEST_S
 
 USUAL = CleaningConfig()
 AROUND_S = 3.0
-"""To within which readings tell when a clock was set."""
+"""Accuracy to which readings determine the time of a clock change."""
 SET_BACK = "was set back"
 SINGLE = 10.0
-"""Times as far must the robot have moved where a frame has one reading only."""
+"""Factor on the required motion for a frame with a single reading."""
 
 
 def clean(recording: Recording, settings: CleaningConfig = USUAL) -> Recording:
@@ -66,16 +66,16 @@ def _odometry(odometry: Odometry, settings: CleaningConfig, remarks: list[str]) 
     order = np.argsort(stamps, kind="stable")
     order = order[np.isfinite(stamps[order])]
     last = np.append(stamps[order][1:] != stamps[order][:-1], True)[: len(order)]
-    _remark(remarks, "odometry rows with the stamp of another left out", int(np.sum(~last)))
+    _remark(remarks, "odometry rows with a repeated stamp dropped", int(np.sum(~last)))
     kept = order[last]
     if len(kept) < len(stamps) or np.any(np.diff(kept) != 1) or np.any(stamps != odometry.stamp_s):
         odometry = replace(rows_of(odometry, kept), stamp_s=stamps[kept])
     velocity = np.stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
     possible = np.all(np.abs(velocity) <= settings.fastest, axis=0)
-    _remark(remarks, "odometry rows that no robot can drive left out", int(np.sum(~possible)))
+    _remark(remarks, "odometry rows beyond possible velocities dropped", int(np.sum(~possible)))
     odometry, velocity = rows_of(odometry, possible), velocity[:, possible]
     spike = spikes(odometry.stamp_s, velocity, settings)
-    _remark(remarks, "odometry rows with a spike left out", int(np.sum(spike)))
+    _remark(remarks, "odometry rows with a spike dropped", int(np.sum(spike)))
     return rows_of(odometry, ~spike)
 
 
@@ -108,20 +108,20 @@ def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]
         raise DataError(problem, field="range_m", hint="ranges and range_max_m in metres")
     real &= ~far & (np.abs(detections.bearing_rad) <= 2.0 * np.pi)
     real &= (detections.frame >= 0) & (detections.frame < len(recording.frames))
-    _remark(remarks, "readings that no sensor can make left out", int(np.sum(~real)))
+    _remark(remarks, "impossible readings dropped", int(np.sum(~real)))
     if not real.all():
         detections = rows_of(detections, real)
     strange = detections.landmark_id < UNKNOWN
     unnamed = (detections.class_id < UNKNOWN) | (detections.class_id >= max(len(recording.class_names), 1))
     unnamed &= len(recording.class_names) > 0
-    _remark(remarks, "identities and classes that do not exist taken as unknown", int(np.sum(strange | unnamed)))
+    _remark(remarks, "invalid identities and classes treated as unknown", int(np.sum(strange | unnamed)))
     if np.any(strange | unnamed):
         names = np.where(strange, UNKNOWN, detections.landmark_id)
         detections = replace(detections, landmark_id=names, class_id=np.where(unnamed, UNKNOWN, detections.class_id))
     for name in ("sigma_range_m", "sigma_bearing_rad"):
         sigma = getattr(detections, name)
         bad = ~np.isnan(sigma) & ~((sigma > 0.0) & (sigma < np.inf))
-        _remark(remarks, f"values of {name} that are none taken as not given", int(np.sum(bad)))
+        _remark(remarks, f"invalid values of {name} treated as missing", int(np.sum(bad)))
         if bad.any():
             mended: dict[str, Any] = {name: np.where(bad, np.nan, sigma)}
             detections = replace(detections, **mended)
@@ -137,14 +137,14 @@ def _in_time(
     sorted_already = np.all(np.diff(detections.frame) >= 0)
     if len(instants) == len(frames) and np.array_equal(instants, frames.stamp_s) and sorted_already:
         return frames, detections
-    _remark(remarks, "frames that came more than once united", int(np.isfinite(stamps).sum()) - len(instants))
+    _remark(remarks, "repeated frames merged", int(np.isfinite(stamps).sum()) - len(instants))
     row: IntArray = np.searchsorted(instants, stamps).astype(np.int64)[detections.frame]
     order = np.argsort(row, kind="stable")
     order = order[np.isfinite(stamps[detections.frame[order]])]
     detections = replace(rows_of(detections, order), frame=row[order])
     same = np.column_stack([detections.frame, detections.landmark_id, detections.range_m, detections.bearing_rad])
     _, first = np.unique(same, axis=0, return_index=True)
-    _remark(remarks, "readings that a frame has twice left out", len(same) - len(first))
+    _remark(remarks, "repeated readings of a frame dropped", len(same) - len(first))
     if not sorted_already:
         remarks.append("detections sorted by frame")
     return replace(frames, stamp_s=instants), rows_of(detections, np.sort(first))
@@ -168,7 +168,7 @@ def _one_clock(
 
 def _taken_back(stamp_s: FloatArray, step: tuple[int, float], what: str, remarks: list[str]) -> FloatArray:
     row, by_s = step
-    remarks.append(f"clock of the {what} was set forward by {by_s:.1f} s, taken back")
+    remarks.append(f"clock of the {what} was set forward by {by_s:.1f} s, undone")
     return np.append(stamp_s[:row], stamp_s[row:] - by_s)
 
 
@@ -206,7 +206,7 @@ def _in_step(recording: Recording, remarks: list[str]) -> Odometry:
     rows = np.maximum.accumulate([0, *(step(row)[0] for row in range(1, len(since_s)))])
     stamp_s = odometry.stamp_s - np.repeat(delay_s, np.diff([*rows, len(odometry)])) + min(delay_s, key=abs)
     for at_s, by_s in zip(since_s[1:], np.diff(delay_s).tolist(), strict=True):
-        remarks.append(f"odometry is later by {by_s:+.1f} s than the detections from {at_s:.1f} s on, taken back")
+        remarks.append(f"odometry is later by {by_s:+.1f} s than the detections from {at_s:.1f} s on, undone")
     kept = stamp_s > np.maximum.accumulate(np.append(-np.inf, stamp_s[:-1]))
     return replace(rows_of(odometry, kept), stamp_s=stamp_s[kept])
 
@@ -232,7 +232,7 @@ def _while_driving(
     if near.all():
         return frames, detections
     _remark(
-        remarks, f"frames more than {settings.stray_s:g} s before or after the odometry left out", int(np.sum(~near))
+        remarks, f"frames more than {settings.stray_s:g} s before or after the odometry dropped", int(np.sum(~near))
     )
     return some_frames(frames, detections, near)
 
@@ -268,7 +268,7 @@ def _fresh(
     )
     if not repeated.any():
         return frames, detections
-    _remark(remarks, "frames left out that repeat the one before, though the robot moved", int(repeated.sum()))
+    _remark(remarks, "frames dropped that repeat the previous one although the robot moved", int(repeated.sum()))
     return some_frames(frames, detections, ~repeated)
 
 
@@ -285,12 +285,12 @@ def _mended(what: str, stamp_s: FloatArray, settings: CleaningConfig, remarks: l
     """(N,) stamps as a clock that is never set back would have shown them, nan where one is none."""
     stamps, back_s = restored(stamp_s, settings)
     real = stamps[np.isfinite(stamps)]
-    _remark(remarks, f"stamps of the {what} that are none left out with their rows", len(stamps) - len(real))
+    _remark(remarks, f"invalid stamps of the {what} dropped with their rows", len(stamps) - len(real))
     late = int(np.sum(real < np.maximum.accumulate(real))) if len(real) else 0
-    _remark(remarks, f"late stamps of the {what} sorted in", late)
+    _remark(remarks, f"late stamps of the {what} sorted", late)
     if len(back_s):
         steps = ", ".join(f"{step:.1f}" for step in back_s[:3]) + (", ..." if len(back_s) > 3 else "")
-        remarks.append(f"clock of the {what} {SET_BACK}, by {steps} s; what follows goes on from there")
+        remarks.append(f"clock of the {what} {SET_BACK}, by {steps} s; later stamps continue from there")
     return stamps
 
 

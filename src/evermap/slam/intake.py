@@ -18,7 +18,7 @@ from evermap.slam.streaming import PriorMap
 from evermap.types import UNKNOWN, IntArray, Landmarks, Recording, Sensor
 
 FIRST_POSE_INFORMATION = 1e8
-"""The first pose is the origin, to 0.1 mm."""
+"""Standard deviation of the first pose, the origin: 0.1 mm."""
 
 
 @dataclass(frozen=True, slots=True)

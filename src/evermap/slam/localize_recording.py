@@ -85,8 +85,8 @@ def localize(
     run = _feed(localizer, recording, frame, drive, realtime=realtime, progress=progress)
     if not run.placed.any():
         raise DataError(
-            f"{recording.name}: cannot localise in the map: too few of its landmarks were seen standing to each other "
-            "as it says",
+            f"{recording.name}: cannot localise in the map: too few of the detected landmarks have the relative "
+            f"positions of the map",
             hint="check that it is the map of this place",
         )
     return _result(recording, run, localizer, prior, drive, landmarks, places)
@@ -259,8 +259,8 @@ def _warnings(recording: Recording, run: _Run, places: KnownPlaces) -> list[str]
     searching = int(sum(one.lost for one in run.located[at:]))
     said = {
         f"{anonymous} detections without identity not used": anonymous,
-        f"{strange} detections of landmarks that the map lacks not used": strange,
-        f"the robot's place in the map was found after {blind:.1f} s; there are no poses before": at,
-        f"in {searching} frames the map did not fit, and the robot's place was searched for": searching,
+        f"{strange} detections of landmarks that are not in the map not used": strange,
+        f"the robot was localised in the map after {blind:.1f} s; there are no poses before": at,
+        f"in {searching} frames the map did not fit, and the pose was searched for": searching,
     }
     return [text for text, count in said.items() if count]

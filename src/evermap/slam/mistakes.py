@@ -73,7 +73,7 @@ _LENGTHS = (
     ("forward_mps", "speeds", "centimetres per second", 1e2), ("forward_mps", "speeds", "miles an hour", 1 / 0.44704),
     ("forward_mps", "speeds", "feet per second", 1 / 0.3048),
 )  # fmt: skip
-"""Commoner units first: odometers that are some per cent off cannot tell km/h from feet per second."""
+"""Common units first: with odometer errors of some per cent, km/h and feet per second are indistinguishable."""
 _LENGTHS_IN_SPACE = tuple(
     (field, what, unit, factor ** (-1 if field == "odometry" else 1))
     for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048), ("inches", 0.0254))
@@ -103,14 +103,15 @@ _ANGLES = (
     ),
     Mistake(
         "forward-sign",
-        "the robot seems to drive the other way than it says: forward speeds have the wrong sign (forward_mps), or the "
+        "the robot seems to drive in the opposite direction: forward speeds have the wrong sign (forward_mps), or the "
         "sensor looks backwards ([mount] theta_rad)",
         forward=-1.0,
     ),
     *(
         Mistake(
             "bearing-axis",
-            f"bearings seem to be {side} from another axis: they count from x ahead (bearing_rad, x_m and y_m, or "
+            f"bearings seem to be {side} from another axis: they are measured from x ahead (bearing_rad, x_m and y_m, "
+            f"or "
             "[mount] theta_rad)",
             bearing=sign,
             offset_rad=offset,
@@ -122,7 +123,7 @@ _ANGLES = (
 _AXES = tuple(
     Mistake(
         "mount-axes",
-        f"detections seem to be in a frame with {seen} although the mount is that of one with {stated}: "
+        f"detections seem to be in a frame with {seen}, but the mount is for one with {stated}: "
         "[mount], or the frame_id of their messages",
         turned=turned,
     )
@@ -133,9 +134,9 @@ _AXES = tuple(
 )
 _DELAYS_S = (*np.arange(1.0, 10.0, 0.5).tolist(), *np.arange(10.0, 61.0, 1.0).tolist())
 AT_ONCE = 32
-"""Mistakes that are undone on trial in one go: arrays of a megabyte."""
+"""Number of corrections that are tried together: arrays of a megabyte."""
 LEAST_STEP_S = 0.4
-"""Smaller steps of one clock against the other are the calibration's, which has a delay."""
+"""Minimum clock difference that is reported; smaller ones are estimated by the calibration."""
 _FACTORS = tuple(10.0**power for power in np.arange(-4.0, 4.01, 0.1) if abs(power) > 0.25)
 
 
@@ -151,7 +152,7 @@ def _late(delay_s: float) -> Mistake:
 def _longer(factor: float, why: str) -> Mistake:
     told = 1.0 / factor
     how = f"{told:.3g} times too long" if told > 1 else f"{factor:.3g} times too short"
-    return Mistake("length-unit", f"ranges seem to be {how} for the way driven: {why}", lengths=factor)
+    return Mistake("length-unit", f"ranges seem to be {how} for the distance driven: {why}", lengths=factor)
 
 
 def likeliest(pairs: Pairs, undone: Mistake, told: Container[str], settings: CheckConfig) -> Mistake | None:

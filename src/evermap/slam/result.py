@@ -31,9 +31,9 @@ from evermap.types import (
 )
 
 TRAJECTORY_STEP_S = 0.1
-"""Longest step between poses of the trajectory that is written."""
+"""Maximum time between poses of the written trajectory."""
 LONGEST_PAUSE_S = 60.0
-"""Longer pauses are divided no further: a clock that was set forward by a day would make a million poses of it."""
+"""Maximum pause that is subdivided: a clock set forward by a day would give a million poses."""
 
 
 def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
@@ -44,8 +44,8 @@ def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
     warnings = list(found.warnings)
     if prepared.prior_map is not None and not outcome.aligned:
         warnings.append(
-            "cannot localise in the prior map: too few of its landmarks were seen standing to each other as it says; "
-            "the map is in the frame of the first pose"
+            "cannot localise in the prior map: too few of the detected landmarks have the relative positions of the "
+            "map; the result is in the frame of the first pose"
         )
     return replace(
         found,
@@ -237,7 +237,7 @@ def described(
         angle = states[BEARING] + askew[0]
         meanings["bearing_bias_rad"] += f"; {angle:.4f} if the robot drove straight"
         meanings["odometry_askew_rad"] = (
-            f"driving to the left of the robot's front; {angle:.4f} if the sensor were mounted as stated"
+            f"driving direction to the left of the robot's front; {angle:.4f} if the sensor were mounted as stated"
         )
     estimates = [
         ParameterEstimate(

@@ -43,9 +43,9 @@ from evermap.slam.streaming import (
 from evermap.types import FloatArray, IntArray, Trajectory
 
 ONE_INSTANT_S = 1e-3
-"""Instants that are this close are one: a robot moves a millimetre in between."""
+"""Instants this close are the same: a robot moves a millimetre in between."""
 MOST_TIES = 200
-"""Sightings of one robot by another by which their frames are laid over each other."""
+"""Maximum mutual sightings used to align the frames of two robots."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,8 +210,8 @@ def _placed(members: Sequence[Member], own: Sequence[tuple[Problem, Estimate]], 
                 best, found = int(agree.sum()), (b, by)
         if found is None or best < members[0].alone.settings.localize.fewest:
             lost = ", ".join(members[r].alone.recording.name for r in range(len(own)) if r not in placed)
-            what = f"nothing ties {lost} to {members[0].alone.recording.name}"
-            raise DataError(what, hint="landmarks with the same ids, or sightings of each other, and one clock")
+            what = f"nothing connects {lost} to {members[0].alone.recording.name}"
+            raise DataError(what, hint="common landmark ids or mutual sightings, and one clock")
         motion[found[0]] = found[1]
         placed.add(found[0])
     return motion

@@ -34,7 +34,7 @@ from evermap.types import (
 )
 
 FIRST_QUARTILE = {2: 0.575, 3: 1.213}
-"""Of a squared standard normal vector, by its dimension: most ids are right, not all."""
+"""First quartile of a squared standard normal vector, by its dimension: most ids are right, not all."""
 FEWEST_PAIRS, LEAST_SHARE = 20, 1e-4
 """Detections of one id from which their error is told, and its variance as a share of the above, at least."""
 

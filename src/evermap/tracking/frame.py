@@ -86,7 +86,7 @@ def boxes(values: Any, m: int) -> FloatArray:
         raise InputError(f"shape {array.shape} instead of ({m}, 4)", field="box", hint="length, width, height, heading")
     wrong = np.flatnonzero(~(np.isfinite(array).all(axis=1) & (array[:, :3] > 0.0).all(axis=1)))
     if wrong.size:
-        what = f"detection {wrong[0]}: {array[wrong[0]].tolist()} is no box"
+        what = f"detection {wrong[0]}: {array[wrong[0]].tolist()} is not a box"
         raise InputError(what, field="box", hint="positive sizes [m] and a heading [rad]")
     return array
 
@@ -226,7 +226,7 @@ class DetectionTable:
 
 def said_of(table: DetectionTable) -> list[str]:
     """Return remarks on what was read: its own, and what was left out."""
-    weak = [f"{counted(table.n_weak, 'detection')} of low score left out"] if table.n_weak else []
+    weak = [f"{counted(table.n_weak, 'detection')} with a low score dropped"] if table.n_weak else []
     return [*table.warnings, *weak]
 
 

@@ -121,7 +121,7 @@ def check_choices(config: TrackConfig, table: DetectionTable) -> None:
         raise ConfigError("the position of the sensor is unknown", field="range_m", hint=hint)
     if config.fov_deg is not None and (config.range_m is None or table.sensor_yaw_rad is None):
         hint = "`range_m`, and a folder with poses in `odometry`"
-        raise ConfigError("what the sensor sees is unknown", field="fov_deg", hint=hint)
+        raise ConfigError("the field of view is unknown", field="fov_deg", hint=hint)
 
 
 def run_track(
@@ -162,7 +162,9 @@ def run_track(
         hint = f"fewer detections to be believed: track.warm_up={max(1, config.warm_up - 1)}"
         if _usual_step_s(table) > config.slow_step_s:
             hint = f"more frames: it takes several in a row, and these are {_usual_step_s(table):g} s apart"
-        raise DataError("no object was seen often enough to be told from false alarms", path=table.source, hint=hint)
+        raise DataError(
+            "no object was seen often enough to be distinguished from false alarms", path=table.source, hint=hint
+        )
     spells = _long_enough(tracker.static_spells(), config.rest_for_s)
     lifetimes, spell_of_lifetime = _lifetimes(spells, config.rest_for_s)
     confirmed = np.isin(track_of_detection, tracks.track_id[tracks.state != TrackState.BIRTH])

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from evermap.types import Alternative, ChangeKind, MapChange, SlamResult
 
 NATS = 5.0
-"""An alternative is worth telling when its log probability is this close to that of the best explanation."""
+"""Maximum difference in log probability of a reported alternative from the best explanation."""
 _MAX_IDS = 12
 
 

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 _DASHES = ("-", "--", ":")
 _POINTS = 2001
 _WIDE = 1e3
-"""A ratio of long to short lifetimes from which the axis of time is logarithmic."""
+"""Ratio of long to short lifetimes above which the time axis is logarithmic."""
 _DECADES = 7.0
-"""Most decades that a logarithmic axis of rates shows."""
+"""Maximum decades of a logarithmic axis of rates."""
 _BOX = "anywhere in a box"
 
 Estimate = Npmle | KaplanMeier | ParametricFit | HazardDraws | LifetimePrior

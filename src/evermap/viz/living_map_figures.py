@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 _EXISTS = 0.5
 _FAINTEST = 0.3
-"""Opacity of what exists with probability 0.5; what certainly exists is opaque."""
+"""Opacity of landmarks with P(exists) 0.5; certain ones are opaque."""
 _P_CLIP = 1e-3
-"""Beliefs beyond are drawn at the edge of the axis."""
+"""Beliefs beyond this are drawn at the edge of the axis."""
 _NATS_CLIP = 20.0
-"""Evidence beyond is drawn at the edge of the axis: 20 nats are odds of 500 million to one."""
+"""Evidence beyond this is drawn at the edge of the axis: 20 nats are odds of 500 million to one."""
 _MAX_WORDS = 6
-"""More sessions than this have no room for words."""
+"""Maximum number of sessions with labels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ def _draw_floor(axes: Axes, columns: View, view: MapView) -> list[Any]:
         corners = 0.5 * view.cell_m * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         squares = view.seen_from_m[:, None, :] + corners
         axes.add_collection(PolyCollection(list(squares), facecolors=SHADE, edgecolors=SHADE, lw=0.4, zorder=0.5))
-        handles.append(_mark("s", "looked from here", color=SHADE, ms=7, mec="none"))
+        handles.append(_mark("s", "sensor positions", color=SHADE, ms=7, mec="none"))
     for wall in view.walls_m if above else ():
         axes.plot(*wall.T, color=INK, lw=1.6, solid_capstyle="round", zorder=1)
     if view.walls_m:
@@ -135,7 +135,7 @@ def _draw_landmarks(axes: Axes, columns: View, view: MapView, reach_m: float) ->
     looks = class_looks(landmarks.class_names)
     handles: list[Any] = []
     for name in sorted(set(names)):
-        look, label = looks[name], legend_name(name) or "class not known"
+        look, label = looks[name], legend_name(name) or "class unknown"
         mine = np.array([other == name for other in names])
         here = np.flatnonzero(mine & there)
         alpha: Any = _FAINTEST + (1.0 - _FAINTEST) * (landmarks.p_exists[here] - _EXISTS) / (1.0 - _EXISTS)
@@ -269,7 +269,7 @@ def _draw_evidence(axes: Axes, axis: TimeAxis, history: LandmarkHistory) -> None
     at = axis.coordinates([history.stamp_s[rows].mean() for rows in groups])
     for side, colour, label in ((said >= 0.0, LANDMARK, "for it"), (said < 0.0, ALERT, "against it")):
         axes.vlines(at[side], 0.0, drawn[side], color=colour, lw=3.0, zorder=3)
-        axes.plot([], [], "-", color=colour, lw=3.0, label=f"a session speaks {label}")
+        axes.plot([], [], "-", color=colour, lw=3.0, label=f"evidence of a session {label}")
     beyond = np.abs(said) > _NATS_CLIP
     for side, marker, colour in ((said > 0.0, "^", LANDMARK), (said < 0.0, "v", ALERT)):
         axes.plot(at[beyond & side], drawn[beyond & side], marker, color=colour, ms=6.0, zorder=4)
@@ -310,7 +310,7 @@ def _draw_stays(
         (any(np.isfinite(stay[4]) for stay in stays), "x", {"color": ALERT, "ms": 5.0, "mew": 1.4}, "found gone"),
         (any(not np.isfinite(stay[4]) for stay in stays), ">", {"color": LANDMARK, "ms": 4.0}, "the stay goes on"),
         (any(np.isfinite(stay[[1, 4][k]]) for stay in stays for k in (0, 1)), "", {"color": MUTED, "lw": 1.0},
-         "came or left in between"),
+         "arrived or left in between"),
     ):  # fmt: skip
         if is_drawn:
             axes.plot([], [], marker=marker or None, ls="" if marker else "-", label=label, **style)  # type: ignore[arg-type]

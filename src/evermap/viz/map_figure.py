@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 _MAX_POINTS = 6000
 LABELS_UP_TO = 60
-"""More landmarks than this have no room for their names."""
+"""Maximum number of landmarks with names."""
 _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 
 
@@ -127,7 +127,7 @@ def _draw_panel(axes: Axes, view: View, scene: _Scene, low: FloatArray, high: Fl
     if len(scene.odometry_m):
         drifted = _thin(scene.odometry_m)
         leaves = bool(np.any((drifted < low) | (drifted > high)))
-        label = "odometry alone" + (" (leaves the picture)" if leaves else "")
+        label = "odometry alone" + (" (leaves the figure)" if leaves else "")
         axes.plot(*drifted[:, view].T, color=ODOMETRY, lw=0.8, alpha=0.65 * faint, label=label, zorder=1)
     if scene.truth_m is not None:
         dashes = "-" if len(low) == 2 else (0, (4, 1.5))
@@ -175,7 +175,7 @@ def _draw_landmarks(axes: Axes, view: View, scene: _Scene, reach_m: float) -> No
     names, looks = class_names_of(landmarks), class_looks(landmarks.class_names)
     for name in sorted(set(names)):
         look, mine = looks[name], [k for k, other in enumerate(names) if other == name]
-        label = legend_name(name) or ("mapped landmark" if set(names) == {""} else "class not known")
+        label = legend_name(name) or ("mapped landmark" if set(names) == {""} else "class unknown")
         axes.plot(*landmarks.position_m[mine].T, look.marker, color=look.colour, ms=4.5, mec=PAPER, mew=0.4,
                   label=label, zorder=6)  # fmt: skip
     if len(landmarks) == 0:
@@ -242,11 +242,11 @@ def draw_ellipses(axes: Axes, points: FloatArray, covariance: FloatArray, colour
 def _caption(recording: AnyRecording, evaluation: Evaluation, scene: _Scene) -> str:
     text = _frame_caption(recording, evaluation, scene.path_m.shape[1])
     if scene.landmarks.rotation is not None:
-        text += " Short lines show which way landmarks with an orientation face, along their z; boxes have their edges."
+        text += " Short lines show the z axis of landmarks with an orientation; boxes have their edges."
     if scene.changed:
         text += (
-            " Arrows lead from where a landmark was (diamond) to where it is now; a plus is what appeared, a cross what"
-            " vanished; dashed: another explanation. The displacements are in the map's own frame."
+            " Arrows lead from the former place of a landmark (diamond) to the present one; plus: appeared; cross: "
+            "vanished; dashed: another explanation. Displacements are in the map's own frame."
         )
     return text
 
@@ -255,15 +255,14 @@ def _frame_caption(recording: AnyRecording, evaluation: Evaluation, size: int) -
     poses, odometry = evaluation.poses, evaluation.dead_reckoning
     if poses is None and evaluation.landmarks_own is None:
         ahead = ", x ahead of it" if size == 2 else ""
-        return f"Frame of the first pose: the map's origin is where the robot stood at the start{ahead}."
-    moved = f"Turned and shifted (SE({size}), no scale)"
+        return f"Frame of the first pose: the map's origin is the robot's position at the start{ahead}."
+    moved = f"Rotated and translated (SE({size}), no scale)"
     if poses is None:
         return f"{moved} onto the surveyed landmarks; there is no true path to compare."
     text = f"{moved} so that the estimated path fits the true one best, for display only."
     if odometry is not None:
         text += (
-            f" Odometry alone, with an alignment of its own, is {odometry.rmse_m:.2f} m off;"
-            f" the estimate {poses.rmse_m:.3f} m."
+            f" Odometry alone, aligned separately, is {odometry.rmse_m:.2f} m off; the estimate {poses.rmse_m:.3f} m."
         )
     covered = (poses.stamp_s[-1] - poses.stamp_s[0]) / max(_duration(recording), 1e-9)
     return text + (f" Truth covers {covered:.0%} of the recording." if covered < 0.98 else "")
@@ -278,7 +277,7 @@ GROUP_COLOURS = (ALERT, ONLINE, GROUP)
 """Interleaved: groups of one colour are distinguished by the legend."""
 _MAX_ALTERNATIVES = 2
 _MOST_LINES = 8
-"""More changes than this have one line of the legend a kind; the report lists them all."""
+"""Number of changes above which the legend has one line per kind; the report lists them all."""
 GONE = "gone: P(exists) below 50 %"
 _KIND_MARKS = {ChangeKind.APPEARED: "+", ChangeKind.VANISHED: "x"}
 

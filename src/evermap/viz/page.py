@@ -127,7 +127,7 @@ def warnings_note(warnings: Sequence[str]) -> str:
 
 
 _REM_PER_INCH = 7.5
-"""One scale for the text of all figures."""
+"""Common text scale of all figures."""
 
 
 def figure_html(named: NamedFigure) -> str:

@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from matplotlib.gridspec import SubplotSpec
 
 BLIND_S = 5.0
-"""A gap longer than this is shown as such."""
+"""Minimum gap that is shown as a gap."""
 
 View = list[int]
-"""Which two coordinates a panel shows: to the right, and upwards."""
+"""The two coordinates of a panel: to the right, and upwards."""
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _EDGES = np.array([[i, i | bit] for bit in (1, 2, 4) for i in range(8) if not i & bit])
 _NORMAL = 0.04
-"""Length of the line that shows where a tag faces, as a share of the picture."""
+"""Length of the line along a tag's normal, as a share of the figure."""
 
 
 def long_gaps(stamp_s: FloatArray) -> IntArray:

@@ -140,7 +140,7 @@ _NOON_S = 12.0 * 3600.0
 _WEEK_STEP_S = 600.0
 _DAYS = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
 _HALF_LIVES = 100.0
-"""How far the forecast is drawn, in times after which half of what the look told is lost."""
+"""Length of the forecast, in half-lives of the information of the look."""
 
 
 def plot_presence_models(models: Mapping[str, PresenceModel]) -> Figure:
@@ -271,7 +271,7 @@ def plot_reliability(bins: Reliability, scores: BeliefScores, *, title: str | No
 _HIT_ROW, _MISS_ROW = (1.04, 1.12), (-0.12, -0.04)
 """Heights of the rows of ticks, above and below the probabilities."""
 _RASTER_FROM = 3000
-"""More ticks than this are embedded as pixels, to keep vector files small."""
+"""Number of ticks above which they are embedded as pixels, to keep vector files small."""
 
 
 def plot_belief(

@@ -91,14 +91,14 @@ def _lead(summary: Mapping[str, Any]) -> str:
         f" of {counts['landmarks']:,} landmarks"
     )
     if counts["robot_sightings"]:
-        text += f"; {counts['robot_sightings']:,} sightings of other robots, which --together uses"
+        text += f"; {counts['robot_sightings']:,} sightings of other robots, used by --together"
     return f"{text}.<br>Read from <code>{escape(source)}</code>." if source else f"{text}."
 
 
 def _interrupted(summary: Mapping[str, Any]) -> str:
     if not summary["interrupted"]:
         return ""
-    return '<p class="note">Stopped before the end of the recording: everything here is about the part until then.</p>'
+    return '<p class="note">Stopped before the end of the recording: all results are for the part until then.</p>'
 
 
 def _changes(result: SlamResult, summary: Mapping[str, Any]) -> str:
@@ -110,7 +110,7 @@ def _changes(result: SlamResult, summary: Mapping[str, Any]) -> str:
     note = ""
     if near_alternatives(result):
         note = (
-            "<p>The recording cannot rule out what follows an 'or'. The maps that would follow are in"
+            "<p>The recording cannot rule out the explanations after 'or'. Their maps are in"
             " <code>alternative_1.geojson</code> and so on, the most probable first.</p>"
         )
     return f"<h2>What changed</h2><ul>{items}</ul>{change_table(result)}{note}"
@@ -159,7 +159,7 @@ def _frames(summary: Mapping[str, Any]) -> str:
             f"truth = R({angle} {turn}) · estimate + ({shift}) m, by"
             f" {escape(alignment['method'])} on {alignment['scored_stamps']} positions at {alignment['rate_hz']:g} Hz,"
             f" {alignment['scored_from_s']:.1f} s to {alignment['scored_to_s']:.1f} s; {escape(alignment['purpose'])}."
-            " Odometry alone and the online poses each have an alignment of their own."
+            " Odometry alone and the online poses are aligned separately."
         )
         rows.append(("alignment", how))
     return f"<h3>Frames</h3>{table(('what', 'meaning'), rows)}"
@@ -189,7 +189,7 @@ def _consistency(summary: Mapping[str, Any]) -> str:
         (
             "NEES of positions, first pose held",
             _cell(metrics["pose_nees_anchored_mean"]),
-            f"{dof}, one draw: scatters widely",
+            f"{dof}; one sample, large scatter",
         ),
         ("NEES of whole poses, aligned", _cell(metrics["whole_pose_nees_mean"]), f"below {3 * dof - 3}"),
         ("NEES of landmarks, aligned", _cell(metrics["landmark_nees_mean"]), f"below {dof}: alignment removes error"),
@@ -216,7 +216,7 @@ def _provenance(summary: Mapping[str, Any]) -> str:
     rows.append(("seeds", escape(json.dumps(summary["seeds"]))))
     config = escape(json.dumps(summary["config"], indent=2, ensure_ascii=False))
     files = " ".join(f"<code>{escape(name)}</code>" for name in summary["outputs"])
-    rows.append(("files beside this one", files))
+    rows.append(("files in this folder", files))
     return (
         f"<h2>Source and settings</h2>{table(('what', ''), rows)}"
         f"<details><summary>Configuration</summary><pre>{config}</pre></details>"
@@ -248,14 +248,14 @@ def _cards(summary: Mapping[str, Any]) -> list[str | None]:
             metrics["online_pose_rmse_m"],
             "{:.3f}",
             "m RMSE",
-            "What the robot knew at the time, without hindsight, while it saw something.",
+            "Causal poses, without later detections, while landmarks were in view.",
         ),
     ]
 
 
 def _gain(value: float | None, odometry: float | None, form: str) -> str:
     if value is None or odometry is None:
-        return "Against truth, after aligning the whole path to it."
+        return "Compared with the truth, after aligning the whole path."
     ratio = odometry / max(value, 1e-9)
     times = (
         "no worse" if ratio < 1.05 else f"{ratio:.1f} times as much" if ratio < 9.95 else f"{ratio:.0f} times as much"
@@ -269,7 +269,7 @@ def _landmark_card(metrics: Mapping[str, Any]) -> str | None:
     if after_path is not None:
         meaning = f"{scored} landmarks with at least {least} sightings, after the alignment of the path."
         return card("Landmark error", after_path, "{:.3f}", "m RMSE", meaning)
-    meaning = f"{scored} landmarks with at least {least} sightings, aligned among themselves: there is no true path."
+    meaning = f"{scored} landmarks with at least {least} sightings, aligned by themselves: there is no true path."
     return card("Landmark error", own, "{:.3f}", "m RMSE", meaning)
 
 
@@ -283,11 +283,11 @@ def _latency(timing: Mapping[str, Any]) -> str:
 def _nis(metrics: Mapping[str, Any]) -> str:
     mean = metrics["nis_mean"]
     if mean > 2.6:
-        verdict = "errors are larger than it believes"
+        verdict = "errors are larger than estimated"
     elif mean < 1.4:
-        verdict = "errors are smaller than it believes"
+        verdict = "errors are smaller than estimated"
     else:
-        verdict = "its uncertainties are about right"
+        verdict = "the uncertainties are about right"
     return f"2 is expected: {verdict}. {metrics['nis_in_band_share']:.0%} lie below the 95% bound."
 
 

@@ -55,15 +55,15 @@ def rgb(colour: str) -> tuple[int, int, int]:
 TIMELINE = "stamp_s"
 _MAX_STEPS = 3000
 _STEP_M = 0.1
-"""A path that is shown while it is driven gets a point this often."""
+"""Interval between the points of a live path."""
 _MAX_LANDMARK_ENTITIES = 250
 _ELLIPSE_CORNERS = 33
 _ROOM_M = 4.0
-"""About a smaller scene, such as a table, robot and landmarks are drawn smaller."""
+"""Scene size below which robot and landmarks are drawn smaller, such as on a table."""
 _SINCE_1970_S = 1e8
-"""Stamps of messages above this are dates."""
+"""Stamps above this are dates."""
 _PLATE_M = (0.16, 0.16, 0.004)
-"""What stands for a tag, whose size a map does not say."""
+"""Drawn size of a tag of unknown size."""
 
 Float32Array = NDArray[np.float32]
 

@@ -61,7 +61,7 @@ def draw_figures(
 
 
 _RASTER_FROM = 1500
-"""Clouds of more points than this are embedded as pixels, to keep vector files small."""
+"""Number of points above which they are embedded as pixels, to keep vector files small."""
 
 
 def blind_stretches(stamp_s: FloatArray, longer_than_s: float = BLIND_S) -> FloatArray:
@@ -169,11 +169,11 @@ def draw_consistency(result: SlamResult) -> NamedFigure | None:
     right.legend(loc="center right")
     figure.legend(*left.get_legend_handles_labels(), loc="outside upper left", ncols=5, columnspacing=1.1)
     caption = (
-        "Squared distance of every detection from its prediction, in standard deviations, before it was used."
-        " If the noise levels are honest the mean is 2 and 95% stay below 5.99."
+        "Squared Mahalanobis distance of every detection from its prediction, before it was used. If the noise levels "
+        "are right the mean is 2 and 95% are below 5.99."
     )
     if result.innovations.dof is not None:
-        caption += " Detections that measure more than two numbers are shown by their tail probability, on one scale."
+        caption += " Detections of more than two numbers are converted by their tail probability."
     if len(kept):
         caption += f" Here: mean {kept.mean():.2f}, {np.mean(kept <= usual):.1%} below"
         caption += f", {np.mean(~inlier):.1%} judged outliers" + (f", {beyond:.1%} beyond the axis." if beyond else ".")
@@ -211,7 +211,7 @@ def draw_latency(recording: AnyRecording, result: SlamResult, real_time_factor: 
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     caption = "Wall-clock time from a frame's arrival to its pose, on one core."
     if real_time_factor is not None:
-        caption += f" The whole recording took {real_time_factor:.0f} times less time than it lasted."
+        caption += f" The whole recording was processed at {real_time_factor:.0f} times real time."
     return NamedFigure("latency", figure, "Step latency", caption)
 
 
@@ -243,11 +243,11 @@ def _error_caption(evaluation: Evaluation, blind: int) -> str:
         return "Uncertainty relative to the first pose; the recording has no pose truth to compare with."
     text = (
         f"After SE({poses.dof}) alignment: {poses.rmse_m:.3f} m and {poses.orientation_rmse_deg:.2f}° RMSE,"
-        f" {poses.max_m:.2f} m at worst. The band is twice the standard deviation that the estimator reports, relative"
-        " to its first pose; alignment makes errors a little smaller than that."
+        f" {poses.max_m:.2f} m at worst. The band is twice the estimated standard deviation relative to the first "
+        f"pose; alignment makes errors a little smaller."
     )
     if evaluation.online is not None:
-        text += " Online poses are those the robot knew at the time, scored where the sensor looked."
+        text += " Online poses are causal, scored at frames of the sensor."
     return text + (f" {blind} stretches without any frame are shaded." if blind > 1 else "")
 
 
@@ -300,7 +300,7 @@ def draw_calibration(result: SlamResult) -> NamedFigure | None:
         )
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     caption = (
-        "Calibration states as the recording determined them, in units of what was assumed: a short bar well inside"
-        " the grey one was learned from the data; a bar as long as the grey one could not be observed."
+        "Estimated calibration states in units of their prior standard deviations: a bar much shorter than the grey "
+        "one was learned from the data; a bar as long as the grey one is unobservable."
     )
     return NamedFigure("calibration", figure, "Calibration", caption)

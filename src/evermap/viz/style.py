@@ -73,7 +73,7 @@ class ClassLook:
 
 
 NO_CLASS = ClassLook(LANDMARK, "o")
-"""Of what has no class, or one without a name."""
+"""Colour of objects without a class, or with an unnamed one."""
 
 
 def class_looks(names: Iterable[str]) -> dict[str, ClassLook]:
@@ -230,11 +230,11 @@ def label_points(axes: Axes, points: Any, texts: Iterable[str]) -> None:
 
 
 _POINT_LABEL = "label of a point"
-"""Marks what `settle` still has to place; an id in files is none of its business."""
+"""Marks labels that `settle` still has to place; ids in files are unrelated."""
 _MARK_PT = 3.5
-"""Half the side of the square about a point that no label should cover."""
+"""Half the side of the square about a point that labels avoid."""
 _NEAR_PT = 9.0
-"""Up to so far from its point a label needs no line."""
+"""Maximum distance of a label from its point without a line."""
 _RINGS_PT = (4.0, 9.0, 16.0, 25.0, 36.0)
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _UNITS = ((300.0, "s", 1.0), (3 * 3600.0, "min", 60.0), (3 * 86400.0, "h", 3600.0), (float("inf"), "days", 86400.0))
-"""Up to which span, name, seconds."""
+"""Maximum span, name and seconds of a unit."""
 
 DURATIONS = (
     ("1 µs", 1e-6),
@@ -31,7 +31,7 @@ DURATIONS = (
     ("10 years", 3652.5 * 86400.0),
     ("100 years", 36525.0 * 86400.0),
 )
-"""Where a logarithmic axis of durations may have its ticks."""
+"""Candidate ticks of a logarithmic axis of durations."""
 
 
 _FIRST_UNIX_S = 6e8

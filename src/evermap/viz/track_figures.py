@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_SPELLS = 80
-"""Rows of the right half; of more spells, the longest."""
+"""Maximum rows of the right half: the longest spells."""
 
 
 def plot_objects(
@@ -99,9 +99,9 @@ def _draw_bars(axes: Axes, rests: Any, colours: Sequence[str], axis: TimeAxis, e
         axes.plot(at([first_s, last_s]), [row, row], color=colour, lw=3.0, solid_capstyle="butt")
     axes.plot([], [], color=MUTED, lw=3.0, label="seen at rest")
     if bounded:
-        axes.plot([], [], color=MUTED, lw=0.8, label="came or left in between")
+        axes.plot([], [], color=MUTED, lw=0.8, label="arrived or left in between")
     if unbounded:
-        axes.plot([], [], color=MUTED, marker=">", ls="", ms=3.5, label="beginning or end not known")
+        axes.plot([], [], color=MUTED, marker=">", ls="", ms=3.5, label="beginning or end unknown")
     which = (
         f"the {len(order)} longest of {len(rests.first_s):,} spells" if len(order) < len(rests.first_s) else "spells"
     )
@@ -112,4 +112,4 @@ def _draw_bars(axes: Axes, rests: Any, colours: Sequence[str], axis: TimeAxis, e
 
 
 STATIC, DYNAMIC = ESTIMATE, GROUP
-"""Blue, and wine for the thesis' purple, which colour-blind readers take for blue."""
+"""Blue, and wine instead of the thesis' purple, which colour-blind readers confuse with blue."""

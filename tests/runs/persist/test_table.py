@@ -63,7 +63,7 @@ def test_parquet_gives_the_same(tmp_path: Path) -> None:
     ("content", "message"),
     [
         ("stamp_s,detected\n1,1\n", r":1: field 'feature_id': missing column \(try: add it, .* only one feature"),
-        ("stamp_s,feature_id,present\n1,a,1\n", r":1: field 'detected': missing column \(try: what the detector said"),
+        ("stamp_s,feature_id,present\n1,a,1\n", r":1: field 'detected': missing column \(try: the detector's output"),
         ("stamp_s,feature,detected\n1,a,1\n", r":1: field 'feature': unknown column \(try: feature_id\)"),
         (f"{HEADER},p_mis\n1,a,1,0\n", r":1: field 'p_mis': unknown column \(try: p_miss\)"),
         (f"{HEADER},weight\n1,a,1,0\n", r":1: field 'weight': unknown column \(try: one of "),
@@ -128,5 +128,5 @@ def test_truth_from_a_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(truth.present, [0.0, 1.0])
     assert remarks == ("truth.csv: 1 feature without looks left out",)
     path.write_text("stamp_s,feature_id,present\n0,c,1\n")
-    with pytest.raises(InputError, match=r"truth\.csv: field 'feature_id': knows none of the features of .*'a'"):
+    with pytest.raises(InputError, match=r"truth\.csv: field 'feature_id': contains none of the features of .*'a'"):
         read_truth(path, looks)

@@ -60,7 +60,7 @@ def test_appearances_of_some(tmp_path: Path) -> None:
     ("text", "named"),
     [
         (f"{HEAD}\n", "has no rows below its header"),
-        (f"{HEAD}\n1,,,\n", "holds no detection"),
+        (f"{HEAD}\n1,,,\n", "contains no detection"),
         (f"{HEAD}\n1,2,,0\n", ":2: field 'y_m': is empty (try: all of x_m, y_m, z_m, or none for an empty frame)"),
         (f"{HEAD}\nnoon,2,0,0\n", ":2: field 'stamp_s': 'noon' is not a number"),
         (f"{HEAD}\n1e15,2,0,0\n", "stamps in seconds, not in milli- or nanoseconds"),
@@ -81,7 +81,7 @@ def test_appearances_of_some(tmp_path: Path) -> None:
         (f"{HEAD},sensor_x_m\n1,2,0,0,1\n", "field 'sensor_y_m': missing column"),
         (
             f"{HEAD},sensor_x_m,sensor_y_m,sensor_z_m\n1,2,0,0,1,1,1\n1,3,0,0,2,1,1\n",
-            ":3: field 'sensor_x_m': the sensor is in two places in one frame",
+            ":3: field 'sensor_x_m': the sensor has two positions in one frame",
         ),
     ],
 )

@@ -132,5 +132,5 @@ def test_mistakes_in_a_folder_are_named(drive: Path, file: str, text: str | None
 
 
 def test_a_field_of_view_wants_poses(drive: Path) -> None:
-    with pytest.raises(EvermapError, match="what the sensor sees is unknown"):
+    with pytest.raises(EvermapError, match="the field of view is unknown"):
         run_track(read_input(drive), TrackConfig(fov_deg=90.0))

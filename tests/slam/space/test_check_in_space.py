@@ -154,7 +154,7 @@ def test_cameras_and_limits_are_told() -> None:
     small = replace(recording, sensors=(replace(recording.sensors[0], resolution_px=(320, 240), range_max_m=2.0),))
     codes, messages = told(small)
     assert codes == ["beyond-range", "beyond-view"]
-    assert "of another resolution" in messages
+    assert "for another resolution" in messages
 
 
 def test_boxes_without_identity_are_no_loss() -> None:

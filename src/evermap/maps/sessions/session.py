@@ -102,9 +102,9 @@ def admitted(recording: RecordingT, living: LivingMap) -> tuple[RecordingT, Livi
         )
     if len(living.places) and recording.clock != living.clock:
         raise DataError(
-            f"{recording.name}: its stamps count '{recording.clock}', the map's '{living.clock}'",
+            f"{recording.name}: its stamps are on the clock '{recording.clock}', those of the map on '{living.clock}'",
             field="stamp_s",
-            hint="sessions of one map need one clock, best seconds since 1970",
+            hint="sessions of one map need one clock, preferably seconds since 1970",
         )
     names = living.class_names + tuple(name for name in recording.class_names if name not in living.class_names)
     number = np.array([names.index(name) for name in recording.class_names] + [UNKNOWN], dtype=np.int64)
@@ -152,7 +152,7 @@ def check_in_order(recording: AnyRecording, living: LivingMap) -> None:
             f"{recording.name}: begins at {stamps[0]:.1f} s, before the newest session of the map, "
             f"{living.session_start_s:.1f} s",
             field="stamp_s",
-            hint="evermap.enter_session(store, recording), or evermap slam --map FILE, enter it where it belongs",
+            hint="evermap.enter_session(store, recording), or evermap slam --map FILE, enter it at its time",
         )
 
 

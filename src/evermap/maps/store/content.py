@@ -204,8 +204,8 @@ def _read_part(name: bytes, stored: bytes) -> FloatArray:
     try:
         return _part_values(name, stored)
     except DamagedError as error:
-        problem = f"a part of what it holds of its places is damaged: {error}"
-        raise InputError(problem, hint="evermap map verify FILE, which tells what can be read") from None
+        problem = f"a part of the data of its places is damaged: {error}"
+        raise InputError(problem, hint="evermap map verify FILE, which lists the intact revisions") from None
 
 
 def _cuts(flat: NDArray[Any]) -> list[int]:
@@ -259,7 +259,7 @@ def unpack(name: bytes, fetch: Fetch, *, lazily: bool = False) -> LivingMap:
         _of_format_1(parts)
     living: LivingMap = _build(LivingMap.in_space() if manifest["format"] == IN_SPACE else LivingMap(), "", parts)
     if parts:
-        raise DamagedError(f"it holds '{min(parts)}', which this evermap does not know; a newer one wrote it")
+        raise DamagedError(f"it contains '{min(parts)}', which this evermap does not know; a newer one wrote it")
     problem = flaw(living)
     if problem:
         raise DamagedError(problem)
@@ -577,12 +577,12 @@ def _lives_from_bytes(values: NDArray[Any]) -> tuple[Life, ...]:
         listed = json.loads(values.tobytes())
         lives = tuple(_life_from_dict(life) for life in listed)
     except (ValueError, TypeError, AttributeError, RecursionError, EvermapError) as error:
-        raise DamagedError(f"what was learned of lifetimes cannot be read: {error}") from None
+        raise DamagedError(f"the learned lifetimes cannot be read: {error}") from None
     for life in lives:
         parts: tuple[Any, ...] = (life.stay, life.absence, life.p_hop, life.p_known, life.n_stays, life.n_ended)
         numbers = all(isinstance(value, int | float) and 0 <= value < 2**53 for value in parts[2:])
         if not (all(isinstance(value, LifetimePrior) for value in parts[:2]) and numbers and max(parts[2:4]) <= 1):
-            raise DamagedError("what was learned of lifetimes is of another type")
+            raise DamagedError("the learned lifetimes have another type")
     return lives
 
 

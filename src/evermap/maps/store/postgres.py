@@ -45,7 +45,7 @@ def open_postgres(address: str, *, create: bool) -> SqlStore:
     engine = engine_of(url.render_as_string(hide_password=False), PREFIX + site)
 
     def explain(problem: str) -> InputError:
-        return DamagedMapError(f"damaged: {problem}", path=where, hint="a backup of the database")
+        return DamagedMapError(f"damaged: {problem}", path=where, hint="restore a backup of the database")
 
     return SqlStore.opened(engine, where, create=create, explain=explain)
 
@@ -59,7 +59,7 @@ def split_address(address: str) -> tuple[URL, str]:
     try:
         url = make_url(address)
     except ArgumentError:
-        raise ConfigError("is no address of a database", field="map", hint=_FORM) from None
+        raise ConfigError("is not the address of a database", field="map", hint=_FORM) from None
     database, _, site = (url.database or "").rpartition("/")
     if not database or "/" in database or not SITE.fullmatch(site):
         problem = f"'{url.render_as_string(hide_password=True)}' names no site"

@@ -89,7 +89,7 @@ class SqlStore(Shown):
         with store._reading() as connection:
             version = store._schema_version(connection)
         if version == 0 and not create:
-            raise InputError("holds no map", path=where, hint="evermap slam INPUT --map FILE writes one")
+            raise InputError("contains no map", path=where, hint="evermap slam INPUT --map FILE writes one")
         if version < schema.SCHEMA_VERSION:
             with store._writing() as connection:
                 version = store._schema_version(connection)  # somebody may have been faster
@@ -226,8 +226,8 @@ class SqlStore(Shown):
         with self._writing() as connection:
             head, before = self._anchor(connection)
             if head != parent:
-                problem = f"revision {head} came in after revision {parent} was read; nothing was written"
-                hint = "the same again, which continues from the newest"
+                problem = f"revision {head} was committed after revision {parent} was read; nothing was written"
+                hint = "run it again, which continues from the newest"
                 raise StaleRevisionError(problem, path=self._where, hint=hint)
             record = Record(
                 {**told, "n_grown": 0 if restores is not None else self._n_grown(connection, parent, living, changes)},
@@ -639,7 +639,7 @@ class SqlStore(Shown):
         if not tables:
             return 0
         if "store" not in tables or "revision" not in tables:
-            raise InputError("is a database, but no evermap map", path=self._where, hint="another file")
+            raise InputError("is a database, but not an evermap map", path=self._where, hint="another file")
         version = connection.execute(select(schema.store.c.schema_version)).scalar()
         if not isinstance(version, int) or version < 1:
             raise DamagedError(f"its schema version is {version!r}")
@@ -687,7 +687,7 @@ class SqlStore(Shown):
             raise self._damaged(str(error)) from error
         except IntegrityError as error:
             raise StaleRevisionError(
-                f"somebody else committed at the same time: {error.orig}", path=self._where, hint="the same again"
+                f"another process committed at the same time: {error.orig}", path=self._where, hint="run it again"
             ) from error
         except DBAPIError as error:
             message = str(error.orig)
@@ -705,7 +705,7 @@ class SqlStore(Shown):
         if explained is not None:
             return explained
         if "is not a database" in problem:
-            return InputError("is no evermap map", path=self._where, hint="another file")
+            return InputError("is not an evermap map", path=self._where, hint="another file")
         return DamagedMapError(f"damaged: {problem}", path=self._where, hint="a copy of the file")
 
 
@@ -713,7 +713,7 @@ _STORE_COLUMNS = ("schema_version", "created_at", "evermap_version", "head", "re
 _FAILURES = (
     ("readonly", "cannot be written: it is read-only", "chmod u+w, or a copy of it"),
     ("locked", "another process keeps it locked", "wait for that one to end"),
-    ("is full", "cannot be written: the disk is full", "make room"),
+    ("is full", "cannot be written: the disk is full", "free some space"),
     ("unable to open", "cannot be opened or written", "check the rights of the file and of its folder"),
 )
 """Common failures of a database that are no damage, with what to do about them."""

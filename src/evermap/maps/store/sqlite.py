@@ -41,7 +41,7 @@ def open_sqlite(path: Path, *, create: bool) -> SqlStore:
     if not path.parent.is_dir():
         raise InputError(f"the folder {path.parent} does not exist", path=path, hint=f"mkdir -p {path.parent}")
     if path.is_file() and path.stat().st_size == 1:  # SQLite would take it for an empty one
-        raise InputError("is no evermap map", path=path, hint="another file")
+        raise InputError("is not an evermap map", path=path, hint="another file")
     engine = engine_of(path, writable=os.access(path if path.exists() else path.parent, os.W_OK))
 
     def explain(problem: str) -> InputError | None:

@@ -21,7 +21,7 @@ from evermap.runs.persist.table import Span
 from evermap.types import BoolArray, FloatArray, IntArray
 
 _SHORTEST_GAP_S = 1e-9
-"""Looks at one time are no time apart, but a change between them can be all that is left."""
+"""Minimum time between two looks: a change between looks at one stamp can be the only explanation."""
 _CERTAIN = 700.0
 """Log odds that a double still tells from certainty."""
 

@@ -147,9 +147,9 @@ def drawn_features(counts: IntArray, most: int) -> IntArray:
 
 AUTO = "auto"
 MOST_STEPS = 20_000_000
-"""Steps of time that learning of run lengths goes through, hundreds of times: more would need gigabytes and days."""
+"""Maximum time steps for learning run lengths, which iterates hundreds of times: more would need gigabytes and days."""
 MOST_BINS = 2_000_000
-"""Ten minutes each, of one feature, that learning of phases goes through: 38 years."""
+"""Maximum ten-minute steps of one feature for learning phases: 38 years."""
 
 Progress = Callable[[float], None]
 
@@ -246,7 +246,7 @@ def _check_span(looks: Looks, kind: str) -> None:
     steps = float(pause_s.sum()) / step_s
     if steps > (MOST_BINS * looks.n_features if phases else MOST_STEPS):
         problem = f"{steps:.2g} steps of {step_s:g} s lie between the looks, the longest pause is {pause_s.max():g} s"
-        hint = "is a stamp astray? else fewer looks (`learn_from`), or `recurrent` two-state"
+        hint = "check for a wrong stamp; otherwise fewer looks (`learn_from`), or `recurrent` two-state"
         raise DataError(problem, field="stamp_s", hint=hint)
 
 

@@ -73,7 +73,7 @@ def _cards(summary: Mapping[str, Any]) -> str:
     if metrics:
         cards += [
             ("Brier score", metrics["brier"], "{:.4f}", "", "Mean squared error of the beliefs; 0 is perfect."),
-            ("Log loss", metrics["log_loss"], "{:.4f}", "nats", "Punishes being sure and wrong; 0 is perfect."),
+            ("Log loss", metrics["log_loss"], "{:.4f}", "nats", "Penalises confident errors; 0 is perfect."),
             ("Calibration error", metrics["calibration_error"], "{:.4f}", "", "Mean distance from the dashed line."),
         ]
     return cards_html(card(*one) for one in cards)
@@ -143,7 +143,7 @@ RASTER_ROWS = 60
 _RASTER_COLUMNS = 480
 _CURVE_POINTS = 400
 _PIXELS = 1200
-"""Columns of a figure: of more looks, each column shows the lowest and the highest belief, and one tick a kind."""
+"""Columns of a figure: with more looks, each column shows the lowest and the highest belief, and one tick per kind."""
 
 
 def clock_of(result: PersistResult) -> Clock:
@@ -217,8 +217,8 @@ def _calibration(result: PersistResult) -> NamedFigure:
     assert result.scores is not None and result.reliability is not None  # noqa: PT018
     figure = plot_reliability(result.reliability, result.scores)
     caption = (
-        "Of all instants at which the belief was about so high, how often was the feature there? On the dashed line"
-        " beliefs mean what they say. Below: how many there were."
+        "Share of instants at which the feature was there, by its belief. On the dashed line beliefs are calibrated. "
+        "Below: the number of instants."
     )
     return NamedFigure("calibration", figure, "Calibration", caption)
 
@@ -254,7 +254,7 @@ def _feature(result: PersistResult, feature: int, clock: Clock, taken: set[str])
     while slug in taken:
         slug += "-"
     taken.add(slug)
-    caption = "Belief, detections (above) and misses (below); shaded where it truly was there, dashed the forecast."
+    caption = "Belief, detections (above) and misses (below); shaded: truly there; dashed: forecast."
     return NamedFigure(f"feature-{slug}", figure, f"Feature {name}", caption)
 
 

@@ -269,7 +269,7 @@ def _score(
     present = truth.at(beliefs.feature, beliefs.stamp_s) if at_rows is None else at_rows
     both = ~np.isnan(present) & ~np.isnan(beliefs.p_exists)
     if not both.any():
-        problem = "no belief falls into the time of which the truth is known"
+        problem = "no belief lies within the time of the truth"
         raise InputError(problem, path=table.source or None, field="present", hint="the same clock in both tables")
     belief, there = beliefs.p_exists[both], present[both]
     return belief_scores(belief, there), reliability(belief, there)

@@ -85,7 +85,7 @@ class LookTable:
         for name, column in columns.items():
             if column is not None and column.shape != self.stamp_s.shape:
                 problem = f"shape {column.shape} where stamp_s has {self.stamp_s.shape}"
-                raise InputError(problem, path=self.source or None, field=name, hint="one value a row")
+                raise InputError(problem, path=self.source or None, field=name, hint="one value per row")
         path = Path(self.source or "looks")
         for quantity in (STAMP_S, _P_MISS, _P_FALSE):
             replace(quantity, optional=False).check(getattr(self, quantity.name), path=path, line=self.line)
@@ -99,12 +99,12 @@ class LookTable:
         if inverted.any():
             row = int(np.argmax(inverted))
             sure = self.p_miss[row] + self.p_false[row] == 1.0
-            told = "tells nothing" if sure else "would speak against the feature, a miss for it"
+            told = "tells nothing" if sure else "would be evidence against the feature, a miss for it"
             self._refuse(
                 inverted,
                 "p_miss",
                 f"{self.p_miss[row]:g} and p_false {self.p_false[row]:g} make 1 or more: a detection {told}",
-                "p_miss + p_false below 1; P(detection | there) is 1 - p_miss; leave out looks that tell nothing",
+                "p_miss + p_false below 1; P(detection | there) is 1 - p_miss; omit looks without information",
             )
 
     def _refuse(self, wrong: BoolArray, field: str, problem: str, hint: str) -> None:
@@ -230,7 +230,7 @@ def _check_defaults(p_miss: float, p_false: float) -> None:
         if not 0.0 <= value <= 1.0:
             raise ConfigError(f"{value} is not a probability", field=name, hint="a number between 0 and 1")
     if p_miss + p_false >= 1.0:
-        problem = f"{p_miss:g} and `p_false` {p_false:g} make 1 or more: a detection would speak against the feature"
+        problem = f"{p_miss:g} and `p_false` {p_false:g} make 1 or more: a detection is evidence against the feature"
         hint = "both below 0.5; P(detection | there) is 1 - p_miss"
         raise ConfigError(problem, field="p_miss", hint=hint)
 
@@ -281,10 +281,10 @@ def read_truth(path: str | Path, looks: LookTable) -> tuple[Truth, tuple[str, ..
     ours = np.array([index.get(name, UNKNOWN) for name in names], dtype=np.int64)
     strangers = int((ours == UNKNOWN).sum())
     if strangers == len(names):
-        problem = f"knows none of the features of {looks.source or 'the looks'}"
+        problem = f"contains none of the features of {looks.source or 'the looks'}"
         raise InputError(problem, path=path, field="feature_id", hint=f"such as {quote(looks.names[0])}")
     if strangers:
-        warnings.append(f"{Path(path).name}: {counted(strangers, 'feature')} without looks left out")
+        warnings.append(f"{Path(path).name}: {counted(strangers, 'feature')} without looks ignored")
     rows = np.flatnonzero((ours[feature] != UNKNOWN) & ~np.isnan(present))
     rows = rows[np.lexsort((stamp_s[rows], ours[feature[rows]]))]
     truth = Truth(firsts_of(ours[feature[rows]], looks.n_features), stamp_s[rows], present[rows])
@@ -299,7 +299,7 @@ def _explain_missing(table: Columns) -> None:
         hint = "add it, with one and the same value if there is only one feature"
         raise table.error("missing column", row=None, field="feature_id", hint=hint)
     if "detected" not in table and "present" in table:
-        hint = "what the detector said, 1 or 0; 'present' is the truth, which only scores the result"
+        hint = "the detector's output, 1 or 0; 'present' is the truth, which only scores the result"
         raise table.error("missing column", row=None, field="detected", hint=hint)
 
 
@@ -326,7 +326,7 @@ def _classes(table: Columns, feature: IntArray, names: tuple[str, ...]) -> tuple
         problem = (
             f"feature {quote(names[feature[row]])} is {quote(class_names[of_row[row]])} here and {quote(first)} above"
         )
-        raise table.error(problem, row=row, field="class_id", hint="one class a feature")
+        raise table.error(problem, row=row, field="class_id", hint="one class per feature")
     return tuple(class_names), of_feature
 
 

@@ -32,10 +32,10 @@ SIZE = tuple(
     Quantity(name, 0.0, 1e4, positive=True, optional=True, hint="metres, in every row with a position")
     for name in ("length_m", "width_m", "height_m")
 )
-YAW = Quantity("yaw_rad", -1e4, 1e4, optional=True, hint="radians, anticlockwise from x")
+YAW = Quantity("yaw_rad", -1e4, 1e4, optional=True, hint="radians, counter-clockwise from x")
 BOX = (*SIZE, YAW)
 IMAGE_BOX = ("left_px", "top_px", "right_px", "bottom_px")
-"""Columns of a detector's box in the image, which nothing here needs."""
+"""Columns of a detector's box in the image, which are not used."""
 COVARIANCE = tuple(f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
 ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _REQUIRED = (STAMP_S.name, *(quantity.name for quantity in POSITION))
@@ -63,7 +63,7 @@ def read_detections(path: str | Path, *, min_score: float | None = None) -> Dete
     looks = _appearance_columns(table)
     table.expect(_REQUIRED, (*_OPTIONAL, *looks))
     if len(table) == 0:
-        raise InputError("has no rows below its header", path=path, hint="one row a detection")
+        raise InputError("has no rows below its header", path=path, hint="one row per detection")
     stamp_s = table.numbers(STAMP_S)
     position = np.stack([table.numbers(quantity) for quantity in POSITION], axis=1)
     given = ~np.isnan(position)
@@ -76,7 +76,7 @@ def read_detections(path: str | Path, *, min_score: float | None = None) -> Dete
     strong = kept & _strong(table, min_score)
     if not strong.any():
         hint = "a row with a position" if not kept.any() else "a lower `min_score`"
-        raise InputError("holds no detection", path=path, field="x_m", hint=hint)
+        raise InputError("contains no detection", path=path, field="x_m", hint=hint)
     frames, frame = np.unique(stamp_s, return_inverse=True)
     rows = np.flatnonzero(strong)
     rows = rows[np.argsort(frame[rows], kind="stable")]
@@ -184,9 +184,9 @@ def _sensor(table: Columns, frame: IntArray, n_frames: int) -> FloatArray | None
     sensor[frame[::-1]] = of_row[::-1]  # of several assignments the last one holds: the first row
     elsewhere = np.flatnonzero(np.abs(of_row - sensor[frame]).max(axis=1) > 1e-6)
     if elsewhere.size:
-        hint = "one position a stamp"
+        hint = "one position per stamp"
         raise table.error(
-            "the sensor is in two places in one frame", row=int(elsewhere[0]), field=SENSOR[0].name, hint=hint
+            "the sensor has two positions in one frame", row=int(elsewhere[0]), field=SENSOR[0].name, hint=hint
         )
     return sensor
 
@@ -269,7 +269,7 @@ def read_poses(path: Path) -> Poses:
     table = read_columns(path, [])
     table.expect((STAMP_S.name, *(q.name for q in (*_PLACE, *_QUATERNION))), tuple(table.cells))
     if len(table) == 0:
-        raise InputError("has no rows below its header", path=path, hint="one row a pose")
+        raise InputError("has no rows below its header", path=path, hint="one row per pose")
     stamp_s = table.numbers(STAMP_S)
     pose = np.stack([table.numbers(quantity) for quantity in (*_PLACE, *_QUATERNION)], axis=1)
     short = np.flatnonzero(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1.0) > 1e-2)

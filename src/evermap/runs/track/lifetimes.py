@@ -104,19 +104,19 @@ def read_lifetimes(path: str | Path) -> LifetimeTable:
     table = read_columns(path, warnings)
     table.expect(_REQUIRED, _OPTIONAL)
     if len(table) == 0:
-        raise InputError("has no rows below its header", path=path, hint="one row a lifetime")
+        raise InputError("has no rows below its header", path=path, hint="one row per lifetime")
     left = table.numbers(LEFT)
     right = table.filled(RIGHT, np.inf)
     entry = table.filled(ENTRY, 0.0)
     weight = table.filled(WEIGHT, 1.0)
     _refuse(
         table, right < left, "right", lambda row: f"ends at {right[row]:g} s, before its left at {left[row]:g} s",
-        "left <= right; equal where the end was watched",
+        "left <= right; equal if the end was observed",
     )  # fmt: skip
     _refuse(
         table, entry >= right, "entry",
-        lambda row: f"known only because it was there at {entry[row]:g} s, but gone by {right[row]:g} s",
-        "entry below right: what is gone before cannot be met",
+        lambda row: f"first observed at age {entry[row]:g} s, but gone by {right[row]:g} s",
+        "entry below right: it must exist when it is first observed",
     )  # fmt: skip
     if not weight.any():
         raise InputError("all weights are 0", path=path, field="weight", hint="1 for a lifetime seen once")

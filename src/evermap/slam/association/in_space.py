@@ -109,8 +109,8 @@ def identified_in_space(
         DataError: no odometry, or too few frames.
     """
     if prior_map is not None:
-        problem = "landmarks without identity in space cannot be found in a map that is fixed"
-        raise ConfigError(problem, field="slam.unknown_ids", hint="leave out the map, or --unknown-ids")
+        problem = "landmarks without identity in space cannot be found in a fixed map"
+        raise ConfigError(problem, field="slam.unknown_ids", hint="omit the map, or --unknown-ids")
     if recording.odometry is None or len(recording.odometry) < 2:
         problem = f"{recording.name}: landmarks without identity need odometry"
         raise DataError(problem, hint="record poses or velocities of the robot, or identities")

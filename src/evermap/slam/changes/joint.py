@@ -215,7 +215,7 @@ class Joint(Method):
     def _warnings(self, *, in_map: bool) -> tuple[str, ...]:
         assert self.verdict is not None
         if in_map and not self._groups and self.verdict.misfit > self._prior.disagreement:
-            return ("the prior map disagrees with what was seen, and no change explains it: cannot localise in it",)
+            return ("the prior map disagrees with the detections, and no change explains it: cannot localise in it",)
         return ()
 
     def _weighed(
