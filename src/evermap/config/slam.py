@@ -144,7 +144,8 @@ class ModesConfig(Section):
     )
     switch_probability: Probability = Field(
         default=1e-4,
-        description="probability of a landmark to be in another mode at the next look; ignored with a lifetime",
+        description="probability probability of a landmark to be in another mode at the next look; ignored with a "
+        "lifetime",
     )
     births: Literal["evidence", "gate"] = Field(
         default="evidence",
@@ -187,12 +188,10 @@ class ChangesConfig(Section):
     usual_softness_m: Positive = Field(
         default=0.02, description="the same during the search for swaps and temporary displacements [m]"
     )
-    most_groups: Count = Field(default=4, description="groups that may have moved, at most")
-    most_candidates: Count = Field(default=40, description="landmarks that may have moved, at most: the likeliest")
-    visit_gap_s: Positive = Field(
-        default=10.0, description="a landmark that was not seen for longer than this is visited anew [s]"
-    )
-    interval: Share = Field(default=0.95, description="probability of the interval in which a change is told to be")
+    most_groups: Count = Field(default=4, description="maximum number of moved groups")
+    most_candidates: Count = Field(default=40, description="maximum number of candidates for moves, the likeliest")
+    visit_gap_s: Positive = Field(default=10.0, description="gap between sightings after which a new visit begins [s]")
+    interval: Share = Field(default=0.95, description="probability of the reported interval of a change")
     rival_nats: NotNegative = Field(
         default=5.0, description="maximum distance of a reported alternative from the best explanation [nats]"
     )

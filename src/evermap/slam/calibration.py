@@ -44,8 +44,8 @@ class Spec:
 
 SPECS: tuple[Spec, ...] = (
     Spec("range_bias_m", 0.0, "m", "constant added to every range"),
-    Spec("range_slope", 0.0, "1", "ranges are too long by this share"),
-    Spec("range_skew_per_rad", 0.0, "1/rad", "range error that grows to one side of the view"),
+    Spec("range_slope", 0.0, "1", "relative error of ranges"),
+    Spec("range_skew_per_rad", 0.0, "1/rad", "range error that grows to one side of the field of view"),
     Spec("range_curvature_per_rad2", 0.0, "1/rad^2", "-0.5: the sensor reports depth, not distance"),
     Spec("bearing_bias_rad", 0.0, "rad", "constant added to every bearing"),
     Spec("odometry_delay_s", 0.0, "s", "odometry stamps minus the stamps of the motion they describe"),
@@ -58,7 +58,7 @@ N_STATES, N_SENSOR = len(SPECS), 5
 NAMES = tuple(spec.name for spec in SPECS)
 BIAS, SLOPE, SKEW, CURVATURE, BEARING, DELAY, FORWARD, SLIP = 0, 1, 2, 3, 4, 5, 6, 8
 LEAST_SIGMA = 1e-6
-"""Of a data sheet that says that there is no error: nothing divides by zero."""
+"""Standard deviation for a data sheet without errors, to avoid division by zero."""
 
 
 @dataclass(frozen=True, slots=True)

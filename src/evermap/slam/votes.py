@@ -36,7 +36,7 @@ from evermap.types import (
 FIRST_QUARTILE = {2: 0.575, 3: 1.213}
 """First quartile of a squared standard normal vector, by its dimension: most ids are right, not all."""
 FEWEST_PAIRS, LEAST_SHARE = 20, 1e-4
-"""Detections of one id from which their error is told, and its variance as a share of the above, at least."""
+"""Minimum detections of one id for learning their error, and minimum of its variance as a share of the above."""
 
 
 def without_contradicted_ids(recording: AnyRecordingT, settings: SlamConfig) -> AnyRecordingT:

@@ -419,7 +419,7 @@ class SqlStore(Shown):
             (head, anchor), (last, newest) = self._anchor(connection), other._anchor(theirs)
             if named.get(head) != anchor:
                 problem = f"revision {head} is none of {other._where}; nothing was written"
-                raise StaleRevisionError(problem, path=self._where, hint="the same again")
+                raise StaleRevisionError(problem, path=self._where, hint="run it again")
             fetch, wanted = partial(other._fetched, theirs), {named[number] for number in named if number > head}
             for number, record in other._chain(theirs, head + 1)[0].items():
                 if number > head:
