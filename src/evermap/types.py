@@ -127,7 +127,7 @@ _TEXT_IDS = 2**52
 
 
 class Clock(StrEnum):
-    """What a stamp counts. Stamps of different clocks are never compared."""
+    """Clock of stamps. Stamps of different clocks are never compared."""
 
     UNIX = "unix"
     """Seconds since 1970-01-01 UTC."""
@@ -160,7 +160,7 @@ class Odometry(_Columns):
 
 @dataclass(frozen=True, slots=True)
 class Frames(_Columns):
-    """Every instant at which the sensor looked, also when it saw nothing.
+    """Frames of the sensor, with or without detections.
 
     Attributes:
         stamp_s: (F,) strictly increasing.
@@ -233,7 +233,7 @@ class Misses(_Columns):
 
 
 class SensorKind(StrEnum):
-    """What measures ranges and bearings, which says how its errors are before any is seen."""
+    """Kind of range-bearing sensor, which sets the priors of its errors."""
 
     LASER = "laser"
     CAMERA = "camera"
@@ -244,7 +244,7 @@ class SensorKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """What the sensor can see and how well: limits and nominal noise of a range-bearing sensor.
+    """Limits and nominal noise of a range-bearing sensor.
 
     Attributes:
         range_min_m, range_max_m: limits of the range.
@@ -536,7 +536,7 @@ ANY_RANGE_M2 = 1e6
 
 @dataclass(frozen=True, slots=True)
 class SpatialDetections(_Columns):
-    """Hits in space: one row a detection, sorted by frame; what a detector does not give is nan.
+    """Hits in space: one row a detection, sorted by frame; values that a detector does not give are nan.
 
     Attributes:
         frame: (M,) row of `Frames`.
@@ -682,7 +682,7 @@ AnyRecordingT = TypeVar("AnyRecordingT", Recording, SpatialRecording)
 
 @dataclass(frozen=True, slots=True)
 class ParameterEstimate(Shown):
-    """One calibration state or noise level: what was assumed, what the recording says.
+    """One calibration state or noise level with prior and estimate.
 
     Attributes:
         name: e.g. 'odometry_delay_s', 'range_bias_m', 'sigma_range_m'.
@@ -707,7 +707,7 @@ class ParameterEstimate(Shown):
 
 @dataclass(frozen=True, slots=True)
 class Innovations(_Columns):
-    """What each detection said before it was used: one row a detection that had a prediction.
+    """Innovations of detections before their use: one row per detection with a prediction.
 
     Attributes:
         stamp_s: (K,) frame stamps.
@@ -727,7 +727,7 @@ class Innovations(_Columns):
 
 
 class ChangeKind(StrEnum):
-    """What happened to a group of landmarks."""
+    """Kind of a change of a group of landmarks."""
 
     MOVED = "moved"
     """All members by the same displacement."""
@@ -745,11 +745,11 @@ class ChangeKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class MapChange(Shown):
-    """One way in which the world differs from the map: some landmarks moved together.
+    """A difference between world and map: a change of a group of landmarks.
 
     Attributes:
         landmark_ids: the group, sorted.
-        kind: what happened to it.
+        kind: kind of the change.
         stamp_from_s, stamp_to_s: it happened between these two; nan and the first stamp for 'before the session'.
         displacement_m: (x, y), in space (x, y, z), of the group's centroid, in the map's frame; nan where it was not,
             or is not, there.
@@ -798,11 +798,11 @@ class Alternative(Shown):
 
 @dataclass(frozen=True, slots=True)
 class SlamResult(Shown):
-    """Everything a run estimated.
+    """All estimates of a run.
 
     Attributes:
         trajectory: smoothed poses at every frame that has one, and in between where the gap is long.
-        online: causal poses (what the robot knew at the time), one a frame.
+        online: causal poses, one per frame.
         landmarks: the map.
         parameters: calibration states and noise levels.
         innovations: consistency of every detection.
@@ -847,7 +847,7 @@ class SlamResult(Shown):
         }
 
     def plot(self, recording: AnyRecording | None = None) -> Figure:
-        """Draw path and map; with its recording also the truth and what was seen. Returns a matplotlib figure."""
+        """Draw path and map; with its recording also the truth and the detections. Returns a matplotlib figure."""
         figure: Figure = draw("plot_result", self, recording)
         return figure
 
@@ -862,7 +862,7 @@ _Table = TypeVar("_Table", bound="DataclassInstance")
 
 
 def rows_of(table: _Table, rows: IntArray | BoolArray) -> _Table:
-    """Return some rows of a table of columns, by number, in that order, or by a mask; what is not a column stays."""
+    """Return some rows of a table of columns, by number, in that order, or by a mask; other fields are kept."""
     columns = {item.name: getattr(table, item.name) for item in fields(table)}
     some: dict[str, Any] = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
     return replace(table, **some)

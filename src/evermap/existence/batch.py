@@ -1,4 +1,4 @@
-"""The fast road: one look at each of many features whose lifetimes have a closed form, compiled or on tensors.
+"""Batched looks at many features whose lifetimes have a closed form, compiled or on tensors.
 
 Every row has its own clock, lifetime parameters, `P_M` and `P_F`. State and answers are arrays of the caller: the new
 stamps are `sight.time_s` itself, and `out` may be reused from look to look (but must not overlap the inputs), so that
@@ -157,7 +157,7 @@ def _apply(kernel: Callable[..., bool], given: Parts, horizon_s: float, answer: 
 
 @cache
 def _pool() -> tuple[int, ThreadPoolExecutor]:
-    """How many cores this process may use, and a thread for each, started at the first call and kept."""
+    """Return the number of usable cores, and a pool with a thread for each, started at the first call and kept."""
     os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive into a child
     cores = len(os.sched_getaffinity(0))
     return cores, ThreadPoolExecutor(cores)

@@ -135,7 +135,7 @@ class RecurrentBeliefTable(BeliefTable):
         """Return the expected time until each feature leaves, if it is there.
 
         Returns:
-            (N,) seconds from `stamp_s` on; `inf` where some stay for ever, NaN where the feature is certainly away.
+            (N,) seconds from `stamp_s` on; `inf` if some never leave, NaN if the feature is certainly away.
         """
         return self._mean_time(True)
 

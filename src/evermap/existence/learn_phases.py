@@ -39,7 +39,7 @@ _SETTLED = 1e-5
 
 
 class Statistics(NamedTuple):
-    """What the looks say about the rates, expected over all that may have happened.
+    """Expected sufficient statistics of the rates, given the looks.
 
     Attributes:
         events: (B, n, n) changes of phase at each time of the week (B is 1008, or 1 without rhythm).
@@ -53,10 +53,10 @@ class Statistics(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """What is believed of every rate beforehand.
+    """Prior of every rate.
 
     Attributes:
-        fastest_hz: no rate is above; what changes more often than the looks come cannot be told.
+        fastest_hz: no rate is above; changes faster than the looks are unobservable.
         prior_s: time in which half a change has been seen: half of the geometric mean of the median gap between looks
             and of the time they span, since habits of any length in between are alike to us.
     """
@@ -77,7 +77,7 @@ class Limits(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LearnedPhases(Shown):
-    """A model learned from looks, and what is needed to go on learning.
+    """A model learned from looks, with the state for further learning.
 
     Attributes:
         model: the chosen chain; it starts as in the long run.
@@ -150,10 +150,10 @@ def learn(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> LearnedPhases:
-    """Return one model of how these features come and go.
+    """Learn one presence model of these features.
 
     Args:
-        looks: at features that share their habits; one feature alone is `looks.of(feature)`.
+        looks: at features that share one model; one feature alone is `looks.of(feature)`.
         phases: 'auto', the name of a structure ('two-state', 'three-phase', '2+3'), a structure, or several.
         rhythm: whether rates follow the hours of the week (stamps in local wall time); 'auto' tries both where the
             looks span two days or more.
@@ -213,7 +213,7 @@ def _check_settings(
 
 
 def _structures(phases: str | Structure | Sequence[str | Structure]) -> list[Structure]:
-    """What to choose from."""
+    """Return the candidate structures."""
     names = AUTO if isinstance(phases, str) and phases == "auto" else phases
     several = [names] if isinstance(names, (str, Structure)) else list(names)
     return [structure_of(s) if isinstance(s, str) else s for s in several]
@@ -305,7 +305,7 @@ def _maximise(structure: Structure, statistics: Statistics, rhythm: bool, limits
 
 
 def _log_prior(model: PhaseType, structure: Structure, start: FloatArray, limits: Limits) -> float:
-    """Of the rates and of the start, up to a constant: of the logarithms of the rates, as the M-step has it."""
+    """Return the log prior of the log rates and of the start, up to a constant, as in the M-step."""
     rates = model.rates_hz[structure.changes]
     return HALF_AN_EVENT * float(np.log(rates).sum() + np.log(start).sum()) - limits.prior_s * float(rates.sum())
 
@@ -388,7 +388,7 @@ def _with_rhythm(data: _Data, structure: Structure, flat: _Fit, limits: Limits) 
 
 
 def _candidate(looks: Looks, structure: Structure, fit: _Fit) -> Candidate:
-    """How well a fit does, its parameters counted against it."""
+    """Return the score of a fit: log evidence less the cost of its parameters."""
     evidence = float(fit.model.track(looks).log_evidence.sum())
     penalty = 0.5 * fit.parameters * float(np.log(max(len(looks.stamp_s), 2)))
     name = f"{structure.name} + rhythm" if fit.model.rhythms else structure.name

@@ -1,4 +1,4 @@
-"""How long things stay and stay away, learned from uncertain looks by expectation maximisation.
+"""Learning of stays and absences from uncertain looks by expectation maximisation.
 
 No truth is needed and no list of changes: the expectation step runs the run-length filter forward and backward and
 counts, with probabilities, at which ages stays and absences ended; the maximisation step fits lifetimes to the counts.
@@ -37,7 +37,7 @@ SETTLED = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Expected(Shown):
-    """What an expectation step finds.
+    """Result of an expectation step.
 
     Attributes:
         counts: of absences and of stays, exposures times the level of their week.
@@ -113,10 +113,10 @@ class Data(Shown):
         return cls(tuple(pieces), weights, tuple(n - 1 - weeks for weeks in ago), n, step_s, rhythm, span, last)
 
     def days(self, model: RunLength, counted: FloatArray) -> tuple[FloatArray, Data, DayShares]:
-        """Tell the kinds of the days by the looks of each.
+        """Infer the kinds of the days from their looks.
 
         Args:
-            model: how features come and go, with a rhythm.
+            model: presence model with a rhythm.
             counted: (K,) numbers of earlier days of each kind.
 
         Returns:
@@ -171,12 +171,12 @@ class Data(Shown):
 
 @dataclass(frozen=True, slots=True)
 class Ascent(Shown):
-    """Where expectation maximisation has arrived.
+    """State of expectation maximisation.
 
     Attributes:
         model: the best model.
         fitted: its absences and stays.
-        expected: what it finds in the looks.
+        expected: its expectation step.
         level: (2, P) drift of the hazards over the weeks.
     """
 
@@ -204,14 +204,12 @@ class Ascent(Shown):
 
     @property
     def candidate(self) -> Candidate:
-        """The same in numbers."""
+        """Return it as a candidate with scores."""
         return Candidate(self.name, self.expected.log_evidence, self.freedom, self.score)
 
 
 def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int) -> Ascent:
-    """Iterate expectation and maximisation until the evidence settles; families are chosen in the first
-    rounds.
-    """
+    """Iterate expectation and maximisation until the evidence settles; families are chosen in the first rounds."""
     allowed: list[Sequence[str]] = [families, families]
     level = np.ones((2, data.n_periods))
     expected = data.expect(model, level)
@@ -268,7 +266,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True)
 class LearnedSojourns(Shown):
-    """What was learned.
+    """Result of learning.
 
     Attributes:
         model: the filter to use from now on.
@@ -291,7 +289,7 @@ class LearnedSojourns(Shown):
     of_kind: FloatArray
 
     def updated(self, looks: Looks) -> LearnedSojourns:
-        """Learn from further looks: one expectation step on them, added to what is remembered of the earlier ones.
+        """Learn from further looks: one expectation step on them, added to the stored counts of the earlier ones.
 
         Args:
             looks: at the same or other features, after those learned from.
@@ -384,7 +382,7 @@ def learn(
 
 
 def _with_unusual_days(data: Data, best: Ascent) -> tuple[Ascent, FloatArray, DayShares]:
-    """The same, learned from the days on which something could change; numbers and shares of the days of each kind."""
+    """Return the same, learned from days with possible changes; numbers and shares of the days of each kind."""
     _, moving, _ = data.days(best.model, np.zeros(4))
     families = tuple(dict.fromkeys(one.family for one in best.fitted))
     again = climb(moving, best.model, families, _LAST_ROUNDS)

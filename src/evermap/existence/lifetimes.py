@@ -1,6 +1,6 @@
-"""What a model of presence knows of a class: how long its stays last, and its absences; as distributions of `survival`.
+"""Lifetimes of stays and absences of a presence model, as distributions of `survival`.
 
-A living map, a forecast or a report needs no more of a model than these two. Every `PresenceModel` has `lifetimes`;
+A living map, a forecast or a report needs only these two of a model. Every `PresenceModel` has `lifetimes`;
 `models.lifetimes_of` reads them from the text of a prior or from a file of models.
 
 For a filter a lifetime is the log-odds of dying within a gap (`log_death_odds`), a mixture of exponentials
@@ -34,7 +34,7 @@ CERTAIN = 800.0
 
 
 class Lifetimes(NamedTuple):
-    """How long the stays of a class last, and its absences.
+    """Lifetimes of the stays and absences of a class.
 
     Attributes:
         stay: lifetime of a stay, from arrival on.
@@ -167,7 +167,7 @@ def log_death_odds(
             if isinstance(prior, GeneralPurpose) and prior.high > WIDE * prior.low:
                 odds[rows] = np.log(_unknown_rate(prior, start, stop))
                 continue
-            if isinstance(prior, PiecewiseConstantHazard):  # what maps learn, and thus asked for millions of gaps
+            if isinstance(prior, PiecewiseConstantHazard):  # learned by maps, and thus evaluated for millions of gaps
                 odds[rows] = np.log(np.expm1(prior.integrated_hazard(start, stop)))
                 continue
             survival = np.asarray(prior.log_conditional_survival(start, stop), dtype=np.float64)
@@ -201,7 +201,7 @@ class HazardTable(NamedTuple):
     Attributes:
         offset: leading bits of the first edge above 0, less 1.
         edge_s: (B,) starts of the bins, the first 0.
-        hazard_hz: (B,) hazard in each; the last holds for ever.
+        hazard_hz: (B,) hazard in each; the last one is unbounded.
         cumulative: (B,) integral of the hazard up to each edge.
     """
 

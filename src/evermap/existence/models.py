@@ -49,7 +49,7 @@ KINDS: Mapping[str, Learner] = {
 
 @dataclass(frozen=True, slots=True)
 class Choice(Shown):
-    """What was chosen.
+    """The chosen kind of model.
 
     Attributes:
         kind: one of `KINDS`.
@@ -195,7 +195,7 @@ def load_model(path: str | Path) -> PresenceModel:
 
 
 def lifetimes_of(source: str | Path) -> dict[str, Lifetimes]:
-    """Return the lifetimes that a user means, by class; '' is for every other class.
+    """Return the lifetimes given by a user, by class; '' is for every other class.
 
     Args:
         source: the text of a prior as `weibull:scale=3d,shape=1.5` (absences then never end), or the path of a file of

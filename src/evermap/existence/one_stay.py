@@ -106,7 +106,7 @@ class PersistenceFilter(Shown):
         return float(1.0 / (1.0 + after))
 
     def _refusal(self, stamp_s: float, p_miss: float, p_false: float) -> InputError:
-        """What was wrong with an update that is refused."""
+        """Return the reason why an update is refused."""
         for value, field in ((p_miss, "p_miss"), (p_false, "p_false")):
             if not 0.0 <= value <= 1.0:
                 return InputError(f"{value} is not a probability", field=field, hint="a number between 0 and 1")
@@ -117,7 +117,7 @@ class PersistenceFilter(Shown):
 
 
 def _death_odds_under(prior: LifetimePrior) -> Callable[[float, float], float]:
-    """What gives `(1 - q) / q` of a gap from its begin and its end, by the shortest road that the prior allows."""
+    """Return a function for `(1 - q) / q` of a gap from its begin and end, by the cheapest formula of the prior."""
     if isinstance(prior, Exponential):
         return partial(_of_constant_hazard, float(prior.rate))
     if isinstance(prior, GeneralPurpose) and prior.high > WIDE * prior.low:
@@ -177,7 +177,7 @@ class OneStay(Shown):
     def track(self, looks: Looks, instants: Instants | None = None) -> Track:
         """Filter every feature's looks in one compiled pass; see `PresenceModel.track`.
 
-        Instants asked for go through the filter as looks that say nothing, so that one pass answers all.
+        Requested instants pass through the filter as looks without information, so that one pass answers all.
 
         Raises:
             NumericalError: a look that is impossible, whether the feature is there or gone.

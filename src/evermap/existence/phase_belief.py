@@ -83,7 +83,7 @@ class PhaseBelief(RecurrentBeliefTable):
         model, inside = self.model, self.model.present == present
         rates = model.rates_by_bin
         for_ever = _may_last(model, inside)
-        kept = np.flatnonzero(inside)[~for_ever]  # from these nothing leads to where one stays for ever
+        kept = np.flatnonzero(inside)[~for_ever]  # no phase without exit can be reached from these
         times = np.full((len(self), model.n_phases), np.inf)
         if kept.size:
             generators = rates[:, kept][:, :, kept] - np.eye(kept.size) * rates[:, kept].sum(2)[:, :, None]
@@ -138,7 +138,7 @@ def _bin_terms(generators: FloatArray, span_s: float) -> tuple[FloatArray, Float
 
 
 def _may_last(model: PhaseType, inside: BoolArray) -> BoolArray:
-    """Of the phases inside, those from which one may come to where nothing leads outside."""
+    """Return the phases inside from which a phase without exit can be reached."""
     changes = model.rates_hz > 0.0
     within = changes[np.ix_(inside, inside)]
     leaves = np.asarray(changes[np.ix_(inside, ~inside)].any(1), dtype=np.bool_)

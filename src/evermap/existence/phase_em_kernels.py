@@ -38,7 +38,7 @@ class Generator(NamedTuple):
 
 
 class Forgetting(NamedTuple):
-    """How expectations are weighed.
+    """Weights of expectations over time.
 
     Attributes:
         end_s: instant at which they weigh 1.
@@ -50,7 +50,7 @@ class Forgetting(NamedTuple):
 
 
 class Expectations(NamedTuple):
-    """What is expected of F features; of one where a dimension is less.
+    """Expectations of F features; of one feature without the first dimension.
 
     Attributes:
         integrals: (B, n, n) added to: as in `piece_integral`.

@@ -22,7 +22,7 @@ NEGLIGIBLE = 1e-17
 
 
 class PhaseChain(NamedTuple):
-    """All that the kernels know of a model; B is 1, or 1008 where there is a rhythm.
+    """Model data of the kernels; B is 1, or 1008 with a rhythm.
 
     Attributes:
         rates_hz: (B, n, n) rate of each change of phase, the diagonal zero.
@@ -40,7 +40,7 @@ class PhaseChain(NamedTuple):
 
 
 class Beginning(NamedTuple):
-    """What is believed before anything was seen.
+    """Belief before the first look.
 
     Attributes:
         start: (1, n) phases, or (1008, n) at the begin of each ten minutes of the week.
@@ -248,7 +248,7 @@ def track_feature(
 ) -> tuple[float, int]:
     """Return one feature's looks and instants, both in order; evidence, and the look that is impossible or -1.
 
-    `belief`, (n,), is filled in with what is believed at the last of them all.
+    `belief`, (n,), is filled with the belief at the last of them.
     """
     look_s, there, gone = seen
     start, fixed = beginning

@@ -32,7 +32,7 @@ class Structure:
     """A chain without its rates.
 
     Attributes:
-        name: what it is called on the command line and in reports.
+        name: its name on the command line and in reports.
         present: (n,) bool, whether a feature in this phase is there.
         changes: (n, n) bool, which changes of phase there are.
     """
@@ -267,7 +267,7 @@ class PhaseType(Shown):
 
     @cached_property
     def _long_run(self) -> FloatArray:
-        """(1, n), or (1008, n) at the begin of each ten minutes: what is left of any beginning."""
+        """Return the (1, n) stationary state, or (1008, n) at the begin of each ten minutes."""
         from evermap.existence.phase_kernels import transitions
 
         chain = self.chain
@@ -290,7 +290,8 @@ class PhaseType(Shown):
 
 
 def _stationary(rates: FloatArray) -> FloatArray | None:
-    """(n,) long run of constant rates without a difference (Grassmann, Taksar and Heyman 1985); None if there is none.
+    """Return the (n,) stationary state of constant rates without subtractions (Grassmann, Taksar and Heyman 1985); None
+    if there is none.
 
     None where some phase is never left for those before it, so that the beginning may matter.
     """

@@ -1,4 +1,4 @@
-"""What every model of presence answers, the tables it is asked with (looks, instants, tracks), and their validation.
+"""The protocol of presence models, their tables (looks, instants, tracks), and the validation of these.
 
 Errors name the row and what to try.
 """
@@ -66,7 +66,7 @@ def as_instants(stamp_s: Any, last_s: float = -np.inf) -> FloatArray:
 
 
 def _first(wrong: BoolArray, rows: IntArray | None) -> tuple[int, int] | None:
-    """Position of the first offender in the arrays, and the row it stands for."""
+    """Return the position of the first invalid value in the arrays, and its row."""
     where = np.flatnonzero(wrong)
     if not where.size:
         return None
@@ -312,7 +312,7 @@ class Instants(Shown):
 
 @dataclass(frozen=True, slots=True)
 class Track(Shown):
-    """Presence of F features as far as their looks tell.
+    """Presence of F features given their looks.
 
     Attributes:
         p_present: (Q,) probability of presence at every instant asked for, given the looks up to and including it;
@@ -346,7 +346,7 @@ class Candidate(NamedTuple):
 
 
 class PresenceFilter(Protocol):
-    """Whatever turns looks into probabilities of presence: a model, or several models of different features."""
+    """Protocol of everything that filters looks: a model, or several models of different features."""
 
     def track(self, looks: Looks, instants: Instants | None = None) -> Track:
         """Filter every feature's looks; asked at the looks themselves where `instants` is None.
@@ -359,11 +359,11 @@ class PresenceFilter(Protocol):
 
 @runtime_checkable
 class PresenceModel(PresenceFilter, Protocol):
-    """How features come and go. Immutable; one model serves any number of features."""
+    """Protocol of presence models. Immutable; one model serves any number of features."""
 
     @property
     def lifetimes(self) -> Lifetimes:
-        """How long a stay lasts, and an absence; hazards that follow the hours count with their mean over the week."""
+        """Lifetimes of a stay and of an absence; hazards with a rhythm count with their mean over the week."""
         ...
 
     def to_dict(self) -> dict[str, Any]:

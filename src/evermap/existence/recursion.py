@@ -1,6 +1,6 @@
 """The persistence recursion: every formula of MATH.md section 2 once, for floats, compiled loops and tensors alike.
 
-Plain Python on one number at a time. `one` calls it as it stands, `kernels` compiles it into loops over rows, `tensors`
+Plain Python on one number at a time. `one` calls it directly, `kernels` compiles it into loops over rows, `tensors`
 reads its conditional expressions as selections between whole tensors. A belief is its inverse odds `r = (1 - p) / p`:
 a gap of conditional survival `q` gives `r + (1 + r) (1 - q) / q`, a look multiplies by its likelihood when gone over
 its likelihood when there.
@@ -128,7 +128,7 @@ def mixed(inverse_odds: Any, leave: Any, comes: Any, gap: Any) -> Any:
     x = max(min(total * gap, LOG_LARGEST), 0.0)
     fresh, kept = -expm1(-x), exp(-x)
     scale = 1.0 / max(total, SMALLEST)
-    leaving = leave * scale if total > 0.0 else 1.0  # neither leaves nor returns: stays as it is
+    leaving = leave * scale if total > 0.0 else 1.0  # neither leaves nor returns: unchanged
     returning = comes * scale
     bounded = min(inverse_odds, LARGEST)
     gone = leaving * fresh + bounded * (leaving + returning * kept)
@@ -246,7 +246,7 @@ def scaled_survival(low: Any, high: Any, time: Any) -> Any:
 
 
 def _scale_step(low: Any, start: Any, stop: Any) -> Any:
-    """By how much `s` grows over a gap."""
+    """Return the growth of `s` over a gap."""
     after = low * stop
     return low * (stop - start) if low * start >= 1.0 else (after if after >= 1.0 else 0.0)
 

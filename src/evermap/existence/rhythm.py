@@ -89,7 +89,7 @@ class DayShares(NamedTuple):
 def day_shares(
     likelihood: FloatArray, importance: FloatArray, counted: FloatArray
 ) -> tuple[FloatArray, FloatArray, DayShares]:
-    """Return how many days were of each kind, and the shares to expect of days to come.
+    """Return the number of days of each kind, and the expected shares of future days.
 
     Days are a multinomial sample with the prior Dirichlet(1/2, ..): a kind that none of `n` days was of has the share
     `1/2 / (n + 2)`, the estimator of least regret in log loss (Krichevsky and Trofimov 1981). A day on which a kind

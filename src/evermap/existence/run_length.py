@@ -31,7 +31,7 @@ _MOST_HYPOTHESES = 10_000
 
 @dataclass(frozen=True)
 class RunLength(Shown):
-    """How features come and go: an alternating renewal process (MATH.md section 4).
+    """Presence as an alternating renewal process (MATH.md section 4).
 
     A hazard at local time `t` of a stay of age `a` is that of its lifetime at `a` times its rhythm at `t`. Within one
     step of time a feature changes at most once, in the middle of it.
@@ -149,7 +149,7 @@ class RunLength(Shown):
 
     @cached_property
     def first(self) -> First:
-        """What is believed before the first look."""
+        """Return the belief before the first look."""
         from evermap.existence.run_length_kernels import First, RunHypotheses, week_of_beliefs
 
         kinds = len(self.law.share)
@@ -208,7 +208,7 @@ class RunLength(Shown):
 
 
 def _equilibrium(table: HazardTable, n: int) -> tuple[FloatArray, FloatArray]:
-    """Ages that a state has been found in after a long time, as `n` points of equal weight, times the mean lifetime.
+    """Return the stationary ages of a state, as `n` points of equal weight, times the mean lifetime.
 
     The age of what is met at random has density `S(age)`, of integral `E[T]`; ages beyond the table count as its end.
     """
@@ -248,7 +248,7 @@ class RunLengthBelief(RecurrentBeliefTable):
 
     @property
     def rows(self) -> BeliefRows:
-        """The same as the kernels want it."""
+        """The same in the layout of the kernels."""
         from evermap.existence.run_length_kernels import BeliefRows, RunHypotheses
 
         held = RunHypotheses(self.start_s, self.weight, self.count)
@@ -300,7 +300,7 @@ class RunLengthBelief(RecurrentBeliefTable):
         return after
 
     def _mean_time(self, present: bool) -> FloatArray:
-        """The mean residual life `int S(a + t) dt / S(a)` over what is believed of the age `a`.
+        """Return the mean residual life `int S(a + t) dt / S(a)` over the belief of the age `a`.
 
         With a rhythm, a numerical integral over the coming weeks.
         """
@@ -320,11 +320,11 @@ class RunLengthBelief(RecurrentBeliefTable):
         return np.where(total > 0.0, mean, np.nan)
 
     def p_lasts(self, stamp_s: Any, *, present: bool = True) -> FloatArray:
-        """Return the probability that what is there now is still there, without a break, at instants ahead.
+        """Return the probability that a present feature is still there, without a break, at instants ahead.
 
         Args:
             stamp_s: (T,) instants in order, none before any row's last.
-            present: False asks of what is away now whether it has not returned.
+            present: False: that an absent feature has not returned.
 
         Returns:
             (N, T) probabilities; NaN where the feature is certainly not in this state.

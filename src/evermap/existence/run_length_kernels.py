@@ -28,7 +28,7 @@ _HIGHEST = 0x7FFFFFFFFFFFFFFF
 
 
 class Law(NamedTuple):
-    """All that the kernels know of a model.
+    """Model data of the kernels.
 
     Attributes:
         step_s: longest step of time.
@@ -361,7 +361,9 @@ def begin_rows(held: RunHypotheses, stamp_s: FloatArray, prior: First) -> None:
 def _track_one(
     looks: LookColumns, asked_s: FloatArray, slots: int, law: Law, prior: First, answer: FloatArray
 ) -> tuple[float, float, int]:
-    """All looks at one feature and all instants asked for; log evidence, mass merged, impossible look or -1."""
+    """Filter all looks at one feature and all requested instants; return log evidence, merged mass, impossible look or
+    -1.
+    """
     stamp_s, absent, present = looks
     held, space = nothing_held(slots, law), room(slots)
     evidence, moved = 0.0, 0.0
@@ -405,7 +407,7 @@ def track(
         (Q,) presence at the instants asked for, (F,) log evidence, (F,) mass merged, and (F,) the number of the first
         look that is impossible under both states, or -1.
     """
-    # arrays of its own, taken out of tuples: what is written to others, a parallel loop takes for dead
+    # arrays of its own, taken out of tuples: a parallel loop takes writes to others for dead
     stamp_s, absent, present = looks
     n = len(first) - 1
     p_present, evidence, moved = np.empty(len(asked_s)), np.empty(n), np.empty(n)

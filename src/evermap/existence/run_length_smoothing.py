@@ -84,7 +84,7 @@ class SojournCounts(NamedTuple):
 
 
 class Calendar(NamedTuple):
-    """What time it is in T steps.
+    """Calendar times of T steps.
 
     Attributes:
         importance: (T,) weight of what happens in each step.

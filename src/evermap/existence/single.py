@@ -59,7 +59,7 @@ class Belief(BeliefTable):
         return (index, values) if looked.all() else (index[looked], [column[looked] for column in values])
 
     def observe(self, stamp_s: Any, log_there: Any, log_gone: Any = 0.0, *, rows: Any = None) -> Self:
-        """Return beliefs after a look at each feature, whatever model of detection says how likely its outcome was.
+        """Return beliefs after a look at each feature, with likelihoods of any detection model.
 
         With `log p(y | there) - log p(y | gone)` in the place of `log_there` the beliefs are the same; the evidence is
         then relative to that of a world without the features.
@@ -83,7 +83,7 @@ class Belief(BeliefTable):
         return self._looked(index, time, there, gone, logs=True)
 
     def run(self, feature: Any, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any) -> tuple[Self, FloatArray]:
-        """Apply a stream of observations in one call, in whatever order its rows come.
+        """Apply a stream of observations in one call, in any order of rows.
 
         Rows are taken by feature and time; those of one feature at one time keep their order. The prior is asked once
         for all gaps, then one compiled pass does the recursion.

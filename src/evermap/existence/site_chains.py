@@ -15,7 +15,7 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class CliqueChains:
-    """Rows of the seats, see `site_kernels`.
+    """Layout of the seats, see `site_kernels`.
 
     Attributes:
         first: (C + 1,) rows of each clique's seats, 'away' first.
@@ -89,7 +89,7 @@ def distinct(priors: tuple[LifetimePrior, ...]) -> tuple[tuple[LifetimePrior, ..
 
 
 def _name(prior: LifetimePrior) -> object:
-    """What equal priors have in common; of one that cannot be compared, what it alone has."""
+    """Return a key that equal priors share; for one that cannot be compared, its identity."""
     try:
         hash(prior)
     except TypeError:
@@ -126,7 +126,7 @@ class Seats(NamedTuple):
 
 
 class Transitions(NamedTuple):
-    """What happens between frames; without meaning at the first frame of a clique.
+    """Transitions between frames; undefined at the first frame of a clique.
 
     Attributes:
         log_route: (R, W) log probability that one that leaves a seat goes to another of its clique.

@@ -1,4 +1,4 @@
-"""Chains of cliques over 'away' and their sites, compiled: what frames say, gaps between sessions, looks within one.
+"""Chains of cliques over 'away' and their sites, compiled: evidence of frames, gaps between sessions, looks within one.
 
 A clique of K sites has K + 1 *seats*: 0 is 'away', the others are its sites. At a seat it is *old*, there since before
 the session, or *new*, come in the meantime; the two differ in age. Rows of columns by seat: one for each site of every
@@ -57,12 +57,12 @@ class Slots(NamedTuple):
 
 
 class SensorNumbers(NamedTuple):
-    """`sites.SiteSensor` in numbers.
+    """`sites.SiteSensor` as plain numbers.
 
     Attributes:
         p_blocked: probability of a detection along a line of sight that is not free.
         p_false: of a detection of nothing.
-        p_occluded: that something stands before the whole clique.
+        p_occluded: that the whole clique is occluded.
         occluded_s: mean duration of that; 0 for an occlusion of its own in every frame.
         use_misses: False has only hits count.
     """
@@ -75,7 +75,7 @@ class SensorNumbers(NamedTuple):
 
 
 class FrameEvidence(NamedTuple):
-    """What F frames say of W seats.
+    """Evidence of F frames on W seats.
 
     Attributes:
         log_ratio: (F, W) log likelihood of each seat, less that of being away.
@@ -107,7 +107,7 @@ class SiteChain(NamedTuple):
 
 @kernel
 def frame_evidence(rows: FrameRows, slots: Slots, sensor: SensorNumbers, said: FrameEvidence) -> None:
-    """Weigh what frames say for each seat against 'away', the lines of sight being learned on the way.
+    """Compute the evidence of frames for each seat against 'away', while learning the lines of sight.
 
     All is given that the clique has been at a site all the time. (Of one that comes while it is watched, the looks
     before count too: a little too cautious then.) Whether the lines of sight to it are free changes as seldom as what
@@ -122,7 +122,7 @@ def frame_evidence(rows: FrameRows, slots: Slots, sensor: SensorNumbers, said: F
     log_ratio, n_hits, n_misses, expected = said
     width = log_ratio.shape[1]
     free, likely = np.empty(width), np.empty(width)  # of each seat: after the last frame, and by its lines alone
-    veil, looked_s = np.empty(width), np.empty(width)  # that somebody stood before it then, if its line is free
+    veil, looked_s = np.empty(width), np.empty(width)  # that it was occluded then, if its line is free
     for f in range(first.size - 1):
         log_ratio[f], n_hits[f], n_misses[f], expected[f] = 0.0, 0, 0, 0.0
         if f == 0 or clique[f] != clique[f - 1]:
@@ -150,7 +150,7 @@ def frame_evidence(rows: FrameRows, slots: Slots, sensor: SensorNumbers, said: F
             seen, hidden = 0.0, 0.0
             for row in range(low, high):
                 a, b = hits[slot[row]], misses[slot[row]]
-                p = max(a / (a + b), p_false)  # what is there is no harder to detect than what is not
+                p = max(a / (a + b), p_false)  # P(detect) of a present landmark is at least that of a false detection
                 q = max(p_blocked, p_false)
                 expected[f, k] += free[k] * p + (1.0 - free[k]) * q
                 if hit[row]:

@@ -1,4 +1,4 @@
-"""The belief of a living map: every clique stands at one of its known sites, or is away.
+"""The belief of a living map: every clique occupies one of its known sites, or is away.
 
 One chain a clique (MATH.md section 5, "Uniting the papers"). A clique at a site stays over a gap with the conditional
 survival of its lifetime; one that leaves stands at another known site at once with `p_hop`, else is away, and one that
@@ -53,7 +53,7 @@ class SiteLooks(Shown):
 
 @dataclass(frozen=True, slots=True)
 class SiteDynamics(Shown):
-    """How S sites of C cliques are left and returned to.
+    """Dynamics of S sites of C cliques: stays, absences and returns.
 
     Attributes:
         stay: S lifetimes of a stay at each site.
@@ -75,12 +75,12 @@ class SiteDynamics(Shown):
 
 
 class SiteSensor(NamedTuple):
-    """How well places are seen.
+    """Detection model of places.
 
     Attributes:
-        lines: what is known of K lines of sight before the session.
+        lines: K lines of sight as known before the session.
         p_false: probability of a detection at a place where nothing of the clique is.
-        p_occluded: that something stands before the whole clique.
+        p_occluded: that the whole clique is occluded.
         occluded_s: mean duration of that, so that a blind spell is one event and not as many as it has frames; 0 for an
             occlusion of its own in every frame.
         use_misses: False has only hits count.
@@ -95,7 +95,7 @@ class SiteSensor(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SiteTrace(Shown):
-    """What was said of cliques, frame by frame: (E,) rows by clique, then by time.
+    """Evidence on cliques, frame by frame: (E,) rows by clique, then by time.
 
     Attributes:
         clique, stamp_s: which frame of which clique.
@@ -119,8 +119,8 @@ class SiteBeliefs(Shown):
     """Beliefs of C cliques with S sites after a session of N looks.
 
     Attributes:
-        p_here: (S,) probability that its clique stands at each site, at the end.
-        p_stayed: (S,) part of it: that it has stood there since before the start.
+        p_here: (S,) probability that each site is occupied, at the end.
+        p_stayed: (S,) part of it: that it has been there since before the start.
         p_before: (S,) before the clique's first look; at the end where there was none.
         since_s: (S,) mean begin of the stay there, given that it stands there at the end.
         weight: (N,) probability that the clique stood at the looks' sites then, given all hits of the session. Misses
@@ -247,7 +247,7 @@ class CliqueFrames:
 
 
 def _said_by(frames: CliqueFrames, looks: SiteLooks, chains: CliqueChains, sensor: SiteSensor) -> FrameEvidence:
-    """What every frame says."""
+    """Return the evidence of every frame."""
     from evermap.existence.site_kernels import FrameEvidence, FrameRows, SensorNumbers, Slots, frame_evidence
 
     lines, p_false, p_occluded, occluded_s, use_misses = sensor
@@ -290,10 +290,10 @@ def follow_sites(
     until_s: float,
     held: BoolArray | None = None,
 ) -> SiteBeliefs:
-    """Take all looks of a session in.
+    """Update beliefs by all looks of a session.
 
     Args:
-        p_here: (S,) probability at `start_s` that its clique stands at each site; the rest to 1 is away.
+        p_here: (S,) probability at `start_s` that each site is occupied; the rest to 1 is away.
         clique_of_site: (S,) row of the clique of each site; a clique may have none.
         dynamics: how sites are left and returned to.
         looks: what was looked at.
@@ -323,7 +323,7 @@ def follow_sites(
     def filtered(said: FrameEvidence) -> tuple[FloatArray, FloatArray, FloatArray]:
         found = np.empty(shape), np.empty(len(frames)), np.empty(n_cliques)
         kernels.forward(chain, log_here, said.log_ratio, *found)
-        return found  # log probabilities after each frame, what it said for the sites, and the evidence of all
+        return found  # log probabilities after each frame, its evidence for the sites, and the total evidence
 
     hits, said = (_said_by(frames, looks, chains, one) for one in (sensor._replace(use_misses=False), sensor))
     log_after, log_odds, log_evidence = filtered(said)
@@ -364,7 +364,7 @@ def _first_beliefs(
     start: FloatArray,
     pinned: BoolArray,
 ) -> _FirstBeliefs:
-    """From the last session to the first look, in steps; then from look to look."""
+    """Predict from the last session to the first look, in steps; then from look to look."""
     from evermap.existence.site_kernels import renew
 
     n_sites = len(dynamics.since_s)

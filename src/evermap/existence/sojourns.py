@@ -58,7 +58,7 @@ class Sojourns(Shown):
 
     @property
     def n_events(self) -> float:
-        """How many ended."""
+        """Number of ended stays."""
         return float(self.events.sum())
 
 
@@ -199,11 +199,11 @@ def _two_parameters(
     build: Callable[[float, float], LifetimePrior],
     cumulative: Callable[[float, float, FloatArray], FloatArray] | None = None,
 ) -> Fitted:
-    """Best lifetime of a family with a logarithm of typical duration, and a logarithm of shape.
+    """Fit a family with two parameters: the logarithms of a typical duration and of a shape.
 
     Args:
         family: its name.
-        counts: what it is fitted to.
+        counts: data of the fit.
         build: makes the lifetime of the two.
         cumulative: makes its cumulative hazard at some ages, if there is a quicker way than the lifetime's own.
     """
@@ -282,7 +282,7 @@ def _mixture(counts: Sojourns, n: int) -> Fitted:
 
 
 def _highest(x: FloatArray, ended: FloatArray, n: int) -> FloatArray:
-    """Where the most events are, one peak after another, each taking away what it explains."""
+    """Return initial peaks: the maxima of the events, one after another, each removing the events that it explains."""
     left, found = ended.copy(), np.empty(n)
     for i in range(n):
         near = np.exp(-0.5 * ((x[:, None] - x[None, :]) / (2.0 * PEAK_SPREAD)) ** 2)

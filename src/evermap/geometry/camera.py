@@ -1,4 +1,4 @@
-"""Cameras: where a point appears in the image, how that depends on the point, and along which ray a pixel looks.
+"""Camera models: projection of points, its derivatives, and rays of pixels.
 
 Points are in the camera's frame (x right, y down, z ahead), pixels are (u right, v down). Three models: 'pinhole';
 'radtan', a pinhole with the radial and tangential distortion of Brown (1966), also called plumb bob; 'equidistant', the
@@ -99,7 +99,7 @@ def _brown(plane: FloatArray, distortion: Sequence[float]) -> tuple[FloatArray, 
 
 
 def _fisheye(point: FloatArray, sensor: SpatialSensor) -> tuple[FloatArray, FloatArray]:
-    """As `_perspective`: the distance from the centre of the image is an odd polynomial of the angle off the axis."""
+    """Project like `_perspective`, with an image radius that is an odd polynomial of the angle off the axis."""
     x, y, z = point[..., 0], point[..., 1], point[..., 2]
     side, whole = np.hypot(x, y), np.linalg.norm(point, axis=-1)
     angle = np.arctan2(side, z)

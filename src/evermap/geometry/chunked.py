@@ -131,7 +131,7 @@ class ChunkedCovariance:
         return cls.of_points(position_m, lambda a, b: covariance_m2[np.ix_(se2.xy_rows(a, dim), se2.xy_rows(b, dim))])
 
     def flaw(self, count: int, dim: int = 2) -> str:
-        """Tell in what this contradicts itself, or is not of so many points; '' if it is consistent."""
+        """Return a description of an inconsistency, also with the number of points; '' if it is consistent."""
         n = len(self.parent)
         own = self.pair[self.pair[:, 0] == self.pair[:, 1], 0]
         good = (
@@ -150,7 +150,7 @@ class ChunkedCovariance:
 
     @property
     def sizes(self) -> IntArray:
-        """How many values each of the parts has."""
+        """Return the number of values of each part."""
         return np.diff(self._index.first[self._index.group])
 
     @functools.cached_property
@@ -204,7 +204,7 @@ class ChunkedCovariance:
         return tuple(parts)
 
     def updated(self, new: Update) -> Self:
-        """Return the covariance after some points were learned anew, others came and others went.
+        """Return the covariance after some points were updated, added or removed.
 
         The points that stay as they are keep their own covariances. With those that were learned they stay correlated
         as they were: `T C`, where `T` is the symmetric map from the old Gaussian of the learned points beside them to
@@ -227,7 +227,7 @@ class ChunkedCovariance:
         centre = _centres(chunk, new.position_m, n_chunks)
         centre[known] = self.centre_m[known]
         pair = _pairs(centre, parent)
-        # pairs of chunks that nothing was learned of are as they were, those of the others are told anew
+        # pairs of chunks without updates are unchanged, the others are computed anew
         code, old_code = pair @ [n_chunks, 1], self.pair @ [n_chunks, 1]
         code = np.union1d(code[touched[pair].any(axis=1)], old_code[~touched[self.pair].any(axis=1)])
         pair = np.column_stack([code // n_chunks, code % n_chunks])
@@ -340,7 +340,7 @@ class ChunkedCovariance:
             if not fitting:
                 continue
             rows = np.concatenate([np.arange(at[g].start, at[g].stop) for g in fitting])
-            # what is kept of those given and what follows of them differ a little: the chunk's own is as it is kept
+            # stored and derived blocks of the given chunks differ a little: the chunk's own block is the stored one
             back = _transport(rest + gain @ joint[np.ix_(rows, rows)] @ gain.T, own)
             joint[mine, :n] = back @ (gain @ joint[rows, :n])
             joint[:n, mine] = joint[mine, :n].T
@@ -348,7 +348,7 @@ class ChunkedCovariance:
         return points, joint
 
     def _follows(self, c: int, given: list[int]) -> tuple[list[int], FloatArray, FloatArray]:
-        """How a chunk (m, m) follows a clique of others (n, n), `(m, n)`, and what is left of its own.
+        """Return the regression (m, n) of a chunk (m, m) on a clique of others (n, n), and its conditional covariance.
 
         Blocks that were told at different times may contradict each other: then the farthest others are left out.
         """
@@ -369,17 +369,17 @@ class ChunkedCovariance:
         return [], np.zeros((len(own), 0)), own
 
     def _near(self, chunks: IntArray) -> dict[int, set[int]]:
-        """Of every chunk its neighbours."""
+        """Return the neighbours of every chunk."""
         graph = self._index.graph
         return {c: set(graph.indices[graph.indptr[c] : graph.indptr[c + 1]].tolist()) for c in chunks.tolist()}
 
     def _elimination(self, near: dict[int, set[int]]) -> dict[int, list[int]]:
-        """Chunks in the order in which they are told, each with those before that it is told given: the largest clique
-        of its neighbours that is found from the nearest on.
+        """Return chunks in elimination order, each with the earlier ones on which it is conditioned: the largest clique
+        of its neighbours, found greedily from the nearest.
         """
         order: dict[int, list[int]] = {}
         waiting = dict.fromkeys(near, 0)
-        while waiting:  # maximum cardinality search: next the chunk that most neighbours were told of
+        while waiting:  # maximum cardinality search: next the chunk with most visited neighbours
             c = max(waiting, key=lambda k: (waiting[k], -k))
             del waiting[c]
             known = np.array(sorted(near[c] & order.keys()), dtype=np.int64)
@@ -429,7 +429,7 @@ def blocks(covariance_m2: JointCovariance, dim: int = 2) -> FloatArray:
 
 
 class Update(NamedTuple):
-    """What was learned of some of N points.
+    """Update of some of N points.
 
     Attributes:
         position_m: (N, 2) of all points after it.
@@ -450,7 +450,7 @@ JointCovariance = FloatArray | ChunkedCovariance
 
 @dataclass(frozen=True)
 class _Index:
-    """Where points and blocks are.
+    """Index of points and blocks.
 
     Attributes:
         chunk: (P,) of every point.

@@ -22,7 +22,7 @@ def consensus(
     landmark: IntArray | None = None,
     weight: FloatArray | None = None,
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the motion that brings most points near their partners: every motion that two of them suggest is asked.
+    """Return the motion that brings most points near their partners, over all motions defined by two of them.
 
     Args:
         source: (k, 2) points.
@@ -87,7 +87,8 @@ def _rotation(moment: FloatArray) -> FloatArray:
 
 
 def _pairs_of_one_length(source: FloatArray, target: FloatArray, name: IntArray) -> tuple[IntArray, IntArray]:
-    """Two different landmarks each, that are about as far from each other in both maps; far ones tell a heading best.
+    """Return pairs of different landmarks with about equal distance in both maps; distant ones determine a heading
+    best.
 
     Every point has some, so that those at the far ends, if these moved, are not in all.
     """
@@ -124,7 +125,7 @@ def _rigid_pairs(a: FloatArray, b: FloatArray, to_a: FloatArray, to_b: FloatArra
 
 
 def _best(pose: FloatArray, source: FloatArray, target: FloatArray, worth: FloatArray, first: IntArray) -> int:
-    """Which motion (m, 3) is worth most, the nearest of equal ones; landmarks begin at the rows `first`."""
+    """Return the motion (m, 3) of highest score, the nearest among equal ones; landmarks begin at the rows `first`."""
     score, distance = np.empty(len(pose)), np.empty(len(pose))
     step = max(1, AT_ONCE // len(source))
     for k in range(0, len(pose), step):

@@ -35,7 +35,7 @@ def from_plane(pose: ArrayLike) -> FloatArray:
 
 
 def from_angles(roll_pitch_yaw: ArrayLike) -> FloatArray:
-    """Return the pose (7,) at the origin that is turned about x, then y, then z, which stay as they are [rad]."""
+    """Return the pose (7,) at the origin rotated about the fixed axes x, then y, then z [rad]."""
     pose = identity()
     for axis in (2, 1, 0):
         pose = compose(pose, exp(np.eye(6)[3 + axis] * np.asarray(roll_pitch_yaw)[axis]))
@@ -48,7 +48,7 @@ def normalised(pose: ArrayLike) -> FloatArray:
 
 
 def _normalise(pose: FloatArray) -> FloatArray:
-    """The same in place."""
+    """Normalise in place."""
     quaternion = pose[..., 3:]
     # whichever of qw, qz, qy, qx is the first that is not zero outweighs all that follow
     backwards = np.sign(quaternion) @ [1.0, 2.0, 4.0, 8.0] < 0.0
@@ -191,7 +191,7 @@ def _turned(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """As `np.cross`, in a fifth of the time."""
+    """Return `np.cross`, in a fifth of the time."""
     ax, ay, az, bx, by, bz = a[..., 0], a[..., 1], a[..., 2], b[..., 0], b[..., 1], b[..., 2]
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     out[..., 0], out[..., 1], out[..., 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx

@@ -1,4 +1,4 @@
-"""Turns of an object after which it looks the same: any about one of its axes, finitely many, or all.
+"""Rotations after which an object looks the same: any about one of its axes, finitely many, or all.
 
 Stated by generators, as text: `axis:z` (any turn about the object's own z axis), `180:z` (that part of a full turn, in
 degrees, and its multiples), `any` (a ball). Several are closed into the group that they generate. Beside an axis, only
@@ -25,7 +25,7 @@ HINT = "axis:z (any rotation about z), 180:z (half a turn about z, or another in
 
 @dataclass(frozen=True, slots=True)
 class Symmetry:
-    """A group of turns in the object's own frame.
+    """A group of rotations in the object's own frame.
 
     Attributes:
         axis: 0, 1 or 2, about which any turn belongs to it; -1 without.
@@ -104,10 +104,10 @@ class Symmetry:
 
 @dataclass(frozen=True, slots=True)
 class Symmetries:
-    """Of P things.
+    """Symmetries of P objects.
 
     Attributes:
-        kinds: different ones, the first of which is that of things without any.
+        kinds: the distinct ones, the first without any symmetry.
         of: (P,) row of these.
     """
 
@@ -116,12 +116,12 @@ class Symmetries:
 
     @classmethod
     def none(cls, count: int) -> Symmetries:
-        """Return those of things that look different from everywhere."""
+        """Return symmetries of objects without any."""
         return cls((Symmetry(),), np.zeros(count, dtype=np.int64))
 
     @classmethod
     def of_classes(cls, stated: Mapping[str, tuple[str, ...]], names: Iterable[str]) -> Symmetries:
-        """Return those of things (P,) by the names of their classes.
+        """Return the symmetries of objects (P,) by the names of their classes.
 
         Raises:
             ValueError: as of `Symmetry.generated`.
@@ -131,7 +131,7 @@ class Symmetries:
         return cls(kinds, np.array([row.get(name, 0) for name in names], dtype=np.int64))
 
     def __getitem__(self, rows: IntArray | BoolArray) -> Symmetries:
-        """Return those of some things (K,)."""
+        """Return those of some objects (K,)."""
         return Symmetries(self.kinds, self.of[rows])
 
     @property

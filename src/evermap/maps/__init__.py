@@ -1,1 +1,1 @@
-"""The living map: what stands where, since when, how surely, and how long such things tend to stay."""
+"""The living map: landmarks at their sites with stays, beliefs and lifetimes."""

@@ -1,4 +1,4 @@
-"""Which landmarks are on one body: those of a class that stand close together, then those that move together.
+"""Assignment of landmarks to rigid bodies: by proximity within a class, then by common motion.
 
 Proximity within a semantic class (Bateman 2020, section 7.3) is a guess: two chairs side by side look like one. What
 they do next tells. A body moves as a whole, so its landmarks keep their distances; bodies move one by one. With
@@ -38,7 +38,7 @@ ALL_TURNS = {2: 2.0 * math.pi, 3: 8.0 * math.pi**2}
 
 
 class Fate(IntEnum):
-    """What a session found of a landmark."""
+    """Outcome of a session for a landmark."""
 
     UNSEEN = 0
     """Nobody looked, or nothing is certain."""
@@ -48,7 +48,7 @@ class Fate(IntEnum):
 
 
 def group(position_m: FloatArray, class_id: IntArray, *, reach_m: float) -> IntArray:
-    """Return cliques by proximity within a class; what has no class stands alone.
+    """Return cliques by proximity within a class; landmarks without a class are separate cliques.
 
     Complete linkage: no two landmarks of a clique are farther apart than `reach_m`, the closest are joined first.
 
@@ -240,7 +240,7 @@ def _logit(p: float) -> float:
 
 
 def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntArray]:
-    """Return the map after its landmarks were given to other cliques.
+    """Return the map after its landmarks were assigned to other cliques.
 
     A site of a clique that is taken apart becomes one for each part; its stays are those of the part that keeps the
     site. Where cliques are put together, the sites at which they most probably stood become one; their other sites hold
@@ -298,7 +298,7 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
 
 
 def _keepers(site: IntArray, owner: IntArray, before: IntArray) -> BoolArray:
-    """Which part of every site keeps its id: that of the clique it was of, else the first."""
+    """Return the part of every site that keeps its id: that of its former clique, else the first."""
     order = np.lexsort((owner, owner != before, site))
     keeps = np.zeros(len(site), dtype=np.bool_)
     keeps[order[np.append(True, np.diff(site[order]) != 0)[: len(order)]]] = True
@@ -306,7 +306,7 @@ def _keepers(site: IntArray, owner: IntArray, before: IntArray) -> BoolArray:
 
 
 def _united(owner: IntArray, before: IntArray, p_here: FloatArray) -> IntArray:
-    """For every part the one that it goes into: itself, but for the likeliest parts of cliques put together."""
+    """Return the part into which every part is merged: itself, except for the likeliest parts of joined cliques."""
     into = np.arange(len(owner))
     for clique in np.unique(owner):
         mine = np.flatnonzero(owner == clique)
@@ -324,8 +324,7 @@ def _of_sum_one(owner: IntArray, p_here: FloatArray) -> FloatArray:
 
 
 def without_missed(before: LivingMap, after: LivingMap, settings: GroupingConfig = USUAL) -> LivingMap:
-    """Return the map after a session, its bodies without members that were missed alone; whether these exist is then
-    open.
+    """Return the map after a session, with members that were missed alone split off their bodies.
 
     Args:
         before: the map as the session found it.
@@ -360,7 +359,7 @@ def without_missed(before: LivingMap, after: LivingMap, settings: GroupingConfig
 
 
 def _at(row: IntArray, column: IntArray) -> FloatArray:
-    """(L,) a column by rows, 0 where there is none."""
+    """Return a column (L,) by rows, 0 for missing rows."""
     return np.append(column, 0)[row].astype(np.float64)  # row -1 is the last
 
 

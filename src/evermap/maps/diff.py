@@ -1,9 +1,9 @@
-"""What changed between revisions of a map: the changes that its sessions told, composed to their net effect.
+"""Differences between revisions of a map: the changes reported by its sessions, composed to their net effect.
 
-Only sessions tell changes (`sessions.decide`), and every revision keeps those of its own. Between neighbouring
-revisions the difference is what the session told, word for word. Over several of them the changes of each landmark are
-composed: what left and came back to its place is no difference, what moved twice moved once. Where the way from one
-revision to the other leads back in history, through a revert or because that was asked for, changes are undone.
+Only sessions report changes (`sessions.decide`), and every revision stores its own. Between neighbouring revisions the
+difference is the session's report. Over several of them the changes of each landmark are composed: what left and came
+back to its place is no difference, what moved twice moved once. Where the way from one revision to the other leads back
+in history, through a revert or because that was asked for, changes are undone.
 
 A landmark that the earlier map did not know, and that nobody saw appear, has not changed: the map grew by it.
 """
@@ -34,11 +34,11 @@ _COMES = frozenset({ChangeKind.APPEARED, ChangeKind.RETURNED})
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A change that a session told, on the way from one map to another.
+    """A reported change on the way from one map to another.
 
     Attributes:
-        change: as it was told.
-        undone: whether the way leads back over it.
+        change: as reported.
+        undone: whether it is inverted on that way.
         session: number of the session on that way.
     """
 
@@ -48,24 +48,24 @@ class Told:
 
     @property
     def comes(self) -> bool:
-        """Whether its landmarks stand somewhere after it, and did not before."""
+        """Whether its landmarks are present after it, and were absent before."""
         return self.change.kind is ChangeKind.VANISHED if self.undone else self.change.kind in _COMES
 
     @property
     def goes(self) -> bool:
-        """Whether its landmarks stand nowhere after it, and did before."""
+        """Whether its landmarks are absent after it, and were present before."""
         return self.change.kind in _COMES if self.undone else self.change.kind is ChangeKind.VANISHED
 
 
 @dataclass(frozen=True, slots=True)
 class Difference(Shown):
-    """How one revision of a map differs from another.
+    """Difference between two revisions of a map.
 
     Attributes:
         a, b: the revisions.
-        changes: net effect of what the sessions between them told.
-        grown: (N,) landmarks that stand in `b` and that `a` did not know, without having appeared.
-        edits: what operators said: landmark and 'pinned', 'unpinned', 'deleted' or 'undeleted'.
+        changes: net effect of the changes reported between them.
+        grown: (N,) landmarks that are present in `b` and unknown in `a`, without having appeared.
+        edits: by operators: landmark and 'pinned', 'unpinned', 'deleted' or 'undeleted'.
     """
 
     a: int
@@ -108,7 +108,7 @@ def diff(store: MapStore, a: int, b: int | None = None) -> Difference:
 
 
 def told_between(store: MapStore, a: int, b: int) -> list[ToldBySession]:
-    """Return what the sessions between two revisions told, undone from `a` back to the revision that both come from."""
+    """Return the changes reported between two revisions, inverted from `a` back to the common ancestor."""
     old, new = store.lineage(a), store.lineage(b)
     common = sum(1 for one, other in zip(old, new, strict=False) if one == other)
     back = [(store.changes(number)[::-1], True) for number in reversed(old[common:])]
@@ -118,7 +118,7 @@ def told_between(store: MapStore, a: int, b: int) -> list[ToldBySession]:
 def net(
     sessions: Sequence[ToldBySession], a: LivingMap, b: LivingMap, settings: DecisionConfig = USUAL
 ) -> tuple[MapChange, ...]:
-    """Return the net effect of what sessions told one after the other.
+    """Return the net effect of successive reported changes.
 
     What one session told is returned as it is, and so is a change of landmarks of which no other is told. Of several
     the interval, the hits and the misses are those of all changes that the net effect rests on, and the probability is
@@ -160,7 +160,7 @@ def net(
 
 
 def grown(known: IntArray, b: LivingMap, changes: Iterable[MapChange]) -> IntArray:
-    """Return (N,) ids of landmarks that stand in `b` beyond those known before, and of which no change is told."""
+    """Return (N,) ids of landmarks that are present in `b`, unknown before, and without a reported change."""
     told = [name for change in changes for name in change.landmark_ids]
     stands = b.members.landmark_id[(b.told_site() != UNKNOWN) & ~b.members.deleted]
     return np.setdiff1d(stands, np.concatenate([known, np.array(told, dtype=np.int64)]))
@@ -229,7 +229,7 @@ def with_swaps(
 
 
 def _exchanged(change: MapChange, other: MapChange) -> MapChange:
-    """Two moves told as one exchange; the displacement is that of the first."""
+    """Combine two moves into one exchange; the displacement is that of the first."""
     return replace(
         change,
         kind=ChangeKind.SWAPPED,
@@ -278,7 +278,7 @@ def _composed(
 
 
 def _shift(path: Sequence[Told], names: tuple[int, ...], a: LivingMap, b: LivingMap) -> tuple[FloatArray, float]:
-    """Shift and rotation from the places in one map to those in the other; where these are unknown, as was told."""
+    """Return translation and rotation between the places in two maps; as reported where these are unknown."""
     was, now = (_poses(living, np.array(names), _dim(a, b)) for living in (a, b))
     both = np.isfinite(was[:, 0]) & np.isfinite(now[:, 0])
     if both.any():
@@ -313,5 +313,5 @@ def _standing(living: LivingMap) -> set[int]:
 
 
 def _possible(kind: ChangeKind, before: bool, after: bool) -> bool:
-    """Whether a change fits what the maps before and after it say of standing."""
+    """Return whether a change is consistent with presence in the maps before and after it."""
     return (before, after) == (kind not in _COMES, kind is not ChangeKind.VANISHED)

@@ -1,4 +1,4 @@
-"""How long things stay, learned from the history of this very map, after every session (MATH.md sections 5 and 6).
+"""Learning of lifetimes from the history of a map, after every session (MATH.md sections 5 and 6).
 
 Classes learn from each other (`survival.class_lifetimes`), places lean on their class, and what a user says of a class
 counts as a number of stays. `History` is what a map knows of the comings and goings of its cliques. What happened
@@ -48,7 +48,7 @@ AGES_AT_ONCE = 50
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """Stays by clique, then by time, with what came after each.
+    """Stays by clique, then by time, with the event after each.
 
     Attributes:
         stays: K of them.
@@ -140,7 +140,7 @@ class History:
         return np.append(of_classes, average)
 
     def counts(self, rows: BoolArray, weight: FloatArray | None = None) -> FloatArray:
-        """Return (C + 1,) how many of some rows (K,), or what they weigh, are of each class, and of all together."""
+        """Return (C + 1,) counts, or weights, of rows (K,) per class, and in total."""
         each = np.ones(len(rows)) if weight is None else weight
         return np.append(np.bincount(self.kind[rows], each[rows], minlength=len(self.class_ids)), each[rows].sum())
 
@@ -150,7 +150,7 @@ class History:
         return float(np.median(np.diff(self.looks_s))) if len(self.looks_s) > 1 else 86_400.0
 
     def sightings(self, back_by_stay: FloatArray, back_rate: FloatArray) -> Sightings:
-        """Return the recent stays as samples, with what may have been missed between the looks at them."""
+        """Return the recent stays as samples, with events that may have been missed between looks."""
         stays, looks_s = self.stays[self.recent], self.looks_s
         first, last = (np.minimum(np.searchsorted(looks_s, t), len(looks_s) - 1) for t in (stays.first_s, stays.last_s))
         n_gaps = np.maximum(last - first, 1)
@@ -174,7 +174,7 @@ def _newest(kind: IntArray, first_s: FloatArray, most: int) -> BoolArray:
 
 @dataclass(frozen=True, slots=True)
 class ClassLives:
-    """What the stays of a map say of the lifetimes of its classes; the last row of all is of a class never seen.
+    """Posterior of the lifetimes of a map's classes; the last row is a class never seen.
 
     Attributes:
         lives: the same as lifetimes by class and place.
@@ -306,7 +306,7 @@ def _learned(history: History, before: Lives, settings: LifetimeConfig) -> _Lear
 
 @dataclass(frozen=True, slots=True)
 class ClassEvidence:
-    """What the stays of a map say by themselves of each of its C classes, without what a user has said.
+    """Log likelihoods of the stays of a map for each of its C classes, without priors of a user.
 
     Attributes:
         class_names: of each; '' for landmarks without a class.
@@ -336,7 +336,7 @@ class ClassEvidence:
 
 
 def stay_said(prior: LifetimePrior, settings: LifetimeConfig = USUAL) -> FloatArray:
-    """Return the (M, A) mean log likelihood of one stay that lasts as a user says, where `stay_posterior` lives.
+    """Return the (M, A) mean log likelihood of one stay distributed as a user's prior, on the grid of `stay_posterior`.
 
     `n` times this is what `n` stays say whose lengths spread as the prior does (a power prior, Ibrahim and Chen 2000);
     of those beyond `settings.prior_longest_s` only that is known.
@@ -364,7 +364,7 @@ def absence_said(prior: LifetimePrior, settings: LifetimeConfig = USUAL) -> Floa
 
 
 def _stacked(parts: list[FloatArray | None]) -> FloatArray | float:
-    """(C, M, A) of what is said of some of the classes; 0 where that is nothing."""
+    """Return (C, M, A) log likelihoods of the given classes; 0 for the others."""
     shape = next((part.shape for part in parts if part is not None), None)
     return 0.0 if shape is None else np.stack([np.zeros(shape) if part is None else part for part in parts])
 
@@ -377,7 +377,7 @@ def _spread(prior: LifetimePrior, settings: LifetimeConfig) -> tuple[FloatArray,
 
 
 def with_priors(living: LivingMap, said: Mapping[str, Lifetimes], class_names: Sequence[str], worth: int) -> LivingMap:
-    """Return a map in which the lifetimes of some classes are what a user says, until its own stays say otherwise.
+    """Return a map with a user's priors for the lifetimes of some classes, to be updated by its own stays.
 
     Args:
         living: the map; what it was told of the same classes before is replaced.
@@ -405,7 +405,7 @@ def with_priors(living: LivingMap, said: Mapping[str, Lifetimes], class_names: S
 
 
 def lifetimes_by_class(living: LivingMap) -> dict[str, Lifetimes]:
-    """Return the lifetimes that a map has learned, or was told of, by class; '' for a class that it does not know."""
+    """Return the learned or given lifetimes of a map, by class; '' for an unknown class."""
     lives, names = living.lives, dict(enumerate(living.class_names))
     kinds = np.union1d(lives.class_id, lives.prior_class_id).tolist()
     found = {}
@@ -418,7 +418,7 @@ def lifetimes_by_class(living: LivingMap) -> dict[str, Lifetimes]:
 def _of_chunks(
     history: History, row: int, life: Life, chunk_m: float, settings: LifetimeConfig
 ) -> list[tuple[tuple[int, int], Life]]:
-    """Chunks in which stays of a class end sooner or later than everywhere, as far as they say so.
+    """Return lifetimes of chunks in which stays of a class end sooner or later than elsewhere, as far as supported.
 
     Rates of a chunk are those of the class times a factor with a gamma prior of mean 1 (Clayton and Kaldor 1987): with
     O ends where E were to be expected, `(f + O) / (f + E)`; the firmness f is weighed by what all chunks say.

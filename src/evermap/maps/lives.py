@@ -1,4 +1,4 @@
-"""How long things stay, how long they stay away, and where they turn up again: by class and place."""
+"""Lifetimes of stays and absences, and sites of returns, by class and place."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def general_purpose() -> LifetimePrior:
 
 @dataclass(frozen=True, slots=True)
 class Life:
-    """Of one kind of thing.
+    """Lifetimes of one class in one place.
 
     Attributes:
         stay: prior of the time at one site.
@@ -39,18 +39,18 @@ class Life:
 
     @property
     def tells_absence(self) -> bool:
-        """Whether it says more of absences than that anything is possible."""
+        """Whether absences are known beyond the default prior."""
         return self.absence != general_purpose()
 
     def as_said(self, said: Life) -> Life:
-        """Return the same with the stay, and the absence if it tells of it, that a user has said."""
+        """Return the same with a user's prior of the stay, and of the absence if it has one."""
         absence = said.absence if said.tells_absence else self.absence
         return replace(self, stay=said.stay, absence=absence, n_stays=0, n_ended=0)
 
 
 @dataclass(frozen=True, slots=True)
 class Lives:
-    """`Life` by class and chunk of the floor; where nothing was learned, of the class, then of everything.
+    """`Life` by class and chunk of the floor, with the class and then the average as fallback.
 
     Attributes:
         class_id: (E,) class of every entry, `UNKNOWN` for all classes together.
@@ -72,7 +72,7 @@ class Lives:
     prior: tuple[Life, ...] = ()
 
     def of(self, class_id: int, position_m: FloatArray | None = None) -> Life:
-        """Return what is known of a class (or `UNKNOWN`): learned of it, else said, else learned of all classes.
+        """Return the life of a class (or `UNKNOWN`): learned, else given, else learned over all classes.
 
         Args:
             class_id: of the class.

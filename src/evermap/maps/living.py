@@ -2,8 +2,8 @@
 
     landmark --(belongs to)--> clique --(stands at one of)--> site --(has one for each landmark)--> place
 
-A *clique* is a rigid body: landmarks that come, move and go together. A *site* is one way in which it stood somewhere,
-and a *place* is where one of its landmarks is then. At most one site of a clique is true at a time, none while it is
+A *clique* is a rigid body: landmarks that arrive, move and leave together. A *site* is one of its poses, and a *place*
+is the position of one of its landmarks there. At most one site of a clique is occupied at a time, none while it is
 away: gone, or where the map does not know. So one chain a clique, with the states 'away, site 1, site 2 ...', is
 Rosen's persistence filter (one site, absorbing 'away'), Bateman's joint clique filter (one chain for many landmarks)
 and Nielsen's modes (many sites), see MATH.md section 5.
@@ -93,7 +93,7 @@ class Members(_Rows):
 
 @dataclass(frozen=True, slots=True)
 class Sites(_Rows):
-    """Ways in which cliques stand or stood: (S,) rows, sorted by `site_id`.
+    """Poses that cliques have occupied: (S,) rows, sorted by `site_id`.
 
     Attributes:
         site_id: unique, never used again.
@@ -165,14 +165,14 @@ class Stays(_Rows):
 
 @dataclass(frozen=True, slots=True)
 class Evidence(_Rows):
-    """What was said about cliques when their places were looked at: (E,) rows, by clique, then by time.
+    """Evidence of looks at the places of cliques: (E,) rows, by clique, then by time.
 
     Attributes:
         clique_id: whose.
         stamp_s: of the frame.
         n_hits, n_misses: landmarks of it that were detected at its most probable site, and expected but not detected.
         expected: mean number of hits, had it stood there.
-        log_odds: what the frame said for 'it stands there' against 'it is away' [nats].
+        log_odds: log likelihood ratio of the frame for 'it is there' against 'it is away' [nats].
         p_exists: probability that it stands at one of its sites, after the frame.
     """
 
@@ -187,7 +187,7 @@ class Evidence(_Rows):
 
 @dataclass(frozen=True, slots=True)
 class Dated(_Rows):
-    """Sites that no session was near of late: what is believed of them is told of an earlier instant than the map's.
+    """Sites whose beliefs are of an earlier instant than the map's, since no recent session was near.
 
     Attributes:
         site_id: (D,) sorted.
@@ -218,14 +218,13 @@ class Boxes(_Rows):
 
 @dataclass(frozen=True, slots=True)
 class Metres(_Rows):
-    """What the robots of a map, as far as sessions have names of theirs, say of its metre: (R,) rows.
+    """Scales of the named robots of a map: (R,) rows.
 
     Attributes:
-        robot_id: `landmark_id_of` the robot's name; 0 of the sessions that have none, and of a survey.
-        log_metre: log of the robot's metre over the map's, the mean of its sessions: positive where it reads ranges too
-            long.
-        log_variance: of the log of the robot's metre over the true one.
-        information: sum of the inverse variances of all sessions of which the robot's metre is the mean.
+        robot_id: `landmark_id_of` the robot's name; 0 for sessions without one, and for a survey. log_metre: log of the
+        robot's scale over the map's, the mean of its sessions: positive if its ranges are too long. log_variance: of
+        the log of the robot's scale over the true one. information: sum of the inverse variances of all sessions of
+        which the robot's metre is the mean.
     """
 
     robot_id: IntArray
@@ -236,7 +235,7 @@ class Metres(_Rows):
 
 @dataclass(frozen=True, slots=True)
 class LivingMap(Shown):
-    """All that is known of a place at one instant; what one session hands to the next.
+    """Everything known about a site at one instant; the input of the next session.
 
     Attributes:
         stamp_s: until when observations went in: beliefs are those of this instant, but for `dated` ones. -inf before
@@ -288,7 +287,7 @@ class LivingMap(Shown):
 
     @classmethod
     def begun(cls, landmarks: Landmarks) -> Self:
-        """Return a map of landmarks that somebody surveyed, each a body by itself, before its first session.
+        """Return a map of surveyed landmarks, each a separate body, before its first session.
 
         They are taken to have been seen when that begins.
         """
@@ -316,7 +315,9 @@ class LivingMap(Shown):
         )
 
     def from_now_on(self, stamp_s: float) -> Self:
-        """Return the map at its first session, which begins at `stamp_s`: what was surveyed is seen until then."""
+        """Return the map at its first session, which begins at `stamp_s`: surveyed landmarks count as seen until
+        then.
+        """
         if np.isfinite(self.stamp_s) or not len(self.places):
             return self
         then = np.full(len(self.sites), stamp_s)
@@ -349,7 +350,7 @@ class LivingMap(Shown):
         return self.landmarks().to_pandas()
 
     def plot(self, *, title: str = "") -> Figure:
-        """Draw the map, what is gone and from where the robot looked; returns a matplotlib figure.
+        """Draw the map, gone landmarks and the sensor positions; returns a matplotlib figure.
 
         Raises:
             InputError: there is nothing to draw.
@@ -373,7 +374,7 @@ class LivingMap(Shown):
         return int(name) if name.isdecimal() and len(name) <= MOST_DIGITS else -1
 
     def p_exists(self, at: float | None = None) -> FloatArray:
-        """Return the (L,) probability that each landmark stands at one of its known places.
+        """Return the (L,) probability that each landmark is at one of its known places.
 
         Args:
             at: stamp at which it is asked for, by what is learned of lifetimes; None for `stamp_s`.
@@ -413,8 +414,7 @@ class LivingMap(Shown):
         return np.asarray(site[_rows_among(clique[last], self.members.clique_id)])
 
     def told_site(self) -> IntArray:
-        """Return (L,) `site_id` at which each landmark's clique is said to stand: where its stay goes on; `UNKNOWN`
-        if away.
+        """Return (L,) `site_id` of the current stay of each landmark's clique; `UNKNOWN` if away.
 
         Of a clique without a stay, as in maps made by hand, its most probable site, if it more probably stands.
         """
@@ -427,7 +427,7 @@ class LivingMap(Shown):
         return np.asarray(np.where(at >= 0, told, np.where(known, UNKNOWN, site)))
 
     def place_row(self, landmark_id: IntArray, site_id: IntArray) -> IntArray:
-        """Return (K,) rows of `places` for pairs of landmark and site, -1 where there is none."""
+        """Return (K,) rows of `places` for pairs of landmark and site, -1 if there is none."""
         return pair_rows((self.places.site_id, self.places.landmark_id), (site_id, landmark_id))
 
     def landmarks(
@@ -486,7 +486,9 @@ class LivingMap(Shown):
         )
 
     def place_covariance_m2(self, row: IntArray) -> FloatArray:
-        """Return (K, 2, 2) covariance of places (K,), with what is not known of the map's size, about its middle."""
+        """Return (K, 2, 2) covariances of places (K,), including the uncertainty of the map's scale, about its
+        middle.
+        """
         middle = self.places.position_m.mean(axis=0) if len(self.places) else np.zeros(self.dim)
         arm = self.places.position_m[row] - middle
         size = self.log_size_variance * arm[:, :, None] * arm[:, None, :]
@@ -505,7 +507,7 @@ class LivingMap(Shown):
         return self._records(rows, own, np.where(self.members.deleted[member], 0.0, p_site[site]))
 
     def edited(self, landmark_id: int, *, pinned: bool | None = None, deleted: bool | None = None) -> LivingMap:
-        """Return the map with an operator's word on one landmark; None leaves it as it is.
+        """Return the map with an operator's edit of one landmark; None keeps a flag.
 
         Raises:
             KeyError: no landmark has this id.

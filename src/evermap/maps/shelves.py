@@ -25,7 +25,7 @@ _COLUMNS = {
 
 @dataclass(frozen=True, eq=False)
 class Shelves(Generic[Table]):
-    """A table that is sorted by its first column, of which only what is asked for is read.
+    """A table sorted by its first column that is read in parts on demand.
 
     Attributes:
         like: the table without rows.
@@ -49,7 +49,7 @@ class Shelves(Generic[Table]):
 
     @property
     def last(self) -> int:
-        """Return the largest key; -1 where there is none."""
+        """Return the largest key; -1 if there is none."""
         return int(key_of(self._read(np.array([len(self.parts) - 1])))[-1]) if self.parts else -1
 
     def table(self) -> Table:
@@ -127,7 +127,7 @@ class Sight:
         return cls(Shelves.of(lines), Shelves.of(views))
 
     def flaw(self) -> str:
-        """Tell in what this contradicts itself; '' if it is consistent."""
+        """Return a description of an inconsistency; '' if it is consistent."""
         for shelves in (self.lines, self.views):
             n = len(shelves.parts)
             if not len(shelves.first) == len(shelves.count) == n or (np.diff(shelves.first) < 0).any():

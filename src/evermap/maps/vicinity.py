@@ -1,4 +1,4 @@
-"""The part of a large map that a session can touch, as a map of its own, and what becomes of it put back.
+"""The part of a large map that a session can observe, as a separate map, and its merge into the whole.
 
 A session sees a few hundred places, however many there are. What it says is worked out on these and on what is near,
 with their joint covariance, as on a small map; the rest keeps what is believed of it, told of the time when a session
@@ -95,7 +95,7 @@ class Vicinity:
         )
 
     def _covariance(self, part: LivingMap, places: Any) -> ChunkedCovariance:
-        """The joint covariance of all places after the session; as it was where that is of looks alone."""
+        """Return the joint covariance of all places after the session; unchanged for a session of looks alone."""
         whole = self.whole
         if part.covariance_m2 is self.part.covariance_m2:
             return _chunked(whole)

@@ -1,4 +1,4 @@
-"""Why a landmark is believed to be there, or gone: what was seen of it, when, and how much each of that says."""
+"""The evidence for and against the existence of a landmark: its looks, their times and their weights."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from evermap.types import Clock, MapChange
 
 @dataclass(frozen=True, slots=True)
 class Visit:
-    """What one session saw of a landmark's clique.
+    """Evidence of one session on a landmark's clique.
 
     Attributes:
         revision, recording, robot: which session, and whose.
@@ -45,7 +45,7 @@ class Visit:
 
 @dataclass(frozen=True, slots=True)
 class Answer(Shown):
-    """All that a map knows of why it believes what it believes of one landmark.
+    """Belief in one landmark, with all its evidence.
 
     Attributes:
         landmark_id, label, class_name: which, and what it is called; '' where the class is not known.
@@ -156,7 +156,7 @@ def _visit(revision: Revision, seen: Evidence) -> Visit:
 
 
 def _edits(store: MapStore, line: list[Revision], landmark_id: int) -> tuple[tuple[int, str, str], ...]:
-    """What operators said of a landmark: revision, when, what."""
+    """Return the operators' edits of a landmark: revision, time, edit."""
     return tuple(
         (item.number, item.created_at, word)
         for item in line
@@ -167,7 +167,7 @@ def _edits(store: MapStore, line: list[Revision], landmark_id: int) -> tuple[tup
 
 
 def _with_words(answer: Answer, living: LivingMap) -> Answer:
-    """The same with its headline and reasons."""
+    """Return the same with its headline and reasons."""
     kind = f" ({answer.class_name})" if answer.class_name else ""
     what = f"landmark {answer.label}{kind}"
     belief = f"P(exists) {_belief(answer.p_exists)}"
@@ -221,7 +221,7 @@ def _on_sightings(answer: Answer, living: LivingMap) -> list[str]:
 
 
 def _on_time(answer: Answer, living: LivingMap, last_s: float) -> list[str]:
-    """How long its like stay."""
+    """Return a line on the lifetimes of its class."""
     row = np.flatnonzero(living.members.landmark_id == answer.landmark_id)
     place = living.place_row(living.members.landmark_id[row], living.site_of()[row])
     waited_s = living.stamp_s - last_s

@@ -37,7 +37,7 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 def chi2_quantile(p: float, dof: float) -> float:
     """Return the value below which a chi-square variable with `dof` degrees stays with probability `p`.
 
-    As scipy.stats computes it, whose import takes as long as a short recording.
+    Equals scipy.stats, whose import takes as long as a short recording.
     """
     from scipy.special import gammaincinv
 
@@ -60,7 +60,7 @@ def share_in_band(values: FloatArray, dof: float = 2, confidence: float = CONFID
 def comparable_nis(innovations: Innovations) -> FloatArray:
     """Return the NIS (K,) on the scale of two degrees of freedom: values with the same chi-square tail probability.
 
-    So detections of any kind have one mean (2) and one bound (5.99) if consistent. As they are where all have two.
+    So detections of any kind have one mean (2) and one bound (5.99) if consistent. Unchanged if all have two.
     """
     nis, dof = innovations.nis, innovations.dof
     if dof is None or np.all(dof == 2):

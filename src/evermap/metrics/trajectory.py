@@ -279,7 +279,7 @@ def evaluate_trajectory(
 def _rows_to_score(
     estimate: Trajectory, truth: Trajectory, rate_hz: float, max_gap_s: float, looked_s: FloatArray | None
 ) -> tuple[IntArray, int]:
-    """Rows of the truth, and how many are left out; see `evaluate_trajectory`."""
+    """Return rows of the truth, and the number of omitted ones; see `evaluate_trajectory`."""
     knots = estimate.stamp_s
     slack_s = 0.0 if looked_s is None else SAME_S
     rows = scored_stamps(truth, knots[0] - slack_s, knots[-1] + slack_s, rate_hz)

@@ -1,1 +1,1 @@
-"""What a sensor should see: probability of detection."""
+"""Detection models: the probability that a sensor detects a landmark."""

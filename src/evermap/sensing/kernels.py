@@ -1,4 +1,4 @@
-"""One look at all cliques, compiled: what is expected, what it says of each clique, and what it teaches.
+"""One look at all cliques, compiled: expected detections, evidence on each clique, and learning.
 
 The cost of a landmark is the rotation into the sensor's frame, two table look-ups and two divisions; logarithms are
 taken of products of many ratios at a time.
@@ -106,7 +106,7 @@ class SensorFrame(NamedTuple):
 
 
 class SensorLaw(NamedTuple):
-    """What the profile says; names as in `profile.Profile` and `profile.Occlusion`."""
+    """Profile data of the kernels; names as in `profile.Profile` and `profile.Occlusion`."""
 
     range_rate: FloatArray
     facing_rate: FloatArray
@@ -135,7 +135,7 @@ class CliqueRows(NamedTuple):
 
 
 class FrameSeen(NamedTuple):
-    """What a frame saw.
+    """Detections of a frame.
 
     Attributes:
         detected: (K,) which landmarks were detected.
@@ -149,7 +149,7 @@ class FrameSeen(NamedTuple):
 
 
 class LookRows(NamedTuple):
-    """What the frame says, names as in `learned.CliqueLook`; filled in."""
+    """Output rows of a frame, names as in `learned.CliqueLook`."""
 
     log_there: FloatArray
     log_gone: FloatArray
@@ -220,7 +220,7 @@ def look(
         if not active[c]:
             continue
 
-        # what is expected, landmark by landmark
+        # expected detections, by landmark
         n = 0
         log_ratio, log_absent, ratio, absent = 0.0, 0.0, 1.0, 1.0
         for k in range(first[c], first[c + 1]):
@@ -254,7 +254,7 @@ def look(
         log_ratio += math.log(ratio)
         log_absent += math.log(absent)
 
-        # who stands before it, under every chain, and what the look says of the clique
+        # occlusion under every chain, and the evidence of the look on the clique
         free = math.exp(min(max(log_ratio, -EXPONENT), EXPONENT))
         top = -np.inf
         for j in range(chains):
@@ -282,7 +282,7 @@ def look(
         p_occluded[c] = hidden
         looked[c] = n
 
-        # what it teaches, if the clique is there: hits and expected hits, each factor with the others given
+        # learning, if the clique is there: hits and expected hits, each factor given the others
         clear = 1.0 - hidden
         for i in range(n):
             k, seen = row[i], inside[i]
@@ -321,7 +321,7 @@ def collect(
     learned: FloatArray,
     log_weight: FloatArray,
 ) -> None:
-    """Move what pends of cliques that are sure into the sums `learned` (P,) and `log_weight` (J,), in place."""
+    """Move pending sums of certain cliques into the sums `learned` (P,) and `log_weight` (J,), in place."""
     last = pending.shape[1]
     for c in range(len(surely_there)):
         if surely_there[c]:
@@ -342,7 +342,7 @@ def witnessed(
     pose: Any, landmark: Any, hit: Any, body: Any, eye: FloatArray, position: FloatArray,
     limits: tuple[float, float, float],
 ) -> tuple[BoolArray, BoolArray]:  # fmt: skip
-    """Find looks in whose frame another body was seen beside or behind the place, and those along the very line.
+    """Find looks in whose frame another body was seen near or behind the place, and those along the same line.
 
     Args:
         pose: (N,) from which is looked, in order.
@@ -499,7 +499,7 @@ def cells(
     for k in range(len(pose)):
         i, j = pose[k], landmark[k]
         dx, dy = np.floor((sensor[i, 0] - place[j, 0]) / cell_m), np.floor((sensor[i, 1] - place[j, 1]) / cell_m)
-        if not (abs(dx) < reach // 2 and abs(dy) < reach // 2):  # also what is not a number
+        if not (abs(dx) < reach // 2 and abs(dy) < reach // 2):  # also nan
             return out, k
         out[k] = (int(dx) + reach // 2) * reach + int(dy) + reach // 2
     return out, -1

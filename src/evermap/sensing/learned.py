@@ -1,4 +1,4 @@
-"""Detection that is learned while the map is watched, and misses that are explained instead of suppressed.
+"""A detection model that is learned online, and explains misses instead of suppressing them.
 
 A landmark that is there is detected with `P_D = P(in the field) R(range) V(incidence) G(landmark, direction)`, or by
 mistake with `P_F`; somebody may stand before its whole clique, and then only false alarms remain (MATH.md section 3,
@@ -41,7 +41,7 @@ SUMS = ("range_hits", "range_expected", "facing_hits", "facing_expected", "false
 
 @dataclass(frozen=True, slots=True)
 class LearnedDetection:
-    """What is known of the sensor, and of K landmarks on C cliques.
+    """Learned state of the sensor, and of K landmarks on C cliques.
 
     Attributes:
         profile: of the sensor.
@@ -98,7 +98,7 @@ class LearnedDetection:
 
 @dataclass(frozen=True, slots=True)
 class CliqueLook:
-    """What one frame says of C cliques; nan for those that were not in the field.
+    """Evidence of one frame on C cliques; nan for those outside of the field.
 
     Attributes:
         stamp_s: (C,) time of the look.
@@ -115,7 +115,7 @@ class CliqueLook:
 
 
 def init(landmark_m: FloatArray, clique: IntArray, profile: Profile | Assumed) -> LearnedDetection:
-    """Return a model of landmarks of which nothing is known but their positions.
+    """Return a model of landmarks with known positions only.
 
     Args:
         landmark_m: (K, 3) in the world, sorted by clique.
@@ -171,7 +171,7 @@ def look(
     *,
     active: BoolArray | None = None,
 ) -> tuple[LearnedDetection, CliqueLook]:
-    """Process one frame: what it says of each clique, and what it teaches.
+    """Process one frame: return the updated model, and its evidence on each clique.
 
     Args:
         model: so far.
@@ -314,7 +314,7 @@ def _frame(profile: Profile, place: FloatArray, turn: FloatArray) -> SensorFrame
 def watched(
     model: LearnedDetection, stamp_s: FloatArray, pose: FloatArray, detected: BoolArray, there: BoolArray
 ) -> LearnedDetection:
-    """Return the model after a session of which it is known when what was there.
+    """Return the model after a session with known presence of landmarks.
 
     Args:
         model: before it; every landmark is a clique by itself.

@@ -1,4 +1,4 @@
-"""What is known of a sensor, whatever it looks at: detection by range and by incidence, false alarms, occlusions.
+"""Detection profile of a sensor: detection by range and by incidence, false alarms, occlusions.
 
 Everything is a ratio of two running sums, *hits over expected hits*, so that a prior is a few hits that were never
 seen, learning is addition, and what two robots learned is added up. Factors multiply; the sums of each are collected
@@ -33,7 +33,7 @@ class Projection(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """What a sensor that looks along its x axis, with z up, can see (Bateman 2020 section 5.1.1).
+    """Field of view of a sensor with x ahead and z up (Bateman 2020 section 5.1.1).
 
     Attributes:
         range_max_m: nothing farther is detected.
@@ -59,7 +59,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Assumed:
-    """What is believed of a sensor before it has seen anything, and how firmly.
+    """Prior of a sensor's profile, and its weight.
 
     Attributes:
         field: its limits.
@@ -128,7 +128,7 @@ class Assumed:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """What was learned of a sensor; add two that learned from the same assumptions with `+`.
+    """Learned profile of a sensor; add two with the same assumptions by `+`.
 
     Attributes:
         assumed: where it started.
@@ -165,7 +165,7 @@ class Profile:
         )
 
     def __add__(self, other: Profile) -> Profile:
-        """What both have learned, the assumptions counted once.
+        """Return the sum of both profiles, with the assumptions counted once.
 
         Raises:
             ConfigError: they started from different assumptions.
@@ -209,7 +209,7 @@ class Profile:
 
 @dataclass(frozen=True, slots=True)
 class Occlusion:
-    """J two-state Markov chains in continuous time, one of which governs who stands before a clique.
+    """J two-state Markov chains in continuous time, one of which governs the occlusion of a clique.
 
     Attributes:
         come_hz: (J,) rate from free to occluded; the first is 0.

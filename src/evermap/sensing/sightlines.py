@@ -1,4 +1,4 @@
-"""From where each place can be seen: lines of sight, learned from hits and misses.
+"""Lines of sight to places, learned from hits and misses.
 
 Nobody gives a map of the walls. A *line of sight* leads from a cell of the floor to one place; cells are counted from
 the place, so that a map whose landmarks move by centimetres keeps its lines. A line is unknown until something was
@@ -35,10 +35,10 @@ _AROUND = tuple((dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1))
 
 
 class Lines(NamedTuple):
-    """What is known of N lines of sight.
+    """State of N lines of sight.
 
     Attributes:
-        p_free: (N,) probability that nothing hides what is at their ends.
+        p_free: (N,) probability that they are not blocked.
         hits, misses: (N,) parameters of the Beta distribution of the detection probability along them if so.
         p_blocked: detection probability along them if not.
     """
@@ -83,7 +83,7 @@ class SightLines:
 
     @property
     def p_hidden(self) -> FloatArray:
-        """(3,) probability that a place cannot be seen, a whole session long, by what is known of the lines to it."""
+        """(3,) probability that a place is hidden for a whole session, by the state of the lines to it."""
         at_first, worth = np.array(self.rules.p_hidden), self.rules.hidden_looks
         return np.asarray((at_first * worth + self.hidden) / (worth + self.hidden + self.shown))
 
@@ -123,7 +123,7 @@ class SightLines:
     def lines(
         self, places: tuple[IntArray, IntArray], place: IntArray, cell: IntArray, p_detect: FloatArray
     ) -> tuple[Lines, FloatArray, BoolArray]:
-        """Return what is known of lines of sight.
+        """Return the state of lines of sight.
 
         Args:
             places: (P,) sites and (P,) landmarks of the places of the map, sorted by both.
@@ -156,8 +156,7 @@ class SightLines:
         hit: BoolArray,
         weight: FloatArray,
     ) -> SightLines:
-        """Return the table after looks at what was there with some probability; lines to places that are no more are
-        left out.
+        """Return the table after looks at landmarks of known P(exists), without lines to removed places.
 
         Args:
             places: (P,) sites and (P,) landmarks of the places of the map, sorted by both.
@@ -224,7 +223,7 @@ class SightLines:
 
 
 def pair_rows(known: tuple[IntArray, IntArray], asked: tuple[IntArray, IntArray]) -> IntArray:
-    """Return (N,) rows of pairs among (P,) known ones, all different; -1 where there is none."""
+    """Return (N,) rows of pairs among (P,) known ones, all different; -1 if there is none."""
     if not len(known[0]):
         return np.full(len(asked[0]), -1, dtype=np.int64)
     number, there = np.zeros(len(known[0]), dtype=np.int64), np.ones(len(asked[0]), dtype=np.bool_)
@@ -246,14 +245,14 @@ def offsets(cell: IntArray, cell_m: float) -> FloatArray:
 
 
 def nominal_lines(p_detect: FloatArray, rules: SightConfig = USUAL) -> Lines:
-    """Return lines of a sensor whose nominal field of view (N,) is taken for the truth."""
+    """Return lines of a sensor with its nominal field of view (N,)."""
     nominal = np.clip(np.asarray(p_detect, dtype=np.float64), *rules.rates)
     return Lines(np.ones(len(nominal)), KNOWN * nominal, KNOWN * (1.0 - nominal), rules.p_blocked_detect)
 
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """From where the robot looked last: (V,) rows sorted by cell and heading.
+    """Last views of the robot: (V,) rows sorted by cell and heading.
 
     Attributes:
         cell: (V, 2) cell of the sensor on the floor.

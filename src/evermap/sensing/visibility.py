@@ -1,4 +1,4 @@
-"""What a look is, what a hit and what a miss, and with what probability landmarks are detected that are there.
+"""Definition of looks, hits and misses, and nominal detection models.
 
 A *look* is a landmark, or one of the places where it may stand, in a frame in which it should be detected:
 `P(detect | there)` is at least `worth_a_look` of what the sensor does at best. A detection is a look too, wherever the
@@ -27,7 +27,7 @@ AT_ONCE = 64
 
 
 class DetectionModel(Protocol):
-    """What is known of a sensor: the probability to detect a landmark that is there.
+    """Protocol of detection models: the probability to detect a present landmark.
 
     Poses are (F, 3) in the plane, or (F, 4, 4) in space; landmarks (L, 2) or (L, 3) in the same frame. Models that
     know each landmark by itself are asked of all of these, in their order.

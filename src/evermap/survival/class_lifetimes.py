@@ -120,7 +120,7 @@ def absence_posterior(log_likelihood: FloatArray, said: FloatArray | float = 0.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SitesPosterior(Shown):
-    """What many sites say together of the durations of C classes, and of a class that none of them has.
+    """Joint posterior of many sites on the durations of C classes, and of an unseen class.
 
     For each pair of spreads, of log mean and of second parameter, the posterior of the company's own; a site's are
     normal about them. Given the spreads all sums are exact on the grid, and the spreads are summed over: nothing is set
@@ -198,7 +198,7 @@ class SitesPosterior(Shown):
 
 @dataclass(frozen=True, slots=True)
 class Sightings(Shown):
-    """K stays as they were seen, and what may have interrupted them between looks.
+    """K stays by their sightings, with possible interruptions between looks.
 
     Attributes:
         elsewhere_s, first_s, last_s, gone_s: (K,) as of `censored.lifetimes_of_sightings`.

@@ -27,7 +27,7 @@ class _OfPositives(Lifetime):
 
 @dataclass(frozen=True, slots=True)
 class Exponential(_OfPositives):
-    """A constant hazard, `S(t) = exp(-rate t)`: how long a feature has stayed says nothing (Rosen 2016 eqs. 21-24).
+    """A constant hazard, `S(t) = exp(-rate t)`: memoryless (Rosen 2016 eqs. 21-24).
 
     Attributes:
         rate: hazard in 1/s, positive.
@@ -92,7 +92,7 @@ class Uniform(_OfPositives):
 
 @dataclass(frozen=True, slots=True)
 class Weibull(_OfPositives):
-    """`S(t) = exp(-(t / scale_s)^shape)`; a shape below 1 means that what has stayed long stays longer.
+    """`S(t) = exp(-(t / scale_s)^shape)`; a shape below 1 means a hazard that falls with age.
 
     Attributes:
         scale_s: time by which 63 % are gone, in seconds, positive.

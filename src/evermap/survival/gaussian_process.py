@@ -48,7 +48,7 @@ _NEGLECTED = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covariates(Shown):
-    """Covariates of N things, each None where unknown.
+    """Covariates of N objects, each None if unknown.
 
     Attributes:
         class_id: (N,) whole numbers.
@@ -116,7 +116,7 @@ class GpHazard(Shown):
         return self.posterior.log_evidence
 
     def at(self, **covariates: Any) -> HazardDraws:
-        """Return the hazard of one thing by the covariates that were learned from: `at(class_id=3)`.
+        """Return the hazard of one object by its covariates: `at(class_id=3)`.
 
         Raises:
             DataError: a missing or unknown covariate, or a class without samples.

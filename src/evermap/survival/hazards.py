@@ -16,7 +16,7 @@ _HOUR_S, _DAY_S = 3600.0, 86400.0
 
 @dataclass(frozen=True, slots=True)
 class PiecewiseConstantHazard(Lifetime):
-    """`h(t) = rates[i]` for `edges_s[i] <= t < edges_s[i + 1]`; the last rate holds for ever.
+    """`h(t) = rates[i]` for `edges_s[i] <= t < edges_s[i + 1]`; the last rate is unbounded in time.
 
     A last rate of 0 means that features still there by then never leave.
 
@@ -129,7 +129,7 @@ def _check_steps(prior: PiecewiseConstantHazard | PeriodicHazard) -> None:
 
 
 def gone_daily(probability: float, *, first_seen_hour: float, hours: tuple[float, float]) -> PeriodicHazard:
-    """Return the hazard of things that leave within some hours of the day only, as parked cars do by night.
+    """Return the hazard of objects that leave within some hours of the day only, as parked cars at night.
 
     Args:
         probability: of leaving in these hours of one day, above 0 and below 1.

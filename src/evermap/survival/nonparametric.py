@@ -188,7 +188,7 @@ class KaplanMeier(SurvivalEstimate, ShownTable):
         return lower[()], upper[()]
 
     def prior(self) -> StepLifetime:
-        """Return it as a lifetime prior; what is left after the last death never leaves."""
+        """Return it as a lifetime prior; mass beyond the last death never leaves."""
         left = np.append(self.survives, 0.0)
         masses = -np.diff(np.concatenate(([1.0], left)))
         return StepLifetime.at_points((*self.time_s.tolist(), np.inf), masses.tolist())

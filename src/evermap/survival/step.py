@@ -124,5 +124,5 @@ class StepLifetime(Lifetime):
 
 
 def never_leaves() -> StepLifetime:
-    """Return the prior of things that never leave, as walls."""
+    """Return the prior of objects that never leave, such as walls."""
     return StepLifetime.at_points((math.inf,), (1.0,))

@@ -1,4 +1,4 @@
-"""Which detections may be of which tracklet, what each pair costs, and the best assignment.
+"""Assignment of detections to tracklets: candidate pairs, their costs, and the optimum.
 
 The cost of a pair is the negative log of how much better 'this detection is of this object' explains it than 'the
 object was missed, and the detection is of nobody known': half the squared Mahalanobis distance, half the log
@@ -26,11 +26,11 @@ from evermap.types import FloatArray, IntArray
 
 
 class Likelihood(NamedTuple):
-    """What a detection says of every object: numbers of the settings.
+    """Likelihood parameters of detections.
 
     Attributes:
         confusion: (C, C) `P(detected class | true class)`, a row a true class.
-        class_prior: (C,) of objects that are not known.
+        class_prior: (C,) of unknown objects.
         log_clutter: log of the density of detections that are of nobody known, 1/m^3.
         gate: largest squared Mahalanobis distance.
         appearance_nats, appearance_neutral: see `TrackerConfig`.
@@ -57,7 +57,7 @@ class Likelihood(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """Where N objects are expected, and what they look like.
+    """Predicted states and appearances of N objects.
 
     Attributes:
         mean: (N, D) of a filter; the first three states are the position.
@@ -84,7 +84,7 @@ class Pairs(NamedTuple):
     Attributes:
         start: (N + 1,) first pair of every row.
         column: (E,) the detection.
-        cost: (E,) below 0: against missing the object and leaving the detection to nobody.
+        cost: (E,) below 0: against missing the object and leaving the detection unassigned.
         log_ratio: (E,) log-likelihood of the detection if it is of the object, over that if of nobody.
     """
 
@@ -265,7 +265,7 @@ def assign(start: IntArray, column: IntArray, cost: FloatArray, n_columns: int) 
     price = np.zeros(n_columns)
     late = np.empty(n, dtype=np.int64)
     n_late = 0
-    for i in range(n):  # whoever wants a column that is free has it
+    for i in range(n):  # a row takes its preferred column if that is free
         best, least = NOBODY, 0.0
         for e in range(start[i], start[i + 1]):
             if cost[e] < least:

@@ -225,7 +225,7 @@ class DetectionTable:
 
 
 def said_of(table: DetectionTable) -> list[str]:
-    """Return remarks on what was read: its own, and what was left out."""
+    """Return remarks on the table: its own, and on ignored detections."""
     weak = [f"{counted(table.n_weak, 'detection')} with a low score dropped"] if table.n_weak else []
     return [*table.warnings, *weak]
 
@@ -296,7 +296,7 @@ def in_world(table: DetectionTable, poses: Poses) -> DetectionTable:
 
 
 def with_empty_frames(stamp_s: FloatArray, counts: IntArray, pose_s: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return stamps and numbers of detections of all frames, those too of which only a pose tells."""
+    """Return stamps and numbers of detections of all frames, including those with a pose only."""
     if len(pose_s) < 2 or (
         len(stamp_s) > 1 and np.median(np.diff(pose_s)) < _FRAME_SHARE * float(np.median(np.diff(stamp_s)))
     ):

@@ -1,4 +1,4 @@
-"""A frame in the life of the tracklets: what detections and misses do to filters, classes, beliefs and states.
+"""Updates of tracklets by a frame: filters, classes, beliefs and states after detections and misses.
 
 Belief is one number, as in the persistence filter (MATH.md section 2): inverse odds, multiplied by
 `p(detection | nobody known) / (P_D p(detection | it))` at a detection and by `1 / (1 - P_D)` at a miss. It confirms
@@ -48,7 +48,7 @@ MOST = 1e30
 
 
 class InSight(NamedTuple):
-    """What a frame can say of N tracklets.
+    """Evidence of a frame on N tracklets.
 
     Attributes:
         p_detect: (N,) probability to detect each, if it is there.

@@ -1,6 +1,6 @@
-"""What the tracker says: events, objects over time, and static spells.
+"""Records of the tracker: events, objects over time, and static spells.
 
-A static spell is a time in which an object stayed where it was, with what is known of its end. The object was seen in a
+A static spell is a time in which an object stayed in one place, with bounds of its end. The object was seen in a
 place from `first_s` to `last_s`. It came after `elsewhere_s`, when it was elsewhere or its place was empty, and was
 found moved or gone at `gone_s`. What that says of lifetimes is in `survival.censored`.
 """
@@ -57,7 +57,7 @@ class InSpace(ShownTable):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What happened to a tracklet, and when."""
+    """An event of a tracklet with its stamp."""
 
     stamp_s: float
     kind: EventKind
@@ -123,7 +123,7 @@ class Recorder:
         self.events: list[Event] = []
 
     def add(self, followed: Followed, events: list[Event]) -> None:
-        """Add what is followed right after a frame, and what happened in that frame."""
+        """Add the tracks after a frame, and the events of that frame."""
         self._frames.append(followed)
         self.events.extend(events)
 
@@ -144,7 +144,7 @@ class Recorder:
         return self._of(keep, frame, columns)
 
     def at_once(self, least_p: float) -> Tracks:
-        """Return what was said at once, frame by frame: every tracklet with a belief of at least `least_p`.
+        """Return the causal output, frame by frame: every tracklet with a belief of at least `least_p`.
 
         Raises:
             DataError: no frame was recorded.
@@ -180,7 +180,7 @@ def _given_up_after(ids: IntArray, frame: IntArray, n_missed: IntArray, n_frames
 
 @dataclass(frozen=True, slots=True, repr=False)
 class StaticSpells(InSpace):
-    """Times at which objects stayed where they were, one row a spell, sorted by track and time.
+    """Times at which objects stayed in place, one row per spell, sorted by track and time.
 
     Attributes:
         track_id: (K,) whose.

@@ -1,4 +1,4 @@
-"""Rows of the struct of arrays: begun, copied and given up; and whether an object is where it was.
+"""Rows of the struct of arrays: started, copied and deleted; and the test for rest.
 
 The place of rest of a tracklet, its speed, and the static spells that follow.
 
@@ -132,7 +132,7 @@ def believed(t: Tracklets, i: int, rules: Rules) -> bool:
 
 @kernel
 def start(t: Tracklets, i: int, track_id: int, frame: Frame, j: int, confusion: FloatArray, rules: Rules) -> None:
-    """Begin a tracklet in row `i` with detection `j`: at rest as far as anybody knows, of any class that fits."""
+    """Start a tracklet in row `i` with detection `j`: assumed at rest, of any compatible class."""
     t.track_id[i] = track_id
     t.state[i] = BIRTH
     t.class_p[i] = 1.0 / t.class_p.shape[1]

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class TrackResult(Shown):
-    """What came out of a run.
+    """Result of a tracking run.
 
     Attributes:
-        table: what was tracked.
+        table: the detections.
         config: the choices.
         tracks: one row an object and frame: of objects that were confirmed, sooner or later; where detections have
             scores of all that were followed, as long as they were at all likely (`p_dead`), as it was said at once.
@@ -243,7 +243,7 @@ def _follow(
 
 
 def _view(table: DetectionTable, config: TrackConfig, k: int) -> View | None:
-    """What could be seen in frame `k`, if that is known: a ball around the sensor, or a part of it."""
+    """Return the view of frame `k`, if known: a ball around the sensor, or a sector of it."""
     if config.range_m is None or table.sensor_m is None:
         return None
     if config.fov_deg is None or table.sensor_yaw_rad is None:
@@ -253,9 +253,9 @@ def _view(table: DetectionTable, config: TrackConfig, k: int) -> View | None:
 
 
 def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s: float, step_s: float) -> list[Event]:
-    """Frames in which nothing can be seen, until what rests is kept and what moves is given up.
+    """Insert frames without a view, until resting tracks are stored and moving ones are deleted.
 
-    A filter's prediction over hours says nothing, and the first frame after would take every object for another.
+    A filter's prediction over hours is useless, and the first frame after it would match every object wrongly.
     """
     nowhere = View.ball(centre_m, 0.0, 0.0)
     n = tracker.settings.max_missed + 1
@@ -274,7 +274,7 @@ def _noise(table: DetectionTable, sigma_m: float) -> FloatArray | None:
 
 
 def _long_enough(spells: StaticSpells, rest_for_s: float) -> StaticSpells:
-    """Those seen to last: a slow object is where it was for a moment again and again, and does not rest."""
+    """Return spells that last: a slow object passes the test for rest again and again, but does not rest."""
     return spells[spells.last_s - spells.first_s >= rest_for_s]
 
 

@@ -1,4 +1,4 @@
-"""What scores of a detector say of a tracklet: whether it is a real object of its class.
+"""Log odds of a tracklet being a real object, from the scores of a detector.
 
 A false alarm is often detected again in the next frame (a pole that looks like a person), so being seen once more is
 weak evidence, and scores of one object are alike. The log odds that a tracklet is real are therefore a mean of the log

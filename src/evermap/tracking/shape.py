@@ -1,4 +1,4 @@
-"""What is filtered of a box beside its centre: size and heading; and what a detected one says about whose it is.
+"""Filters of a box's size and heading, and their likelihoods for the assignment.
 
 A box in the state is nine numbers: length, width, height [m], heading [rad], their four variances, and the log odds
 that the heading is right rather than opposite, which detectors confuse. Every number has a filter of its own: sizes are
@@ -60,7 +60,7 @@ def predict_shapes(box: FloatArray, n: int, gap_s: float, turning: float, resizi
 def update_shape(
     box: FloatArray, detected: FloatArray, noise: FloatArray, mean: FloatArray, covariance: FloatArray, rules: Rules
 ) -> None:
-    """Update a box by a detection, and tell its front from its back by the way the object goes."""
+    """Update a box by a detection, and distinguish front and back by its direction of motion."""
     for k in range(3):
         gain = box[VARIANCE + k] / (box[VARIANCE + k] + noise[k])
         box[k] += gain * (detected[k] - box[k])

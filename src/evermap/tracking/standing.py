@@ -1,4 +1,4 @@
-"""Which tracks stand and which move, by all of their detections: windows of time, one after the other.
+"""Static and moving tracks, by all of their detections in successive time windows.
 
 Over a window the velocity is a robust line through the detections, whose errors are alike for about a second: ten
 detections of it are hardly more than two. That it stands is a special case, velocity zero but for what a detector
@@ -21,7 +21,7 @@ HEAVY, ROUNDS = 2.0, 5
 
 
 class Stood(NamedTuple):
-    """What stands.
+    """Static tracks and stays.
 
     Attributes:
         stay: (M,) number of the stay that each detection is of, `UNKNOWN` where its thing moves or nothing is known.
@@ -45,7 +45,7 @@ def standing(
     stamp_s: FloatArray, position_m: FloatArray, range_m: FloatArray, track: IntArray, speed_mps: FloatArray,
     settings: StillConfig,
 ) -> Stood:  # fmt: skip
-    """Return what stands, and when.
+    """Return the static tracks and their stays.
 
     Args:
         stamp_s: (M,) of detections, in order of time.
@@ -91,7 +91,7 @@ def _enough(stamp_s: FloatArray, settings: StillConfig) -> bool:
 
 
 def _windows(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: float, settings: StillConfig) -> FloatArray:
-    """(K,) probability to stand, by what is seen around each detection."""
+    """Return the (K,) probability of being static, from the window around each detection."""
     half_s = 0.5 * settings.window_s
     if stamp_s[-1] - stamp_s[0] <= settings.window_s:
         return np.full(len(stamp_s), _p_static(stamp_s, at, sigma, limit, settings))
@@ -108,21 +108,19 @@ def _windows(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: floa
 
 
 def _p_static(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: float, settings: StillConfig) -> float:
-    """Probability that what was seen at (K, 2) stood."""
+    """Return the probability that an object seen at (K, 2) is static."""
     return _p_of(*_line(stamp_s, at, sigma, settings), limit, settings)
 
 
 def _p_of(velocity: FloatArray, spread: float, limit: float, settings: StillConfig) -> float:
-    """Probability that a thing of a velocity (2,), known to a variance on each axis, stands; as probable as not
-    beforehand.
-    """
+    """Return the probability that an object with a velocity (2,) of known variance is static; the prior is one half."""
     still, moving = (settings.still * limit) ** 2 + spread, (settings.moving * limit) ** 2 + spread
     log_factor = np.log(moving / still) - 0.5 * float(velocity @ velocity) * (1.0 / still - 1.0 / moving)
     return float(1.0 / (1.0 + np.exp(-np.clip(log_factor, -700.0, 700.0))))
 
 
 def _way(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, settings: StillConfig) -> tuple[FloatArray, float]:
-    """Velocity (2,) from the beginning of a track to its end, and its variance: what stands in between counts, too."""
+    """Return the mean velocity (2,) of a track from beginning to end, including stops, and its variance."""
     part = max(3, len(at) // 8)
     ends = slice(0, part), slice(-part, None)
     lasted_s = float(np.median(stamp_s[ends[1]]) - np.median(stamp_s[ends[0]]))
@@ -150,7 +148,7 @@ def _line(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, settings: Stil
 
 
 def _stays(still: BoolArray, stamp_s: FloatArray, at: FloatArray, settings: StillConfig) -> list[IntArray]:
-    """Runs of detections (K, 2) that stand; those that follow each other in one place are one."""
+    """Return runs of static detections (K, 2); successive ones in one place are joined."""
     rows = np.flatnonzero(still)
     if not len(rows):
         return []
@@ -164,7 +162,7 @@ def _stays(still: BoolArray, stamp_s: FloatArray, at: FloatArray, settings: Stil
 
 
 def _ends(part: IntArray, stamp_s: FloatArray, at: FloatArray, settings: StillConfig) -> tuple[float, float]:
-    """When a stay began and ended, by a thing that was clearly elsewhere before and after; nan where it was not."""
+    """Return begin and end of a stay of an object that was clearly elsewhere before and after; nan otherwise."""
     here, found = np.median(at[part], axis=0), [np.nan, np.nan]
     for k, (outside, beside) in enumerate(((slice(0, part[0]), part[0] - 1), (slice(part[-1] + 1, None), part[-1]))):
         away = np.linalg.norm(at[outside] - here, axis=1)

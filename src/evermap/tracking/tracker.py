@@ -1,7 +1,7 @@
 """The tracker (Bateman 2020, Algorithm 2), frame after frame; reads as the algorithm does.
 
-Predict; give the detections to the tracklets; give what is left to the working set; begin a tracklet with every
-detection that then remains; and let those die that should have been seen and were not.
+Predict; assign detections to tracklets, and the others to the working set; start a tracklet with every remaining
+detection; and delete those that should have been seen and were not.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ ROOM = 64
 
 
 class Tracker(Shown):
-    """Follows objects in space, and finds them again where they were left.
+    """Tracks objects in space, and re-identifies them at their place of rest.
 
     Args:
-        settings: what is assumed about objects and their detector.
+        settings: assumptions about objects and their detector.
         n_classes: number of classes.
         confusion: (C, C) `P(detected class | true class)`, a row a true class; equal mistakes where None.
         n_appearance: length of the appearance vectors that come with detections, 0 for none.
@@ -117,7 +117,7 @@ class Tracker(Shown):
         self._tables(ROOM)
 
     def __len__(self) -> int:
-        """How many tracklets are active."""
+        """Return the number of active tracklets."""
         return self._n
 
     def step(
@@ -132,7 +132,7 @@ class Tracker(Shown):
         appearance: Any = None,
         view: View | None = None,
     ) -> tuple[IntArray, list[Event]]:
-        """Take in one frame, an empty one too.
+        """Process one frame, also an empty one.
 
         Args:
             stamp_s: when, after the frame before.
@@ -183,7 +183,7 @@ class Tracker(Shown):
         )
 
     def p_static(self, prior: float = 0.5) -> FloatArray:
-        """Return (N,) probabilities that what is `followed` stands still, in the same order.
+        """Return (N,) probabilities that the `followed` objects are static, in the same order.
 
         That an object stands is a special case of its filter: the density of velocity zero after all detections, over
         that before, is the Bayes factor (Dickey 1971).
@@ -211,7 +211,7 @@ class Tracker(Shown):
         return self.followed().to_pandas()
 
     def plot(self) -> Figure:
-        """Draw what is followed, and what rests out of view, from above."""
+        """Draw the tracks, and objects at rest out of view, from above."""
         resting = self.working_set.stored.position[self.working_set.rows]
         figure: Figure = draw("plot_followed", self.followed(), resting)
         return figure
@@ -276,7 +276,7 @@ class Tracker(Shown):
         self._death_odds = float(np.expm1(min(self.settings.vanish_rate_hz * gap, 600.0)))
 
     def _associate(self, frame: Frame, view: View | None, events: list[Event]) -> IntArray:
-        """Detections to tracklets, with all consequences; (M,) ids, `UNKNOWN` where nobody had a detection."""
+        """Assign detections to tracklets and update these; return (M,) ids, `UNKNOWN` for unassigned detections."""
         t, n = self._tracklets, self._n
         p_detect = np.full(n, self.settings.p_detect) if view is None else view.probability(t.mean[:n, :3])
         track_of_detection = np.full(len(frame.position), UNKNOWN)
@@ -297,7 +297,7 @@ class Tracker(Shown):
         return track_of_detection
 
     def _find_again(self, frame: Frame, view: View | None, track_of_detection: IntArray, events: list[Event]) -> None:
-        """Detections that nobody had to objects of the working set, which are active again then."""
+        """Assign remaining detections to objects of the working set, which become active again."""
         w, s = self.working_set, self.settings
         free = np.flatnonzero(track_of_detection == UNKNOWN)
         if len(w) == 0 or len(free) == 0:
@@ -355,7 +355,7 @@ class Tracker(Shown):
     def _wake(
         self, rows: IntArray, covariance: FloatArray, p_detect: FloatArray, log_ratio: FloatArray, stamp_s: float
     ) -> None:
-        """Copy objects of the working set behind the active tracklets, as they were."""
+        """Copy objects of the working set behind the active tracklets, unchanged."""
         t, w = self._tracklets, self.working_set
         into = slice(self._n, self._n + len(rows))
         gain = np.exp(-np.clip(log_ratio, -60.0, 60.0)) / np.maximum(p_detect, self.settings.least_p_detect)
@@ -366,7 +366,7 @@ class Tracker(Shown):
         t.rest_mean[into], t.rest_covariance[into] = w.stored.position[rows], covariance
 
     def _begin(self, frame: Frame, track_of_detection: IntArray, events: list[Event]) -> None:
-        """A new tracklet for every detection that nobody had, in the order of their places."""
+        """Start a tracklet for every unassigned detection, in the order of their places."""
         free = np.flatnonzero(track_of_detection == UNKNOWN)
         if len(free) == 0:
             return

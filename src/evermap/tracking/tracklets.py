@@ -1,4 +1,4 @@
-"""What the tracker remembers of the objects that it follows: a struct of arrays, one row a tracklet; and its states."""
+"""The tracker's state: a struct of arrays, one row per tracklet; and the states of tracklets."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class TrackState(IntEnum):
 
 
 class EventKind(IntEnum):
-    """What happens to a tracklet."""
+    """Events of tracklets."""
 
     BORN = 0
     """It is ALIVE for the first time; the stamp is that of its first detection."""
@@ -161,7 +161,7 @@ class EventTable(NamedTuple):
 
 
 class SpellTable(NamedTuple):
-    """Room for static spells that end in a frame, one row each.
+    """Buffer for static spells that end in a frame, one row each.
 
     Attributes:
         track_id, class_id: (K,) whose.

@@ -1,4 +1,4 @@
-"""What the sensor could see: evidence from objects that were not detected, and when a place was last seen empty."""
+"""Views of the sensor: evidence from misses, and the time at which a place was last seen empty."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What can be seen in a frame.
+    """Field of view in a frame.
 
     Attributes:
         centre_m: (3,) where the sensor is, in the world.

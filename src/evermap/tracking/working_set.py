@@ -18,7 +18,7 @@ UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))
 
 
 class Stored(NamedTuple):
-    """What is kept of an object, 125 bytes and two for every number of its appearance; one row each.
+    """Stored objects, one row each: 125 bytes, and two per number of the appearance.
 
     Attributes:
         track_id: (N,).
@@ -120,7 +120,7 @@ class WorkingSet:
 
     @property
     def stored(self) -> Stored:
-        """All rows, those that are free too; to be read."""
+        """All rows, including free ones; read only."""
         return self._stored
 
     @property

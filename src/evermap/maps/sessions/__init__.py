@@ -1,1 +1,1 @@
-"""Where maps and sessions meet: a session laid over the living map, and the map that comes out of it."""
+"""Updates of a living map by a session: alignment, beliefs, decisions and the next map."""

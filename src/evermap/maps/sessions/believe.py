@@ -17,7 +17,7 @@ from evermap.types import BoolArray, FloatArray, IntArray, Sensor, rows_of
 
 
 def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
-    """Return how the cliques of a map stay, leave and return, by what was learned of their class and place."""
+    """Return the dynamics of the cliques of a map, from the lifetimes of their class and place."""
     sites = living.sites
     cliques, row = clique_rows(sites)
     class_id = class_of(living, cliques)
@@ -47,12 +47,12 @@ def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
 
 
 def predicted(living: LivingMap, config: LivingConfig, until_s: float) -> FloatArray:
-    """Return (S,) probability of every site to be where its clique stands, at a later instant."""
+    """Return the (S,) probability that each site is occupied at a later instant."""
     return aged(living, config, until_s).p_here
 
 
 def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
-    """Return the sites of a map as they are believed in at a later instant, at which nobody has looked again."""
+    """Return the sites of a map with beliefs predicted to a later instant, without looks."""
     if not config.existence or len(living.sites) == 0:
         return living.sites
     start_s = living.believed_s()[np.unique(living.sites.clique_id, return_index=True)[1]]  # of a clique all are told
@@ -65,7 +65,7 @@ def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
 
 
 def with_beliefs(sites: Sites, p_start: FloatArray, after: SiteBeliefs) -> Sites:
-    """Return sites (S,) with what is believed after a while, and how much of it is the stay that was seen last."""
+    """Return sites (S,) with beliefs after a gap, and the part of each that is the last seen stay."""
     never_left = np.divide(sites.p_kept, p_start, out=np.zeros(len(sites)), where=p_start > 0.0)
     return replace(sites, p_here=after.p_here, p_kept=after.p_stayed * np.minimum(never_left, 1.0))
 
@@ -99,7 +99,7 @@ def believed(
 
 
 def evidence(living: LivingMap, beliefs: SiteBeliefs) -> Evidence:
-    """Return what was seen of every clique, frame by frame."""
+    """Return the evidence on every clique, frame by frame."""
     cliques, _ = clique_rows(living.sites)
     told = beliefs.trace
     return Evidence(
@@ -108,7 +108,7 @@ def evidence(living: LivingMap, beliefs: SiteBeliefs) -> Evidence:
 
 
 def said(living: LivingMap, beliefs: SiteBeliefs) -> FloatArray:
-    """Return (C,) log likelihood ratio of a session's looks, for 'it stands somewhere' against 'it is away'."""
+    """Return the (C,) log likelihood ratio of a session's looks, for 'it is present' against 'it is away'."""
     cliques, row = clique_rows(living.sites)
     before, after = (
         np.clip(np.bincount(row, p, minlength=len(cliques)), 1e-12, 1.0 - 1e-12)

@@ -1,6 +1,6 @@
-"""Where boxes without identity lie in a map: by the frame of an odometry, or by their constellation.
+"""Alignment of boxes without identity with a map: by the frame of an odometry, or by their constellation.
 
-One way to lay a session over the map must be far better than all others, since a wrong place is worse than none: rows
+One alignment of a session with the map must be far better than all others, since a wrong one is worse than none: rows
 of parked cars resemble each other, and cars come and go (`slam.association.constellation`).
 """
 
@@ -76,8 +76,7 @@ class MapBoxes(NamedTuple):
 
 
 def placed(seen: SeenBoxes, known: MapBoxes, *, metre: bool) -> tuple[FloatArray, float] | None:
-    """Return the motion (7,) from a session to the map, and the factor on its lengths; None where nothing tells these
-    without doubt.
+    """Return the motion (7,) from a session to the map, and the factor on its lengths; None if these are ambiguous.
 
     Args:
         seen: boxes of the session, in the frame of its odometry.
@@ -125,7 +124,7 @@ def _factor(own_m: FloatArray, there_m: FloatArray, settings: BoxesConfig) -> fl
 
 
 def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArray, IntArray]:
-    """Return rows of boxes of a session, and of the map, that are the same by their constellation.
+    """Return matching rows of boxes of a session and of the map, by their constellation.
 
     Args:
         seen: boxes of the session, in the map as far as it is known.
@@ -207,7 +206,7 @@ def _alike(seen: SeenBoxes, known: MapBoxes) -> BoolArray:
 
 
 def _headings_agree(seen: SeenBoxes, known: MapBoxes, pairs: list[tuple[int, int]]) -> bool:
-    """Whether boxes turn with the motion that their positions say."""
+    """Return whether the headings of boxes agree with the motion of their positions."""
     mine, theirs = (np.array(part) for part in zip(*pairs, strict=True))
     turn = rigid(seen.position_m[mine, :2], known.position_m[theirs, :2])[2]
     off = half_turn(known.heading_rad[theirs] - seen.heading_rad[mine] - turn)

@@ -1,4 +1,4 @@
-"""A session with boxes without identity, once they have the ids of a map: what it found and what it looked at."""
+"""A session with boxes without identity, after association with a map: what it found and looked at."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SlamResult, 
 
 @dataclass(frozen=True, slots=True)
 class SeenBoxes:
-    """Boxes of a session that stood: (K,) rows.
+    """Static boxes of a session: (K,) rows.
 
     Attributes:
         place: row of the problem's places.
@@ -107,7 +107,7 @@ class BoxVisit(SpatialVisit):
     """A session in traffic.
 
     Attributes:
-        taken: what stands in it.
+        taken: its static objects.
         track: settings of the tracker.
         boxes: where they are, by the places of the problem.
         kept: (P,) places that enter the map.
@@ -141,11 +141,11 @@ class BoxVisit(SpatialVisit):
         return replace(living, boxes=both, landmark_texts=tuple(sorted({*living.landmark_texts, *texts})))
 
     def concluded(self) -> SlamResult:
-        """Return the session as the estimator has it, with the tracks of what moved."""
+        """Return the solved session, with the tracks of moving objects."""
         return conclude_in_traffic(self.taken, self.intake, self.solved, self.track)[0]
 
     def told(self, some: BoolArray) -> tuple[IntArray, FloatArray]:
-        """Return rows (K,) of some places (P,), if they enter the map, by their ids; and orientations (K, 4)."""
+        """Return rows (K,) of those of some places (P,) that enter the map, by their ids; and orientations (K, 4)."""
         row, rotation = super().told(some & self.kept)
         heading = np.full(len(self.kept), np.nan)
         heading[self.boxes.place] = self.boxes.heading_rad

@@ -1,10 +1,10 @@
-"""Boxes without identity in a living map: which of its landmarks they are, and which are new.
+"""Association of boxes without identity with the landmarks of a living map.
 
-The tracker says what stands (`slam.space.moving`). Where a session lies in the map follows from the frame of its
-odometry, if the things that stand agree with it, else from named landmarks, else from the constellation of what stands
-(`slam.association.constellation`): one way to lay it over the map must be far better than all others, since a wrong
-place is worse than none. What stands is then assigned to the boxes of the map, one to one, against 'new' and 'clutter':
-by class, by a Gaussian in the position that the session has with all others held there, by size and heading, and by how
+The tracker finds static objects (`slam.space.moving`). The pose of a session in the map follows from the frame of its
+odometry, if static objects agree with it, else from identified landmarks, else from the constellation of static objects
+(`slam.association.constellation`): one alignment with the map must be far better than all others, since a wrong place
+is worse than none. What stands is then assigned to the boxes of the map, one to one, against 'new' and 'clutter': by
+class, by a Gaussian in the position that the session has with all others held there, by size and heading, and by how
 probably the map's box still stands. Held by these, the session is solved again, until they stay the same.
 """
 
@@ -84,10 +84,10 @@ def localised(
 def visited_in_traffic(
     taken: TrafficIntake, living: LivingMap, p_site: FloatArray, config: Config, progress: Progress | None = None
 ) -> tuple[BoxVisit, Laid | None]:
-    """Return a session solved within a map, and where it lies there; None where the map is empty, or does not show it.
+    """Return a session solved within a map, and its alignment; None if the map is empty, or does not match.
 
     Args:
-        taken: what stands in the session.
+        taken: static objects of the session.
         living: the map.
         p_site: (S,) probability of its sites, at the beginning of the session.
         config: settings.
@@ -123,7 +123,7 @@ def visited_in_traffic(
 
 @dataclass(frozen=True, slots=True)
 class _Matched:
-    """Where (P,) places of a session stand in the map: rows of the map's places, -1 for none, and how probably."""
+    """Matches of (P,) places of a session: rows of the map's places, -1 for none, and their probabilities."""
 
     place: IntArray
     probability: FloatArray
@@ -135,7 +135,7 @@ class _Matched:
 
 
 def _agrees(taken: TrafficIntake, held: SpatialSolved, matched: _Matched, living: LivingMap, known: MapBoxes) -> bool:
-    """Whether enough of what stands is where the map has it: of the boxes that stand among those of the map a share."""
+    """Return whether a sufficient share of the static boxes matches the map, among those near boxes of the map."""
     if len(_named(taken, held, living)[0]) > 1:
         return True
     settings = known.settings
@@ -163,7 +163,7 @@ def _frame_of(recording: SpatialRecording) -> FloatArray:
 
 
 def _moved(optimum: SpatialOptimum, motion: FloatArray) -> SpatialOptimum:
-    """The same in another frame, by a rigid motion (7,)."""
+    """Transform the session by a rigid motion (7,)."""
     estimate, oriented = optimum.estimate, optimum.smoother.problem.oriented
     place = se3.compose(motion, estimate.place)
     place[~oriented, 3:] = se3.NO_TURN
@@ -218,7 +218,7 @@ def _same(seen: SeenBoxes, settings: BoxesConfig) -> tuple[IntArray, IntArray]:
 
 
 def _named(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap) -> tuple[IntArray, IntArray]:
-    """Rows of the problem's places with an identity of the recording, and of where the map has these."""
+    """Return rows of the problem's places with an identity, and of the matching places of the map."""
     identity = identities_of(taken.intake, solved)[0]
     members = living.members
     _, member, row = np.intersect1d(members.landmark_id, identity, return_indices=True)
@@ -231,9 +231,7 @@ def _named(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap) -> tu
 def _placed(
     taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes
 ) -> tuple[FloatArray, float] | None:
-    """The motion (7,) from the session to the map, and the factor on its lengths; None where nothing tells these
-    without doubt.
-    """
+    """Return the motion (7,) from the session to the map, and the factor on its lengths; None if ambiguous."""
     row, place = _named(taken, solved, living)
     own, there = solved.optimum.estimate.place[row, :3], living.places.position_m[place]
     if len(row) > 1:
@@ -247,7 +245,7 @@ def _placed(
 def _settled(
     taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes
 ) -> tuple[SpatialSolved, _Matched]:
-    """The session held by the boxes of the map that it shows, until these stay the same.
+    """Solve the session constrained by matching boxes of the map, until the matches no longer change.
 
     Behind a stretch in which nothing was seen it may be off by more than any gate: there the constellation is asked.
     """
@@ -270,7 +268,7 @@ def _settled(
 
 
 def _labels(matched: _Matched) -> IntArray:
-    """(P,) the same number for places of a session that stand at one place of the map."""
+    """Return (P,) labels, equal for places of a session that match one place of the map."""
     count = len(matched.place)
     return np.where(matched.place >= 0, count + matched.place, np.arange(count))
 
@@ -305,8 +303,8 @@ def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched, settings:
 def _matched(
     taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes, held_m: FloatArray
 ) -> _Matched:
-    """Which boxes of the map those of the session are, one to one; parts of one that was lost in between are the
-    same. The farther from those that are held at (H, 2), the farther off a box may be.
+    """Match boxes of the session to those of the map, one to one, except for parts of an interrupted track. Gates grow
+    with the distance from the constrained places (H, 2).
     """
     settings = known.settings
     seen, count = seen_boxes(taken, solved, settings), len(solved.identity)
@@ -342,7 +340,7 @@ def _matched(
 
 
 def _log_odds(seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> FloatArray:
-    """(K, M) log odds that a box of the session is one of the map against that it is new, -inf beyond gates.
+    """Return (K, M) log odds that a box of the session is one of the map, against being new; -inf beyond gates.
 
     Each may be off by `loose_m` (K,) beside what is known.
     """

@@ -1,4 +1,4 @@
-"""What changed in a session: stays that ended or began, and the changes that are told of them."""
+"""Decisions after a session: stays that ended or began, and the reported changes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ USUAL = DecisionConfig()
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """Where cliques stand: their ids, and the row of the site of each, -1 where it is away."""
+    """Occupied sites of cliques: their ids, and the row of the site of each, -1 if it is away."""
 
     clique_id: IntArray
     site: IntArray
@@ -31,7 +31,7 @@ class Standing:
 
 
 def standing(living: LivingMap) -> Standing:
-    """Return the site of every clique that is more probable than all else."""
+    """Return the site of every clique that is more probable than all alternatives."""
     cliques, row = clique_rows(living.sites)
     site = np.full(len(cliques), -1, dtype=np.int64)
     likely = np.flatnonzero(living.sites.p_here >= EXISTS)
@@ -50,10 +50,10 @@ def decided(
     *,
     settings: DecisionConfig = USUAL,
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
-    """Return the map with its stays up to date, and what changed since it was told last, by clique.
+    """Return the map with updated stays, and the changes since the last report, by clique.
 
-    A stay goes on until looks end it: age alone lowers a belief, and is never told as a change. A clique that was away
-    and is seen again has returned only if it had really left.
+    A stay continues until looks end it: age alone lowers a belief, and is never reported as a change. A clique that was
+    away and is seen again has returned only if it had left.
 
     Args:
         before: the map as the session found it.
@@ -182,12 +182,12 @@ class _Session:
         )
 
     def weigh(self, row: int) -> None:
-        """Learn from a clique that was missed and stands how often cliques are hidden."""
+        """Update the probability of being hidden by a clique that was missed and is present."""
         if self._missed(row) and not self.was_hit[row]:
             self.hidden[self._sight(row)] += 1.0 - self.p_away[row]
 
     def told_before(self, row: int, old: int, stay: int) -> None:
-        """Decide on a clique that stood at the site `old`, by the stay `stay` (-1 for none)."""
+        """Decide on a clique that occupied the site `old`, by the stay `stay` (-1 for none)."""
         site = int(self.site[row])
         if self._stands(row) and site == old:
             self._goes_on(row, stay)
@@ -204,7 +204,7 @@ class _Session:
             self.p_gone[stay] = self.p_away[row]
 
     def was_away(self, row: int) -> None:
-        """Decide on a clique that stood nowhere, or is new."""
+        """Decide on a clique that was away, or is new."""
         clique, site, sites = int(self.cliques[row]), int(self.site[row]), self.after.sites
         newest = self.newest.get(clique, -1)
         if site in self.arrivals.left_s and not self._stands(row):
@@ -295,7 +295,7 @@ class _Session:
         self._tell(ChangeKind.VANISHED, old, -1, left_s, to_s, p_away, 0, int(self.misses[old]))
 
     def _since_when(self, site: int, newest: int, same: bool, share: float) -> tuple[ChangeKind, float, float]:
-        """Whether a clique that is there now returned or appeared, until when it was not there, and how probably."""
+        """Return whether a present clique returned or appeared, the last time of its absence, and the probability."""
         came_s, p_came = self.arrivals.came.get(site, (-np.inf, 0.0))
         if newest >= 0:  # where it was last it was found missing; elsewhere it may have come when it left
             elsewhere_s = max(float(self.gone_s[newest] if same else self.last_s[newest]), came_s)
@@ -346,7 +346,7 @@ class _Session:
         n_hits: int,
         n_misses: int,
     ) -> None:
-        """A change of the clique that left one site (row, -1 for none), and stands at another."""
+        """Return the change of a clique from one site (row, -1 for none) to another."""
         away = np.full(self.after.dim, np.nan), 0.0
         step, turn = _motion(self.after, left, site) if site >= 0 and left >= 0 else away
         change = MapChange(
@@ -364,7 +364,7 @@ class _Session:
 
 
 def _told(before: LivingMap, after: LivingMap) -> dict[int, tuple[int, int]]:
-    """For every clique that is said to stand somewhere the row of its site, and of its stay (-1 for none)."""
+    """Return rows of the site and of the stay (-1 for none) of every clique with a current stay."""
     told: dict[int, tuple[int, int]] = {}
     stays = after.stays
     for row in np.flatnonzero(stays.gone_s == np.inf).tolist():
@@ -382,7 +382,7 @@ def _told(before: LivingMap, after: LivingMap) -> dict[int, tuple[int, int]]:
 
 
 def without_forgotten(living: LivingMap, most_sites: int, settings: DecisionConfig = USUAL) -> LivingMap:
-    """Return the map without what it need not remember: its cost is that of what stands there, whatever its age.
+    """Return the map without negligible sites and cliques, so that its cost depends on what is present, not on its age.
 
     Left out are the least probable sites of cliques that have more than `most_sites`, and cliques that are away for
     good: those that return with little probability, or, where too many are away, that went first. Their stays are kept
@@ -468,13 +468,13 @@ def _row(living: LivingMap, site_id: int) -> int:
 
 
 def _found(ids: IntArray, wanted: int) -> int:
-    """The row of an id among sorted ones, -1 where it is none of them."""
+    """Return the row of an id among sorted ones, -1 if it is not among them."""
     at = int(np.searchsorted(ids, wanted))
     return at if at < len(ids) and ids[at] == wanted else -1
 
 
 def _last_site(before: LivingMap, after: LivingMap, clique: int) -> int:
-    """Where a clique that is away was seen last, in rows of the new map."""
+    """Return the site at which an absent clique was seen last, as a row of the new map."""
     mine = np.flatnonzero(before.sites.clique_id == clique)
     if not len(mine):
         return -1

@@ -45,7 +45,7 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class Extended:
-    """The map, before its beliefs are updated.
+    """The map with the session's sites, before its beliefs are updated.
 
     Attributes:
         before: the map as it was, but for bodies that this session took apart or put together.
@@ -143,7 +143,7 @@ def _turned(places: Places, found: Found, seen: IntArray, new: IntArray) -> Plac
 def _with_bodies(
     living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig, drift_m: float
 ) -> tuple[LivingMap, LivingMap, FloatArray, Found]:
-    """The map as it was and as it is believed, beliefs in its sites, and what was found, with the bodies of now."""
+    """Return the map before and after, beliefs in its sites, and the found landmarks, with regrouped bodies."""
     expected = replace(living, sites=replace(living.sites, p_here=p_site))
     clique_id = _bodies(expected, found, config, drift_m)
     if np.array_equal(clique_id, living.members.clique_id):
@@ -156,7 +156,7 @@ def _with_bodies(
 
 
 def _with_members(living: LivingMap, found: Found, config: LivingConfig) -> tuple[Members, int]:
-    """The map's landmarks and the new ones, these with cliques of their own or in those they stand among."""
+    """Return the map's landmarks with the new ones, in cliques of their own or in those of their neighbours."""
     members = living.members
     is_new = ~np.isin(found.landmark_id, members.landmark_id)
     new = np.flatnonzero(is_new)
@@ -206,7 +206,7 @@ def _join_known(clique: IntArray, new: IntArray, members: Members, found: Found,
 
 
 def _bodies(living: LivingMap, found: Found, config: LivingConfig, drift_m: float) -> IntArray:
-    """(L,) cliques of the map's landmarks: taken apart whose members went apart, and put together that moved as one."""
+    """Return (L,) cliques of the map's landmarks: split if members separated, joined if they moved as one."""
     if not config.cliques or not len(living.members):
         return living.members.clique_id
     members, places = living.members, living.places
@@ -237,7 +237,7 @@ def _bodies(living: LivingMap, found: Found, config: LivingConfig, drift_m: floa
 
 
 def _torn(living: LivingMap, clique_id: IntArray, found: Found, reach_m: float) -> IntArray:
-    """Cliques without members that cannot be where the others are: a clique stands at one site.
+    """Split off members of cliques that cannot be at the site of the others: a clique occupies one site.
 
     Those who stand at another known site, or at a new place though they have one at the site of the others, or out of
     reach of these, are cliques of their own. Those at the site that was believed in most keep the clique.
@@ -270,7 +270,7 @@ def _torn(living: LivingMap, clique_id: IntArray, found: Found, reach_m: float) 
 
 
 def _standing_at(living: LivingMap, found: Found, clique: IntArray) -> dict[int, int]:
-    """For every clique that stands at a known site which one."""
+    """Return the known site that every clique occupies."""
     rows = np.flatnonzero(found.place >= 0)
     return {int(clique[k]): int(living.places.site_id[found.place[k]]) for k in rows}
 

@@ -1,4 +1,4 @@
-"""Joint Gaussians of a session and of a map: what a session says of its landmarks, the scale, and the places after it.
+"""Joint Gaussians of a session and of a map: the session's landmarks, the scale, and the updated places.
 
 The poses of a session are marginalised, so nothing of it remains but the places: the cost of a map is that of its size.
 
@@ -74,8 +74,7 @@ def with_session(
 
 
 def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
-    """Return the joint covariance of a new map in the frame that its places define: as a whole they neither move nor
-    turn.
+    """Return the joint covariance of a new map in the frame defined by its places (S-transformation).
 
     A session knows its landmarks in the frame of its first pose, whose heading is no better known than the robot saw.
     Later sessions would turn the whole map as they learn how the robot stood when all began, which is of no interest.
@@ -105,7 +104,7 @@ def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
 
 
 def resized(living: LivingMap, size: Size, metres: Metres) -> LivingMap:
-    """Return the map longer by a factor, about its middle; how well its metre is known goes with it."""
+    """Return the map scaled by a factor about its middle, with the updated uncertainty of its scale."""
     position = living.places.position_m
     middle = position.mean(axis=0)
     return replace(
@@ -163,7 +162,7 @@ class OwnLandmarks:
 
 
 def own_landmarks(outcome: Outcome, settings: FitConfig = USUAL, in_place: IntArray | None = None) -> OwnLandmarks:
-    """Return what a session says of its landmarks, in its own metres: those of the map where it was solved with one.
+    """Return the Gaussian of a session's landmarks, in its own scale: that of the map if it was solved with one.
 
     Args:
         outcome: of the session.
@@ -185,7 +184,7 @@ def own_landmarks(outcome: Outcome, settings: FitConfig = USUAL, in_place: IntAr
 
 
 def _misread(outcome: Outcome, n_fit: FloatArray, settings: FitConfig) -> BoolArray:
-    """(L,) landmarks that are another one: detections of that with a wrong identity agree on a place, which is its.
+    """Return (L,) landmarks that are misread detections of another one at the same place.
 
     Args:
         outcome: of the session.
@@ -225,7 +224,7 @@ UNHEARD = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """What a session and a map say of the size of the world, together.
+    """Scales of a session and of a map after their comparison.
 
     Attributes:
         map_factor: by which the map should be longer.
@@ -251,8 +250,8 @@ def settled(
     """Return both sizes after they were compared.
 
     The map's metre is the mean of those of all sessions. What one robot gets wrong about the metre it gets wrong in
-    every session, so errors are taken as fully correlated: more sessions do not make the metre surer. A metre that
-    contradicts the map's does not change it, but halves what it is worth: one that began wrong comes round.
+    every session, so errors are taken as fully correlated: more sessions do not reduce the uncertainty. A scale that
+    contradicts the map's does not change it, but halves its weight, so that a wrong first scale is corrected.
 
     Args:
         log_ratio: of the map's size over that of the session, as its landmarks show it.
@@ -352,7 +351,8 @@ def agreed(log_metre: FloatArray, sigma: FloatArray, settings: MetreConfig = USU
 def log_ratio(
     session_m: FloatArray, session_m2: FloatArray, map_m: FloatArray, map_m2: FloatArray
 ) -> tuple[float, float]:
-    """Return the log of the map's size over the session's, and its variance: a similarity by generalised least squares.
+    """Return the log of the map's scale over the session's, and its variance: a similarity by generalised least
+    squares.
 
     Where residuals are larger than the covariances allow, as in a session that is bent, the variance grows with them.
 

@@ -1,4 +1,4 @@
-"""What a session looked at, and what looks say of new landmarks.
+"""Looks of a session, and their evidence on new landmarks.
 
 A hit is a look anywhere. A miss is a look only along a line of sight that is known to be clear.
 
@@ -35,7 +35,7 @@ ROUNDS = 5
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """What a session saw of the places of a map.
+    """Detections of a session at the places of a map.
 
     Attributes:
         stamp_s: (F,) of the frames.
@@ -50,7 +50,7 @@ class Sighting:
 
 
 class Watch(NamedTuple):
-    """What was looked at, where a sensor was.
+    """Sensor poses of a session with the places in view.
 
     Attributes:
         stamp_s: (F,) of the looks of a sensor.
@@ -78,7 +78,7 @@ class PlaceLooks:
         place: (N,) row of the map's places.
         cell: (N,) cell of the sensor, see `SightLines.cells`.
         lines: (K,) what is known of the different lines of sight.
-        counts: (N,) whether it says anything: a hit, or a miss along a line that is known to be clear.
+        counts: (N,) whether it is evidence: a hit, or a miss along a line that is known to be clear.
         settled: (N,) whether the site was seen shortly before or after: what was missed there is hidden, not gone. Such
             looks teach lines of sight before anything is judged by these, so that a robot on a way that it never took
             does not take what stands behind a wall for gone.
@@ -175,7 +175,9 @@ def _unwitnessed(rows: SiteLooks, was_unknown: BoolArray, n: int, least: int) ->
 
 
 class _Seen(NamedTuple):
-    """(N,) looks along clear lines, those of them with something seen beside or behind, and along unknown lines."""
+    """Return (N,) masks of looks along clear lines, of those with a sighting nearby or behind, and along unknown
+    lines.
+    """
 
     clear: BoolArray
     beside: BoolArray
@@ -190,7 +192,7 @@ def _hidden(
     ends: Callable[[IntArray], tuple[FloatArray, FloatArray]],
     settings: LooksConfig,
 ) -> tuple[BoolArray, IntArray, FloatArray]:
-    """Looks that count, (C,) what is known of the lines to each clique, and (C,) probability that it cannot be seen.
+    """Return looks that count, the (C,) state of the lines to each clique, and its (C,) probability of being hidden.
 
     A miss with a witness counts for what it is: something else was seen along the line. Without one the line may be
     closed in this session, the more probably the more cliques are missed from there together: one door hides them all,
@@ -224,7 +226,7 @@ def _hidden(
 
 
 def _sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) -> IntArray:
-    """(C,) from how many sides each clique was looked at, one at least: what hides it from one need not from others.
+    """Return the (C,) number of sides from which each clique was looked at, at least one.
 
     Args:
         clique: (N,) of the looks that count, and missed.
@@ -259,7 +261,7 @@ def sensor_poses(sighting: Sighting, sensor: Sensor) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """Where cliques were seen that had no site there before: (A,) rows.
+    """Cliques seen at new sites: (A,) rows.
 
     Attributes:
         site: (A,) row of the new site.

@@ -1,4 +1,4 @@
-"""Landmarks without identity in a map of the plane: which of its landmarks they are, and which are new.
+"""Association of landmarks without identity with a map in the plane.
 
 A session is associated by itself (`slam.association`). Where it lies in the map follows from the constellation of what
 stands: one way to lay it over the map must be far better than all others, and than being elsewhere. From there its
@@ -51,13 +51,13 @@ CERTAIN = math.log(P_MERGE / (1.0 - P_MERGE))
 
 @dataclass(frozen=True, slots=True)
 class _Stood:
-    """Places of a map at which landmarks may stand: (P,) rows.
+    """Candidate places of a map: (P,) rows.
 
     Attributes:
         row: of the map's places; landmark: (P,) row of the map's members.
         position_m, covariance_m2: (P, 2), (P, 2, 2).
         class_id: of its landmark.
-        p: probability that it stands there when the session begins; p_away: that it stands at no known place.
+        p: probability that it is there when the session begins; p_away: that it is at no known place.
     """
 
     row: IntArray
@@ -113,7 +113,7 @@ def named_in(recording: Recording, living: LivingMap, config: Config) -> Recordi
 
 
 def _new_names(found: Associated, recording: Recording, landmark_id: IntArray, start_s: float) -> dict[int, str]:
-    """What new landmarks are called: class, number in the session, and when that began."""
+    """Return names of new landmarks: class, number in the session, and its first stamp."""
     start = f"{start_s:.3f}".rstrip("0").rstrip(".")
     kind, words = found.assignment.of_kind[:, 0], recording.class_names
     new = np.flatnonzero(landmark_id == UNKNOWN).tolist()
@@ -121,12 +121,12 @@ def _new_names(found: Associated, recording: Recording, landmark_id: IntArray, s
 
 
 class Where(NamedTuple):
-    """Landmarks of a session in a map, each by all that are held there but itself.
+    """Landmarks of a session in a map, each predicted by all matched ones except itself.
 
     Attributes:
         position_m, covariance_m2: (K, 2), (K, 2, 2).
-        drift_m: standard deviation, each axis, by which what stands is not quite where it was.
-        joint_m2: (2 K, 2 K) covariance of all, by all that are held.
+        drift_m: standard deviation of unmoved landmarks between sessions, each axis.
+        joint_m2: (2 K, 2 K) covariance of all, given all matched ones.
     """
 
     position_m: FloatArray
@@ -138,7 +138,7 @@ class Where(NamedTuple):
 def held_at(
     local: LocalMap, held: IntArray, position_m: FloatArray, covariance_m2: FloatArray, config: OverlayConfig
 ) -> Where:
-    """Return where landmarks of a session are if some of them stand at places of a map.
+    """Return the landmarks of a session in the map, given that some of them are at places of the map.
 
     Gaussian conditioning of the session, with a motion that is free, on the differences of those that are held. Of each
     of these the difference is predicted by the others alone, from the inverse of the covariance of all.
@@ -209,15 +209,15 @@ class _Assigned:
         return member
 
     def _where(self, some: IntArray, place: IntArray) -> Where:
-        """Some landmarks in the map, by those among them that stand at places (K,) of the map."""
+        """Return some landmarks in the map, given those among them at places (K,) of the map."""
         held = np.flatnonzero(place[some] >= 0)
         at = self._stood.row[place[some[held]]]
         known = of_places(self._living.covariance_m2, at)
         return held_at(self._local.part(some), held, self._living.places.position_m[at], known, self._overlay)
 
     def _grown(self, place: IntArray) -> IntArray:
-        """(K,) `place` with all that surely stands at places: outwards from those that are held, some at a time, which
-        must agree with each other.
+        """Return (K,) `place` with all certain matches: outwards from the matched ones, in groups that must agree with
+        each other.
         """
         place, x = place.copy(), self._local.place
         tried = place >= 0
@@ -236,7 +236,7 @@ class _Assigned:
         return place
 
     def _agreed(self, group: IntArray, where: Where, place: IntArray) -> tuple[IntArray, IntArray]:
-        """Landmarks of a group, the first of `where`, and the places at which they surely stand."""
+        """Return landmarks of a group, the first of `where`, and the places that they certainly match."""
         stood = self._stood
         free = ~np.isin(stood.landmark, stood.landmark[place[place >= 0]])
         k, m, stands, _ = self._odds(group, where, free)
@@ -256,8 +256,8 @@ class _Assigned:
         return group[k[sure]], m[sure]
 
     def _placed(self) -> IntArray:
-        """(K,) rows of the places at which some landmarks surely stand, -1 for the others: those of one stretch of the
-        way, which an error of the odometry bends less than all.
+        """Return (K,) rows of the places that some landmarks certainly match, -1 for the others: those of one stretch,
+        which an odometry error distorts less than all.
         """
         stands, every = np.flatnonzero(self._stood.p >= EXISTS), np.arange(len(self._local.place))
         place, named = np.full(len(every), -1, dtype=np.int64), self._named[:MOST_HELD]
@@ -273,8 +273,8 @@ class _Assigned:
         return place
 
     def _regained(self, where: Where, member: IntArray, place: IntArray) -> IntArray:
-        """`place` with landmarks that are off by more than a gate, behind a stretch that is bent: their constellation
-        says where they stand. They may be parts of landmarks that were met before it.
+        """Return `place` with landmarks outside of their gates after a distorted stretch, matched by their
+        constellation. They may be copies of landmarks seen before it.
         """
         stood, together, found = self._stood, self._found.assignment.together, place.copy()
         stands, left = np.flatnonzero(stood.p >= EXISTS), np.flatnonzero(member < 0)
@@ -293,7 +293,7 @@ class _Assigned:
         return found
 
     def _about(self, stands: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Places, and how well each is known, with what may be off from session to session."""
+        """Return places with their covariances, including the deviation from session to session."""
         drift_m = max(self._overlay.drifts_m)
         return self._stood.position_m[stands], self._stood.covariance_m2[stands] + drift_m**2 * np.eye(2)
 
@@ -344,7 +344,7 @@ class _Assigned:
         return k, m, stands, moved
 
     def _assigned(self, where: Where, place: IntArray) -> IntArray:
-        """(K,) rows of the members that landmarks are, those included of which it is less sure, -1 for new ones."""
+        """Return (K,) rows of the members that landmarks match, including uncertain ones; -1 for new ones."""
         stood, every = self._stood, np.arange(len(place))
         k, m, stands, moved = self._odds(every, where, np.ones(len(stood.p), dtype=np.bool_))
         table = np.full((len(place), len(self._living.members)), -np.inf)
@@ -359,7 +359,7 @@ class _Assigned:
         return np.where(member >= 0, member, _one_to_one(table))
 
     def _with_parts(self, member: IntArray, table: FloatArray) -> IntArray:
-        """The same with landmarks of the session that are another part of one that is assigned: never seen with it."""
+        """Return the same with further copies of assigned landmarks: those never seen together with them."""
         together, found = self._found.assignment.together, member.copy()
         for k in np.flatnonzero((member < 0) & (table.max(axis=1, initial=-np.inf) > 0.0)).tolist():
             one = int(np.argmax(table[k]))

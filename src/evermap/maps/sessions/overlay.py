@@ -1,4 +1,4 @@
-"""Which cliques stand where the map has them: the joint search over changes, for bodies that are known (MATH.md 5).
+"""Alignment of a session with the map: the joint search over changes, for known bodies (MATH.md 5).
 
 A session that was solved alone is a joint Gaussian over its landmarks, in a frame of its own, with trajectory and
 calibration marginalised. Laid over the map by an unknown rigid motion, the landmarks that stand at places of the map
@@ -49,14 +49,14 @@ class Sighted:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Places of these landmarks in the map.
+    """Candidate places of the session's landmarks in the map.
 
     Attributes:
         position_m, covariance_m2: (P, 2), (2 P, 2 P), in the map's frame.
         landmark: (P,) row of the session's landmark.
         site: (P,) row of its site.
-        log_p_site: (S,) log probability that the clique of each site stands there, before this session.
-        log_p_elsewhere: (C,) log probability that a clique stands at none of its sites.
+        log_p_site: (S,) log probability that each site is occupied, before this session.
+        log_p_elsewhere: (C,) log probability that a clique occupies none of its sites.
         log_turned: (S,) what the orientations of its landmarks say for standing there against having been moved.
     """
 
@@ -71,13 +71,13 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """How a session lies over the map.
+    """Alignment of a session with the map.
 
     Attributes:
         pose_map_session: (3,) the rigid motion, in space (7,).
-        place: (L,) row of the place at which each landmark stands, `ELSEWHERE` where it stands at none.
-        probability: (L,) of that, given what is decided of the others.
-        drift_m: standard deviation by which landmarks that nobody moved are not quite where they were.
+        place: (L,) row of the place of each landmark, `ELSEWHERE` if it is at none.
+        probability: (L,) of that, given the assignments of the others.
+        drift_m: standard deviation of unmoved landmarks between sessions.
     """
 
     pose_map_session: FloatArray
@@ -93,7 +93,7 @@ def lay_over(
     settings: OverlayConfig = USUAL,
     motion: FloatArray | None = None,
 ) -> Overlay | None:
-    """Return the most probable assignment of sites to cliques, and the motion that goes with it.
+    """Return the most probable assignment of sites to cliques, and its motion.
 
     Args:
         sighted: the session's landmarks.
@@ -203,7 +203,9 @@ class _Options:
         return chosen
 
     def rest_of(self, chosen: IntArray) -> IntArray:
-        """Return (C,) those that are elsewhere at their most probable sites, and those that stand elsewhere."""
+        """Return (C,) the complement of an assignment: moved cliques at their most probable sites, and the others
+        elsewhere.
+        """
         likely = self.likeliest_sites()
         return np.asarray(np.where(chosen == ELSEWHERE, likely, ELSEWHERE))
 
@@ -240,7 +242,7 @@ class _Options:
         return total
 
     def is_this_place(self, chosen: IntArray) -> bool:
-        """Return whether what stands where it stood outweighs the surprise that all else was moved.
+        """Return whether the unmoved cliques outweigh the improbability that all others moved.
 
         In another place where the map's identities are used again, all landmarks stand anywhere: some agree by chance.
         """
@@ -248,8 +250,8 @@ class _Options:
         return here > math.log(self.settings.p_another_place) + count * self._log_room
 
     def outweighs_the_rest(self, chosen: IntArray) -> bool:
-        """Return False where a single body says where the session is, and is less likely to have stayed than what it
-        denies.
+        """Return False if a single body determines the pose, and is less likely to be unmoved than the bodies that it
+        contradicts.
 
         Two that stand to each other as in the map have hardly both moved. One fits itself wherever it is.
         """
@@ -263,7 +265,9 @@ class _Options:
         return len(stand) != 1 or not denied or log_odds[stand[0]] > sum(denied)
 
     def _log_standing(self, chosen: IntArray) -> tuple[float, int]:
-        """Log probability of the options, with the density of all that stands at its site; and how many places do."""
+        """Return the log probability of the options, with the density of all landmarks at their sites, and their
+        number.
+        """
         error, inverse, rows = self._field(chosen)
         log_volume = float(np.linalg.slogdet(inverse)[1]) if len(rows) else 0.0
         total = 0.5 * log_volume - 0.5 * float(error @ inverse @ error) - 0.5 * len(error) * math.log(2.0 * math.pi)
@@ -274,11 +278,11 @@ class _Options:
         return total, len(rows)
 
     def n_standing(self, chosen: IntArray) -> int:
-        """Return landmarks that stand where the map has them."""
+        """Return landmarks that are at their places in the map."""
         return len(np.unique(self.known.landmark[self._chosen_rows(chosen)]))
 
     def concluded(self, chosen: IntArray, *, split: bool) -> Overlay:
-        """Return the assignment, landmark by landmark, with bodies taken apart whose members disagree."""
+        """Return the assignment by landmark, with bodies split whose members disagree."""
         table = self._scores(chosen)
         place = np.full(len(self.landmark_m), ELSEWHERE, dtype=np.int64)
         probability = np.zeros(len(place))
@@ -302,7 +306,7 @@ class _Options:
         return Overlay(motion, place, probability, self.drift_m)
 
     def _split(self, clique: int, chosen: IntArray, together: float, place: IntArray) -> None:
-        """Members that stand where they stood, while the body as a whole does not."""
+        """Return members that have not moved, while the body as a whole has."""
         error, inverse, rows = self._field(chosen)
         for site in self.sites[clique]:
             stay = []
@@ -323,7 +327,7 @@ class _Options:
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     def _scores(self, chosen: IntArray) -> list[dict[int, float]]:
-        """For every clique the log probability of its options, given what is chosen for the others."""
+        """Return the log probability of the options of every clique, given the choices for the others."""
         error, inverse, rows = self._field(chosen)
         start = {}
         at = 0

@@ -1,4 +1,4 @@
-"""Where a session lies in the map: its landmarks at places of the map, and solved again with these as a prior."""
+"""Alignment of a session with the map, and its solution with the matched places as a prior."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
 VisitT = TypeVar("VisitT")
 USUAL = FitConfig()
 NOT_FOUND = (
-    "too few of its landmarks were seen standing to each other as it says",
-    "begin another map with it, or first enter a session that sees both",
+    "too few of the detected landmarks have the relative positions of the map",
+    "begin another map with it, or first enter a session that overlaps both",
 )
 CONTRADICTED = (
-    "most sightings contradict it or each other; the session is bent, or of another place",
-    "`evermap check` names what is odd; `--set living.search=gate` enters it all the same, by what most agree on",
+    "most sightings contradict the map or each other; the session is distorted, or from another place",
+    "`evermap check` names problems; `--set living.search=gate` enters it anyway, by the alignment with most agreement",
 )
 """Why a session cannot be localised in a map, and what to try."""
 SMALLEST_P = 1e-6
@@ -40,14 +40,14 @@ BENT_ROUNDS = 5
 
 @dataclass(frozen=True, slots=True)
 class Laid:
-    """Where the landmarks of a session stand in the map.
+    """Matches of the landmarks of a session in the map.
 
     Attributes:
         landmark_id: (K,) landmarks of the session, sorted.
         pose_map_session: (3,) motion from the session's frame to the map's.
-        place: (K,) row of the map's places, `ELSEWHERE` where a landmark stands at none of its own, or is new.
+        place: (K,) row of the map's places, `ELSEWHERE` if a landmark is at none of its own, or is new.
         probability: (K,) of that.
-        drift_m: standard deviation by which landmarks that nobody moved are not quite where they were.
+        drift_m: standard deviation of unmoved landmarks between sessions.
         assumed: (K,) those that seem to have moved and are taken to stand, since the session seems bent; see `unbent`.
     """
 
@@ -59,7 +59,7 @@ class Laid:
     assumed: BoolArray
 
     def as_seen(self) -> Laid:
-        """Return the same without what is assumed."""
+        """Return the same without assumed matches."""
         place = np.where(self.assumed, ELSEWHERE, self.place)
         return replace(self, place=place, assumed=np.zeros(len(place), dtype=np.bool_))
 
@@ -89,7 +89,7 @@ class Localised(Generic[VisitT]):
 
 
 class Turned(NamedTuple):
-    """How the landmarks of a session in space are turned, of which it is known about where it lies.
+    """Orientations of the landmarks of a session in space with a known approximate alignment.
 
     Attributes:
         pose_map_session: (7,) where.
@@ -137,7 +137,7 @@ def laid_over(
     config: LivingConfig,
     turned: Turned | None = None,
 ) -> Laid | None:
-    """Find a session in the map; None where it shows nothing that stands as there.
+    """Align a session with the map; None if no landmarks match.
 
     Args:
         living: the map.
@@ -198,8 +198,7 @@ def unbent(
     together: sparse.csr_array,
     settings: FitConfig = USUAL,
 ) -> Laid:
-    """Return where a session lies in the map, if it is bent: a part of it fits the map, too, but by another rigid
-    motion.
+    """Return the alignment of a distorted session: a part of it fits the map, too, but by another rigid motion.
 
     One wrong identity after a blind stretch may turn all that follows. Then everything seen there seems to have moved,
     by one and the same motion, which things that really move do not. Such landmarks are laid at their places again, and
@@ -260,8 +259,7 @@ def _homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
 
 
 def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid:
-    """Return landmarks that were seen too rarely to say where they are, laid at the sites at which others of their
-    body stand.
+    """Return rarely seen landmarks, assigned to the sites that others of their body occupy.
 
     Whether their sightings fit there is seen when the session is solved with the map.
 
@@ -323,10 +321,10 @@ PLACING_ROUNDS = 10
 
 
 class Held(NamedTuple):
-    """Landmarks that a map holds.
+    """Landmarks constrained by a map.
 
     Attributes:
-        row: (K,) landmarks of the problem that stand at places of the map.
+        row: (K,) landmarks of the problem that are at places of the map.
         mean_m: (K, 2) positions of these places.
         covariance_m2: (2 K, 2 K) joint covariance of them.
     """
@@ -346,14 +344,14 @@ def refitted(
     settings: FitConfig = USUAL,
     robust: bool,
 ) -> tuple[Outcome, bool]:
-    """Return the session in the frame of the map, and whether it had to be straightened for that.
+    """Return the session solved in the frame of the map, and whether it had to be corrected for a distortion.
 
     Args:
         outcome: of the session alone.
         prior: of the calibration states.
         pose_map_session: (3,) where the session's frame is in the map.
         size: metres of the map for one of the session's graph.
-        held: landmarks that stand at places of the map.
+        held: landmarks that are at places of the map.
         settings: when it was bent, and how it is straightened then.
         robust: explain outliers.
 

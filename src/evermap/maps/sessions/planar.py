@@ -1,4 +1,4 @@
-"""A session in the plane: solved by itself, laid over a map, solved again with the map as its prior."""
+"""A session in the plane: solved alone, aligned with a map, solved again with the map as its prior."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class PlanarVisit:
 
     @property
     def witnessed(self) -> Witnessed:
-        """What was seen to come to rest, or to leave: nothing, since nothing is tracked."""
+        """Observed arrivals and departures: none, since nothing is tracked."""
         return Witnessed.nothing()
 
     def concluded(self, scratch: str = "first_pose") -> SlamResult:
@@ -103,7 +103,7 @@ class PlanarVisit:
         return of_slam.concluded(self.solved, scratch)
 
     def begun(self, living: LivingMap) -> LivingMap:
-        """Return an empty map with the metre of this session, its first."""
+        """Return an empty map with the scale of this session, its first."""
         variance = self.solved.outcome.log_scale_sigma**2
         information = 1.0 / variance if variance > 0.0 else np.inf
         living = replace(living, log_size_variance=variance, log_size_information=information)
@@ -164,7 +164,7 @@ class PlanarVisit:
 def solve_session(
     recording: Recording, remarks: tuple[str, ...], config: Config, progress: Progress | None = None
 ) -> Solved:
-    """Solve a session by itself: clean, with known identities. What moved is asked when it lies over the map.
+    """Solve a cleaned session with known identities alone. Moves are searched for after its alignment with the map.
 
     Raises:
         DataError: fewer than two frames with a landmark of known identity.
@@ -175,13 +175,13 @@ def solve_session(
 
 
 def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = True) -> Localised[PlanarVisit]:
-    """Return a session that was solved alone, solved again where it lies in a map.
+    """Return a session that was solved alone, solved again at its alignment with a map.
 
     Args:
         alone: the session.
         living: the map, with its classes (`session.admitted`).
         config: settings.
-        cut: solve without the frames that say nothing sure (`doubtful`), if there are any.
+        cut: solve without doubtful frames (`doubtful`), if there are any.
     """
     settings, lost = config.living, Localised.lost(PlanarVisit(alone), living, CONTRADICTED)
     large = len(living.places) > settings.whole_places
@@ -210,7 +210,7 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
 
 
 def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingConfig) -> Laid | None:
-    """Return where the session lies in the map; None where it shows nothing that stands as in the map."""
+    """Return the alignment of the session with the map; None if no landmarks match."""
     own = own_landmarks(alone.outcome, config.fit)
     names = alone.prepared.landmark_id[own.row]
     log_sigma = np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance))
@@ -238,7 +238,7 @@ def _seen_together(alone: Solved, row: IntArray, least: float) -> sparse.csr_arr
 
 
 def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tuple[Vicinity, Laid | None]:
-    """Return the part of a large map that a session can touch, and where the session lies in it; None as of `laid`.
+    """Return the part of a large map that a session can observe, and its alignment there; None as of `laid`.
 
     That is what the sensor may have seen on its way, once the session is laid over those that it names, and some more.
     """
@@ -255,8 +255,7 @@ def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tupl
 def refit(
     living: LivingMap, p_site: FloatArray, where: Laid, alone: Solved, config: LivingConfig, *, robust: bool, part: bool
 ) -> tuple[LivingMap, Laid, Solved]:
-    """Return the session solved again, its landmarks held by the map's places at which they stand; and the map,
-    resized.
+    """Return the session solved again with its matched landmarks constrained by the map, and the rescaled map.
 
     A session that had to be straightened for that is asked again what stands where it stood. Where the map is only a
     part of a larger one it keeps its size.
@@ -322,7 +321,7 @@ def _remarked(alone: Solved, log_ratio: float, found: Size, settings: MetreConfi
     by = f"{found.off:.1f} standard deviations" if contradicts else "more than these differ"
     remark = (
         f"its metre is {abs(off):.1%} {'shorter' if off < 0.0 else 'longer'} than {than}, {by}: its ranges or its "
-        "odometer have drifted; it is entered in the metres of the map"
+        "odometer have drifted; it is entered in the scale of the map"
     )
     return replace(alone, prepared=replace(alone.prepared, warnings=(*alone.prepared.warnings, remark)))
 
@@ -335,7 +334,7 @@ def fits(visit: Solved, alone: Solved, config: LivingConfig) -> bool:
 
 
 def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> BoolArray:
-    """Return (F,) frames of a session that say nothing sure: they are not entered.
+    """Return (F,) doubtful frames of a session, which are not entered.
 
     Where the odometry was silent, a session falls into parts, if what was seen does not tie them. Those that show none
     of the map, or in a map that begins, all but the largest, may be anywhere. And where most sightings of a stretch
@@ -410,6 +409,6 @@ def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved, near_m: 
 
 
 def _inliers(visit: Solved, least: float) -> tuple[IntArray, IntArray]:
-    """Rows of the detections that fit, and of their landmarks."""
+    """Return rows of the inlier detections, and of their landmarks."""
     good = np.flatnonzero(visit.outcome.inlier >= least)
     return visit.prepared.used[good], visit.prepared.problem.landmark_row[good]

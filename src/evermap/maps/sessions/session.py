@@ -49,11 +49,11 @@ Visit = PlanarVisit | SpatialVisit
 
 @dataclass(frozen=True, slots=True)
 class Session(Shown):
-    """What a session made of a map.
+    """Result of a session in a map.
 
     Attributes:
         living: the map after it.
-        found: False where the session could not be found in the map, which then stays as it was.
+        found: False if the session could not be localised in the map, which is then unchanged.
         recording: as it was used: repaired, with the map's class numbers, without deleted landmarks; rows of `slam`
             that name detections and frames are rows of it.
         slam: trajectory, landmarks and all else, in the map's frame.
@@ -164,8 +164,8 @@ class Judged:
         living: the map after it.
         changes: what changed since the session before.
         evidence: what was seen of every clique, frame by frame.
-        misses: of landmarks at the places where they most probably stand, as the map counts them.
-        classes: what was learned of the lifetimes of classes; None where nothing is.
+        misses: of landmarks at their most probable places, as the map counts them.
+        classes: learned lifetimes of classes; None if nothing was learned.
         found: landmarks of the session.
     """
 
@@ -180,7 +180,7 @@ class Judged:
 def judged(
     living: LivingMap, where: Laid | None, visit: Visit, config: LivingConfig, known: Judged | None = None
 ) -> Judged:
-    """Return the map after the session, what changed, and what was seen and missed.
+    """Return the map after the session, the changes, the evidence and the misses.
 
     What was found goes into the map, then hits and misses into beliefs, and those into decisions.
 
@@ -252,14 +252,14 @@ def believed(
 
 
 def _without_departed(entry: Extended, now: Believed, seen: PlaceLooks, visit: Visit) -> tuple[Believed, PlaceLooks]:
-    """Beliefs and looks with what was seen to leave."""
+    """Return beliefs and looks with the observed departures."""
     site = visit.witnessed.sites(entry.living, entry.landmark_id, entry.place)
     living, said, evidence, seen = departed(now.living, now.log_evidence, now.evidence, seen, visit.witnessed, site)
     return Believed(living, said, evidence), seen
 
 
 def missed(living: LivingMap, seen: PlaceLooks, visit: Visit) -> Misses:
-    """Return the looks that the map counts as misses of landmarks where they most probably stand after the session.
+    """Return the looks that count as misses of landmarks at their most probable places after the session.
 
     These are looks in the field of view, without a detection, along lines of sight that are known to be clear.
     """
@@ -276,8 +276,7 @@ def missed(living: LivingMap, seen: PlaceLooks, visit: Visit) -> Misses:
 def decided(
     entry: Extended, now: Believed, seen: PlaceLooks, visit: Visit, config: LivingConfig, classes: ClassLives | None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
-    """Return the map with its stays up to date and without what is forgotten, and what changed since the session
-    before.
+    """Return the map with updated stays and without forgotten cliques, and the changes since the previous session.
 
     Args:
         entry: the map as the session found it, and what it found.
@@ -319,7 +318,7 @@ def learned(
 
 
 def told(found: Judged, where: Laid | None, visit: Visit) -> Session:
-    """Return the session that made a map of another; its landmarks have hits and misses of all sessions of the map."""
+    """Return the session with its map and changes; its landmarks have hits and misses of all sessions of the map."""
     frame = "first_pose" if where is None else "prior_map"
     names = {**visit.recording.landmark_names, **found.living.landmark_names}
     known = replace(found.living.landmarks(), frame=frame, names=names)
@@ -332,9 +331,9 @@ def told(found: Judged, where: Laid | None, visit: Visit) -> Session:
 def brought_in(
     session: Localised[PlanarVisit] | Localised[SpatialVisit], whole: LivingMap, config: LivingConfig
 ) -> Session:
-    """Return what a session makes of a map, judged twice: the second time by the lifetimes that the first has learned.
+    """Return the result of a session in a map, computed twice: the second time with the lifetimes learned in the first.
 
-    A session that is lost stands by itself, and the map stays as it was.
+    A session that cannot be localised keeps its own result, and the map is unchanged.
     """
     visit, where = session.visit, session.where
     if session.reason:
@@ -365,7 +364,7 @@ def solved(
 
 
 def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult:
-    """Return the result of a recording by itself with its misses, and with the belief that each landmark still exists.
+    """Return the result of a single recording with its misses and the belief that each landmark exists.
 
     Both are those of a living map whose first session the recording is.
     """
@@ -398,7 +397,7 @@ def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult
 
 
 def _as_seen(living: LivingMap, hit_site: IntArray, last_s: FloatArray) -> FloatArray:
-    """Beliefs of a map that never doubts: a clique stands where it was seen last."""
+    """Return beliefs without decay: a clique is where it was seen last."""
     p_here = living.sites.p_here.copy()
     _, clique = clique_rows(living.sites)
     seen = np.unique(hit_site)

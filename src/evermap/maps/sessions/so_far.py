@@ -1,4 +1,4 @@
-"""What a drive says of a map while it goes on, by the poses that the robot knew at the time.
+"""Beliefs and changes during a drive, from the causal poses.
 
 The looks of a session, its beliefs and its decisions, by the code that judges a session at its end. What that adds:
 smoothed poses, places that the map does not have yet, and bodies.
@@ -23,7 +23,7 @@ from evermap.types import MapChange, Sensor
 def judged_so_far(
     living: LivingMap, sighting: Sighting, sensor: Sensor, config: LivingConfig, classes: ClassLives | None = None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
-    """Return a map as it is believed after a part of a drive, and what changed since the map was told last.
+    """Return the map with beliefs after a part of a drive, and the changes since the last report.
 
     Args:
         living: the map before it.
@@ -51,7 +51,7 @@ def judged_so_far(
 
 
 def lives_of(living: LivingMap, config: LivingConfig) -> ClassLives | None:
-    """Return how long things stay, by the history of a map; None where nothing is learned or known."""
+    """Return the lifetimes from the history of a map; None if nothing is learned or given."""
     if not (config.learn_lifetimes and len(living.stays) and len(living.lives.looks_s)):
         return None
     return ClassLives.of(living.stays, living.lives, None, config.lifetimes)

@@ -1,9 +1,9 @@
-"""A session in space: what it found and what it looked at, for the same map and the same steps as in the plane.
+"""A session in space: its landmarks and looks, for the same map and the same steps as in the plane.
 
-A camera that is carried by hand knows nothing of how it came from one group of tags to the next, so that a session by
-itself may be loose. Therefore it is solved within the map from the beginning, every landmark weighted by the
-probability that it stands (`slam.space.against_map`); what the session says by itself is that optimum without what the
-map said. It is laid over the map as any other session, and solved once more with what stands.
+A camera that is carried by hand has no information on the motion between groups of tags, so that a session by itself
+may be loose. Therefore it is solved within the map from the beginning, every landmark weighted by the probability that
+it stands (`slam.space.against_map`); what the session says by itself is that optimum without what the map said. It is
+laid over the map as any other session, and solved once more with what stands.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class SpatialVisit:
         recording: as it was used.
         intake: as the estimator wants it.
         solved: its values.
-        witnessed: what was seen to come to rest, or to leave.
+        witnessed: observed arrivals and departures.
     """
 
     recording: SpatialRecording
@@ -80,7 +80,7 @@ class SpatialVisit:
         return concluded_in_space(self.recording, self.intake, self.solved)
 
     def begun(self, living: LivingMap) -> LivingMap:
-        """Return an empty map as it is: in space the metre is that of the sensors."""
+        """Return an empty map: in space the scale is that of the sensors."""
         return living
 
     @property
@@ -125,7 +125,7 @@ class SpatialVisit:
 
     @functools.cached_property
     def floor_sensor(self) -> Sensor:
-        """How far and how widely the sensors saw, as one on the floor: what earlier looks are asked by."""
+        """Range and field of view of the sensors, as one planar sensor, for earlier looks."""
         direction, range_m = self._directions(np.flatnonzero(self.inlier >= EXISTS))
         settings = self.intake.problem.settings
         half = float(np.abs(np.arctan2(direction[:, 1], direction[:, 0])).max(initial=0.0)) + settings.field_margin_rad
@@ -164,7 +164,9 @@ class SpatialVisit:
         return np.bincount(problem.place, self.inlier, minlength=len(problem.oriented)).astype(np.float64)
 
     def told(self, some: BoolArray) -> tuple[IntArray, FloatArray]:
-        """Return rows (K,) of some places (P,), if located, by their ids; and orientations (K, 4), nan of points."""
+        """Return rows (K,) of the located ones of some places (P,), by their ids; and orientations (K, 4), nan for
+        points.
+        """
         row = np.flatnonzero(some & self.located[1])
         row = row[np.argsort(self.landmark_id[row], kind="stable")]
         oriented = self.optimum.smoother.problem.oriented[row, None]
@@ -311,7 +313,7 @@ def visited(
     config: LivingConfig,
     progress: Progress | None = None,
 ) -> tuple[SpatialVisit, Laid | None]:
-    """Return a session solved within a map, and where it lies there; None where it shows nothing that stands."""
+    """Return a session solved within a map, and its alignment; None if no landmarks match."""
     if not len(living.places):
         return SpatialVisit(recording, intake, solve_space(intake, None, progress=progress)), None
     solved = solve_space(intake, standing(living, p_site), progress=progress)
@@ -329,7 +331,7 @@ def localised_in_space(
     remarks: tuple[str, ...] = (),
     progress: Progress | None = None,
 ) -> Localised[SpatialVisit]:
-    """Return a session solved where it lies in a map, or in the part of a large one that it can touch.
+    """Return a session solved at its alignment with a map, or with the part of a large one that it can observe.
 
     Args:
         recording: the session.
@@ -353,7 +355,7 @@ def localised_in_space(
 
 
 def standing(living: LivingMap, p_site: FloatArray) -> Landmarks:
-    """Return what more probably stands than not, where it most probably does, by beliefs (S,) in the sites."""
+    """Return landmarks with P(exists) above one half at their most probable places, by beliefs (S,) in the sites."""
     believed = replace(living, sites=replace(living.sites, p_here=p_site), dated=Dated.empty(), stamp_s=-np.inf)
     return believed.landmarks(p_least=EXISTS)
 
@@ -386,7 +388,7 @@ def _numbered(intake: SpatialIntake, solved: SpatialSolved, living: LivingMap) -
 
 
 def _laid(visit: SpatialVisit, living: LivingMap, p_site: FloatArray, config: LivingConfig) -> Laid | None:
-    """Where the session lies in the map, by what it says without the map."""
+    """Return the alignment of the session with the map, from its own information."""
     alone, names, place = by_itself(visit.optimum), visit.landmark_id, visit.optimum.estimate.place
     row, rotation = visit.told(visit.n_fit >= config.fit.sightings_in_place)
     at = se2.xy_rows(row, 3)
@@ -399,7 +401,7 @@ def _laid(visit: SpatialVisit, living: LivingMap, p_site: FloatArray, config: Li
 def _fused(
     position_m: FloatArray, covariance_m2: FloatArray, place: IntArray, living: LivingMap, drift_m: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Positions (K, 3) and their joint covariance by a session and the map, of which those with a `place` stand."""
+    """Return positions (K, 3) and their joint covariance from a session and the map, fused for those with a `place`."""
     stand = np.flatnonzero(place >= 0)
     s = se2.xy_rows(stand, 3)
     known = drifted(of_places(living.covariance_m2, place[stand], 3), drift_m)
@@ -410,7 +412,7 @@ def _fused(
 
 
 def _held(visit: SpatialVisit, living: LivingMap, where: Laid) -> SpatialOptimum:
-    """The session solved once more, its landmarks held where they stand in the map."""
+    """Solve the session once more, with matched landmarks constrained to their places in the map."""
     optimum = visit.optimum
     problem, places = optimum.smoother.problem, living.places
     _, row, at = np.intersect1d(visit.landmark_id, where.landmark_id[where.place >= 0], return_indices=True)

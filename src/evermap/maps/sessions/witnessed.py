@@ -1,4 +1,4 @@
-"""What was seen to come to rest, or to leave: direct evidence, beside that of looks at places.
+"""Observed arrivals and departures: direct evidence, in addition to looks at places.
 
 A tracker that sees a car drive off knows more than a thousand misses of it would say, since what is missed may be
 hidden. So the belief that it stands ends there and then, and of looks only one remains: the first at which it was gone.
@@ -23,13 +23,13 @@ LEAST_P, MOST_P = 1e-6, 1.0 - 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Witnessed:
-    """Landmarks that a session saw come to rest, or leave: (W,) rows.
+    """Landmarks that a session saw arriving or leaving: (W,) rows.
 
     Attributes:
         landmark_id: which.
-        since_s, until_s: when it came, and when it left; nan where it was not seen.
+        since_s, until_s: when it arrived, and when it left; nan if that was not seen.
         probability: of that.
-        when_s: to within which both are known, to both sides.
+        when_s: half width of the intervals of both times.
     """
 
     landmark_id: IntArray
@@ -44,14 +44,14 @@ class Witnessed:
         return cls(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), np.zeros(0))
 
     def sites(self, living: LivingMap, landmark_id: IntArray, place: IntArray) -> IntArray:
-        """Return (W,) rows of the sites at which they stood, -1 where they have none: landmarks (K,) at places (K,)."""
+        """Return (W,) rows of their sites, -1 for none, from landmarks (K,) at places (K,)."""
         row = np.full(len(self.landmark_id), -1, dtype=np.int64)
         _, mine, at = np.intersect1d(self.landmark_id, landmark_id, return_indices=True)
         row[mine] = np.searchsorted(living.sites.site_id, living.places.site_id[place[at]])
         return row
 
     def unlooked(self, watch: Watch, landmark_id: IntArray, place: IntArray) -> Watch:
-        """Return what was looked at without the places of these before they came and after they left."""
+        """Return the watched places without those of these landmarks before they arrived and after they left."""
         since, until = np.full(1 + int(place.max(initial=0)), -np.inf), np.full(1 + int(place.max(initial=0)), np.inf)
         _, mine, at = np.intersect1d(self.landmark_id, landmark_id, return_indices=True)
         since[place[at]] = np.nan_to_num(self.since_s[mine] + self.when_s, nan=-np.inf)
@@ -67,7 +67,7 @@ class Witnessed:
 def departed(
     living: LivingMap, log_evidence: FloatArray, evidence: Evidence, seen: PlaceLooks, what: Witnessed, site: IntArray
 ) -> tuple[LivingMap, FloatArray, Evidence, PlaceLooks]:
-    """Return the map without what was seen to leave, and what says so: by clique, frame by frame, and as a look.
+    """Return the map with observed departures, and their evidence: by clique, by frame, and as a look.
 
     Args:
         living: the map with the beliefs of the session's looks.
@@ -131,7 +131,7 @@ def _with_looks(
 
 
 def arrived(came: Arrivals, living: LivingMap, before: LivingMap, what: Witnessed, site: IntArray) -> Arrivals:
-    """Return what came with what was seen to come, and what of that left again.
+    """Return arrivals with the observed ones, and departures among these.
 
     Args:
         came: by earlier looks.

@@ -1,4 +1,4 @@
-"""Where living maps are kept: every session is a revision, none is ever overwritten.
+"""Stores of living maps: every session is a revision, none is ever overwritten.
 
 `open_store` is all that callers need; what it gives answers `MapStore`. The database library is loaded by it, not by
 importing this package.
@@ -81,7 +81,7 @@ def _open(where: str | Path, *, create: bool) -> SqlStore:
 
 
 def verify_store(where: str | Path) -> Verification:
-    """Check every revision of a map, and the file that it is in.
+    """Check every revision of a map, and its file.
 
     Raises:
         ConfigError, InputError: as `open_store`, but not for damage: that is what the answer tells.

@@ -1,6 +1,6 @@
-"""A living map as columns of bytes, cut into chunks that are named by what is in them.
+"""A living map as columns of bytes, cut into chunks that are named by their checksums.
 
-What two revisions have in common is therefore in the file once: an edit writes two short columns, and of a long history
+Common parts of two revisions are therefore stored once: an edit writes two short columns, and of a long history
 of stays only the rows that changed. A *manifest* lists the columns of a map and their chunks; its name is that of the
 whole map.
 """
@@ -61,7 +61,7 @@ Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
 
 
 class DamagedError(Exception):
-    """Bytes that are not what was written."""
+    """Bytes that differ from those written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +172,7 @@ def pack(living: LivingMap) -> tuple[bytes, dict[bytes, Chunk]]:
 
 @dataclass(frozen=True, slots=True)
 class _PartChunk(Chunk):
-    """A part of a large map under the name that it is kept by; its bytes are asked for only where they are missing.
+    """A part of a large map under its stored name; its bytes are read only on demand.
 
     Attributes:
         part: of its covariance, lines of sight or views.
@@ -209,7 +209,7 @@ def _read_part(name: bytes, stored: bytes) -> FloatArray:
 
 
 def _cuts(flat: NDArray[Any]) -> list[int]:
-    """Where a column is cut: before values whose hash says so, so that rows put in shift no cut behind them."""
+    """Return the cuts of a column: before values chosen by a hash, so that inserted rows do not shift later cuts."""
     if len(flat) <= _LONGEST:
         return [*range(0, len(flat), _CHUNK), len(flat)] if len(flat) else []
     wide = np.ascontiguousarray(flat).view(np.uint64 if flat.itemsize == 8 else np.uint8).astype(np.uint64)
@@ -267,7 +267,7 @@ def unpack(name: bytes, fetch: Fetch, *, lazily: bool = False) -> LivingMap:
 
 
 def _of_format_1(parts: dict[str, Any]) -> None:
-    """What format 1 did not know of a map; its lines of sight, between cells of the floor, are learned again."""
+    """Return columns that format 1 lacks; its lines of sight, between cells of the floor, are learned again."""
     for column in ("key", "hits", "looks", "cell_m"):
         parts.pop(f"sightlines.{column}", None)
     if isinstance(parts.get("sites.p_here"), np.ndarray):
@@ -334,7 +334,7 @@ _COUNTS = ("sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlin
 
 
 def flaw(living: LivingMap) -> str:
-    """Tell in what a map contradicts itself; '' if it is consistent.
+    """Return a description of an inconsistency of a map; '' if it is consistent.
 
     The rules are those that the rest of the package relies on: columns of equal length, sorted unique ids, references
     that lead somewhere, finite positions, probabilities in [0, 1].
@@ -515,7 +515,7 @@ def _value(name: str, like: Any, found: Any) -> Any:
 
 
 def _flat(column: str, array: NDArray[Any]) -> NDArray[Any]:
-    """All values in a row; of a symmetric matrix only those up to the diagonal."""
+    """Return all values in a row; of a symmetric matrix only those up to the diagonal."""
     if column == "covariance_m2" and array.ndim == 2 and len(array) > 1:
         bits = np.ascontiguousarray(array).view(np.int64)
         if np.array_equal(bits, bits.T):

@@ -1,4 +1,4 @@
-"""The record of a revision: everything about it but its content, as one text.
+"""The record of a revision: everything about it except its content, as one text.
 
 Records, contents, configurations, evidence and attachments are all chunks, named by the SHA-256 of what is in them. A
 record holds the names of its parts and that of its parent's record, so its own name is a checksum over the revision and
@@ -86,7 +86,7 @@ class Record:
         return self.number - 1 if restores is None else int(restores)
 
     def parts(self) -> set[bytes]:
-        """Return the chunks that it names, without those that are named by its content and its evidence in turn."""
+        """Return the chunks that it names, without those named by its content and its evidence."""
         named = {self.content, self.config, *(name for name, _ in self.attachments.values())}
         return named | ({self.evidence} if self.evidence is not None else set())
 
@@ -97,7 +97,7 @@ class Record:
         ]
 
     def revision(self, config: str) -> Revision:
-        """Return as the history tells it."""
+        """Return it as a `Revision` of the history."""
         row = {**self.about, "kind": RevisionKind(self.about["kind"]), "config": config}
         row |= {name: _or_nan(row[name]) for name in _MAY_BE_NAN}
         provenance = Provenance(**{item.name: row[item.name] for item in fields(Provenance)})
@@ -165,7 +165,7 @@ _PARTS = {"changes", "attachments", "lost", "n_cliques_ever", "n_sites_ever"}
 
 
 def lineage(origin: Mapping[int, int], number: int) -> tuple[int, ...]:
-    """Return the revisions that one was made from, oldest first, itself included; those that were lost are left out.
+    """Return the ancestors of a revision and itself, oldest first, without lost ones.
 
     Args:
         origin: the revision whose map each one started from: its parent, or what it restored.

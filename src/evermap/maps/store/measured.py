@@ -1,4 +1,4 @@
-"""What sessions measured and saw, as bytes: recordings to bring in once more, and the evidence of every clique.
+"""Stored recordings of sessions, for replays, and the evidence of every clique, as bytes.
 
 Of a recording is kept what the estimate may see: odometry, frames, detections, sensor and objects, bit by bit, and no
 truth. Evidence is one chunk a clique, some ten bytes a look, and an index of them.
@@ -127,7 +127,7 @@ _COLUMNS = {
 
 
 class CliqueLooks(NamedTuple):
-    """Where the looks at one clique are.
+    """Location of the stored looks at one clique.
 
     Attributes:
         clique_id: whose.

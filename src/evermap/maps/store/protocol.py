@@ -1,4 +1,4 @@
-"""What every map store answers, and what it says of a revision."""
+"""The protocol of map stores, and their revisions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evermap.types import ChangeKind, MapChange
 
 
 class RevisionKind(StrEnum):
-    """What made a revision."""
+    """Origin of a revision."""
 
     SESSION = "session"
     """A recording went into the map."""
@@ -26,15 +26,15 @@ class RevisionKind(StrEnum):
 
 
 class StaleRevisionError(InputError):
-    """Somebody else committed since the map was read; nothing was written."""
+    """Another process committed since the map was read; nothing was written."""
 
 
 class StoreUnavailableError(InputError):
-    """The database of a map does not answer, or refuses; nothing is wrong with the map, or with what was asked."""
+    """The database of a map does not answer, or refuses; neither the map nor the request is at fault."""
 
 
 class DamagedMapError(InputError):
-    """A map file whose bytes are not those that were written.
+    """A map file with bytes that differ from those written.
 
     Attributes:
         intact: numbers of the revisions that are whole; `revert` goes back to any of them.
@@ -66,7 +66,7 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Where a revision comes from.
+    """Provenance of a revision.
 
     Attributes:
         kind: what made it.
@@ -123,7 +123,7 @@ class Revision:
 
 @dataclass(frozen=True, slots=True)
 class Pruning:
-    """What `MapStore.prune` deleted, or would delete.
+    """Content that `MapStore.prune` deleted, or would delete.
 
     Attributes:
         revisions: whose content that was.
@@ -152,7 +152,7 @@ class MapStore(Protocol):
         ...
 
     def head(self) -> int:
-        """Return the newest revision; 0 where there is none yet."""
+        """Return the newest revision; 0 if there is none yet."""
         ...
 
     def log(self) -> tuple[Revision, ...]:
@@ -160,9 +160,7 @@ class MapStore(Protocol):
         ...
 
     def lineage(self, revision: int | None = None) -> tuple[int, ...]:
-        """Return the revisions that one was made from, oldest first, itself included; what was reverted is not among
-        them.
-        """
+        """Return the ancestors of a revision and itself, oldest first, without reverted ones."""
         ...
 
     def load(self, revision: int | None = None) -> LivingMap:
@@ -227,7 +225,7 @@ class MapStore(Protocol):
         ...
 
     def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
-        """Return what was committed as the changes of one revision."""
+        """Return the committed changes of one revision."""
         ...
 
     def changes_of(self, landmark_id: int | None = None) -> tuple[tuple[int, MapChange], ...]:
@@ -242,7 +240,7 @@ class MapStore(Protocol):
         since_s: float = -np.inf,
         revisions: Collection[int] | None = None,
     ) -> Evidence:
-        """Return what sessions saw, by time; of one clique, or of the cliques that a landmark belonged to.
+        """Return the evidence of sessions, by time; of one clique, or of the cliques that a landmark belonged to.
 
         Args:
             clique_id: the clique; None for all.
@@ -253,7 +251,7 @@ class MapStore(Protocol):
         ...
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
-        """Return what is attached to revisions, oldest first, without reading it.
+        """Return the attachments of revisions, oldest first, without reading them.
 
         Args:
             revisions: which; None for those of `lineage()`.

@@ -1,4 +1,4 @@
-"""The tables of a map store, in the words of any SQL database, and the way from one schema to the next.
+"""The tables of a map store in portable SQL, and the migrations from one schema to the next.
 
 `docs/maps.md` says what is in the tables. A store is brought up to date when it is opened, in one transaction.
 """
@@ -148,7 +148,7 @@ def _pruned(connection: Connection) -> None:
 
 
 def _changes(connection: Connection, number: int) -> list[Any]:
-    """Of a revision of schema 2, as lists."""
+    """Return the changes of a revision of schema 2, as lists."""
     named: dict[int, list[int]] = {}
     listed = text("SELECT position, landmark_id FROM change_landmark WHERE revision = :number ORDER BY position, rank")
     for position, landmark in connection.execute(listed, {"number": number}):

@@ -354,7 +354,7 @@ class SqlStore(Shown):
         return found[np.argsort(found.stamp_s, kind="stable")]
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
-        """Return what is attached to revisions."""
+        """Return the attachments of revisions."""
         with self._reading() as connection:
             return tuple(item for record in self._records_of(connection, revisions) for item in record.attached())
 
@@ -448,7 +448,7 @@ class SqlStore(Shown):
     def _n_grown(
         self, connection: Connection, parent: int, living: LivingMap, changes: Sequence[MapChange]
     ) -> int | None:
-        """How many landmarks a map has grown by; None where it is not known what its parent knew."""
+        """Return the number of landmarks that a map has grown by; None if its parent is unknown."""
         known = np.zeros(0, dtype=np.int64)
         try:
             if parent:
@@ -680,7 +680,7 @@ class SqlStore(Shown):
 
     @contextmanager
     def _plainly(self) -> Iterator[None]:
-        """What went wrong in the database, in one line."""
+        """Return the failure of the database, in one line."""
         try:
             yield
         except (DamagedError, UnicodeDecodeError) as error:  # the latter even from the driver's own messages
@@ -700,7 +700,7 @@ class SqlStore(Shown):
             raise self._damaged(message) from error
 
     def _damaged(self, problem: str) -> InputError:
-        """One line that says which revisions are whole, and how to go back to them."""
+        """Return one line that names the intact revisions, and how to revert to them."""
         explained = self._explain(problem)
         if explained is not None:
             return explained
@@ -752,7 +752,7 @@ def now_utc() -> str:
 
 
 def _told(provenance: Provenance, living: LivingMap, **numbers: int | None) -> dict[str, Any]:
-    """What the record of a new revision tells of it."""
+    """Return the fields of a new revision's record."""
     return about(
         provenance,
         **numbers,

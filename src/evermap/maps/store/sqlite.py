@@ -97,7 +97,7 @@ _INTEGER_BYTES = (0, 1, 2, 3, 4, 6, 8)
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What is whole in a map file.
+    """Intact and damaged parts of a map file.
 
     Attributes:
         head: the newest revision that is known of.
@@ -124,7 +124,7 @@ class Verification:
         return not self.damaged and not self.problems
 
     def error(self, path: Path | str, problem: str = "") -> DamagedMapError:
-        """Return one line that says what is damaged, which revisions are whole, and how to go back to them."""
+        """Return one line that names the damage, the intact revisions, and how to revert to them."""
         told = [problem] if problem else list(self.problems[:1])
         if self.damaged and not problem:
             number = min(self.damaged)
@@ -236,7 +236,7 @@ def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> t
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What was found in a file.
+    """Records and chunks found in a file.
 
     Attributes:
         chunks: stored bytes of pieces that are what was written, by name.
@@ -265,7 +265,7 @@ class _Found:
         store.fill({name: self.chunks[name] for name in sorted(kept)}, names, head, since, made)
 
     def verified(self, problems: Iterable[str], n_bytes: int) -> Verification:
-        """Return what is whole, of the maps themselves too."""
+        """Return the verification, including the maps themselves."""
         intact, pruned, damaged = self.verdicts(deep=True)
         lost = tuple(sorted(self.lost))
         return Verification(self.head, intact, damaged, lost, tuple(problems), len(self.chunks), n_bytes, pruned)
@@ -384,7 +384,7 @@ class _Found:
 
 
 def _is_chunk(name: bytes, data: bytes) -> bool:
-    """Whether stored bytes are what their name says, of whichever type."""
+    """Return whether stored bytes match their name, of any type."""
     for dtype in DTYPES:
         with suppress(DamagedError):
             Chunk.of_stored(name, dtype, data)
@@ -393,7 +393,7 @@ def _is_chunk(name: bytes, data: bytes) -> bool:
 
 
 def _problems(path: Path) -> Iterator[str]:
-    """What the database itself finds, and what ordinary reading finds in its lists."""
+    """Return problems found by the database itself, and by reading its lists."""
     try:
         with open_sqlite(path, create=False) as store:
             unread = list(_unread(store))
@@ -412,7 +412,7 @@ def _problems(path: Path) -> Iterator[str]:
 
 
 def _unread(store: SqlStore) -> Iterator[str]:
-    """What ordinary reading finds in the lists of a map."""
+    """Return problems found by reading the lists of a map."""
     try:
         store.log()
         store.head()
@@ -425,7 +425,7 @@ def _plain(error: DamagedMapError) -> str:
 
 
 def _finish_transactions(path: Path) -> None:
-    """Let the database take back what was not committed, if it still can."""
+    """Let the database roll back uncommitted changes, if it still can."""
     with suppress(sqlite3.DatabaseError, UnicodeDecodeError), closing(sqlite3.connect(path)) as database:
         database.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
