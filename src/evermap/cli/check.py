@@ -1,4 +1,4 @@
-"""`evermap check`: what a recording holds and what is odd about it, before anything is estimated."""
+"""`evermap check`: a summary of a recording and its problems, before anything is estimated."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def check(
     show_config: ShowConfig = False,
     as_json: AsJson = False,
 ) -> None:
-    """Tell whether a recording can be used, and what is odd.
+    """Check whether a recording is usable, and report problems.
 
-    Looked at are units, signs, clocks, gaps, jumps, rates, identities, limits and coverage. Exit code 0: usable,
-    perhaps with warnings; 2: it is not, in one line.
+    Checks units, signs, clocks, gaps, jumps, rates, identities, limits and coverage. Exit code 0: usable, possibly with
+    warnings; 2: unusable, in one line.
 
     \b
     Examples:

@@ -32,7 +32,7 @@ _KNOWN = "a recording, ROS bag, living map, run folder, landmarks, trajectory (.
 
 
 class Described(NamedTuple):
-    """What is told of a path: its kind, everything for programs, and lines for people."""
+    """Description of a path: its kind, all facts for programs, and lines for people."""
 
     kind: str
     facts: dict[str, Any]
@@ -45,7 +45,7 @@ def info(
     robot: Robot = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what a file or folder is and holds.
+    """Describe a file or folder.
 
     \b
     Examples:

@@ -96,7 +96,7 @@ def learn(
 
 
 def one_of(workers: int | None, cluster: str | None) -> None:
-    """Refuse processes here and a cluster at once."""
+    """Refuse the combination of local processes and a cluster."""
     if cluster is not None and workers is not None:
         raise ConfigError("are the cluster's", field="workers", hint="leave out --workers, or --cluster")
 
@@ -149,7 +149,7 @@ def _half_gone_s(lifetimes: Lifetimes) -> float | None:
 
 
 def _written(folder: RunFolder, company: Company, names: list[str]) -> dict[str, Any]:
-    """Write the files of a company and its sites; return what was learned, for the summary."""
+    """Write the files of a company and its sites; return the results for the summary."""
     from evermap.existence.models import save_lifetimes
 
     general = company.lifetimes()
@@ -178,7 +178,7 @@ def _written(folder: RunFolder, company: Company, names: list[str]) -> dict[str,
 
 
 def _print(summary: dict[str, Any], out: Path) -> None:
-    """What a person wants to know of it."""
+    """Print the results for people."""
     from evermap.survival.durations import duration_text
 
     rows = []

@@ -78,9 +78,9 @@ def live(
 ) -> None:
     """Localise and map while the robot drives.
 
-    What has changed is told as it becomes certain; pose, frames, map and changes are sent to all who are connected.
+    Changes are reported as they become certain; pose, frames, map and changes are sent to all connected clients.
 
-    What was driven enters the map every few minutes (live.revision_s) and at the end, also by Ctrl-C; after a crash,
+    The drive enters the map every few minutes (live.revision_s) and at the end, also by Ctrl-C; after a crash,
     when the map is fed again.
 
     \b
@@ -165,7 +165,7 @@ def _give_memory_back() -> None:
 
 
 class _Drive:
-    """A drive: an engine, its readings, and the connections and terminal that show what it knows."""
+    """A drive: an engine, its readings, and its outputs to connections and terminal."""
 
     def __init__(
         self,
@@ -185,14 +185,14 @@ class _Drive:
         from evermap.live.feed import run_live
 
         _give_memory_back()
-        # what is replayed faster than it was driven cannot wait for what is done beside it
+        # a replay faster than real time cannot wait for parallel work
         engine = self._engine(mapping=not localize, beside=realtime or self._recording is None)
         shown = _Shown(as_json=as_json, mailbox=self._mailbox)
         with engine:
             readings = self._readings(engine, shown, realtime=realtime)
             warm_up(engine.warm_up)
             gc.collect()
-            gc.freeze()  # what is loaded by now stays: to look it through again would take a tenth of a second
+            gc.freeze()  # objects loaded so far are kept: collecting them again would take a tenth of a second
             gc.set_threshold(OBJECTS)
             kept(self._map_file, f"the drive enters {self._map_file} at the next start")
             with self._teller(engine, wires) as tell:
@@ -241,7 +241,7 @@ class _Drive:
 
     @contextmanager
     def _teller(self, engine: Engine, wires: Sequence[Wire]) -> Iterator[Callable[[Now], None]]:
-        """What sends what is known, where somebody is connected."""
+        """Return the sender of the engine's outputs, if there are connections."""
         if not wires:
             yield lambda _: None
             return
@@ -264,7 +264,7 @@ def _until_stopped(readings: Iterator[Reading | None], watch: watched) -> Iterat
 
 
 class _Shown:
-    """What is told: a line of progress on the terminal, poses and changes as JSON lines."""
+    """Outputs on stdout: a progress line on the terminal, poses and changes as JSON lines."""
 
     def __init__(self, *, as_json: bool, mailbox: Mailbox | None) -> None:
         self._json, self._last_s, self._n_changes, self._n_frames = as_json, 0.0, 0, 0
@@ -274,7 +274,7 @@ class _Shown:
         self._now: Now | None = None
 
     def tell(self, now: Now) -> None:
-        """Show what is known."""
+        """Show the present state."""
         from evermap.viz.change_words import describe
 
         for text in now.warnings:
@@ -304,7 +304,7 @@ class _Shown:
             warn(line)
 
     def finish(self, map_file: Path) -> None:
-        """Show what came of it."""
+        """Show the results."""
         if sys.stderr.isatty():
             typer.echo(err=True)
         if self._now is None or self._json:

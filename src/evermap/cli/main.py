@@ -39,7 +39,7 @@ class Verbs(TyperGroup):
         return [*plugins.found("evermap.verbs"), *super().list_commands(ctx)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command of a verb; None where there is none of this name."""
+        """Return the command of a verb; None if there is none of this name."""
         return super().get_command(ctx, cmd_name) or reproduce.command("evermap.verbs", cmd_name)
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
@@ -145,7 +145,7 @@ def options(
 
 
 def run() -> None:
-    """Parse what was typed, run it, and end this process."""
+    """Parse the command line, run it, and end this process."""
     interrupts.leave_on_signals()
     try:
         app(prog_name="evermap")

@@ -33,7 +33,7 @@ _AtRevision = Annotated[
 def log(file: MapFile, as_json: AsJson = False) -> None:
     """List the revisions.
 
-    Every session, edit and revert, with what it changed.
+    Every session, edit and revert, with its changes.
 
     \b
     Example:
@@ -119,9 +119,9 @@ def diff(
     b: Annotated[int | None, typer.Argument(metavar="B", help="The later one.", show_default="newest")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what changed between two revisions.
+    """List the changes between two revisions.
 
-    What appeared, vanished, moved, swapped places and returned, by how much the map grew, and what operators did.
+    Landmarks that appeared, vanished, moved, swapped places and returned, growth of the map, and operators' edits.
 
     \b
     Example:
@@ -263,9 +263,9 @@ def why(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell why a landmark is believed to be there, or gone.
+    """Explain why a landmark is believed to exist or gone.
 
-    What was seen of it, and how much each of that says.
+    Lists its looks and the weight of each as evidence.
 
     \b
     Example:
@@ -291,7 +291,7 @@ def why(
 def _writer(
     out: Path | None, cell_m: float, radius_m: float | None, ahead_s: float | None, route_graph: Path | None
 ) -> Callable[[LivingMap, Landmarks], dict[str, Any]]:
-    """What writes such a file, and returns what is to be told of it.
+    """Return the writer for such a file, which returns facts for the summary.
 
     Raises:
         ConfigError: no map is written to such a file.
@@ -348,7 +348,7 @@ def _speed_mask(
 
 
 def _route_graph(out: Path, graph: Path, clearance_m: float, _: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
-    """Write a route graph; tell which of its edges are closed, and which are doubtful."""
+    """Write a route graph; return its closed and its uncertain edges."""
     from evermap.io.route_graph import write_route_graph
 
     edges = write_route_graph(landmarks, graph, out, clearance_m=clearance_m)

@@ -1,4 +1,4 @@
-"""What `evermap map` prints of revisions, landmarks and changes for people.
+"""Output of `evermap map` for people: revisions, landmarks and changes.
 
 How `evermap map why` answers: lines, a table of the sessions, a figure.
 """
@@ -72,7 +72,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def print_why(answer: Answer) -> None:
-    """Print the answer, what it rests on, and what every session saw."""
+    """Print the answer, its reasons, and the evidence of every session."""
     from evermap.maps.why import probability_text
 
     echo(answer.headline)

@@ -1,4 +1,4 @@
-"""What the verbs share on the command line: common options, the configuration, and arguments of errors as options."""
+"""Common parts of the verbs: options, the configuration, and errors that name options instead of arguments."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def default_out(name: str) -> Path:
 
 
 class Verb(TyperCommand):
-    """A command whose errors and remarks speak of its options where the core speaks of arguments."""
+    """A command whose errors and remarks name options instead of the core's arguments."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
@@ -142,7 +142,7 @@ def with_options(text: str, ctx: Any) -> str:
 
 
 def _option(name: str, ctx: Any) -> str | None:
-    """Return how an argument of the core is called on the command line; None where it has no option.
+    """Return the option of an argument of the core; None if it has none.
 
     An argument `step_s` is the option whose parameter is called so; a configuration key `persist.step_s` is, too, if
     that option was given.

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class StampsCount(StrEnum):
-    """What stamps count, as `types.Clock`, which would load numpy for `--help`."""
+    """Clock of stamps, as `types.Clock`, which would load numpy for `--help`."""
 
     UNIX = "unix"
     RECORDING = "recording"

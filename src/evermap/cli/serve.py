@@ -1,4 +1,4 @@
-"""`evermap serve` and `evermap work`: the maps of a fleet behind HTTP, and those who enter its sessions."""
+"""`evermap serve` and `evermap work`: the maps of a fleet behind HTTP, and the workers that enter its sessions."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def serve(
 ) -> None:
     """Serve the maps of a fleet: sessions are uploaded, queued, and entered by workers.
 
-    The first token, of an administrator, is printed where there is none yet.
+    Without any token, that of an administrator is created and printed.
 
     \b
     Examples:
@@ -183,7 +183,7 @@ def doctor(
 
 
 def _of_database(store: str) -> Iterator[tuple[str, bool, str]]:
-    """What is to be known of the store of a server: what, whether it is fine, and a line on it."""
+    """Yield the checks of a server's store: name, result, and a line."""
     from evermap.maps.store import is_address
     from evermap.server.database import VERSION, Role
     from evermap.server.sites import SiteStores
@@ -225,7 +225,7 @@ def _of_database(store: str) -> Iterator[tuple[str, bool, str]]:
 
 
 def _of_address(url: str) -> tuple[str, bool, str]:
-    """Whether a server answers there, in a way that nobody can listen to."""
+    """Return whether a server answers there over TLS."""
     from urllib.request import urlopen
 
     host, scheme = urlsplit(url).hostname or "", urlsplit(url).scheme
@@ -308,7 +308,7 @@ def _uvicorn() -> Any:
 
 @contextmanager
 def _working(store: str, count: int) -> Iterator[None]:
-    """Run workers beside this process, and end them with it; what they were at goes back to the queue."""
+    """Run worker processes, and end them with this one; their sessions return to the queue."""
     command = [sys.executable, "-m", "evermap", "work", "--store", store]
     processes = [subprocess.Popen(command, stdin=subprocess.DEVNULL) for _ in range(count)]  # nosec  # B603: ourselves
     try:

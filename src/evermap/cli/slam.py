@@ -284,7 +284,7 @@ def run_and_write(
     realtime: bool = False,
     **how: Unpack[_How],
 ) -> None:
-    """Run, write the folder, show what came out. A run that Ctrl-C cut short is written as far as it came."""
+    """Run, write the folder, show the results. A run interrupted by Ctrl-C is written as far as it got."""
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.pipeline import run_slam
     from evermap.slam.changes.joint import may_search
@@ -348,7 +348,7 @@ class _How(TypedDict):
 
 
 def _info(config: Config, elapsed_s: float, *, realtime: bool, entered: Entered | None = None) -> RunInfo:
-    """What the result cannot say of a run."""
+    """Return the facts on a run that its result lacks."""
     from evermap.runs.summary import RunInfo
 
     return RunInfo(
@@ -364,7 +364,7 @@ def _info(config: Config, elapsed_s: float, *, realtime: bool, entered: Entered 
 def _write(
     out: Path, recording: AnyRecording, result: SlamResult, config: Config, info: RunInfo, **how: Unpack[_How]
 ) -> None:
-    """Write the folder; print its summary as JSON, or the main numbers, the files to look at and what was found."""
+    """Write the folder; print its summary as JSON, or the main numbers, the main files and the changes."""
     from evermap.runs.folder import write_run
     from evermap.viz.change_words import explanations, grew
 
@@ -383,7 +383,7 @@ def _write(
 
 
 def main_numbers(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the main numbers of a run's summary, with what they are called."""
+    """Return the main numbers of a run's summary, with their names."""
     twice = (
         {"orientation_rmse_deg"} if summary["metrics"].get("heading_rmse_deg") is not None else set()
     )  # in the plane
@@ -422,14 +422,14 @@ def _check_map_options(
 
 
 def _check_together(**given: object) -> None:
-    """Refuse what is for one robot."""
+    """Refuse options for a single robot."""
     for field, value in given.items():
         if value is not None:
             raise ConfigError("is for one robot at a time", field=field, hint="omit it or --together")
 
 
 def _write_what_is_to_edit(folder: Path | None, bag: Path | None, *, in_space: bool) -> None:
-    """Write a template of a recording, or what is read of a bag."""
+    """Write a template of a recording, or the settings of a bag."""
     from evermap.io import write_template
 
     if folder is None:
@@ -484,12 +484,12 @@ def _associated(unknown_ids: bool, empty_ids: bool) -> bool | str | None:
 
 
 class MapOptions(NamedTuple):
-    """What the command line says of a living map.
+    """Options of a living map.
 
     Attributes:
         map_file: the map.
-        priors: how long things stay, `[CLASS=]PRIOR`.
-        localize: only localise; the map stays.
+        priors: lifetimes, `[CLASS=]PRIOR`.
+        localize: only localise; the map is not changed.
         realtime: at the recording's pace.
         survey: landmarks that a new map begins with.
         later: of several sessions this is not the first: it needs the survey only if none before it began the map.
@@ -504,7 +504,7 @@ class MapOptions(NamedTuple):
 
 
 def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out: Path, **how: Unpack[_How]) -> None:
-    """Run, write the folder, then commit the map: what is in the map has its folder, whatever happens in between."""
+    """Run, write the folder, then commit the map, so that every session in the map has its folder."""
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.existence.models import priors_of
     from evermap.maps.store import open_store

@@ -261,7 +261,7 @@ def _draw(path: Path, groups: Sequence[LifetimeGroup], estimates: Sequence[Lifet
 
 
 def _remarks(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> list[str]:
-    """What a reader of the result must know."""
+    """Return remarks on the result."""
     import numpy as np
 
     endless = [g.label for g in groups if not np.isfinite(table.data.right_s[g.rows]).any()]
@@ -269,7 +269,7 @@ def _remarks(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> list[str]
 
 
 def _counts(table: LifetimeTable, group: LifetimeGroup) -> dict[str, Any]:
-    """How many lifetimes there are of each sort."""
+    """Return the number of lifetimes of each sort."""
     import numpy as np
 
     left, right, entry = (getattr(table.data, name)[group.rows] for name in ("left_s", "right_s", "entry_s"))
@@ -285,7 +285,7 @@ def _counts(table: LifetimeTable, group: LifetimeGroup) -> dict[str, Any]:
 
 
 def _content(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) -> dict[str, Any]:
-    """For `--json`."""
+    """Return the content of `--json`."""
     who: dict[str, Any] = {}
     if group.class_id is not None:
         who["class_id"] = group.class_id
@@ -302,7 +302,7 @@ def _content(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate
 
 
 def _lines(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) -> list[tuple[str, str]]:
-    """What a person wants to know."""
+    """Return the lines for people."""
     counts = _counts(table, group)
     ends = f"{counts['exact']:,} observed, {counts['intervals']:,} between two looks"
     lines = [
@@ -318,7 +318,7 @@ def _lines(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) 
 
 
 def _learned_lines(choice: Choice) -> list[tuple[str, str]]:
-    """What a person wants to know of a model."""
+    """Return the lines on a model for people."""
     import numpy as np
 
     from evermap.survival.durations import duration_text

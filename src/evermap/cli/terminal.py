@@ -1,4 +1,4 @@
-"""What the verbs share at the terminal: lines, tables and progress. Results go to stdout, everything else to stderr."""
+"""Terminal output of the verbs: lines, tables and progress. Results go to stdout, everything else to stderr."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _MOST = 2000
 
 
 def echo(line: str) -> None:
-    """Print a line of the result, names as they are, without control characters."""
+    """Print a line of the result, with unchanged names, without control characters."""
     typer.echo(printable(line))
 
 
@@ -72,7 +72,7 @@ def print_table(
     Args:
         title: above it.
         rows: cells.
-        head: names of the columns; none for lines that say what they are.
+        head: names of the columns; none for self-explanatory lines.
         numbers: columns to align right.
     """
     cells = [[printable(cell) for cell in line] for line in rows]
@@ -97,7 +97,7 @@ def print_table(
 
 
 def warm_up(compile_kernels: Callable[[], None] | None = None) -> None:
-    """Compile the kernels (of the pipeline if not told which), or load them; says so where that takes a while."""
+    """Compile the kernels (of the pipeline by default), or load them; prints a line if that takes a while."""
     if compile_kernels is None:
         from evermap.slam.warmup import warm_up as of_the_pipeline
 
@@ -146,7 +146,7 @@ def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]
 
 
 def command_line() -> str:
-    """Return what was typed, for the summary, without passwords in addresses."""
+    """Return the command line, for the summary, without passwords in addresses."""
     return re.sub(r"(://[^/\s:@]*):[^/\s@]*@", r"\1:***@", shlex.join(["evermap", *sys.argv[1:]]))
 
 

@@ -86,7 +86,7 @@ def _need_screen() -> None:
 
 
 def _look_at(path: Path, save: Path | None, *, as_json: bool) -> None:
-    """Show what was written."""
+    """Open the written file in the viewer."""
     from evermap.runs.folder import check_output_file
     from evermap.runs.view import write_view
 

@@ -113,7 +113,7 @@ class Data(Shown):
         return cls(tuple(pieces), weights, tuple(n - 1 - weeks for weeks in ago), n, step_s, rhythm, span, last)
 
     def days(self, model: RunLength, counted: FloatArray) -> tuple[FloatArray, Data, DayShares]:
-        """Infer the kinds of the days from their looks.
+        """Estimate the kinds of the days from their looks.
 
         Args:
             model: presence model with a rhythm.

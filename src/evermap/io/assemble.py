@@ -1,4 +1,4 @@
-"""The checks that every recording passes, whatever it was read from, and what is survived with a counted warning."""
+"""The checks of every recording, in any format, and defects that are tolerated with a counted warning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2 as recordings in space: which topics are what, where the sensors are, what was seen.
+"""Bags of ROS 1 and ROS 2 as recordings in space: topics, mounts and detections.
 
 What a topic holds follows from the type of its messages, the sensors' mounts from the tree of frames, the cameras from
 their `CameraInfo`. What is guessed can be written to a file beside the bag (`bag_settings`), edited there, and is read
@@ -66,7 +66,7 @@ _MODELS = {"plumb_bob": "radtan", "radtan": "radtan", "equidistant": "equidistan
 
 @dataclass(frozen=True, slots=True)
 class BagSensor:
-    """How the messages of one topic are read.
+    """Settings of one topic of detections.
 
     Attributes:
         topic: of the detections.
@@ -89,7 +89,7 @@ class BagSensor:
 
 @dataclass(frozen=True, slots=True)
 class BagSettings:
-    """What is read of a bag.
+    """Settings of a bag.
 
     Attributes:
         odometry, truth: topics; '' for none.
@@ -114,7 +114,7 @@ def settings_path(path: str | Path) -> Path:
 
 
 def read_bag(path: str | Path, robot: int | None = None, topics: str | Path | None = None) -> SpatialRecording:
-    """Return the recording in a bag, by its settings file where there is one, else by what its topics seem to be.
+    """Return the recording in a bag, by its settings file if there is one, else by guessed topics.
 
     Args:
         path: `.bag` or `.bag.bz2` of ROS 1; of ROS 2 a folder with `metadata.yaml`, a `.mcap` or a `.db3`.
@@ -137,7 +137,7 @@ def read_bag(path: str | Path, robot: int | None = None, topics: str | Path | No
 
 
 def bag_settings(path: str | Path) -> str:
-    """Return the settings of a bag as they are guessed, as the text of its settings file.
+    """Return the guessed settings of a bag, as the text of its settings file.
 
     Raises:
         InputError: the bag is missing or damaged.
@@ -215,12 +215,12 @@ def _sensor(content: BagContent, topic: str) -> BagSensor:
 
 
 def stated_settings(path: Path, content: BagContent, guessed: BagSettings, *, whole: bool = True) -> BagSettings:
-    """Return the settings in a file; what it leaves out is as guessed.
+    """Return the settings in a file; missing ones are guessed.
 
     Args:
         path: the file.
         content: of the bag.
-        guessed: what its topics seem to be.
+        guessed: its guessed topics.
         whole: topics that the content lacks are errors; else they may come yet.
 
     Raises:
@@ -327,7 +327,7 @@ def detections_of(
     seen: tuple[list[tuple[int, Seen]], IntArray, Sequence[str], dict[int, str]],
     warnings: list[str],
 ) -> SpatialDetections:
-    """Return what messages say that was seen, with poses, corners and directions.
+    """Return the detections of messages, with poses, corners and directions.
 
     Args:
         path: of the bag, for errors.
@@ -483,7 +483,7 @@ def _odometry(
         return None
     rows, stamp_s = np.array(content.motion[topic], dtype=np.float64), stamps_of(content, topic, settings.clock)
     order = np.argsort(stamp_s, kind="stable")
-    if content.kind(topic) in POSES:  # nobody knows how a robot is turned whose message leaves it out
+    if content.kind(topic) in POSES:  # the orientation of a robot is unknown if its message lacks it
         order = order[np.linalg.norm(rows[order, 3:7], axis=1) > 0.5]
     if not len(order):
         raise DataError(f"poses on {topic} have no orientation", path=path, hint="another topic (`--init-bag`)")

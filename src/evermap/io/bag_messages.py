@@ -1,4 +1,4 @@
-"""What the messages in a bag say of motion, detections, cameras and frames, whatever package their types are of.
+"""Motion, detections, cameras and frames from the messages in a bag, of types in any package.
 
 Fields decide more than types: a pose may come with a header, a covariance, or both; a detection of a tag with its pose
 or its corners; class and score of an object in the forms of three releases of `vision_msgs`.
@@ -38,7 +38,7 @@ class Seen(NamedTuple):
 
 @dataclass(slots=True)
 class BagContent:
-    """All that a bag says of motion, detections, cameras and frames; lists by topic, in the order of recording."""
+    """Motion, detections, cameras and frames of a bag; lists by topic, in the order of recording."""
 
     topics: dict[str, Topic] = field(default_factory=dict)
     stamps: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # in the header, and of recording
@@ -141,7 +141,7 @@ def _seen_of(content: BagContent, topic: str, parts: Callable[[Any, int], Iterat
 
 
 def _said(message: Any) -> tuple[float, str]:
-    """Stamp [s] and frame of a message, or of the first of its parts; nan and '' where there is none."""
+    """Return stamp [s] and frame of a message, or of the first of its parts; nan and '' if missing."""
     for one in (message, *getattr(message, "markers", ()), *getattr(message, "entities", ())):
         if hasattr(one, "header"):
             return stamp_of(one), str(one.header.frame_id)

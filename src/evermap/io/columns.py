@@ -287,7 +287,7 @@ def _cells(column: Any) -> Any:
 
 
 def _without(text: Any, known: BoolArray) -> Any:
-    """An array of text with null for what is not known."""
+    """Return an array of text with null for unknown values."""
     import pyarrow as pa
 
     valid = np.packbits(np.concatenate([np.zeros(text.offset, dtype=np.bool_), known]), bitorder="little")
@@ -368,7 +368,7 @@ def _as_float(cells: Any) -> FloatArray:
 
 
 def _coded(words: Any) -> tuple[IntArray, list[str]]:
-    """Which of its different values each cell has, -1 where it is missing, and these values."""
+    """Return the index of each cell among the distinct values, -1 if missing, and these values."""
     coded = words.dictionary_encode()
     codes, known = numbers_of(coded.indices, np.int32)
     return np.where(known, codes, -1).astype(np.int64), coded.dictionary.to_pylist()

@@ -1,4 +1,4 @@
-"""Files as they are read and written.
+"""Reading and writing of files.
 
 A folder and a zip of it look the same to a reader: a `FileSet` of named byte strings. What is written is there whole or
 not at all: bytes go to a temporary sibling first and then take the name in one step.
@@ -22,7 +22,7 @@ from evermap.interrupts import temporary
 from evermap.io.text import reason
 from evermap.types import Recording, SpatialRecording
 
-# What `zipfile` raises on damaged or encrypted archives, as found by corrupting them at random.
+# Errors of `zipfile` on damaged or encrypted archives, found by corrupting them at random.
 _ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError)
 
 

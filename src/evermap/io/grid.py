@@ -21,7 +21,7 @@ LEAST_SPEED = 0.1
 
 
 class Footprints(NamedTuple):
-    """What landmarks cover of the floor: centres (L, 2), directions (L, 2) of their lengths, halves (L, 2) of their
+    """Footprints of landmarks on the floor: centres (L, 2), directions (L, 2) of their lengths, halves (L, 2) of their
     sizes; points have no size.
     """
 
@@ -51,7 +51,7 @@ class Footprints(NamedTuple):
 
 
 def write_grid(landmarks: Landmarks, path: str | Path, *, cell_m: float = 0.05, radius_m: float = 0.25) -> Path:
-    """Write `path` (.yaml) and the image beside it (.pgm): each cell is as occupied as the landmarks there exist.
+    """Write `path` (.yaml) and its image (.pgm): the occupancy of a cell is P(exists) of its landmarks.
 
     With `mode: scale` a cell gets 100 times the greatest probability to exist of the landmarks that cover it: what is
     certain is kept out by Nav2's keepout filter, what is doubtful costs more.

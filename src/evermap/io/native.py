@@ -219,7 +219,7 @@ def _robot_sightings(table: Table | None, clock: Clock) -> RobotSightings | None
 
 
 def _clock(settings: Settings, tables: dict[str, Table | None], files: FileSet) -> Clock:
-    """What the recording's stamps count: what its dates say, and else what `sensor.toml` says."""
+    """Return the clock of the recording: that of its dates, else that of `sensor.toml`."""
     said = {table.clock(): table for table in tables.values() if table is not None and table.clock() is not None}
     if len(said) > 1:
         problem = "some tables have dates with a zone, others without"

@@ -165,7 +165,7 @@ def _survey(landmarks: Landmarks, names: Mapping[int, str], class_names: tuple[s
 
 
 def _called(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
-    """A column of ids: as they are, or as text where some have a text behind them."""
+    """Return a column of ids: as numbers, or as text if any id has a text."""
     if not names.keys() & set(landmark_id.tolist()):
         return landmark_id
     return ["" if number == UNKNOWN else names.get(number, str(number)) for number in landmark_id.tolist()]

@@ -38,7 +38,7 @@ _CAMERA = ("model", "intrinsics", "distortion", "resolution_px", "baseline_m", "
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The sensors of a recording in space, and what is known of its tags.
+    """The sensors of a recording in space, and the sizes of its tags.
 
     Attributes:
         settings: name, clock and the like.

@@ -117,7 +117,7 @@ class Table:
         return Table(self.path, {name: plain}, self.line, self.header_line).ids(name, optional=optional)
 
     def labels(self, name: str) -> list[str]:
-        """Return a column of names, '' where empty. Whole numbers stand for themselves as text."""
+        """Return a column of names, '' where empty. Whole numbers are converted to text."""
         cells = self.columns[name]
         if not isinstance(cells, np.ndarray):
             broken = [row for row, cell in enumerate(cells) if not cell.isprintable()]
@@ -336,7 +336,7 @@ def _split(line: str, path: Path, number: int) -> list[str]:
 
 
 def _broken(cell: str, others: list[list[str]]) -> bool:
-    """Whether a cell is not a number in a column that otherwise is one."""
+    """Return whether a cell is not a number in a column of numbers."""
     return not _is_number(cell) and bool(others) and all(_is_number(row[-1]) for row in others[-8:])
 
 

@@ -85,9 +85,9 @@ Not part of the recording: an older map, for '--prior-map survey.csv'. The cart,
 
 
 def write_template(folder: str | Path, *, in_space: bool = False) -> Path:
-    """Write a commented, complete recording that can be localised as it is; the same bytes every time.
+    """Write a commented, complete recording that runs unchanged; the same bytes every time.
 
-    In the plane a minute, beside an older map; in space 20 s.
+    In the plane one minute, with an older map; in space 20 s.
 
     Args:
         folder: to make.

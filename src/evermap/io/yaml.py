@@ -135,7 +135,7 @@ def _map(lines: list[_Line], start: int, path: Path) -> tuple[dict[str, Any], in
 
 
 def _inside(lines: list[_Line], start: int, indent: int, path: Path) -> tuple[Any, int]:
-    """What stands deeper than `indent` from a line on; None where nothing does."""
+    """Return the block indented deeper than `indent` from a line on; None if there is none."""
     if start < len(lines) and lines[start].indent > indent:
         return _block(lines, start, path)
     return None, start

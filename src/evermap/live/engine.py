@@ -1,4 +1,4 @@
-"""The engine of a robot that drives: `Engine` takes readings as they come, and tells what the robot may know by then.
+"""The live engine: `Engine` takes readings as they arrive, and returns causal estimates.
 
 In a map the localiser of `run_localization` says where the robot is, in an unmapped place the stream of a
 session; both frame by frame, as over a recording. What was driven is entered by `run_session`, in a process of its own
@@ -37,9 +37,9 @@ Numbers = Sequence[float] | FloatArray
 
 
 class Engine:
-    """Feed readings with `odometry` and `detections`, from any thread, and ask with `step`.
+    """Feed readings with `odometry` and `detections`, from any thread, and call `step` for estimates.
 
-    As a context manager it enters what was driven when the block ends; after an error or a crash the next engine does.
+    As a context manager it enters the drive when the block ends; after an error or a crash the next engine does.
 
     Args:
         map: file of a living map, made where there is none; or a map in memory, which stays as it is.
@@ -92,7 +92,7 @@ class Engine:
 
     @property
     def mapping(self) -> bool:
-        """Whether what is driven enters the map. It may be set at any time; what was driven until then is entered."""
+        """Whether the drive enters the map. It may be set at any time; the drive until then is entered."""
         return self._mapping
 
     @mapping.setter
@@ -109,12 +109,12 @@ class Engine:
 
     @property
     def living(self) -> LivingMap:
-        """The map that the robot is in, as it is stored."""
+        """The stored map that the robot is in."""
         return self._living
 
     @property
     def sensor(self) -> Sensor:
-        """What sees landmarks."""
+        """The sensor of landmarks."""
         return self._sensor
 
     @property
@@ -166,11 +166,11 @@ class Engine:
         sigma_range_m: Numbers | None = None,
         sigma_bearing_rad: Numbers | None = None,
     ) -> None:
-        """Take what the sensor saw in a frame; one in which it saw nothing is one, too: what was expected is missed.
+        """Take the detections of a frame; also call it for a frame without any: expected landmarks are misses.
 
         Args:
             stamp_s: when it looked.
-            landmark_id: (M,) what was seen, as numbers or texts; -1 for unknown.
+            landmark_id: (M,) detected landmarks, as numbers or texts; -1 for unknown.
             range_m: (M,) distances from the sensor.
             bearing_rad: (M,) counter-clockwise from where it looks.
             class_name: (M,) classes, None for unknown ones.
@@ -185,7 +185,7 @@ class Engine:
         )
 
     def step(self) -> Now:
-        """Process what has come, and tell what the robot knows by now; without anything new in some microseconds."""
+        """Process new readings, and return the present estimates; without new readings in some microseconds."""
         with self._lock:
             if self._keeper.collect():
                 self._keeper.beside("load", self._go_on)
@@ -197,7 +197,7 @@ class Engine:
             if ready:
                 self._keep_house()
             if self._judge is not None:
-                if not self._mapping:  # no revision will tell
+                if not self._mapping:  # no revision will report these
                     self._told.known.clear()
                 self._told.add(self._judge.told())
             return self._now()
@@ -205,7 +205,7 @@ class Engine:
     def landmarks(
         self, *, at: float | None = None, within: tuple[float, float, float, float] | None = None
     ) -> Landmarks:
-        """Return the landmarks of the map as they are believed in by now, or at a later stamp.
+        """Return the landmarks of the map with their present beliefs, or at a later stamp.
 
         Args:
             at: stamp for which the probabilities are asked.
@@ -220,10 +220,10 @@ class Engine:
         warm_up(self._config)
 
     def save(self) -> Entered | None:
-        """Enter what was driven as a revision, and go on in the map that comes of it.
+        """Enter the drive so far as a revision, and continue in that map.
 
         Returns:
-            What it made of the map; None where nothing was entered, which is a warning of the next step.
+            The entered session; None if nothing was entered, which is a warning of the next step.
 
         Raises:
             InputError: the map is in memory.
@@ -240,7 +240,7 @@ class Engine:
             return entered
 
     def close(self) -> None:
-        """End without entering what was driven since the last time; the next engine of the map does."""
+        """End without entering the drive since the last revision; the next engine of the map does."""
         with self._lock:
             self._keeper.wait(self._lock)
             self._keeper.close()
@@ -258,7 +258,7 @@ class Engine:
             self.close()
 
     def _process(self, frame: LiveFrame, odometry: FloatArray, *, kept: bool) -> None:
-        """A frame through the filter; before any odometry it says nothing."""
+        """Process a frame by the filter; before any odometry it has no effect."""
         if frame.stamp_s < self._inbox.first_s or not len(odometry):
             return
         if self._filter is None:
@@ -306,7 +306,7 @@ class Engine:
         return KnownPlaces.of(rows.landmark_id, rows.position_m, living.covariance_m2, rows.p_exists).existing()
 
     def _keep_house(self) -> None:
-        """Do what is due: a revision, readings to the disk, the question what has changed."""
+        """Do periodic work: a revision, readings to the disk, an update of changes."""
         live, now_s = self._config.live, self._inbox.settled_s
         if not self._mapping:
             if now_s - self._session_s >= live.idle_s:
@@ -326,7 +326,7 @@ class Engine:
 
     @property
     def _can_be_found(self) -> bool:
-        """Whether the session so far shows enough of the map to be entered; one that explores goes on until it does."""
+        """Return whether the session so far shows enough of the map to be entered; an exploring one continues."""
         return (
             len(self._met) >= self._config.slam.localize.enough
             if isinstance(self._filter, Localizer)

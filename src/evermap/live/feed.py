@@ -1,4 +1,4 @@
-"""What feeds an engine and what it tells are two ends of a wire: readings come from an iterator, answers go to a call.
+"""The loop around an engine: readings come from an iterator, outputs go to a callback.
 
 A recording that is replayed is such an iterator; a transport of a robot's middleware is another one.
 """
@@ -45,7 +45,7 @@ _Stamped = TypeVar("_Stamped", bound=tuple[Any, ...])
 
 
 def replayed(recording: Recording, *, paced: bool = False) -> Iterator[Reading | None]:
-    """Yield the readings of a recording in the order of their stamps, and None after every look.
+    """Yield the readings of a recording in the order of their stamps, and None after every frame.
 
     Args:
         recording: in the plane.
@@ -87,7 +87,7 @@ def in_time(stamped: Iterable[_Stamped], *, paced: bool, speed: float = 1.0) -> 
 def run_live(
     engine: Engine, readings: Iterable[Reading | None], tell: Callable[[Now], None], refused: Callable[[str], None]
 ) -> None:
-    """Feed an engine until the readings end, with a step wherever None is among them.
+    """Feed an engine until the readings end, with a step for every None among them.
 
     Args:
         engine: that is fed.

@@ -1,4 +1,4 @@
-"""Readings as they arrive: checked, put in order of their stamps, kept for the map.
+"""Incoming readings: validated, sorted by stamps, kept for the map.
 
 A reading may come late by a window of time. A frame is given out when nothing that may still come is earlier than it,
 and when the odometry is known up to it: what is later than that would change a pose that was told already.
@@ -59,12 +59,12 @@ class LiveFrame(NamedTuple):
 
     @property
     def landmark_id(self) -> IntArray:
-        """(M,) what was seen."""
+        """(M,) detected landmarks."""
         return self.rows[:, 0].astype(np.int64)
 
 
 class Inbox:
-    """What was fed. Every method may be called from any thread.
+    """Readings fed so far. Every method may be called from any thread.
 
     Args:
         about: name, sensor, clock and classes of the recording that is made of the readings.
@@ -189,7 +189,7 @@ class Inbox:
             return frames + self._odometry.nbytes
 
     def _in_time(self, stamp_s: float, put: Callable[[], None]) -> None:
-        """Put a reading in; one whose stamp is far later than all others when the next one says the same."""
+        """Insert a reading; one with a stamp far later than all others only after the next one confirms it."""
         before, self._stray = self._stray, None
         if stamp_s > self.newest_s + self._stray_s:  # the first one, too
             if before is None or abs(before[0] - stamp_s) > self._stray_s:
@@ -235,7 +235,7 @@ class Inbox:
         self._n_odometry, self._n_written = kept.shape[1], self._n_written - first
 
     def _keep(self, frame: LiveFrame, before_s: float) -> bool:
-        """Whether there is room for a frame's readings: a bucket that fills with time."""
+        """Return whether a frame's readings fit the maximum rate: a token bucket."""
         since_s = min(frame.stamp_s - before_s, BURST_S)
         self._room = min(self._room + self._readings_hz * since_s, self._readings_hz * BURST_S)
         if self._room < 0.0:

@@ -1,4 +1,4 @@
-"""What a drive says of the map so far: beliefs of what is in view, and changes as they become certain."""
+"""Beliefs of landmarks in view, and changes, during a drive."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class _Glance(NamedTuple):
 
 
 class Judge:
-    """Looks at a map, asked from time to time what they say; by another thread than the one that looks.
+    """Accumulated looks at a map, evaluated from time to time by another thread.
 
     Args:
         living: the map.
@@ -70,12 +70,12 @@ class Judge:
 
     @property
     def living(self) -> LivingMap:
-        """The map as it is believed to be by now."""
+        """The map with its present beliefs."""
         after, vicinity = self._after
         return after if vicinity is None else vicinity.put_back(after)
 
     def look(self, frame: LiveFrame, located: Located, states: FloatArray) -> None:
-        """Take what was seen of the map in a frame, with (9,) calibration states; of many frames some."""
+        """Take the looks of a frame, with (9,) calibration states; a subset of dense frames."""
         if located.lost or not len(located.expected):
             return
         if self._glances and frame.stamp_s < self._glances[-1].stamp_s + self._config.live.look_s:
@@ -126,7 +126,7 @@ class Judge:
         return found
 
     def in_view(self, located: Located) -> Landmarks:
-        """Return the landmarks that are, or should be, in view, with what is believed of them by now."""
+        """Return the landmarks that are, or should be, in view, with their present beliefs."""
         with self._lock:
             table = self._table
         seen = located.place[located.place != UNKNOWN]
@@ -148,7 +148,7 @@ def _sighted(living: LivingMap, glances: Sequence[_Glance]) -> Sighting:
 
 
 def _with_moves(changes: Sequence[MapChange], glances: Sequence[_Glance], fewest: int) -> list[MapChange]:
-    """What has left its place and is seen at another one, which the map does not have yet, has moved."""
+    """Return changes in which a landmark that left its place and is seen at a new one has moved."""
     names = np.concatenate([one.elsewhere_id for one in glances])
     away_m = np.concatenate([one.away_m for one in glances])
     told = []

@@ -1,4 +1,4 @@
-"""What is done beside the steps of an engine: readings to the disk, sessions into the map, threads and processes."""
+"""Parallel work of an engine: readings to the disk, sessions into the map, threads and processes."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from evermap.types import Clock, MapChange
 
 @dataclass
 class News:
-    """What the next step tells, and changes that were told since the newest revision."""
+    """Outputs of the next step, and changes reported since the newest revision."""
 
     changes: list[MapChange] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     known: set[tuple[Any, ...]] = field(default_factory=set)
 
     def add(self, changes: Sequence[MapChange]) -> None:
-        """Add changes that were not told."""
+        """Add unreported changes."""
         for change in changes:
             if (key := (change.kind, change.landmark_ids)) not in self.known:
                 self.known.add(key)
@@ -46,7 +46,7 @@ class News:
 
 
 class Keeper:
-    """The sessions of a map file, of which one is being driven.
+    """The sessions of a map file, including the current one.
 
     Args:
         path: the map; None for a map in memory, of which nothing is kept.
@@ -117,7 +117,7 @@ class Keeper:
             return store.load(head), changes
 
     def beside(self, name: str, job: Callable[[], None]) -> None:
-        """Run something beside the steps, unless it still runs."""
+        """Run a job in parallel to the steps, unless it still runs."""
         before = self._jobs.get(name)
         if self._pool is None:
             job()
@@ -125,7 +125,7 @@ class Keeper:
             self._jobs[name] = self._pool.submit(job)
 
     def collect(self) -> bool:
-        """Take what was done beside the steps; returns whether sessions were entered."""
+        """Collect the results of parallel jobs; returns whether sessions were entered."""
         for name, job in list(self._jobs.items()):
             if not job.done():
                 continue
@@ -162,7 +162,7 @@ class Keeper:
         self._inbox.cut(f"{self._name} {self.n_sessions}")
 
     def enter_if_waiting(self) -> bool:
-        """Enter sessions that wait, beside the steps; returns whether that is done already."""
+        """Enter waiting sessions in parallel; returns whether that is done already."""
         waiting = [] if self._spool is None or self._child is not None else self._spool.waiting()
         if not waiting or waiting == self._tried:
             return False
@@ -183,7 +183,7 @@ class Keeper:
         return entered
 
     def wait(self, lock: threading.RLock) -> None:
-        """Wait for what is done beside the steps, which may need the lock."""
+        """Wait for parallel jobs, which may need the lock."""
         while self._child is not None or self._jobs:
             if self._child is not None:
                 self._child.wait()

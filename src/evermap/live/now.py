@@ -1,4 +1,4 @@
-"""What an engine tells with every step, and the recording that it begins with."""
+"""The output of an engine's step, and its initial recording."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from evermap.types import Clock, FloatArray, Landmarks, MapChange, Recording, Se
 
 @dataclass(frozen=True, slots=True)
 class Now:
-    """What the robot knows.
+    """Present state of the robot and its map.
 
     Attributes:
         stamp_s: of the newest odometry; nan before any.

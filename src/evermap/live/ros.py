@@ -1,4 +1,4 @@
-"""Messages of ROS 2 as readings of an engine, and what the engine knows as messages: no ROS is needed for either.
+"""Conversion of ROS 2 messages to readings of an engine, and of its outputs to messages, without ROS.
 
 What topics hold is guessed or stated as for a bag (`io.bag`). The engine drives in the plane, so what was seen is laid
 on the floor under the robot.
@@ -118,7 +118,7 @@ class Listener:
         return (self.settings.base_frame if self.settings is not None else "") or "base_link"
 
     def readings(self, message: Message) -> list[Reading]:
-        """Return what a message says, and those before it that waited until it was known what is read.
+        """Return the readings of a message, and of earlier ones that waited for the choice of topics.
 
         Raises:
             InputError: it cannot be read, or says what cannot be.
@@ -156,7 +156,7 @@ class Listener:
         return self.base_frame, None
 
     def _guess(self, now_s: float) -> bool:
-        """Whether it is known by now what is read."""
+        """Return whether the topics are chosen."""
         guessed = guessed_settings(self._content)
         if guessed.odometry and guessed.sensors:
             self._first_s = min(self._first_s, now_s)
@@ -182,14 +182,14 @@ class Listener:
             self._say(text)
 
     def _forget(self, topic: str, most: int) -> None:
-        """Drop what was read of a topic if it is more than so many messages."""
+        """Drop messages of a topic beyond a number."""
         content = self._content
         if len(content.stamps.get(topic, ())) > most:
             for kept in (content.stamps, content.motion, content.seen):
                 kept.get(topic, []).clear()
 
     def _velocities(self, topic: str) -> Iterator[Velocity]:
-        """What poses say between two of them, from the first on; nothing between two of different publishers."""
+        """Return velocities between successive poses; none between those of different publishers."""
         assert self.settings is not None
         content, source = self._content, self._sources[topic]
         stamps = stamps_of(content, topic, self.settings.clock).tolist()
@@ -262,7 +262,7 @@ class Listener:
 
 
 def heard(mailbox: Mailbox, listener: Listener, refused: Callable[[str], None]) -> Iterator[Reading | None]:
-    """Yield readings as they come, for ever, and None after every look and where none waits.
+    """Yield readings as they arrive, without end, and None after every frame and if none waits.
 
     Args:
         mailbox: where messages come in.
@@ -283,7 +283,7 @@ def heard(mailbox: Mailbox, listener: Listener, refused: Callable[[str], None]) 
 def spoken(
     recording: AnyRecording, listener: Listener, refused: Callable[[str], None], *, paced: bool = False
 ) -> Iterator[Reading | None]:
-    """Yield what a listener makes of the messages of a robot that drives as in a recording, and None after each.
+    """Yield the readings of a listener for messages made from a recording, and None after each.
 
     Args:
         recording: of any kind.
@@ -297,7 +297,7 @@ def spoken(
 
 
 def play(recording: AnyRecording, wires: Sequence[Wire], going_on: Callable[[], None], *, speed: float = 1.0) -> int:
-    """Send what a robot publishes that drives as in a recording; returns the number of messages.
+    """Publish the messages of a recorded drive; returns their number.
 
     Args:
         recording: of any kind.
@@ -329,7 +329,7 @@ def _on_the_floor(pose: FloatArray) -> FloatArray:
 
 
 class Scene(Protocol):
-    """What shows a drive; stamps in seconds, places (3,) in the map."""
+    """Protocol of viewers of a drive; stamps in seconds, places (3,) in the map."""
 
     def robot(self, stamp_s: float, position_m: FloatArray, quaternion: FloatArray) -> None:
         """Show where the robot is."""
@@ -345,7 +345,7 @@ class Scene(Protocol):
 
 
 def look_on(mailbox: Mailbox, scene: Scene, going_on: Callable[[], None]) -> None:
-    """Show what an engine tells, until `going_on` raises `KeyboardInterrupt`."""
+    """Show the outputs of an engine, until `going_on` raises `KeyboardInterrupt`."""
     types = ros2_types()
     try:
         while True:
@@ -376,7 +376,7 @@ def _show(message: Any, scene: Scene) -> None:
 
 
 class Teller:
-    """Sends what an engine knows, in a thread of its own: of poses the newest, and all changes.
+    """Publishes the outputs of an engine in a separate thread: the newest pose, and all changes.
 
     Args:
         engine: whose landmarks are told.
@@ -403,7 +403,7 @@ class Teller:
         self._thread.start()
 
     def tell(self, now: Now, listener: Listener | None = None) -> None:
-        """Take what is known, and the odometry's pose as a listener knows it; returns at once."""
+        """Take the present state, and the odometry's pose of the listener; returns at once."""
         driven = ("base_link", None) if listener is None else listener.odometry_at(now.stamp_s)
         with self._lock:
             self._now, self._driven = now, driven
@@ -411,7 +411,7 @@ class Teller:
         self._news.set()
 
     def close(self) -> None:
-        """Send what is left, and end."""
+        """Send pending messages, and end."""
         self._stop = True
         self._news.set()
         self._thread.join(timeout=5.0)
@@ -479,7 +479,7 @@ class Teller:
             self._draw([marker for marker, _ in pairs], [], [entity for _, entity in pairs], now.stamp_s)
 
     def _is_news(self, seen: Landmarks) -> BoolArray:
-        """Whether each landmark is elsewhere, or otherwise believed in, than was told."""
+        """Return whether position or belief of each landmark differs from the published one."""
         now = np.column_stack([seen.position_m, seen.p_exists])
         untold = np.full(now.shape[1], np.nan)
         said = np.array([self._told.get(one, untold) for one in seen.landmark_id.tolist()]).reshape(now.shape)

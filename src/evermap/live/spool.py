@@ -1,4 +1,4 @@
-"""Readings of a drive on the disk, beside its map, until they have entered it: what survives a crash.
+"""Readings of a drive on the disk until they have entered the map; they survive a crash.
 
 The folder `MAP.live` holds a file for each session: parts of a recording one after the other, each with its length in
 front, so that a part that a crash cut off is recognised. The one that is being written ends in `.part`. A process that
@@ -32,7 +32,7 @@ TRIES = 3
 
 @dataclass(frozen=True, slots=True)
 class Brought:
-    """What became of a session that was waiting.
+    """Result of entering a waiting session.
 
     Attributes:
         name: of its recording.
@@ -107,7 +107,7 @@ class Spool:
         return sorted(self.folder.glob("*.readings"))
 
     def enter_beside(self) -> subprocess.Popen[str]:
-        """Enter what waits in a process of its own, which tells a line of JSON for each session."""
+        """Enter waiting sessions in a separate process, which prints a line of JSON for each."""
         command = [sys.executable, "-c", "import sys; from evermap.live.spool import _main; _main(*sys.argv[1:])"]
         quiet = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
         return subprocess.Popen(  # nosec  # B603: ourselves; no shell reads the name of the map
@@ -116,7 +116,7 @@ class Spool:
 
 
 def enter_waiting(map_file: Path) -> Iterator[Brought]:
-    """Enter the sessions that wait beside a map, one after the other, and tell of each.
+    """Enter the waiting sessions of a map, one after the other, and report each.
 
     One that cannot be entered is set aside as a recording in the native format, beside the others.
     """
@@ -190,7 +190,7 @@ def _entered(map_file: Path, recording: Recording, config: Config, path: Path) -
 
 
 def _main(map_file: str) -> None:
-    """Enter what waits, and tell: the process beside the engine."""
+    """Enter waiting sessions and report them: the main function of the separate process."""
     with suppress(OSError, AttributeError):
         os.nice(10)
     for one in enter_waiting(Path(map_file)):

@@ -35,7 +35,7 @@ HINT = "pip install 'evermap[live]'"
 
 
 class Message(NamedTuple):
-    """A message as it came.
+    """A received message.
 
     Attributes:
         topic: name.
@@ -75,7 +75,7 @@ class Mailbox:
         self._came.set()
 
     def take(self) -> Message | None:
-        """Return the oldest message that waits, None where there is none."""
+        """Return the oldest waiting message, None if there is none."""
         try:
             return self._waiting.popleft()
         except IndexError:
@@ -255,7 +255,7 @@ class Foxglove:
 
 
 class _Clients:
-    """What clients of Foxglove's server do, as the library calls it from a thread of its own."""
+    """Callbacks of Foxglove's server, called by the library from a separate thread."""
 
     def __init__(self, mailbox: Mailbox) -> None:
         self._mailbox = mailbox
@@ -300,13 +300,13 @@ def _zenoh_config(zenoh: Any, where: str) -> Any:
 
 
 def _first_line(error: Exception) -> str:
-    """What is wrong, and with a file where, without where in the library's source."""
+    """Return the first line of an error, without positions in the library's source."""
     first, *others = str(error).split(" at /")[0].strip().splitlines() or [type(error).__name__]
     return printable(": ".join([first.strip(" ->"), *(one.strip(" =") for one in others[-1:])]), 200)
 
 
 def wires_of(zenoh: str | None, foxglove: str | None, mailbox: Mailbox | None) -> list[Wire]:
-    """Return the connections that are asked for.
+    """Return the requested connections.
 
     Raises:
         InputError: a package is missing, or a connection cannot be.

@@ -1,4 +1,4 @@
-"""What concerns all maps of a company, in this process or on a Dask cluster: `evermap learn`, `evermap map reenter`.
+"""Work on all maps of a company, in this process or on a Dask cluster: `evermap learn`, `evermap map reenter`.
 
 A class has a mean stay and a shape in the company, and its own at every site, about them; how far sites differ is
 learned, too (`survival.class_lifetimes.SitesPosterior`). Of each map only the log likelihoods of its classes are
@@ -91,7 +91,7 @@ def collect(
     cluster: str | None = None,
     progress: Progress | None = None,
 ) -> list[ClassEvidence]:
-    """Return what each of many maps says of its classes, in their order.
+    """Return the evidence of each of many maps on its classes, in their order.
 
     Args:
         maps: files or addresses; the workers of a cluster reach them under the same names.
@@ -124,7 +124,7 @@ def reenter_all(
     cluster: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Reentered | EvermapError]:
-    """Enter all sessions of many maps again (`runs.sessions.reenter`); returns what came of it, by site.
+    """Enter all sessions of many maps again (`runs.sessions.reenter`); returns the results by site.
 
     Args:
         maps: files or addresses by the names of their sites; the workers of a cluster reach them, and `out`, under the
@@ -153,7 +153,7 @@ def spread_over(
     cluster: str | None = None,
     progress: Progress | None = None,
 ) -> list[Any]:
-    """Return what a function gives for each of many names, in their order: here, in processes, or on a cluster.
+    """Return the results of a function for many names, in their order: here, in processes, or on a cluster.
 
     Args:
         items: the names.

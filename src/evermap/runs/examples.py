@@ -38,7 +38,7 @@ optional    present: the truth, 1 or 0, empty where unknown; it only scores the 
 
 
 def write_looks(path: str | Path) -> Path:
-    """Write a commented table that `evermap persist` takes as it is; the same bytes every time.
+    """Write a commented table for `evermap persist`; the same bytes every time.
 
     Raises:
         InputError: the file exists, or cannot be written.
@@ -98,7 +98,7 @@ class _Stay(NamedTuple):
 
 
 def write_detections(path: str | Path) -> Path:
-    """Write a commented table that `evermap track --range-m 12` takes as it is; the same bytes every time.
+    """Write a commented table for `evermap track --range-m 12`; the same bytes every time.
 
     Raises:
         InputError: the file exists, or cannot be written.
@@ -134,7 +134,7 @@ def _rows(random: np.random.Generator) -> Iterator[tuple[str, ...]]:
 def _seen(
     random: np.random.Generator, there: list[tuple[str, FloatArray]], sensor: FloatArray
 ) -> Iterator[tuple[str, FloatArray]]:
-    """What is detected of what is there, and now and then what is not."""
+    """Return detections of present objects, and some false ones."""
     for kind, position in there:
         if np.linalg.norm(position - sensor) <= RANGE_M and random.random() < _P_DETECT:
             yield kind, position + random.normal(0.0, _SIGMA_M, 3)

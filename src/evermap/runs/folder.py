@@ -1,4 +1,4 @@
-"""What a command writes where the user says, and what it never takes away.
+"""Output folders of commands, and the protection of the user's files.
 
 `RunFolder` is the one way to an output folder, for every verb and from Python. Everything is made in a hidden
 sibling (`.<name>.partial-...`) and takes its place at the very end, so an older good run stays until a new good run
@@ -123,7 +123,9 @@ class RunFolder:
         return content
 
     def _take_place(self) -> None:
-        """Whole by a rename where the old folder is evermap's alone, else file by file among those of the user."""
+        """Move into place by one rename if the old folder is evermap's alone, else file by file among those of the
+        user.
+        """
         try:
             new = {name: _checksum(self._partial / name) for name in self.files() if name != MANIFEST}
             (self._partial / MANIFEST).write_text(_manifest_text({name: [of] for name, of in new.items()}), "utf-8")
@@ -266,7 +268,7 @@ def _places() -> list[Path]:
 
 
 def _real_places(path: Path) -> list[Path]:
-    """Where an input lies: as it is called, where its links lead, and for a folder where the links in it lead."""
+    """Return the paths of an input: as given, with links resolved, and for a folder the targets of its links."""
     path = path.expanduser()
     places = [path.absolute(), Path(os.path.normpath(path.absolute())), path.resolve()]
     with suppress(OSError):
@@ -275,7 +277,7 @@ def _real_places(path: Path) -> list[Path]:
 
 
 def _is_within(path: Path, folder: Path) -> bool:
-    """Whether a path is `folder` or in it, by name or by what the file system says is the same."""
+    """Return whether a path is `folder` or in it, by name or by file identity."""
     if path.is_relative_to(folder):
         return True
     with suppress(OSError):
@@ -298,7 +300,7 @@ def _entries(folder: Path) -> list[str]:
 
 
 def _whose(folder: Path) -> tuple[dict[str, str], list[str]]:
-    """What evermap wrote and is unchanged (its list too), with checksums; and names of the user's files and links."""
+    """Return evermap's unchanged files (with the list) and checksums; and the user's files and links."""
     listed = _manifest(folder)
     ours: dict[str, str] = {}
     foreign = []
@@ -315,7 +317,7 @@ def _whose(folder: Path) -> tuple[dict[str, str], list[str]]:
 
 
 def _check_free(folder: Path, ours: Mapping[str, str], new: Iterable[str]) -> None:
-    """Whether nothing of the user has the name of a new file, or of a folder that it needs.
+    """Check that no file of the user has the name of a new file, or of a folder that it needs.
 
     Raises:
         ConfigError: something has.
@@ -368,7 +370,7 @@ def _cannot_write(out: Path, error: OSError) -> ConfigError:
 
 
 class Asked(TypedDict, total=False):
-    """What a caller asks of a run folder; what is missing or None is left to the configuration.
+    """Requests of a caller for a run folder; missing or None values follow the configuration.
 
     Attributes:
         figures: whether to draw; `config.output.figures`, or yes.
@@ -479,7 +481,7 @@ def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
 
 
 def _write_innovations(innovations: Innovations, path: Path) -> None:
-    """One row a detection that had a prediction; columns as the attributes of `Innovations`."""
+    """Write one row per detection with a prediction; columns as the attributes of `Innovations`."""
     from evermap.io.table import parquet_bytes
 
     path.write_bytes(parquet_bytes(innovations._columns()))
@@ -505,7 +507,7 @@ def _write_figures(folder: RunFolder, figures: Sequence[NamedFigure]) -> None:
 def _write_extras(
     folder: RunFolder, recording: AnyRecording, result: SlamResult, evaluation: Evaluation, asked: Asked, wanted: Any
 ) -> list[str]:
-    """Writes what other programs show, where it is asked for."""
+    """Write the files for other programs, if requested."""
     remarks: list[str] = []
     if _choose(asked.get("scene"), wanted, "rerun", default=False):
         from evermap.viz.rerun_scene import write_scene

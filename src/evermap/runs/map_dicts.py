@@ -1,4 +1,4 @@
-"""A living map and its history as plain values under stable keys, as `evermap map --json` and a server tell them."""
+"""A living map and its history as plain values under stable keys, for `evermap map --json` and the server."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def prior_dicts(living: LivingMap) -> list[dict[str, Any]]:
 
 
 def life_dicts(living: LivingMap) -> list[dict[str, Any]]:
-    """Return what was learned of how long things stay, by class ('' for all) and chunk (None for the whole floor)."""
+    """Return the learned lifetimes, by class ('' for all) and chunk (None for the whole floor)."""
     from evermap.maps.lives import EVERYWHERE
     from evermap.survival.text import prior_text
 

@@ -1,4 +1,4 @@
-"""A run as ROS 2 messages in one MCAP file, which Foxglove opens as it is, RViz plays, and `evermap slam` reads."""
+"""A run as ROS 2 messages in one MCAP file, which Foxglove opens directly, RViz plays, and `evermap slam` reads."""
 
 from __future__ import annotations
 
@@ -347,7 +347,7 @@ def _changes(ros: Ros, result: SlamResult, start_s: float) -> Iterator[_Stamped]
 
 
 def told(ros: Ros, change: MapChange, stamp_s: float, name: str, there: Mapping[int, FloatArray]) -> tuple[Any, Any]:
-    """Return a change as a line and as an arrow in a scene, which is None where none of its landmarks is known.
+    """Return a change as a line and as an arrow in a scene, which is None if none of its landmarks is known.
 
     Args:
         ros: makes the messages.

@@ -81,7 +81,7 @@ def _nanoseconds(stamp_s: float) -> int:
 
 
 def _records(landmarks: Landmarks) -> dict[int, dict[str, Any]]:
-    """What a map says of each landmark, by its id."""
+    """Return the record of each landmark, by its id."""
     classes = labels_of(landmarks.class_id, landmarks.class_names)
     columns = (landmarks.first_seen_s, landmarks.last_seen_s, landmarks.p_exists)
     names = ("class", "first_seen_s", "last_seen_s", "p_exists")
@@ -90,7 +90,7 @@ def _records(landmarks: Landmarks) -> dict[int, dict[str, Any]]:
 
 
 def _cell(value: Any) -> Any:
-    """A value as it is written: nothing for what is not known, and no text that a spreadsheet would run."""
+    """Return the cell of a value: empty if unknown, and without text that a spreadsheet would execute."""
     if isinstance(value, float):
         return repr(value) if math.isfinite(value) else ""
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULAS) else value

@@ -51,12 +51,12 @@ class TwiceError(InputError):
 
 
 class UnbridgedError(DataError):
-    """A late session with which a later one of the map cannot be found any more; others may show what lies between."""
+    """A late session after which a later one can no longer be localised; others may connect them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entered(Shown):
-    """What a session made of a stored map; nothing is committed yet.
+    """Result of a session in a stored map, before its commit.
 
     Attributes:
         session: the session itself, in the map as it was at its time.
@@ -78,7 +78,7 @@ class Entered(Shown):
 
     @property
     def grown(self) -> IntArray:
-        """Landmarks that the map did not know before, and whose appearance was not seen."""
+        """New landmarks whose appearance was not observed."""
         from evermap.maps.diff import grown
 
         return grown(self.newest.members.landmark_id, self.living, self.changes)
@@ -146,7 +146,7 @@ def enter_session(
     later: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Entered:
-    """Bring a session into the newest map of a store, at its place in time.
+    """Enter a session into the newest map of a store, at its time.
 
     Args:
         store: the map.
@@ -224,7 +224,7 @@ WORDS: Mapping[str, Mapping[str, bool]] = {
 def edit_landmarks(
     store: MapStore, landmarks: Sequence[str], word: str, *, note: str = "", command: str = ""
 ) -> tuple[int, tuple[int, ...], str]:
-    """Commit an operator's word on landmarks; nothing where nothing would change.
+    """Commit an operator's edit of landmarks, unless it changes nothing.
 
     Args:
         store: the map.
@@ -416,7 +416,7 @@ def _session_again(store: MapStore, step: _Step, living: LivingMap, config: Conf
 
 @dataclass(frozen=True, slots=True)
 class Reentered(Shown):
-    """What came of entering all sessions of a map again.
+    """Result of entering all sessions of a map again.
 
     Attributes:
         sessions: how many it has.
@@ -464,7 +464,7 @@ def reenter(where: str, work: Path, config: Config | None = None, *, adopt: bool
                     assert isinstance(entered, SqlStore)
                     store.extend(entered)
                 return replace(found, adopted=True)
-            except StaleRevisionError:  # somebody committed meanwhile
+            except StaleRevisionError:  # another process committed meanwhile
                 continue
 
 
@@ -545,7 +545,7 @@ def _last_revert(store: MapStore) -> int:
 
 
 def _said(living: LivingMap) -> dict[str, Life]:
-    """What users said of lifetimes, by class; '' for all others."""
+    """Return the users' lifetime priors, by class; '' for all others."""
     named = (*living.class_names, "")
     return {named[kind]: prior for kind, prior in zip(living.lives.prior_class_id, living.lives.prior, strict=True)}
 

@@ -1,4 +1,4 @@
-"""`summary.json`: what a run was, what it found and what it cost, as plain values with stable keys.
+"""`summary.json`: inputs, results and cost of a run, as plain values with stable keys.
 
 Everything outside of `timing` and `versions` is a function of the inputs and the seed alone.
 """
@@ -40,7 +40,7 @@ _ROBOT = {
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """What the result itself cannot say about a run.
+    """Facts on a run that its result lacks.
 
     Attributes:
         command: the command line, '' if there was none.
@@ -115,8 +115,8 @@ def summary_dict(
     """Return the content of `summary.json` but for `outputs`, which `RunFolder.finish` adds. Pure.
 
     Args:
-        recording: what was processed.
-        result: what came out.
+        recording: the processed recording.
+        result: of the run.
         metrics: `metrics_dict(...)`.
         config: configuration as JSON values.
         info: command and seeds.
@@ -237,7 +237,7 @@ def versions() -> dict[str, str]:
 
 
 def peak_memory_mb() -> float | None:
-    """Return the largest resident size of this process so far [MB]; None where the system does not tell.
+    """Return the largest resident size of this process so far [MB]; None if the system does not report it.
 
     Linux counts the parent's size at the fork into `ru_maxrss`; the high-water mark of the address space does not.
     """

@@ -54,7 +54,7 @@ _PAGE = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
 
 @dataclass(slots=True)
 class Server:
-    """What requests are answered from.
+    """State of a server.
 
     Attributes:
         database: tokens and the queue.
@@ -79,7 +79,7 @@ class Server:
 
 
 def prepare(server: Server) -> None:
-    """Load the code that reading takes, and some of the maps, so that nobody who asks waits for that."""
+    """Load the code for reading, and some of the maps, so that no request waits for that."""
     row, number = np.zeros(1), np.zeros(1, dtype=np.int64)
     one = Landmarks(number, np.zeros((1, 2)), np.zeros((1, 2, 2)), number, row + 1.0, number, number, row, row)
     living = LivingMap.begun(one).from_now_on(0.0)
@@ -90,7 +90,7 @@ def prepare(server: Server) -> None:
 
 
 class PlainJSON(JSONResponse):
-    """JSON in ASCII: whatever text a map holds, also what no encoding has, can be sent."""
+    """JSON in ASCII, so that any text of a map can be sent."""
 
     def render(self, content: Any) -> bytes:
         """Encode the answer."""
@@ -112,7 +112,7 @@ def create_app(server: Server) -> FastAPI:
 
 
 async def _guard(request: Request, answer: Callable[[Request], Awaitable[Response]]) -> Response:
-    """Note who changed what, and tell browsers what a page may do."""
+    """Log changes to the audit, and send the security headers of pages."""
     response = await answer(request)
     response.headers["Content-Security-Policy"] = _POLICY
     response.headers["X-Content-Type-Options"] = "nosniff"
@@ -120,13 +120,13 @@ async def _guard(request: Request, answer: Callable[[Request], Awaitable[Respons
     if request.method == "POST":
         who = getattr(request.state, "who", "-")
         what = f"{request.method} {request.url.path} {getattr(request.state, 'said', '')}"
-        with suppress(*AWAY):  # the answer says so
+        with suppress(*AWAY):  # the answer reports it
             await run_in_threadpool(_server(request).database.note, who, what, response.status_code)
     return response
 
 
 async def _mistake(request: Request, error: Exception) -> Response:
-    """One line, without the places of files on this machine."""
+    """Return one line, without paths of this machine."""
     assert isinstance(error, EvermapError)
     status = 404 if isinstance(error, NoSuchSiteError) or request.method == "GET" else 422
     if isinstance(error, StaleRevisionError):
@@ -140,7 +140,7 @@ async def _mistake(request: Request, error: Exception) -> Response:
 
 
 async def _unread(_: Request, error: Exception) -> Response:
-    """What is wrong with a request, without repeating it."""
+    """Return the error of a request, without repeating its content."""
     assert isinstance(error, RequestValidationError)
     told = [f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
     return PlainJSON({"detail": printable("; ".join(told), 400)}, 422)
@@ -151,14 +151,14 @@ async def _outage(_: Request, __: Exception) -> Response:
 
 
 def _told(request: Request, site: str, make: Callable[[SqlStore], Any]) -> Response:
-    """What follows from a map alone, and stays as it is until there is a newer revision."""
+    """Answer from a map alone, unchanged until there is a newer revision."""
     asked = f"{request.url.path}?{request.url.query}"
     tag, found = _server(request).sites.answer(site, asked, lambda store: bytes(PlainJSON(make(store)).body))
     return _tagged(request, found, tag, "application/json")
 
 
 def _tagged(request: Request, data: bytes, tag: str, media_type: str, **headers: str) -> Response:
-    """An answer with its ETag, or that the one who asks has it."""
+    """Return an answer with its ETag, or 304 if the client has it."""
     told = {"ETag": f'"{tag}"', **headers}
     if told["ETag"] in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=told)
@@ -192,7 +192,7 @@ def _may(role: Role) -> Any:
 
 
 async def _answering(request: Request) -> Server:
-    """As it waits for nothing, it needs no thread."""
+    """An asynchronous dependency that needs no thread, since it never waits."""
     return _server(request)
 
 
@@ -210,7 +210,7 @@ Number = Annotated[float | None, Query(allow_inf_nan=False)]
 
 
 class Detail(BaseModel):
-    """What is wrong, in one line."""
+    """The error, in one line."""
 
     detail: str
 
@@ -229,7 +229,7 @@ _MISTAKES = {
 
 
 def _as(media_type: str) -> dict[str, Any]:
-    """How an answer that is not JSON is described."""
+    """Return the description of an answer that is not JSON."""
     return {"response_class": Response, "responses": {200: {"content": {media_type: {}}}}}
 
 
@@ -260,13 +260,13 @@ class Chosen(BaseModel):
 
 @router.get("/whoami")
 def show_token(request: Request, who: Reader) -> dict[str, str]:
-    """Tell the name and the role of the token."""
+    """Return the name and the role of the token."""
     return {"name": who, "role": request.state.role.name.lower()}
 
 
 @router.get("/healthz")
 def health(server: Answering) -> dict[str, Any]:
-    """Tell that the server and its database answer; needs no token."""
+    """Report that the server and its database answer; needs no token."""
     return {"evermap": __version__, "waiting": server.database.depth()}
 
 
@@ -317,13 +317,13 @@ def list_jobs(
 
 @router.get("/jobs/{number}")
 def show_job(number: Annotated[int, Field(ge=0, le=2**31 - 1)], server: Answering, _: Reader) -> dict[str, Any]:
-    """Tell what became of an uploaded session."""
+    """Return the state of an uploaded session."""
     return asdict(_job(server, number))
 
 
 @router.get("/jobs/{number}/payload", **_as("application/octet-stream"))
 def show_payload(number: Annotated[int, Field(ge=0, le=2**31 - 1)], server: Answering, _: Approver) -> Response:
-    """Return the bytes of a session that waits or was refused, as they were uploaded."""
+    """Return the uploaded bytes of a waiting or refused session."""
     data = server.database.payload(_job(server, number).id)
     if data is None:
         raise HTTPException(404, "its recording is in the map")
@@ -369,7 +369,7 @@ def changes(request: Request, site: Site, _: Reader, since: AtRevision = 0) -> R
 
 
 class LandmarkQuery(BaseModel):
-    """Which landmarks: of a revision, within a region, at least as probable; and when one wants to know of them."""
+    """Query of landmarks: revision, region, minimum probability, and stamp of the forecast."""
 
     revision: int | None = Field(None, ge=0, le=2**31 - 1)
     at_s: float | None = Field(None, allow_inf_nan=False)
@@ -456,7 +456,7 @@ def approve(request: Request, site: Site, chosen: Chosen, server: Answering, who
 def actions(request: Request, site: Site, server: Answering, _: Reader, robot: RobotName | None = None) -> Response:
     """List the instant actions of VDA 5050 by which a robot comes to use the approved revision, in their order.
 
-    Of a robot that is named, only what it still lacks, by the maps that it said it holds.
+    For a named robot, only the missing ones, by the maps that it reported.
     """
     number = _approved(server, site)
     told = [one for item in server.database.robots() if item["robot"] == robot for one in item["maps"]]
@@ -509,7 +509,7 @@ def revert(request: Request, site: Site, chosen: Chosen, server: Answering, who:
 
 
 def _word(action: str, word: str) -> None:
-    """The answer to an operator who says this of landmarks."""
+    """Return the answer to an operator's edit of landmarks."""
 
     def say(request: Request, site: Site, said: Said, server: Answering, who: Approver) -> dict[str, Any]:
         request.state.said = ", ".join(said.landmarks)
@@ -584,7 +584,7 @@ def _head(server: Server, site: str) -> int:
 
 
 def _beat(server: Server, site: str) -> tuple[Any, ...] | None:
-    """What changes with all that is beside the map; None while the database does not answer."""
+    """Return a value that changes with the state beyond the map; None while the database does not answer."""
     try:
         return server.database.pulse(site)
     except AWAY:

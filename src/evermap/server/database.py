@@ -1,4 +1,4 @@
-"""What a server keeps beside its maps: tokens, uploaded sessions, approvals, what robots hold, and who did what.
+"""The server's tables: tokens, uploaded sessions, approvals, maps on robots, and the audit.
 
 In SQLite it is one file, `server.db` in the folder of the maps; in PostgreSQL a schema `evermap_server` in their
 database. A job is never lost: a worker leases it for a while and renews the lease as long as it lives; what a killed
@@ -130,7 +130,7 @@ _audit = Table(
 
 
 class Role(IntEnum):
-    """What a token may do; each role may do what those before it may."""
+    """Role of a token; each includes the permissions of those before it."""
 
     READ = 1
     UPLOAD = 2
@@ -139,7 +139,7 @@ class Role(IntEnum):
 
 
 class JobState(StrEnum):
-    """Where an uploaded session is."""
+    """State of an uploaded session."""
 
     QUEUED = "queued"
     WORKING = "working"
@@ -247,7 +247,7 @@ class Database:
             return [dict(row) for row in connection.execute(question).mappings()]
 
     def who(self, text: str) -> tuple[str, Role] | None:
-        """Return the name and role of a token; None of one that is not known."""
+        """Return the name and role of a token; None for an unknown one."""
         with self._engine.begin() as connection:
             row = connection.execute(
                 select(_token.c.name, _token.c.role).where(_token.c.digest == _digest(text))
@@ -279,7 +279,7 @@ class Database:
         return None if row is None else _job_of(row)
 
     def claim(self, worker: str, lease_s: float) -> tuple[Job, bytes] | None:
-        """Lease the oldest waiting session of a site on which nobody works; None where there is none."""
+        """Lease the oldest waiting session of a site without a worker; None if there is none."""
         now, other = time.time(), _job.alias()
         busy = exists().where(
             other.c.site == _job.c.site, other.c.state == JobState.WORKING.value, other.c.lease_s >= now
@@ -304,7 +304,7 @@ class Database:
             connection.execute(update(_job).where(_mine(job, worker)).values(lease_s=time.time() + lease_s))
 
     def finish(self, job: int, worker: str, state: JobState, reason: str = "", revision: int | None = None) -> None:
-        """Say what became of a session; nothing happens where its lease is somebody else's by now."""
+        """Record the result of a session, unless another worker has its lease by now."""
         values: dict[str, Any] = {
             "state": state.value,
             "reason": printable(reason, 2000),
@@ -359,14 +359,14 @@ class Database:
             announce(connection, PREFIX + site)
 
     def approved(self, site: str) -> dict[str, Any] | None:
-        """Return the revision that was approved last, by whom and when; None where none was."""
+        """Return the revision approved last, its operator and time; None if there is none."""
         question = select(_approval.c.revision, _approval.c.who, _approval.c.at).where(_approval.c.site == site)
         with self._engine.begin() as connection:
             row = connection.execute(question.order_by(_approval.c.id.desc()).limit(1)).mappings().one_or_none()
         return None if row is None else dict(row)
 
     def hold(self, robot: str, maps: list[dict[str, str]]) -> None:
-        """Keep which maps a robot says that it holds, instead of what it said before."""
+        """Store the maps that a robot reports, in place of its earlier report."""
         values = {"maps": json.dumps(maps), "at": now_utc()}
         news = case((_robot.c.maps == values["maps"], 0), else_=1)
         for _ in range(2):  # again where it says so the first time, and twice at once
@@ -399,7 +399,7 @@ class Database:
         return approved, *told, *map(tuple, jobs)
 
     def note(self, who: str, what: str, status: int) -> None:
-        """Note who asked for a change, and what came of it."""
+        """Log who requested a change, and its result."""
         with self._writer.begin() as connection:
             row = {"at": now_utc(), "who": who, "what": printable(what, 500), "status": status}
             connection.execute(insert(_audit).values(row))
@@ -418,7 +418,7 @@ class Database:
             return connection.execute(select(func.count()).select_from(_job).where(waiting)).scalar_one()
 
     def queue(self) -> tuple[dict[str, int], float, int]:
-        """Return sessions by state, how long the oldest waits that nobody has begun [s], and how many are in work."""
+        """Return sessions by state, the longest waiting time [s], and the number in work."""
         counts = select(_job.c.state, func.count()).group_by(_job.c.state)
         oldest = select(func.min(_job.c.changed_at)).where(_job.c.state == JobState.QUEUED.value)
         leased = and_(_job.c.state == JobState.WORKING.value, _job.c.lease_s >= time.time())

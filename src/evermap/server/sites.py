@@ -80,7 +80,7 @@ class SiteStores:
 
     @contextmanager
     def store(self, site: str, *, create: bool = False) -> Iterator[SqlStore]:
-        """Yield a store that nobody else uses meanwhile; what it has read of the history is kept for the next one.
+        """Yield a store for exclusive use; its cached history is kept for the next user.
 
         Raises:
             NoSuchSiteError: there is none, and none is made.
@@ -132,7 +132,7 @@ class SiteStores:
         return number, found
 
     def answer(self, site: str, asked: str, make: Callable[[SqlStore], bytes]) -> tuple[str, bytes]:
-        """Return the newest revision's name and what was asked of the map; kept until there is a newer one.
+        """Return the newest revision's name and the answer to a query; cached until there is a newer one.
 
         Args:
             site: its name.

@@ -55,7 +55,7 @@ _ROTTEN = (
 
 @dataclass(frozen=True, slots=True)
 class UploadLimits:
-    """How large an upload may be.
+    """Limits of an upload.
 
     Attributes:
         n_bytes: as it is sent.
@@ -69,7 +69,7 @@ class UploadLimits:
 
 
 def checked_digest(data: bytes, limits: UploadLimits) -> str:
-    """Return the SHA-256 of the session in an upload, the same however it was packed.
+    """Return the SHA-256 of the session in an upload, independent of its packing.
 
     Raises:
         InputError: it is neither a zip of a native folder or of a bag, nor a bag, or may harm who reads it.
@@ -151,7 +151,7 @@ def _content(archive: zipfile.ZipFile, info: zipfile.ZipInfo, limits: UploadLimi
 
 
 def _check_parquet(content: bytes, name: str, limits: UploadLimits) -> None:
-    """Refuse a table that is small only as it is packed."""
+    """Refuse a table that expands beyond the limits."""
     import pyarrow as pa
     from pyarrow import parquet
 

@@ -1,4 +1,4 @@
-"""Workers, who enter the sessions that wait by the same code as `evermap slam --map`."""
+"""Workers that enter waiting sessions by the same code as `evermap slam --map`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OUTAGE_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class JobOutcome:
-    """What became of a session.
+    """Result of a session.
 
     Attributes:
         state: entered, rejected, set aside where it does not fit the map, or queued where the store did not answer.
@@ -102,7 +102,7 @@ class Worker:
                         took_s = time.perf_counter() - start
                         number = entered.commit(store, self._config, command="evermap work", wall_s=took_s)
                         return JobOutcome(JobState.ENTERED, ", ".join(entered.session.slam.warnings[:3]), number)
-                except StaleRevisionError:  # somebody committed meanwhile: again, from the newest
+                except StaleRevisionError:  # another process committed meanwhile: again, from the newest
                     continue
         except TwiceError as error:  # a worker died between the commit and saying so, or it came another way
             return JobOutcome(JobState.ENTERED, error.problem, error.revision)
@@ -112,7 +112,7 @@ class Worker:
             return JobOutcome(JobState.QUEUED, error.problem)
         except EvermapError as error:
             return JobOutcome(JobState.REJECTED, error.one_line())
-        except Exception as error:  # a defect of ours must not stop those who wait behind it
+        except Exception as error:  # a bug must not stop the sessions behind it
             return JobOutcome(JobState.REJECTED, f"a bug in evermap: {type(error).__name__}: {error}")
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""What changed, in words: for the terminal, the report and the legends."""
+"""Changes in words, for the terminal, the report and the legends."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ _MAX_IDS = 12
 
 
 def explanations(result: SlamResult) -> list[str]:
-    """Return one line for each change, then 'or: ...' for each alternative worth telling; [] where nothing is in
-    question.
-    """
+    """Return one line for each change, then 'or: ...' for each relevant alternative; [] if there is none."""
     start_s = float(result.trajectory.stamp_s[0]) if len(result.trajectory) else 0.0
     near = near_alternatives(result)
     lines = [f"{describe(change, start_s)}, {probability(change.probability)}" for change in result.changes]

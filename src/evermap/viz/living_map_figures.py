@@ -46,7 +46,7 @@ _MAX_WORDS = 6
 
 @dataclass(frozen=True, slots=True)
 class MapView:
-    """What the figure of a living map shows.
+    """Content of the figure of a living map.
 
     Attributes:
         landmarks: L landmarks at their most probable places, also those that are believed gone.
@@ -186,7 +186,7 @@ def _legend(figure: Figure, handles: Sequence[Any]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class LandmarkHistory:
-    """What a map knows of one landmark over time.
+    """History of one landmark in a map.
 
     Attributes:
         stamp_s: (N,) of the looks, never decreasing.
@@ -262,7 +262,7 @@ def _draw_belief(axes: Axes, axis: TimeAxis, history: LandmarkHistory) -> None:
 
 
 def _draw_evidence(axes: Axes, axis: TimeAxis, history: LandmarkHistory) -> None:
-    """What every session said, upwards for and downwards against, with its hits and misses written to it."""
+    """Draw the evidence of every session, upwards for and downwards against, with its hits and misses."""
     groups = history.sessions()
     said = np.array([float(history.log_odds[rows].sum()) for rows in groups])
     drawn = np.clip(said, -_NATS_CLIP, _NATS_CLIP)

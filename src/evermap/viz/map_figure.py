@@ -44,7 +44,7 @@ _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 
 @dataclass(frozen=True, slots=True)
 class _Scene:
-    """What a map shows, in the frame of the picture; all with two or all with three coordinates.
+    """Content of a map figure, in its frame; all with two or all with three coordinates.
 
     Attributes:
         path_m: (N, D) positions of the robot, nan between stretches of it; odometry_m: as odometry alone has them.
@@ -64,7 +64,7 @@ class _Scene:
     changed: Sequence[Move]
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
-        """Return the corners of what must be in the picture; odometry and a larger survey may leave it."""
+        """Return the corners of the required content; odometry and a larger survey may exceed it."""
         moved = [part for move in self.changed for part in (move.before_m, move.after_m)]
         survey = None if self.survey_m is None else self.survey_m[self.mapped]
         true = [part for part in (self.truth_m, survey) if part is not None]
@@ -309,7 +309,7 @@ class Move:
 
 
 def moves(result: SlamResult, pose_truth_map: FloatArray) -> list[Move]:
-    """Return what to draw of a run: its changes by time, then those of the nearest alternatives.
+    """Return the changes to draw: those of the run by time, then those of the nearest alternatives.
 
     Args:
         result: what came out.
@@ -373,7 +373,7 @@ def draw_moves(axes: Axes, drawn: Sequence[Move]) -> list[Artist]:
 
 
 def _change_mark(kind: ChangeKind, colour: str) -> dict[str, Any]:
-    """What a kind of change is marked with; what moved has a diamond where it was."""
+    """Return the marker of a kind of change; a moved landmark has a diamond at its former place."""
     if kind in _KIND_MARKS:
         return {"marker": _KIND_MARKS[kind], "mec": colour, "mew": 1.6, "ms": 8.0}
     return {"marker": "D", "mfc": PAPER, "mec": colour, "mew": 1.1, "ms": 4.0}

@@ -57,7 +57,7 @@ def plot_result(result: SlamResult, recording: AnyRecording | None = None) -> Fi
 
 
 def plot_map(living: Any, *, title: str = "") -> Figure:
-    """Draw a `LivingMap`: landmarks, their other places, what is gone, and from where the robot looked."""
+    """Draw a `LivingMap`: landmarks, their other places, gone ones, and the sensor positions."""
     landmarks, places = living.landmarks(), living.places
     views = living.views if living.sight is None else living.sight.views.table()
     here = living.place_row(living.members.landmark_id, living.site_of())
@@ -98,7 +98,7 @@ def plot_followed(followed: Any, resting_m: FloatArray) -> Figure:
 
 
 def plot_landmarks(landmarks: Landmarks) -> Figure:
-    """Draw a map by class with 2-sigma ellipses; what may be gone is fainter, what probably is, crossed out."""
+    """Draw a map by class with 2-sigma ellipses; uncertain landmarks are fainter, probably gone ones crossed out."""
     if not len(landmarks):
         with drawing(6.0, 5.0) as figure:
             figure.add_subplot(**_PLAN)
@@ -146,7 +146,7 @@ def plot_trajectory(trajectory: Trajectory) -> Figure:
 
 
 def plot_recording(recording: AnyRecording) -> Figure:
-    """Draw what was seen and driven over time, and the true path where there is one."""
+    """Draw detections and speeds over time, and the true path if there is one."""
     truth = recording.truth
     rows = _seen_rows(recording) | _driven_rows(recording)
     start_s = recording.frames.stamp_s[0] if len(recording.frames) else 0.0

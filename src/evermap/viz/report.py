@@ -102,7 +102,7 @@ def _interrupted(summary: Mapping[str, Any]) -> str:
 
 
 def _changes(result: SlamResult, summary: Mapping[str, Any]) -> str:
-    """What differs from the map, in words and numbers, and what else it may be; '' where nothing is in question."""
+    """Return the changes in words and numbers, with the alternatives; '' if there are none."""
     lines = explanations(result) + grew(summary["counts"].get("landmarks_grown"))
     if not lines:
         return ""
@@ -147,7 +147,7 @@ def _png(figure: Figure) -> bytes:
 
 
 def _frames(summary: Mapping[str, Any]) -> str:
-    """What the coordinates mean, and how they were compared with truth."""
+    """Return the section on frames, and on the alignment with the truth."""
     rows = [(escape(name), escape(meaning)) for name, meaning in summary["frames"].items()]
     alignment = summary["metrics"]["alignment"]
     pose = alignment["pose_truth_estimate"]
@@ -318,7 +318,7 @@ def _held(parameter: ParameterEstimate) -> str:
 
 
 def _learned(parameter: ParameterEstimate) -> str:
-    """How many times narrower than its prior the estimate is."""
+    """Return the ratio of the prior's to the estimate's standard deviation."""
     if not has_prior(parameter) or not 0 < parameter.sigma < math.inf:
         return "–"
     return f"{parameter.prior_sigma / parameter.sigma:.3g} ×"

@@ -144,7 +144,7 @@ def _blueprint(recording: AnyRecording, result: SlamResult, pose_truth_map: Floa
 
 
 def _kind(clock: Clock) -> str:
-    """What rerun takes stamps for: dates, or seconds since some start."""
+    """Return the kind of rerun's timeline: dates, or seconds since a start."""
     return "duration" if clock is Clock.RECORDING else "timestamp"
 
 
@@ -155,7 +155,7 @@ def _time(stamp_s: FloatArray, clock: Clock) -> Any:
 
 
 def _thin(count: int, limit: int = _MAX_STEPS) -> IntArray:
-    """Rows of a long sequence that are kept, ends included."""
+    """Return the kept rows of a long sequence, including both ends."""
     return (
         np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64)) if count else np.zeros(0, int)
     )

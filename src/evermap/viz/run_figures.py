@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 def draw_figures(
     recording: AnyRecording, result: SlamResult, evaluation: Evaluation, *, real_time_factor: float | None = None
 ) -> tuple[NamedFigure, ...]:
-    """Return all figures that this run has something to show in, in the order of the report.
+    """Return all figures with content for this run, in the order of the report.
 
     Args:
         recording: what was processed.

@@ -239,9 +239,9 @@ _RINGS_PT = (4.0, 9.0, 16.0, 25.0, 36.0)
 
 
 def _declutter(axes: Axes, labels: Sequence[Any]) -> None:
-    """Give each label in turn the nearest position around its point where it covers no label and no point.
+    """Move each label to the nearest free position around its point.
 
-    Where none is free, the one that covers least.
+    If none is free, to the one with least overlap.
     """
     from matplotlib.text import Text
 

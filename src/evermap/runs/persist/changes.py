@@ -1,4 +1,4 @@
-"""What follows from beliefs: when features vanished and returned, and presence after the latest look.
+"""Changes and forecasts from beliefs: when features vanished and returned, and presence after the latest look.
 
 A change is decided at the first look after which the belief in the other state reaches a confidence. When it happened
 is another question, and the looks answer it: between two decisions there was one change, and its place has a

@@ -1,4 +1,6 @@
-"""Which model of presence a run uses: one stay for each feature, a model from a file, or one learned from the looks."""
+"""Choice of the presence model of a run: one stay for each feature, a model from a file, or one learned from the
+looks.
+"""
 
 from __future__ import annotations
 
@@ -156,7 +158,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True)
 class LearnedModels:
-    """What was learned.
+    """Learned models.
 
     Attributes:
         models: the model of every feature.
@@ -188,7 +190,7 @@ def learn_models(
     *,
     progress: Progress | None = None,
 ) -> LearnedModels:
-    """Learn how features come and go from looks alone.
+    """Learn presence models from looks alone.
 
     Args:
         table: what was read; its truth is not looked at.
@@ -309,7 +311,7 @@ def load_models(path: str | Path, table: LookTable) -> ModelOfEach:
 
 
 def _of_feature(path: str | Path, names: tuple[str, ...], per: str, table: LookTable) -> IntArray:
-    """Which model each feature of the table has."""
+    """Return the model of each feature of the table."""
     index = {name: number for number, name in enumerate(names)}
     if per == "feature":
         wanted = list(table.names)

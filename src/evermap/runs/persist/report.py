@@ -1,4 +1,4 @@
-"""Figures and `report.html` of a run: what is there now, what changed, whether probabilities mean what they say."""
+"""Figures and `report.html` of a run: present features, changes, calibration."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ class Totals:
 
 @dataclass(frozen=True, slots=True)
 class PersistResult:
-    """Everything a run found.
+    """All results of a run.
 
     Attributes:
         table: what was read.
@@ -221,7 +221,7 @@ def warm_up() -> None:
 def _filter(
     table: LookTable, order: IntArray, config: PersistConfig, models: ModelOfEach, looks: Looks
 ) -> tuple[Beliefs, FloatArray, Forecasts, float]:
-    """Beliefs at the instants asked for and at the looks, forecasts, and the mass that was moved about."""
+    """Return beliefs at the requested instants and at the looks, forecasts, and the merged mass."""
     at_rows = config.query == "times"
     feature, stamp_s = (table.feature, table.stamp_s) if at_rows else _grid(table, config)
     later_s = forecast_stamps(table.span, config)

@@ -1,4 +1,4 @@
-"""The table of looks that `evermap persist` reads: who was looked at when, and whether it was detected."""
+"""The table of looks of `evermap persist`: feature, stamp, and whether it was detected."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ class LookTable:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What truly was there: T samples, each holding until the feature's next one.
+    """True presence: T samples, each holding until the feature's next one.
 
     Attributes:
         first: (F + 1,) those of feature `f` are rows `first[f]` to `first[f + 1]`, in order of time.

@@ -45,7 +45,7 @@ class LifetimeTable:
     """N rows of a table, in its order.
 
     Attributes:
-        data: what is known of each lifetime.
+        data: the censored lifetimes.
         class_names: classes in use, in natural order.
         class_of_row: (N,) index into them, `UNKNOWN` where the table names none.
         position_m: (N, 2) where on the ground, nan where the table does not say.
@@ -231,7 +231,7 @@ NPMLE, KAPLAN_MEIER, BEST, GP = "npmle", "kaplan-meier", "best", "gp"
 
 @dataclass(frozen=True, slots=True)
 class LifetimeEstimate:
-    """What an estimator says of N lifetimes.
+    """Estimate from N lifetimes.
 
     Attributes:
         estimator: its name; of 'best', the family that was chosen.
@@ -262,7 +262,7 @@ def check_estimator(name: str) -> None:
 
 
 def estimates(name: str, table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterator[LifetimeEstimate]:
-    """Yield what an estimator says of each group, one after the other, so that a progress bar can follow.
+    """Yield the estimate of each group, one after the other, for a progress bar.
 
     The Gaussian process learns from all groups what they have in common; the others see one group at a time.
 
@@ -382,5 +382,5 @@ def _with_prior(
 
 
 def _nulls(values: FloatArray) -> list[float | None]:
-    """For JSON, which knows no infinity."""
+    """Replace infinities by null for JSON."""
     return [value if math.isfinite(value) else None for value in values.tolist()]

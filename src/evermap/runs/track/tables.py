@@ -31,7 +31,7 @@ def track_files(result: TrackResult) -> dict[str, Callable[[], bytes]]:
 
 
 def _tracks(result: TrackResult) -> dict[str, tuple[tuple[str, ...], IntArray] | FloatArray | IntArray]:
-    """One row an object and frame; columns of names are the names and which of them each row has."""
+    """Return one row per object and frame; columns of names hold the names and their indices."""
     tracks = result.tracks
     return {
         "stamp_s": tracks.stamp_s,
@@ -63,7 +63,7 @@ def _beliefs(result: TrackResult) -> dict[str, FloatArray]:
 
 
 def _spells(result: TrackResult) -> dict[str, tuple[tuple[str, ...], IntArray] | FloatArray | IntArray]:
-    """One row a spell; empty where it is not known when it began or that it ended."""
+    """Return one row per spell, with empty cells for unknown begins and ends."""
     spells = result.spells
     return {
         "track_id": spells.track_id,
@@ -77,7 +77,7 @@ def _spells(result: TrackResult) -> dict[str, tuple[tuple[str, ...], IntArray] |
 
 
 def _detections(result: TrackResult) -> dict[str, Any]:
-    """Which object each detection is of; empty for those of none."""
+    """Return the object of each detection; empty for unassigned ones."""
     table = result.table
     frame = np.repeat(np.arange(table.n_frames), np.diff(table.first))
     found = result.track_of_detection
@@ -89,7 +89,7 @@ def _detections(result: TrackResult) -> dict[str, Any]:
 
 
 def _events(result: TrackResult) -> str:
-    """One JSON object a line, of objects that were confirmed."""
+    """Return the events of confirmed objects, one JSON object per line."""
     known = set(np.unique(result.objects().track_id).tolist())
     return "".join(
         json.dumps({"stamp_s": event.stamp_s, "event": event.kind.name.lower(), "track_id": event.track_id}) + "\n"
@@ -113,12 +113,12 @@ def _axes(prefix: str, unit: str, vectors: FloatArray) -> dict[str, FloatArray]:
 
 
 def _with_names(columns: dict[str, Any]) -> dict[str, Any]:
-    """For `csv_bytes`."""
+    """Return the columns for `csv_bytes`."""
     return {name: named(*cells) if isinstance(cells, tuple) else cells for name, cells in columns.items()}
 
 
 def _with_lists(columns: dict[str, Any]) -> dict[str, Any]:
-    """For `parquet_bytes`."""
+    """Return the columns for `parquet_bytes`."""
     return {
         name: np.array(cells[0], dtype=object)[cells[1]].tolist() if isinstance(cells, tuple) else cells
         for name, cells in columns.items()
