@@ -28,7 +28,7 @@ from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, 
 
 USUAL = DecisionConfig()
 ToldBySession = tuple[Sequence[MapChange], bool]
-"""Changes that a session told, and whether they are undone."""
+"""Changes reported by a session, and whether they are inverted."""
 _COMES = frozenset({ChangeKind.APPEARED, ChangeKind.RETURNED})
 
 

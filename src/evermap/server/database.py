@@ -399,7 +399,7 @@ class Database:
         return approved, *told, *map(tuple, jobs)
 
     def note(self, who: str, what: str, status: int) -> None:
-        """Log who requested a change, and its result."""
+        """Note who requested a change, and its result."""
         with self._writer.begin() as connection:
             row = {"at": now_utc(), "who": who, "what": printable(what, 500), "status": status}
             connection.execute(insert(_audit).values(row))

@@ -1,1 +1,1 @@
-"""Where the robot is and where the landmarks are: factor graph, calibration and noise of one session."""
+"""Estimation of one session: factor graph, calibration and noise."""

@@ -1,4 +1,4 @@
-"""Calibration states: what the sensors do to the truth, and how much of it one believes beforehand.
+"""Calibration states: systematic errors of the sensors, and their priors.
 
 The range law is `z_r = a0 + r (1 + a1 + a2 b + a3 b^2)` with true range `r` and bearing `b`; `a3 = -1/2` is a camera
 that reports depth. A bearing reads `z_b = b + b0`. Between two instants the robot moves by the odometry between the two
@@ -113,7 +113,9 @@ class CalibrationPrior:
         return prior if sensor is None else prior._as_stated(sensor)
 
     def _as_stated(self, sensor: Sensor) -> CalibrationPrior:
-        """The prior narrowed by what is stated of the sensor, and how errors that only show together are divided."""
+        """Return the prior narrowed by the stated sensor, and the division of errors that are only observable
+        together.
+        """
         sheet = {
             BIAS: sensor.sigma_offset_m,
             SLOPE: sensor.sigma_scale,
@@ -176,7 +178,7 @@ class CalibrationPrior:
         return odds * (states - self.mean) ** 2
 
     def without_scale(self) -> CalibrationPrior:
-        """Return the prior of the states that are observable without a prior map, in the metres of the range sensor.
+        """Return the prior of the states that are observable without a prior map, in the scale of the range sensor.
 
         Range slope, forward scale and the size of the whole map trade off exactly: `1 + a1` times the map with
         `k_v / (1 + a1)` explains every reading as well. So the graph holds `a1` at its mean, lets the forward scale
@@ -203,7 +205,7 @@ class CalibrationPrior:
         return bool(self.free[SLOPE] and self.free[FORWARD])
 
     def metre(self, states: FloatArray, covariance: FloatArray) -> tuple[float, float, float]:
-        """Return by how much the graph's lengths are too long as a robot's priors have it.
+        """Return the log factor by which the graph's lengths are too long according to a robot's priors.
 
         Args:
             states: (9,) estimate in which nothing but these priors says what a metre is.
@@ -221,7 +223,7 @@ class CalibrationPrior:
 
     @property
     def _slope_share(self) -> float:
-        """Of what range slope and odometer scale show together, the sensor's."""
+        """Return the sensor's share of the product of range slope and odometer scale."""
         believed = self.sigma[SLOPE] ** 2 / (self.sigma[SLOPE] ** 2 + self.sigma[FORWARD] ** 2)
         return float(believed if self.slope_share is None else self.slope_share)
 
@@ -252,7 +254,7 @@ class CalibrationPrior:
         for state, power in ((SLIP, -1.0), (SKEW, 1.0), (CURVATURE, 1.0)):
             if self.free[state]:
                 states[state] *= np.exp(power * log_slope)
-        # what the product does not tell keeps the prior's spread; what it tells has the product's
+        # the unobservable part keeps the prior's spread; the product has its own
         by_forward, by_slope = weight[0] * self._slope_share, weight[0] * (1.0 - self._slope_share)
         own, drives = covariance[SLOPE, SLOPE], covariance[FORWARD, FORWARD]
         covariance[SLOPE, SLOPE] = spread + by_forward**2 * drives + (1.0 - by_slope) ** 2 * own
@@ -292,7 +294,7 @@ class CalibrationPrior:
         return float((1.0 - self.angle_share) * states[BEARING]) if self._shares_angle else 0.0
 
     def front(self, states: FloatArray, mount: FloatArray) -> FloatArray:
-        """Return (3,) where the robot's front is, seen from poses as the graph has them.
+        """Return the pose (3,) of the robot's front relative to the poses of the graph.
 
         There the robot drives along its front and the sensor is turned by the whole bearing bias; where it is the robot
         that drives askew, its front is turned the other way. Where the sensor is stays as it was.
@@ -317,7 +319,7 @@ def from_front(pose: FloatArray, covariance: FloatArray, front: FloatArray) -> t
 
 
 def needed(prior: CalibrationPrior, states: FloatArray, covariance: FloatArray, worth: FloatArray) -> FloatArray:
-    """Return (9,) probability of each free state to be another than stated, nan of others.
+    """Return the (9,) probability that each free state differs from its stated value, nan for others.
 
     Every subset of states is weighed by its evidence against all as stated: of a Gaussian likelihood of the states,
     which the estimate under the priors holds, in closed form (Savage and Dickey's ratio).

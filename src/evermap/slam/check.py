@@ -1,4 +1,4 @@
-"""What is odd about a recording, told before anything is estimated: units, signs, clocks, identities, limits.
+"""Problems of a recording, found before anything is estimated: units, signs, clocks, identities, limits.
 
 **Units, signs and clocks** show in whether landmarks stand still (`slam.mistakes`); a second mistake is looked for when
 the first is undone. Honest recordings err by metres in a hundred and by tenths of a second: no mistake on the list is
@@ -42,12 +42,12 @@ OUTSIDE = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is odd.
+    """One problem of a recording.
 
     Attributes:
         code: short and stable, for programs.
-        message: what, how much, and the likely cause.
-        usable: False where estimates would be nonsense.
+        message: the problem, its size, and the likely cause.
+        usable: False if estimates would be meaningless.
     """
 
     code: str
@@ -57,7 +57,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Check(Shown):
-    """What a recording holds, and what is odd about it.
+    """Summary and problems of a recording.
 
     Attributes:
         name, source: of the recording.
@@ -83,7 +83,7 @@ class Check(Shown):
 
     @property
     def usable(self) -> bool:
-        """Whether estimates would mean anything."""
+        """Whether the recording is usable."""
         return all(finding.usable for finding in self.findings)
 
     def as_dict(self) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def findings_in_space(recording: SpatialRecording, settings: SlamConfig) -> tupl
 
 
 def odd(recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> tuple[str, ...]:
-    """Return what `findings` has, as warnings of a run.
+    """Return the `findings` as warnings of a run.
 
     Raises:
         DataError: identities that would cost gigabytes and tell nothing.
@@ -196,7 +196,7 @@ def contents(recording: AnyRecording) -> dict[str, dict[str, Any]]:
 
 
 def _way(odometry: Odometry | SpatialOdometry) -> dict[str, Any]:
-    """How often, how far and how fast."""
+    """Return rates, distances and speeds of the odometry."""
     step_s = np.diff(odometry.stamp_s)
     if isinstance(odometry, SpatialOdometry):
         step = np.abs(_velocity(odometry)) * step_s
@@ -301,7 +301,7 @@ def _limits_in_space(recording: SpatialRecording) -> list[Finding]:
 
 
 def _left_out(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:
-    """What the estimator cannot use. Boxes without identity are found again by where they are."""
+    """Return detections that the estimator cannot use. Boxes without identity are associated by position."""
     from evermap.slam.space.intake import prepare_space
     from evermap.slam.space.moving import boxes_of, has_traffic
 
@@ -378,7 +378,7 @@ def _identities(recording: AnyRecording, settings: CheckConfig) -> list[Finding]
 
 
 def _motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]:
-    """Mistakes that make landmarks move that stand still."""
+    """Return mistakes that make static landmarks appear to move."""
     pairs = pairs_of(recording, settings)
     if pairs is None:
         return []
@@ -457,14 +457,16 @@ def screened(
         else:
             recording = valid(recording, config.sensor, prior_map)
         remarks = odd(recording, identities=settings.unknown_ids is not True, settings=settings.check)
-    if settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording):  # the tracker tells who is who
+    if (
+        settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording)
+    ):  # the tracker assigns identities
         return recording, remarks
     voted = without_contradicted_ids(recording, settings)
     return voted, (*remarks, *voted.warnings[len(recording.warnings) :])
 
 
 def check_recording(recording: AnyRecording, config: Config | None = None) -> Check:
-    """Tell what a recording holds, and what is odd about it: units, signs, clocks, identities, limits, gaps, jumps.
+    """Return a summary of a recording, and its problems: units, signs, clocks, identities, limits, gaps, jumps.
 
     In the plane `run_slam`, `run_session` and `run_localization` tell the same in the warnings of their results.
 

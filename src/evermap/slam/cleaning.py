@@ -26,7 +26,7 @@ SINGLE = 10.0
 
 
 def clean(recording: Recording, settings: CleaningConfig = USUAL) -> Recording:
-    """Return the recording in order of time, impossible values left out; every kind of repair is a counted warning.
+    """Return the recording in order of time, without impossible values; every kind of repair is a counted warning.
 
     Args:
         recording: columns of equal length; everything else may be wrong. Rows stand in the order of arrival.
@@ -173,7 +173,7 @@ def _taken_back(stamp_s: FloatArray, step: tuple[int, float], what: str, remarks
 
 
 def _in_step(recording: Recording, remarks: list[str]) -> Odometry:
-    """The odometry on the clock of the frames, where readings say that it is not.
+    """Return the odometry on the clock of the frames, if sightings show that the two differ.
 
     A clock that was set forward leaves a pause in its own stream. One that was set back was taken back already, by
     counting messages, and is off by those that were lost at that moment.
@@ -223,7 +223,7 @@ def _longest_pause(stamp_s: FloatArray, first_s: float, last_s: float) -> tuple[
 def _while_driving(
     frames: Frames, detections: Detections, odometry: Odometry, settings: CleaningConfig, remarks: list[str]
 ) -> tuple[Frames, Detections]:
-    """Without frames far before the first or after the last odometry: nobody knows what the robot did then."""
+    """Drop frames far before the first or after the last odometry, where the motion is unknown."""
     if len(odometry) == 0:
         return frames, detections
     near = (frames.stamp_s >= odometry.stamp_s[0] - settings.stray_s) & (
@@ -282,7 +282,7 @@ def _moved_since(row: IntArray, frames: Frames, odometry: Odometry, most: FloatA
 
 
 def _mended(what: str, stamp_s: FloatArray, settings: CleaningConfig, remarks: list[str]) -> FloatArray:
-    """(N,) stamps as a clock that is never set back would have shown them, nan where one is none."""
+    """Return (N,) stamps of a clock that is never set back, nan for invalid ones."""
     stamps, back_s = restored(stamp_s, settings)
     real = stamps[np.isfinite(stamps)]
     _remark(remarks, f"invalid stamps of the {what} dropped with their rows", len(stamps) - len(real))
@@ -300,7 +300,7 @@ def _remark(remarks: list[str], what: str, count: int) -> None:
 
 
 def restored(stamp_s: FloatArray, settings: CleaningConfig) -> tuple[FloatArray, FloatArray]:
-    """Return the stamps as a clock that is never set back would have shown them.
+    """Return the stamps of a clock that is never set back.
 
     Args:
         stamp_s: (N,) in the order of arrival, anything.

@@ -1,6 +1,6 @@
 """Several robots that share landmarks and see each other, as one least-squares problem.
 
-Each keeps its own poses, calibration and noise; what stands still is one place for all who saw it. A robot that sees
+Each keeps its own poses, calibration and noise; an unmoved landmark is one place for all that saw it. A robot that sees
 another measures range and bearing from its own pose to that of the other at the same instant: both have a pose there,
 tied to their others by odometry, so nothing is interpolated.
 """
@@ -42,7 +42,7 @@ class Encounters(NamedTuple):
 
 
 class _Eyes(NamedTuple):
-    """What it takes to read encounters.
+    """Sensor data for the encounters.
 
     Of each robot (R, 9) states and which are free, (R, 3) mounts, (R, 2) standard deviations, and (R,) as for
     `kernels.inlier_weight`.
@@ -124,7 +124,7 @@ class Together(Smoother):
         self._own: tuple[Estimate, list[Estimate]] | None = None
 
     def of(self, robots: Sequence[Smoother], sigma: FloatArray) -> Together:
-        """Return the same of robots with other noise or other priors; what is known of its structure is kept."""
+        """Return the same for robots with other noise or priors; its structure is kept."""
         other = Together(robots, self.places, self.start_s, self.met, sigma)
         other._structure, other._blocks = self._structure, self._blocks
         return other

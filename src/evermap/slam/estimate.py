@@ -22,11 +22,11 @@ from evermap.types import FloatArray, Landmarks, Progress, Recording, Sensor
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """A recording by itself, in a frame of its own or in that of a prior map.
+    """The solution of one recording, in its own frame or in that of a prior map.
 
     Attributes:
         recording: as it was used.
-        prepared: as the estimator wants it.
+        prepared: input of the estimator.
         outcome: smoothed values with their covariances.
         slam: the estimator, for what it knew at the time of each frame.
         prior: of the calibration states.
@@ -135,7 +135,7 @@ def fed(
     except KeyboardInterrupt:
         if done < least:
             raise
-        interrupted = True  # also in the last frame: whoever asked a command to end wants it to end
+        interrupted = True  # also in the last frame: a command that was asked to end must end
     return step_s[:done], interrupted
 
 

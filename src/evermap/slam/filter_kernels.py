@@ -1,4 +1,4 @@
-"""The steps of the local filter, compiled: drive on, compare a frame with places, update by all of it at once.
+"""The steps of the local filter, compiled: predict, compare a frame with places, update by all of it at once.
 
 A state is the newest pose, the calibration states and the places in slots: covariance (12 + 2 K, 12 + 2 K) in this
 order, rows of slots that are free zero. Everything is in place.
@@ -136,7 +136,7 @@ def innovations(
     pose: FloatArray, states: FloatArray, covariance: FloatArray, place: FloatArray, slot: Any, own: FloatArray,
     reading: FloatArray, sigma: FloatArray, mount: FloatArray, free: Any,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
-    """Compare K detections with a place each, each pair by itself: `S = H P H' + R`.
+    """Compare K detections with one place each, each pair separately: `S = H P H' + R`.
 
     Args:
         pose: (3,) of the state.
@@ -251,7 +251,7 @@ def update(
             weight[m] = inlier_weight(squared, 0.0, True)
         for each in range(2 * count):
             root[each, each] += sigma[each // 2, each % 2] ** 2 / weight[each // 2]
-            # innovation at the step so far, told at the start
+            # innovation at the step so far, expressed at the start
             for a in range(10):
                 innovation[each] -= jacobian[each, a] * step[column[each // 2, a]]
         if unsure:
@@ -305,13 +305,15 @@ def update(
 def _surprises(
     part: FloatArray, jacobian: FloatArray, spread: FloatArray, residual: FloatArray, sigma: FloatArray, nis: FloatArray
 ) -> bool:
-    """Squared distance of every detection by itself; True where the pose is so uncertain that this tells little."""
+    """Return the squared distance of every detection alone; True if the pose is too uncertain for this to be
+    informative.
+    """
     unsure = False
     for m in range(len(nis)):
         r, q, x = sigma[m, 0] ** 2, sigma[m, 1] ** 2, AT_PLACES + 2 * m
         a, b, d = spread[2 * m, 2 * m] + r, spread[2 * m, 2 * m + 1], spread[2 * m + 1, 2 * m + 1] + q
         nis[m] = _squared(a, b, d, residual[2 * m], residual[2 * m + 1])
-        # what it would be if only the reading and the place were uncertain
+        # its value if only the reading and the place were uncertain
         xx, xy, yy = part[x, x], part[x, x + 1], part[x + 1, x + 1]
         i, j = jacobian[2 * m, 8], jacobian[2 * m, 9]
         k, n = jacobian[2 * m + 1, 8], jacobian[2 * m + 1, 9]
@@ -332,7 +334,8 @@ def _weigh_by_the_others(
     credible: FloatArray,
     weight: FloatArray,
 ) -> float:
-    """New weights, at most `credible`, by each detection's innovation given all others; returns the largest change.
+    """Compute weights, at most `credible`, from each detection's innovation given all others; return the largest
+    change.
 
     With `V` the inverse of the innovations' covariance and `p = V r`, what is left of detection m when the others have
     been used is `V_mm^-1 p_m`, with covariance `V_mm^-1` (leave one out).

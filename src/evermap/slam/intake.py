@@ -1,4 +1,4 @@
-"""What goes into the estimator: the usable part of a recording, and what is believed before its first frame."""
+"""Input of the estimator: the usable part of a recording, and the priors before its first frame."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIRST_POSE_INFORMATION = 1e8
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A recording as the estimator wants it.
+    """A recording as input of the estimator.
 
     Attributes:
         problem: stamps count from `start_s`.
@@ -60,9 +60,9 @@ def prepare(
     remarks: tuple[str, ...] = (),
     settings: OdometryConfig = USUAL,
 ) -> Prepared:
-    """Sort out what can be used: detections of known identity, while there is odometry.
+    """Select the usable part: detections of known identity, during the odometry.
 
-    `remarks` on the recording come before those on what was left out; `settings` say what is believed of odometry.
+    `remarks` on the recording come before those on dropped parts; `settings` has the limits of odometry.
 
     Raises:
         DataError: fewer than two frames with a landmark of known identity.

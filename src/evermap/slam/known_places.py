@@ -1,4 +1,4 @@
-"""A map that is not estimated: where landmarks are known to stand, found by name and by neighbourhood."""
+"""A fixed map: known places of landmarks, found by identity and by neighbourhood."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class KnownPlaces:
     """Places: (P,) rows, sorted by `landmark_id`. A landmark that is known at several sites has one row for each.
 
     Attributes:
-        landmark_id: whose place.
+        landmark_id: of each place.
         position_m: (P, 2) in the map's frame.
         covariance_m2: (P, 2, 2) of each by itself.
         p_here: probability that the landmark stands there now; of one landmark they sum to 1 at most.
@@ -89,11 +89,11 @@ class KnownPlaces:
 
 
 class Neighbourhood:
-    """Points by cells of the floor, so that those near a position cost what is near it and not what there is.
+    """Points by cells of the floor, so that a query costs only what is near it.
 
     Args:
         position_m: (P, 2).
-        reach_m: how far 'near' is; inf for everywhere.
+        reach_m: radius of 'near'; inf for everywhere.
     """
 
     def __init__(self, position_m: FloatArray, reach_m: float) -> None:
@@ -137,7 +137,7 @@ SIGMA_M = 0.5 * AGREE_M
 
 
 class Placed(NamedTuple):
-    """A place in the map.
+    """A pose in the map.
 
     Attributes:
         pose: (3,) of the robot.
@@ -172,7 +172,7 @@ class LocalTrack:
         self._pose = se2.compose(self._pose, increment)
 
     def see(self, stamp_s: float, landmark_id: IntArray, reading: FloatArray, states: FloatArray) -> None:
-        """Add sightings (M, 2) of landmarks of the map, range and bearing; forget what was seen too long ago."""
+        """Add sightings (M, 2) of landmarks of the map, range and bearing; forget those that are too old."""
         if np.isnan(self._began_s):
             self._began_s = stamp_s
         at = sighted_at(self._pose, reading, states, self._mount)
@@ -184,7 +184,7 @@ class LocalTrack:
             self._seen.pop(name, None)
 
     def placed(self, stamp_s: float, places: KnownPlaces) -> Placed | None:
-        """Lay the drive over the map; None where that is not sure, or was tried before with the same landmarks."""
+        """Align the drive with the map; None if that is uncertain, or was tried before with the same landmarks."""
         names = frozenset(self._seen)
         settings = self._settings
         alone = stamp_s - self._began_s >= settings.alone_s
@@ -224,7 +224,7 @@ class LocalTrack:
     def _uncertainty(
         self, turn_rad: float, local: FloatArray, rows: IntArray
     ) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Of the pose, the drive having been turned into the map, where landmarks (n, 2) agree; see `Placed`."""
+        """Return the covariance of the aligned pose, with agreeing landmarks (n, 2); see `Placed`."""
         arm = local - local.mean(axis=0)
         size = max((arm**2).sum(), self._settings.spread_online_m**2)
         away = se2.rotation(self._pose[2]).T @ (self._pose[:2] - local.mean(axis=0))

@@ -1,4 +1,4 @@
-"""One Gaussian of the newest pose, the calibration states and the places around, step by step.
+"""One Gaussian of the newest pose, the calibration states and the nearby places, step by step.
 
 Given the newest pose the older ones say nothing more about the next detection. So a step predicts the newest pose by
 its odometry, marginalises the one before, and updates with the detections of the frame: an iterated extended Kalman
@@ -45,7 +45,7 @@ NO_PLACES, NO_GAIN, NO_ODDS, NOWHERE = np.arange(0), np.zeros((2, 0)), np.zeros(
 
 @dataclass(frozen=True, slots=True)
 class Ties:
-    """Where a place was when it was in no covariance any more, together with its neighbours.
+    """A place when it left the covariance, together with its neighbours.
 
     Attributes:
         rows: (k,) neighbours.
@@ -186,7 +186,7 @@ class LocalFilter:
         self.position[row] = place
 
     def sight(self, row: int, place: FloatArray, by_pose: FloatArray, spread: FloatArray) -> None:
-        """Put a place where a sighting from the newest pose says, in a map whose places are only considered.
+        """Initialise a place from a sighting at the newest pose, in a map whose places are only considered.
 
         It is as wrong as the pose is now, and stays there: the pose is held by it, but gets no better than it was.
 
@@ -283,8 +283,8 @@ class LocalFilter:
         self.covariance[at], self.covariance[:, at] = 0.0, 0.0
 
     def _tied(self, waiting: list[int]) -> list[Ties]:
-        """What ties places to others, each to those before it, too: as it was when they left, or as the solution or the
-        map says where these know them and most of their neighbours have left.
+        """Return the ties of places to others, each also to those before it: as stored when they left, or from the
+        solution or the map if these contain them and most of their neighbours have left.
         """
         solved, here = np.isfinite(self._given_position[:, 0]), self._slot >= 0
         of = self.active if self._neighbours else NO_PLACES
@@ -346,7 +346,7 @@ def columns(slots: IntArray) -> IntArray:
 
 
 def _nearest(position: FloatArray, to: FloatArray, count: int) -> IntArray:
-    """Rows of the nearest points, the nearest first."""
+    """Return rows of the nearest points, the nearest first."""
     away = ((position - to) ** 2).sum(axis=1)
     near: IntArray = np.argsort(away, kind="stable")[:count]
     return near

@@ -1,4 +1,4 @@
-"""Where the robot is in a map that is not changed by it: pose and calibration, frame after frame, at a fixed cost.
+"""Localisation in a fixed map: pose and calibration, frame by frame, at a fixed cost.
 
 An error-state extended Kalman filter of the newest pose and the calibration states. What a frame costs depends on what
 is in view, not on the size of the map: of its places only those used last are considered (see `local_filter`), and only
@@ -44,7 +44,7 @@ class FrameSightings(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """What one frame said.
+    """Result of one frame.
 
     Attributes:
         pose: (3,) in the map's frame; nan while it is not known.
@@ -210,7 +210,9 @@ class Localizer(Shown):
             self._filter.drive(motion)
 
     def _search(self, stamp_s: float) -> None:
-        """Lay the drive since the robot got lost over the map, and go there if that explains much more than staying."""
+        """Align the drive since the robot got lost with the map, and accept that if it explains much more than the
+        present pose.
+        """
         assert self._track is not None
         placed = self._track.placed(stamp_s, self.places)
         if placed is None:
@@ -226,7 +228,7 @@ class Localizer(Shown):
         self._place_at(placed)
 
     def _place_at(self, placed: Placed) -> None:
-        """Begin anew at a pose; what is known of the calibration stays."""
+        """Restart at a pose; the calibration is kept."""
         local, places = self._filter, self.places
         self._new.clear()
         self._log_p = self._log_p[: len(places)]
@@ -267,7 +269,7 @@ class Localizer(Shown):
         return row[:count], nis[:count], weight[:count]
 
     def _meet(self, new: IntArray, seen: FrameSightings) -> None:
-        """Remember where landmarks stand that are seen for the first time, or where it was often doubted."""
+        """Store places of landmarks that are seen for the first time, or whose place was often doubted."""
         filter_, known = self._filter, len(self.places)
         doubted = self._believed[known:] <= self._log_p[known:] - self._settings.most_doubt
         self._new = {name: row for name, row in self._new.items() if not doubted[row - known]}
@@ -312,7 +314,7 @@ class Localizer(Shown):
             self._track = None
 
     def _expect(self, seen_id: IntArray) -> tuple[IntArray, FloatArray, BoolArray]:
-        """Rows of places in view, P(detect) of each, and which are missed."""
+        """Return rows of places in view, P(detect) of each, and the missed ones."""
         spread, pose = self._filter.covariance, self._filter.pose
         sigma = math.sqrt(max(spread[0, 0], spread[1, 1]))
         if not self._is_placed or self._track is not None or sigma > self._settings.sure_m:

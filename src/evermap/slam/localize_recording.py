@@ -53,7 +53,7 @@ def localize(
     """Localise a recording in a map that is not changed: causal poses, from an unknown start.
 
     Args:
-        recording: what a reader returned; its truth is not looked at.
+        recording: from a reader; its truth is not used.
         landmarks: the map. Here, other than elsewhere, a landmark may have several rows: one a site where it may stand,
             with `p_exists` the probability of each; those of probability 0 are not looked at.
         prior: of the calibration states.
@@ -101,7 +101,7 @@ def _existing(landmarks: Landmarks, joint_m2: JointCovariance | None) -> tuple[L
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """What the frames said.
+    """Results of the frames.
 
     Attributes:
         frame: (F,) rows of `Recording.frames` that were processed.
@@ -228,13 +228,13 @@ def warm_up() -> None:
     seen = FrameSightings(np.arange(3), reading, np.full((3, 2), np.nan))
     for stamp_s in (0.0, 0.1):
         localizer.step(stamp_s, Drive.from_rows(np.array([0.0, 0.1]), np.zeros((2, 3))), seen)
-    NominalField(sensor).p_detect(np.zeros((1, 3)), at)  # asked for places that are believed to be there
+    NominalField(sensor).p_detect(np.zeros((1, 3)), at)  # for places that are believed to exist
 
 
 def _with_counts(
     landmarks: Landmarks, recording: Recording, run: _Run, places: KnownPlaces, misses: Misses
 ) -> Landmarks:
-    """One row a landmark, with the hits and misses of this recording."""
+    """Return one row per landmark, with the hits and misses of this recording."""
     best = _rows(landmarks, np.argsort(landmarks.landmark_id, kind="stable")[places.most_probable()])
     names, hit = best.landmark_id, run.detection[run.all("p_inlier") > 0.5]
     n_hits, n_misses = (

@@ -1,6 +1,6 @@
-"""An unmapped place, mapped while the robot drives: `StreamingSlam`, fed frame by frame.
+"""Online mapping of an unmapped place: `StreamingSlam`, fed frame by frame.
 
-What it says of a frame is what the stream of the whole recording says of it, but for rounding: landmarks are numbered
+Its result for a frame equals that of the stream over the whole recording, up to rounding: landmarks are numbered
 as they come.
 """
 
@@ -110,7 +110,7 @@ class Mapper:
         return at
 
     def step(self, stamp_s: float, odometry: FloatArray, seen: FrameSightings) -> Located:
-        """Process a frame; one without a known landmark only tells where odometry has led.
+        """Process a frame; one without a known landmark only predicts by odometry.
 
         Args:
             stamp_s: of the frame, on the clock of the odometry, later than the last one.
@@ -162,7 +162,7 @@ class Mapper:
         self._told()
 
     def _told(self) -> None:
-        """Tell the stream what there is by now."""
+        """Pass the present rows to the stream."""
         rows, new = self._odometry.rows, len(self._row) - len(self._problem.landmark_mean)
         information = self._problem.landmark_information
         self._problem = replace(

@@ -1,4 +1,4 @@
-"""How a landmark that is not where it was is explained: the seam between the estimator and the methods.
+"""The interface between the estimator and the methods that explain moved landmarks.
 
 A *place* is one row of the problem's landmarks. The first L places are the landmarks themselves, in the order in which
 the session was prepared; a landmark that moved has further places, behind them. Which place a detection belongs to
@@ -40,7 +40,7 @@ class Rival:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """What a method makes of all that was measured so far.
+    """Result of a method for all measurements so far.
 
     Attributes:
         problem: the same measurements, with other places and priors, or the very object that was given.
@@ -81,7 +81,7 @@ class Method(Protocol):
     def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
         """Return the problem, and values to start from, on which noise levels are learned before the last revisions.
 
-        As they are, for a method that has no prejudice: nothing that it believes bends the solution.
+        Unchanged for a method without assumptions that distort the solution.
         """
         return problem, estimate
 
@@ -104,7 +104,7 @@ class Method(Protocol):
 
 
 class Static(Method):
-    """`nohyp`: the world is as it is, every detection belongs to the one place of its landmark."""
+    """`nohyp`: a static world, every detection belongs to the one place of its landmark."""
 
     def __init__(self, n_landmarks: int) -> None:
         self._current = np.arange(n_landmarks)
@@ -120,6 +120,6 @@ class Static(Method):
         return False
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
-        """Return the problem as it is."""
+        """Return the problem unchanged."""
         del noise, heavy, final
         return Explanation(problem, estimate, self._current)

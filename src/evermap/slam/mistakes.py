@@ -1,4 +1,4 @@
-"""How readings would have to be changed to make landmarks stand still: the mistakes that recordings are made with.
+"""Common mistakes of recordings: changes of the readings that make landmarks static.
 
 Two readings of one landmark, a few seconds apart, and the odometry between them say the same thing twice: where the
 landmark is the second time. The difference is taken in the logarithm of the range and in the bearing, in space in the
@@ -26,7 +26,7 @@ USUAL = CheckConfig()
 
 @dataclass(frozen=True, slots=True)
 class Mistake:
-    """How readings would have to be changed to undo a mistake, and its name.
+    """A mistake: the change of the readings that undoes it, and its name.
 
     Attributes:
         code, message: as in `slam.check.Finding`.
@@ -156,11 +156,11 @@ def _longer(factor: float, why: str) -> Mistake:
 
 
 def likeliest(pairs: Pairs, undone: Mistake, told: Container[str], settings: CheckConfig) -> Mistake | None:
-    """Return the mistake that explains most of what is left, if it surely explains anything.
+    """Return the mistake that explains most of the rest, if it certainly explains anything.
 
     Args:
         pairs: of sightings.
-        undone: what was found already.
+        undone: the mistakes found so far.
         told: codes of mistakes that are not looked for.
         settings: what is sure.
     """
@@ -221,7 +221,7 @@ def off(residual: FloatArray) -> FloatArray:
 
 
 def pairs_of(recording: AnyRecording, settings: CheckConfig = USUAL) -> Pairs | None:
-    """Return what tells of mistakes; None where hardly any landmark is seen twice while there is odometry."""
+    """Return pairs of sightings; None if hardly any landmark is seen twice during the odometry."""
     first, second = _pairs(recording, settings)
     if len(first) < settings.fewest:
         return None
@@ -229,7 +229,7 @@ def pairs_of(recording: AnyRecording, settings: CheckConfig = USUAL) -> Pairs | 
 
 
 def _pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, IntArray]:
-    """Rows of detections: two of the same landmark each, within a few seconds and within the odometry's time."""
+    """Return pairs of rows of detections of one landmark, within a few seconds and during the odometry."""
     detections = recording.detections
     stamp_s = recording.frames.stamp_s[detections.frame]
     known = detections.landmark_id != UNKNOWN
@@ -315,7 +315,7 @@ class PlanarPairs:
 
 
 class SpatialPairs:
-    """The same in space."""
+    """Pairs of sightings in space."""
 
     units, angles = _UNITS_IN_SPACE, _AXES
     why_longer = "another unit of detections or odometry, or a wrong size of tags (tag_size_m)"
@@ -396,7 +396,7 @@ def clock_steps(recording: Recording, settings: CheckConfig = USUAL) -> tuple[Fl
     until_s = recording.frames.stamp_s[recording.detections.frame[second]]
     begin_s, second_of = np.unique(np.floor(until_s), return_inverse=True)
     usual, path = settings.fits, np.zeros(len(begin_s), dtype=np.int64)
-    for _ in range(2):  # what is usual shows at the right delays only
+    for _ in range(2):  # the usual difference is only visible at the right delays
         usual = max(settings.fits, float(np.median(far[path[second_of], np.arange(len(first))])))
         # a sighting is in two pairs
         loss = 0.5 * np.log1p((far / usual) ** 2)

@@ -53,7 +53,7 @@ START = start_noise(NoiseConfig())
 
 @dataclass(frozen=True, slots=True)
 class NoiseFit:
-    """New noise levels and how well they are known.
+    """New noise levels with their uncertainties.
 
     Attributes:
         noise: the levels.
@@ -104,7 +104,7 @@ def refine_noise(
 
 
 class Extrapolation:
-    """Noise levels ahead of a sequence of `refine_noise` steps: Anderson's mixing (1965) of their logarithms.
+    """Extrapolated noise levels of a sequence of `refine_noise` steps: Anderson mixing (1965) of their logarithms.
 
     Kinds of noise that act on the same residuals take dozens of steps to separate, each a few per cent in the same
     direction. The steps so far tell where that leads.
@@ -151,7 +151,7 @@ def _odometry_sums(
     free: Any,
     explained: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of every kind of odometry noise, with `L = W - W V W`: sums of `e' W P_k W e` and of `tr(L P_k)`.
+    """Return for every kind of odometry noise, with `L = W - W V W`: sums of `e' W P_k W e` and of `tr(L P_k)`.
 
     And the Fisher information of the variances, `sum tr(P_k L P_l L) / 2`.
     """

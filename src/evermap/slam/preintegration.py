@@ -1,4 +1,4 @@
-"""Odometry between poses, integrated once for all who ask at the same calibration states.
+"""Odometry between poses, integrated once for all uses with the same calibration states.
 
 Between two changes of the calibration, neither the steps of the smoother's poses and landmarks nor its noise levels
 change what the odometry says of an interval: increment, derivatives, and covariance for unit noise of every kind
@@ -44,7 +44,7 @@ class Intervals(NamedTuple):
 
 
 class Preintegration:
-    """The intervals that were asked for last, and what they were integrated with."""
+    """The last integrated intervals, and their calibration."""
 
     def __init__(self) -> None:
         self._stamp_s = np.zeros(0)

@@ -1,4 +1,4 @@
-"""What is known, what is sought, and how noisy: the three nouns that the estimators of this package exchange."""
+"""Problem, estimate and noise: the three nouns that the estimators of this package exchange."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ class ConditionalPrior:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Everything measured and believed beforehand.
+    """All measurements and priors.
 
     Attributes:
         stamp_s: (N,) instants of the poses, on the clock of `drive`.
@@ -220,7 +220,7 @@ class Problem:
         return sparse.csr_array(kept - ties.T @ sparse.csr_array(rest) @ ties)
 
     def conditional_prior(self, row: int, known: BoolArray) -> ConditionalPrior:
-        """Return what the prior says about landmark `row`, given the `known` ones (of which it is none)."""
+        """Return the prior of landmark `row`, given the `known` ones (without it)."""
         first = self.landmark_information.indptr
         if first[2 * row] == first[2 * row + 2]:
             return ConditionalPrior(self.landmark_mean[row], np.zeros((2, 2)), np.zeros(0, np.int64), np.zeros((2, 0)))
@@ -240,7 +240,7 @@ class Problem:
         return ConditionalPrior(self.landmark_mean[row], own, given, gain[:, np.repeat(tied, 2)])
 
     def until(self, n_poses: int, *, last_is_blind: bool = False) -> Problem:
-        """Return the problem as it stood after `n_poses` poses; landmarks keep their rows.
+        """Return the problem after `n_poses` poses; landmarks keep their rows.
 
         With `last_is_blind`, before the detections of the last of them.
         """
@@ -326,7 +326,7 @@ class Noise:
 
 
 class Block(NamedTuple):
-    """Where a problem is in a system of equations, which may be that of several.
+    """Position of a problem in a system of equations, which may contain several.
 
     Attributes:
         first: row of its first pose among the variables; the others follow.

@@ -1,4 +1,4 @@
-"""What comes out of the estimator, as plain arrays with the recording's ids and stamps, in metres."""
+"""Results of the estimator, as plain arrays with the recording's ids and stamps, in metres."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ LONGEST_PAUSE_S = 60.0
 
 
 def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
-    """Return trajectory and map, what moved, and what may have moved instead; from `scratch` in the frame so called."""
+    """Return trajectory and map, changes, and alternatives; from `scratch` in the frame of that name."""
     prepared, outcome, recording = solved.prepared, solved.outcome, solved.recording
     frame = "prior_map" if outcome.aligned else scratch
     found = result(solved, frame, landmarks(prepared, outcome, recording, frame))
@@ -56,7 +56,7 @@ def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
 
 
 def result(solved: Solved, frame: str, in_map: Landmarks) -> SlamResult:
-    """Bridge the blind stretches, and put all of an estimate into plain arrays.
+    """Bridge the blind stretches, and return the estimate as plain arrays.
 
     Args:
         solved: the recording and its estimate.
@@ -84,7 +84,7 @@ def result(solved: Solved, frame: str, in_map: Landmarks) -> SlamResult:
         landmarks=in_map,
         parameters=states,
         innovations=innovations(prepared, solved.slam, outcome, recording),
-        misses=Misses.empty(),  # the map says what they are
+        misses=Misses.empty(),  # the map has their classes
         step_s=solved.step_s,
         dead_reckoning=dead_reckoning(prepared, path),
         warnings=tuple(warnings),
@@ -178,7 +178,7 @@ def _records(
 
 
 def changes(prepared: Prepared, outcome: Outcome, moved: tuple[MapChange, ...]) -> tuple[MapChange, ...]:
-    """Return what moved, with the recording's ids and stamps, in metres."""
+    """Return the changes, with the recording's ids and stamps, in metres."""
     return tuple(
         replace(
             change,
@@ -225,7 +225,8 @@ def described(
 ) -> tuple[ParameterEstimate, ...]:
     """Return calibration states (9,) with their covariance (9, 9), driving askew, and noise levels, as records.
 
-    What only shows together is told both ways in their meanings. With `undivided`, the scale is of that kind.
+    For errors that are only observable together the meanings give both interpretations. With `undivided`, the scale is
+    of that kind.
     """
     needs = np.full(len(SPECS), np.nan) if p_needed is None else p_needed
     meanings = {spec.name: spec.meaning for spec in SPECS}
@@ -290,7 +291,7 @@ def dead_reckoning(prepared: Prepared, trajectory: Trajectory) -> Trajectory:
 
 
 def _dense_stamps(recording: Recording, outcome: Outcome, start_s: float) -> FloatArray:
-    """All frames up to the last one processed, with long steps divided."""
+    """Return the stamps of all frames up to the last processed one, with long steps divided."""
     last = start_s + outcome.problem.stamp_s[-1]
     stamps = recording.frames.stamp_s
     stamps = stamps[stamps <= last + 1e-9]
@@ -303,7 +304,7 @@ def _dense_stamps(recording: Recording, outcome: Outcome, start_s: float) -> Flo
 
 
 def _in_metres(pose: FloatArray, covariance: FloatArray, outcome: Outcome) -> tuple[FloatArray, FloatArray]:
-    """From the graph's metres to metres, with the uncertainty of the scale."""
+    """Convert the graph's lengths to metres, with the uncertainty of the scale."""
     if outcome.scale == 1.0 and outcome.log_scale_sigma == 0.0:
         return pose, covariance
     pose = pose * [outcome.scale, outcome.scale, 1.0]

@@ -16,7 +16,7 @@ ROOM_SHARE = 0.75
 
 
 class SessionFilter(LocalFilter):
-    """The newest pose of a `Problem`, with the places and the priors of that.
+    """The filter of a `Problem`: its newest pose, with its places and priors.
 
     Args:
         problem: the measurements; rows beyond those added are not looked at. May be exchanged between two steps for one
@@ -59,7 +59,7 @@ class SessionFilter(LocalFilter):
         self._old_pose, self._new_pose = estimate.pose[:-1], [self.pose.copy()]
 
     def motion(self, row: int) -> Motion:
-        """Return odometry from the pose before to pose `row`, with the states as they are known."""
+        """Return odometry from the previous pose to pose `row`, with the present states."""
         return Motion.between(self.problem, self._noise, row, self.states)
 
     def distances(self, detections: IntArray, places: IntArray) -> tuple[FloatArray, FloatArray]:

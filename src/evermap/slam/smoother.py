@@ -55,7 +55,7 @@ class Linearised:
 
 @dataclass(frozen=True, slots=True)
 class Equations:
-    """What does not change with values and noise, as long as the same landmarks are known.
+    """The structure of the equations, which is independent of values and noise for the same known landmarks.
 
     Attributes:
         known: (L,) landmarks with a position.
@@ -98,7 +98,7 @@ class Smoother:
         return self.problem.prior.sigma
 
     def under(self, noise: Noise, *, heavy: bool) -> Smoother:
-        """Return the smoother of the same problem at other noise; what is known of its structure is kept."""
+        """Return the smoother of the same problem at other noise; its structure is kept."""
         other = Smoother(self.problem, noise, heavy=heavy, robust=self.robust)
         other._structure = self._structure
         return other
@@ -179,7 +179,7 @@ class Smoother:
         return Marginals(solved, len(estimate.pose), len(self.problem.pose_row), estimate.known)
 
     def worth(self, estimate: Estimate, marginals: Marginals) -> FloatArray:
-        """Return (9,) variances of the states by residuals as they are, relative to those of independent residuals.
+        """Return (9,) variances of the states with correlated residuals, relative to those of independent ones.
 
         What each stretch of the recording adds to the states is summed before it is squared, which makes no assumption
         on how errors hang together within it: White's covariance (1980), with stretches as clusters (Liang and Zeger
@@ -224,7 +224,7 @@ class Smoother:
         return values.reshape(-1, 2, 11)
 
     def information(self, estimate: Estimate, poses: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return what is known of some poses, the known landmarks and the states, all other poses marginalised.
+        """Return the information on some poses, the known landmarks and the states, with all other poses marginalised.
 
         Returns:
             (n, n) and (n,), n = 3 poses + 2 known landmarks + 9: information and right side of a step from `estimate`.

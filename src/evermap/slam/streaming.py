@@ -74,7 +74,7 @@ class PriorMap:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """All that a finished session knows, in the metres and the frame of the map.
+    """Result of a finished session, in the scale and the frame of the map.
 
     Attributes:
         estimate: smoothed values.
@@ -196,7 +196,7 @@ class StreamingSlam:
 
     @property
     def states(self) -> FloatArray:
-        """(9,) calibration states, as they are known by now."""
+        """(9,) present calibration states."""
         return self._filter.states.copy()
 
     def ahead(self, stamp_s: float, drive: Drive) -> tuple[FloatArray, FloatArray]:
@@ -295,7 +295,7 @@ class StreamingSlam:
         return divided(solved, self._prior, p_needed, fit, revision, aligned=self._aligned)
 
     def _ahead(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
-        """The same, turned so that the first pose has the robot's front ahead, where it is not in a map."""
+        """Return the same, rotated so that the first pose has the robot's front ahead, unless it is in a map."""
         front = self._prior.front(estimate.states, problem.mount)
         start = problem.start_pose if self._aligned else se2.inverse(front)
         if np.array_equal(start, problem.start_pose):
@@ -391,7 +391,7 @@ class StreamingSlam:
         return any(not mapped[j] and self._n_compared[j] in DISPUTED_AT for j in doubted)
 
     def _meet_new_landmarks(self, running: SessionFilter, landmark: FloatArray, detections: IntArray) -> None:
-        """Where a landmark that is seen for the first time must be: in the map, or by this one sighting."""
+        """Initialise landmarks that are seen for the first time: from the map, or from this sighting."""
         new = np.isnan(landmark[self._problem.landmark_row[detections], 0])
         for m in detections[new] if np.count_nonzero(new) else ():
             j = self._problem.landmark_row[m]
@@ -405,7 +405,7 @@ class StreamingSlam:
                 landmark[j] = sighted_at(running.pose, reading, running.states, mount)
 
     def _relinearised(self, *, learn: bool) -> Slices[None]:
-        """Relinearise all poses so far beside the stream, catch up with it, and take over.
+        """Relinearise all poses so far in parallel to the stream, catch up with it, and take over.
 
         With `learn`, also vote on places, ask the method, and learn the noise.
         """
@@ -467,7 +467,9 @@ class StreamingSlam:
         self._filter.restart(estimate, self._noise, self._problem)
 
     def _can_align(self, *, final: bool = False) -> bool:
-        """Most of the prior map's landmarks seen so far stand to each other as in the map; two must do at the end."""
+        """Return whether most of the prior map's landmarks seen so far have the relative positions of the map; two
+        suffice at the end.
+        """
         assert self._prior_map is not None
         both = self._prior_map.given & np.isfinite(self._landmark[: len(self._prior_map.given), 0])
         count = int(both.sum())
@@ -485,7 +487,7 @@ class StreamingSlam:
         return bool(enough and np.ptp(at[agree], axis=0).max() >= settings.spread_m)
 
     def _enter_map(self) -> None:
-        """From the first pose's frame into the prior map's: move all that is known, then hold it by the map."""
+        """Move the estimate from the first pose's frame into the prior map's, then constrain it by the map."""
         prior_map = self._prior_map
         assert prior_map is not None
         estimate = self._filter.estimate()

@@ -1,9 +1,9 @@
-"""Several robots that drove at the same time, solved together.
+"""Joint solution of several simultaneous recordings.
 
-Each is solved alone first. Then their frames are laid over each other, by landmarks with the same id and by sightings
-of each other; the instants of those become poses; and all is solved as one problem (`slam.encounters`), noise levels
-and the calibration states that are needed included. The metre that one robot alone cannot tell from its odometer is
-the mean of what all of them say (`CalibrationPrior.metre`).
+Each is solved alone first. Then their frames are aligned by landmarks with the same id and by mutual sightings; the
+instants of those become poses; and all is solved as one problem (`slam.encounters`), noise levels and the calibration
+states that are needed included. The metre that one robot alone cannot tell from its odometer is the mean of what all of
+them say (`CalibrationPrior.metre`).
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ MOST_TIES = 200
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A robot's recording by itself, and who it is.
+    """A robot's own solution, and its number.
 
     Attributes:
         number: by which others call it.
@@ -140,13 +140,13 @@ def _sighted(members: Sequence[Member]) -> tuple[Encounters, list[FloatArray], l
 
 
 def _with_instants(own_s: FloatArray, new_s: FloatArray) -> FloatArray:
-    """Instants (N,), and those of others, sorted, that are none of them."""
+    """Return instants (N,), and the other, sorted ones that are not among them."""
     new_s = new_s[np.abs(own_s[_nearest(own_s, new_s)] - new_s) > ONE_INSTANT_S]
     return np.sort(np.concatenate([own_s, new_s[np.diff(new_s, prepend=-np.inf) > ONE_INSTANT_S]]))
 
 
 def _nearest(own_s: FloatArray, stamp_s: FloatArray) -> IntArray:
-    """Rows of the instants (N,) that are nearest to others."""
+    """Return rows of the instants (N,) that are nearest to others."""
     after = np.clip(np.searchsorted(own_s, stamp_s), 1, len(own_s) - 1)
     return after - (stamp_s - own_s[after - 1] < own_s[after] - stamp_s)
 
@@ -218,7 +218,7 @@ def _placed(members: Sequence[Member], own: Sequence[tuple[Problem, Estimate]], 
 
 
 def _shared(members: Sequence[Member]) -> list[IntArray]:
-    """Which place each place of each robot is: one for those with the same id, but of what one of them saw move."""
+    """Return the common place of each place of each robot: one per id, except for landmarks that a robot saw moving."""
     revisions = [member.alone.outcome.revision for member in members]
     names = [member.alone.prepared.landmark_id for member in members]
     moved = {
@@ -248,7 +248,9 @@ def _laid_together(
         new = np.isfinite(at[:, 0]) & np.isnan(landmark[places[r], 0])
         landmark[places[r][new]] = at[new]
         prior, held = member.alone.prior, problem.start_information if r == 0 else ALIGNED_INFORMATION
-        if not metric:  # in the metres of the first one's ranges: all free within their priors prefer a small world
+        if (
+            not metric
+        ):  # in the scale of the first one's ranges: with all free within their priors a small map is preferred
             prior = prior.relative(np.sqrt(2.0) * prior.sigma[SLOPE] if r else 0.0)
         placed = replace(problem, start_pose=pose_r[0], start_information=held, prior=prior)
         robots.append(Smoother(placed, member.alone.outcome.noise.noise, robust=member.alone.settings.robust))
@@ -305,7 +307,7 @@ def _refined(
 
 
 def _as_needed(joint: Together, estimate: Estimate) -> tuple[Together, Estimate, list[FloatArray]]:
-    """The same under priors of the calibration states that are needed; how much each is."""
+    """Return the same under priors of the needed calibration states, with their probabilities."""
     marginals = exhausted(joint.marginals_in_slices(estimate))
     robots, states, p_needed = [], [], []
     parts = zip(joint.robots, joint.estimates(estimate), joint.parts(estimate, marginals), strict=True)
@@ -320,7 +322,7 @@ def _as_needed(joint: Together, estimate: Estimate) -> tuple[Together, Estimate,
 
 
 def _ahead(first: Member, joint: Together, estimate: Estimate) -> tuple[Together, Estimate]:
-    """The same, turned so that the first robot's first pose has its front ahead."""
+    """Return the same, rotated so that the first robot's first pose has its front ahead."""
     problem = joint.robots[0].problem
     start = se2.inverse(first.alone.prior.front(estimate.states[:9], problem.mount))
     turn, robots = se2.compose(start, se2.inverse(problem.start_pose)), []
@@ -339,7 +341,7 @@ def _divided(
     p_needed: Sequence[FloatArray],
     fits: Sequence[NoiseFit],
 ) -> list[Outcome]:
-    """What each robot knows at the optimum, in metres that all agree on; changes are as each alone has them."""
+    """Return each robot's part of the optimum, in the common scale; changes are those of each alone."""
     own, parts = joint.estimates(estimate), joint.parts(estimate, marginals)
     priors = [member.alone.prior for member in members]
     told = [

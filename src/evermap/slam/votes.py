@@ -1,4 +1,4 @@
-"""Identities that were read wrongly, by the vote of the seconds around.
+"""Detection of wrong identities, by votes of detections within seconds.
 
 Carried to one pose by odometry, which is good for some seconds, detections of one landmark lie together. Several with
 one id, and none or hardly any with its own anywhere near, say that an id was read wrongly. How far detections of one
@@ -51,7 +51,7 @@ def without_contradicted_ids(recording: AnyRecordingT, settings: SlamConfig) -> 
     given = recording.detections
     try:
         used, read = _read(recording, settings)
-    except DataError:  # too few ids: the estimator says so, if it needs any
+    except DataError:  # too few ids: the estimator reports it, if it needs any
         return recording
     name, (wrong, doubled) = read.name, contradicted(read, settings.votes)
     left_out = wrong | doubled[name]
@@ -91,7 +91,7 @@ def _read(recording: AnyRecording, settings: SlamConfig) -> tuple[IntArray, Read
 
 
 def _in_plane(recording: Recording, settings: SlamConfig) -> tuple[IntArray, Read]:
-    """Rows of detections that vote, and what they say."""
+    """Return rows of detections that vote, and their positions."""
     prepared = prepare(recording, settings=settings.odometry)
     problem = prepared.problem
     pose, _ = dead_reckoned(problem.stamp_s, problem.drive, problem.prior.mean, START)
@@ -101,7 +101,7 @@ def _in_plane(recording: Recording, settings: SlamConfig) -> tuple[IntArray, Rea
 
 
 def _in_space(recording: SpatialRecording, settings: SlamConfig) -> tuple[IntArray, Read]:
-    """The same in space, with odometry."""
+    """Return those of a recording in space with odometry."""
     if recording.odometry is None:
         raise DataError(f"{recording.name}: no odometry")
     intake = prepare_space(recording, settings.space)

@@ -30,7 +30,7 @@ GATE = 18.4
 WINDOWS = 12, 6
 """Boxes, one after the other on the way, that are searched for in the map together; fewer where it is known about."""
 TESTED_M2 = 157.0
-"""Area that one trial of the search covers: what agrees by chance in a large map is that much more probable."""
+"""Area that one trial of the search covers: chance agreement is proportionally more probable in a large map."""
 FACTORS = 1.0, 0.99, 1.01, 0.98, 1.02
 """On the lengths of a session, that are tried where its metre is its odometry's."""
 

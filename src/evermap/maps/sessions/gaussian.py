@@ -219,7 +219,7 @@ USUAL_METRE = MetreConfig()
 AS_GOOD = np.geomspace(0.05, 1.0, 9)
 """Robots of one map may know their metre better than is said, all by one factor, each of these as likely."""
 UNHEARD = 1e-9
-"""Information on the metre of a robot of which the map has no session."""
+"""Information on the scale of a robot without sessions in the map."""
 
 
 @dataclass(frozen=True, slots=True)

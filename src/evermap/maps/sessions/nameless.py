@@ -42,9 +42,9 @@ WINDOW = 12
 GROUP, MOST_HELD, MOST_PAIRS = 24, 100, 400
 """Landmarks that are assigned together, those near them that hold them, and pairs that are weighed, at most."""
 HELD_NATS = 100.0
-"""Log odds of what is sure."""
+"""Log odds of a certain match."""
 GATE = float(gates(1, 0.9999)[1])
-"""Squared distance beyond which a landmark does not stand at a place."""
+"""Squared distance beyond which a landmark is not at a place."""
 CERTAIN = math.log(P_MERGE / (1.0 - P_MERGE))
 """By how much a landmark must more probably be one of the map than anything else, to hold the session there [nats]."""
 

@@ -26,7 +26,7 @@ ELSEWHERE = -1
 """Option of a clique that stands at no known site."""
 FAR_M = 2.0
 HOPELESS = -200.0
-"""Who lies farther than this from a site, where most agree, with less than this log density, is not asked again."""
+"""Distance from a site, and log density, beyond which a clique is not considered again."""
 USUAL = OverlayConfig()
 MOST_FLIPS = 400
 """Steps of one ascent, at most: it ends long before."""

@@ -389,8 +389,8 @@ def without(visit: Solved, doubt: BoolArray) -> Recording | None:
     after_s = recording.frames.stamp_s - start_s
     told = ", ".join(f"{after_s[a]:.0f} to {after_s[b - 1]:.0f} s" for a, b in spans.reshape(-1, 2)[:3])
     remark = (
-        f"{int(doubt.sum())} frames left out ({told}{', ...' if len(spans) > 6 else ''} after the first): most of what "
-        "they show contradicts the rest, or the odometry was silent and nothing ties them to it"
+        f"{int(doubt.sum())} frames left out ({told}{', ...' if len(spans) > 6 else ''} after the first): most of "
+        f"their detections contradict the rest, or the odometry was silent and nothing connects them to it"
     )
     return replace(recording, frames=frames, detections=detections, warnings=(*recording.warnings, remark))
 

@@ -49,7 +49,7 @@ from evermap.types import (
 AXES_OF_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Columns are ahead, left and up of a sensor that looks along its z, with y down."""
 MOST_OF_ONE_IDENTITY = 4
-"""Landmarks that a map tells apart."""
+"""Maximum landmarks that share one identity in a map."""
 MOST_VIEWS = 2000
 """Looks that detection is learned from."""
 

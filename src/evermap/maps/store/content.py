@@ -49,12 +49,12 @@ DTYPES = tuple(_KINDS.values())
 """Types of the values of a chunk."""
 NAME_BYTES = 32
 MEMBERS = "members."
-"""The table that stays of a pruned revision: whose evidence it has, and what operators said."""
+"""The table that is kept of a pruned revision: landmarks of its evidence, and operators' edits."""
 _LIFE = ("lives.life", "lives.prior")
 _NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s", "places.rotation",
           "places.rotation_covariance", "boxes.landmark_id", "boxes.size_m", "metres.robot_id",
           "metres.log_metre", "metres.log_variance", "metres.information")  # fmt: skip
-"""Not written where there is none, so that an older evermap reads the map."""
+"""Written only if present, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
 """Stored bytes of chunks by their names, all of them; `DamagedError` if one is missing."""

@@ -123,7 +123,7 @@ _COLUMNS = {
     "log_odds": "<f4",
     "p_exists": "<f4",
 }
-"""Evidence explains what was decided and decides nothing: 7 digits of it are enough."""
+"""Evidence only explains decisions: 7 digits are enough."""
 
 
 class CliqueLooks(NamedTuple):

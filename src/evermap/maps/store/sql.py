@@ -418,7 +418,7 @@ class SqlStore(Shown):
             named: dict[int, Any] = {row.number: row.record for row in theirs.execute(select(schema.revision))}
             (head, anchor), (last, newest) = self._anchor(connection), other._anchor(theirs)
             if named.get(head) != anchor:
-                problem = f"revision {head} is none of {other._where}; nothing was written"
+                problem = f"revision {head} is not in {other._where}; nothing was written"
                 raise StaleRevisionError(problem, path=self._where, hint="run it again")
             fetch, wanted = partial(other._fetched, theirs), {named[number] for number in named if number > head}
             for number, record in other._chain(theirs, head + 1)[0].items():
@@ -716,7 +716,7 @@ _FAILURES = (
     ("is full", "cannot be written: the disk is full", "free some space"),
     ("unable to open", "cannot be opened or written", "check the rights of the file and of its folder"),
 )
-"""Common failures of a database that are no damage, with what to do about them."""
+"""Common failures of a database other than damage, with hints."""
 
 
 def is_anchor(values: Sequence[Any]) -> bool:

@@ -1,1 +1,1 @@
-"""Which landmarks moved together: the joint search over changes, with the trajectory marginalised."""
+"""The joint search over changes of groups of landmarks, with the trajectory marginalised."""

@@ -1,4 +1,4 @@
-"""What the measurements alone say about the landmarks, and how that compares with a map.
+"""The Gaussian of the landmarks from the measurements alone, and its comparison with a map.
 
 Poses and calibration states are eliminated from the linearised problem. What is left is a Gaussian over the landmarks
 whose freedom to be moved, turned and (within the calibration's prior) stretched as a whole is part of it, so that no
@@ -231,7 +231,7 @@ def compare(evidence: WindowEvidence, mean: FloatArray, covariance: FloatArray, 
 
 
 class _Piece(NamedTuple):
-    """What one window says about the pose after it, the pose it begins with, its copies and the states."""
+    """The information of one window on the pose after it, its first pose, its copies and the states."""
 
     landmark: IntArray
     position: FloatArray
@@ -272,7 +272,7 @@ def _piece(
 
 
 def _copies(part: Problem, estimate: Estimate, pose_row: IntArray, landmark: IntArray) -> FloatArray:
-    """Where the landmarks of a window are, seen from its poses alone: the median of their sightings."""
+    """Return the landmarks of a window by its poses alone: the median of their sightings."""
     if len(landmark) == 0:
         return np.zeros((0, 2))
     points = sighted_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
@@ -282,7 +282,7 @@ def _copies(part: Problem, estimate: Estimate, pose_row: IntArray, landmark: Int
 
 
 def in_sensor_metres(estimate: Estimate, prior: CalibrationPrior) -> Estimate:
-    """Return the same explanation with the range slope at its mean: what it was goes into the size of everything.
+    """Return the same explanation with the range slope at its mean, compensated by the scale of everything.
 
     Only their product is measured; where the odometry's noise is fixed in metres, a likelihood that may choose the size
     prefers a small world (see `CalibrationPrior.without_scale`).

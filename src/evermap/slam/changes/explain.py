@@ -23,12 +23,12 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class GivenMap:
-    """What is believed of the landmarks before the session.
+    """Prior of the landmarks before the session.
 
     Attributes:
         mean: (L, 2) positions.
         covariance: (L, 2, 2) of each.
-        given: (L,) landmarks that it holds.
+        given: (L,) landmarks that it contains.
     """
 
     mean: FloatArray
@@ -150,7 +150,7 @@ HELD_M = 0.005
 
 
 def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArray) -> Estimate:
-    """Return the estimate with poses that no sighting of the members has bent.
+    """Return the estimate with poses that are not distorted by sightings of the members.
 
     Sightings that were given to the wrong places have drawn the poses towards these, and would be right again there.
     """

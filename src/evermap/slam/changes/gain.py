@@ -1,4 +1,4 @@
-"""What a hypothesis about changes gains over 'nothing moved' (MATH.md section 5).
+"""The gain of a hypothesis about changes over 'nothing moved' (MATH.md section 5).
 
 With `e` = estimated minus mapped positions, `A` the inverse covariance of `e` if nothing moved and `b = A e`, groups
 with displacements `d ~ N(0, s^2 I)` that enter through columns `B` gain
@@ -29,7 +29,7 @@ _TURN_STEPS = 6
 
 
 class Tables(NamedTuple):
-    """What gains are computed from.
+    """Precomputed tables for gains.
 
     Attributes:
         quadratic: (4 K, 4 K) `T'AT`.

@@ -1,8 +1,8 @@
 """The joint search as a method of the estimator: relinearise, compare with the map, search, solve again.
 
-One landmark at a time cannot tell 'these four moved' from 'the robot is elsewhere'. So the changes are searched with
-the trajectory marginalised (`evidence`, `weigh`), the best hypothesis becomes a problem of its own (`explain`), and
-its solution is where everything is linearised next, until the groups stay.
+One landmark at a time cannot distinguish 'these four moved' from 'the robot is elsewhere'. So the changes are searched
+with the trajectory marginalised (`evidence`, `weigh`), the best hypothesis becomes a problem of its own (`explain`),
+and its solution is where everything is linearised next, until the groups stay.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def may_search(n_frames: int, *, in_map: bool) -> bool:
 
 
 class Joint(Method):
-    """Which landmarks moved together, before the session or within it.
+    """Method that finds groups of moved landmarks, before the session or within it.
 
     Args:
         n_landmarks: landmarks of the session.
@@ -107,11 +107,11 @@ class Joint(Method):
         return Estimate(se2.compose(motion, estimate.pose), se2.transform(motion, estimate.landmark), estimate.states)
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
-        """Search at the present estimate, and again at what it leads to where the session ends."""
+        """Search at the present estimate, and at the end of the session again at the resulting one."""
         if final and self._concluded is not None:
             return replace(self._concluded, problem=problem, estimate=estimate)
         if final:
-            self.verdict = None  # nothing of what was thought on the way is taken for granted
+            self.verdict = None  # hypotheses found on the way are not assumed
             if self._loosened is not None:
                 # what has not been explained yet may look like outliers on the wrong side: none is ruled out here
                 problem, free, start = self._loosened
@@ -167,7 +167,7 @@ class Joint(Method):
         return replace(problem, landmark_row=self._landmark[problem.landmark_row])
 
     def _first_places(self, estimate: Estimate) -> Estimate:
-        """One place a landmark: the first."""
+        """Return one place per landmark: the first."""
         return Estimate(estimate.pose, estimate.landmark[: self._count], estimate.states)
 
     def _explained(
@@ -263,7 +263,7 @@ class Joint(Method):
         evidence: WindowEvidence,
         bounds: IntArray,
     ) -> MovedGroup:
-        """The group with the time of its change, where that was within the session.
+        """Return the group with the time of its change, if that was within the session.
 
         The search, for which no pose is certain, says between which windows. Within those every detection tells, once
         the poses are those of a world where it happened then.
@@ -313,7 +313,7 @@ class Joint(Method):
 
 
 class _Loosened(NamedTuple):
-    """The problem as it was held, the same with the map believed to a metre, and where to start that from."""
+    """The problem with its map, the same with the map loosened to a metre, and initial values for that."""
 
     held: Problem
     free: Problem
@@ -356,7 +356,7 @@ def _current(landmark: IntArray, count: int) -> IntArray:
 
 
 def _with_copies(estimate: Estimate, evidence: WindowEvidence, groups: tuple[MovedGroup, ...]) -> Estimate:
-    """Where members of groups that moved within the session were seen first."""
+    """Return the first places of members of groups that moved within the session."""
     landmark = estimate.landmark.copy()
     first = evidence.first_seen(landmark)
     for group in groups:

@@ -147,7 +147,7 @@ SLOTS = 1 << 17
 
 
 class Weighed(NamedTuple):
-    """All hypotheses weighed so far: a hash table of gains, and those that were worth keeping row by row.
+    """All hypotheses evaluated so far: a hash table of gains, and the best ones row by row.
 
     Attributes:
         key, value: (SLOTS,) hash of a hypothesis, 0 where the slot is free, and its gain.
@@ -224,7 +224,7 @@ def _hash(label: IntArray, onset: IntArray, turns: Any) -> int:
 
 @kernel
 def _weigh(label: IntArray, onset: IntArray, turns: Any, tables: Tables, weighed: Weighed) -> float:
-    """Gain of a hypothesis, whose groups are numbered anew in place; remembered."""
+    """Return the gain of a hypothesis, after renumbering its groups in place; it is cached."""
     _compact(label, onset, turns)
     key = _hash(label, onset, turns)
     slot = (key ^ (key >> 32)) & (SLOTS - 1)
@@ -259,7 +259,7 @@ def _copy(label: IntArray, onset: IntArray, turns: Any, to_label: IntArray, to_o
 def _climb(
     label: IntArray, onset: IntArray, turns: Any, may_turn: bool, tables: Tables, weighed: Weighed, uphill: bool
 ) -> float:
-    """From one start uphill to a local optimum, in place; its gain. Else weigh all that one move makes of the start."""
+    """Climb from a start to a local optimum, in place, and return its gain; or evaluate all neighbours of the start."""
     n_windows = len(tables.log_onset)
     trial, trial_onset, trial_turns = label.copy(), onset.copy(), turns.copy()
     best = _weigh(label, onset, turns, tables, weighed) if uphill else np.inf
@@ -352,7 +352,7 @@ def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: i
 def _add_best_pair(
     landmark: int, group: int, may_turn: bool, tables: Tables, label: IntArray, onset: IntArray, turns: Any
 ) -> None:
-    """A new group of a static landmark and the static one that goes with it best, at the best time, in place.
+    """Add a group of a static landmark and its best static partner, at the best time, in place.
 
     What moved with others may lose by moving alone, whenever that was; and what turned has no displacement in common.
     """

@@ -1,4 +1,4 @@
-"""All hypotheses under all degrees of belief in map and sightings, weighed against each other.
+"""Weights of all hypotheses under all credibilities of map and sightings.
 
 How far the map is to be believed, and how large the error is that all sightings of one window share, are chosen by
 evidence together with the changes: an unexplained change makes both look bad.
@@ -24,7 +24,7 @@ MAP_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the evidence says.
+    """Result of the search.
 
     Attributes:
         groups: the most probable changes.
@@ -57,7 +57,7 @@ def weigh(
     thorough: bool = True,
     spared: bool = False,
 ) -> Verdict:
-    """Search for changes, and weigh what was found.
+    """Search for changes, and compute their probabilities.
 
     Args:
         evidence: of all copies.
@@ -196,7 +196,7 @@ _Key = tuple[tuple[tuple[int, ...], bool], ...]
 
 
 def _groups(hypotheses: Hypotheses, row: int, seen: _SeenWithin) -> tuple[_Key, tuple[MovedGroup, ...]]:
-    """What stands for a hypothesis where windows and kinds of motion do not matter, and its groups."""
+    """Return a key of a hypothesis that ignores windows and kinds of motion, and its groups."""
     label = hypotheses.label[row]
     groups = []
     for g in range(1, int(label.max()) + 1):

@@ -1,4 +1,4 @@
-"""Which places of a given map are where it says: each is asked as if the others alone had located the robot.
+"""Test of the places of a given map: each against a robot located by all the others.
 
 A landmark stands where the map has it, to within the map's own accuracy, or it was moved somewhere. With all other
 places and the session fixed, its position is Gaussian in both cases, so the odds follow from two densities.
@@ -29,7 +29,7 @@ LEAST_INFORMATION = 1.0 / 25.0
 
 @dataclass(frozen=True, slots=True)
 class MapComparison:
-    """The map's places beside those of the session.
+    """Comparison of the map's places with those of the session.
 
     Attributes:
         p_stands: (K,) probability that each is where the map has it.
@@ -66,8 +66,8 @@ def compared(optimum: SpatialOptimum, stated: FloatArray) -> tuple[SpatialOptimu
 
 
 def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
-    """(K,) weights of the map's places: of those that do not stand the farthest are let go first, which may have
-    drawn the others after them.
+    """Return (K,) weights of the map's places: of the moved ones the farthest are released first, since they may have
+    distorted the others.
     """
     spread = found.covariance + sigma[:, :, None] ** 2 * np.eye(6)
     far = np.einsum("ki,kij,kj->k", found.off, np.linalg.inv(spread), found.off)
@@ -77,7 +77,7 @@ def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> Fl
 
 
 def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
-    """Every place as the others and the session have it."""
+    """Predict every place from the others and the session."""
     problem, prior = optimum.smoother.problem, optimum.smoother.problem.prior
     settings = problem.settings.map
     spread = optimum.smoother.spread(optimum.now)
@@ -88,7 +88,7 @@ def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
         mean = problem.off_map(np.array([k]), own_place, oriented=bool(problem.oriented[place]))[0]
         dim, at = len(mean), spread.own_first[n + place]
         own = np.linalg.inv(spread.own[at : at + dim * dim].reshape(dim, dim))
-        # the map's own word on it is taken back; what is left may be little, but is something
+        # the map's own information on it is removed; the rest may be weak, but is positive
         values, vectors = np.linalg.eigh(own - np.diag(prior.weight[k] / prior.sigma[k, :dim] ** 2))
         alone = np.linalg.inv((vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T)
         mean = alone @ (own @ mean)
@@ -103,7 +103,7 @@ def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
 
 
 class Alone(NamedTuple):
-    """What a session says of its P places without the map, in the frame in which the map has put it.
+    """The Gaussian of a session's P places without the map, in the frame of the map.
 
     Attributes:
         shift_m: (P, 3) from where they are with the map.
@@ -159,7 +159,7 @@ def _log_density(off: FloatArray, covariance: FloatArray) -> float:
 
 
 def _accuracy(found: MapComparison, stated: FloatArray, problem: SpatialProblem) -> float:
-    """The factor on the map's stated deviations that fits the places which stand; 1 counts for some."""
+    """Return the factor on the map's stated deviations that fits the unmoved places, with a weak prior at 1."""
     total = count = problem.settings.map.pseudo_count
     for k, place in enumerate(problem.prior.place):
         dim = 6 if problem.oriented[place] else 3

@@ -1,4 +1,4 @@
-"""What odometry and detector get wrong, before anything is estimated: what wanders, and what repeats itself.
+"""Errors of odometry and detector, estimated before solving: drift, correlated and systematic errors.
 
 Each landmark is put where each of its sightings has it along the odometry alone. The squared distance between two of
 these places grows with the time between them: at once by white noise, to a limit by errors that persist (a view, a bias
@@ -50,7 +50,7 @@ each of them (Akaike 1974)."""
 
 
 class Drift(NamedTuple):
-    """What a recording says of its noise.
+    """Noise of a recording.
 
     Attributes:
         translation: of the odometry [m / sqrt(s)]; rotation: [rad / sqrt(s)]; None where too little is seen twice.
@@ -105,7 +105,7 @@ def drift_of(problem: SpatialProblem, driven: FloatArray) -> Drift:
 
 
 def _instants(count: int) -> tuple[IntArray, IntArray]:
-    """All pairs of some of so many sightings."""
+    """Return all pairs of a subset of sightings."""
     some = np.arange(count)[:: max(1, count // SIGHTINGS_A_PLACE)]
     i, j = np.triu_indices(len(some), 1)
     return some[i], some[j]
@@ -142,7 +142,7 @@ def _shared_growth(problem: SpatialProblem, at: FloatArray, stamp_s: FloatArray)
 
 
 def _least_growth(curve: _Curve) -> float:
-    """What grows for ever of a curve, beside errors that persist."""
+    """Return the unbounded growth of a curve, in addition to persistent errors."""
     columns = np.column_stack([*_columns(curve, PERSIST_S[:-2]), curve.lag_s])
     found, _ = nnls(columns / curve.square[:, None], np.ones(len(curve.lag_s)))
     return float(found[-1])
@@ -201,7 +201,7 @@ MOST_SCALE, SCALE_STEP, EM_ROUNDS = 0.1, 0.01, 12
 
 
 class Gauge(NamedTuple):
-    """Errors that repeat themselves.
+    """Systematic errors of scale and bend.
 
     Attributes:
         stated: factor on ranges that is known beforehand; None where it is not.
@@ -222,13 +222,13 @@ class Gauge(NamedTuple):
 
     @classmethod
     def before(cls, settings: SpaceConfig) -> Gauge:
-        """Return what is known before anything is seen."""
+        """Return the prior of the errors."""
         given = settings.traffic
         return cls(settings.range_scale, scale_sigma=given.sigma_scale, bend_sigma=given.sigma_bend)
 
     @property
     def range_scale(self) -> float:
-        """Return the factor on ranges: what is stated, else the odometry's metre holds."""
+        """Return the factor on ranges: the stated one, else that of the odometry's scale."""
         return 1.0 + self.scale if self.stated is None else self.stated
 
     @property
@@ -261,7 +261,7 @@ def gauge_of(
     pose: FloatArray, when_s: FloatArray, frame: IntArray, seen: FloatArray, mount_m: FloatArray, thing: IntArray,
     settings: SpaceConfig = USUAL, still: StillConfig = STILL,
 ) -> Gauge:  # fmt: skip
-    """Return scale and bend by which as many things as possible stand still.
+    """Return scale and bend for which as many objects as possible are static.
 
     Args:
         pose: (F, 7) of the robot by the odometry.
@@ -304,7 +304,7 @@ def gauge_of(
 def _directions(
     pose: FloatArray, frame: IntArray, seen: FloatArray, mount_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where sightings (K, 2) are from above, and (K, 2, 2) how that changes by the scale and by the bend."""
+    """Return sightings (K, 2) from above, and (K, 2, 2) their derivatives by scale and bend."""
     at = se3.transform(pose[frame], seen)
     step = np.linalg.norm(np.diff(pose[:, :3], axis=0), axis=1)
     up = se3.rotation_of(pose)[1:, :, 2] * step[:, None]
@@ -319,7 +319,7 @@ def _still(
     when_s: FloatArray, at: FloatArray, by: FloatArray, of: IntArray, sigma: FloatArray, given: TrafficConfig,
     alike_s: float,
 ) -> FloatArray:  # fmt: skip
-    """(count,) probability that each thing stands, by its velocity: a mixture of what stands and what moves.
+    """Return the (count,) probability that each object is static, by its velocity: a mixture of static and moving.
 
     The scale and the bend are those of its highest optimum (expectation-maximisation from a grid of scales), so that
     traffic which creeps along does not count for what stands.
@@ -351,7 +351,7 @@ def _still(
 
 
 def _spans(when_s: FloatArray, of: IntArray, count: int) -> FloatArray:
-    """(count,) seconds from the first to the last sighting of each thing."""
+    """Return (count,) seconds from the first to the last sighting of each object."""
     first, last = np.full(count, np.inf), np.full(count, -np.inf)
     np.minimum.at(first, of, when_s)
     np.maximum.at(last, of, when_s)
@@ -359,7 +359,7 @@ def _spans(when_s: FloatArray, of: IntArray, count: int) -> FloatArray:
 
 
 def _stretches(when_s: FloatArray, of: IntArray, count: int) -> IntArray:
-    """(count,) stretch of the drive in which each thing is seen: as many things in each."""
+    """Return the (count,) stretch of the drive of each object, with equal numbers in each."""
     middle = _summed(when_s[:, None], of, count)[:, 0] / np.bincount(of)
     return np.asarray(np.argsort(np.argsort(middle)) * STRETCHES // count)
 
@@ -368,8 +368,8 @@ def _steady(
     at: FloatArray, by: FloatArray, of: IntArray, still: FloatArray, sigma: FloatArray, prior: FloatArray,
     stretch: IntArray,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """The two numbers, by reweighted least squares within each of the things that stand; and their deviations, with
-    things as witnesses, and with stretches of the drive.
+    """Return scale and bend by reweighted least squares over the static objects; and their deviations, clustered by
+    objects and by stretches of the drive.
     """
     trust, found, count = np.maximum(still, 1e-9)[of], np.zeros(2), len(still)
     weight, total, told = trust / sigma**2, np.eye(2), np.zeros((count, 2))
@@ -391,18 +391,18 @@ def _steady(
 
 
 def _log_odds(value: float, sigma: float, usual: float, count: float) -> float:
-    """That there is an error: Student's density of what `count` things say, over that by chance."""
+    """Return the log odds of an error: Student's density over `count` objects, against that without an error."""
     sigma = max(sigma, 1e-12)
     fit = 0.5 * count * np.log1p((value / sigma) ** 2 / max(count - 2.0, 1e-3))
     return float(fit - np.log(np.hypot(usual, sigma) / sigma))
 
 
 def _centred(values: FloatArray, of: IntArray, count: int, weight: FloatArray) -> FloatArray:
-    """Values (K, C) less the mean of their thing."""
+    """Return values (K, C) less the mean of their object."""
     mean = _summed(weight[:, None] * values, of, count) / np.bincount(of, weight, minlength=count)[:, None]
     return np.asarray(values - mean[of])
 
 
 def _summed(values: FloatArray, of: IntArray, count: int) -> FloatArray:
-    """(count, C) sums by thing."""
+    """Return (count, C) sums by object."""
     return np.stack([np.bincount(of, column, minlength=count) for column in values.T], axis=1)

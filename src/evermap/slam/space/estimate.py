@@ -33,7 +33,7 @@ MOST_CANDIDATES = 60
 
 @dataclass(frozen=True, slots=True)
 class SpatialOptimum:
-    """Values, noise, and what was linearised there."""
+    """Values, noise, and the linearised problem at the optimum."""
 
     estimate: SpatialEstimate
     noise: SpatialNoise
@@ -44,7 +44,7 @@ class SpatialOptimum:
 def converged(
     problem: SpatialProblem, start: SpatialEstimate, noise: SpatialNoise, *, heavy_rounds: int = 2
 ) -> SpatialOptimum:
-    """Return the optimum and its noise levels, in turns until neither changes.
+    """Return the optimum and its noise levels, alternated until neither changes.
 
     Args:
         problem: the measurements.
@@ -67,7 +67,7 @@ def converged(
 
 
 def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, begun: SpatialNoise) -> SpatialNoise:
-    """Return noise levels by expectation-maximisation: residuals, and what is not known of them, by inlier weight."""
+    """Return noise levels by expectation-maximisation: residuals and their uncertainties, by inlier weight."""
     problem, kind = smoother.problem, smoother.problem.kind
     n_steps, spread, worth = len(problem.increment), smoother.spread(now), problem.settings.pseudo_count
     trace = _traces(smoother, spread.of_factors, spread.of_factors_first)

@@ -1,4 +1,4 @@
-"""What goes into the estimator in space: the usable part of a recording, with what each detection is worth."""
+"""Input of the estimator in space: the usable part of a recording, with the weight of each detection."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HARDLY = 1.0
 
 @dataclass(frozen=True, slots=True)
 class SpatialIntake:
-    """A recording as the estimator wants it.
+    """A recording as input of the estimator.
 
     Attributes:
         problem: stamps count from `start_s`.
@@ -49,11 +49,11 @@ class SpatialIntake:
 def prepare_space(
     recording: SpatialRecording, settings: SpaceConfig, remarks: tuple[str, ...] = (), *, fewest: int = 2
 ) -> SpatialIntake:
-    """Sort out what can be used: detections of known identity, while there is odometry.
+    """Select the usable part: detections of known identity, during the odometry.
 
     Args:
         recording: as read.
-        settings: what is believed of the sensors.
+        settings: priors of the sensors.
         remarks: on the recording, before those on what was left out.
         fewest: frames with a landmark that it takes.
 
@@ -116,7 +116,7 @@ def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
 
 
 def _symmetries(recording: SpatialRecording, place: IntArray, used: IntArray, kind: IntArray) -> Symmetries:
-    """Turns after which places look the same, by their classes; of none tags, which have a pattern.
+    """Return the symmetries of places by their classes; none for tags, which have a pattern.
 
     What has no orientation becomes a point: `kind` (M,) is written to.
     """
@@ -144,7 +144,7 @@ def _too_little(recording: SpatialRecording, seen: int, fewest: int) -> DataErro
 def _said(
     recording: SpatialRecording, settings: SpaceConfig, remarks: tuple[str, ...]
 ) -> tuple[_Where, BoolArray, BoolArray, list[str]]:
-    """What detections say, which (M,) can be used, frames (F,) while there is odometry, and what is left out."""
+    """Return the measurements, usable detections (M,), frames (F,) during the odometry, and remarks on dropped ones."""
     usable, moving, warnings = _usable(recording, remarks)
     where, broken = _where(recording, usable, settings)
     if broken.any():
@@ -158,7 +158,9 @@ def _said(
 
 
 def _usable(recording: SpatialRecording, remarks: tuple[str, ...]) -> tuple[BoolArray, BoolArray, list[str]]:
-    """Detections (M,) of known identity while there is odometry, frames (F,) while there is, and what is left out."""
+    """Return detections (M,) of known identity during the odometry, frames (F,) during it, and remarks on dropped
+    ones.
+    """
     detections, stamps, warnings = recording.detections, recording.frames.stamp_s, list(remarks)
     usable = detections.landmark_id != UNKNOWN
     if not usable.all():
@@ -176,7 +178,7 @@ def _usable(recording: SpatialRecording, remarks: tuple[str, ...]) -> tuple[Bool
 
 @dataclass(frozen=True, slots=True)
 class _Where:
-    """What each detection says, for all rows; see `SpatialProblem`."""
+    """Measurements of all detections; see `SpatialProblem`."""
 
     kind: IntArray
     measured: FloatArray
@@ -192,7 +194,7 @@ class _Where:
 
 
 def _where(recording: SpatialRecording, usable: BoolArray, settings: SpaceConfig) -> tuple[_Where, BoolArray]:
-    """What the detections say, and which of the usable ones say nothing."""
+    """Return the measurements, and the usable detections without any."""
     given = recording.detections
     count = len(given)
     found = _Where(
@@ -252,7 +254,8 @@ def without_range(recording: SpatialRecording) -> BoolArray:
 
 
 def _with_ranges(recording: SpatialRecording, where: _Where, usable: BoolArray, settings: SpaceConfig) -> BoolArray:
-    """Give detections without a range one, from where else the same landmark was seen shortly before and after.
+    """Triangulate the ranges of detections without one, from other detections of the same landmark shortly before and
+    after.
 
     The covariance keeps what was seen across; the range itself is hardly believed. Returns (M,) those that could not.
     """
@@ -313,7 +316,7 @@ def _put(
 
 
 def _covariance(recording: SpatialRecording, settings: SpaceConfig) -> FloatArray:
-    """(M, 3, 3) of positions: as given, or by what is usual of such sensors."""
+    """Return (M, 3, 3) covariances of positions: as given, or usual ones of such sensors."""
     given = recording.detections
     at = given.position_sensor_m
     range_m = np.maximum(np.linalg.norm(at, axis=1), settings.nearest_m)

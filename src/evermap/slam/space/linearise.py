@@ -84,7 +84,7 @@ class SpatialSightings(NamedTuple):
 def weighed(squared: float, log_odds: float, n_rows: int, share: float, heavy: bool) -> tuple[float, float]:
     """Return the weight of a factor with `n_rows` normalised residuals, and its negative log likelihood.
 
-    It is a mixture of what the noise levels say and of an outlier, whose information is `share` of that.
+    It is a mixture of an inlier by the noise levels and of an outlier, whose information is `share` of that.
     """
     if heavy:
         scale = TAIL_SIGMAS * TAIL_SIGMAS * n_rows

@@ -1,4 +1,4 @@
-"""Boxes without identity around a robot that moves: what stands still holds its poses, what moves is followed.
+"""Boxes without identity around a moving robot: static ones constrain its poses, moving ones are tracked.
 
 The tracker gives the boxes identities where the odometry has the robot; what stands by them shows the errors that
 odometry and detector repeat (`gauge`); with these taken off, the tracker is asked again, until nothing changes. What
@@ -51,12 +51,12 @@ WANDERS = 0.03, 0.003
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """What is around the robot.
+    """Objects around the robot.
 
     Attributes:
         followed: the tracker's answer; None where nothing was seen often enough.
-        standing: what of it stands, a row a box.
-        gauge: errors that repeat themselves.
+        standing: static stays, one row per box.
+        gauge: systematic errors.
     """
 
     followed: TrackResult | None
@@ -78,7 +78,7 @@ def run_in_traffic(
     prior_map: Landmarks | None = None,
     progress: Progress | None = None,
 ) -> SlamResult:
-    """Estimate poses, what stands as landmarks, and the ways of what moves.
+    """Estimate poses, static objects as landmarks, and tracks of moving objects.
 
     Args:
         recording: with odometry and boxes without identities; landmarks with identities may be there, too.
@@ -101,7 +101,7 @@ def run_in_traffic(
 
 @dataclass(frozen=True, slots=True)
 class TrafficIntake:
-    """A recording in traffic as the solver takes it.
+    """A recording in traffic as input of the solver.
 
     Attributes:
         recording: with a frame for every pose; its other detections are left out.
@@ -125,9 +125,7 @@ class TrafficIntake:
 
 
 def take_in_traffic(recording: SpatialRecording, space: SpaceConfig, track: TrackConfig) -> TrafficIntake:
-    """Return what stands in a recording with the errors that repeat themselves taken off; arguments as of
-    `run_in_traffic`.
-    """
+    """Return the static objects of a recording with systematic errors removed; arguments as of `run_in_traffic`."""
     recording, rows = _whole(recording)
     driven = _driven(recording)
     return _taken(recording, rows, driven, _settled(recording, driven, space, track), space)
@@ -146,7 +144,7 @@ def _taken(
 
 
 def rescaled(taken: TrafficIntake, factor: float, space: SpaceConfig) -> TrafficIntake:
-    """Return the same with all lengths times a factor, by a map that knows the metre: odometry and ranges alike."""
+    """Return the same with all lengths scaled to a map: odometry and ranges alike."""
     gauge = taken.traffic.gauge
     ranges, driven = factor * gauge.range_scale, factor * gauge.odometry_scale
     gauge = gauge._replace(stated=ranges, scale=1.0 / driven - 1.0)
@@ -154,7 +152,7 @@ def rescaled(taken: TrafficIntake, factor: float, space: SpaceConfig) -> Traffic
 
 
 def solve_in_traffic(taken: TrafficIntake, progress: Progress | None = None) -> SpatialSolved:
-    """Return the solution of what stands, by itself.
+    """Return the solution of the static objects alone.
 
     Raises:
         NumericalError: no finite optimum.
@@ -165,7 +163,7 @@ def solve_in_traffic(taken: TrafficIntake, progress: Progress | None = None) -> 
 def conclude_in_traffic(
     taken: TrafficIntake, intake: SpatialIntake, solved: SpatialSolved, track: TrackConfig
 ) -> tuple[SlamResult, TrackResult | None]:
-    """Return poses and what stands, rows of detections those of `taken.recording`; and tracks along these poses."""
+    """Return poses and static objects, with rows of detections of `taken.recording`; and tracks along these poses."""
     result = concluded_in_space(taken.standing, intake, solved)
     followed = _followed(taken.recording, result.trajectory.pose_world_robot, taken.traffic.gauge, track)
     if followed is not None:
@@ -216,7 +214,7 @@ def _driven(recording: SpatialRecording) -> FloatArray:
 
 
 def _settled(recording: SpatialRecording, driven: FloatArray, space: SpaceConfig, track: TrackConfig) -> Traffic:
-    """Identities, what stands, and the errors that repeat themselves: in turns, until the errors are the same."""
+    """Return identities, static objects, and systematic errors, alternated until the errors no longer change."""
     rows, stamps, gauge = boxes_of(recording), recording.frames.stamp_s, Gauge.before(space)
     mount, frame = mounts_of(recording)[rows], recording.detections.frame[rows]
     seen = se3.transform(mount, recording.detections.position_sensor_m[rows])
@@ -226,7 +224,7 @@ def _settled(recording: SpatialRecording, driven: FloatArray, space: SpaceConfig
         stands = _stands(recording, followed, track.still)
         if followed is None:
             break
-        # nothing is known in the first round: every track may stand
+        # in the first round every track may be static
         thing = stands.stay if gauge.things else long_enough(stamps[frame], followed.track_of_detection, track.still)
         on = np.flatnonzero(thing != UNKNOWN)
         found = gauge_of(driven, stamps[frame[on]], frame[on], seen[on], mount[on, :3], thing[on], space, track.still)
@@ -243,7 +241,7 @@ def mounts_of(recording: SpatialRecording) -> FloatArray:
 
 
 def _followed(recording: SpatialRecording, pose: FloatArray, gauge: Gauge, track: TrackConfig) -> TrackResult | None:
-    """What the tracker says of the boxes, with the robot at poses (F, 7)."""
+    """Return the tracks of the boxes, with the robot at poses (F, 7)."""
     given, rows, stamps = recording.detections, boxes_of(recording), recording.frames.stamp_s
     mount = mounts_of(recording)[rows]
     local = np.column_stack([gauge.range_scale * given.position_sensor_m[rows], given.rotation[rows]])
@@ -274,7 +272,7 @@ def _followed(recording: SpatialRecording, pose: FloatArray, gauge: Gauge, track
 
 
 def _stands(recording: SpatialRecording, followed: TrackResult | None, settings: StillConfig) -> Stood:
-    """What of the boxes stands."""
+    """Return the static boxes."""
     rows = boxes_of(recording)
     stamp_s = recording.frames.stamp_s[recording.detections.frame[rows]]
     if followed is None:
@@ -286,7 +284,7 @@ def _stands(recording: SpatialRecording, followed: TrackResult | None, settings:
 
 
 def _identity(recording: SpatialRecording, stands: Stood) -> IntArray:
-    """(M,) identities of the solver: of boxes their stay, where they stand."""
+    """Return (M,) identities of the solver: for static boxes their stay."""
     identity = recording.detections.landmark_id.copy()
     identity[boxes_of(recording)] = np.where(stands.stay == UNKNOWN, UNKNOWN, _known(recording) + stands.stay)
     return identity
@@ -295,7 +293,7 @@ def _identity(recording: SpatialRecording, stands: Stood) -> IntArray:
 def _standing_only(
     recording: SpatialRecording, driven: FloatArray, traffic: Traffic, identity: IntArray
 ) -> SpatialRecording:
-    """The recording as the solver takes it: with what has an identity (M,), and without repeated errors."""
+    """Return the input of the solver: detections with an identity (M,), without systematic errors."""
     assert recording.odometry is not None
     rows, given = boxes_of(recording), recording.detections
     rotation, position = given.rotation.copy(), given.position_sensor_m.copy()
@@ -312,7 +310,7 @@ def _standing_only(
 
 
 def _wandering(solved: SpatialSolved) -> SpatialSolved:
-    """The solution with odometry that wanders, where that explains far better what is seen; else as it is.
+    """Return the solution with drifting odometry if that explains the detections far better; else the given one.
 
     The errors of boxes are alike for seconds, and things that creep are taken for such that stand: both look like an
     odometry that wanders a little. So good odometry is believed, until things agree that it is not.
@@ -330,7 +328,7 @@ def _wandering(solved: SpatialSolved) -> SpatialSolved:
 def with_stays(
     result: SlamResult, taken: TrafficIntake, followed: TrackResult | None, track: TrackConfig
 ) -> SlamResult:
-    """Return the result with what stood under the ids of its tracks.
+    """Return the result with static objects under the ids of their tracks.
 
     Args:
         result: landmarks of ids from `taken.known` on are stays.
@@ -406,7 +404,7 @@ def _headed(landmarks: Landmarks, ours: IntArray, track: IntArray, followed: Tra
 
 
 def _parameters(gauge: Gauge, settings: TrafficConfig) -> tuple[ParameterEstimate, ...]:
-    """What odometry and detector repeat in error."""
+    """Return the systematic errors of odometry and detector."""
     if not gauge.things:
         return ()
     given, usual = gauge.stated is not None, settings.sigma_scale
@@ -414,7 +412,7 @@ def _parameters(gauge: Gauge, settings: TrafficConfig) -> tuple[ParameterEstimat
     return (
         ParameterEstimate(
             "range_scale", gauge.range_scale, ranges, 1.0, settings.sigma_scale, "1", fixed=given,
-            meaning="factor on ranges of boxes, by the odometry's metre",
+            meaning="factor on ranges of boxes, relative to the odometry",
         ),
         ParameterEstimate(
             "odometry_scale", gauge.odometry_scale, driven, 1.0, usual if given else float("nan"), "1", fixed=not given,
@@ -422,13 +420,13 @@ def _parameters(gauge: Gauge, settings: TrafficConfig) -> tuple[ParameterEstimat
         ),
         ParameterEstimate(
             "odometry_bend_radpm", gauge.bend, gauge.bend_sigma, 0.0, settings.sigma_bend, "rad/m",
-            meaning="angle that the odometry turns too little by the metre",
+            meaning="missing rotation of the odometry per metre",
         ),
     )  # fmt: skip
 
 
 def _changes(standing: Stood, identities: IntArray, names: Mapping[int, str], when_s: float) -> tuple[MapChange, ...]:
-    """What came to rest in view, and what left."""
+    """Return arrivals and departures in view."""
     found = []
     for stay, identity in enumerate(identities.tolist()):
         hits = int(np.count_nonzero(standing.stay == stay))

@@ -1,4 +1,4 @@
-"""What is measured in space, what is sought, and how noisy: the nouns that the modules of this package exchange."""
+"""Problem, estimate and noise in space: the nouns that the modules of this package exchange."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class SpatialNoise:
 
 @dataclass(frozen=True, slots=True)
 class PlacePrior:
-    """Where some places are by a map that is given.
+    """Prior of some places from a given map.
 
     Attributes:
         place: (K,) rows of places.
@@ -70,13 +70,13 @@ class PlacePrior:
 
     @classmethod
     def none(cls) -> PlacePrior:
-        """Return a map that says nothing."""
+        """Return an empty prior."""
         return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 7)), np.ones((0, 6)), np.ones(0))
 
 
 @dataclass(frozen=True, slots=True)
 class SpatialProblem:
-    """Everything measured and believed beforehand.
+    """All measurements and priors.
 
     Attributes:
         stamp_s: (N,) instants of the poses.
@@ -188,7 +188,7 @@ class SpatialProblem:
         )  # fmt: skip
 
     def as_points(self) -> SpatialProblem:
-        """Return the same with positions only: what is left has one optimum, near any start."""
+        """Return the same with positions only, which has one optimum, near any start."""
         prior = replace(self.prior, sigma=np.hstack([self.prior.sigma[:, :3].max(axis=1, keepdims=True)] * 6))
         return replace(self, kind=np.full_like(self.kind, POINT), oriented=np.zeros_like(self.oriented), prior=prior)
 

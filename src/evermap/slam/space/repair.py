@@ -1,4 +1,4 @@
-"""Out of wrong optima: poses and orientations that another explanation of the same views fits better.
+"""Escapes from wrong optima: poses and orientations that another explanation of the same views fits better.
 
 The view of a single far tag has two explanations, and the optimum of one is no way to the other. So the poses that
 every detection by itself suggests, in both ways, are asked, and the orientations that all detections of a place vote.
@@ -38,7 +38,7 @@ def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
 
 
 def unjumped(optimum: SpatialOptimum) -> SpatialOptimum:
-    """Return the optimum, or a better one in which not the robot jumped, but landmarks of the map were moved.
+    """Return the optimum, or a better one in which landmarks of the map were moved instead of a jump of the robot.
 
     A robot that sees only things that were carried away together finds itself where these had been, and jumps back
     with the next view. So the stretches of frames between jumps of the odometry are asked once more without them,

@@ -1,4 +1,4 @@
-"""What comes out of the estimator in space, as plain arrays with the recording's ids and stamps, in metres."""
+"""Results of the estimator in space, as plain arrays with the recording's ids and stamps, in metres."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class _Told:
 
 
 def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solved: SpatialSolved) -> SlamResult:
-    """Return trajectory and map, and what stands elsewhere than a given map says."""
+    """Return trajectory and map, and differences to a given map."""
     frame = "prior_map" if len(solved.optimum.smoother.problem.prior.place) else "first_pose"
     optimum = solved.optimum
     found, placed = located(optimum.smoother.problem, optimum.now)
@@ -73,15 +73,13 @@ def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solve
         for k in np.setdiff1d(optimum.smoother.problem.place[optimum.now.weight > inlier], np.flatnonzero(placed))
     ]
     if left_out:
-        warnings.append(
-            f"landmarks left out, since nothing tells where they are beside the others: {', '.join(left_out)}"
-        )
+        warnings.append(f"landmarks left out, since nothing connects them to the others: {', '.join(left_out)}")
     if not found.all():
         warnings.append(f"{int((~found).sum())} frames in which the robot could not be located left out")
     seen = np.bincount(optimum.smoother.problem.place, optimum.now.weight, minlength=len(identities)) > inlier
     twice = [_called(names, int(identities[k])) for k in np.flatnonzero((solved.number > 1) & seen & placed)]
     if twice:
-        warnings.append(f"identities that several landmarks carry, told apart by their places: {', '.join(twice)}")
+        warnings.append(f"identities on several landmarks, distinguished by their places: {', '.join(twice)}")
     rough = np.repeat(solved.online_spread**2, 3, axis=1)[:, :, None] * np.eye(6)
     return SlamResult(
         trajectory=Trajectory(
@@ -125,7 +123,7 @@ def _called(names: Mapping[int, str], identity: int) -> str:
 
 
 def located(problem: SpatialProblem, now: SpatialLinear) -> tuple[BoolArray, BoolArray]:
-    """Return (N,) poses and (P,) places of which it is known where they are, beside the map or beside each other.
+    """Return (N,) poses and (P,) places that are located relative to the map or to each other.
 
     That is by odometry, or by detections that are no outliers. Without odometry these tie frames to landmarks, and
     what is tied to neither the map nor to most that was seen may be anywhere.
@@ -230,7 +228,7 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
 
 
 def _innovations(told: _Told, identities: IntArray) -> Innovations:
-    """NIS of all detections, each as if it had not been used, from residuals r and what it leaned on itself.
+    """Return the NIS of all detections, each as if it had not been used, from residuals r and their leverage.
 
     With H = J S J' of whitened Jacobians and the covariance S, and the weight w: r' (1 - w H)^-1 (1 - w H + H)^-1 r.
     """
@@ -266,7 +264,7 @@ def _dead_reckoning(told: _Told) -> Trajectory:
 
 
 def _changes(told: _Told, identities: IntArray, names: Mapping[int, str]) -> tuple[MapChange, ...]:
-    """Landmarks that stand elsewhere than the given map says, the most certain first."""
+    """Return landmarks that moved relative to the given map, the most certain first."""
     found = told.solved.from_map
     if found is None:
         return ()

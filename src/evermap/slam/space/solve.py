@@ -1,4 +1,4 @@
-"""A recording in space, from its first values to the optimum, beside a map that may be given."""
+"""The solution of a recording in space, from initial values to the optimum, optionally with a map."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SPLITS = 2
 
 @dataclass(frozen=True, slots=True)
 class SpatialSolved:
-    """What a session in space came to.
+    """Solution of a session in space.
 
     Attributes:
         optimum: values, noise and covariances of the last problem.
@@ -56,7 +56,7 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     """Estimate poses, places and noise of a recording in space.
 
     Args:
-        intake: the recording as the estimator wants it.
+        intake: the recording as input of the estimator.
         prior_map: landmarks to localise in; None maps from scratch, in the frame of the first pose.
         progress: told after every frame.
 
@@ -138,7 +138,7 @@ def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[Spati
 def _likelier(
     problem: SpatialProblem, noise: SpatialNoise, stepwise: SpatialEstimate, whole: SpatialEstimate
 ) -> SpatialEstimate:
-    """First values: frame after frame, or along the odometry as a whole; what is more probable."""
+    """Return initial values: frame by frame, or along the whole odometry; the more probable ones."""
     points = problem.as_points()
     cost = []
     for start in (stepwise, whole):

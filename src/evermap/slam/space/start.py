@@ -1,7 +1,7 @@
-"""Where to start in space: frame after frame, each pose by the odometry and by the tags that are known by then.
+"""Initial values in space: frame by frame, each pose from the odometry and the tags known by then.
 
-Without odometry the robot stands still until its tags say otherwise. A tag puts the robot in one of two places, where
-its view has two explanations; the one that agrees with the other tags and with the motion is taken.
+Without odometry the robot is assumed static until its tags show otherwise. A tag puts the robot in one of two places,
+where its view has two explanations; the one that agrees with the other tags and with the motion is taken.
 """
 
 from __future__ import annotations

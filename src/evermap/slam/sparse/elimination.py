@@ -47,7 +47,7 @@ class Spread(NamedTuple):
 
 
 class Elimination(NamedTuple):
-    """Numbers of an elimination that may be under way.
+    """Numeric state of an elimination, possibly incomplete.
 
     Attributes:
         stored: rows (own, size) of the Cholesky factor `L'`, front after front.
@@ -88,7 +88,7 @@ class Elimination(NamedTuple):
 
 @kernel
 def _of_factor(tree: Tree, factors: Factors, f: int, index: Any) -> int:
-    """Write where the numbers of a factor stand in its front; return how many they are."""
+    """Write the positions of a factor's numbers in its front; return their count."""
     width = 0
     for k in range(factors.first[f], factors.first[f + 1]):
         for a in range(tree.dim[factors.variable[k]]):
@@ -99,7 +99,7 @@ def _of_factor(tree: Tree, factors: Factors, f: int, index: Any) -> int:
 
 @kernel
 def _passed_on(tree: Tree, node: int, index: Any) -> int:
-    """Write where the numbers that a front passes on stand in its parent's; return how many they are."""
+    """Write the positions of a front's passed-on numbers in its parent's; return their count."""
     left = 0
     for k in range(tree.first[node] + tree.n_own[node], tree.first[node + 1]):
         for a in range(tree.dim[tree.variable[k]]):
@@ -339,7 +339,7 @@ def spread(
                 for b in range(dim):
                     out.own[own_first[v] + a * dim + b] = cov[at + a, at + b]
             for j in range(tree.first[node] + tree.n_own[node], tree.first[node + 1]):
-                # the border stands last in every front, in its own order
+                # the border is last in every front, in its own order
                 if tree.in_border[tree.variable[j]] >= 0:
                     to = tree.in_border[tree.variable[j]]
                     for a in range(dim):

@@ -170,7 +170,7 @@ BATCH = 64
 
 
 class System:
-    """Structure of a least-squares problem: what is eliminated where.
+    """Structure of a least-squares problem: the place of every elimination.
 
     Args:
         dim: (V,) numbers of each variable.

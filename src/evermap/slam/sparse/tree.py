@@ -1,4 +1,4 @@
-"""The elimination tree: which variable is eliminated where, and what it is tied to by then.
+"""The elimination tree: where each variable is eliminated, and its remaining neighbours.
 
 Factors come in *leaves*, for example those of a few consecutive poses. The leaves are bisected again and again, each
 time along the axis (time, or a coordinate) and at the cut across which the least is shared: nested dissection (George
@@ -30,7 +30,7 @@ kernel = kept(effort=1, error_model="numpy")
 
 
 class Factors(NamedTuple):
-    """Which variables each factor ties.
+    """Variables of each factor.
 
     Attributes:
         first: (F + 1,) where the variables of each factor begin in `variable`.
@@ -388,7 +388,7 @@ def _positions(
     first: Any, variable: Any, at: Any, factor_first: Any, factor: Any, variable_first: Any, of_factor: Any,
     n_variables: int,
 ) -> IntArray:  # fmt: skip
-    """Where the variables of each factor begin in its front."""
+    """Return the position of the variables of each factor in its front."""
     position, place = np.empty(len(of_factor), np.int64), np.zeros(n_variables, np.int64)
     for node in range(len(first) - 1):
         if factor_first[node] == factor_first[node + 1]:
