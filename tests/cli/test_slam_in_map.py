@@ -207,7 +207,7 @@ def test_several_sessions_in_one_call(
         assert store.load(store.head()).places.position_m == pytest.approx(single.load(2).places.position_m, abs=1e-12)
     result = run("slam", recordings[0], recordings[1])
     assert result.exit_code == 2
-    assert "several recordings are sessions of a map (try: --map FILE" in result.stderr
+    assert "several recordings need a map (try: --map FILE" in result.stderr
 
 
 def test_of_several_sessions_the_first_that_is_read_begins_with_the_survey(

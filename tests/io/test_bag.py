@@ -152,7 +152,7 @@ def test_motion_is_read_of_poses_and_of_velocities(name: str, kind: str, tmp_pat
 def test_clocks_that_differ_are_told_and_can_be_given_up(tmp_path: Path) -> None:
     bag = write(tmp_path / "drive", "aruco", late_s=3.0)
     recording = read_bag(bag)
-    assert any("recorded 3 s later after their stamps than those of /odom" in one for one in recording.warnings)
+    assert any("recorded 3 s later, relative to their stamps, than those of /odom" in one for one in recording.warnings)
     settings_path(bag).write_text(bag_settings(bag).replace('clock = "header"', 'clock = "receive"'))
     recording = read_bag(bag)
     assert not any("recorded" in one for one in recording.warnings)
@@ -187,7 +187,7 @@ def test_what_is_guessed_is_told_and_reads_back_the_same(tmp_path: Path, assert_
     bag = write(tmp_path / "drive", "aruco")
     guessed = read_bag(bag)
     assert guessed.warnings == (
-        "topics as guessed: detections /camera/seen; odometry /odom (`--init-bag` writes them to be edited)",
+        "topics as guessed: detections /camera/seen; odometry /odom (`--init-bag` writes them for editing)",
     )
     text = bag_settings(bag)
     assert "#   /rosout_agg  std_msgs/msg/String  0" in text

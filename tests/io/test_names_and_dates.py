@@ -160,7 +160,7 @@ def test_dates_with_a_zone_are_unix_and_without_one_the_clocks_on_the_wall(tmp_p
             "sensor.toml",
             "format_version = 1",
             'format_version = 1\nclock = "local_wall"',
-            "dates that count unix seconds",
+            "dates on the clock unix",
         ),
     ],
 )

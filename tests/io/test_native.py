@@ -385,7 +385,7 @@ BAD = {
         edit(TOML, "[recording]\n", '[recording]\nclass_names = ["door"]\n'),
         [f"{DET}:5", "'class_id'", "'pillar'"],
     ),
-    "two formats": (put("odometry.parquet", "x"), [ODO, "lies beside odometry.parquet"]),
+    "two formats": (put("odometry.parquet", "x"), [ODO, "exists together with odometry.parquet"]),
     "truncated truth": (put("truth.csv", "stamp_s,x_m,y_m,theta_rad\n0,0,0\n1,1,1,1\n"), ["truth.csv:2", "3 cells"]),
 }
 

@@ -95,11 +95,11 @@ def test_why_it_is_gone(store: MapStore) -> None:
     text = " / ".join(answer.reasons)
     assert "last detected at 01:00:00; then P(exists) = 0.9999" in text
     # 1.75 + 0.5 expected, -3.0 - 4.5 nats
-    assert "looked for in 2 frames: 3 misses and no detection, where 2.2 detections were expected" in text
+    assert "looked for in 2 frames: 3 misses and no detection, where 2.2 detections would be expected" in text
     assert "that is 7.5 nats against it" in text
     # of an exponential law with a mean of 10 h, exp(-5 h / 10 h) stay for another 5 h
     assert (
-        f"{np.exp(-0.5):.0%} of those that have stayed for 58.3 min stand for another 5 h (learned from 12 stays)"
+        f"{np.exp(-0.5):.0%} of those that have stayed for 58.3 min stay for another 5 h (learned from 12 stays)"
         in text
     )
     assert "shares a body with landmark 6" in text
@@ -110,7 +110,7 @@ def test_why_it_is_there(store: MapStore) -> None:
     assert before.headline == "landmark 6 (pallet) is believed to be there: P(exists) = 0.9999"
     assert [v.revision for v in before.visits] == [1, 2]
     assert before.changes == ()
-    assert "in its newest session it was detected 2 times, where 1.8 detections were expected" in " ".join(
+    assert "in its newest session it was detected 2 times, where 1.8 detections would be expected" in " ".join(
         before.reasons
     )
     other = why(store, 9)
@@ -124,7 +124,7 @@ def test_an_operators_word_is_part_of_the_answer(store: MapStore) -> None:
     store.commit(living.edited(5, pinned=True), edit, parent=3)
     store.commit(living.edited(5, deleted=True), edit, parent=4)
     answer = why(store, 5)
-    assert answer.headline.startswith("landmark 5 (pallet) is not used: an operator deleted it; by what was seen, P(")
+    assert answer.headline.startswith("landmark 5 (pallet) is not used: an operator deleted it; by its looks, P(")
     assert [(revision, word) for revision, _, word in answer.edits] == [(4, "pinned"), (5, "deleted"), (5, "unpinned")]
     assert "an operator deleted it in revision 5" in " ".join(answer.reasons)
     assert why(store, 6).edits == ()

@@ -435,7 +435,7 @@ def test_a_file_in_the_way_stays_and_the_new_run_is_put_beside(theirs, tmp_path)
     (out / theirs).parent.mkdir(parents=True)
     (out / theirs).write_text("mine")
     new = {"map.csv": "new", "figures/a.png": "new", "summary.json": "new"}
-    with pytest.raises(ConfigError, match="holds '") as refused:
+    with pytest.raises(ConfigError, match="contains '") as refused:
         write(out, new, force=True)
     assert snapshot(out) == {theirs: b"mine"}
     if theirs != "summary.json":  # that one is known before the run

@@ -287,7 +287,7 @@ def test_nothing_ties_robots() -> None:
     """Landmarks with other names, and no sightings; sightings alone tie them."""
     recordings = [replace(one, robot_sightings=None) for one in drives_together(2, n_robots=2)]
     strange = with_ids(recordings[1], lambda ids: ids + 100)
-    with pytest.raises(DataError, match="nothing ties robot 2 to robot 1"):
+    with pytest.raises(DataError, match="nothing connects robot 2 to robot 1"):
         run_together({1: recordings[0], 2: strange})
     met = drives_together(2, n_robots=2)
     results = run_together({1: met[0], 2: with_ids(met[1], lambda ids: ids + 100)})

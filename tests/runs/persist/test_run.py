@@ -207,7 +207,7 @@ def test_features_that_come_back_under_one_stay_are_remarked_on(tmp_path: Path) 
     path.write_text("stamp_s,feature_id,detected\n" + rows)
     result = run_persist(read_looks(path))
     np.testing.assert_array_equal(result.changes.returned, [False, True])
-    assert "1 feature came back, which lifetimes of one stay rule out: try `recurrent`" in result.warnings
+    assert "1 feature returned, which lifetimes of one stay rule out: try `recurrent`" in result.warnings
 
 
 def test_models_by_class_answer_for_a_part_of_the_features() -> None:
@@ -282,8 +282,8 @@ def test_looks_that_make_beliefs_wrong_are_told(tmp_path: Path) -> None:
         path.write_text(f"stamp_s,feature_id,detected\n{rows}")
         return " ".join(run_persist(read_looks(path)).warnings)
 
-    assert "not one of 4 looks is a miss" in remarks("0,a,1\n0,b,1\n9,a,1\n9,b,1\n")
-    assert "not one of 3 looks is a detection" in remarks("0,a,0\n5,a,0\n9,a,0\n")
+    assert "none of 4 looks is a miss" in remarks("0,a,1\n0,b,1\n9,a,1\n9,b,1\n")
+    assert "none of 3 looks is a detection" in remarks("0,a,0\n5,a,0\n9,a,0\n")
     odd = remarks("0,a,1\n0,a,1\n5,a,1\n5,a,0\n5,b,1\n9,b,0\n")
     assert "1 look that repeat another" in odd
     assert "1 look that contradict another" in odd

@@ -126,7 +126,7 @@ def test_truth_from_a_file(tmp_path: Path) -> None:
     truth, remarks = read_truth(path, looks)
     np.testing.assert_array_equal(truth.first, [0, 0, 2])
     np.testing.assert_array_equal(truth.present, [0.0, 1.0])
-    assert remarks == ("truth.csv: 1 feature without looks left out",)
+    assert remarks == ("truth.csv: 1 feature without looks ignored",)
     path.write_text("stamp_s,feature_id,present\n0,c,1\n")
     with pytest.raises(InputError, match=r"truth\.csv: field 'feature_id': contains none of the features of .*'a'"):
         read_truth(path, looks)

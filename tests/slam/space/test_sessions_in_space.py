@@ -129,7 +129,7 @@ def test_what_nothing_ties_to_the_rest_is_left_out() -> None:
     found = run_slam(replace(recording, detections=replace(seen, **columns)))
     sides = {bool(site.place[name, 0] > 7.5) for name in found.landmarks.landmark_id}
     assert len(sides) == 1
-    assert any("nothing tells where" in warning for warning in found.warnings)
+    assert any("nothing connects" in warning for warning in found.warnings)
 
 
 def test_a_second_tag_of_one_identity_keeps_its_name() -> None:
