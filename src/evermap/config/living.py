@@ -29,14 +29,18 @@ class FitConfig(Section):
     misread_share: Share = Field(
         default=0.2, description="maximum share of sightings for that, with none in a frame with the other one"
     )
-    glimpse_m: Positive = Field(default=0.4, description="a landmark seen once this close to its place is there [m]")
-    bent_m: Positive = Field(default=0.15, description="bodies that moved alike to within this are a bend [m]")
-    bent_cliques: int = Field(default=3, ge=2, description="bodies that must have moved alike for that")
-    window: Count = Field(default=12, description="sightings by which each pose of a bent session is placed")
+    glimpse_m: Positive = Field(
+        default=0.4, description="a landmark seen once this close to its place counts as present [m]"
+    )
+    bent_m: Positive = Field(
+        default=0.15, description="tolerance within which bodies with a common motion indicate a distorted session [m]"
+    )
+    bent_cliques: int = Field(default=3, ge=2, description="minimum number of bodies with a common motion for that")
+    window: Count = Field(default=12, description="sightings by which each pose of a distorted session is aligned")
     bent_windows: Count = Field(
         default=3, description="so many of these that contradict the rest are wrong poses, not misread identities"
     )
-    placing_m: Positive = Field(default=0.3, description="residual from which sightings count for less in that [m]")
+    placing_m: Positive = Field(default=0.3, description="residual above which sightings are down-weighted in that [m]")
     loose_m: Positive = Field(
         default=0.5, description="position uncertainty above which silent odometry splits a session into parts [m]"
     )
@@ -185,16 +189,22 @@ class LooksConfig(Section):
     worth_a_look: Share = Field(
         default=0.3, description="share of a sensor's detection probability from which a landmark is looked at"
     )
-    settled_s: NotNegative = Field(default=300.0, description="what is seen within this time of a look was there [s]")
+    settled_s: NotNegative = Field(
+        default=300.0, description="a landmark seen within this time of a look was there [s]"
+    )
     settled_online_s: NotNegative = Field(
         default=10.0, description="the same while the robot drives, as long as the session is not over [s]"
     )
-    beside_m: Positive = Field(default=1.0, description="what is seen this close to a place is seen along its line [m]")
-    beside_rad: Positive = Field(default=0.15, description="what is seen behind it at this angle is, too [rad]")
-    along_m: Positive = Field(default=0.3, description="distance from a line of sight that shows it to be clear [m]")
-    witnesses: Count = Field(default=3, description="frames in which something else must be seen along a line")
-    sides: Count = Field(default=6, description="sectors around a place that count as sides of it")
-    most_sides: Count = Field(default=3, description="sides that count for having been seen all around")
+    beside_m: Positive = Field(
+        default=1.0, description="a landmark seen this close to a place is seen along its line [m]"
+    )
+    beside_rad: Positive = Field(default=0.15, description="so is a landmark seen behind it within this angle [rad]")
+    along_m: Positive = Field(
+        default=0.3, description="distance from a line of sight within which a sighting shows it to be clear [m]"
+    )
+    witnesses: Count = Field(default=3, description="frames in which another landmark must be seen along a line")
+    sides: Count = Field(default=6, description="number of sectors around a place")
+    most_sides: Count = Field(default=3, description="sectors from which a place counts as seen from all sides")
     together_m: NotNegative = Field(
         default=2.0, description="cliques missed from places this close may be hidden by one object [m]"
     )
@@ -219,7 +229,7 @@ class DecisionConfig(Section):
         default=0.3, description="bodies this close to the former place of another one have taken its place [m]"
     )
     same_turn_rad: Positive = Field(default=0.3, description="bodies turned by less than this have not turned [rad]")
-    same_spot_m: Positive = Field(default=0.1, description="bodies this close to where they stood have not moved [m]")
+    same_spot_m: Positive = Field(default=0.1, description="bodies this close to their former place have not moved [m]")
     new_clique_p: Share = Field(default=0.9, description="belief in a new body before its sightings are counted")
     surely_away: Probability = Field(default=0.02, description="belief below which a clique may be forgotten")
     forgotten_p: Probability = Field(default=0.05, description="probability of a return below which it is forgotten")
@@ -233,11 +243,13 @@ class GroupingConfig(Section):
     """Which landmarks are on one body, by how they moved."""
 
     p_one_body: Share = Field(
-        default=0.9, description="probability probability that two landmarks of a clique are on one body"
+        default=0.9, description="probability probability probability that two landmarks of a clique are on one body"
     )
     p_split_before: Share = Field(default=0.05, description="the same for two nearby ones of different cliques")
     p_other_class: Share = Field(default=0.001, description="the same for two nearby ones of different classes")
-    p_moved: Share = Field(default=0.1, description="probability probability that a body moves between two sessions")
+    p_moved: Share = Field(
+        default=0.1, description="probability probability probability that a body moves between two sessions"
+    )
     move_sigma_m: Positive = Field(default=2.0, description="standard deviation of displacements, each axis [m]")
     misses_in_a_row: float = Field(
         default=4.0, ge=1.0, description="misses of one session that count as one independent one"
@@ -340,13 +352,13 @@ class LivingConfig(Section):
     fit: FitConfig = Field(default_factory=FitConfig, description="acceptance of a session")
     overlay: OverlayConfig = Field(default_factory=OverlayConfig, description="priors of moves")
     sight: SightConfig = Field(default_factory=SightConfig, description="lines of sight")
-    looks: LooksConfig = Field(default_factory=LooksConfig, description="what counts as a look")
-    decisions: DecisionConfig = Field(default_factory=DecisionConfig, description="what is told and forgotten")
-    grouping: GroupingConfig = Field(default_factory=GroupingConfig, description="which landmarks are on one body")
+    looks: LooksConfig = Field(default_factory=LooksConfig, description="definition of a look")
+    decisions: DecisionConfig = Field(default_factory=DecisionConfig, description="reporting and forgetting")
+    grouping: GroupingConfig = Field(default_factory=GroupingConfig, description="assignment of landmarks to bodies")
     metre: MetreConfig = Field(default_factory=MetreConfig, description="the length of a metre")
     nameless: NamelessConfig = Field(default_factory=NamelessConfig, description="landmarks without identities")
     boxes: BoxesConfig = Field(default_factory=BoxesConfig, description="boxes without identities")
-    lifetimes: LifetimeConfig = Field(default_factory=LifetimeConfig, description="how lifetimes are learned")
+    lifetimes: LifetimeConfig = Field(default_factory=LifetimeConfig, description="learning of lifetimes")
 
 
 class LiveConfig(Section):
@@ -373,5 +385,5 @@ class LiveConfig(Section):
     beliefs_s: Positive = Field(
         default=300.0, description="looks over so long become beliefs, and are not asked again [s]"
     )
-    judge_s: Positive = Field(default=5.0, description="how often it is asked what has changed [s]")
-    look_s: Positive = Field(default=0.5, description="time between two frames whose looks are asked for that [s]")
+    judge_s: Positive = Field(default=5.0, description="interval between searches for changes [s]")
+    look_s: Positive = Field(default=0.5, description="time between two frames whose looks are used for that [s]")

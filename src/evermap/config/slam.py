@@ -144,8 +144,8 @@ class ModesConfig(Section):
     )
     switch_probability: Probability = Field(
         default=1e-4,
-        description="probability probability of a landmark to be in another mode at the next look; ignored with a "
-        "lifetime",
+        description="probability probability probability of a landmark to be in another mode at the next look; ignored "
+        "with a lifetime",
     )
     births: Literal["evidence", "gate"] = Field(
         default="evidence",
@@ -174,7 +174,7 @@ class ChangesConfig(Section):
         default=7.0,
         gt=0,
         le=50,
-        description="prior log odds against a landmark being elsewhere for a part of the session [nats]",
+        description="prior log odds against a temporary displacement of a landmark [nats]",
     )
     map_factor_spread: Positive = Field(
         default=0.35, description="standard deviation of the logarithm of a factor on the sigmas of a map"

@@ -55,9 +55,9 @@ class PersistConfig(Section):
         lt=0.5,
         description="probability that a change lies before the interval given for it, and as much after it",
     )
-    p_miss: Probability = Field(default=0.1, description="P(no detection | there) where the table does not say")
-    p_false: Probability = Field(default=0.1, description="P(detection | not there) where the table does not say")
-    figures: int = Field(default=12, ge=0, description="how many features get a figure of their own")
+    p_miss: Probability = Field(default=0.1, description="P(no detection | there) if the table has no p_miss")
+    p_false: Probability = Field(default=0.1, description="P(detection | not there) if the table has no p_false")
+    figures: int = Field(default=12, ge=0, description="number of features with an individual figure")
     rows_at_once: int = Field(
         default=5_000_000, ge=1, description="rows that are held in memory; a larger Parquet table is done in parts"
     )

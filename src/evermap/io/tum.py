@@ -50,7 +50,7 @@ def read_tum(
 
     Raises:
         InputError: the file is missing or malformed, time runs backwards, or a quaternion is not of unit length.
-        DataError: it holds no pose.
+        DataError: it contains no pose.
     """
     path = Path(path)
     try:

@@ -1,6 +1,6 @@
 """Definition of looks, hits and misses, and nominal detection models.
 
-A *look* is a landmark, or one of the places where it may stand, in a frame in which it should be detected:
+A *look* is a landmark, or one of its candidate places, in a frame in which it should be detected:
 `P(detect | there)` is at least `worth_a_look` of what the sensor does at best. A detection is a look too, wherever the
 field of view is said to end. A look with a detection is a *hit*, one without is a *miss*. Whether a miss says anything
 depends on the line of sight (`sightlines`); a model without them takes every line for clear.

@@ -353,13 +353,13 @@ def list_revisions(request: Request, site: Site, _: Reader) -> Response:
 
 @router.get("/maps/{site}/diff")
 def diff(request: Request, site: Site, _: Reader, a: AtRevision = 0, b: AtRevision = None) -> Response:
-    """Tell what changed between two revisions."""
+    """Return the changes between two revisions."""
     return _told(request, site, lambda store: map_dicts.diff_dict(between(store, a or 0, b)))
 
 
 @router.get("/maps/{site}/changes")
 def changes(request: Request, site: Site, _: Reader, since: AtRevision = 0) -> Response:
-    """List the changes that revisions after `since` told, one by one."""
+    """List the changes reported by revisions after `since`."""
 
     def listed(store: SqlStore) -> list[dict[str, Any]]:
         line = {number for number in store.lineage() if number > (since or 0)}
@@ -406,13 +406,13 @@ def landmarks(request: Request, site: Site, _: Reader, asked: Annotated[Landmark
 
 @router.get("/maps/{site}/landmarks/{landmark}/why")
 def why(request: Request, site: Site, landmark: str, _: Reader, revision: AtRevision = None) -> Response:
-    """Tell why a landmark is believed to be there, or gone."""
+    """Return why a landmark is believed to exist or gone."""
     return _told(request, site, lambda store: map_dicts.answer_dict(of_landmark(store, landmark, revision)))
 
 
 @router.get("/maps/{site}/lifetimes")
 def lifetimes(request: Request, site: Site, _: Reader, revision: AtRevision = None) -> Response:
-    """Tell how long things stay, by class and place."""
+    """Return the lifetimes by class and place."""
 
     def told(store: SqlStore) -> dict[str, Any]:
         living = _server(request).sites.living(store, revision)[1]
@@ -454,7 +454,7 @@ def approve(request: Request, site: Site, chosen: Chosen, server: Answering, who
 
 @router.get("/maps/{site}/actions")
 def actions(request: Request, site: Site, server: Answering, _: Reader, robot: RobotName | None = None) -> Response:
-    """List the instant actions of VDA 5050 by which a robot comes to use the approved revision, in their order.
+    """List the instant actions of VDA 5050 that install the approved revision on a robot, in their order.
 
     For a named robot, only the missing ones, by the maps that it reported.
     """

@@ -159,7 +159,7 @@ def run_track(
     recorder, track_of_detection, n_gaps = _follow(tracker, table, config, progress)
     tracks = recorder.tracks() if table.score is None else recorder.at_once(config.p_dead)
     if not (tracks.state != TrackState.BIRTH).any():
-        hint = f"fewer detections to be believed: track.warm_up={max(1, config.warm_up - 1)}"
+        hint = f"fewer detections for confirmation: track.warm_up={max(1, config.warm_up - 1)}"
         if _usual_step_s(table) > config.slow_step_s:
             hint = f"more frames: it takes several in a row, and these are {_usual_step_s(table):g} s apart"
         raise DataError(

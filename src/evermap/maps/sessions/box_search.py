@@ -32,7 +32,7 @@ WINDOWS = 12, 6
 TESTED_M2 = 157.0
 """Area that one trial of the search covers: chance agreement is proportionally more probable in a large map."""
 FACTORS = 1.0, 0.99, 1.01, 0.98, 1.02
-"""On the lengths of a session, that are tried where its metre is its odometry's."""
+"""Candidate factors on the lengths of a session with the scale of its odometry."""
 
 
 class MapBoxes(NamedTuple):
@@ -116,7 +116,7 @@ def _searched(
 
 
 def _factor(own_m: FloatArray, there_m: FloatArray, settings: BoxesConfig) -> float:
-    """How much longer distances between points (K, 2) are in the map; 1 where they hardly tell."""
+    """Return the ratio of distances between points (K, 2) in the map to those given; 1 if it is hardly determined."""
     own, there = (np.linalg.norm(at[:, None] - at[None], axis=2) for at in (own_m, there_m))
     factor = float((own * there).sum() / max(float((own**2).sum()), 1e-9))
     spread_m = float(np.linalg.norm(own_m - own_m.mean(axis=0)))

@@ -52,7 +52,7 @@ class SeenBoxes:
 
 
 def seen_boxes(taken: TrafficIntake, solved: SpatialSolved, settings: BoxesConfig) -> SeenBoxes:
-    """Return the boxes of a session that stood, where its solution has them."""
+    """Return the static boxes of a session at their estimated places."""
     optimum, stands = solved.optimum, taken.traffic.standing
     problem, estimate, count = optimum.smoother.problem, optimum.estimate, len(optimum.estimate.place)
     row = taken.used[taken.intake.used]

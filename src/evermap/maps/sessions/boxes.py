@@ -172,9 +172,7 @@ def _moved(optimum: SpatialOptimum, motion: FloatArray) -> SpatialOptimum:
 
 
 def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, settings: BoxesConfig) -> SpatialSolved:
-    """The session with places put together that are one: those of one `label` (P,), and boxes that stand in each
-    other.
-    """
+    """Merge places of a session: those with one `label` (P,), and overlapping boxes."""
     seen, count = seen_boxes(taken, solved, settings), len(label)
     first = np.unique(label, return_index=True)[1][np.unique(label, return_inverse=True)[1].ravel()]
     i, j = _same(seen, settings)
@@ -206,7 +204,7 @@ def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, sett
 
 
 def _same(seen: SeenBoxes, settings: BoxesConfig) -> tuple[IntArray, IntArray]:
-    """Pairs of boxes that are one: of a class, standing in each other, and neither came when the other had left."""
+    """Return pairs of boxes that are one: of one class, overlapping, and neither arrived after the other had left."""
     away = np.linalg.norm(seen.position_m[:, None, :2] - seen.position_m[None, :, :2], axis=2)
     width = np.nan_to_num(seen.size_m[:, 1], nan=0.5)
     near = (away < settings.same_share * 0.5 * (width[:, None] + width)) & (seen.class_id[:, None] == seen.class_id)
@@ -274,7 +272,7 @@ def _labels(matched: _Matched) -> IntArray:
 
 
 def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched, settings: BoxesConfig) -> SpatialSolved:
-    """The session solved with its places held where they stand in the map."""
+    """Solve the session with its places constrained to their matches in the map."""
     optimum, row = solved.optimum, np.flatnonzero(matched.place >= 0)
     place = matched.place[row]
     pose = se3.identity(len(row))
@@ -375,7 +373,7 @@ def _log_odds(seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> FloatArr
 def _visit(
     taken: TrafficIntake, solved: SpatialSolved, matched: _Matched, living: LivingMap, config: Config
 ) -> BoxVisit:
-    """The session with ids of the map: its own where a box stands, new ones for the others."""
+    """Return the session with ids of the map for matched boxes, and new ones for the others."""
     settings = config.living.boxes
     seen = seen_boxes(taken, solved, settings)
     identity, names = identities_of(taken.intake, solved)

@@ -217,7 +217,7 @@ def of_unknown_size(own: OwnLandmarks, log_sigma: float) -> FloatArray:
 ITERATIONS = 5
 USUAL_METRE = MetreConfig()
 AS_GOOD = np.geomspace(0.05, 1.0, 9)
-"""Robots of one map may know their metre better than is said, all by one factor, each of these as likely."""
+"""Candidate factors on the stated scale uncertainty, common to all robots of a map, a priori equally likely."""
 UNHEARD = 1e-9
 """Information on the scale of a robot without sessions in the map."""
 
@@ -247,7 +247,7 @@ def settled(
     log_ratio: float, ratio_variance: float, session: tuple[float, float], map_variance: float, information: float,
     settings: MetreConfig = USUAL_METRE,
 ) -> Size:  # fmt: skip
-    """Return both sizes after they were compared.
+    """Return both scales after their comparison.
 
     The map's metre is the mean of those of all sessions. What one robot gets wrong about the metre it gets wrong in
     every session, so errors are taken as fully correlated: more sessions do not reduce the uncertainty. A scale that
@@ -282,7 +282,7 @@ def settled_by(
     shown: tuple[float, float], session: tuple[float, float], living: LivingMap, robot: str,
     settings: MetreConfig = USUAL_METRE,
 ) -> tuple[Size, Metres]:  # fmt: skip
-    """Return both sizes after a session of a robot was compared with the map, and what each robot says since.
+    """Return both scales after comparing a session of a robot with the map, and the updated scale of each robot.
 
     Errors of the metre are a robot's, alike in all its sessions. So each robot has the mean of its sessions, as
     `settled` has it, and the map what its robots have together (`agreed`), however long each of them drives.
@@ -321,7 +321,7 @@ def settled_by(
 
 
 def agreed(log_metre: FloatArray, sigma: FloatArray, settings: MetreConfig = USUAL_METRE) -> tuple[float, FloatArray]:
-    """Return the metre that robots have together, and for each of them the probability that its own has drifted.
+    """Return the scale on which robots agree, and for each of them the probability that its own has drifted.
 
     The metre of a robot is off by what its priors say, or, as robots of one make may agree better than that, by a
     share of it that is one for all; that of a robot that has drifted, by some times more, whatever the share. Metre

@@ -300,7 +300,7 @@ class _Assigned:
     def _overlaid(
         self, some: IntArray, stands: IntArray, index: PlaceIndex | None, allowed: BoolArray, *, fewest: int = 0
     ) -> list[tuple[int, int]]:
-        """Some landmarks of the session with places at which they surely stand, among some (S,) of all."""
+        """Return some landmarks of the session with places that they certainly match, among some (S,) of all."""
         fewest = fewest or self._settings.fewest
         if len(some) < fewest or len(stands) < fewest:
             return []

@@ -23,7 +23,7 @@ from evermap.geometry.rigid import AGREE_M, consensus, rigid
 from evermap.types import FloatArray, IntArray
 
 ELSEWHERE = -1
-"""Option of a clique that stands at no known site."""
+"""Option of a clique at no known site."""
 FAR_M = 2.0
 HOPELESS = -200.0
 """Distance from a site, and log density, beyond which a clique is not considered again."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 MOST_ROWS = 100_000_000
-"""More beliefs than this are a mistake in the step, not a wish."""
+"""Number of beliefs above which the step is considered a mistake."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,12 +291,12 @@ def remarks(config: PersistConfig, models: ModelOfEach, totals: Totals) -> list[
         )
     if totals.features_back and config.stays_once:
         back = counted(totals.features_back, "feature")
-        told.append(f"{back} came back, which lifetimes of one stay rule out: try `recurrent`")
+        told.append(f"{back} returned, which lifetimes of one stay rule out: try `recurrent`")
     return told
 
 
 def _odd_looks(totals: Totals) -> list[str]:
-    """What makes beliefs wrong without being impossible: no miss or no hit at all, and looks that came twice."""
+    """Return warnings on implausible looks: no miss or no hit at all, and repeated looks."""
     told = []
     several = totals.looks > len(totals.p_now)
     if totals.detections == totals.looks and several:
