@@ -73,7 +73,7 @@ def test_a_replay_enters_what_slam_enters_and_tells_poses_and_changes(tmp_path: 
         (["--map", "m.evermap", "--zenoh", "nonsense", "--sensor", "{0}/sensor.toml"], "--zenoh"),
         (["--map", "m.evermap", "--zenoh", "z.json5", "--sensor", "{0}/sensor.toml"], "z.json5: 1:"),
         (["--map", "m.evermap", "--zenoh", "none.json5", "--sensor", "{0}/sensor.toml"], "none.json5: No such file"),
-        (["--replay", "{0}", "--map", "m.evermap", "--sensor", "none.toml"], "leave --sensor out"),
+        (["--replay", "{0}", "--map", "m.evermap", "--sensor", "none.toml"], "omit --sensor"),
         (["--replay", "{0}", "--map", "m.evermap", "--topics", "none.toml"], "omit --topics"),
         (["--replay", "{0}", "--map", "z.json5"], "z.json5: is not an evermap map"),
         (["--map", "m.evermap", "--foxglove", "nonsense", "--sensor", "{0}/sensor.toml"], "no server at nonsense"),

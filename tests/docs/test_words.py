@@ -25,6 +25,16 @@ AVOIDED = {
     r"by turns": "interleaved",
     r"how dear|how sure": "cost; calibration",
     r"for want of": "without",
+    r"laid (?:over|on|beside) (?:the map|the rest|it|each other|one another)": "aligned with",
+    r"surer": "more certain",
+    r"who is who": "identity",
+    r"stands? (?:elsewhere|there|nowhere|somewhere|at one of|beside)|what stands|what stood": "is at; static",
+    r"(?:is|are|was|were|be) told": "reported; given",
+    r"the metre of (?:the|a) (?:map|session|robot|others?)|metres? (?:is|of) the map": "scale",
+    r"says? nothing": "gives no evidence",
+    r"works as it is|read as they are|as it is read": "runs unchanged; read directly",
+    r"what it stands": "robustness",
+    r"(?:a|one) (?:row|line) a(?= [a-z]+[,:.])": "one row per",
 }
 
 

@@ -354,7 +354,7 @@ def test_mistakes_of_the_beginning_are_one_line(tmp_path: Path) -> None:
     for sensor, told in (("no.toml", "No such file"), (3, "a Sensor is needed")):
         with pytest.raises(InputError, match=told):
             em.Engine(LivingMap(), sensor, mapping=False)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="stays as it is"):
+    with pytest.raises(InputError, match="a map in memory cannot be changed"):
         em.Engine(LivingMap(), Sensor(range_max_m=8.0))
     with pytest.raises(ConfigError, match="is not below"):
         em.Engine(LivingMap(), Sensor(5.0, 1.0), mapping=False)
@@ -366,7 +366,9 @@ def test_mistakes_of_the_beginning_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="a map in space"):
         em.Engine(LivingMap.in_space(), Sensor(range_max_m=8.0), mapping=False)
     there = LivingMap.begun(Landmarks.at([0], [[1.0, 0.0]], sigma_m=0.1))
-    with pytest.raises(InputError, match=r"stamps count 'unix', the map's 'recording' \(try: .*clock='recording'"):
+    with pytest.raises(
+        InputError, match=r"stamps are on the clock 'unix', those of the map on 'recording' \(try: .*clock='recording'"
+    ):
         em.Engine(there, Sensor(range_max_m=8.0), mapping=False)
     with pytest.raises(InputError):
         em.Engine(tmp_path / "none.evermap", Sensor(range_max_m=8.0), mapping=False)

@@ -438,7 +438,7 @@ def test_columns_of_other_lengths_are_a_flaw(column: str) -> None:
         (lambda m: m["columns"].pop("members.pinned"), "columns of different lengths in 'members'"),
         (
             lambda m: m["values"].update(colour="red"),
-            "it holds 'colour', which this evermap does not know",
+            "it contains 'colour', which this evermap does not know",
         ),
         (lambda m: m.update(format=4), "columns of format 4, this evermap reads 1 to 3"),
     ],

@@ -150,7 +150,7 @@ InitBag = Annotated[
 InSpace = Annotated[bool, typer.Option("--3d", help="With --init: a recording in space, of a camera that sees tags.")]
 
 HELP = """\
-Estimate the trajectory of the robot and the map of the landmarks.
+Estimate the trajectory and the map of landmarks.
 
 \b
 Examples:

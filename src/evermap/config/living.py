@@ -242,14 +242,10 @@ class DecisionConfig(Section):
 class GroupingConfig(Section):
     """Which landmarks are on one body, by how they moved."""
 
-    p_one_body: Share = Field(
-        default=0.9, description="probability probability probability that two landmarks of a clique are on one body"
-    )
+    p_one_body: Share = Field(default=0.9, description="probability that two landmarks of a clique are on one body")
     p_split_before: Share = Field(default=0.05, description="the same for two nearby ones of different cliques")
     p_other_class: Share = Field(default=0.001, description="the same for two nearby ones of different classes")
-    p_moved: Share = Field(
-        default=0.1, description="probability probability probability that a body moves between two sessions"
-    )
+    p_moved: Share = Field(default=0.1, description="probability that a body moves between two sessions")
     move_sigma_m: Positive = Field(default=2.0, description="standard deviation of displacements, each axis [m]")
     misses_in_a_row: float = Field(
         default=4.0, ge=1.0, description="misses of one session that count as one independent one"

@@ -144,8 +144,7 @@ class ModesConfig(Section):
     )
     switch_probability: Probability = Field(
         default=1e-4,
-        description="probability probability probability of a landmark to be in another mode at the next look; ignored "
-        "with a lifetime",
+        description="probability of a landmark to be in another mode at the next look; ignored with a lifetime",
     )
     births: Literal["evidence", "gate"] = Field(
         default="evidence",

@@ -95,7 +95,7 @@ def read_planar(path: str | Path, robot: int | None = None) -> Recording:
     """
     recording = read_recording(path, robot)
     if not isinstance(recording, Recording):
-        raise InputError("the recording is in space; this works in the plane only only", path=path)
+        raise InputError("the recording is in space; this works in the plane only", path=path)
     return recording
 
 

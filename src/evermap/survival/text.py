@@ -206,7 +206,7 @@ FORMS: Mapping[str, Form] = {
     ),
     "weibull": Form(
         "weibull:scale=2d,shape=0.7",
-        "shape < 1: what has stayed stays longer; > 1: it wears out",
+        "shape < 1: the hazard falls with age; > 1: it rises",
         lambda v: Weibull(v["scale"], v["shape"]),
         needed={"scale": parse_duration_s, "shape": parse_positive},
     ),

@@ -83,7 +83,7 @@ def test_in_parts_the_files_are_those_of_one_piece(tmp_path: Path, query: str) -
     told = same(write(looks(), tmp_path / "looks.parquet"), tmp_path, "--query", query)
     assert told["counts"]["rows"] == 4000
     assert told["counts"]["vanished"] > 70
-    assert any("came back" in remark for remark in told["warnings"])
+    assert any("returned" in remark for remark in told["warnings"])
 
 
 def test_a_folder_of_files_is_one_table(tmp_path: Path) -> None:

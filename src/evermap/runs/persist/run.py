@@ -301,16 +301,16 @@ def _odd_looks(totals: Totals) -> list[str]:
     several = totals.looks > len(totals.p_now)
     if totals.detections == totals.looks and several:
         told.append(
-            f"not one of {totals.looks:,} looks is a miss, so nothing can vanish: a row with detected 0 is needed "
+            f"none of {totals.looks:,} looks is a miss, so nothing can vanish: add a row with detected 0 "
             "wherever a feature was looked at and not detected"
         )
     elif totals.detections == 0 and several:
-        told.append(f"not one of {totals.looks:,} looks is a detection: is the column 'detected' inverted?")
+        told.append(f"none of {totals.looks:,} looks is a detection: is the column 'detected' inverted?")
     for what, (count, first_s) in (("repeat", totals.repeated), ("contradict", totals.contradicted)):
         if count:
             told.append(
-                f"{counted(count, 'look')} that {what} another at the same feature and time, each taken as evidence of "
-                f"its own (first at {first_s:.15g} s): one row a look is meant"
+                f"{counted(count, 'look')} that {what} another at the same feature and time, each counted as "
+                f"independent evidence (first at {first_s:.15g} s): write one row per look"
             )
     return told
 

@@ -218,7 +218,7 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
     _explain_missing(table)
     table.expect(_REQUIRED, _OPTIONAL)
     if len(table) == 0:
-        raise InputError("has no rows below its header", path=path, hint="one row a look")
+        raise InputError("has no rows below its header", path=path, hint="one row per look")
     found = _looks_of(table, p_miss, p_false)
     if np.isnan(found.detected).all():
         raise _no_look(Path(path))
@@ -468,7 +468,7 @@ def _surveyed(path: Path) -> _Surveyed:
             of = 0 if kind == UNKNOWN else found.classes.index(class_names[kind])
             found.features[name] = (had[0] + int(rows), had[1] + int(looks), had[2] or of)
     if not found.features:
-        raise InputError("has no rows below its header", path=path, hint="one row a look")
+        raise InputError("has no rows below its header", path=path, hint="one row per look")
     if not np.isfinite(found.span.last_look_s):
         raise _no_look(path)
     return found
