@@ -110,7 +110,7 @@ def test_why_it_is_there(store: MapStore) -> None:
     assert before.headline == "landmark 6 (pallet) is believed to be there: P(exists) = 0.9999"
     assert [v.revision for v in before.visits] == [1, 2]
     assert before.changes == ()
-    assert "in its newest session it was detected 2 times, where 1.8 detections would be expected" in " ".join(
+    assert "in its newest session it was detected 2 times, where 1.8 detections were expected" in " ".join(
         before.reasons
     )
     other = why(store, 9)

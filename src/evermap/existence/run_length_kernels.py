@@ -361,9 +361,7 @@ def begin_rows(held: RunHypotheses, stamp_s: FloatArray, prior: First) -> None:
 def _track_one(
     looks: LookColumns, asked_s: FloatArray, slots: int, law: Law, prior: First, answer: FloatArray
 ) -> tuple[float, float, int]:
-    """Filter all looks at one feature and all requested instants; return log evidence, merged mass, impossible look or
-    -1.
-    """
+    """Filter all looks at one feature; return log evidence, merged mass, impossible look or -1."""
     stamp_s, absent, present = looks
     held, space = nothing_held(slots, law), room(slots)
     evidence, moved = 0.0, 0.0

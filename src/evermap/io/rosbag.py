@@ -274,6 +274,4 @@ UNSTATED = {
         for size in ("2D", "3D")
     },
 }
-"""Definitions of messages beyond ROS 2's own, for SQLite bags, which do not contain them: apriltag_msgs 2,
-vision_msgs 4, foxglove_msgs.
-"""
+"""Message definitions that SQLite bags lack: apriltag_msgs 2, vision_msgs 4, foxglove_msgs."""

@@ -87,9 +87,7 @@ class Inbox:
         """First stamp of the odometry."""
         self._stray: tuple[float, Callable[[], None]] | None = None
         self.n_late = self.n_repeated = self.n_thinned = self.n_stray = 0
-        """Counts of late readings, odometry with a repeated stamp, frames not kept for the map, and readings with
-        implausible stamps.
-        """
+        """Counts of late readings, repeated odometry stamps, frames not kept, and implausible stamps."""
         self._classes: list[str] = list(about.class_names)
         self._texts: dict[int, str] = dict(about.landmark_names)
         self._n_kept = self._n_written = 0

@@ -315,9 +315,7 @@ class LivingMap(Shown):
         )
 
     def from_now_on(self, stamp_s: float) -> Self:
-        """Return the map at its first session, which begins at `stamp_s`: surveyed landmarks count as seen until
-        then.
-        """
+        """Return the map at its first session, which begins at `stamp_s`; surveyed landmarks are seen until then."""
         if np.isfinite(self.stamp_s) or not len(self.places):
             return self
         then = np.full(len(self.sites), stamp_s)
@@ -486,9 +484,7 @@ class LivingMap(Shown):
         )
 
     def place_covariance_m2(self, row: IntArray) -> FloatArray:
-        """Return (K, 2, 2) covariances of places (K,), including the uncertainty of the map's scale, about its
-        middle.
-        """
+        """Return (K, 2, 2) covariances of places (K,), with the uncertainty of the map's scale about its middle."""
         middle = self.places.position_m.mean(axis=0) if len(self.places) else np.zeros(self.dim)
         arm = self.places.position_m[row] - middle
         size = self.log_size_variance * arm[:, :, None] * arm[:, None, :]

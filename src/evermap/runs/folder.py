@@ -123,9 +123,7 @@ class RunFolder:
         return content
 
     def _take_place(self) -> None:
-        """Move into place by one rename if the old folder is evermap's alone, else file by file among those of the
-        user.
-        """
+        """Move into place by one rename if the old folder is evermap's alone, else file by file."""
         try:
             new = {name: _checksum(self._partial / name) for name in self.files() if name != MANIFEST}
             (self._partial / MANIFEST).write_text(_manifest_text({name: [of] for name, of in new.items()}), "utf-8")

@@ -63,9 +63,7 @@ SHOWN = 20
 """Newest sessions of a site whose state is sent to followers."""
 
 _GROWTH = 4
-"""Growth of the map between retries: a session that never fits is tried a number of times logarithmic in its
-revisions.
-"""
+"""Growth of the map between retries, so that their number is logarithmic in its revisions."""
 
 metadata = MetaData()
 _server = Table("server", metadata, Column("version", Integer, nullable=False))

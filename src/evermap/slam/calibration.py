@@ -113,9 +113,7 @@ class CalibrationPrior:
         return prior if sensor is None else prior._as_stated(sensor)
 
     def _as_stated(self, sensor: Sensor) -> CalibrationPrior:
-        """Return the prior narrowed by the stated sensor, and the division of errors that are only observable
-        together.
-        """
+        """Return the prior narrowed by the stated sensor, and the division of jointly observable errors."""
         sheet = {
             BIAS: sensor.sigma_offset_m,
             SLOPE: sensor.sigma_scale,

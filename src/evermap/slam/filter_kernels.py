@@ -305,9 +305,7 @@ def update(
 def _surprises(
     part: FloatArray, jacobian: FloatArray, spread: FloatArray, residual: FloatArray, sigma: FloatArray, nis: FloatArray
 ) -> bool:
-    """Return the squared distance of every detection alone; True if the pose is too uncertain for this to be
-    informative.
-    """
+    """Return the squared distance of every detection alone; True if the pose is too uncertain for this."""
     unsure = False
     for m in range(len(nis)):
         r, q, x = sigma[m, 0] ** 2, sigma[m, 1] ** 2, AT_PLACES + 2 * m

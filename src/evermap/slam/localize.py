@@ -210,9 +210,7 @@ class Localizer(Shown):
             self._filter.drive(motion)
 
     def _search(self, stamp_s: float) -> None:
-        """Align the drive since the robot got lost with the map, and accept that if it explains much more than the
-        present pose.
-        """
+        """Align the drive since the robot got lost with the map, if that explains much more than the present pose."""
         assert self._track is not None
         placed = self._track.placed(stamp_s, self.places)
         if placed is None:

@@ -467,9 +467,7 @@ class StreamingSlam:
         self._filter.restart(estimate, self._noise, self._problem)
 
     def _can_align(self, *, final: bool = False) -> bool:
-        """Return whether most of the prior map's landmarks seen so far have the relative positions of the map; two
-        suffice at the end.
-        """
+        """Return whether most landmarks of the map seen so far have its relative positions; two at the end."""
         assert self._prior_map is not None
         both = self._prior_map.given & np.isfinite(self._landmark[: len(self._prior_map.given), 0])
         count = int(both.sum())

@@ -301,9 +301,7 @@ def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched, settings:
 def _matched(
     taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes, held_m: FloatArray
 ) -> _Matched:
-    """Match boxes of the session to those of the map, one to one, except for parts of an interrupted track. Gates grow
-    with the distance from the constrained places (H, 2).
-    """
+    """Match boxes to the map, one to one but for parts of a track; gates grow with the distance to (H, 2)."""
     settings = known.settings
     seen, count = seen_boxes(taken, solved, settings), len(solved.identity)
     found = _Matched.nothing(solved)

@@ -175,9 +175,7 @@ def _unwitnessed(rows: SiteLooks, was_unknown: BoolArray, n: int, least: int) ->
 
 
 class _Seen(NamedTuple):
-    """Return (N,) masks of looks along clear lines, of those with a sighting nearby or behind, and along unknown
-    lines.
-    """
+    """Return (N,) masks of looks along clear lines, those with a sighting nearby or behind, and unknown lines."""
 
     clear: BoolArray
     beside: BoolArray

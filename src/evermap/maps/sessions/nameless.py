@@ -216,9 +216,7 @@ class _Assigned:
         return held_at(self._local.part(some), held, self._living.places.position_m[at], known, self._overlay)
 
     def _grown(self, place: IntArray) -> IntArray:
-        """Return (K,) `place` with all certain matches: outwards from the matched ones, in groups that must agree with
-        each other.
-        """
+        """Return (K,) `place` with all certain matches: outwards from the given ones, in agreeing groups."""
         place, x = place.copy(), self._local.place
         tried = place >= 0
         while not tried.all():
@@ -256,9 +254,7 @@ class _Assigned:
         return group[k[sure]], m[sure]
 
     def _placed(self) -> IntArray:
-        """Return (K,) rows of the places that some landmarks certainly match, -1 for the others: those of one stretch,
-        which an odometry error distorts less than all.
-        """
+        """Return (K,) rows of the places that landmarks of one stretch certainly match, -1 for the others."""
         stands, every = np.flatnonzero(self._stood.p >= EXISTS), np.arange(len(self._local.place))
         place, named = np.full(len(every), -1, dtype=np.int64), self._named[:MOST_HELD]
         best = self._overlaid(named, stands[self._alike[named][:, stands].any(axis=0)], None, self._alike, fewest=2)
@@ -273,9 +269,7 @@ class _Assigned:
         return place
 
     def _regained(self, where: Where, member: IntArray, place: IntArray) -> IntArray:
-        """Return `place` with landmarks outside of their gates after a distorted stretch, matched by their
-        constellation. They may be copies of landmarks seen before it.
-        """
+        """Return `place` with landmarks beyond their gates after a distorted stretch, by their constellation."""
         stood, together, found = self._stood, self._found.assignment.together, place.copy()
         stands, left = np.flatnonzero(stood.p >= EXISTS), np.flatnonzero(member < 0)
         held = np.flatnonzero(member >= 0)

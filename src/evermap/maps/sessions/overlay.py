@@ -203,9 +203,7 @@ class _Options:
         return chosen
 
     def rest_of(self, chosen: IntArray) -> IntArray:
-        """Return (C,) the complement of an assignment: moved cliques at their most probable sites, and the others
-        elsewhere.
-        """
+        """Return (C,) the complement: moved cliques at their most probable sites, the others elsewhere."""
         likely = self.likeliest_sites()
         return np.asarray(np.where(chosen == ELSEWHERE, likely, ELSEWHERE))
 
@@ -265,9 +263,7 @@ class _Options:
         return len(stand) != 1 or not denied or log_odds[stand[0]] > sum(denied)
 
     def _log_standing(self, chosen: IntArray) -> tuple[float, int]:
-        """Return the log probability of the options, with the density of all landmarks at their sites, and their
-        number.
-        """
+        """Return the log probability of the options, with the density of landmarks at their sites, and their number."""
         error, inverse, rows = self._field(chosen)
         log_volume = float(np.linalg.slogdet(inverse)[1]) if len(rows) else 0.0
         total = 0.5 * log_volume - 0.5 * float(error @ inverse @ error) - 0.5 * len(error) * math.log(2.0 * math.pi)

@@ -104,9 +104,7 @@ class Turned(NamedTuple):
     symmetries: Symmetries
 
     def log_odds(self, landmark: IntArray, places: Places, settings: OverlayConfig) -> FloatArray:
-        """Return (P,) log likelihood ratio of the orientations of landmarks (P,) at places, for 'unmoved' over
-        'moved'.
-        """
+        """Return (P,) log likelihood ratio of orientations of landmarks (P,) at places, 'unmoved' over 'moved'."""
         turn = se3.compose(self.pose_map_session, _turns(self.rotation[landmark]))
         known_turn = self.symmetries[landmark].nearest(_turns(places.rotation), turn)
         off = se3.local(known_turn, turn)[:, 3:]

@@ -164,9 +164,7 @@ class SpatialVisit:
         return np.bincount(problem.place, self.inlier, minlength=len(problem.oriented)).astype(np.float64)
 
     def told(self, some: BoolArray) -> tuple[IntArray, FloatArray]:
-        """Return rows (K,) of the located ones of some places (P,), by their ids; and orientations (K, 4), nan for
-        points.
-        """
+        """Return rows (K,) of located places among (P,), by their ids; and orientations (K, 4), nan for points."""
         row = np.flatnonzero(some & self.located[1])
         row = row[np.argsort(self.landmark_id[row], kind="stable")]
         oriented = self.optimum.smoother.problem.oriented[row, None]

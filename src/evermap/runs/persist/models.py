@@ -1,6 +1,4 @@
-"""Choice of the presence model of a run: one stay for each feature, a model from a file, or one learned from the
-looks.
-"""
+"""Choice of the presence model of a run: one stay for each feature, a model from a file, or a learned one."""
 
 from __future__ import annotations
 

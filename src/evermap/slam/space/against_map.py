@@ -66,9 +66,7 @@ def compared(optimum: SpatialOptimum, stated: FloatArray) -> tuple[SpatialOptimu
 
 
 def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
-    """Return (K,) weights of the map's places: of the moved ones the farthest are released first, since they may have
-    distorted the others.
-    """
+    """Return (K,) weights of the map's places: the farthest moved ones, which may distort others, go first."""
     spread = found.covariance + sigma[:, :, None] ** 2 * np.eye(6)
     far = np.einsum("ki,kij,kj->k", found.off, np.linalg.inv(spread), found.off)
     moved = (found.p_stands < 0.5) & (before >= 0.5)

@@ -368,9 +368,7 @@ def _steady(
     at: FloatArray, by: FloatArray, of: IntArray, still: FloatArray, sigma: FloatArray, prior: FloatArray,
     stretch: IntArray,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Return scale and bend by reweighted least squares over the static objects; and their deviations, clustered by
-    objects and by stretches of the drive.
-    """
+    """Return scale and bend by reweighted least squares; and deviations clustered by objects and by stretches."""
     trust, found, count = np.maximum(still, 1e-9)[of], np.zeros(2), len(still)
     weight, total, told = trust / sigma**2, np.eye(2), np.zeros((count, 2))
     for _ in range(ROUNDS):

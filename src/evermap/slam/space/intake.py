@@ -158,9 +158,7 @@ def _said(
 
 
 def _usable(recording: SpatialRecording, remarks: tuple[str, ...]) -> tuple[BoolArray, BoolArray, list[str]]:
-    """Return detections (M,) of known identity during the odometry, frames (F,) during it, and remarks on dropped
-    ones.
-    """
+    """Return detections (M,) of known identity and frames (F,) during the odometry, and remarks."""
     detections, stamps, warnings = recording.detections, recording.frames.stamp_s, list(remarks)
     usable = detections.landmark_id != UNKNOWN
     if not usable.all():
