@@ -497,7 +497,7 @@ def test_a_map_in_a_database_is_verified_and_reverted(site_address: str) -> None
         connection.exec_driver_sql("UPDATE chunk SET data = '\\x00' WHERE name = (SELECT record FROM revision LIMIT 1)")
     damaged = verify_store(site_address)
     assert not damaged.sound
-    with open_store(site_address) as store, pytest.raises(DamagedMapError, match="a backup of the database"):
+    with open_store(site_address) as store, pytest.raises(DamagedMapError, match="restore a backup"):
         store.log()
 
 

@@ -29,9 +29,7 @@ class FitConfig(Section):
     misread_share: Share = Field(
         default=0.2, description="maximum share of sightings for that, with none in a frame with the other one"
     )
-    glimpse_m: Positive = Field(
-        default=0.4, description="a landmark seen once this close to its place counts as present [m]"
-    )
+    glimpse_m: Positive = Field(default=0.4, description="a landmark seen once this close to its place is present [m]")
     bent_m: Positive = Field(
         default=0.15, description="tolerance within which bodies with a common motion indicate a distorted session [m]"
     )
@@ -189,15 +187,11 @@ class LooksConfig(Section):
     worth_a_look: Share = Field(
         default=0.3, description="share of a sensor's detection probability from which a landmark is looked at"
     )
-    settled_s: NotNegative = Field(
-        default=300.0, description="a landmark seen within this time of a look was there [s]"
-    )
+    settled_s: NotNegative = Field(default=300.0, description="a landmark seen this close to a look was there [s]")
     settled_online_s: NotNegative = Field(
         default=10.0, description="the same while the robot drives, as long as the session is not over [s]"
     )
-    beside_m: Positive = Field(
-        default=1.0, description="a landmark seen this close to a place is seen along its line [m]"
-    )
+    beside_m: Positive = Field(default=1.0, description="sightings this close to a place are along its line [m]")
     beside_rad: Positive = Field(default=0.15, description="so is a landmark seen behind it within this angle [rad]")
     along_m: Positive = Field(
         default=0.3, description="distance from a line of sight within which a sighting shows it to be clear [m]"

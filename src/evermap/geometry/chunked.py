@@ -374,9 +374,7 @@ class ChunkedCovariance:
         return {c: set(graph.indices[graph.indptr[c] : graph.indptr[c + 1]].tolist()) for c in chunks.tolist()}
 
     def _elimination(self, near: dict[int, set[int]]) -> dict[int, list[int]]:
-        """Return chunks in elimination order, each with the earlier ones on which it is conditioned: the largest clique
-        of its neighbours, found greedily from the nearest.
-        """
+        """Return chunks in elimination order, each with the clique of earlier neighbours on which it depends."""
         order: dict[int, list[int]] = {}
         waiting = dict.fromkeys(near, 0)
         while waiting:  # maximum cardinality search: next the chunk with most visited neighbours

@@ -283,9 +283,7 @@ class LocalFilter:
         self.covariance[at], self.covariance[:, at] = 0.0, 0.0
 
     def _tied(self, waiting: list[int]) -> list[Ties]:
-        """Return the ties of places to others, each also to those before it: as stored when they left, or from the
-        solution or the map if these contain them and most of their neighbours have left.
-        """
+        """Return the ties of places to others: as stored, or from the solution or the map if most neighbours left."""
         solved, here = np.isfinite(self._given_position[:, 0]), self._slot >= 0
         of = self.active if self._neighbours else NO_PLACES
         of = of[of < len(solved)]

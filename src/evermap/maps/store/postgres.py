@@ -45,7 +45,7 @@ def open_postgres(address: str, *, create: bool) -> SqlStore:
     engine = engine_of(url.render_as_string(hide_password=False), PREFIX + site)
 
     def explain(problem: str) -> InputError:
-        return DamagedMapError(f"damaged: {problem}", path=where, hint="restore a backup of the database")
+        return DamagedMapError(f"damaged: {problem}", path=where, hint="restore a backup")
 
     return SqlStore.opened(engine, where, create=create, explain=explain)
 
