@@ -17,7 +17,21 @@ VERBS = [
     "bench",
 ]  # fmt: skip
 GROUPS = {
-    "map": ["log", "show", "diff", "export", "why", "verify", "gc", "reenter", "revert", "pin", "unpin", "delete", "undelete"],
+    "map": [
+        "log",
+        "show",
+        "diff",
+        "export",
+        "why",
+        "verify",
+        "gc",
+        "reenter",
+        "revert",
+        "pin",
+        "unpin",
+        "delete",
+        "undelete",
+    ],
     "serve": ["token", "doctor"],
     "survival": ["plot", "fit", "learn"],
 }

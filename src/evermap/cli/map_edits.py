@@ -129,7 +129,7 @@ def reenter(
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Enter all sessions of many maps again, with other settings or after an upgrade.
+    """Enter all sessions of maps again, as with new settings.
 
     Each map is copied to --out and entered there; the maps stay as they are, and can be compared. With --adopt the new
     revisions are appended to the maps: a map has all of them or none, and `evermap map revert` goes back. What an
