@@ -58,9 +58,8 @@ CAMERA = Sensor(
     p_detect=0.4,
     p_false=0.001,
 )
-"""The robots' forward camera. Rounded outwards from the readings of all robots (0.8 to 9.6 m, -0.59 to 0.57 rad),
-without the truth. It decodes less than half of the barcodes in view. Noise is estimated from the recording.
-"""
+"""The robots' forward camera. Rounded outwards from their readings (0.8 to 9.6 m, -0.59 to 0.57 rad).
+It decodes less than half of the barcodes in view. Noise is estimated from the recording."""
 
 MOST_STRAY = 1e-3
 """Maximum share of rows out of order in a file that is sorted."""
