@@ -80,7 +80,7 @@ def test_evidence_is_that_of_the_joint_gaussian(monkeypatch: pytest.MonkeyPatch)
     expected = multivariate_normal.logpdf(zero, cov=covariance) - perfect
     met = np.zeros(len(at.landmark))
     for row in problem.landmark_row:  # one that was seen n times is seen again with n / (n + 1)
-        expected += np.log((particles.SEEN + met[row]) / (particles.SEEN + met[row] + 1.0))
+        expected += np.log((particles.FEWEST_SIGHTINGS + met[row]) / (particles.FEWEST_SIGHTINGS + met[row] + 1.0))
         met[row] += 1
     assert evidence == pytest.approx(expected, abs=0.5)
 

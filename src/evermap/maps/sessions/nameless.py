@@ -97,7 +97,8 @@ def named_in(recording: Recording, living: LivingMap, config: Config) -> Recordi
     Raises:
         DataError: too few frames with detections, or too many for the memory.
     """
-    found = associated(recording, *beliefs(recording.sensor, config.slam), keep_ids=True)
+    believed, odometry = beliefs(recording.sensor, config.slam), config.slam.odometry
+    found = associated(recording, *believed, keep_ids=True, odometry=odometry)
     start_s = float(recording.frames.stamp_s[0])
     landmark_id = found.assignment.name
     if len(living.places):

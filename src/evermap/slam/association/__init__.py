@@ -20,4 +20,5 @@ def with_identities(recording: AnyRecording, settings: SlamConfig, prior_map: La
         return recording
     if isinstance(recording, SpatialRecording):
         return identified_in_space(recording, settings.space, prior_map, keep_ids=keep_ids)
-    return identified(recording, *beliefs(recording.sensor, settings), prior_map=prior_map, keep_ids=keep_ids)
+    believed, odometry = beliefs(recording.sensor, settings), settings.odometry
+    return identified(recording, *believed, prior_map=prior_map, keep_ids=keep_ids, odometry=odometry)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,10 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 NOBODY = -1
 """Landmark row of a detection that belongs to none."""
 
+FEWEST_SIGHTINGS, FEWEST_TO_PAIR = 3, 2
+"""Sightings of a landmark that is believed in; and of one that may be paired with another, which counts both."""
+NAMED_NATS = math.log(100.0)
+"""Log odds by which two of one name are rather one, for each detection with a name."""
 FORGET_S = 20.0
 """Time without a detection that ends a visit; what has too few detections by then is forgotten."""
 SHARED_M, SHARED_SHARE = 0.02, 0.5

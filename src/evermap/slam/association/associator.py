@@ -15,10 +15,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.slam.association.assignment import FORGET_S, NOBODY, Assignment, alike, same_name
+from evermap.slam.association.assignment import (
+    FEWEST_SIGHTINGS,
+    FORGET_S,
+    NAMED_NATS,
+    NOBODY,
+    Assignment,
+    alike,
+    same_name,
+)
 from evermap.slam.association.constellation import MOST_LAID, propose_constellation
 from evermap.slam.association.features import MISREAD_NATS, Likeness, Traits
-from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
+from evermap.slam.association.jcbb import CONFIDENCE, Pairings, gates, pairing_probability
 from evermap.slam.association.merging import FEW_NATS, Differences, Solution, propose_merges
 from evermap.slam.association.relaying import displaced_stretches, laid
 from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
@@ -41,8 +49,6 @@ SLIP, SLIP_NATS = 3.0, math.log(20.0)
 """And this much worse in a step after which no landmark is where it should be; a priori one step in twenty slips, so
 that the wide gate alone does not make a landmark's detection of that of a ghost."""
 
-GATE = 0.999
-"""Confidence of the gates of single detections and of whole frames."""
 P_MATCH, P_RETURN = 0.95, 0.99
 """Probability from which a detection is given to a landmark; and to one not seen for `FORGET_S`, which closes a
 loop by itself: wrong, it bends the map for good; in doubt `merging` weighs several landmarks together later."""
@@ -54,16 +60,12 @@ P_NEW = 0.1
 """Probability of being none of the known from which it starts a landmark."""
 P_MERGE = 0.97
 """Probability from which two landmarks are one."""
-NAMED_NATS = math.log(100.0)
-"""Odds that of two landmarks with one name there is only one, for every time that it was read off the lesser,"""
 MOST_TOLD = 10
 """at most so many times: what was read wrongly once is likely to be so again."""
 UNMET = 0.1
 """Share of landmarks that one has not met yet around those that are followed."""
 FEWEST, SMALLEST_M2 = 2.0, 20.0
 """Landmarks, and the area that they span, at least, where their density is measured."""
-MIN_SIGHTINGS = 3
-"""Detections that make a landmark."""
 FIRST_STOCK = 40
 """Poses before the first batch solution; the next come after as many, or as their number grew by this share."""
 STOCK_SHARE = 0.05
@@ -319,7 +321,7 @@ class Associator:
             read = self._traits.singly(detections[pairings.source])
             told = self._traits.same(read, self._like.part(pairings.target))
             pairings = replace(pairings, log_density_new=pairings.log_density_new - told)
-        probability, evidence, _ = pairing_probability(pairings, confidence=GATE)
+        probability, evidence, _ = pairing_probability(pairings, confidence=CONFIDENCE)
         known = np.zeros(len(detections))
         np.add.at(known, pairings.source, probability)
         assert pairings.followed is not None
@@ -355,7 +357,7 @@ class Associator:
         by = np.hstack([np.eye(2), -np.eye(2)])
         spread = by @ local.covariance[np.ix_(at, at)] @ by.T + 1e-12 * np.eye(2)
         gap = local.position[a] - local.position[b]
-        return bool(gap @ np.linalg.solve(spread, gap) < gates(1, GATE)[1])
+        return bool(gap @ np.linalg.solve(spread, gap) < gates(1, CONFIDENCE)[1])
 
     def _use(self, frame: _Frame, detections: IntArray) -> None:
         """Update with the certain pairings, and start landmarks where none is near enough."""
@@ -489,7 +491,7 @@ class Associator:
         for _ in range(RELAID):
             now = solved.assignment
             stretches = displaced_stretches(
-                now, solved.marginals, now.sightings >= MIN_SIGHTINGS, density=self._density_m2, probability=P_MERGE
+                now, solved.marginals, now.sightings >= FEWEST_SIGHTINGS, density=self._density_m2, probability=P_MERGE
             )
             starts = (laid(now, stretch, before) for stretch in stretches[:STRETCHES] for before in BEFORE)
             trials = (self._all_merged(self._solved(start)) for start in starts)
@@ -575,7 +577,7 @@ def by_name(one: IntArray, other: IntArray, told: IntArray) -> FloatArray:
 
 def _seldom(assignment: Assignment) -> BoolArray:
     """(L,) what was seen too seldom to be a landmark, and has no name."""
-    return np.asarray((assignment.sightings < MIN_SIGHTINGS) & (assignment.told == 0))
+    return np.asarray((assignment.sightings < FEWEST_SIGHTINGS) & (assignment.told == 0))
 
 
 def _latest(assignment: Assignment, count: int | None) -> BoolArray:
@@ -631,7 +633,7 @@ def pairings_of_frame(
     source, target = source[same], target[same]
     seen = detections[source]
     nis, log_det, innovation, by = local.compare(target, problem.reading[seen], sigma[seen])
-    inside = np.flatnonzero(nis <= gates(1, GATE)[1])
+    inside = np.flatnonzero(nis <= gates(1, CONFIDENCE)[1])
     # what is followed has a neighbourhood that is known; elsewhere the gate may hold another landmark by chance
     followed = log_det[inside] <= 2.0 * np.log(sigma[seen[inside]]).sum(axis=1) + FOLLOWED
     source, target, seen, count = source[inside], target[inside], seen[inside], len(inside)

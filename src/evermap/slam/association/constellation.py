@@ -18,13 +18,11 @@ from scipy.spatial import KDTree
 
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
-from evermap.slam.association.assignment import Assignment, alike, same_name
+from evermap.slam.association.assignment import FEWEST_TO_PAIR, Assignment, alike, same_name
 from evermap.slam.association.features import MISREAD_NATS
-from evermap.slam.association.jcbb import Pairings, most_pairings
+from evermap.slam.association.jcbb import CONFIDENCE, LOOSE_GATE, Pairings, most_pairings
 from evermap.types import BoolArray, FloatArray, IntArray
 
-CONFIDENCE = 0.999
-"""Of the gates: a pair that fails is never the same landmark."""
 MIN_SPAN_M = 0.5
 """Two landmarks fix a motion if they are this far apart."""
 MAX_SEEDS = 12
@@ -249,9 +247,6 @@ def _blocks(covariance: FloatArray, rows: IntArray) -> FloatArray:
     return covariance.reshape(count, 2, count, 2)[rows][:, :, rows]
 
 
-MIN_SIGHTINGS = 2
-LOOSE_GATE = 60.0
-"""Squared distance up to which a pair may be meant at all, though the linearisation is far off."""
 STIFF_M = 0.2
 """Landmarks belong to one stiff part if they are known against each other to this."""
 MOST_LAID = 120
@@ -297,7 +292,7 @@ def stiff_and_loose(sightings: IntArray, joint: FloatArray) -> tuple[IntArray, I
         sightings: (L,) detections of each.
         joint: (G, G) covariance, that of the landmarks first.
     """
-    seen = np.flatnonzero(sightings >= MIN_SIGHTINGS)
+    seen = np.flatnonzero(sightings >= FEWEST_TO_PAIR)
     if not len(seen):
         return seen, seen
     within = np.linalg.eigvalsh(_spreads(joint, seen, seen))[..., 1] < STIFF_M**2

@@ -14,6 +14,7 @@ from operator import itemgetter
 import numpy as np
 from scipy.linalg import block_diag
 
+from evermap.config import OdometryConfig
 from evermap.slam.association.assignment import NOBODY, Assignment, alike
 from evermap.slam.association.associator import P_MERGE, Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
@@ -22,7 +23,7 @@ from evermap.slam.association.particles import WIDER, drawn
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
-from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.problem import USUAL, Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import StreamingSlam
 from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Recording
@@ -84,7 +85,14 @@ class Associated:
         return replace(recording, detections=replace(recording.detections, landmark_id=given))
 
 
-def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, keep_ids: bool = False) -> Associated:
+def associated(
+    recording: Recording,
+    prior: CalibrationPrior,
+    noise: Noise,
+    *,
+    keep_ids: bool = False,
+    odometry: OdometryConfig = USUAL,
+) -> Associated:
     """Associate the detections of a recording by geometry.
 
     Args:
@@ -92,12 +100,15 @@ def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, k
         prior: of the calibration states.
         noise: where noise levels start.
         keep_ids: detections with an id keep it, those without may be of the same landmarks; else ids are ignored.
+        odometry: what is believed of it.
 
     Raises:
         DataError: too few frames with detections, or too many for the memory.
     """
     given = recording.detections
-    prepared = prepare(replace(recording, detections=replace(given, landmark_id=np.zeros_like(given.landmark_id))))
+    prepared = prepare(
+        replace(recording, detections=replace(given, landmark_id=np.zeros_like(given.landmark_id))), settings=odometry
+    )
     problem = replace(prepared.problem, prior=prior.without_scale())
     name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
     kind = np.column_stack([given.class_id, name])[prepared.used]
@@ -226,6 +237,7 @@ def identified(
     *,
     prior_map: Landmarks | None = None,
     keep_ids: bool = False,
+    odometry: OdometryConfig = USUAL,
 ) -> Recording:
     """Return the recording with landmark ids by geometry.
 
@@ -235,6 +247,7 @@ def identified(
         noise: where noise levels start.
         prior_map: landmarks that keep their ids where they are met again, from whatever place the robot starts in.
         keep_ids: as of `associated`.
+        odometry: what is believed of it.
 
     Returns:
         The same detections. Landmarks without an id that are not in the prior map are numbered from 1, in the order in
@@ -244,7 +257,7 @@ def identified(
     Raises:
         DataError: too few frames with detections, or too many for the memory.
     """
-    found = associated(recording, prior, noise, keep_ids=keep_ids)
+    found = associated(recording, prior, noise, keep_ids=keep_ids, odometry=odometry)
     met, known = found.assignment.name, np.zeros(0, dtype=np.int64)
     if prior_map is not None:
         known = prior_map.landmark_id

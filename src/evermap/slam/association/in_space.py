@@ -19,7 +19,9 @@ from evermap.config import SpaceConfig
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se2, se3
 from evermap.slam.association.assignment import (
+    FEWEST_SIGHTINGS,
     FORGET_S,
+    NAMED_NATS,
     NOBODY,
     SHARED_M,
     SHARED_SHARE,
@@ -31,12 +33,9 @@ from evermap.slam.association.assignment import (
 )
 from evermap.slam.association.associator import (
     CAUTION,
-    GATE,
     INFLATION,
     LAST_ROUNDS,
     MERGE_ROUNDS,
-    MIN_SIGHTINGS,
-    NAMED_NATS,
     P_MERGE,
     P_NEW,
     RISE_MOST,
@@ -50,9 +49,9 @@ from evermap.slam.association.associator import (
     effective_number,
 )
 from evermap.slam.association.identify import numbered
-from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
+from evermap.slam.association.jcbb import CONFIDENCE, Pairings, gates, pairing_probability
 from evermap.slam.association.merging import Differences, Solution, in_reach, propose_merges
-from evermap.slam.association.revise import CONFIDENCE, lying_together, may_be_of, most_probable
+from evermap.slam.association.revise import lying_together, may_be_of, most_probable
 from evermap.slam.space.estimate import as_seen, converged, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, prepare_space, without_range
 from evermap.slam.space.linearise import POINT, POSE
@@ -240,11 +239,11 @@ class SpatialAssociator:
         solved = self._merged(self._learned(row, _driven(self._problem)))
         for _ in range(LAST_ROUNDS):
             again = self._with_overlooked(self._reassigned(solved), solved.estimate.pose)
-            again = _without(again, np.bincount(again[again >= 0]) < MIN_SIGHTINGS)
+            again = _without(again, np.bincount(again[again >= 0]) < FEWEST_SIGHTINGS)
             if np.array_equal(again, solved.row):
                 break
             solved = self._merged(self._learned(again, solved.estimate.pose))
-        return _without(solved.row, np.bincount(solved.row[solved.row >= 0]) < MIN_SIGHTINGS)
+        return _without(solved.row, np.bincount(solved.row[solved.row >= 0]) < FEWEST_SIGHTINGS)
 
     def _follow(self) -> None:
         """Pair the detections of every view with what was seen in the last seconds."""
@@ -284,7 +283,7 @@ class SpatialAssociator:
         at = 3 * target[:, None] + np.arange(3)
         spread = near.covariance[at[:, :, None], at[:, None, :]] + own[source]
         squared = np.einsum("ki,ki->k", innovation, np.linalg.solve(spread, innovation[..., None])[..., 0])
-        inside = squared <= gates(1, GATE, 3)[1]
+        inside = squared <= gates(1, CONFIDENCE, 3)[1]
         inside[inside] = self._turned_alike(view[source[inside]], near, target[inside])
         source, target, innovation, spread = source[inside], target[inside], innovation[inside], spread[inside]
         rows = se2.xy_rows(target, 3)
@@ -298,7 +297,7 @@ class SpatialAssociator:
         pairs = Pairings(
             source, target, innovation, joint.reshape(3 * len(source), 3 * len(source)), new, len(view), None, least
         )
-        probability, evidence, _ = pairing_probability(pairs, confidence=GATE)
+        probability, evidence, _ = pairing_probability(pairs, confidence=CONFIDENCE)
         known = np.zeros(len(view))
         np.add.at(known, source, probability)
         best = np.zeros(len(source), dtype=np.bool_)

@@ -22,6 +22,10 @@ from scipy.special import gammaincinv
 from evermap.slam.kernels import kernel
 from evermap.types import BoolArray, FloatArray, IntArray
 
+CONFIDENCE = 0.999
+"""Share of what belongs together that a gate lets through."""
+LOOSE_GATE = 60.0
+"""Squared distance within which pairs are asked whether they are one: errors that neighbours share leave every gate."""
 NEGLIGIBLE = 25.0
 """Nats by which sets of no weight fall short of the best."""
 MAX_NODES = 200_000

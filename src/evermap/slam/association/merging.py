@@ -16,21 +16,14 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import KDTree
 
-from evermap.slam.association.assignment import alike, same_name
+from evermap.slam.association.assignment import FEWEST_TO_PAIR, alike, same_name
 from evermap.slam.association.consensus import FREE, Candidates, Consensus, consensus
-from evermap.slam.association.jcbb import gates
+from evermap.slam.association.jcbb import CONFIDENCE, LOOSE_GATE, gates
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
-CONFIDENCE = 0.999
-"""Of the gate of a pair, given others that are one: a pair that fails is none."""
-LOOSE_GATE = 60.0
-"""Squared distance up to which a pair may be meant by itself: the robot's own error may be larger than it knows, which
-many pairs that agree on it outweigh."""
 FEW_NATS = 7.0
 """Margin of a pair of a set of no more than fix how one map lies over another (any two trees as far apart fit), as long
 as later frames may tell more."""
-MIN_SIGHTINGS = 2
-"""Detections of a landmark that is compared: one alone may be of nothing."""
 GROUP = 24
 """Landmarks, met one after the other, that are looked up in the rest of the map at the same time."""
 MOST_TOGETHER = 200
@@ -111,7 +104,7 @@ def propose_merges(
         refused: pairs that are not looked at.
         known: (L,) landmarks that they may be; None for all.
     """
-    seen = (solution.sightings >= MIN_SIGHTINGS) | (solution.kind[:, -1] != UNKNOWN)
+    seen = (solution.sightings >= FEWEST_TO_PAIR) | (solution.kind[:, -1] != UNKNOWN)
     sources, targets = np.flatnonzero(seen & among), np.flatnonzero(seen if known is None else seen & known)
     if len(sources) < 1 or len(targets) < 2:
         return []

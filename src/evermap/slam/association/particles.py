@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from evermap.slam.association.assignment import NOBODY, Assignment
+from evermap.slam.association.assignment import FEWEST_SIGHTINGS, FORGET_S, NAMED_NATS, NOBODY, Assignment
 from evermap.slam.association.features import MOST_READINGS, Likeness, Traits, Variances, same_nats
 from evermap.slam.association.jcbb import gates
 from evermap.slam.filter_kernels import vectorised
@@ -40,14 +40,10 @@ beside where it belongs, by less than what takes one for another."""
 GATE = float(gates(1, 1.0 - 1e-4)[1])
 WIDE_GATE = GATE * (1.0 + 1e-6)
 """By more than is rounded where part of it is tested ahead."""
-SEEN, FORGET_S = 3, 20.0
-"""Detections that make a landmark; what has less after so long is forgotten."""
 ROOM = 2, 64
 """Landmarks of a particle at most: so many for each that is known, and more."""
 FEWEST_EFFECTIVE = 0.5
 """Share of particles that count, below which they are drawn anew."""
-NAMED_NATS = math.log(100.0)
-"""Odds for a landmark whose name is read."""
 
 
 class _Seen(NamedTuple):
@@ -164,7 +160,7 @@ def _begun(place: FloatArray, label: IntArray, like: Likeness, count: int) -> _C
         away = np.ravel(KDTree(place).query(place, [2])[0]) if n > 1 else np.ones(1)
         cloud.place[:, :, :n], cloud.label[:, :n], cloud.of[:, :n] = place.T, label, np.arange(n)
         cloud.spread[:, 0, :n] = cloud.spread[:, 2, :n] = (BENT * away) ** 2
-        cloud.sightings[:, :n] = SEEN
+        cloud.sightings[:, :n] = FEWEST_SIGHTINGS
         cloud.like[:, :n], cloud.read[:, :n] = like.value, np.minimum(like.readings, MOST_READINGS)
     return cloud
 
@@ -439,7 +435,7 @@ def _place(seen: Any, d: int, stamp_s: float, sensor: Any, cloud: Any, i: int, s
 def _free_slot(cloud: Any, i: int, stamp_s: float) -> int:
     """A slot that is free, as what was in it was seen too seldom; -1 where there is none."""
     for k in range(cloud.slots[i]):
-        if cloud.sightings[i, k] < SEEN and stamp_s - cloud.last_s[i, k] > FORGET_S:
+        if cloud.sightings[i, k] < FEWEST_SIGHTINGS and stamp_s - cloud.last_s[i, k] > FORGET_S:
             return k
     if cloud.slots[i] == cloud.of.shape[1]:
         return -1

@@ -15,15 +15,13 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.special import gammainc
 
-from evermap.slam.association.assignment import NOBODY, Assignment, alike, same_name
-from evermap.slam.association.jcbb import gates
+from evermap.slam.association.assignment import FEWEST_SIGHTINGS, NOBODY, Assignment, alike, same_name
+from evermap.slam.association.jcbb import CONFIDENCE, gates
 from evermap.slam.association.merging import in_reach
 from evermap.slam.kernels import kernel
 from evermap.slam.linearise import detection_residuals
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
-CONFIDENCE = 0.999
-"""Of the gate: a detection outside is not of this landmark."""
 P_OWN = 0.5
 """Least probability of the landmark that a detection is given to."""
 LEAST_SEEN = 1.0 / 3.0
@@ -31,8 +29,6 @@ LEAST_SEEN = 1.0 / 3.0
 LOOK_BINS = 12
 """Classes of range with as many detections each, within which landmarks are typically seen alike."""
 ROUNDS = 20
-MIN_SIGHTINGS = 3
-"""Detections, in as many frames, that make a landmark of what was left over."""
 
 
 def reassigned(assignment: Assignment, explained: FloatArray, *, density: float) -> Assignment:
@@ -116,7 +112,7 @@ def with_overlooked(assignment: Assignment) -> Assignment:
     """Return the assignment with new landmarks where detections of none lie together in frames enough."""
     problem = assignment.measured
     left = np.flatnonzero(assignment.landmark_row == NOBODY)
-    if len(left) < MIN_SIGHTINGS:
+    if len(left) < FEWEST_SIGHTINGS:
         return assignment
     at, sigma = assignment.points()[left], problem.sigma_given[left]
     wide = np.hypot(sigma[:, 0], problem.reading[left, 0] * sigma[:, 1])
@@ -129,7 +125,7 @@ def with_overlooked(assignment: Assignment) -> Assignment:
 
 
 def lying_together(at: FloatArray, wide: FloatArray, kind: IntArray, frame: IntArray) -> list[IntArray]:
-    """Return groups of detections that lie together in `MIN_SIGHTINGS` frames or more, one of each frame.
+    """Return groups of detections that lie together in `FEWEST_SIGHTINGS` frames or more, one of each frame.
 
     Args:
         at: (M, D) places in the world.
@@ -142,16 +138,16 @@ def lying_together(at: FloatArray, wide: FloatArray, kind: IntArray, frame: IntA
     found_near: Any = tree.query_ball_point(at, 3.0 * wide, return_sorted=False)
     near = [np.array(each, dtype=np.int64) for each in found_near]
     for k in np.argsort([-len(each) for each in near], kind="stable").tolist():
-        if not free[k] or np.count_nonzero(free[near[k]]) < MIN_SIGHTINGS:
+        if not free[k] or np.count_nonzero(free[near[k]]) < FEWEST_SIGHTINGS:
             continue
         mine = near[k][free[near[k]] & alike(kind[near[k]], kind[k])]
         mine = mine[alike(kind[mine], _most_frequent(kind[mine]))]
         mine = mine[np.unique(frame[mine], return_index=True)[1]]
-        if len(mine) < MIN_SIGHTINGS:
+        if len(mine) < FEWEST_SIGHTINGS:
             continue
         off = np.linalg.norm(at[mine] - _middle(at[mine], wide[mine]), axis=1)
         mine = mine[off < 3.0 * wide[mine]]
-        if len(mine) < MIN_SIGHTINGS:
+        if len(mine) < FEWEST_SIGHTINGS:
             continue
         free[mine] = False
         found.append(mine)
