@@ -182,7 +182,7 @@ def test_scores_of_any_scale_become_probabilities() -> None:
     ("box", "p_real", "named"),
     [
         (np.ones((1, 3)), np.ones(1), "field 'box': shape (1, 3) instead of (1, 4)"),
-        (np.array([[4.0, -1.0, 1.0, 0.0]]), np.ones(1), "is no box (try: positive sizes [m] and a heading [rad])"),
+        (np.array([[4.0, -1.0, 1.0, 0.0]]), np.ones(1), "is not a box (try: positive sizes [m] and a heading [rad])"),
         (np.ones((1, 4)), np.ones(2), "field 'p_real': shape (2,) instead of (1,)"),
         (np.ones((1, 4)), np.full(1, 1.5), "field 'p_real': detection 0: 1.5 is not a probability"),
         (None, np.ones(1), "field 'box'"),
