@@ -66,9 +66,8 @@ def reordered(recording: Recording, part: str, rows: np.ndarray) -> Recording:
         old = recording.detections
         pick = [np.flatnonzero(old.frame == row) for row in rows]
         take = np.concatenate(pick)
-        columns = {name: getattr(old, name)[take] for name in old.__dataclass_fields__}
-        columns["frame"] = np.repeat(np.arange(len(rows)), [len(few) for few in pick])
-        return replace(stream, detections=replace(old, **columns))
+        frame = np.repeat(np.arange(len(rows)), [len(few) for few in pick])
+        return replace(stream, detections=replace(rows_of(old, take), frame=frame))
     columns = {
         name: getattr(table, name)[rows]
         for name in table.__dataclass_fields__
@@ -328,8 +327,7 @@ def test_a_sensor_that_hangs_with_a_single_reading() -> None:
     rows = np.concatenate([keep, np.full(40, one)])
     frame = np.concatenate([detections.frame[keep], np.arange(first + 1, first + 41)])
     order = np.argsort(frame, kind="stable")
-    shown = {name: getattr(detections, name)[rows][order] for name in detections.__dataclass_fields__}
-    shown["frame"] = frame[order]
-    mended = clean(replace(recording, detections=replace(detections, **shown)))
+    shown = replace(rows_of(detections, rows[order]), frame=frame[order])
+    mended = clean(replace(recording, detections=shown))
     assert any("repeat the previous one" in warning for warning in mended.warnings)
     assert len(mended.frames) < len(frames) - 15
