@@ -43,11 +43,10 @@ def test_two_landmarks_that_are_seen_together_are_two() -> None:
     mine = rows_of_landmark(recording, 5)[::8]
     second = rows_of(recording.detections, mine)
     second = replace(second, landmark_id=np.full(len(mine), FAR), bearing_rad=second.bearing_rad + 0.02)
-    both = {
-        column: np.concatenate([getattr(recording.detections, column), getattr(second, column)])
-        for column in recording.detections.__dataclass_fields__
-    }
-    order = np.argsort(both["frame"], kind="stable")
-    detections = replace(recording.detections, **{column: values[order] for column, values in both.items()})
+    rows = np.concatenate([np.arange(len(recording.detections)), mine])
+    both = rows_of(recording.detections, rows)
+    new = np.arange(len(rows)) >= len(recording.detections)
+    both.landmark_id[new], both.bearing_rad[new] = second.landmark_id, second.bearing_rad
+    detections = rows_of(both, np.argsort(both.frame, kind="stable"))
     living = em.run_session(replace(recording, detections=detections)).living
     assert FAR in living.members.landmark_id

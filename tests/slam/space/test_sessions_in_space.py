@@ -14,7 +14,7 @@ from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
 from evermap.pipeline import run_session, run_slam
-from evermap.types import ChangeKind, Landmarks, landmark_id_of
+from evermap.types import ChangeKind, Landmarks, landmark_id_of, rows_of
 
 from .corridors import Site
 
@@ -125,8 +125,7 @@ def test_what_nothing_ties_to_the_rest_is_left_out() -> None:
     names = seen.landmark_id
     between = np.isin(names, np.intersect1d(names[at[seen.frame] <= 5.0], names[at[seen.frame] >= 10.0]))
     kept = ~blind & ~between
-    columns = {name: getattr(seen, name)[kept] for name in seen.__dataclass_fields__}
-    found = run_slam(replace(recording, detections=replace(seen, **columns)))
+    found = run_slam(replace(recording, detections=rows_of(seen, kept)))
     sides = {bool(site.place[name, 0] > 7.5) for name in found.landmarks.landmark_id}
     assert len(sides) == 1
     assert any("nothing connects" in warning for warning in found.warnings)
