@@ -118,7 +118,7 @@ def test_a_late_session_with_which_a_later_one_is_lost_stays_out(tmp_path: Path)
     days = simulate_building(BuildingConfig(days=8, patrol_s=35.0), 10).sessions
     with open_store(tmp_path / "site.evermap", create=True) as store:
         fed(store, days[5])
-        with pytest.raises(UnbridgedError, match="revision 1 cannot be replayed: too few"):
+        with pytest.raises(UnbridgedError, match="revision 1 cannot be brought in again: too few"):
             em.enter_session(store, days[2])
         assert store.head() == 1
 
