@@ -187,5 +187,5 @@ def test_what_cannot_be_read_is_refused_in_one_line_and_the_rest_goes_on() -> No
         with contextlib.suppress(InputError):
             one.listener.readings(Message("/odom", "nav_msgs/msg/Odometry", broken, START_S, 0))
     assert one.listener.readings(Message("/x", "my_msgs/msg/TagDetectionArray", b"\0\1\0\0", START_S, 0)) == []
-    assert "my_msgs/msg/TagDetectionArray of /x is not known" in said[-1]
+    assert "my_msgs/msg/TagDetectionArray of /x is unknown" in said[-1]
     assert one.listener.readings(Message("/image", "sensor_msgs/msg/Image", b"", START_S, 0)) == []

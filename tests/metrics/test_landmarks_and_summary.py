@@ -9,7 +9,7 @@ import pytest
 from evermap.geometry import se2
 from evermap.metrics.landmarks import evaluate_landmarks
 from evermap.metrics.summary import compare_with_truth, in_view, metrics_dict
-from evermap.types import Innovations, Landmarks
+from evermap.types import Innovations, Landmarks, rows_of
 
 STABLE_KEYS = {
     "pose_rmse_m",
@@ -103,10 +103,7 @@ def test_summary_of_a_run_without_innovations(run):
 def test_errors_in_view_are_those_near_a_sighting(run):
     recording, result = run
     blind = np.isin(recording.detections.frame, np.arange(200, 900))  # nothing seen for 700 frames
-    detections = dataclasses.replace(
-        recording.detections,
-        **{f.name: getattr(recording.detections, f.name)[~blind] for f in dataclasses.fields(recording.detections)},
-    )
+    detections = rows_of(recording.detections, ~blind)
     recording = dataclasses.replace(recording, detections=detections)
     evaluation = compare_with_truth(recording, result)
     poses = evaluation.poses

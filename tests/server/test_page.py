@@ -301,7 +301,7 @@ def test_an_operator_deletes_with_the_evidence_before_them(site: Site, browser: 
     browser.value("document.querySelector('#candidates li:last-child button').click()")
     browser.wait("document.getElementById('number').textContent === '3'")
     browser.value("document.getElementById('reverts').click()")
-    browser.wait("document.getElementById('said').textContent === 'revision 7 restores revision 3 was'")
+    browser.wait("document.getElementById('said').textContent === 'revision 7 restores revision 3'")
 
 
 def test_who_only_reads_has_no_buttons_that_change(site: Site, browser: Browser) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from evermap.geometry import se2
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
 from evermap.pipeline import run_session
-from evermap.types import FloatArray, IntArray, Recording
+from evermap.types import FloatArray, IntArray, Recording, rows_of
 from evermap_studies.sim import (
     BuildingConfig,
     BuildingSimulation,
@@ -72,8 +72,7 @@ def lived_through(
 def unseen(recording: Recording, landmark_id: Sequence[int] | IntArray) -> Recording:
     """As if these landmarks had not been there."""
     kept = ~np.isin(recording.detections.landmark_id, landmark_id)
-    columns = {item.name: getattr(recording.detections, item.name)[kept] for item in fields(recording.detections)}
-    return replace(recording, detections=replace(recording.detections, **columns))
+    return replace(recording, detections=rows_of(recording.detections, kept))
 
 
 def p_exists(living: LivingMap, landmark_id: int) -> float:
