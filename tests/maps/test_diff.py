@@ -17,7 +17,7 @@ from evermap.cli.main import app
 from evermap.maps.diff import Difference, diff, edits, grown, net
 from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
 from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
-from evermap.types import ChangeKind, MapChange
+from evermap.types import ChangeKind, MapChange, rows_of
 
 APPEARED, VANISHED, RETURNED = ChangeKind.APPEARED, ChangeKind.VANISHED, ChangeKind.RETURNED
 MOVED, SWAPPED = ChangeKind.MOVED, ChangeKind.SWAPPED
@@ -198,12 +198,9 @@ def part_of(recording: em.Recording, begin: float, end: float) -> em.Recording:
     stamps = frames.stamp_s
     first_s, last_s = (stamps[0] + share * np.ptp(stamps) for share in (begin, end))
     kept = np.flatnonzero((stamps >= first_s) & (stamps <= last_s))
-    mine = np.isin(recording.detections.frame, kept)
-    columns = {name: getattr(recording.detections, name)[mine] for name in recording.detections.__slots__}
-    columns["frame"] = np.searchsorted(kept, columns["frame"])
-    return replace(
-        recording, frames=replace(frames, stamp_s=stamps[kept]), detections=replace(recording.detections, **columns)
-    )
+    seen = rows_of(recording.detections, np.isin(recording.detections.frame, kept))
+    seen = replace(seen, frame=np.searchsorted(kept, seen.frame))
+    return replace(recording, frames=replace(frames, stamp_s=stamps[kept]), detections=seen)
 
 
 @pytest.fixture(scope="module")
