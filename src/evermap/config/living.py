@@ -27,7 +27,7 @@ class FitConfig(Section):
         default=0.3, description="distance within which a landmark may be another one with a misread identity [m]"
     )
     misread_share: Share = Field(
-        default=0.2, description="maximum share of sightings for that, with none in a frame with the other one"
+        default=0.2, description="maximum share of sightings for that, if it is never in one frame with the other one"
     )
     glimpse_m: Positive = Field(default=0.4, description="a landmark seen once this close to its place is present [m]")
     bent_m: Positive = Field(
@@ -71,7 +71,7 @@ class OverlayConfig(Section):
     stood_rad: tuple[Positive, ...] = Field(
         default=(0.02, 0.06, 0.15),
         min_length=1,
-        description="standard deviations by which landmarks in space that stand seem turned, all alike [rad]",
+        description="standard deviations of a common apparent turn of unmoved landmarks in space [rad]",
     )
     turned_rad: tuple[Positive, ...] = Field(
         default=(0.2, 1.0), min_length=1, description="the same of landmarks that were moved [rad]"
@@ -92,7 +92,7 @@ class MetreConfig(Section):
         default=0.05, description="probability that a robot's metre is not what its sensor is said to know"
     )
     drifted: float = Field(default=4.0, ge=1.0, description="times by which it is off then, as standard deviation")
-    p_told: Share = Field(default=0.95, description="probability from which a robot is told to have drifted")
+    p_told: Share = Field(default=0.95, description="probability from which a robot is reported as drifted")
 
 
 class NamelessConfig(Section):
@@ -102,7 +102,7 @@ class NamelessConfig(Section):
     farthest_m: Positive = Field(default=2.0, description="how far a landmark that is the same may be off [m]")
     bent_m: Positive = Field(default=2.0, description="the same behind a stretch that is bent [m]")
     p_found: Share = Field(
-        default=0.9, description="that a landmark which stands beside one that was found is found, too"
+        default=0.9, description="probability that a landmark next to a detected one is detected, too"
     )
 
 
@@ -110,7 +110,7 @@ class BoxesConfig(Section):
     """Boxes without identity in a map: which are the same from session to session."""
 
     drift_m: Positive = Field(
-        default=0.2, description="by which a box that nobody moved seems to be elsewhere, each axis [m]"
+        default=0.2, description="standard deviation of the position of an unmoved box between sessions, each axis [m]"
     )
     height_m: Positive = Field(default=0.5, description="the same of its height over a street that is not flat [m]")
     far_share: Share = Field(default=0.3, description="share of boxes that are off by more ...")
@@ -121,20 +121,24 @@ class BoxesConfig(Section):
     sigma_class_m: tuple[Positive, Positive, Positive] = Field(
         default=(0.6, 0.2, 0.25), description="standard deviations of the sizes of boxes of one class [m]"
     )
-    size_nats: Positive = Field(default=8.0, description="that size, or heading, may say against two boxes being one")
+    size_nats: Positive = Field(
+        default=8.0, description="most evidence of size or heading against two boxes being one [nats]"
+    )
     heading_rad: Positive = Field(default=0.15, description="standard deviation of headings [rad]")
     round: Positive = Field(default=1.3, description="boxes less long than this times their width have no heading")
-    density: Positive = Field(default=0.02, description="boxes where things stand, at least [1/m^2]")
-    p_stands: Share = Field(default=0.9, description="that a box which stands is seen at its place again")
+    density: Positive = Field(default=0.02, description="least density of static boxes [1/m^2]")
+    p_stands: Share = Field(
+        default=0.9, description="probability that a box that exists is detected at its place again"
+    )
     returns: Share = Field(
-        default=0.5, description="that what comes to where a box of the map had stood is that box, beforehand"
+        default=0.5, description="prior probability that an arrival at a former place of a box is that box"
     )
-    least_gone: Share = Field(default=0.02, description="least probability that a box left, where another one stands")
-    same_share: Positive = Field(
-        default=0.6, description="boxes that stand closer than this share of their widths are one"
+    least_gone: Share = Field(
+        default=0.02, description="least probability that a box left, if another one is at its place"
     )
+    same_share: Positive = Field(default=0.6, description="boxes closer than this share of their widths are merged")
     at_once_s: NotNegative = Field(
-        default=5.0, description="a box that left, and stands there again so shortly after, had not left [s]"
+        default=5.0, description="a box that is detected again at its place within this time had not left [s]"
     )
     named_m: Positive = Field(
         default=0.5, description="a landmark with an identity is where the map has it, if this near [m]"
@@ -166,7 +170,7 @@ class BoxesConfig(Section):
     )
     perhaps: Share = Field(default=0.2, description="belief from which a box of the map counts for that")
     tied_m: Positive = Field(
-        default=80.0, description="farther from what ties a session to the map, misses say nothing [m]"
+        default=80.0, description="beyond this distance from the landmarks shared with the map, misses are ignored [m]"
     )
     glimpse_m: Positive = Field(
         default=1.0, description="a detection this near to a box of the map may be of it, at no range [m] ..."

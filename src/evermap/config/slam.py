@@ -69,7 +69,7 @@ class OdometryConfig(Section):
     """What is believed of the odometry, beside its noise."""
 
     silence_s: Positive = Field(
-        default=1.0, description="odometry that says nothing for longer is not believed to go on as before [s]"
+        default=1.0, description="gap of the odometry beyond which the last velocity is not continued [s]"
     )
     silent_variance: Positive = Field(
         default=0.25, description="variance that such a silence adds every second, at least [m^2/s, rad^2/s]"
@@ -77,7 +77,9 @@ class OdometryConfig(Section):
     longest_silence_s: Positive = Field(
         default=60.0, description="after a longer silence no more is unknown than after this [s]"
     )
-    turn_s: Positive = Field(default=2.0, description="span in which a turn stands out of the odometry's jitter [s]")
+    turn_s: Positive = Field(
+        default=2.0, description="span over which a turn is distinguished from the odometry's jitter [s]"
+    )
     stands_out: Positive = Field(default=3.0, description="standard deviations of the jitter by which it does")
     loose_rad: Positive = Field(
         default=0.3, description="heading that a silence leaves unknown, from which a recording is in parts [rad]"
@@ -106,7 +108,7 @@ class VotesConfig(Section):
 class LocalizeConfig(Section):
     """When the place of a robot in a map is known, and when it is lost; landmarks are found by their identity."""
 
-    fewest: Count = Field(default=3, description="landmarks that must stand to each other as in the map")
+    fewest: Count = Field(default=3, description="landmarks that must have the relative positions of the map")
     enough: Count = Field(default=5, description="so many do by no accident, even if they are fewer than half")
     alone_s: NotNegative = Field(
         default=10.0, description="where no third landmark comes into view for so long, two are enough [s]"
@@ -119,7 +121,7 @@ class LocalizeConfig(Section):
     )
     track_s: Positive = Field(default=30.0, description="age of sightings that odometry still ties to the newest [s]")
     least_belief: Share = Field(
-        default=0.05, description="that a landmark is where it was known to stand, if it is seen there; at least"
+        default=0.05, description="least probability that a landmark is at its known place, if it is seen there"
     )
     believed: Share = Field(default=0.5, description="belief from which not to be seen is a miss")
     sure_m: Positive = Field(
@@ -271,7 +273,7 @@ class MapInSpaceConfig(Section):
 
     sigma: Positive = Field(default=0.02, description="standard deviation of landmarks that state none [m, rad]")
     loose_m: Positive = Field(
-        default=0.05, description="a map is believed no better than this until it is known what stands [m, rad]"
+        default=0.05, description="least standard deviation of a map before static landmarks are identified [m, rad]"
     )
     pseudo_count: Positive = Field(
         default=6.0, description="residuals that the accuracy which a map states counts for where that is learned"
@@ -290,9 +292,9 @@ class MapInSpaceConfig(Section):
         default=1.0, description="sum of inlier probabilities below which a landmark was not seen at its place"
     )
     drift_rad: Positive = Field(
-        default=0.02, description="by which landmarks that nobody moved are turned, session to session [rad]"
+        default=0.02, description="standard deviation of the orientation of unmoved landmarks between sessions [rad]"
     )
-    p_told: Share = Field(default=0.5, description="probability from which a landmark is told to have moved")
+    p_told: Share = Field(default=0.5, description="probability from which a landmark is reported as moved")
 
 
 class RepairConfig(Section):
@@ -322,10 +324,10 @@ class TrafficConfig(Section):
         default=-3.0, ge=-50, le=50, description="prior log odds that there is such an error [nats]"
     )
     still_mps: Positive = Field(
-        default=0.1, description="velocity that a detector sees of what stands, standard deviation [m/s]"
+        default=0.1, description="standard deviation of the measured velocity of a static object [m/s]"
     )
     moving_mps: Positive = Field(default=3.0, description="the same of what moves [m/s]")
-    witnesses: Count = Field(default=10, description="things that must say that the odometry wanders")
+    witnesses: Count = Field(default=10, description="fewest objects that must show a drift of the odometry")
     better_by: float = Field(default=2.0, ge=1.0, description="factor by which their residuals must become smaller")
     tilt_rad: Positive = Field(default=0.05, description="boxes are upright to within this [rad]")
 
@@ -361,7 +363,7 @@ class SpaceConfig(Section):
     sigma_m: Positive = Field(default=0.005, description="noise of unstated positions at no range [m] ...")
     sigma_along: NotNegative = Field(default=0.02, description="... along the ray, as a share of the range ...")
     sigma_across: NotNegative = Field(default=0.01, description="... and across")
-    sigma_rad: Positive = Field(default=0.05, description="noise of an orientation, where none is stated [rad]")
+    sigma_rad: Positive = Field(default=0.05, description="standard deviation of an orientation that states none [rad]")
     sigma_px: Positive = Field(default=2.0, description="noise of a tag's corners in the image, to start from [px]")
     corner_m: Positive = Field(default=1e-3, description="position of a tag by its corners is no better than this [m]")
     widest: Positive = Field(
@@ -460,7 +462,7 @@ class SlamConfig(Section):
         description="an outlier is as likely as an inlier at a squared normalised residual of twice this",
     )
     fewest_sightings: Count = Field(
-        default=3, description="sightings that tell where a landmark is, at least: one or two may be misread"
+        default=3, description="fewest sightings that locate a landmark: one or two may have a wrong identity"
     )
     estimate_noise: bool = Field(
         default=True, description="learn noise levels from the recording; off: keep the nominal ones"

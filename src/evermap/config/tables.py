@@ -80,13 +80,14 @@ class StillConfig(Section):
     sigma_share: NotNegative = Field(default=0.01, description="... and as a share of its range")
     alike_s: NotNegative = Field(default=0.5, description="for how long such errors are alike [s]")
     still: Positive = Field(
-        default=0.25, description="standard deviation of the velocity of what stands, over its class's speed limit"
+        default=0.25,
+        description="standard deviation of the measured velocity of a static object, over its class's speed limit",
     )
     moving: Positive = Field(default=4.8, description="the same of what moves; at the limit both are as probable")
-    window_s: Positive = Field(default=2.0, description="time over which a velocity is told [s]")
+    window_s: Positive = Field(default=2.0, description="time over which a velocity is estimated [s]")
     least_s: Positive = Field(default=0.4, description="time that a track or a stay must last [s] ...")
     fewest: Count = Field(default=4, description="... and detections that it takes")
-    p_stands: Share = Field(default=0.8, description="probability from which a thing is believed to stand")
+    p_stands: Share = Field(default=0.8, description="probability from which an object is taken to be static")
     same_m: Positive = Field(default=0.5, description="stays this close are one [m]")
     elsewhere_m: Positive = Field(default=2.0, description="what left was farther away than this [m]")
     when_s: NotNegative = Field(
@@ -102,21 +103,19 @@ class ShapeConfig(Section):
     )
     p_misplaced: Share = Field(default=0.02, description="... and how often that is")
     other_size: Positive = Field(default=0.25, description="sizes of other objects differ by this share")
-    p_misshapen: Share = Field(
-        default=0.05, description="share of detections with a size or a heading that says nothing"
-    )
+    p_misshapen: Share = Field(default=0.05, description="share of detections with an arbitrary size or heading")
     turning: NotNegative = Field(
         default=0.5, description="random walk of a heading: the end of a box moves sideways by this [m/sqrt(s)]"
     )
     resizing: NotNegative = Field(default=0.01, description="random walk of a size, as a share of it [1/sqrt(s)]")
     forward_nats: Positive = Field(
-        default=3.0, description="log odds by which a detection tells front from back: one of 20 is turned around"
+        default=3.0, description="log odds that the heading of a detection is not reversed: one in 20 is"
     )
     most_forward_nats: Positive = Field(
         default=7.0, description="log odds that this may be sure by: three opposite detections turn it, two do not"
     )
     sure_of_way: Positive = Field(
-        default=9.0, description="squared speed ahead over its variance from which the way tells front from back"
+        default=9.0, description="squared forward speed over its variance from which the motion decides the heading"
     )
 
 
@@ -215,7 +214,7 @@ class TrackerConfig(Section):
     displaced: Positive = Field(
         default=30.66, description="squared normalised distance at which a position is another place: one in a million"
     )
-    most_counted: Count = Field(default=50, description="detections beyond which more of them say no more")
+    most_counted: Count = Field(default=50, description="largest number of detections that counts as evidence")
     p_empty: Share = Field(
         default=1e-3, description="probability of misses in a row at which a place has been seen to be empty"
     )
@@ -223,10 +222,10 @@ class TrackerConfig(Section):
         default=(1e-8, 1e-2), description="rates of leaving a place, where nothing is known: from, to [1/s]"
     )
     slow_step_s: Positive = Field(
-        default=2.0, description="frames farther apart than this say little about motion: a remark says so [s]"
+        default=2.0, description="frame interval beyond which a warning says that motion is poorly observed [s]"
     )
     shape: ShapeConfig = Field(default_factory=ShapeConfig, description="sizes and headings of boxes")
-    still: StillConfig = Field(default_factory=StillConfig, description="what stands beside a moving robot")
+    still: StillConfig = Field(default_factory=StillConfig, description="static objects beside a moving robot")
 
     @property
     def order(self) -> int:
