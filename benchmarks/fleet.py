@@ -202,9 +202,9 @@ def _scored(rng: np.random.Generator, sites: int, spread: float, **world: Any) -
         for kind, name in enumerate(living.class_names):
             ways = {
                 "its own stays": own.of(kind).stay,
-                "all stays as of one site": everywhere[name].stay,
+                "all stays pooled": everywhere[name].stay,
                 "evermap learn": learned[name].stay,
-                "a map that was told": entered.of(kind).stay,
+                "a map with the file as prior": entered.of(kind).stay,
                 "a site without stays": elsewhere[name].stay,
             }
             for way, prior in ways.items():
