@@ -17,7 +17,7 @@ What do the parts of a server cost as sites and sessions become many (PostgreSQL
     python -m benchmarks.fleet --constants
 
 And what do sites learn from each other? Stays at 20 simulated sites are seen at one look a day; each next stay is
-forecast by what its own site has seen, by all stays as of one site, and by `evermap learn`:
+forecast by what its own site has seen, by all stays pooled, and by `evermap learn`:
 
     python -m benchmarks.fleet --lifetimes
 """
