@@ -121,21 +121,15 @@ class BoxesConfig(Section):
     sigma_class_m: tuple[Positive, Positive, Positive] = Field(
         default=(0.6, 0.2, 0.25), description="standard deviations of the sizes of boxes of one class [m]"
     )
-    size_nats: Positive = Field(
-        default=8.0, description="most evidence of size or heading against two boxes being one [nats]"
-    )
+    size_nats: Positive = Field(default=8.0, description="evidence of size or heading against a match, at most [nats]")
     heading_rad: Positive = Field(default=0.15, description="standard deviation of headings [rad]")
     round: Positive = Field(default=1.3, description="boxes less long than this times their width have no heading")
     density: Positive = Field(default=0.02, description="least density of static boxes [1/m^2]")
-    p_stands: Share = Field(
-        default=0.9, description="probability that a box that exists is detected at its place again"
-    )
+    p_stands: Share = Field(default=0.9, description="probability that a box is detected at its place again")
     returns: Share = Field(
         default=0.5, description="prior probability that an arrival at a former place of a box is that box"
     )
-    least_gone: Share = Field(
-        default=0.02, description="least probability that a box left, if another one is at its place"
-    )
+    least_gone: Share = Field(default=0.02, description="least probability that a box left a place now taken")
     same_share: Positive = Field(default=0.6, description="boxes closer than this share of their widths are merged")
     at_once_s: NotNegative = Field(
         default=5.0, description="a box that is detected again at its place within this time had not left [s]"

@@ -77,9 +77,7 @@ class OdometryConfig(Section):
     longest_silence_s: Positive = Field(
         default=60.0, description="after a longer silence no more is unknown than after this [s]"
     )
-    turn_s: Positive = Field(
-        default=2.0, description="span over which a turn is distinguished from the odometry's jitter [s]"
-    )
+    turn_s: Positive = Field(default=2.0, description="span over which turns stand out from jitter [s]")
     stands_out: Positive = Field(default=3.0, description="standard deviations of the jitter by which it does")
     loose_rad: Positive = Field(
         default=0.3, description="heading that a silence leaves unknown, from which a recording is in parts [rad]"

@@ -81,7 +81,7 @@ class StillConfig(Section):
     alike_s: NotNegative = Field(default=0.5, description="for how long such errors are alike [s]")
     still: Positive = Field(
         default=0.25,
-        description="standard deviation of the measured velocity of a static object, over its class's speed limit",
+        description="standard deviation of a static object's velocity, over its class's speed limit",
     )
     moving: Positive = Field(default=4.8, description="the same of what moves; at the limit both are as probable")
     window_s: Positive = Field(default=2.0, description="time over which a velocity is estimated [s]")
