@@ -152,6 +152,7 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
     return session.brought_in(planar.localised(alone, living, config), living, config.living)
 
 
+@single_threaded()
 def run_localization(
     recording: AnyRecording,
     living: LivingMap,
