@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.options import AsJson, ConfigFile, Force, Settings, ShowConfig, configured
+from evermap.cli.options import AsJson, Cluster, ConfigFile, Force, Settings, ShowConfig, Workers, configured, one_of
 from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say
 from evermap.errors import ConfigError
 
@@ -46,19 +46,6 @@ Store = Annotated[
         metavar="WHERE", help="All maps of a server: folder, or postgresql://user@host/database.", show_default="none"
     ),
 ]
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        max=1024,
-        help="Processes here; 1 needs no Dask.",
-        show_default="one for each core, where Dask is installed",
-    ),
-]
-Cluster = Annotated[
-    str | None,
-    typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler whose workers do it.", show_default="none"),
-]
 
 
 def learn(
@@ -93,12 +80,6 @@ def learn(
         print_json(summary)
         return
     _print(summary, out)
-
-
-def one_of(workers: int | None, cluster: str | None) -> None:
-    """Refuse the combination of local processes and a cluster."""
-    if cluster is not None and workers is not None:
-        raise ConfigError("are the cluster's", field="workers", hint="leave out --workers, or --cluster")
 
 
 def sites_of(maps: list[str], store: str | None, cluster: str | None = None) -> dict[str, str]:

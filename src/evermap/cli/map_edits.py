@@ -10,8 +10,8 @@ from typing import Annotated
 
 import typer
 
-from evermap.cli.learn import Cluster, Maps, Store, Workers, one_of, sites_of
-from evermap.cli.options import ConfigFile, Settings, configured
+from evermap.cli.learn import Maps, Store, sites_of
+from evermap.cli.options import Cluster, ConfigFile, Settings, Workers, configured, one_of
 from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say
 from evermap.errors import ConfigError, EvermapError
 

@@ -34,6 +34,16 @@ Topics = Annotated[
     typer.Option(metavar="FILE", help="Settings file of the topics, as slam --init-bag writes it.", show_default=False),
 ]
 TableOut = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<input>")]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=1, max=1024, help="Processes here; 1 needs no Dask.", show_default="one per core, if Dask is installed"
+    ),
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler whose workers do it.", show_default="none"),
+]
 Priors = Annotated[
     list[str] | None,
     typer.Option(
@@ -45,6 +55,12 @@ Priors = Annotated[
 
 _OTHER_NAMES = {"class_priors": "prior", "class_speed_mps": "speed", "speeds_mps": "speed", "living": "map_file"}
 """Arguments of the core whose option has another name."""
+
+
+def one_of(workers: int | None, cluster: str | None) -> None:
+    """Refuse the combination of local processes and a cluster."""
+    if cluster is not None and workers is not None:
+        raise ConfigError("are the cluster's", field="workers", hint="leave out --workers, or --cluster")
 
 
 def configured(

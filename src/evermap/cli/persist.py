@@ -10,18 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.learn import Cluster, Workers, one_of
 from evermap.cli.options import (
     AsJson,
+    Cluster,
     ConfigFile,
     Force,
     Priors,
     Settings,
     ShowConfig,
     TableOut,
+    Workers,
     configured,
     default_out,
     duration_s,
+    one_of,
     priors_by_class,
 )
 from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say, warm_up, warn
