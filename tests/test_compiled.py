@@ -233,3 +233,47 @@ run()
     said, ended = done.stderr.splitlines()
     assert said.startswith("evermap: warning: compiled kernels are cached in a temporary folder")
     assert ended == "evermap: error: nothing.csv: no such file"
+
+
+ONE_THREAD = """
+import threading
+from evermap.compiled import single_threaded
+
+def numbers():
+    import threadpoolctl
+    return {one["num_threads"] for one in threadpoolctl.threadpool_info() if one["user_api"] == "blas"}
+
+with single_threaded():  # neither numpy nor scipy was loaded
+    assert numbers() == {1}
+import threadpoolctl
+threadpoolctl.threadpool_limits(2)  # in the thread that owns the limit to threadpoolctl
+assert numbers() == {2}
+
+entered, left = threading.Event(), threading.Event()
+
+def outlasts():
+    with single_threaded():
+        entered.set()
+        left.wait()
+        assert numbers() == {1}
+
+thread = threading.Thread(target=outlasts)
+with single_threaded():
+    thread.start()
+    entered.wait()
+    with single_threaded():
+        pass
+    assert numbers() == {1}
+left.set()
+thread.join()
+assert numbers() == {2}
+print("done")
+"""
+
+
+def test_blas_has_one_thread_while_any_thread_asks_for_it_and_then_what_it_had() -> None:
+    """In a process of its own, which begins without numpy."""
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "2", "PYTHONPATH": str(SOURCES)}
+    code = [sys.executable, "-c", ONE_THREAD]
+    done = subprocess.run(code, capture_output=True, text=True, env=environment, check=False)
+    assert (done.stderr, done.stdout) == ("", "done\n")

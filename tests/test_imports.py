@@ -39,10 +39,10 @@ RULES = {
         "errors interrupts show types config geometry stamps survival valid io metrics existence tracking viz maps "
         "pipeline"
     ),
-    "live": "errors types config geometry valid io maps runs slam",
+    "live": "errors compiled types config geometry valid io maps runs slam",
     "server": "errors types config io maps runs",
     "cli": (
-        "errors interrupts compiled plugins types config geometry stamps survival valid io existence tracking viz slam "
+        "errors interrupts plugins types config geometry stamps survival valid io existence tracking viz slam "
         "maps pipeline runs live server"
     ),
 }

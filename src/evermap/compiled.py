@@ -11,6 +11,7 @@ import pickle  # nosec  # B403: for the name of its error: the index of kept cod
 import stat
 import sys
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from enum import Enum
@@ -24,13 +25,40 @@ from evermap.interrupts import held, raises
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
+_LOCK, _INSIDE = threading.Lock(), list[list[tuple[Any, int]]]()
+"""Who is within `single_threaded`, with the numbers of threads before the first of them."""
+
+
 @contextlib.contextmanager
 def single_threaded() -> Iterator[None]:
-    """Keep BLAS to one thread: matrices are small, and more threads sum in another order on another machine."""
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1, user_api="blas"):
+    """Keep BLAS to one thread: matrices are small, more threads sum in another order on another machine, and idle ones
+    take a core of their own. The number is one for the whole process: the last thread that leaves restores it.
+    """
+    with _LOCK:
+        _INSIDE.append(_INSIDE[0] if _INSIDE else [(library, library.num_threads) for library in _blas()])
+        for library, _ in _INSIDE[0]:
+            _set_threads(library, 1)
+    try:
         yield
+    finally:
+        with _LOCK:
+            before = _INSIDE.pop()
+            for library, number in () if _INSIDE else before:
+                _set_threads(library, number)
+
+
+@functools.cache
+def _blas() -> list[Any]:
+    """Those of numpy and scipy; finding them takes a millisecond."""
+    import scipy.linalg  # noqa: F401  (one that is loaded later would not be found)
+    from threadpoolctl import ThreadpoolController
+
+    return list(ThreadpoolController().select(internal_api="openblas").lib_controllers)
+
+
+def _set_threads(library: Any, number: int) -> None:
+    """Also after another thread has done so, which threadpoolctl 3.8 ignores without a word."""
+    getattr(library, "_real_set_num_threads", library.set_num_threads)(number)
 
 
 UNREADABLE = (AttributeError, ImportError, EOFError, pickle.UnpicklingError)

@@ -10,17 +10,21 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from feeding import AT_THE_END, SESSIONS, assert_equal, engine, entered, fed, messages, online, send, stored
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import evermap as em
 from evermap.config import Config, SlamConfig
 from evermap.errors import ConfigError, InputError
+from evermap.live.judge import Judge
 from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store
 from evermap.maps.store.measured import RECORDING, unpack_recording
+from evermap.slam.localize import Localizer
 from evermap.types import ChangeKind, Clock, Landmarks, Sensor
 
 
@@ -475,6 +479,39 @@ def test_after_warm_up_no_step_waits_for_a_kernel(tmp_path: Path, two_sessions: 
     code = WARM.format(here=str(Path(__file__).parent), path=str(path), number=number)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_blas_has_one_thread_within_steps_and_jobs_and_the_users_number_between(
+    tmp_path: Path, two_sessions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two: the machine may have one only, of which this would show nothing."""
+
+    def threads() -> set[int]:
+        return {one["num_threads"] for one in threadpool_info() if one["internal_api"] == "openblas"}
+
+    within: dict[str, set[int]] = {"step": set(), "judge": set()}
+
+    def spy(kind: type, name: str) -> None:
+        real = getattr(kind, name)
+
+        def spied(*given: Any) -> Any:
+            found = real(*given)
+            within[name].update(threads())
+            return found
+
+        monkeypatch.setattr(kind, name, spied)
+
+    spy(Localizer, "step")
+    spy(Judge, "judge")
+    recording = SESSIONS[2]
+    with threadpool_limits(limits=2, user_api="blas"):
+        live = engine(copied(two_sessions, tmp_path), recording, mapping=False, beside=True)
+        between = [threads() for _ in fed(live, recording) if not live._keeper._jobs]
+        live.close()
+        assert threads() == {2}
+    assert within == {"step": {1}, "judge": {1}}
+    assert len(between) > 100
+    assert all(one == {2} for one in between)
 
 
 @pytest.mark.slow

@@ -18,7 +18,6 @@ import typer
 
 from evermap.cli.options import ConfigFile, Robot, Settings, Topics, configured
 from evermap.cli.terminal import echo, print_table, say, warm_up, warn
-from evermap.compiled import single_threaded
 from evermap.errors import ConfigError
 from evermap.interrupts import kept, watched
 
@@ -117,8 +116,7 @@ def live(
             _be_the_robot(recording, wires)
             return
         drive = _Drive(Path(map_file), chosen, sensor, topics, mailbox, recording)
-        with single_threaded():  # idle threads of BLAS would take a core of their own
-            drive.run(wires, localize=localize, realtime=realtime, as_json=as_json)
+        drive.run(wires, localize=localize, realtime=realtime, as_json=as_json)
     finally:
         for wire in wires:
             wire.close()

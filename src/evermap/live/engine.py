@@ -16,6 +16,7 @@ from typing import Self
 
 import numpy as np
 
+from evermap.compiled import single_threaded
 from evermap.config import Config
 from evermap.errors import ConfigError
 from evermap.live.inbox import Inbox, LiveFrame
@@ -184,6 +185,7 @@ class Engine:
             stamp_s, (landmark_id, range_m, bearing_rad, class_name, sigma_range_m, sigma_bearing_rad)
         )
 
+    @single_threaded()
     def step(self) -> Now:
         """Process new readings, and return the present estimates; without new readings in some microseconds."""
         with self._lock:
@@ -215,10 +217,12 @@ class Engine:
             living, judge = self._living, self._judge
         return (living if judge is None else judge.living).landmarks(at=at, within=within)
 
+    @single_threaded()
     def warm_up(self) -> None:
         """Compile the kernels, or load them, so that no step has to wait for it."""
         warm_up(self._config)
 
+    @single_threaded()
     def save(self) -> Entered | None:
         """Enter the drive so far as a revision, and continue in that map.
 

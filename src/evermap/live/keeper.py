@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from evermap.compiled import single_threaded
 from evermap.config import Config
 from evermap.errors import EvermapError, InputError
 from evermap.live.inbox import Inbox
@@ -122,7 +123,7 @@ class Keeper:
         if self._pool is None:
             job()
         elif before is None or before.done():
-            self._jobs[name] = self._pool.submit(job)
+            self._jobs[name] = self._pool.submit(single_threaded()(job))
 
     def collect(self) -> bool:
         """Collect the results of parallel jobs; returns whether sessions were entered."""
