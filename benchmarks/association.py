@@ -164,9 +164,9 @@ def score(recording: Recording | SpatialRecording, config: Config | None = None)
     began = time.process_time()
     found: Recording | SpatialRecording
     if isinstance(recording, SpatialRecording):
-        found = identified_in_space(recording, config.slam.space)
+        found = identified_in_space(recording, config.slam)
     else:
-        found = identified(recording, *beliefs(recording.sensor, config.slam))
+        found = identified(recording, *beliefs(recording.sensor, config.slam), settings=config.slam)
     associated = time.process_time()
     nameless = em.run_slam(found, config)
     ended = time.process_time()
@@ -237,9 +237,9 @@ def mixed_line(recording: Recording | SpatialRecording, share: float, of: str) -
     """Return a row of the table of a recording of which some landmarks, or detections, keep their identities."""
     true, config, some = recording.detections.landmark_id, Config(), partly_named(recording, share, of)
     if isinstance(some, SpatialRecording):
-        found: Recording | SpatialRecording = identified_in_space(some, config.slam.space, keep_ids=True)
+        found: Recording | SpatialRecording = identified_in_space(some, config.slam, keep_ids=True)
     else:
-        found = identified(some, *beliefs(some.sensor, config.slam), keep_ids=True)
+        found = identified(some, *beliefs(some.sensor, config.slam), keep_ids=True, settings=config.slam)
     given = found.detections.landmark_id
     every = [em.run_slam(one, config) for one in (found, some, recording)]
     truth = _truth(recording, every[-1])

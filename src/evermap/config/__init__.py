@@ -35,15 +35,18 @@ from evermap.config.living import (
 )
 from evermap.config.section import Section, config_error
 from evermap.config.slam import (
+    AssociationConfig,
     CalibrationConfig,
     ChangesConfig,
     CheckConfig,
     CleaningConfig,
+    ConstellationConfig,
     LocalizeConfig,
     ModesConfig,
     NoiseConfig,
     OdometryConfig,
     OutputConfig,
+    ReadingsConfig,
     SensorConfig,
     SlamConfig,
     SpaceConfig,
@@ -196,12 +199,14 @@ def _toml_text(value: Any) -> str:
 
 
 __all__ = [
+    "AssociationConfig",
     "BoxesConfig",
     "CalibrationConfig",
     "ChangesConfig",
     "CheckConfig",
     "CleaningConfig",
     "Config",
+    "ConstellationConfig",
     "DecisionConfig",
     "FitConfig",
     "GroupingConfig",
@@ -218,6 +223,7 @@ __all__ = [
     "OutputConfig",
     "OverlayConfig",
     "PersistConfig",
+    "ReadingsConfig",
     "Section",
     "SensorConfig",
     "ShapeConfig",

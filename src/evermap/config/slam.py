@@ -266,6 +266,173 @@ class CleaningConfig(Section):
         return around
 
 
+class ConstellationConfig(Section):
+    """Maps that are aligned by the constellation of their landmarks alone."""
+
+    near_m: Positive = Field(
+        default=0.5, description="distance within which two landmarks are a pair, once aligned [m]"
+    )
+    least_span_m: Positive = Field(default=0.5, description="landmarks that are closer than this fix no heading [m]")
+    span_slack_m: NotNegative = Field(
+        default=0.2, description="tolerance of distances within both maps, beside their uncertainty [m]"
+    )
+    free_m: Positive = Field(default=5.0, description="standard deviation of the offset around a candidate motion [m]")
+    free_rad: Positive = Field(default=2.0, description="standard deviation of its rotation [rad]")
+    certain_nats: NotNegative = Field(
+        default=7.0, description="evidence of an alignment over no alignment, and over its best rival [nats]"
+    )
+    lead_nats: NotNegative = Field(
+        default=20.0, description="the same over its best rival, if a whole map was searched [nats]"
+    )
+    stiff_m: Positive = Field(
+        default=0.2, description="landmarks known this well relative to each other are one rigid part of a map [m]"
+    )
+    longest_side_m: Positive = Field(default=25.0, description="longest side of an indexed triangle [m]")
+    side_sigmas: Positive = Field(
+        default=3.4, description="standard deviations by which the sides of matching triangles may differ ..."
+    )
+    side_slack_m: NotNegative = Field(default=0.02, description="... and by this in addition [m]")
+    same_place_m: Positive = Field(
+        default=5.0, description="motions that differ by less at the centre of a session are one alignment [m]"
+    )
+    least_found: Share = Field(default=0.4, description="least share of a group that must be found in a map")
+    reach_m: Positive = Field(
+        default=15.0, description="distance within which places are compared, once an alignment is known [m]"
+    )
+
+
+class ReadingsConfig(Section):
+    """Columns that describe landmarks, such as radius or colour."""
+
+    misread_nats: NotNegative = Field(
+        default=2.995732273553991, description="evidence of one reading for or against a match, at most [nats]"
+    )
+    most_readings: Count = Field(
+        default=4, description="readings that a visit counts as, at most: their errors are correlated"
+    )
+    least_nats: NotNegative = Field(
+        default=0.1, description="mean evidence per pair of visits, below which columns are not used [nats]"
+    )
+    confidence: Share = Field(default=0.999, description="confidence that landmarks differ in a column, to use it")
+    fewest_in_halves: int = Field(
+        default=6, ge=2, description="readings of a visit from which its first and second half are compared"
+    )
+    p_wrong: Share = Field(default=0.1, description="prior share of visits that are assigned to the wrong landmark ...")
+    wrong_worth: Positive = Field(default=2.0, description="... and the visits that this prior counts as")
+    preferred_nats: NotNegative = Field(
+        default=2.0, description="gain in log likelihood that a smaller error of visits needs [nats]"
+    )
+    fewest_pairs: Positive = Field(default=3.0, description="pairs of visits from which that error is learned")
+
+
+class ParticlesConfig(Section):
+    """Whole histories of associations, drawn where many detections are ambiguous."""
+
+    new_nats: NotNegative = Field(
+        default=2.995732273553991, description="log odds of clutter against a landmark that is new [nats]"
+    )
+    wider: tuple[Positive, ...] = Field(
+        default=(1.2, 1.5), min_length=1, description="factors on the noise of sightings, one after the other"
+    )
+    bent: Positive = Field(
+        default=0.3, description="error of known landmarks, as a share of the distance to the nearest one"
+    )
+
+
+class AnonymousInSpaceConfig(Section):
+    """The same in space, where it differs."""
+
+    least_extent_m: Positive = Field(default=1.0, description="least extent of the landmarks along each axis [m]")
+    least_volume_m3: Positive = Field(default=20.0, description="least volume that they span [m^3]")
+    shared_rad: Positive = Field(
+        default=0.05, description="error that all sightings of an orientation have in common [rad]"
+    )
+    alike_rad: Positive = Field(default=0.2, description="spread of the orientations of landmarks on one wall [rad]")
+    turn_sigmas: Positive = Field(
+        default=4.0, description="standard deviations by which orientations of one landmark may differ ..."
+    )
+    turn_floor_rad: Positive = Field(default=0.1, description="... where their least error is this [rad]")
+    tail: float = Field(default=5.0, ge=1, description="factor on the error of detections in the tail ...")
+    tail_share: Share = Field(default=0.1, description="... and their share")
+    widened: Positive = Field(
+        default=1.5, description="factor on the variance of a detection, for the uncertainty of the poses"
+    )
+
+
+class AssociationConfig(Section):
+    """Landmarks without identities, associated by geometry."""
+
+    gate_confidence: Share = Field(default=0.999, description="share of true pairs inside the gates")
+    loose_gate: Positive = Field(
+        default=60.0, description="squared distance up to which landmarks are compared, before shared errors are known"
+    )
+    p_match: Share = Field(default=0.95, description="probability from which a detection is assigned at once ...")
+    p_return: Share = Field(default=0.99, description="... and to a landmark that was out of view, which closes a loop")
+    tight_m2: Positive = Field(
+        default=0.04, description="area of a gate in which a wrong choice is harmless for a while [m^2]"
+    )
+    followed: float = Field(
+        default=2.0, ge=1, description="a landmark is tracked while it at most multiplies the noise of readings by this"
+    )
+    unmet_share: Share = Field(default=0.1, description="share of landmarks near tracked ones that are not mapped yet")
+    p_new: Share = Field(default=0.1, description="probability to be new from which a detection starts a landmark")
+    p_merge: Share = Field(default=0.97, description="probability from which two landmarks are merged")
+    p_own: Share = Field(default=0.5, description="least probability of the landmark that a detection ends with")
+    forget_s: Positive = Field(
+        default=20.0, description="gap after which a new visit begins, and landmarks with too few sightings go [s]"
+    )
+    fewest_to_pair: Count = Field(default=2, description="sightings from which two landmarks may be merged")
+    least_landmarks: Positive = Field(default=2.0, description="least number of landmarks in their density ...")
+    least_area_m2: Positive = Field(default=20.0, description="... and the least area that they span [m^2]")
+    odometry_caution: Positive = Field(default=2.0, description="factor on the odometry noise during association")
+    slip: Positive = Field(default=3.0, description="factor on that in a step with slipping wheels ...")
+    slip_nats: NotNegative = Field(default=2.995732273553991, description="... and its prior log odds [nats]")
+    noise_caution: Positive = Field(default=1.3, description="factor on the learned noise of sightings")
+    noise_floor: Positive = Field(default=0.5, description="prior of that noise, as a share of the stated one ...")
+    pseudo_sightings: Positive = Field(default=100.0, description="... and the sightings that this counts as")
+    clipped_at: Positive = Field(
+        default=9.0, description="squared normalised residual that counts in full where variances are learned"
+    )
+    shared_m: Positive = Field(
+        default=0.02, description="error that all sightings of a landmark have in common [m] ..."
+    )
+    shared_share: NotNegative = Field(default=0.5, description="... and as a share of their range noise")
+    name_nats: NotNegative = Field(
+        default=4.605170185988092,
+        description="evidence of an identity that two landmarks share, per reading [nats] ...",
+    )
+    most_names: Count = Field(default=10, description="... of which so many count, at most")
+    rise_nats: NotNegative = Field(default=7.0, description="rise of the cost that is accepted for a merge [nats] ...")
+    rise_per_sighting: NotNegative = Field(
+        default=1.75, description="... for each sighting of the lesser one [nats] ..."
+    )
+    most_rise_nats: NotNegative = Field(default=100.0, description="... and in all, at most [nats]")
+    landmark_nats: NotNegative = Field(default=7.0, description="cost of a further landmark [nats]")
+    few_nats: NotNegative = Field(
+        default=7.0, description="evidence for merging two pairs or one, while later frames may tell more [nats]"
+    )
+    double_nats: NotNegative = Field(
+        default=5.0, description="evidence against a pair for each frame that shows both [nats]"
+    )
+    in_turn_nats: NotNegative = Field(
+        default=0.2, description="evidence for a pair for each frame that shows only one of them [nats] ..."
+    )
+    most_in_turn_nats: NotNegative = Field(default=10.0, description="... and in all, at most: one may hide the other")
+    around_frames: Count = Field(default=3, description="frames before and after, in which it should have been seen")
+    contradiction: Share = Field(default=0.95, description="confidence from which a visit contradicts all others")
+    fewest_displaced: Count = Field(default=4, description="landmarks from which a stretch is displaced as a whole")
+    least_seen: Share = Field(
+        default=1.0 / 3.0, description="sightings below this share of the usual number are of no landmark"
+    )
+    doubtful_share: Probability = Field(
+        default=0.02, description="share of ambiguous detections from which particles are drawn"
+    )
+    constellation: ConstellationConfig = Field(default_factory=ConstellationConfig, description="aligned maps")
+    readings: ReadingsConfig = Field(default_factory=ReadingsConfig, description="columns of detections")
+    particles: ParticlesConfig = Field(default_factory=ParticlesConfig, description="drawn histories")
+    space: AnonymousInSpaceConfig = Field(default_factory=AnonymousInSpaceConfig, description="points and tags")
+
+
 class MapInSpaceConfig(Section):
     """What of a given map in space stands where it says, and what was moved."""
 
@@ -480,6 +647,9 @@ class SlamConfig(Section):
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="noise levels to start from")
     odometry: OdometryConfig = Field(default_factory=OdometryConfig, description="silences and jitter of the odometry")
     votes: VotesConfig = Field(default_factory=VotesConfig, description="identities that were read wrongly")
+    association: AssociationConfig = Field(
+        default_factory=AssociationConfig, description="landmarks without identities"
+    )
     localize: LocalizeConfig = Field(default_factory=LocalizeConfig, description="where a robot is in a map")
     space: SpaceConfig = Field(default_factory=SpaceConfig, description="sensors in space")
     check: CheckConfig = Field(default_factory=CheckConfig, description="thresholds of the recording check")

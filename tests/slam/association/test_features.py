@@ -14,21 +14,15 @@ from scipy.stats import multivariate_normal, norm
 from evermap.config import Config
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator
-from evermap.slam.association.features import (
-    MISREAD_NATS,
-    MOST_READINGS,
-    Likeness,
-    Traits,
-    Variances,
-    learned,
-    medians,
-)
+from evermap.slam.association.features import Likeness, Traits, Variances, learned, medians
 from evermap.slam.association.identify import identified
 from evermap.slam.association.particles import drawn as drawn_anew
-from evermap.slam.association.splitting import told_by_others
+from evermap.slam.association.splitting import traits_against_others
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import beliefs
 from evermap.types import UNKNOWN
+
+READINGS = Config().slam.association.readings
 
 
 def brute_force(a: float, va: float, b: float, vb: float, between: float) -> float:
@@ -76,7 +70,7 @@ def test_readings_of_visits_and_landmarks_are_those_of_a_joint_gaussian() -> Non
     apart = multivariate_normal(np.zeros(2), own[:2, :2] + 5.0).logpdf(value[:2, 0]) + norm(0, np.sqrt(5.5)).logpdf(0.4)
     assert traits.same(visits.part([2]), known)[0] == pytest.approx(same - apart)
     first = brute_force(1.0, 0.5, 1.8, 0.5, 5.0)
-    assert traits.told(np.arange(3), np.zeros(3, dtype=np.int64)) == pytest.approx(first + same - apart)
+    assert traits.evidence(np.arange(3), np.zeros(3, dtype=np.int64)) == pytest.approx(first + same - apart)
 
 
 def test_a_misread_one_tells_little_and_moves_no_median() -> None:
@@ -84,12 +78,12 @@ def test_a_misread_one_tells_little_and_moves_no_median() -> None:
     value = np.zeros((12, 1))
     value[3] = 1e6
     traits, visit = Traits(value, spread), np.repeat([0, 1], 6)
-    assert traits.told(visit, np.zeros(2, dtype=np.int64)) > 0.0
+    assert traits.evidence(visit, np.zeros(2, dtype=np.int64)) > 0.0
     visits = traits.of_visits(visit, 2)
     one = traits.same(traits.singly(np.array([3])), visits.part([1]))
-    assert one[0] == -MISREAD_NATS
+    assert one[0] == -READINGS.misread_nats
     other = Traits(value + np.where(visit == 0, 1e3, 0.0)[:, None], spread).of_visits(visit, 2)
-    assert traits.same(other.part([0]), other.part([1]))[0] == -MOST_READINGS * MISREAD_NATS
+    assert traits.same(other.part([0]), other.part([1]))[0] == -READINGS.most_readings * READINGS.misread_nats
 
 
 def test_medians_are_those_of_numpy() -> None:
@@ -115,7 +109,7 @@ def test_spreads_are_learned_in_any_unit(unit: float) -> None:
     assert found is not None
     np.testing.assert_allclose(found.spread.reading, unit**2 * true.reading, rtol=0.25)
     np.testing.assert_allclose(found.spread.landmark, unit**2 * true.landmark, rtol=0.35)
-    errors = found.spread.visit + found.spread.reading / MOST_READINGS
+    errors = found.spread.visit + found.spread.reading / READINGS.most_readings
     assert np.all((errors > 0.5 * unit**2 * true.visit) & (errors < 2.5 * unit**2 * (true.visit + 0.25 * true.reading)))
 
 
@@ -153,7 +147,7 @@ def test_columns_that_say_the_same_count_once() -> None:
     one, four = learned(value, visit, landmark), learned(np.tile(value, 4), visit, landmark)
     assert one is not None
     assert four is not None
-    assert four.told(visit, landmark) == pytest.approx(one.told(visit, landmark), rel=0.01)
+    assert four.evidence(visit, landmark) == pytest.approx(one.evidence(visit, landmark), rel=0.01)
 
 
 def test_nothing_read_is_no_evidence() -> None:
@@ -185,18 +179,18 @@ def test_misread_radii_split_nothing(seed: int) -> None:
 
 
 def test_an_exchange_of_two_landmarks_is_seen() -> None:
-    """Where landmarks 0 and 1 stood, the other one stands when the robot comes back; places tell nothing."""
+    """Landmarks 0 and 1 are exchanged when the robot comes back; positions give no evidence."""
     made = make_world(1, n_poses=60, n_landmarks=8, prior=CalibrationPrior.from_settings(calibrated=False))
     place, back = made.problem.landmark_row, made.problem.pose_row >= 30
     is_there = np.where(back & (place < 2), 1 - place, place)
     traits = radii(np.random.default_rng(1), 7 * is_there % 8)
     later = replace(made.problem, stamp_s=made.problem.stamp_s + 100.0 * (np.arange(60) >= 30))
     found = Assignment(later, place, made.truth, np.full((len(place), 2), UNKNOWN), traits)
-    told, landmark = told_by_others(found, 20.0), np.repeat(np.arange(8), 2)
-    assert np.all(told[landmark < 2] < -2.0 * MISREAD_NATS)
-    assert np.all(told[landmark >= 2] > 0.0)
-    gained = traits.told(*replace(found, landmark_row=is_there).of_visits()) - traits.told(*found.of_visits())
-    assert gained > 2.0 * MOST_READINGS * MISREAD_NATS
+    nats, landmark = traits_against_others(found), np.repeat(np.arange(8), 2)
+    assert np.all(nats[landmark < 2] < -2.0 * READINGS.misread_nats)
+    assert np.all(nats[landmark >= 2] > 0.0)
+    gained = traits.evidence(*replace(found, landmark_row=is_there).of_visits()) - traits.evidence(*found.of_visits())
+    assert gained > 2.0 * READINGS.most_readings * READINGS.misread_nats
 
 
 def test_a_useless_column_changes_nothing_and_a_good_one_no_identity() -> None:

@@ -10,8 +10,8 @@ from identity_scores import identity_scores
 from problems import World, make_world
 from scipy.stats import multivariate_normal
 
+from evermap.config import Config
 from evermap.geometry import se2
-from evermap.slam.association import particles
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator
 from evermap.slam.association.identify import searched
@@ -44,11 +44,11 @@ def exchanged(found: Assignment, one: int, other: int) -> Assignment:
     return replace(found, landmark_row=swapped, estimate=replace(found.estimate, landmark=place))
 
 
-def test_evidence_is_that_of_the_joint_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where it is clear who is who: readings of all frames about those that are expected, by one covariance."""
+def test_evidence_is_that_of_the_joint_gaussian() -> None:
+    """Of unambiguous detections: readings of all frames about the expected ones, by one covariance."""
     made = make_world(3, n_poses=6, n_landmarks=4, prior=KNOWN_SENSORS)
     problem, noise = made.problem, made.noise
-    monkeypatch.setattr(particles, "BENT", 1e-3)
+    settings = Config(slam={"association": {"particles": {"bent": 1e-3}}}).slam
     motion = problem.drive.between(problem.stamp_s, made.truth.states)
     pose = [problem.start_pose]
     for step in motion.increment:
@@ -56,7 +56,8 @@ def test_evidence_is_that_of_the_joint_gaussian(monkeypatch: pytest.MonkeyPatch)
     problem = replace(problem, sigma_given=np.tile(noise.detection, (len(problem.pose_row), 1)))
     at = replace(made.truth, pose=np.array(pose))
     kind = np.full((len(problem.pose_row), 2), -1)
-    _, evidence = drawn(Assignment(problem, problem.landmark_row, at, kind), noise.odometry, seed=0, wider=1.0)
+    given = Assignment(problem, problem.landmark_row, at, kind, settings=settings)
+    _, evidence = drawn(given, noise.odometry, seed=0, wider=1.0)
 
     def residuals(change: np.ndarray) -> np.ndarray:
         steps, moved, poses = change[: 3 * len(pose)].reshape(-1, 3), change[3 * len(pose) :].reshape(-1, 2), []
@@ -80,7 +81,8 @@ def test_evidence_is_that_of_the_joint_gaussian(monkeypatch: pytest.MonkeyPatch)
     expected = multivariate_normal.logpdf(zero, cov=covariance) - perfect
     met = np.zeros(len(at.landmark))
     for row in problem.landmark_row:  # one that was seen n times is seen again with n / (n + 1)
-        expected += np.log((particles.FEWEST_SIGHTINGS + met[row]) / (particles.FEWEST_SIGHTINGS + met[row] + 1.0))
+        seen = settings.fewest_sightings + met[row]
+        expected += np.log(seen / (seen + 1.0))
         met[row] += 1
     assert evidence == pytest.approx(expected, abs=0.5)
 

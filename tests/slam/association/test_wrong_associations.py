@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from problems import World, make_world
 
+from evermap.config import Config
 from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import BEFORE
@@ -23,8 +24,9 @@ from evermap.types import UNKNOWN
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
 KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False)
-TWICE, PAUSE_S = 5, 5.0
-"""A landmark that is seen in two visits, and what lies between them."""
+TWICE = 5
+"""A landmark that is seen in two visits."""
+SETTINGS = Config(slam={"association": {"forget_s": 5.0}}).slam
 KICK_RAD = 0.6
 PARK = ParkConfig(
     drive_m=1800.0, n_trees=120, n_cars=0, p_ghost=0.0, speed_scale=1.0, steering_bias_rad=0.0, steering_walk_rad=0.0
@@ -49,15 +51,15 @@ def two_visits(seed: int, off_m: float = 0.0) -> tuple[World, Assignment, np.nda
     row[(row == TWICE) & (problem.pose_row > 24) & (problem.pose_row <= 36)] = NOBODY
     sigma = np.tile(made.noise.detection, (len(row), 1))
     measured = replace(problem, reading=reading, sigma_given=sigma)
-    return made, Assignment(measured, row, made.truth, np.full((len(row), 2), UNKNOWN)), np.flatnonzero(late)
+    kind = np.full((len(row), 2), UNKNOWN)
+    return made, Assignment(measured, row, made.truth, kind, settings=SETTINGS), np.flatnonzero(late)
 
 
 def weighed(made: World, assignment: Assignment) -> Visits:
     found, marginals, smoother = solved(made, assignment)
     return weighed_visits(
-        found, marginals, smoother.detections(found.estimate),
-        among=np.arange(8) == TWICE, density=0.1, pause_s=PAUSE_S,
-    )  # fmt: skip
+        found, marginals, smoother.detections(found.estimate), among=np.arange(8) == TWICE, density=0.1
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -82,9 +84,8 @@ def test_where_nothing_is_a_landmark_there_are_no_visits() -> None:
     nothing = assignment.without(np.ones(8, dtype=bool))
     _, marginals, smoother = solved(made, assignment)
     visits = weighed_visits(
-        nothing, marginals, smoother.detections(assignment.estimate),
-        among=np.ones(0, dtype=bool), density=0.1, pause_s=PAUSE_S,
-    )  # fmt: skip
+        nothing, marginals, smoother.detections(assignment.estimate), among=np.ones(0, dtype=bool), density=0.1
+    )
     assert len(visits.rows) == len(visits.evidence) == 0
 
 

@@ -9,7 +9,7 @@ import pytest
 from identity_scores import identity_scores
 
 from evermap import run_slam
-from evermap.config import Config, SpaceConfig
+from evermap.config import Config
 from evermap.errors import ConfigError, DataError
 from evermap.slam.association.in_space import identified_in_space
 from evermap.types import UNKNOWN, SpatialRecording
@@ -18,13 +18,13 @@ from .corridors import tagged_corridor
 from .halls import hall
 from .rooms import Room
 
-SPACE = SpaceConfig()
+SLAM = Config().slam
 NAMELESS = Config(slam={"unknown_ids": True})
 
 
 def scored(recording: SpatialRecording, *, purity: float, completeness: float) -> SpatialRecording:
     """The recording with ids by geometry, as right as stated, and with as many landmarks as there are."""
-    found = identified_in_space(recording, SPACE)
+    found = identified_in_space(recording, SLAM)
     real = recording.detections.landmark_id != UNKNOWN
     scores = identity_scores(found.detections.landmark_id[real], recording.detections.landmark_id[real])
     assert scores.purity >= purity
@@ -83,7 +83,7 @@ def test_landmarks_of_two_classes_at_one_place_stay_two():
 def test_identities_of_the_recording_are_not_looked_at():
     recording = hall(3, n_points=20, n_frames=150)
     hidden = replace(recording.detections, landmark_id=np.full(len(recording.detections), UNKNOWN))
-    one, other = (identified_in_space(each, SPACE) for each in (recording, replace(recording, detections=hidden)))
+    one, other = (identified_in_space(each, SLAM) for each in (recording, replace(recording, detections=hidden)))
     np.testing.assert_array_equal(one.detections.landmark_id, other.detections.landmark_id)
 
 
@@ -94,7 +94,7 @@ def test_points_of_which_some_have_names(share):
     named = np.isin(true, np.random.default_rng(0).permutation(40)[: int(40 * share)])
     given = np.where(named, 100 + true, UNKNOWN)
     some = replace(recording, detections=replace(recording.detections, landmark_id=given))
-    found = identified_in_space(some, SPACE, keep_ids=True).detections.landmark_id
+    found = identified_in_space(some, SLAM, keep_ids=True).detections.landmark_id
     np.testing.assert_array_equal(found[named], given[named])
     assert not np.isin(found[~named], given[named]).any()
     real = true != UNKNOWN
@@ -109,13 +109,13 @@ def test_tags_that_are_not_always_read():
     true = recording.detections.landmark_id
     read = np.where(np.random.default_rng(0).random(len(true)) < 0.5, true, UNKNOWN)
     some = replace(recording, detections=replace(recording.detections, landmark_id=read))
-    found = identified_in_space(some, SPACE, keep_ids=True).detections.landmark_id
+    found = identified_in_space(some, SLAM, keep_ids=True).detections.landmark_id
     assert np.mean(found == true) > 0.99
 
 
 def test_what_it_cannot_do_is_refused():
     recording = tagged_corridor(0, n_frames=40, odometry=False).recording
     with pytest.raises(DataError, match="need odometry"):
-        identified_in_space(recording, SPACE)
+        identified_in_space(recording, SLAM)
     with pytest.raises(ConfigError, match="a fixed map"):
         run_slam(tagged_corridor(0, n_frames=40).recording, NAMELESS, prior_map=recording.true_landmarks)

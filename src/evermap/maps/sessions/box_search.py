@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from evermap.config import BoxesConfig
+from evermap.config import BoxesConfig, Config, SlamConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.box_visit import SeenBoxes
-from evermap.slam.association.constellation import CERTAIN_NATS, LocalMap, agreed_pairs
+from evermap.slam.association.constellation import LocalMap, agreed_pairs
 from evermap.slam.association.identify import ALL_TRIED
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.tracking.frame import heading_of
@@ -45,6 +45,7 @@ class MapBoxes(NamedTuple):
         heading_rad, size_m: (M,), nan where there is none, and (M, 3).
         p: probability that it stands there when the session begins.
         settings: which boxes are the same.
+        slam: settings of the alignment by constellation.
     """
 
     place: IntArray
@@ -56,11 +57,12 @@ class MapBoxes(NamedTuple):
     size_m: FloatArray
     p: FloatArray
     settings: BoxesConfig
+    slam: SlamConfig
 
     @classmethod
-    def of(cls, living: LivingMap, p_site: FloatArray, settings: BoxesConfig) -> MapBoxes:
+    def of(cls, living: LivingMap, p_site: FloatArray, config: Config) -> MapBoxes:
         """Return those of a map, by beliefs (S,) in its sites."""
-        places, members = living.places, living.members
+        places, members, settings = living.places, living.members, config.living.boxes
         row = np.flatnonzero(np.isin(places.landmark_id, living.boxes.landmark_id))
         name = places.landmark_id[row]
         known = np.isfinite(places.rotation[row, :1])
@@ -71,7 +73,7 @@ class MapBoxes(NamedTuple):
             row, name, members.class_id[member], places.position_m[row],
             blocks(living.covariance_m2, 3)[row].reshape(-1, 3, 3),
             np.where(known[:, 0], heading_of(pose), np.nan), living.boxes.of(name),
-            np.where(members.deleted[member], settings.p_stands, p), settings,
+            np.where(members.deleted[member], settings.p_stands, p), settings, config.slam,
         )  # fmt: skip
 
 
@@ -169,9 +171,9 @@ def _agreed(
     motions = None if motion is None else [motion]
     if motion is None and len(row) > ALL_TRIED:
         sigma_m = math.sqrt(float(np.trace(source.covariance)) / len(some))
-        motions = list(
-            PlaceIndex(at, _floor(known.covariance_m2[row], settings.drift_m)).motions(source.place, sigma_m)
-        )
+        index = PlaceIndex(at, _floor(known.covariance_m2[row], settings.drift_m), settings=known.slam)
+        motions = list(index.motions(source.place, sigma_m))
+    anywhere_nats = known.slam.association.constellation.certain_nats + max(math.log(area_m2 / TESTED_M2), 0.0)
     found = agreed_pairs(
         source,
         LocalMap(at, block_diag(*_floor(known.covariance_m2[row], settings.drift_m))),
@@ -179,8 +181,8 @@ def _agreed(
         density=max(len(row) / area_m2, settings.density),
         probability=settings.p_stands,
         motions=motions,
-        least_nats=CERTAIN_NATS + max(math.log(area_m2 / TESTED_M2), 0.0) if motion is None else settings.shared_nats,
-        lead_nats=settings.lead_nats,
+        margins_nats=(anywhere_nats if motion is None else settings.shared_nats, settings.lead_nats),
+        settings=known.slam,
     )
     pairs = [(int(some[k]), int(row[m])) for k, m in found]
     return pairs if not pairs or _headings_agree(seen, known, pairs) else []

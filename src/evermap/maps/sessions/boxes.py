@@ -97,7 +97,7 @@ def visited_in_traffic(
         NumericalError: no finite optimum.
     """
     settings = config.living.boxes
-    solved, known = _by_itself(taken, progress, settings), MapBoxes.of(living, p_site, settings)
+    solved, known = _by_itself(taken, progress, settings), MapBoxes.of(living, p_site, config)
     found = _placed(taken, solved, living, known) if len(living.places) else None
     if found is not None and found[1] != 1.0:
         taken = rescaled(taken, found[1], config.slam.space)

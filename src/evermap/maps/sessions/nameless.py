@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.optimize import linear_sum_assignment
 
-from evermap.config import Config, LivingConfig, OverlayConfig
+from evermap.config import Config, OverlayConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import blocks, of_places
 from evermap.geometry.rigid import rigid
@@ -28,12 +28,12 @@ from evermap.maps.sessions.box_search import TESTED_M2
 from evermap.maps.sessions.gaussian import drifted
 from evermap.maps.sessions.placing import SMALLEST_P
 from evermap.slam.association.assignment import alike
-from evermap.slam.association.associator import P_MERGE, density_of_unmet
+from evermap.slam.association.associator import density_of_unmet
 from evermap.slam.association.consensus import Candidates, consensus
-from evermap.slam.association.constellation import CERTAIN_NATS, NEAR_M, LocalMap, agreed_pairs
+from evermap.slam.association.constellation import LocalMap, agreed_pairs
 from evermap.slam.association.identify import ALL_TRIED, Associated, associated
 from evermap.slam.association.jcbb import gates
-from evermap.slam.association.place_index import LEAD_NATS, PlaceIndex
+from evermap.slam.association.place_index import PlaceIndex
 from evermap.slam.intake import beliefs
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Recording, landmark_id_of
 
@@ -45,8 +45,6 @@ HELD_NATS = 100.0
 """Log odds of a certain match."""
 GATE = float(gates(1, 0.9999)[1])
 """Squared distance beyond which a landmark is not at a place."""
-CERTAIN = math.log(P_MERGE / (1.0 - P_MERGE))
-"""By how much a landmark must more probably be one of the map than anything else, to hold the session there [nats]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,13 +95,12 @@ def named_in(recording: Recording, living: LivingMap, config: Config) -> Recordi
     Raises:
         DataError: too few frames with detections, or too many for the memory.
     """
-    believed, odometry = beliefs(recording.sensor, config.slam), config.slam.odometry
-    found = associated(recording, *believed, keep_ids=True, odometry=odometry)
+    found = associated(recording, *beliefs(recording.sensor, config.slam), keep_ids=True, settings=config.slam)
     start_s = float(recording.frames.stamp_s[0])
     landmark_id = found.assignment.name
     if len(living.places):
         p_site = aged(living, config.living, start_s).p_here
-        member = _Assigned(found, living, _Stood.of(living, p_site), config.living).members()
+        member = _Assigned(found, living, _Stood.of(living, p_site), config).members()
         known = (member >= 0) & (landmark_id == UNKNOWN)
         landmark_id[known] = living.members.landmark_id[member[known]]
     names = _new_names(found, recording, landmark_id, start_s)
@@ -184,16 +181,16 @@ def _drifted(covariance: FloatArray, error: FloatArray, config: OverlayConfig) -
 class _Assigned:
     """Landmarks of a session (K,), to be assigned to those of a map."""
 
-    def __init__(self, found: Associated, living: LivingMap, stood: _Stood, config: LivingConfig) -> None:
-        self._found, self._living, self._stood, self._overlay = found, living, stood, config.overlay
-        self._settings = config.nameless
-        self._local, self._beside_m = found.in_metres, config.looks.beside_m
+    def __init__(self, found: Associated, living: LivingMap, stood: _Stood, config: Config) -> None:
+        self._found, self._living, self._stood, self._overlay = found, living, stood, config.living.overlay
+        self._settings, self._slam = config.living.nameless, config.slam
+        self._local, self._beside_m = found.in_metres, config.living.looks.beside_m
         name, known = found.assignment.name, living.members.landmark_id[stood.landmark]
         # what has a name is the landmark with that name, and nothing else is
         same = np.where((name == UNKNOWN)[:, None], ~np.isin(known, name), name[:, None] == known)
         self._alike = same & alike(found.assignment.of_kind[:, None, :1], stood.class_id[None, :, None])
         self._named = np.flatnonzero(np.isin(name, known))
-        self._density = density_of_unmet(self._local.place)
+        self._density = density_of_unmet(self._local.place, config.slam)
 
     def members(self) -> IntArray:
         """Return (K,) rows of the map's members, -1 for new ones."""
@@ -251,7 +248,8 @@ class _Assigned:
         against = own - stands[some]
         conflict = (k[:, None] == k) | (stood.landmark[m][:, None] == stood.landmark[m])
         found = consensus(Candidates(off, covariance, against, conflict), gate=GATE, loose=GATE)
-        sure = found.pairs[found.margin >= CERTAIN]
+        p_merge = self._slam.association.p_merge
+        sure = found.pairs[found.margin >= math.log(p_merge / (1.0 - p_merge))]
         return group[k[sure]], m[sure]
 
     def _placed(self) -> IntArray:
@@ -260,7 +258,9 @@ class _Assigned:
         place, named = np.full(len(every), -1, dtype=np.int64), self._named[:MOST_HELD]
         best = self._overlaid(named, stands[self._alike[named][:, stands].any(axis=0)], None, self._alike, fewest=2)
         if not best and len(stands) >= self._settings.fewest:
-            index = PlaceIndex(*self._about(stands)) if len(stands) > ALL_TRIED else None
+            index = None
+            if len(stands) > ALL_TRIED:
+                index = PlaceIndex(*self._about(stands), settings=self._slam)
             for some in _windows(every):
                 best = max(best, self._overlaid(some, stands, index, self._alike), key=len)
             best = best if len(best) >= self._settings.fewest else []
@@ -296,7 +296,7 @@ class _Assigned:
         self, some: IntArray, stands: IntArray, index: PlaceIndex | None, allowed: BoolArray, *, fewest: int = 0
     ) -> list[tuple[int, int]]:
         """Return some landmarks of the session with places that they certainly match, among some (S,) of all."""
-        fewest = fewest or self._settings.fewest
+        fewest, rules = fewest or self._settings.fewest, self._slam.association.constellation
         if len(some) < fewest or len(stands) < fewest:
             return []
         (at, spread), local, motions = self._about(stands), self._local.part(some), None
@@ -305,17 +305,19 @@ class _Assigned:
             motions = list(index.motions(local.place, local.beside_m))
             if not motions:
                 return []
-            near = index.around(se2.transform(np.array(motions)[:, None], local.place).reshape(-1, 2), 2.0 * NEAR_M)
+            near = index.around(
+                se2.transform(np.array(motions)[:, None], local.place).reshape(-1, 2), 2.0 * rules.near_m
+            )
             at, spread, stands = at[near], spread[near], stands[near]
         pairs = agreed_pairs(
             local,
             LocalMap(at, block_diag(*spread)),
             allowed[np.ix_(some, stands)],
             density=self._density,
-            probability=P_MERGE,
+            probability=self._slam.association.p_merge,
             motions=motions,
-            least_nats=CERTAIN_NATS + max(math.log(area_m2 / TESTED_M2), 0.0),
-            lead_nats=LEAD_NATS,
+            margins_nats=(rules.certain_nats + max(math.log(area_m2 / TESTED_M2), 0.0), rules.lead_nats),
+            settings=self._slam,
         )
         return [(int(some[k]), int(stands[m])) for k, m in pairs]
 

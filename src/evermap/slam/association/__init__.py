@@ -1,4 +1,4 @@
-"""Which detection is which landmark, by geometry alone: for recordings without identities."""
+"""Association of detections with landmarks by geometry alone, for recordings without identities."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from evermap.types import AnyRecording, Landmarks, SpatialRecording
 
 
 def with_identities(recording: AnyRecording, settings: SlamConfig, prior_map: Landmarks | None = None) -> AnyRecording:
-    """Return the recording with landmark ids by geometry where `slam.unknown_ids` asks for them.
+    """Return the recording with landmark ids by geometry, if `slam.unknown_ids` is set.
 
     Errors are those of `identify.identified` in the plane, and of `in_space.identified_in_space`.
     """
@@ -19,6 +19,6 @@ def with_identities(recording: AnyRecording, settings: SlamConfig, prior_map: La
     if not settings.unknown_ids:
         return recording
     if isinstance(recording, SpatialRecording):
-        return identified_in_space(recording, settings.space, prior_map, keep_ids=keep_ids)
-    believed, odometry = beliefs(recording.sensor, settings), settings.odometry
-    return identified(recording, *believed, prior_map=prior_map, keep_ids=keep_ids, odometry=odometry)
+        return identified_in_space(recording, settings, prior_map, keep_ids=keep_ids)
+    believed = beliefs(recording.sensor, settings)
+    return identified(recording, *believed, prior_map=prior_map, keep_ids=keep_ids, settings=settings)

@@ -1,8 +1,8 @@
-"""Frame after frame, which detection is which landmark, and from time to time which landmarks are one.
+"""Association frame by frame, and detection of duplicate landmarks at intervals.
 
-A detection is given to a landmark only if no other explanation is nearly as good; in doubt it starts a landmark of its
-own, which can be merged later, when a batch solution knows more (`merging`). Nothing is decided that cannot be mended:
-at the end every detection is compared once more with the whole map (`revise`).
+A detection is assigned to a landmark only if no other explanation is nearly as probable; otherwise it starts its own
+landmark, which can be merged later, after a batch solution (`merging`). No decision is final: at the end every
+detection is compared again with the whole map (`revise`).
 """
 
 from __future__ import annotations
@@ -14,20 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evermap.config import AssociationConfig, SlamConfig
 from evermap.geometry import se2
-from evermap.slam.association.assignment import (
-    FEWEST_SIGHTINGS,
-    FORGET_S,
-    NAMED_NATS,
-    NOBODY,
-    Assignment,
-    alike,
-    same_name,
-)
+from evermap.slam.association.assignment import NOBODY, Assignment, alike, same_name
 from evermap.slam.association.constellation import MOST_LAID, propose_constellation
-from evermap.slam.association.features import MISREAD_NATS, Likeness, Traits
-from evermap.slam.association.jcbb import CONFIDENCE, Pairings, gates, pairing_probability
-from evermap.slam.association.merging import FEW_NATS, Differences, Solution, propose_merges
+from evermap.slam.association.features import Likeness, Traits
+from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
+from evermap.slam.association.merging import Differences, Solution, propose_merges
 from evermap.slam.association.relaying import displaced_stretches, laid
 from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
 from evermap.slam.association.splitting import weighed_visits
@@ -39,71 +32,36 @@ from evermap.slam.noise import Extrapolation, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.sparse.system import exhausted
-from evermap.slam.streaming import sighted_at
+from evermap.slam.streaming import USUAL, sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
-CAUTION = 2.0
-"""Odometry is taken to be this much worse than where learning would start. It is not learned here: what was associated
-is what agreed with it."""
-SLIP, SLIP_NATS = 3.0, math.log(20.0)
-"""And this much worse in a step after which no landmark is where it should be; a priori one step in twenty slips, so
-that the wide gate alone does not make a landmark's detection of that of a ghost."""
-
-P_MATCH, P_RETURN = 0.95, 0.99
-"""Probability from which a detection is given to a landmark; and to one not seen for `FORGET_S`, which closes a
-loop by itself: wrong, it bends the map for good; in doubt `merging` weighs several landmarks together later."""
-TIGHT_M2 = 0.04
-"""Product of a gate's standard deviations, (0.2 m)^2, within which a wrong choice is harmless for a while."""
-FOLLOWED = math.log(16.0)
-"""A landmark is followed as long as its place beside the robot at most doubles the standard deviations of readings."""
-P_NEW = 0.1
-"""Probability of being none of the known from which it starts a landmark."""
-P_MERGE = 0.97
-"""Probability from which two landmarks are one."""
-MOST_TOLD = 10
-"""at most so many times: what was read wrongly once is likely to be so again."""
-UNMET = 0.1
-"""Share of landmarks that one has not met yet around those that are followed."""
-FEWEST, SMALLEST_M2 = 2.0, 20.0
-"""Landmarks, and the area that they span, at least, where their density is measured."""
-FIRST_STOCK = 40
-"""Poses before the first batch solution; the next come after as many, or as their number grew by this share."""
-STOCK_SHARE = 0.05
+FIRST_BATCH, BATCH_SHARE = 40, 0.05
+"""Poses before the first batch solution; then as many, or this share of all, before the next: bounds the work."""
 RECENT = 48
-"""Landmarks, those seen last, that are looked up in the map then."""
-NOISE_FLOOR = 0.5
-"""Share of the start's noise of sightings that imaginary ones vouch for."""
-INFLATION = 1.3
-"""Of the noise of sightings: what was associated is what agreed."""
+"""Number of landmarks, those seen last, whose duplicates are searched at a batch solution: bounds the work."""
 MOST_COMPARED = 96
-"""Landmarks, the nearest, that a frame is compared with."""
+"""Number of nearest landmarks that a frame is compared with: bounds the work."""
 MERGE_ROUNDS = 8
-"""Merges that are tried whenever everything is relinearised, at most: each makes the map stiffer."""
-RISE_NATS, RISE_SHARE, RISE_MOST = 7.0, 1.75, 100.0
-"""By how much the cost may rise for a pair that is merged: for the difference of the two, and for the detections of the
-lesser of them, of which a quarter may become outliers; at most. Errors of sightings from one place are alike, which the
-cost does not know."""
-RELAID, STRETCHES = 8, 2
-"""Stretches that are laid where they belong, at most, and those that are tried each time, the longest first."""
+"""Maximum number of rounds of merging per solution: each makes the map stiffer."""
+REALIGNED, STRETCHES = 8, 2
+"""Maximum number of realigned stretches, and of those that are tried each time, the longest first: bound the work."""
 BEFORE = (8.0, 2.0, 0.0)
-"""How long before a stretch revisits may be wrong already, relative to its length; tried in this order."""
+"""Grid of the time before a stretch in which revisits may be wrong, relative to its length; tried in this order."""
 SPLIT_ROUNDS = 5
-"""Times that contradictory visits are split off, at most."""
-CONTRADICTS = gates(1, 0.95)[1]
-"""Squared distance of a visit from what is known without it, from which it is tried by itself."""
+"""Maximum number of rounds of splitting."""
 NOISE_ROUNDS = 6
-"""Steps towards the noise of the odometry that the associated detections tell."""
+"""Rounds of learning the odometry noise; extrapolated, they converge within these."""
 SAME_NATS = 0.5
-"""By how much the cost must fall for as many landmarks: less is how far the optimum was iterated."""
+"""Least fall of the cost for as many landmarks: the tolerance of the optimum."""
 LAST_ROUNDS = 5
-"""Comparisons of every detection with the whole map at the end, at most."""
+"""Maximum number of comparisons of every detection with the whole map at the end."""
 SAME_SHARE = 0.002
-"""Share of detections that change their landmark in the last of these."""
+"""Share of detections that change their landmark in the last of these: a tolerance."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """An assignment at its optimum: with covariances, its cost, outliers decided, and what solved it."""
+    """An assignment at its optimum, with covariances, cost and smoother."""
 
     assignment: Assignment
     marginals: Marginals
@@ -113,9 +71,8 @@ class _Solved:
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    """A frame compared with the map.
-
-    Rows of `pairings` that are certain, p (n,) of each detection to be new, and evidence [nats] over all being new.
+    """A frame compared with the map: rows of `pairings` that are certain, p (n,) of each detection to be new, and the
+    evidence over only new landmarks [nats].
     """
 
     pairings: Pairings
@@ -128,11 +85,13 @@ class Associator:
     """Feed frames in order with `step`, then `finish`.
 
     Args:
-        problem: the measurements; its `landmark_row` is not looked at.
-        noise: where the noise levels start.
-        kind: (M, 2) class and name of every detection, `UNKNOWN` for none; None where there are none.
-        odometry: (5,) noise levels of the odometry, where they are known; None for `CAUTION` times those of `noise`.
-        traits: what was read of the landmarks themselves; None for nothing that tells.
+        problem: the measurements; its `landmark_row` is ignored.
+        noise: initial noise levels.
+        kind: (M, 2) class and name of every detection, `UNKNOWN` for none; None if there are none.
+        odometry: (5,) noise levels of the odometry, if known; None for a multiple of those of `noise`
+            (`slam.association.odometry_caution`).
+        traits: readings of the landmarks themselves; None if they give no evidence.
+        settings: of the estimator.
     """
 
     def __init__(
@@ -142,25 +101,29 @@ class Associator:
         kind: IntArray | None = None,
         odometry: FloatArray | None = None,
         traits: Traits | None = None,
+        settings: SlamConfig = USUAL,
     ) -> None:
-        self._problem = problem
+        self._problem, self._settings = problem, settings
+        rules = self._rules = settings.association
         self._kind = np.full((len(problem.pose_row), 2), UNKNOWN) if kind is None else kind
         self._of_kind: IntArray = np.zeros((0, 2), dtype=np.int64)
         self._traits = traits
         self._like = None if traits is None else traits.nothing(0)
         self._seen_s = np.zeros(0)
         self._start_noise = noise
-        self.noise = replace(noise, odometry=CAUTION * noise.odometry if odometry is None else odometry)
-        """Noise levels that everything is solved with; detections carry their own."""
-        self._slipping = replace(noise, odometry=SLIP * self.noise.odometry)
+        if odometry is None:
+            odometry = rules.odometry_caution * noise.odometry
+        self.noise = replace(noise, odometry=odometry)
+        """Noise levels of all solutions; detections have their own."""
+        self._slipping = replace(noise, odometry=rules.slip * self.noise.odometry)
         self._first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
         self._pose = np.zeros((len(problem.stamp_s), 3))
         self._row: IntArray = np.full(len(problem.pose_row), NOBODY, dtype=np.int64)
-        self._sigma = INFLATION * SightingNoise.constant(noise.detection).of_detections(problem)
+        self._sigma = rules.noise_caution * SightingNoise.constant(noise.detection).of_detections(problem)
         self._filter = LocalFilter(problem.mount, problem.prior, most=MOST_COMPARED)
         self._done, self._doubted = 0, 0
-        self._next_stock = FIRST_STOCK
-        self._density_m2 = landmark_density(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
+        self._next_batch = FIRST_BATCH
+        self._density_m2 = landmark_density(np.zeros((0, 2)), np.zeros(0, dtype=np.int64), settings)
 
     def step(self) -> None:
         """Associate the next frame."""
@@ -176,12 +139,12 @@ class Associator:
         self._use(frame, detections)
         self._pose[row] = local.pose
         self._done += 1
-        if self._done == self._next_stock:
-            self._take_stock()
-            self._next_stock = self._done + max(FIRST_STOCK, int(STOCK_SHARE * self._done))
+        if self._done == self._next_batch:
+            self._relinearise()
+            self._next_batch = self._done + max(FIRST_BATCH, int(BATCH_SHARE * self._done))
 
     def _after_driving(self, row: int, detections: IntArray) -> _Frame:
-        """The next frame compared with the map; if nothing is where it should be, as after wheels that slipped."""
+        """Compare the next frame with the map; if no landmark matches, once more with the noise of slipping wheels."""
         local, problem = self._filter, self._problem
         motion = Motion.between(problem, self.noise, row, local.states)
         self._have_near(se2.compose(local.pose, motion.increment))
@@ -190,33 +153,33 @@ class Associator:
         frame = self._match(detections)
         if len(frame.taken):
             return frame
-        after = local.pose, local.covariance  # the wheels slipped, or stamps jittered in a turn?
+        after = local.pose, local.covariance  # did the wheels slip, or stamps jitter in a turn?
         local.pose, local.covariance = before
         local.drive(Motion.between(problem, self._slipping, row, local.states))
         slipped = self._match(detections)
-        if len(slipped.taken) and slipped.evidence >= frame.evidence + SLIP_NATS:
+        if len(slipped.taken) and slipped.evidence >= frame.evidence + self._rules.slip_nats:
             return slipped
         local.pose, local.covariance = after
         return frame
 
     def _have_near(self, pose: FloatArray) -> None:
-        """Have the landmarks around a pose in the filter: all, if they are few."""
+        """Bring the nearest landmarks around a pose into the filter."""
         away = np.hypot(*(self._filter.position - pose[:2]).T)
         self._filter.bring(np.argsort(away, kind="stable")[:MOST_COMPARED])
 
     def having(self, traits: Traits) -> Associator:
-        """Return one that has seen the same frames and knows what was read of the landmarks, too."""
+        """Return a copy, with the same frames processed, that also uses traits."""
         other = copy.copy(self)
         other._traits = traits
         return other
 
     def heed_names(self, pose: Callable[[], FloatArray]) -> None:
-        """Begin again from poses that names alone lead to, if landmarks with one name lie apart and it is better so.
+        """Restart from poses estimated from names alone, if several landmarks have one name and the result is better.
 
-        Wrong matches between two that were seen by name bend the map, until those do not meet any more.
+        Wrong matches between two named detections distort the map until the loop between these stays open.
 
         Args:
-            pose: returns (N, 3) those poses; called where they are asked for.
+            pose: returns these poses (N, 3); called only if needed.
         """
         solved = self._settled(self._assignment())
         self._go_on_from(solved)
@@ -224,7 +187,7 @@ class Associator:
         if not len(_twice(now)):
             return
         begun = replace(now, estimate=replace(now.estimate, pose=pose()))
-        row, points = begun.in_visits(FORGET_S), begun.points()
+        row, points = begun.in_visits(self._rules.forget_s), begun.points()
         seen = row >= 0
         each = np.bincount(row[seen])
         place: FloatArray = np.column_stack([np.bincount(row[seen], x) / each for x in points[seen].T])
@@ -233,17 +196,17 @@ class Associator:
         while (later := again.assignment.n_landmarks - first) > 0:
             again = self._all_merged(again, within=(first, later - RECENT))
             first = again.assignment.n_landmarks - (later - RECENT)
-        # what is not merged yet has two numbers more to fit, a nat on average
+        # each landmark not yet merged has two more parameters, a nat on average
         gained = solved.cost - again.cost - (again.assignment.n_landmarks - now.n_landmarks)
         if gained + _twice(now).sum() > _twice(again.assignment).sum():
             self._go_on_from(again)
 
     def finish(self, begun: Assignment | None = None, *, goal: float = math.inf) -> Assignment:
-        """Settle everything processed so far, and mend what was associated wrongly.
+        """Solve and merge everything processed so far, and correct wrong associations.
 
         Args:
-            begun: who is who to begin with, of the same detections; None for what `step` found.
-            goal: a cost, as of `against`; what will not reach it is given up.
+            begun: initial assignment of the same detections; None for that of `step`.
+            goal: a cost, as of `against`; the search ends early if it cannot be reached.
         """
         refused: set[tuple[int, int]] = set()
         total = math.inf
@@ -251,7 +214,7 @@ class Associator:
             begun = self._assignment()
         else:
             self._sigma = begun.measured.sigma_given
-        solved = self._relaid(self._contradictions_split(self._settled(begun), refused))
+        solved = self._realigned(self._contradictions_split(self._settled(begun), refused))
         for left in reversed(range(LAST_ROUNDS)):
             before = solved.assignment
             again = reassigned(before, solved.marginals.explained_detections, density=self._density_m2)
@@ -267,18 +230,18 @@ class Associator:
                 break
         assignment = solved.assignment
         assignment = assignment.without(_seldom(assignment))
-        return assignment.without(~likely_real(assignment) & (assignment.told == 0))
+        return assignment.without(~likely_real(assignment) & (assignment.n_named == 0))
 
     @property
     def doubtful(self) -> float:
-        """Share of the detections so far that might have been of several landmarks when they were made."""
+        """Share of the detections so far that were ambiguous between landmarks in their frame."""
         return self._doubted / max(int(self._first[self._done]), 1)
 
     def learned_odometry(self, assignment: Assignment) -> FloatArray:
-        """Return (5,) noise levels of the odometry by restricted likelihood, were all associations right.
+        """Return (5,) noise levels of the odometry by restricted likelihood, given all associations.
 
         Args:
-            assignment: what `finish` returned.
+            assignment: as `finish` returns it.
         """
         noise, ahead = self.noise, Extrapolation()
         for _ in range(NOISE_ROUNDS):
@@ -294,78 +257,80 @@ class Associator:
     def against(self, assignment: Assignment) -> float:
         """Return the negative log likelihood [nats] of all detections under an assignment, up to a constant.
 
-        A detection of no landmark is as likely as an outlier of one. Comparable between assignments of one recording.
+        An unassigned detection is as likely as an outlier. Comparable between assignments of one recording.
 
         Args:
-            assignment: what `finish` returned, of this associator or another one of the same recording.
+            assignment: as `finish` returns it, of this associator or another one of the same recording.
         """
         assignment = self._solved(assignment).assignment
         measured = self._with_sigma(assignment.measured)  # its own noise
         return self._total(self._solved(replace(assignment, measured=measured)))
 
     def _total(self, solved: _Solved) -> float:
-        """`against` under the noise that it was solved with."""
+        """`against` under the noise of the solution."""
         assignment = solved.assignment
         nobody = np.count_nonzero(assignment.landmark_row == NOBODY)
         fit = solved.cost + float(np.log(assignment.measured.sigma_given).sum())
-        told = float(_twice(assignment).sum()) + FEW_NATS * assignment.n_landmarks
-        return fit + self.noise.outlier_log_odds * nobody + told
+        landmarks = float(_twice(assignment).sum()) + self._rules.landmark_nats * assignment.n_landmarks
+        return fit + self.noise.outlier_log_odds * nobody + landmarks
 
     def _match(self, detections: IntArray) -> _Frame:
-        """The frame's detections weighed against the landmarks known so far."""
+        """Weigh the detections of the frame against the landmarks so far."""
         kind = self._kind[detections], self._of_kind
         pairings = pairings_of_frame(
-            self._filter, self._problem, self._sigma, detections, density=self._density_m2, kind=kind
-        )
+            self._filter, self._problem, self._sigma, detections,
+            density=self._density_m2, kind=kind, settings=self._rules,
+        )  # fmt: skip
         if self._traits is not None and self._like is not None:
             read = self._traits.singly(detections[pairings.source])
-            told = self._traits.same(read, self._like.part(pairings.target))
-            pairings = replace(pairings, log_density_new=pairings.log_density_new - told)
-        probability, evidence, _ = pairing_probability(pairings, confidence=CONFIDENCE)
+            by_traits = self._traits.same(read, self._like.part(pairings.target))
+            pairings = replace(pairings, log_density_new=pairings.log_density_new - by_traits)
+        probability, evidence, _ = pairing_probability(pairings, confidence=self._rules.gate_confidence)
         known = np.zeros(len(detections))
         np.add.at(known, pairings.source, probability)
         assert pairings.followed is not None
-        away = self._problem.stamp_s[self._done] - self._seen_s[pairings.target] > FORGET_S
-        least = np.where(away & ~pairings.followed, P_RETURN, P_MATCH)
+        away = self._problem.stamp_s[self._done] - self._seen_s[pairings.target] > self._rules.forget_s
+        least = np.where(away & ~pairings.followed, self._rules.p_return, self._rules.p_match)
         taken = np.flatnonzero((probability >= least) | self._harmless(pairings, probability, known, least))
         return _Frame(pairings, taken, 1.0 - known, evidence)
 
     def _harmless(self, pairings: Pairings, probability: FloatArray, known: FloatArray, least: FloatArray) -> BoolArray:
-        """(K,) the best pairing of a detection where a wrong choice bends nothing, and the end or a merge will tell.
+        """(K,) the best pairing of a detection if a wrong choice does no harm, and is corrected later.
 
-        That is where the gate is small, or where its rivals may well be the same landmark.
+        That is so if the gate is small, or if the rivals are probably the same landmark.
         """
+        p_match = self._rules.p_match
         best = np.zeros(len(probability), dtype=bool)
-        for s in np.flatnonzero(known >= P_MATCH):
+        for s in np.flatnonzero(known >= p_match):
             rows = np.flatnonzero(pairings.source == s)
             first = rows[probability[rows].argmax()]
             if probability[first] >= least[first]:
-                continue  # it is taken anyway
-            rivals = rows[(probability[rows] > 1.0 - P_MATCH) & (rows != first)]
+                continue  # taken anyway
+            rivals = rows[(probability[rows] > 1.0 - p_match) & (rows != first)]
             own = pairings.covariance[2 * first : 2 * first + 2, 2 * first : 2 * first + 2]
             area_m2 = math.sqrt(np.linalg.det(own)) * math.exp(pairings.log_density_new[first]) / self._density_m2
-            if area_m2 < TIGHT_M2:
+            if area_m2 < self._rules.tight_m2:
                 best[first] = True
             elif known[s] >= least[first]:
                 best[first] = all(self._may_be_one(pairings.target[first], pairings.target[k]) for k in rivals)
         return best
 
     def _may_be_one(self, a: int, b: int) -> bool:
-        """True where the difference of two landmarks is insignificant."""
+        """True if the difference of two landmarks is insignificant."""
         local = self._filter
         at = columns(local.bring(np.array([a, b])))
         by = np.hstack([np.eye(2), -np.eye(2)])
         spread = by @ local.covariance[np.ix_(at, at)] @ by.T + 1e-12 * np.eye(2)
         gap = local.position[a] - local.position[b]
-        return bool(gap @ np.linalg.solve(spread, gap) < gates(1, CONFIDENCE)[1])
+        return bool(gap @ np.linalg.solve(spread, gap) < gates(1, self._rules.gate_confidence)[1])
 
     def _use(self, frame: _Frame, detections: IntArray) -> None:
-        """Update with the certain pairings, and start landmarks where none is near enough."""
+        """Update with the certain pairings, and start landmarks from detections without candidates."""
         problem, local, pairings = self._problem, self._filter, frame.pairings
         known, target = detections[pairings.source[frame.taken]], pairings.target[frame.taken]
         self._row[known] = target
         local.update(target, problem.reading[known], self._sigma[known], weighing=GATED)
-        new = detections[frame.p_new >= P_NEW]
+        new = detections[frame.p_new >= self._rules.p_new]
         self._doubted += len(detections) - len(known) - len(new)
         self._of_kind[target] = np.maximum(self._of_kind[target], self._kind[known])
         self._seen_s[target] = problem.stamp_s[self._done]
@@ -384,8 +349,8 @@ class Associator:
             local.meet(row, place)
         local.update(self._row[new], problem.reading[new], self._sigma[new], weighing=GATED)
 
-    def _take_stock(self) -> None:
-        """Solve everything so far, merge what is one, and go on from there."""
+    def _relinearise(self) -> None:
+        """Solve everything so far, merge duplicates, and continue from there."""
         self._go_on_from(self._settled(self._without_chance(self._assignment()), RECENT))
 
     def _go_on_from(self, solved: _Solved) -> None:
@@ -402,44 +367,50 @@ class Associator:
         estimate = Estimate(self._pose[: self._done].copy(), self._filter.position.copy(), self._filter.states.copy())
         count = len(measured.pose_row)
         traits = None if self._traits is None else self._traits.until(count)
-        return Assignment(measured, self._row[:count].copy(), estimate, self._kind[:count], traits)
+        row, kind = self._row[:count].copy(), self._kind[:count]
+        return Assignment(measured, row, estimate, kind, traits, self._settings)
 
     def _with_sigma(self, measured: Problem) -> Problem:
-        """Detections with the noise that has been learned."""
+        """The measurements with the learned noise of sightings."""
         count = len(measured.pose_row)
         return replace(measured, sigma_given=self._sigma[:count])
 
     def _without_chance(self, assignment: Assignment) -> Assignment:
-        """Landmarks that were seen once or twice, long ago, were none."""
+        """The assignment without landmarks with too few sightings, long ago."""
         age = assignment.measured.stamp_s[-1] - assignment.last_seen_s
-        return assignment.without(_seldom(assignment) & (age > FORGET_S))
+        return assignment.without(_seldom(assignment) & (age > self._rules.forget_s))
 
     def _settled(self, assignment: Assignment, recent: int | None = None) -> _Solved:
-        """The batch solution, all landmarks or those seen last merged with others while there is something to merge."""
+        """Solve the batch, and merge duplicates of all landmarks or of those seen last."""
         assignment = replace(assignment, measured=self._with_sigma(assignment.measured))
         return self._all_merged(self._solved(assignment), recent)
 
     def _all_merged(
         self, solved: _Solved, recent: int | None = None, *, within: tuple[int, int] | None = None
     ) -> _Solved:
-        """All landmarks merged, or those seen last, or those from a row on but for so many later ones, with others that
-        are no later.
+        """Merge duplicates while there are any.
+
+        Args:
+            solved: to begin with.
+            recent: number of landmarks, those seen last, whose duplicates are searched; None for all.
+            within: only landmarks from the first number on, except the second number of youngest ones.
         """
+        settings, p_merge = self._settings, self._rules.p_merge
         refused: set[tuple[int, int]] = set()
         for _ in range(MERGE_ROUNDS):
             now = solved.assignment
-            self._density_m2 = density = landmark_density(now.estimate.landmark, now.sightings)
+            self._density_m2 = density = landmark_density(now.estimate.landmark, now.sightings, settings)
             among, known = _latest(now, recent), np.ones(now.n_landmarks, dtype=bool)
             if within is not None:
                 known = np.arange(now.n_landmarks) < now.n_landmarks - within[1]
                 among = known & (np.arange(now.n_landmarks) >= within[0])
             pairs = propose_merges(
-                compared(now, solved.marginals, density), probability=P_MERGE,
+                compared(now, solved.marginals, density), probability=p_merge,
                 among=among, known=known, last=recent is None, refused=refused,
             )  # fmt: skip
             if not pairs and within is None and now.n_landmarks <= MOST_LAID:
                 honest = now.with_shared_errors(solved.marginals.shared)[: 2 * now.n_landmarks, : 2 * now.n_landmarks]
-                pairs = propose_constellation(now, honest, density=density, probability=P_MERGE, refused=refused)
+                pairs = propose_constellation(now, honest, density=density, probability=p_merge, refused=refused)
             if not pairs:
                 break
             merged = self._merged(solved, pairs, refused)
@@ -451,19 +422,18 @@ class Associator:
     def _contradictions_split(
         self, solved: _Solved, refused: set[tuple[int, int]], recent: int | None = None
     ) -> _Solved:
-        """What was given to a landmark wrongly gets one of its own, and is merged again, if the map is better for it.
+        """Split contradictory visits from their landmarks, and merge again, if the result is better.
 
         Visits that were tried without gain are in `refused`, by first detection and number.
         """
+        rules = self._rules
         for _ in range(SPLIT_ROUNDS):
             now = solved.assignment
             linear = solved.smoother.detections(now.estimate)
-            visits = weighed_visits(
-                now, solved.marginals, linear, density=self._density_m2, pause_s=FORGET_S,
-                among=_latest(now, recent),
-            )  # fmt: skip
-            doubtful = visits.evidence < math.log(P_MERGE / (1.0 - P_MERGE))
-            doubtful &= (visits.squared > CONTRADICTS) | (visits.told < -MISREAD_NATS)
+            visits = weighed_visits(now, solved.marginals, linear, density=self._density_m2, among=_latest(now, recent))
+            doubtful = visits.evidence < math.log(rules.p_merge / (1.0 - rules.p_merge))
+            by_traits = visits.by_traits < -rules.readings.misread_nats
+            doubtful &= (visits.squared > gates(1, rules.contradiction)[1]) | by_traits
             order = np.flatnonzero(doubtful)[np.argsort(visits.evidence[doubtful], kind="stable")]
             _, first = np.unique(visits.landmark[order], return_index=True)  # one of each landmark
             parts = [visits.rows[k] for k in order[np.sort(first)] if _key(visits.rows[k]) not in refused]
@@ -476,7 +446,7 @@ class Associator:
     def _better_split(
         self, solved: _Solved, parts: list[IntArray], refused: set[tuple[int, int]], recent: int | None
     ) -> _Solved | None:
-        """With all parts split off, or with half of them, and so on, if that is better."""
+        """Split all parts, or half of them, and so on, until the result is better; None if it never is."""
         while parts:
             trial = self._all_merged(self._solved(solved.assignment.split(parts)), recent)
             if _is_better(trial, solved):
@@ -486,12 +456,13 @@ class Associator:
             parts = parts[: len(parts) // 2]
         return None
 
-    def _relaid(self, solved: _Solved) -> _Solved:
-        """Stretches that lie beside where they belong laid there, if the map is better for it."""
-        for _ in range(RELAID):
+    def _realigned(self, solved: _Solved) -> _Solved:
+        """Realign displaced stretches, if the result is better."""
+        for _ in range(REALIGNED):
             now = solved.assignment
+            trusted = now.sightings >= self._settings.fewest_sightings
             stretches = displaced_stretches(
-                now, solved.marginals, now.sightings >= FEWEST_SIGHTINGS, density=self._density_m2, probability=P_MERGE
+                now, solved.marginals, trusted, density=self._density_m2, probability=self._rules.p_merge
             )
             starts = (laid(now, stretch, before) for stretch in stretches[:STRETCHES] for before in BEFORE)
             trials = (self._all_merged(self._solved(start)) for start in starts)
@@ -502,12 +473,14 @@ class Associator:
         return solved
 
     def _merged(self, solved: _Solved, pairs: list[tuple[int, int]], refused: set[tuple[int, int]]) -> _Solved | None:
-        """With all pairs merged, or with half of them, and so on, until the cost agrees; one alone may be refused."""
+        """Merge all pairs, or half of them, and so on, until the cost permits; a single one may be refused."""
+        rules = self._rules
         sightings = solved.assignment.sightings
         while pairs:
             trial = self._solved(solved.assignment.merged(pairs))
             lesser = np.array([min(sightings[u], sightings[o]) for u, o in pairs])
-            if trial.cost - solved.cost <= np.minimum(RISE_NATS + RISE_SHARE * lesser, RISE_MOST).sum():
+            rise = np.minimum(rules.rise_nats + rules.rise_per_sighting * lesser, rules.most_rise_nats)
+            if trial.cost - solved.cost <= rise.sum():
                 return trial
             if len(pairs) == 1:
                 refused.update(pairs)
@@ -515,7 +488,7 @@ class Associator:
         return None
 
     def _solved(self, assignment: Assignment, noise: Noise | None = None) -> _Solved:
-        """Optimum, covariances and cost; learns the noise of sightings on the way."""
+        """Optimum, covariances and cost; also learns the noise of sightings."""
         problem = assignment.problem()
         noise = self.noise if noise is None else noise
         smoother = Smoother(problem, noise, heavy=True)
@@ -525,18 +498,19 @@ class Associator:
         given = self._problem.sigma_given[: len(measured.pose_row)]
         unknown = replace(problem, sigma_given=given[assignment.landmark_row >= 0])
         left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
-        noise_of = fit_sighting_noise(unknown, estimate, NOISE_FLOOR * self._start_noise.detection, left)
-        self._sigma = INFLATION * noise_of.of_detections(self._problem)
+        start = self._rules.noise_floor * self._start_noise.detection
+        noise_of = fit_sighting_noise(unknown, estimate, start, left, self._rules)
+        self._sigma = self._rules.noise_caution * noise_of.of_detections(self._problem)
         cost = smoother.under(noise, heavy=False).cost(estimate)
         if assignment.traits is not None:
-            cost -= assignment.traits.told(*assignment.of_visits())
+            cost -= assignment.traits.evidence(*assignment.of_visits())
         return _Solved(replace(assignment, estimate=estimate), marginals, cost, smoother)
 
 
 def compared(assignment: Assignment, marginals: Marginals, density: float) -> Solution:
-    """Return the landmarks of an assignment at its optimum, as `propose_merges` wants them."""
-    place, kind, told = assignment.estimate.landmark, assignment.of_kind, assignment.told
-    like = assignment.like()
+    """Return the landmarks of an assignment at its optimum, for `propose_merges`."""
+    place, kind, named = assignment.estimate.landmark, assignment.of_kind, assignment.n_named
+    like, settings = assignment.like(), assignment.settings.association
 
     def differences(younger: IntArray, older: IntArray) -> Differences:
         rows, both = np.unique(np.concatenate([younger, older]), return_inverse=True)
@@ -552,47 +526,56 @@ def compared(assignment: Assignment, marginals: Marginals, density: float) -> So
             difference = joint[:, se2.xy_rows(u[some])] - joint[:, se2.xy_rows(o[some])]
             return difference[se2.xy_rows(u[some])] - difference[se2.xy_rows(o[some])]
 
-        new = math.log(density) - by_name(kind[younger], kind[older], np.minimum(told[younger], told[older]))
+        readings = np.minimum(named[younger], named[older])
+        new = math.log(density) - by_name(kind[younger], kind[older], readings, settings)
         if assignment.traits is not None and like is not None:
             new -= assignment.traits.same(like.part(younger), like.part(older))
         return Differences(place[younger] - place[older], own, new, together)
 
     return Solution(
         place, marginals.landmark, differences, assignment.sightings, assignment.last_seen_s,
-        *assignment.seen_together(), kind,
+        *assignment.seen_together(), kind, settings,
     )  # fmt: skip
 
 
 def _twice(assignment: Assignment) -> FloatArray:
-    """(K,) evidence [nats] against landmarks with a name that another one has, too."""
-    kind, told = assignment.of_kind, assignment.told
+    """(K,) evidence against several landmarks with one name [nats]."""
+    kind, named = assignment.of_kind, assignment.n_named
     one, other = np.nonzero(np.triu(same_name(kind[:, None], kind[None]), 1))
-    return by_name(kind[one], kind[other], np.minimum(told[one], told[other]))
+    return by_name(kind[one], kind[other], np.minimum(named[one], named[other]), assignment.settings.association)
 
 
-def by_name(one: IntArray, other: IntArray, told: IntArray) -> FloatArray:
-    """Return evidence [nats] that two are one: labels (K, P) of both, and how often the name of the lesser was read."""
-    return np.asarray(NAMED_NATS * np.minimum(told, MOST_TOLD) * same_name(one, other))
+def by_name(one: IntArray, other: IntArray, readings: IntArray, settings: AssociationConfig) -> FloatArray:
+    """Return the evidence of names that pairs are the same [nats], by labels (K, P) of both.
+
+    Args:
+        one: labels of the first of each pair.
+        other: labels of the second.
+        readings: (K,) number of times that the name was read, of the lesser one.
+        settings: of the association.
+    """
+    return np.asarray(settings.name_nats * np.minimum(readings, settings.most_names) * same_name(one, other))
 
 
 def _seldom(assignment: Assignment) -> BoolArray:
-    """(L,) what was seen too seldom to be a landmark, and has no name."""
-    return np.asarray((assignment.sightings < FEWEST_SIGHTINGS) & (assignment.told == 0))
+    """(L,) landmarks without a name and with too few sightings."""
+    return np.asarray((assignment.sightings < assignment.settings.fewest_sightings) & (assignment.n_named == 0))
 
 
 def _latest(assignment: Assignment, count: int | None) -> BoolArray:
-    """(L,) the landmarks with two sightings that were seen last; None for all."""
-    last = np.where(assignment.sightings > 1, assignment.last_seen_s, -np.inf)
+    """(L,) the landmarks with sightings enough to pair that were seen last; None for all."""
+    enough = assignment.sightings >= assignment.settings.association.fewest_to_pair
+    last = np.where(enough, assignment.last_seen_s, -np.inf)
     if count is None or count >= len(last):
         return np.ones(len(last), dtype=bool)
     return np.asarray(last >= np.partition(last, -count)[-count])
 
 
 def _is_better(trial: _Solved, solved: _Solved) -> bool:
-    """Whether an assignment explains the detections better, by more than landmarks that it needs beside."""
+    """Whether the gain of a trial exceeds the cost of its additional landmarks."""
     more = trial.assignment.n_landmarks - solved.assignment.n_landmarks
     gained = solved.cost - trial.cost + _twice(solved.assignment).sum() - _twice(trial.assignment).sum()
-    return bool(gained - FEW_NATS * more > (0.0 if more else SAME_NATS))
+    return bool(gained - solved.assignment.settings.association.landmark_nats * more > (0.0 if more else SAME_NATS))
 
 
 def _key(rows: IntArray) -> tuple[int, int]:
@@ -600,7 +583,7 @@ def _key(rows: IntArray) -> tuple[int, int]:
 
 
 def _partners(row: IntArray) -> IntArray:
-    """(M,) the first detection of the same landmark; -1 where there is none."""
+    """(M,) the first detection of the same landmark; -1 if unassigned."""
     first = np.full(len(row), -1)
     seen = np.flatnonzero(row >= 0)
     _, at, of = np.unique(row[seen], return_index=True, return_inverse=True)
@@ -616,16 +599,18 @@ def pairings_of_frame(
     *,
     density: float,
     kind: tuple[IntArray, IntArray],
+    settings: AssociationConfig,
 ) -> Pairings:
-    """Return detections of a frame with the landmarks whose gates they pass.
+    """Return detections of a frame paired with the landmarks whose gates they pass.
 
     Args:
-        local: the pose that made the detections, with the landmarks that are compared.
+        local: the pose of the frame, with the landmarks that are compared.
         problem: the readings.
         sigma: (M, 2) standard deviations of all detections.
         detections: (n,) rows of those of the frame.
-        density: landmarks a square metre that one expects where none was met before.
+        density: expected landmarks per square metre in an unmapped area.
         kind: (n, 2) classes and names of the detections and (L, 2) of the landmarks.
+        settings: of the association.
     """
     target = np.sort(local.active)
     source, target = np.repeat(np.arange(len(detections)), len(target)), np.tile(target, len(detections))
@@ -633,9 +618,10 @@ def pairings_of_frame(
     source, target = source[same], target[same]
     seen = detections[source]
     nis, log_det, innovation, by = local.compare(target, problem.reading[seen], sigma[seen])
-    inside = np.flatnonzero(nis <= gates(1, CONFIDENCE)[1])
-    # what is followed has a neighbourhood that is known; elsewhere the gate may hold another landmark by chance
-    followed = log_det[inside] <= 2.0 * np.log(sigma[seen[inside]]).sum(axis=1) + FOLLOWED
+    inside = np.flatnonzero(nis <= gates(1, settings.gate_confidence)[1])
+    # the neighbourhood of a tracked landmark is mapped; other gates may contain an unmapped landmark by chance
+    wider = 2.0 * math.log(settings.followed**2)
+    followed = log_det[inside] <= 2.0 * np.log(sigma[seen[inside]]).sum(axis=1) + wider
     source, target, seen, count = source[inside], target[inside], seen[inside], len(inside)
     at, joint = np.empty((count, 10), dtype=np.int64), np.empty((2 * count, 2 * count))
     at[:, :8], at[:, 8:] = np.arange(8), columns(local.bring(target)).reshape(-1, 2)
@@ -643,43 +629,40 @@ def pairings_of_frame(
         scratch = np.empty((2 * count, len(local.covariance)))
         spread_of_frame(local.covariance, by[inside].reshape(2 * count, 10), at, scratch, joint)
     joint[np.diag_indices(2 * count)] += (sigma[seen] ** 2).ravel()
-    # a square metre has r dr db
-    new = np.log(np.where(followed, UNMET, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))
-    new -= NAMED_NATS * same_name(kind[0][source], kind[1][target])
+    # area element r dr db
+    new = np.log(np.where(followed, settings.unmet_share, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))
+    new -= settings.name_nats * same_name(kind[0][source], kind[1][target])
     return Pairings(source, target, innovation[inside], joint, new, len(detections), followed)
 
 
-def density_of_unmet(place: FloatArray) -> float:
-    """Return landmarks a square metre that one may still meet in the area that those at `place` (L, 2) span."""
-    return FEWEST / _area_m2(place)
+def density_of_unmet(place: FloatArray, settings: SlamConfig = USUAL) -> float:
+    """Return the density of unmapped landmarks [1/m^2] in the area that those at `place` (L, 2) span."""
+    return settings.association.least_landmarks / _area_m2(place, settings)
 
 
-def _area_m2(place: FloatArray) -> float:
-    return max(float(np.prod(np.ptp(place, axis=0))) if len(place) else 0.0, SMALLEST_M2)
+def _area_m2(place: FloatArray, settings: SlamConfig) -> float:
+    area_m2 = float(np.prod(np.ptp(place, axis=0))) if len(place) else 0.0
+    return max(area_m2, settings.association.least_area_m2)
 
 
-def landmark_density(place: FloatArray, sightings: IntArray) -> float:
-    """Return landmarks a square metre in the area that those at `place` (L, 2) span, as many as one expects anywhere.
+def landmark_density(place: FloatArray, sightings: IntArray, settings: SlamConfig = USUAL) -> float:
+    """Return the density of landmarks [1/m^2] in the area that those at `place` (L, 2) span; see `effective_number`."""
+    return effective_number(sightings, settings) / _area_m2(place, settings)
 
-    Those that are seen twice under two numbers are not counted twice: the number is `(sum s)^2 / sum s^2` of the
-    `sightings` (L,), where all are seen alike that of the landmarks.
+
+def effective_number(sightings: IntArray, settings: SlamConfig = USUAL) -> float:
+    """Return the effective number of landmarks from their sightings (L,): `(sum s)^2 / sum s^2`.
+
+    A duplicate with few sightings counts little; landmarks with equal sightings count one each.
     """
-    return effective_number(sightings) / _area_m2(place)
-
-
-def effective_number(sightings: IntArray) -> float:
-    """Return how many landmarks there are, by their sightings (L,): `(sum s)^2 / sum s^2`, at least `FEWEST`."""
     squares = float((sightings.astype(float) ** 2).sum())
-    return max(float(sightings.sum()) ** 2 / max(squares, 1.0), FEWEST)
+    return max(float(sightings.sum()) ** 2 / max(squares, 1.0), settings.association.least_landmarks)
 
 
-PSEUDO_SIGHTINGS = 100.0
-"""Imaginary sightings with the start's noise: what was associated first is little, and only what agreed."""
-CLIPPED_AT = 9.0
-"""Squared normalised residual beyond which a sighting tells nothing more about the noise."""
 LEAST_LEFT = 0.1
-"""Share of a residual's variance that the fit leaves, at least: where it leaves less, the residual tells nothing."""
+"""Least share of the variance of a residual that the fit leaves: a bound against division by small numbers."""
 ROUNDS = 10
+"""Rounds of Fisher scoring; they converge within these."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -692,11 +675,11 @@ class SightingNoise:
 
     @classmethod
     def constant(cls, sigma: FloatArray) -> SightingNoise:
-        """Return noise that is the same at all ranges: sigma (2,) of range [m] and bearing [rad]."""
+        """Return noise independent of range: sigma (2,) of range [m] and bearing [rad]."""
         return cls(float(sigma[0] ** 2), 0.0, float(sigma[1] ** 2))
 
     def of_detections(self, problem: Problem) -> FloatArray:
-        """Return (M, 2) standard deviation of every detection: its own where it came with one."""
+        """Return (M, 2) standard deviation of every detection: its own if it states one."""
         fourth = problem.reading[:, 0] ** 4
         modelled = np.column_stack(
             [self.range_variance + self.range_growth * fourth, np.full(len(fourth), self.bearing_variance)]
@@ -705,17 +688,23 @@ class SightingNoise:
 
 
 def fit_sighting_noise(
-    problem: Problem, estimate: Estimate, start: FloatArray, left: FloatArray | None = None
+    problem: Problem,
+    estimate: Estimate,
+    start: FloatArray,
+    left: FloatArray | None = None,
+    settings: AssociationConfig = USUAL.association,
 ) -> SightingNoise:
-    """Estimate noise from the residuals of associated detections, which came without their own.
+    """Estimate noise from the residuals of assigned detections that state none.
 
     Args:
         problem: detections with their landmarks.
         estimate: the optimum.
-        left: (M, 2) share of the noise's variance that the fit leaves in the residuals (restricted likelihood, see
+        start: (2,) standard deviations of the prior.
+        left: (M, 2) share of the variance that the fit leaves in the residuals (restricted likelihood, see
             `slam.noise`); None for all of it.
-        start: (2,) standard deviations that `PSEUDO_SIGHTINGS` imaginary sightings vouch for.
+        settings: of the association.
     """
+    pseudo, clipped_at = settings.pseudo_sightings, settings.clipped_at
     free = ~np.isfinite(problem.sigma_given)
     left = np.ones(free.shape) if left is None else np.maximum(left, LEAST_LEFT)
     squared = detection_residuals(problem, estimate) ** 2 / left
@@ -726,14 +715,14 @@ def fit_sighting_noise(
     variance, growth, bearing = start[0] ** 2, 0.0, start[1] ** 2
     for _ in range(ROUNDS):
         expected = variance + growth * fourth
-        clipped = np.minimum(in_range, CLIPPED_AT * expected)
-        # Fisher scoring of a Gaussian whose variance is linear in two numbers, neither negative
-        weight = np.append((left[free[:, 0], 0] / expected) ** 2, PSEUDO_SIGHTINGS / (variance + growth * middle) ** 2)
+        clipped = np.minimum(in_range, clipped_at * expected)
+        # Fisher scoring of a Gaussian whose variance is linear in two non-negative numbers
+        weight = np.append((left[free[:, 0], 0] / expected) ** 2, pseudo / (variance + growth * middle) ** 2)
         column = np.append(fourth, middle)
         value = np.append(clipped, start[0] ** 2)
         variance, growth = _line_not_negative(column, value, weight)
-        total = own @ np.minimum(in_bearing, CLIPPED_AT * bearing) + PSEUDO_SIGHTINGS * start[1] ** 2
-        bearing = total / (own.sum() + PSEUDO_SIGHTINGS)
+        total = own @ np.minimum(in_bearing, clipped_at * bearing) + pseudo * start[1] ** 2
+        bearing = total / (own.sum() + pseudo)
     return SightingNoise(variance, growth, float(bearing))
 
 

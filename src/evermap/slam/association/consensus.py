@@ -1,10 +1,10 @@
-"""Which pairs of landmarks are one, all at the same time: consensus in the joint Gaussian of their differences.
+"""Pairs of landmarks that are the same, decided jointly: consensus in the joint Gaussian of their differences.
 
-A landmark that is met again after a long way may be any of a dozen by its own gate, but all that are met again share
-one error of the robot. A set of pairs is therefore grown from a seed: conditioned on the pairs so far being one, the
-pair with most evidence comes next, until none has any. That is done from every seed. A pair is certain if the best set
-without it, whatever else it has, explains far less. (Joint compatibility, Neira and Tardos 2001, with evidence in place
-of counts, and greedy in place of branch and bound: polynomial however wide the gates are.)
+A landmark that returns after a long way may match a dozen others by its own gate, but all returning landmarks share
+one error of the robot. A set of pairs is therefore grown from a seed: given the pairs so far, the pair with most
+evidence is added, until none has any. That is repeated from every seed. A pair is certain if the best set without it
+has far less evidence. (Joint compatibility, Neira and Tardos 2001, with evidence instead of counts, and greedy instead
+of branch and bound: polynomial for any width of the gates.)
 """
 
 from __future__ import annotations
@@ -19,26 +19,27 @@ from evermap.slam.kernels import kernel
 from evermap.types import BoolArray, FloatArray, IntArray
 
 MOST_SEEDS = 80
-"""Pairs that sets are grown from, those with most evidence by themselves."""
+"""Number of seeds, the pairs with most evidence by themselves: bounds the work."""
 LARGEST_SET = 32
+"""Largest number of pairs in a set: bounds the work."""
 IMPLIED_M2 = 1e-7
-"""Variance of a difference that a set of pairs fixes."""
+"""Variance up to which a difference follows from the other pairs: a tolerance."""
 LEAST_M2 = 1e-12
-"""No variance is less, by rounding."""
+"""Lower bound of variances, against rounding."""
 FREE = 2
-"""Pairs that fix how one map lies over another."""
+"""Number of pairs that determine a motion in the plane."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """P pairs that may be one.
+    """P candidate pairs.
 
     Attributes:
-        difference: (P, D) of the two places, in the plane or in space.
+        difference: (P, D) of the two positions, in the plane or in space.
         covariance: (D P, D P) of all differences together.
-        log_density: (P,) of the difference and all else that speaks against it, were they two.
-        conflict: (P, P) pairs that cannot both be one.
-        ends: (P, 2) the two landmarks of each, counted from 0: what follows from other pairs is no evidence. None where
+        log_density: (P,) of the difference if they are two landmarks, with all other evidence against the pair.
+        conflict: (P, P) pairs that exclude each other.
+        ends: (P, 2) the two landmarks of each, counted from 0: a pair that follows from others is no evidence. None if
             no pair can follow from others.
     """
 
@@ -55,8 +56,8 @@ class Consensus:
 
     Attributes:
         pairs: (n,) rows of the candidates.
-        evidence: that they are one, over all being two [nats].
-        margin: (n,) by how much the best set without each falls short [nats].
+        evidence: of the set over no pairs [nats].
+        margin: (n,) the same over the best set without each pair [nats].
     """
 
     pairs: IntArray
@@ -65,12 +66,12 @@ class Consensus:
 
 
 def consensus(candidates: Candidates, *, gate: float, loose: float) -> Consensus:
-    """Return the best set of pairs that are one, and how sure each is.
+    """Return the set of pairs with most evidence, and the margin of each.
 
     Args:
         candidates: the pairs.
-        gate: squared distance of a pair, given those before it, that none in a set exceeds.
-        loose: the same of the first `FREE` pairs, which fix how the maps lie.
+        gate: largest squared distance of a pair, given those before it.
+        loose: the same for the first `FREE` pairs, which determine the motion.
     """
     count = len(candidates.difference)
     ends = np.arange(2 * count).reshape(count, 2) if candidates.ends is None else candidates.ends
@@ -90,7 +91,7 @@ def consensus(candidates: Candidates, *, gate: float, loose: float) -> Consensus
         return Consensus(np.zeros(0, dtype=np.int64), 0.0, np.zeros(0))
     top = int(np.argmax(evidence))
     best = sets[top][sets[top] >= 0]
-    margin = np.full(len(best), evidence[top])  # over all being two
+    margin = np.full(len(best), evidence[top])  # over no pairs
     for m, pair in enumerate(best.tolist()):
         without = evidence[label[:, ends[pair, 0]] != label[:, ends[pair, 1]]]
         _, rest, _ = _grown(np.delete(best, m), pair, LARGEST_SET, gate, loose, *every)
@@ -100,7 +101,7 @@ def consensus(candidates: Candidates, *, gate: float, loose: float) -> Consensus
 
 @functools.cache
 def warm_up() -> None:
-    """Compile the kernels, or load them where that was done before: by one pair that is one."""
+    """Compile the kernels, or load them from the cache, by one pair."""
     one = Candidates(np.zeros((1, 2)), np.eye(2), np.array([-9.0]), np.zeros((1, 1), dtype=np.bool_))
     consensus(one, gate=9.0, loose=9.0)
 
@@ -116,8 +117,8 @@ def _all_grown(
     conflict: Any,
     ends: IntArray,
 ) -> tuple[IntArray, FloatArray, IntArray]:
-    """Sets (K, LARGEST_SET) grown from seeds (K,), -1 where they end, the evidence (K,) of each, and (K, L) which
-    landmarks are one in it: those of one label.
+    """Sets (K, LARGEST_SET) grown from seeds (K,), padded by -1, the evidence (K,) of each, and labels (K, L) of
+    landmarks: those with one label are the same.
     """
     sets, evidence = np.full((len(seeds), LARGEST_SET), -1), np.zeros(len(seeds))
     label = np.empty((len(seeds), ends.max() + 1), dtype=np.int64)
@@ -142,8 +143,8 @@ def _grown(
     conflict: Any,
     ends: IntArray,
 ) -> tuple[IntArray, float, IntArray]:
-    """Grow a set from pairs `start` to at most `most`, in which the `forbidden` one is none; returns it, its evidence,
-    and labels of landmarks.
+    """Grow a set from pairs `start` to at most `most`, without the `forbidden` one; return it, its evidence, and the
+    labels of landmarks.
     """
     count = len(difference)
     room = max(min(most, LARGEST_SET), len(start))
@@ -165,7 +166,7 @@ def _grown(
             most_gained = _gain(own[best], rest[best], root, z)[0] - log_density[best]
         else:
             for k in range(count):
-                # what follows from the set, as the third pair of three landmarks, is no evidence
+                # a pair that follows from the set, as the third of three landmarks, is no evidence
                 if open_[k] and _least_variance(own[k]) > IMPLIED_M2:
                     gain, squared = _gain(own[k], rest[k], root, z)
                     if squared <= (loose if n < FREE else gate) and gain - log_density[k] > most_gained:
@@ -174,7 +175,7 @@ def _grown(
             break
         evidence += most_gained
         chosen[n] = best
-        _gain(own[best], rest[best], root, z)  # leaves the lower root of its covariance, given those before
+        _gain(own[best], rest[best], root, z)  # leaves the lower root of its covariance, given the pairs before
         open_[best] = False
         one, other = label[ends[best, 0]], label[ends[best, 1]]
         label[label == other] = one
@@ -224,8 +225,8 @@ def _least_variance(own: FloatArray) -> float:
 
 @kernel
 def _gain(own: FloatArray, rest: FloatArray, root: FloatArray, z: FloatArray) -> tuple[float, float]:
-    """Log density of a difference at zero, and its squared distance; `root` becomes the lower root of the covariance,
-    `z` the whitened difference.
+    """Log density of a difference at zero, and its squared distance; writes the lower root of the covariance to `root`
+    and the whitened difference to `z`.
     """
     squared, log_det = 0.0, 0.0
     for a in range(len(rest)):

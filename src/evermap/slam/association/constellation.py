@@ -1,9 +1,9 @@
-"""One map laid over another by its shape: which landmarks of a local map are which of a larger one.
+"""Alignment of a local map with a larger one by the constellation of their landmarks.
 
-After a long blind stretch, or in a given map, the local map may be turned far beyond what a linear gate can follow. Two
-of its landmarks with the right distance from each other fix a motion; around every such motion the difference of the
-maps is linear again, and joint compatibility tells how many landmarks agree. Motions are weighed by the evidence of
-what they explain, so that a chance agreement of two does not beat the right one of five.
+After a long blind stretch, or in a given map, the rotation of the local map may be too large for a linear gate. Two of
+its landmarks with a matching distance determine a motion; around each such motion the difference of the maps is linear,
+and joint compatibility counts the landmarks that agree. Motions are compared by evidence, so that a chance agreement of
+two landmarks does not beat the correct one of five.
 """
 
 from __future__ import annotations
@@ -16,43 +16,37 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from evermap.config import AssociationConfig, ConstellationConfig, SlamConfig
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
-from evermap.slam.association.assignment import FEWEST_TO_PAIR, Assignment, alike, same_name
-from evermap.slam.association.features import MISREAD_NATS
-from evermap.slam.association.jcbb import CONFIDENCE, LOOSE_GATE, Pairings, most_pairings
+from evermap.slam.association.assignment import Assignment, alike, same_name
+from evermap.slam.association.jcbb import Pairings, most_pairings
+from evermap.slam.streaming import USUAL
 from evermap.types import BoolArray, FloatArray, IntArray
 
-MIN_SPAN_M = 0.5
-"""Two landmarks fix a motion if they are this far apart."""
 MAX_SEEDS = 12
-"""Landmarks of the local map that seeds are made of, the best known."""
+"""Number of landmarks of the local map that seeds consist of, the best known: bounds the work."""
 MAX_MOTIONS = 20
-"""Motions, those under which most landmarks come near one of the map, that are weighed exactly."""
-NEAR_M = 0.5
-CERTAIN_NATS = 7.0
-"""By how much an overlay must beat 'all new' and its best rival: 1000 to 1."""
-MOTION_SIGMA = np.array([5.0, 5.0, 2.0])
-"""Prior of the motion around a seed [m, m, rad]: as good as none."""
-SPAN_SLACK_M = 0.2
-"""Distances within both maps are compared to this, beside what is unknown of them."""
+"""Number of motions that are weighed exactly, those with most landmarks near one of the map: bounds the work."""
+MOST_LAID = 120
+"""Number of landmarks up to which a loose part of a map is aligned with the rest: bounds the work."""
 
 
 @dataclass(frozen=True, slots=True)
 class LocalMap:
-    """Landmarks and how well they are known: place (n, 2), covariance (2 n, 2 n)."""
+    """Landmarks with their uncertainty: place (n, 2), covariance (2 n, 2 n)."""
 
     place: FloatArray
     covariance: FloatArray
 
     def part(self, rows: IntArray) -> LocalMap:
-        """Return some of the landmarks, in that order."""
+        """Return some of the landmarks, in the order of the rows."""
         at = se2.xy_rows(rows)
         return LocalMap(self.place[rows], self.covariance[np.ix_(at, at)])
 
     @property
     def beside_m(self) -> float:
-        """Standard deviation of a landmark beside its neighbours [m]: of the differences to the nearest."""
+        """Standard deviation of a landmark relative to its nearest neighbour [m], the median."""
         n = len(self.place)
         near: IntArray = np.asarray(KDTree(self.place).query(self.place, k=2)[1])[:, 1]
         by = np.zeros((2 * n, 2 * n))
@@ -65,12 +59,12 @@ class LocalMap:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """A motion and what it explains.
+    """A motion and the pairs that it explains.
 
     Attributes:
-        motion: (3,) from the source's frame to the target's.
+        motion: (3,) from the frame of the source to that of the target.
         pairs: (source, target) of landmarks that agree.
-        log_evidence: of the pairs being the same, over being different.
+        log_evidence: of the pairs over no pairs [nats].
     """
 
     motion: FloatArray
@@ -85,19 +79,21 @@ def overlays(
     *,
     density: float,
     motions: Sequence[FloatArray] | None = None,
+    settings: SlamConfig = USUAL,
 ) -> list[Alignment]:
-    """Return ways to lay `source` over `target`, the one with most evidence first; each set of pairs once.
+    """Return alignments of `source` with `target`, that with most evidence first; each set of pairs once.
 
     Args:
-        source: the local map, its landmarks in order of trust.
+        source: the local map, its best known landmarks first.
         target: the map.
-        allowed: (n, m) which pairs may be the same at all.
-        density: landmarks a square metre that one expects where they are not the same.
-        motions: those that are weighed; None tries all pairs.
+        allowed: (n, m) pairs that may be the same.
+        density: expected landmarks per square metre, if they are not the same.
+        motions: candidates; None tries all pairs.
+        settings: of the estimator.
     """
     found: dict[tuple[tuple[int, int], ...], Alignment] = {}
-    for motion in _motions(source, target, allowed) if motions is None else motions:
-        overlay = _weighed(motion, source, target, allowed, density)
+    for motion in _motions(source, target, allowed, settings.association.constellation) if motions is None else motions:
+        overlay = _weighed(motion, source, target, allowed, density, settings.association)
         known = found.get(overlay.pairs)
         if known is None or known.log_evidence < overlay.log_evidence:
             found[overlay.pairs] = overlay
@@ -112,24 +108,27 @@ def agreed_pairs(
     density: float,
     probability: float,
     motions: Sequence[FloatArray] | None = None,
-    least_nats: float = CERTAIN_NATS,
-    lead_nats: float = CERTAIN_NATS,
+    margins_nats: tuple[float, float] | None = None,
+    settings: SlamConfig = USUAL,
 ) -> list[tuple[int, int]]:
-    """Return pairs (source, target) that are certain: of an overlay far better than any other, without doubt in it.
+    """Return pairs (source, target) that are certain: of an alignment far better than any other, and certain in it.
 
-    Empty where the maps can be laid over each other in several ways, or in none.
+    Empty if there are several good alignments, or none.
 
     Args:
-        source: the local map, its landmarks in order of trust.
+        source: the local map, its best known landmarks first.
         target: the map.
-        allowed: (n, m) which pairs may be the same at all.
-        density: landmarks a square metre that one expects where they are not the same.
-        probability: least probability of a pair beside all overlays that differ in it alone.
-        motions: those that are weighed; None tries all pairs.
-        least_nats: evidence of an overlay, over 'all new', from which it may be meant at all.
-        lead_nats: by how much it must beat its best rival.
+        allowed: (n, m) pairs that may be the same.
+        density: expected landmarks per square metre, if they are not the same.
+        probability: least probability of a pair, against all alignments that differ in this pair only.
+        motions: candidates; None tries all pairs.
+        margins_nats: evidence that an alignment needs over no alignment, and over its best rival; None for the default
+            (`slam.association.constellation.certain_nats`).
+        settings: of the estimator.
     """
-    every = overlays(source, target, allowed, density=density, motions=motions)
+    certain = settings.association.constellation.certain_nats
+    least_nats, lead_nats = margins_nats or (certain, certain)
+    every = overlays(source, target, allowed, density=density, motions=motions, settings=settings)
     found = [overlay for overlay in every if len(overlay.pairs) > 1]
     if not found or found[0].log_evidence < least_nats:
         return []
@@ -137,15 +136,13 @@ def agreed_pairs(
     rivals = [other for other in found[1:] if not set(other.pairs) & set(best.pairs)]
     if rivals and best.log_evidence - rivals[0].log_evidence < lead_nats:
         return []
-    sure = _without_doubt(best, source, target, allowed, density, math.log(probability / (1.0 - probability)))
+    pairings = _pairings(best.motion, source, target, allowed, density, settings.association.constellation)
+    sure = _certain(best, pairings, density, math.log(probability / (1.0 - probability)))
     return sure if len(sure) > 1 else []
 
 
-def _without_doubt(
-    best: Alignment, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float, margin: float
-) -> list[tuple[int, int]]:
-    """Pairs that are better by `margin` nats than any change of the overlay by one: none, another, or exchanged."""
-    pairings = _pairings(best.motion, source, target, allowed, density)
+def _certain(best: Alignment, pairings: Pairings, density: float, margin: float) -> list[tuple[int, int]]:
+    """Pairs that exceed any change of the alignment in one pair by `margin` nats: removed, replaced, or exchanged."""
     row_of = {(int(a), int(b)): k for k, (a, b) in enumerate(zip(pairings.source, pairings.target, strict=True))}
     chosen = dict(best.pairs)
     whole = _evidence(pairings, [row_of[pair] for pair in chosen.items()], density)
@@ -168,7 +165,7 @@ def _without_doubt(
 
 
 def _evidence(pairings: Pairings, rows: list[int], density: float) -> float:
-    """Of some pairs (rows) being the same, over being different [nats]."""
+    """Evidence of some pairs (rows) over no pairs [nats]."""
     if not rows:
         return 0.0
     columns = np.array([[2 * k, 2 * k + 1] for k in rows]).ravel()
@@ -178,23 +175,23 @@ def _evidence(pairings: Pairings, rows: list[int], density: float) -> float:
     return float(-0.5 * (distance + log_det) - len(rows) * np.log(density))
 
 
-def _motions(source: LocalMap, target: LocalMap, allowed: BoolArray) -> list[FloatArray]:
-    """Motions by two landmarks each, those that bring most landmarks near some other first; alike ones once."""
+def _motions(source: LocalMap, target: LocalMap, allowed: BoolArray, rules: ConstellationConfig) -> list[FloatArray]:
+    """Motions from two landmarks each, those with most landmarks near one of the target first; equal ones once."""
     between = np.linalg.norm(target.place[:, None] - target.place[None], axis=2)
     scored: list[tuple[int, float, FloatArray]] = []
     seen: set[tuple[tuple[int, int], ...]] = set()
     for i in range(min(len(source.place), MAX_SEEDS)):
         for j in range(i):
             span = float(np.linalg.norm(source.place[i] - source.place[j]))
-            if span < MIN_SPAN_M:
+            if span < rules.least_span_m:
                 continue
-            fits = np.abs(between - span) < 3.0 * _sigma_of_span(source, i, j) + SPAN_SLACK_M
+            fits = np.abs(between - span) < 3.0 * _sigma_of_span(source, i, j) + rules.span_slack_m
             fits &= allowed[i][:, None] & allowed[j][None, :]
             motions = rigid(source.place[[i, j]], target.place[np.argwhere(fits & (between > 0.0))])
             gap = np.linalg.norm(se2.transform(motions[:, None], source.place)[:, :, None] - target.place, axis=3)
             gap[:, ~allowed] = np.inf
             for motion, nearest, at in zip(motions, gap.argmin(axis=2), gap.min(axis=2), strict=True):
-                near = np.flatnonzero(at < NEAR_M)
+                near = np.flatnonzero(at < rules.near_m)
                 key = tuple(zip(near.tolist(), nearest[near].tolist(), strict=True))
                 if key not in seen:
                     seen.add(key)
@@ -211,10 +208,17 @@ def _sigma_of_span(source: LocalMap, i: int, j: int) -> float:
     return math.sqrt(max(float(row @ source.covariance @ row), 0.0))
 
 
-def _weighed(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float) -> Alignment:
+def _weighed(
+    motion: FloatArray,
+    source: LocalMap,
+    target: LocalMap,
+    allowed: BoolArray,
+    density: float,
+    settings: AssociationConfig,
+) -> Alignment:
     """The largest jointly compatible set of pairs around a motion, and its evidence."""
-    pairings = _pairings(motion, source, target, allowed, density)
-    found = most_pairings(pairings, confidence=CONFIDENCE)
+    pairings = _pairings(motion, source, target, allowed, density, settings.constellation)
+    found = most_pairings(pairings, confidence=settings.gate_confidence)
     rows = found.pairing[found.pairing >= 0]
     if len(rows) == 0:
         return Alignment(motion, (), 0.0)
@@ -222,11 +226,18 @@ def _weighed(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: Bo
     return Alignment(motion, pairs, _evidence(pairings, rows.tolist(), density))
 
 
-def _pairings(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float) -> Pairings:
-    """Pairs that come near each other under the motion, with the covariance of their differences around it."""
+def _pairings(
+    motion: FloatArray,
+    source: LocalMap,
+    target: LocalMap,
+    allowed: BoolArray,
+    density: float,
+    rules: ConstellationConfig,
+) -> Pairings:
+    """Pairs near each other under the motion, with the covariance of their differences around it."""
     place = se2.transform(motion, source.place)
     gap = place[:, None] - target.place[None]
-    s, t = np.nonzero(allowed & (np.linalg.norm(gap, axis=2) < NEAR_M))
+    s, t = np.nonzero(allowed & (np.linalg.norm(gap, axis=2) < rules.near_m))
     turn, n = se2.rotation(motion[2]), len(s)
     blocks = source.covariance.reshape(len(place), 2, len(place), 2)
     of_source = np.einsum("ij,kjml,nl->kimn", turn, blocks, turn)
@@ -234,7 +245,8 @@ def _pairings(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: B
     lever = (place - place.mean(axis=0))[s]
     by_motion = np.zeros((n, 2, 3))
     by_motion[:, :, :2], by_motion[:, 0, 2], by_motion[:, 1, 2] = np.eye(2), -lever[:, 1], lever[:, 0]
-    around = (by_motion * MOTION_SIGMA**2).reshape(2 * n, 3) @ by_motion.reshape(2 * n, 3).T
+    free = np.array([rules.free_m, rules.free_m, rules.free_rad])
+    around = (by_motion * free**2).reshape(2 * n, 3) @ by_motion.reshape(2 * n, 3).T
     return Pairings(
         s.astype(np.int64), t.astype(np.int64), gap[s, t], covariance.reshape(2 * n, 2 * n) + around,
         np.full(n, np.log(density)), len(source.place),
@@ -242,15 +254,9 @@ def _pairings(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: B
 
 
 def _blocks(covariance: FloatArray, rows: IntArray) -> FloatArray:
-    """(n, 2, n, 2) of some places, of a covariance (2 P, 2 P)."""
+    """(n, 2, n, 2) blocks of some places, of a covariance (2 P, 2 P)."""
     count = len(covariance) // 2
     return covariance.reshape(count, 2, count, 2)[rows][:, :, rows]
-
-
-STIFF_M = 0.2
-"""Landmarks belong to one stiff part if they are known against each other to this."""
-MOST_LAID = 120
-"""Landmarks of a map up to which a loose part of it is laid over the rest."""
 
 
 def propose_constellation(
@@ -261,41 +267,44 @@ def propose_constellation(
     probability: float,
     refused: set[tuple[int, int]],
 ) -> list[tuple[int, int]]:
-    """Return pairs (younger, older) by which a part of the map that is loose lies on the rest in one way only."""
+    """Return pairs (younger, older) of a loose part of the map that has one alignment with the rest."""
+    settings = assignment.settings
+    rules = settings.association
     place, sightings = assignment.estimate.landmark, assignment.sightings
     apart = assignment.together.toarray() > 0.0
-    root, loose = stiff_and_loose(sightings, joint)
+    root, loose = stiff_and_loose(sightings, joint, rules)
     if len(loose) < 2:
         return []
     loose = loose[np.argsort(-sightings[loose], kind="stable")]
     allowed = ~apart[np.ix_(loose, root)]
     gap = place[loose][:, None] - place[root][None]
     spread = _spreads(joint, loose, root)
-    near = np.einsum("ijk,ijk->ij", gap, np.linalg.solve(spread, gap[..., None])[..., 0]) < LOOSE_GATE
+    near = np.einsum("ijk,ijk->ij", gap, np.linalg.solve(spread, gap[..., None])[..., 0]) < rules.loose_gate
     one, other = assignment.of_kind[loose][:, None], assignment.of_kind[root][None]
     allowed &= (near | same_name(one, other)) & alike(one, other)
     like = assignment.like()
     if assignment.traits is not None and like is not None:
         k, m = np.nonzero(allowed)
-        allowed[k, m] = assignment.traits.same(like.part(loose[k]), like.part(root[m])) >= -MISREAD_NATS
+        allowed[k, m] = assignment.traits.same(like.part(loose[k]), like.part(root[m])) >= -rules.readings.misread_nats
     for k, m in np.argwhere(allowed):
         allowed[k, m] = _ordered(loose[k], root[m]) not in refused
     source, target = _local(place, joint, loose), _local(place, joint, root)
-    pairs = agreed_pairs(source, target, allowed, density=density, probability=probability)
+    pairs = agreed_pairs(source, target, allowed, density=density, probability=probability, settings=settings)
     return [_ordered(loose[k], root[m]) for k, m in pairs]
 
 
-def stiff_and_loose(sightings: IntArray, joint: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return landmarks that hang together with the oldest, each well known against the next; and all others.
+def stiff_and_loose(sightings: IntArray, joint: FloatArray, settings: AssociationConfig) -> tuple[IntArray, IntArray]:
+    """Return landmarks connected with the oldest, each well known relative to the next; and all others.
 
     Args:
-        sightings: (L,) detections of each.
+        sightings: (L,) number of detections of each.
         joint: (G, G) covariance, that of the landmarks first.
+        settings: of the association.
     """
-    seen = np.flatnonzero(sightings >= FEWEST_TO_PAIR)
+    seen = np.flatnonzero(sightings >= settings.fewest_to_pair)
     if not len(seen):
         return seen, seen
-    within = np.linalg.eigvalsh(_spreads(joint, seen, seen))[..., 1] < STIFF_M**2
+    within = np.linalg.eigvalsh(_spreads(joint, seen, seen))[..., 1] < settings.constellation.stiff_m**2
     _, part = connected_components(within, directed=False)
     return seen[part == part[0]], seen[part != part[0]]
 

@@ -1,10 +1,10 @@
-"""What landmarks are like, as their radius or colour: evidence on which detections are of one landmark.
+"""Traits of landmarks, such as radius or colour, as evidence on which detections are of one landmark.
 
-Random effects: of each column a landmark has a value of its own, every visit adds an error that all its readings share
-(another side, another light), every reading one more. Two groups of readings are then more or less probable if they are
-of one landmark than if they are of two, by a ratio of Gaussians in closed form: `same_nats`, which every stage of the
-association asks. All variances are learned from a recording that was associated without, so that units and scales do
-not matter and a column that tells nothing is not used.
+Random effects: in each column a landmark has its own value, every visit adds an error that its readings share (another
+side, another light), every reading one more. The likelihood ratio of two groups of readings, of one landmark over of
+two, is then a ratio of Gaussians in closed form: `same_nats`, which every stage of the association uses. All variances
+are learned from a recording that was associated without traits, so units and scales do not matter, and a column without
+evidence is not used.
 """
 
 from __future__ import annotations
@@ -16,52 +16,38 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import gammaincinv
 
+from evermap.config import ReadingsConfig, SlamConfig
 from evermap.slam.kernels import kernel
+from evermap.slam.streaming import USUAL
 from evermap.types import FloatArray, IntArray
 
-MISREAD_NATS = math.log(20.0)
-"""What a reading may tell at most: one in twenty is of something else, or of nothing."""
-MOST_READINGS = 4
-"""Readings that a visit counts as, at most: their errors are alike."""
 MOST_COLUMNS = 16
-"""Those that tell most are used."""
-LEAST_NATS = 0.1
-"""What two visits must tell on average, for columns to be used at all."""
-CONFIDENCE = 0.999
-"""That landmarks differ in a column, for it to be used."""
-CLIPPED_AT = 9.0
-"""Squared normalised deviation beyond which one tells nothing more about a variance."""
-HALVES = 6
-"""Readings of a visit whose halves are compared: as the robot drives by, errors change that depend on where it is."""
+"""Number of columns that are used, those with most evidence: bounds the work."""
 SHARES = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.6, 1.0])
-"""Of all variance, that the error of a visit may be."""
-WRONG, WRONG_WORTH = 0.1, 2.0
-"""Share of visits that are taken for those of one landmark and are not, before any is seen, and what that is worth."""
-PREFERRED_NATS = 2.0
-"""By how much visits must be more alike than that, for a lesser error of a visit to be believed."""
+"""Grid of the share of all variance that is the error of a visit."""
 SETTLED = 0.5
-"""Relative change of a variance that calls for nothing to be done again."""
-FEWEST_PAIRS = 3.0
-"""Pairs of visits, each landmark's counting as one less than its visits, from which that is told."""
+"""Tolerance of a variance, as the change of its logarithm, for the association to be repeated."""
 MOST_COMPARED = 1_000_000
-"""Differences that it is told by."""
+"""Number of differences of visits that are used: bounds the work."""
 ROUNDS = 12
+"""Rounds of reweighting; they converge within a few."""
 
 
 class Variances(NamedTuple):
-    """Variances (C,) of columns: of readings in a visit, of visits to a landmark, of landmarks; and the share of the
-    columns that tell something of their own.
+    """Variances (C,) of columns: of readings in a visit, of visits to a landmark, of landmarks; the share of
+    independent columns; and the evidence of one reading at most [nats].
     """
 
     reading: FloatArray
     visit: FloatArray
     landmark: FloatArray
     share: float
+    misread_nats: float = USUAL.association.readings.misread_nats
 
 
 class Likeness(NamedTuple):
-    """G groups of readings: value and variance of its error (G, C), nan where nothing was read, and (G,) how many
-    readings each counts as.
+    """G groups of readings: value and variance of its error (G, C), nan without readings, and (G,) the number of
+    readings that each counts as.
     """
 
     value: FloatArray
@@ -77,17 +63,17 @@ class Likeness(NamedTuple):
 def same_nats(
     one: FloatArray, of_one: FloatArray, other: FloatArray, of_other: FloatArray, readings: float, spread: Any
 ) -> float:
-    """Return how much more probable two groups are if they are of one landmark, at most so much for each reading.
+    """Return the evidence that two groups are of one landmark, over of two, bounded per reading [nats].
 
     With values a, b about the mean of all, variances A, B of their errors and V of landmarks, it is
     `N((a, b); 0, [[V + A, V], [V, V + B]]) / (N(a; 0, V + A) N(b; 0, V + B))`.
 
     Args:
-        one: (C,) values, nan where nothing was read.
+        one: (C,) values, nan without readings.
         of_one: (C,) variances of their errors.
-        other: (C,) values of the other one.
+        other: (C,) values of the other group.
         of_other: (C,) variances of their errors.
-        readings: how many the lesser of the two counts as.
+        readings: number that the smaller group counts as.
         spread: a `Variances`.
     """
     total = 0.0
@@ -99,7 +85,7 @@ def same_nats(
         det = va * vb - v * v
         together = (vb * a * a - 2.0 * v * a * b + va * b * b) / det
         total += 0.5 * (a * a / va + b * b / vb - together + np.log(va * vb / det))
-    most = MISREAD_NATS * readings
+    most = spread.misread_nats * readings
     return float(min(max(spread.share * total, -most), most))
 
 
@@ -114,61 +100,67 @@ def _each_same(one: Any, other: Any, spread: Any) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """Readings (M, C) of detections about the mean of all, in the columns that are used, and how these spread."""
+    """Readings (M, C) of detections, centred, in the columns that are used; their variances; and settings."""
 
     value: FloatArray
     spread: Variances
+    settings: SlamConfig = USUAL
 
     @classmethod
-    def none(cls, count: int) -> Traits:
-        """Return those of detections of which nothing was read."""
-        return cls(np.zeros((count, 0)), Variances(np.zeros(0), np.zeros(0), np.zeros(0), 1.0))
+    def none(cls, count: int, settings: SlamConfig = USUAL) -> Traits:
+        """Return those of detections without readings."""
+        return cls(np.zeros((count, 0)), Variances(np.zeros(0), np.zeros(0), np.zeros(0), 1.0), settings)
+
+    @property
+    def most_readings(self) -> int:
+        """Number of readings that a visit counts as, at most."""
+        return self.settings.association.readings.most_readings
 
     @property
     def errors(self) -> FloatArray:
-        """(N, C) variances of the error of a visit that counts as so many readings, from none on."""
-        readings = np.arange(MOST_READINGS + 1)[:, None]
+        """(N, C) variance of the error of a visit by the number of readings that it counts as, from 0 on."""
+        readings = np.arange(self.most_readings + 1)[:, None]
         return self.spread.visit + self.spread.reading / np.maximum(readings, 1)
 
     def close_to(self, other: Traits) -> bool:
-        """Return whether the same columns have errors of the same size, or nearly."""
-        one, two = self.errors[MOST_READINGS], other.errors[MOST_READINGS]
+        """Return whether the same columns have errors of about the same size."""
+        one, two = self.errors[self.most_readings], other.errors[self.most_readings]
         return one.shape == two.shape and bool(np.all(np.abs(np.log(one / two)) < SETTLED))
 
     def until(self, count: int) -> Traits:
-        """Return those of the first detections."""
+        """Return the traits of the first detections."""
         return replace(self, value=self.value[:count])
 
     def singly(self, rows: IntArray) -> Likeness:
-        """Return detections each by itself."""
+        """Return a group per detection."""
         value = self.value[rows]
         return Likeness(value, np.tile(self.errors[1], (len(value), 1)), np.isfinite(value).any(axis=1).astype(float))
 
     def nothing(self, count: int) -> Likeness:
-        """Return landmarks of which nothing was read."""
+        """Return landmarks without readings."""
         nothing = np.full((count, self.value.shape[1]), np.nan)
         return Likeness(nothing, nothing.copy(), np.zeros(count))
 
     def followed(self, known: Likeness, landmark: IntArray, rows: IntArray) -> Likeness:
-        """Return landmarks with readings more, each of another one: a running mean, until medians are taken."""
+        """Return landmarks with further readings, each of a different one: a running mean, until medians are taken."""
         value, variance, readings = (each.copy() for each in known)
         old, now = value[landmark], self.value[rows]
         gain = 1.0 / (1.0 + readings[landmark, None])
         mean = np.where(np.isnan(old), now, old + gain * np.where(np.isnan(now), 0.0, now - old))
         value[landmark] = mean
         readings[landmark] += np.isfinite(now).any(axis=1)
-        counts = np.minimum(readings[landmark], MOST_READINGS).astype(np.int64)
+        counts = np.minimum(readings[landmark], self.most_readings).astype(np.int64)
         variance[landmark] = np.fmin(variance[landmark], self.errors[counts])
         return Likeness(value, variance, readings)
 
     def of_visits(self, visit: IntArray, count: int) -> Likeness:
-        """Return visits by the medians of their readings; visit (M,) of each detection, negative for none."""
+        """Return the medians of the readings per visit; visit (M,) of each detection, negative for none."""
         value, read = medians(self.value, visit, count)
-        variance = self.spread.visit + self.spread.reading / np.clip(read, 1, MOST_READINGS)
-        return Likeness(value, variance, np.minimum(read.max(axis=1, initial=0), MOST_READINGS).astype(float))
+        variance = self.spread.visit + self.spread.reading / np.clip(read, 1, self.most_readings)
+        return Likeness(value, variance, np.minimum(read.max(axis=1, initial=0), self.most_readings).astype(float))
 
     def of_landmarks(self, visits: Likeness, landmark: IntArray, count: int) -> Likeness:
-        """Return landmarks by their visits; landmark (V,) of each."""
+        """Return landmarks as means of their visits; landmark (V,) of each visit."""
         known = np.isfinite(visits.value)
         weight = np.where(known, 1.0 / visits.variance, 0.0)
         total, middle = np.zeros((count, weight.shape[1])), np.zeros((count, weight.shape[1]))
@@ -180,15 +172,15 @@ class Traits:
         return Likeness(middle / some, 1.0 / some, readings)
 
     def same(self, one: Likeness, other: Likeness) -> FloatArray:
-        """Return (K,) nats by which groups are more probable if each is of one landmark with the other one."""
+        """Return (K,) the evidence that groups are pairwise of one landmark [nats]."""
         return _each_same(one, other, self.spread)
 
-    def told(self, visit: IntArray, landmark: IntArray) -> float:
-        """Return how much more probable all readings are, visits belonging together as they do, than if each were to
-        another landmark [nats]; visit (M,) of detections, numbered by landmark and time, landmark (V,) of visits.
+    def evidence(self, visit: IntArray, landmark: IntArray) -> float:
+        """Sum the evidence of all readings for this assignment of visits, over each to its own landmark [nats]; visit
+        (M,) of detections, numbered by landmark and time, landmark (V,) of visits.
         """
         visits = self.of_visits(visit, len(landmark))
-        first = np.searchsorted(landmark, landmark)  # of the landmark that each is to
+        first = np.searchsorted(landmark, landmark)  # visit to the same landmark
         rank, found = np.arange(len(landmark)) - first, 0.0
         for k in range(1, int(rank.max(initial=0)) + 1):
             now, before = np.flatnonzero(rank == k), np.flatnonzero(rank < k)
@@ -198,12 +190,12 @@ class Traits:
 
 
 def medians(value: FloatArray, number: IntArray, count: int) -> tuple[FloatArray, IntArray]:
-    """Return (G, C) medians of readings (M, C) of each group, nan where there are none, and how many there are.
+    """Return (G, C) medians of the readings (M, C) of each group, nan for none, and their number.
 
     Args:
-        value: nan where nothing was read.
+        value: nan without a reading.
         number: (M,) group of each, negative for none.
-        count: how many groups there are.
+        count: number of groups.
     """
     found, read = np.full((count, value.shape[1]), np.nan), np.zeros((count, value.shape[1]), dtype=np.int64)
     for c, column in enumerate(value.T):
@@ -216,49 +208,55 @@ def medians(value: FloatArray, number: IntArray, count: int) -> tuple[FloatArray
     return found, read
 
 
-def learned(value: FloatArray, visit: IntArray, landmark: IntArray, *, revisits: bool = True) -> Traits | None:
-    """Return what columns tell, by visits whose detections are surely of one landmark each; None if they tell nothing.
+def learned(
+    value: FloatArray, visit: IntArray, landmark: IntArray, *, revisits: bool = True, settings: SlamConfig = USUAL
+) -> Traits | None:
+    """Learn the variances of columns from visits, each of one landmark with certainty; None without evidence.
 
     Args:
-        value: (M, D) readings, nan where there are none.
+        value: (M, D) readings, nan for none.
         visit: (M,) of each detection, numbered by landmark and time; negative for none.
-        landmark: (V,) of each visit, right for many of them.
-        revisits: whether the error of a visit is told by what visits to one landmark differ by; else it is as little as
-            readings within a visit say.
+        landmark: (V,) of each visit, correct for many of them.
+        revisits: estimate the error of a visit from the differences between visits to one landmark; else it is the
+            least that the readings within a visit permit.
+        settings: of the estimator.
     """
+    rules = settings.association.readings
     middle, read = medians(value, visit, len(landmark))
     with np.errstate(all="ignore"):
         mean = _median(middle)
         value, middle = value - mean, middle - mean
-        reading, least = _within(value, visit, middle, read)
-        every = _clipped(middle, np.ones_like(middle))
-        own = reading / np.clip(read, 1, MOST_READINGS)
+        reading, least = _within(value, visit, middle, read, settings)
+        every = _clipped(middle, np.ones_like(middle), settings)
+        own = reading / np.clip(read, 1, rules.most_readings)
         free = np.maximum(every - least, 0.0)
-        share = _visit_share(middle, own, landmark, least, free) if revisits else np.zeros_like(free)
+        share = _visit_share(middle, own, landmark, least, free, rules) if revisits else np.zeros_like(free)
         error = least + share * free
         typical = error + _mean(np.where(read > 0, own, np.nan))
         between = np.maximum(every - typical, 0.0)
-        many = (read > 0).sum(axis=0)  # as independent as visits are, if landmarks do not differ
-        beyond = 2.0 * gammaincinv(0.5 * np.maximum(many - 1, 1), CONFIDENCE) / np.maximum(many - 1, 1)
-        told = -0.5 * np.log1p(-((between / (between + typical)) ** 2))
-    told = np.where((every > beyond * typical) & (many > 2) & np.isfinite(told), told, 0.0)
-    used = np.sort(np.argsort(-told, kind="stable")[:MOST_COLUMNS])
-    used = used[told[used] > 0.0]
+        many = (read > 0).sum(axis=0)  # visits are independent if landmarks do not differ
+        beyond = 2.0 * gammaincinv(0.5 * np.maximum(many - 1, 1), rules.confidence) / np.maximum(many - 1, 1)
+        nats = -0.5 * np.log1p(-((between / (between + typical)) ** 2))
+    nats = np.where((every > beyond * typical) & (many > 2) & np.isfinite(nats), nats, 0.0)
+    used = np.sort(np.argsort(-nats, kind="stable")[:MOST_COLUMNS])
+    used = used[nats[used] > 0.0]
     alone = _alone(middle[:, used])
-    if alone * told[used].sum() < LEAST_NATS:
+    if alone * nats[used].sum() < rules.least_nats:
         return None
-    spread = Variances(reading[used], error[used], between[used], alone)
-    return Traits(np.ascontiguousarray(value[:, used]), spread)
+    spread = Variances(reading[used], error[used], between[used], alone, rules.misread_nats)
+    return Traits(np.ascontiguousarray(value[:, used]), spread, settings)
 
 
-def _within(value: FloatArray, visit: IntArray, middle: FloatArray, read: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Variances (D,) of readings about those of their visit, and of what halves of a visit differ by beyond that."""
+def _within(
+    value: FloatArray, visit: IntArray, middle: FloatArray, read: IntArray, settings: SlamConfig
+) -> tuple[FloatArray, FloatArray]:
+    """Variances (D,) of readings about the median of their visit, and of drift between the halves of a visit."""
     seen = np.flatnonzero(visit >= 0)
     of = visit[seen]
     left = 1.0 - 1.0 / np.maximum(read[of], 1.5)
     off = np.where(read[of] > 1, value[seen] - middle[of], np.nan)
     reading = (1.4826 * _median(np.abs(off) / np.sqrt(left))) ** 2
-    reading = np.where(reading > 0.0, reading, _clipped(off, left))  # most are equal where values are rounded
+    reading = np.where(reading > 0.0, reading, _clipped(off, left, settings))  # the median is 0 if values are rounded
     order = np.lexsort((seen, of))  # detections are in the order of time
     size = np.bincount(of, minlength=len(middle))
     rank = np.empty(len(seen), dtype=np.int64)
@@ -266,40 +264,43 @@ def _within(value: FloatArray, visit: IntArray, middle: FloatArray, read: IntArr
     half = np.full(len(visit), -1)
     half[seen] = 2 * of + (2 * rank >= size[of])
     halves, each = medians(value, half, 2 * len(middle))
-    apart, both = halves[1::2] - halves[::2], (each[1::2] + each[::2] >= HALVES) & (each[1::2] * each[::2] > 0)
+    apart, both = (
+        halves[1::2] - halves[::2],
+        (each[1::2] + each[::2] >= settings.association.readings.fewest_in_halves) & (each[1::2] * each[::2] > 0),
+    )
     by_chance = np.where(both, 1.0 / np.maximum(each[1::2], 1) + 1.0 / np.maximum(each[::2], 1), np.nan)
-    drifting = _clipped(np.where(both, apart, np.nan), np.ones_like(apart))
+    drifting = _clipped(np.where(both, apart, np.nan), np.ones_like(apart), settings)
     more = 0.5 * (drifting - 0.5 * np.pi * reading * _mean(by_chance))
     return reading, np.where(np.isfinite(more), np.maximum(more, 0.0), 0.0)
 
 
 def _median(value: FloatArray) -> FloatArray:
-    """Medians (D,) of columns (N, D), nan where nothing was read."""
+    """Medians (D,) of columns (N, D), nan without readings."""
     return np.asarray(medians(value, np.zeros(len(value), dtype=np.int64), 1)[0][0])
 
 
 def _mean(value: FloatArray) -> FloatArray:
-    """Means (D,), nan where nothing was read."""
+    """Means (D,), nan without readings."""
     known = np.isfinite(value)
     return np.asarray(np.where(known, value, 0.0).sum(axis=0) / known.sum(axis=0))
 
 
-def _clipped(off: FloatArray, left: FloatArray) -> FloatArray:
-    """Variances (D,) of deviations (N, D), nan for none, which are so many times smaller as they should be."""
+def _clipped(off: FloatArray, left: FloatArray, settings: SlamConfig) -> FloatArray:
+    """Variances (D,) of deviations (N, D), nan for none; left (N, D) is the share of their variance that remains."""
     squared = off**2 / left
     found = _mean(squared)
     for _ in range(ROUNDS):
-        found = _mean(np.minimum(squared, CLIPPED_AT * found))
+        found = _mean(np.minimum(squared, settings.association.clipped_at * found))
     return np.where(np.isfinite(found), found, 0.0)
 
 
 def _visit_share(
-    middle: FloatArray, own: FloatArray, landmark: IntArray, least: FloatArray, free: FloatArray
+    middle: FloatArray, own: FloatArray, landmark: IntArray, least: FloatArray, free: FloatArray, rules: ReadingsConfig
 ) -> FloatArray:
-    """(D,) share of what visits vary by that is an error of visits, not what landmarks differ by.
+    """(D,) share of the variance between visits that is an error of visits, not a difference of landmarks.
 
-    Of the visits to what is taken for one landmark some are to others: two differ by errors, or by the landmarks, too
-    (a mixture with one share for all columns). The largest errors that explain the differences are taken.
+    Some visits are assigned to the wrong landmark: two differ by errors only, or by their landmarks, too (a mixture
+    with one share for all columns). The largest errors that explain the differences are chosen.
     """
     size = np.bincount(landmark)
     first, pairs = np.cumsum(size) - size, list[IntArray]()
@@ -311,30 +312,31 @@ def _visit_share(
     one, other = one[some], other[some]
     weight = 2.0 * some.step / size[landmark[one]]
     gap, chance = middle[one] - middle[other], own[one] + own[other]
-    usual = np.where(free > 0.0, np.minimum(_mean(own) * MOST_READINGS / np.maximum(free, 1e-300), 1.0), 1.0)
-    if weight.sum() < FEWEST_PAIRS:
+    usual = np.where(free > 0.0, np.minimum(_mean(own) * rules.most_readings / np.maximum(free, 1e-300), 1.0), 1.0)
+    if weight.sum() < rules.fewest_pairs:
         return usual
     alone = _alone(middle)
 
     def nats(share: FloatArray) -> FloatArray:
-        """Give (2, K, D) log likelihoods of differences, of one landmark and of two."""
+        """Give (2, K, D) log likelihoods of differences, for one landmark and for two."""
         right = 2.0 * (least + share * free) + chance + 1e-300
         wrong = right + 2.0 * (1.0 - share) * free
-        told = np.stack([-0.5 * (np.log(variance) + gap**2 / variance) for variance in (right, wrong)])
-        return alone * np.where(np.isfinite(gap), told, 0.0)
+        each = np.stack([-0.5 * (np.log(variance) + gap**2 / variance) for variance in (right, wrong)])
+        return alone * np.where(np.isfinite(gap), each, 0.0)
 
-    def fit(told: FloatArray) -> float:
-        """Fit the share of wrong ones to (2, K) log likelihoods; returns that of all."""
-        wrong = WRONG
+    def fit(each: FloatArray) -> float:
+        """Fit the share of wrong ones to (2, K) log likelihoods; returns the log likelihood of all."""
+        prior, worth = rules.p_wrong, rules.wrong_worth
+        wrong = prior
         for _ in range(ROUNDS):
-            odds = told[1] - told[0] + math.log(wrong / (1.0 - wrong))
-            wrong = float(weight @ (1.0 / (1.0 + np.exp(-np.clip(odds, -500.0, 500.0)))) + WRONG * WRONG_WORTH)
-            wrong /= float(weight.sum()) + WRONG_WORTH
-        prior = WRONG_WORTH * (WRONG * math.log(wrong) + (1.0 - WRONG) * math.log1p(-wrong))
-        return prior + float(weight @ np.logaddexp(told[0] + math.log1p(-wrong), told[1] + math.log(wrong)))
+            odds = each[1] - each[0] + math.log(wrong / (1.0 - wrong))
+            wrong = float(weight @ (1.0 / (1.0 + np.exp(-np.clip(odds, -500.0, 500.0)))) + prior * worth)
+            wrong /= float(weight.sum()) + worth
+        of_prior = worth * (prior * math.log(wrong) + (1.0 - prior) * math.log1p(-wrong))
+        return of_prior + float(weight @ np.logaddexp(each[0] + math.log1p(-wrong), each[1] + math.log(wrong)))
 
     def largest(found: list[float]) -> float:
-        return float(SHARES[np.flatnonzero(np.array(found) >= max(found) - PREFERRED_NATS)[-1]])
+        return float(SHARES[np.flatnonzero(np.array(found) >= max(found) - rules.preferred_nats)[-1]])
 
     every = [nats(np.full(len(free), share)) for share in SHARES]
     share = np.full(len(free), largest([fit(each.sum(axis=2)) for each in every]))
@@ -348,7 +350,7 @@ def _visit_share(
 
 
 def _alone(value: FloatArray) -> float:
-    """Share of columns (V, D) that tell something of their own: effective number, by their correlations, over all."""
+    """Share of independent columns (V, D): their effective number, from correlations, over all."""
     count = value.shape[1]
     if count < 2:
         return 1.0

@@ -1,6 +1,6 @@
-"""A recording whose detections get their landmarks from geometry: what `--unknown-ids` does before the estimator runs.
+"""Association of a whole recording by geometry: the step of `--unknown-ids` before the estimator.
 
-A detection's landmark may be decided by what is seen minutes later; the estimator then runs as on any recording.
+The landmark of a detection may depend on detections minutes later; the estimator then runs as on any recording.
 """
 
 from __future__ import annotations
@@ -14,49 +14,46 @@ from operator import itemgetter
 import numpy as np
 from scipy.linalg import block_diag
 
-from evermap.config import OdometryConfig
+from evermap.config import SlamConfig
 from evermap.slam.association.assignment import NOBODY, Assignment, alike
-from evermap.slam.association.associator import P_MERGE, Associator, density_of_unmet
+from evermap.slam.association.associator import Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
 from evermap.slam.association.features import Traits, learned
-from evermap.slam.association.particles import WIDER, drawn
+from evermap.slam.association.particles import drawn
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
-from evermap.slam.problem import USUAL, Estimate, Noise, Problem
+from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import StreamingSlam
+from evermap.slam.streaming import USUAL, StreamingSlam
 from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Recording
 
 ALL_TRIED = 100
-"""Landmarks of a prior map up to which every pair of them is tried; beyond, an index over constellations is asked."""
+"""Number of landmarks of a prior map up to which every pair is tried; above, an index of constellations is used."""
 MOST_NAMED = 100
-"""Landmarks known by name that a session is laid over a map by."""
-FEW_DOUBTFUL = 0.02
-"""Share of doubtful detections up to which who is who is not drawn by particles."""
+"""Maximum number of landmarks with a common name that align a session with a map: bounds the work."""
 RUNS, MOST_ROUNDS, MOST_IN_VAIN = 4, 6, 2
-"""Draws of which some are settled, how often, and how often in a row without gain."""
+"""Draws per round, maximum number of rounds, and of rounds in a row without gain: bound the work."""
 SETTLED = 120
-"""Landmarks of the draws that are settled in a round, at most, or one draw: then that takes no longer than to draw."""
-LITTLE_NATS = 0.035
-"""A 200th of what a detection of no landmark costs: by which all detections are explained better, for each of them,
-before it is worth while to draw again."""
+"""Maximum number of landmarks of all draws that are solved per round, or one draw: as long as the draws take."""
+LITTLE = 200.0
+"""Gain per detection below which the search ends, as a fraction 1/`LITTLE` of the cost of an outlier: a tolerance."""
 MOST_LEARNED = 3
-"""Times that it is learned what landmarks are like, from who is who by what was known of that before."""
+"""Maximum number of rounds of learning traits and associating with them; they converge within these."""
 MAP_FLOOR_M = 1e-3
-"""A prior map without uncertainty is taken to be known to a millimetre."""
+"""Standard deviation that is added to a prior map, which may state none: a tolerance."""
 
 
 @dataclass(frozen=True)
 class Associated:
-    """A recording whose detections got their landmarks from geometry.
+    """A recording whose detections were associated by geometry.
 
     Attributes:
-        landmark_row: (M,) landmark of every detection of the recording, in the order in which they were met; `NOBODY`
-            where it belongs to none that was seen often enough.
-        name: (M,) identity that every detection came with, `UNKNOWN` where it has none or it was not looked at.
-        assignment: of the detections that were used.
-        noise: that it was solved with.
+        landmark_row: (M,) landmark of every detection of the recording, by first detection; `NOBODY` if it is of no
+            landmark with enough sightings.
+        name: (M,) given identity of every detection, `UNKNOWN` if there is none or it was ignored.
+        assignment: of the used detections.
+        noise: of its solution.
         prior: of the calibration states.
     """
 
@@ -68,8 +65,8 @@ class Associated:
 
     @functools.cached_property
     def in_metres(self) -> LocalMap:
-        """Return the landmarks in the frame of the first pose, scale divided, what is unknown of it in the
-        covariance.
+        """Return the landmarks in the frame of the first pose, with the scale divided by the priors and its uncertainty
+        in the covariance.
         """
         assignment, prior = self.assignment, self.prior
         marginals = Smoother(assignment.problem(), self.noise, heavy=True).marginals(assignment.estimate)
@@ -79,7 +76,7 @@ class Associated:
         return LocalMap(place, covariance + log_sigma**2 * np.outer(place.ravel(), place.ravel()))
 
     def named(self, recording: Recording, landmark_id: IntArray) -> Recording:
-        """Return the recording with ids (L,) of its landmarks where detections came without; `UNKNOWN` for none's."""
+        """Return the recording with ids (L,) of its landmarks for detections without one; `UNKNOWN` if unassigned."""
         found = np.append(landmark_id, UNKNOWN)[self.landmark_row]
         given = np.where(self.name == UNKNOWN, found, self.name)
         return replace(recording, detections=replace(recording.detections, landmark_id=given))
@@ -91,24 +88,23 @@ def associated(
     noise: Noise,
     *,
     keep_ids: bool = False,
-    odometry: OdometryConfig = USUAL,
+    settings: SlamConfig = USUAL,
 ) -> Associated:
     """Associate the detections of a recording by geometry.
 
     Args:
-        recording: what a reader returned.
+        recording: as read.
         prior: of the calibration states.
-        noise: where noise levels start.
+        noise: initial noise levels.
         keep_ids: detections with an id keep it, those without may be of the same landmarks; else ids are ignored.
-        odometry: what is believed of it.
+        settings: of the estimator.
 
     Raises:
         DataError: too few frames with detections, or too many for the memory.
     """
     given = recording.detections
-    prepared = prepare(
-        replace(recording, detections=replace(given, landmark_id=np.zeros_like(given.landmark_id))), settings=odometry
-    )
+    nameless = replace(recording, detections=replace(given, landmark_id=np.zeros_like(given.landmark_id)))
+    prepared = prepare(nameless, settings=settings.odometry)
     problem = replace(prepared.problem, prior=prior.without_scale())
     name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
     kind = np.column_stack([given.class_id, name])[prepared.used]
@@ -117,54 +113,57 @@ def associated(
         for _ in problem.stamp_s:
             associator.step()
         if (name != UNKNOWN).any():
-            associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior))
+            associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior, settings))
         return associator.finish()
 
     def found(traits: Traits | None) -> tuple[Associator, Assignment]:
-        first = Associator(problem, noise, kind, traits=traits)
+        first = Associator(problem, noise, kind, traits=traits, settings=settings)
         assignment = finished(first)
-        if first.doubtful > FEW_DOUBTFUL:
-            again = lambda odometry: finished(Associator(problem, noise, kind, odometry, traits))  # noqa: E731
+        if first.doubtful > settings.association.doubtful_share:
+            again = lambda odometry: finished(  # noqa: E731
+                Associator(problem, noise, kind, odometry, traits, settings)
+            )
             assignment = searched(first, assignment, again)
         return first, assignment
 
     cautious, assignment = found(None)
     if given.features is not None:
-        assignment, cautious = _told_apart(assignment, cautious, given.features[prepared.used], found)
+        assignment, cautious = _with_traits(assignment, cautious, given.features[prepared.used], found)
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
     return Associated(row, name, assignment, cautious.noise, prior)
 
 
-def _told_apart(
+def _with_traits(
     plain: Assignment,
     associator: Associator,
     features: FloatArray,
     found: Callable[[Traits], tuple[Associator, Assignment]],
 ) -> tuple[Assignment, Associator]:
-    """Return the assignment that explains all detections best by what landmarks are like, too, and what solved it.
+    """Return the assignment that explains all detections and their traits best, and its associator.
 
-    How much that tells is learned from who is who without it, where that may be wrong: first as much as readings within
-    visits say, then what revisits do. Each is only a proposal; what explains most is kept, by its own spreads.
+    The variances of the traits are learned from the assignment without them, which may be wrong: first from readings
+    within visits, then from revisits. Each result is a proposal; the one with most evidence, by its own variances, is
+    kept.
 
     Args:
-        plain: who is who without.
-        associator: which found it.
+        plain: the assignment without traits.
+        associator: of this assignment.
         features: (M, D) of the detections.
-        found: returns what another one finds with given traits.
+        found: returns another associator and its assignment, with given traits.
     """
 
     def explained(assignment: Assignment) -> tuple[float, Assignment]:
-        own = replace(assignment, traits=learned(features, *assignment.of_visits()))
+        own = replace(assignment, traits=learned(features, *assignment.of_visits(), settings=plain.settings))
         return associator.against(own), own
 
-    traits = learned(features, *plain.of_visits(), revisits=False)
+    traits = learned(features, *plain.of_visits(), revisits=False, settings=plain.settings)
     if traits is None:
         return plain, associator
     cost, best = explained(plain)
     for _ in range(MOST_LEARNED):
         known = replace(best, traits=traits)
-        if traits.told(*known.of_visits()) > 0.0:
+        if traits.evidence(*known.of_visits()) > 0.0:
             cautious = associator.having(traits)
             trial = cautious.finish(known)
         else:  # most of it is wrong
@@ -181,22 +180,23 @@ def _told_apart(
 
 
 def searched(associator: Associator, assignment: Assignment, again: Callable[[FloatArray], Assignment]) -> Assignment:
-    """Return what explains all detections best, by particles that start from the best so far, again and again.
+    """Return the best assignment of repeated rounds of particles, each started from the best assignment so far.
 
-    Of `RUNS` draws those that predicted the detections best are settled, of many landmarks one, of few all; what then
-    explains them best is kept if it is better than before. Where it is not, frame by frame is tried once more, with the
-    noise of the odometry that the first pass tells. The search ends where it gains little, or several times nothing.
+    Of `RUNS` draws per round those with most evidence are solved (one of many landmarks, all of few), and the best is
+    kept if it is better than before. If none is, the detections are associated frame by frame once more, with the
+    odometry noise from the first pass. The search ends when it gains little, or repeatedly nothing.
 
     Args:
-        associator: which has seen all frames.
-        assignment: what it finished with.
-        again: returns what another one finishes with under (5,) noise levels of the odometry.
+        associator: with all frames processed.
+        assignment: its result.
+        again: returns the result of another associator under (5,) noise levels of the odometry.
     """
-    cost, little = associator.against(assignment), LITTLE_NATS * len(assignment.landmark_row)
+    outlier_nats, factors = assignment.settings.outlier_log_odds, assignment.settings.association.particles.wider
+    cost, little = associator.against(assignment), outlier_nats / LITTLE * len(assignment.landmark_row)
     odometry = at_first = associator.learned_odometry(assignment)
     in_vain, asked = 0, False
     for k, seeds in enumerate(np.arange(MOST_ROUNDS * RUNS).reshape(-1, RUNS).tolist()):
-        draw = functools.partial(drawn, assignment, odometry, wider=WIDER[k % len(WIDER)])
+        draw = functools.partial(drawn, assignment, odometry, wider=factors[k % len(factors)])
         with ThreadPoolExecutor(len(seeds)) as pool:
             draws = [each for each, _ in sorted(pool.map(draw, seeds), key=itemgetter(1), reverse=True)]
         settled = max(1, SETTLED // max(draws[0].n_landmarks, 1))
@@ -216,15 +216,17 @@ def searched(associator: Associator, assignment: Assignment, again: Callable[[Fl
     return assignment
 
 
-def _by_names(problem: Problem, name: IntArray, noise: Noise, prior: CalibrationPrior) -> FloatArray:
-    """(N, 3) poses by the detections with a name (M,) alone."""
+def _by_names(
+    problem: Problem, name: IntArray, noise: Noise, prior: CalibrationPrior, settings: SlamConfig
+) -> FloatArray:
+    """(N, 3) poses estimated from the detections with a name (M,) alone."""
     named = name != UNKNOWN
     names, row = np.unique(name[named], return_inverse=True)
     landmark = np.full(len(name), NOBODY)
     landmark[named] = row
     start = Estimate(np.zeros((len(problem.stamp_s), 3)), np.zeros((len(names), 2)), prior.mean)
     some = Assignment(problem, landmark, start, name[:, None]).problem()
-    slam = StreamingSlam(some, noise, prior.without_scale())
+    slam = StreamingSlam(some, noise, prior.without_scale(), settings=settings)
     for _ in some.stamp_s:
         slam.step()
     return slam.finish().estimate.pose
@@ -237,27 +239,26 @@ def identified(
     *,
     prior_map: Landmarks | None = None,
     keep_ids: bool = False,
-    odometry: OdometryConfig = USUAL,
+    settings: SlamConfig = USUAL,
 ) -> Recording:
     """Return the recording with landmark ids by geometry.
 
     Args:
-        recording: what a reader returned.
+        recording: as read.
         prior: of the calibration states.
-        noise: where noise levels start.
-        prior_map: landmarks that keep their ids where they are met again, from whatever place the robot starts in.
+        noise: initial noise levels.
+        prior_map: landmarks that keep their ids when they are found again, wherever the robot starts.
         keep_ids: as of `associated`.
-        odometry: what is believed of it.
+        settings: of the estimator.
 
     Returns:
-        The same detections. Landmarks without an id that are not in the prior map are numbered from 1, in the order in
-        which they were met, leaving out ids that there are; `UNKNOWN` where a detection without an id belongs to none
-        that was seen often enough.
+        The same detections. Landmarks without an id that are not in the prior map are numbered from 1 by first
+        detection, without the ids in use; `UNKNOWN` if a detection is of no landmark with enough sightings.
 
     Raises:
         DataError: too few frames with detections, or too many for the memory.
     """
-    found = associated(recording, prior, noise, keep_ids=keep_ids, odometry=odometry)
+    found = associated(recording, prior, noise, keep_ids=keep_ids, settings=settings)
     met, known = found.assignment.name, np.zeros(0, dtype=np.int64)
     if prior_map is not None:
         known = prior_map.landmark_id
@@ -268,7 +269,7 @@ def identified(
 
 
 def numbered(landmark_id: IntArray, taken: IntArray) -> IntArray:
-    """Return ids (L,) with numbers from 1 that are not taken (K,) where there is none."""
+    """Return ids (L,) in which missing ones are numbers from 1 that are not taken (K,)."""
     new, there = landmark_id == UNKNOWN, np.unique(taken)
     free = np.setdiff1d(np.arange(1, len(landmark_id) + len(there) + 1), there)
     after = landmark_id.copy()
@@ -277,21 +278,24 @@ def numbered(landmark_id: IntArray, taken: IntArray) -> IntArray:
 
 
 def _found_in(prior_map: Landmarks, found: Associated) -> list[tuple[int, int]]:
-    """Landmarks of the session with rows of the prior map, by names where two are in both, and by the shape of both."""
+    """Landmarks of the session with rows of the prior map, by common names if there are two, and by constellation."""
+    settings = found.assignment.settings
+    p_merge = settings.association.p_merge
     trusted = np.argsort(-found.assignment.sightings, kind="stable")
     source = found.in_metres.part(trusted)
-    known, density = prior_map.covariance_m2 + MAP_FLOOR_M**2 * np.eye(2), density_of_unmet(source.place)
+    known, density = prior_map.covariance_m2 + MAP_FLOOR_M**2 * np.eye(2), density_of_unmet(source.place, settings)
     name = found.assignment.name[trusted]
     named, of = (each[:MOST_NAMED] for each in np.intersect1d(name, prior_map.landmark_id, return_indices=True)[1:])
     sure = agreed_pairs(
         source.part(named), LocalMap(prior_map.position_m[of], block_diag(*known[of])), np.eye(len(of), dtype=bool),
-        density=density, probability=P_MERGE,
+        density=density, probability=p_merge, settings=settings,
     ) if len(of) > 1 else []  # fmt: skip
     if sure or len(prior_map) > ALL_TRIED:
         given = [(int(named[k]), int(of[m])) for k, m in sure]
-        pairs = PlaceIndex(prior_map.position_m, known).pairs(source, density=density, probability=P_MERGE, given=given)
+        index = PlaceIndex(prior_map.position_m, known, settings=settings)
+        pairs = index.pairs(source, density=density, probability=p_merge, given=given)
     else:
         target = LocalMap(prior_map.position_m, block_diag(*known))
         allowed = alike(name[:, None, None], prior_map.landmark_id[None, :, None])
-        pairs = agreed_pairs(source, target, allowed, density=density, probability=P_MERGE)
+        pairs = agreed_pairs(source, target, allowed, density=density, probability=p_merge, settings=settings)
     return [(int(trusted[k]), m) for k, m in pairs]

@@ -1,13 +1,13 @@
-"""Joint compatibility: which pairings of detections with landmarks can be true at the same time.
+"""Joint compatibility: which pairings of detections with landmarks can be true together.
 
 Neira and Tardos: Data Association in Stochastic Mapping Using the Joint Compatibility Test, IEEE T-RA 17(6), 2001.
 Pairings that pass their own gates may contradict each other, since all share the robot's error. A set of pairings is
 jointly compatible if its stacked innovation passes the gate under the stacked covariance. Branch and bound over the
-interpretation tree finds the set with most pairings, and of these the one with the smallest distance. The distance
-grows pairing by pairing with a Cholesky factor that grows along (their incremental form, square-root).
+interpretation tree finds the set with most pairings, and among these the one with the smallest distance. The distance
+is updated pairing by pairing with a growing Cholesky factor (their incremental form, square-root).
 
-The largest set is not always right: where gates are wide, chance makes pairings. `pairing_probability` therefore weighs
-all compatible sets by Bayes' rule against what is as good an explanation, landmarks that were never met before.
+The largest set is not always right: wide gates contain chance pairings. `pairing_probability` therefore weighs all
+compatible sets by Bayes' rule against the alternative, landmarks that are new.
 """
 
 from __future__ import annotations
@@ -22,14 +22,10 @@ from scipy.special import gammaincinv
 from evermap.slam.kernels import kernel
 from evermap.types import BoolArray, FloatArray, IntArray
 
-CONFIDENCE = 0.999
-"""Share of what belongs together that a gate lets through."""
-LOOSE_GATE = 60.0
-"""Squared distance within which pairs are asked whether they are one: errors that neighbours share leave every gate."""
 NEGLIGIBLE = 25.0
-"""Nats by which sets of no weight fall short of the best."""
+"""Log weight below the best set [nats] from which a set is ignored: rounding is larger than its weight."""
 MAX_NODES = 200_000
-"""Nodes of the tree that are visited at most; a tenth of a second."""
+"""Maximum number of visited nodes; a tenth of a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,14 +34,15 @@ class Pairings:
 
     Attributes:
         source: (K,) detection, or landmark of a local map, counted from 0.
-        target: (K,) landmark that it may be.
+        target: (K,) candidate landmark.
         innovation: (K, D) measured minus predicted, in the plane or in space.
         covariance: (D K, D K) of all innovations together.
-        log_density_new: (K,) of the innovation, were it a landmark not met before.
-        n_sources: how many sources there are, with pairings or not.
-        followed: (K,) whose place beside the robot is known as well as it is measured; None where that is not asked.
-        log_det_least: (K,) of the covariance of an innovation by itself, given all others, at least; lets sets of many
-            detections be weighed without those of no weight. None where that is not known.
+        log_density_new: (K,) of the innovation if the landmark is new.
+        n_sources: number of sources, with pairings or not.
+        followed: (K,) whether the landmark is tracked: known relative to the robot as well as it is measured; None if
+            unused.
+        log_det_least: (K,) lower bound of that of the covariance of an innovation given all others, to cut sets of no
+            weight; None if unknown.
     """
 
     source: IntArray
@@ -60,12 +57,12 @@ class Pairings:
 
 @dataclass(frozen=True, slots=True)
 class Matching:
-    """What the search found.
+    """The result of the search.
 
     Attributes:
         pairing: (n_sources,) the row of `Pairings` of every source in the best set, -1 for none.
         distance: squared Mahalanobis distance of the best set.
-        complete: False where the search was cut short.
+        complete: False if the search was cut short.
     """
 
     pairing: IntArray
@@ -82,7 +79,7 @@ def gates(n: int, confidence: float, dim: int = 2) -> FloatArray:
 
 
 def most_pairings(pairings: Pairings, *, confidence: float = 0.99, max_nodes: int = MAX_NODES) -> Matching:
-    """Return the jointly compatible set with most pairings and, of those, the smallest distance."""
+    """Return the jointly compatible set with most pairings and, among those, the smallest distance."""
     found, distance, _, _, complete = _search(*_arguments(pairings, confidence), False, max_nodes)
     return Matching(found, distance, complete)
 
@@ -90,11 +87,11 @@ def most_pairings(pairings: Pairings, *, confidence: float = 0.99, max_nodes: in
 def pairing_probability(
     pairings: Pairings, *, confidence: float = 0.99, max_nodes: int = MAX_NODES
 ) -> tuple[FloatArray, float, bool]:
-    """Return what is known of the pairings over all jointly compatible sets.
+    """Return posterior probabilities of the pairings over all jointly compatible sets.
 
     Returns:
-        (K,) probability of every pairing; evidence of all sets together, over all sources being new [nats]; and whether
-        all sets were weighed.
+        (K,) probability of every pairing; evidence of all sets together over only new sources [nats]; and whether the
+        search was complete.
     """
     _, _, probability, evidence, complete = _search(*_arguments(pairings, confidence), True, max_nodes)
     return probability, evidence, complete
@@ -127,7 +124,7 @@ def _extend(
     """Append pairing `k` to the `n` chosen: rows of the Cholesky factor and of the whitened innovation.
 
     Returns:
-        What the squared distance and the log determinant gain.
+        The increments of the squared distance and of the log determinant.
     """
     gain, log_det, dim = 0.0, 0.0, innovation.shape[1]
     for a in range(dim):
@@ -161,14 +158,14 @@ def _search(
     weigh_all: bool,
     max_nodes: int,
 ) -> tuple[Any, float, FloatArray, float, bool]:
-    """Depth first over the tree whose level is a source and whose branches are its pairings, and none.
+    """Search depth first; a level of the tree is a source, its branches are the pairings of the source, and none.
 
-    With `weigh_all` every compatible set is visited and adds its weight to the pairings in it, but for those of no
-    weight: `rest` (n_sources + 1,) is what the sources from each level on can add. Without, branches that cannot become
-    better than the best set so far are cut.
+    With `weigh_all` every compatible set adds its weight to its pairings, except sets of no weight: `rest`
+    (n_sources + 1,) bounds the contribution of the sources from each level on. Without it, branches that cannot exceed
+    the best set so far are cut.
     """
     n_sources, n_pairings, dim = len(first) - 1, len(target), innovation.shape[1]
-    remaining = np.zeros(n_sources + 1, dtype=np.int64)  # sources from here on that have any pairing
+    remaining = np.zeros(n_sources + 1, dtype=np.int64)  # sources from here on with any pairing
     for level in range(n_sources - 1, -1, -1):
         remaining[level] = remaining[level + 1] + (1 if first[level + 1] > first[level] else 0)
     cursor = np.zeros(n_sources + 1, dtype=np.int64)
@@ -205,7 +202,7 @@ def _search(
             level -= 1
             continue
         n = count[level]
-        if k == first[level + 1]:  # the source is none of the known
+        if k == first[level + 1]:  # the source is unpaired
             picked[level] = -1
             count[level + 1], distance[level + 1], score[level + 1] = n, distance[level], score[level]
         else:

@@ -1,7 +1,7 @@
-"""Landmarks that were met twice: pairs whose difference vanishes, found near each other and weighed together.
+"""Duplicate landmarks: pairs whose difference vanishes, found near each other and weighed jointly.
 
-Candidates are neighbours (a k-d tree), their covariances come from the sparse factorisation, for the landmarks that are
-compared only. `consensus` weighs the candidates of a group of landmarks at the same time.
+Candidates are neighbours (a k-d tree); their covariances come from the sparse factorisation, for the compared landmarks
+only. `consensus` weighs the candidates of a group of landmarks jointly.
 """
 
 from __future__ import annotations
@@ -16,28 +16,21 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import KDTree
 
-from evermap.slam.association.assignment import FEWEST_TO_PAIR, alike, same_name
+from evermap.config import AssociationConfig
+from evermap.slam.association.assignment import alike, same_name
 from evermap.slam.association.consensus import FREE, Candidates, Consensus, consensus
-from evermap.slam.association.jcbb import CONFIDENCE, LOOSE_GATE, gates
+from evermap.slam.association.jcbb import gates
+from evermap.slam.streaming import USUAL
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
-FEW_NATS = 7.0
-"""Margin of a pair of a set of no more than fix how one map lies over another (any two trees as far apart fit), as long
-as later frames may tell more."""
 GROUP = 24
-"""Landmarks, met one after the other, that are looked up in the rest of the map at the same time."""
+"""Number of consecutive landmarks that are weighed jointly with the rest of the map: bounds the work."""
 MOST_TOGETHER = 200
-"""Landmarks whose joint covariance is held for groups that are looked up one after the other."""
+"""Number of landmarks in one joint covariance, for consecutive groups: bounds the memory."""
 MOST_PAIRS = 400
-"""Pairs of a group that are weighed, those with most evidence by themselves."""
+"""Number of pairs of a group, those with most evidence by themselves: bounds the work."""
 MOST_NEAR = 80
-"""Landmarks, the nearest, that one is compared with."""
-DOUBLE_NATS = 5.0
-"""Evidence against a pair from every frame that detects both: a sensor sees one thing twice in one of 150 frames."""
-
-IN_TURN_NATS, MOST_IN_TURN_NATS = 0.2, 10.0
-"""Evidence for a pair from every frame that detects one of two that are both in view, where one in five is missed by
-chance, and at most: one may hide the other."""
+"""Number of nearest landmarks that one is compared with: bounds the work."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +38,10 @@ class Differences:
     """K pairs of landmarks, in D numbers.
 
     Attributes:
-        gap: (K, D) by which the two differ.
-        covariance: (K, D, D) of each, with what sightings from one place share.
-        log_density: (K,) of the gap, were they two.
-        joint: covariance (D P, D P) of some rows (P,) together.
+        gap: (K, D) difference of the two.
+        covariance: (K, D, D) of each, with the shared errors of sightings.
+        log_density: (K,) of the gap if they are two landmarks.
+        joint: returns the covariance (D P, D P) of some rows (P,) together.
     """
 
     gap: FloatArray
@@ -64,15 +57,16 @@ class Differences:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """L landmarks at an optimum, in the plane or in space, as they are compared with each other.
+    """L landmarks at an optimum, in the plane or in space, to be compared with each other.
 
     Attributes:
         place: (L, 2 or 3).
         covariance: (L, 2, 2) or (L, 3, 3) of each by itself.
-        differences: of pairs, rows (K,) of the younger ones and (K,) of the older ones.
-        sightings, last_seen_s: (L,) detections of each, stamp of the last.
-        together, in_turn: (L, L) frames, see `seen_together`.
-        kind: (L, P) class and name of each, `UNKNOWN` for none: different ones are never one.
+        differences: returns those of pairs, by rows (K,) of the younger and (K,) of the older ones.
+        sightings, last_seen_s: (L,) number of detections, stamp of the last.
+        together, in_turn: (L, L) numbers of frames, see `seen_together`.
+        kind: (L, P) class and name of each, `UNKNOWN` for none: different ones exclude each other.
+        settings: of the association.
     """
 
     place: FloatArray
@@ -83,6 +77,7 @@ class Solution:
     together: sparse.csr_array
     in_turn: sparse.csr_array
     kind: IntArray
+    settings: AssociationConfig = USUAL.association
 
 
 def propose_merges(
@@ -94,23 +89,21 @@ def propose_merges(
     refused: set[tuple[int, int]],
     known: BoolArray | None = None,
 ) -> list[tuple[int, int]]:
-    """Return pairs (younger, older) of landmarks that are one with at least `probability`, given all other such pairs.
+    """Return pairs (younger, older) of landmarks that are the same with at least `probability`, given all such pairs.
 
     Args:
         solution: the landmarks.
         probability: least posterior probability.
-        among: (L,) landmarks that are looked up among all.
-        last: True where no later frames will tell more.
-        refused: pairs that are not looked at.
-        known: (L,) landmarks that they may be; None for all.
+        among: (L,) landmarks to find duplicates of.
+        last: True if no frames will follow.
+        refused: pairs to leave out.
+        known: (L,) candidate duplicates; None for all.
     """
-    seen = (solution.sightings >= FEWEST_TO_PAIR) | (solution.kind[:, -1] != UNKNOWN)
+    seen = (solution.sightings >= solution.settings.fewest_to_pair) | (solution.kind[:, -1] != UNKNOWN)
     sources, targets = np.flatnonzero(seen & among), np.flatnonzero(seen if known is None else seen & known)
     if len(sources) < 1 or len(targets) < 2:
         return []
-    pairs = np.vstack(
-        [_near(solution.place, solution.covariance, sources, targets), _named(solution.kind, sources, targets)]
-    )
+    pairs = np.vstack([_near(solution, sources, targets), _named(solution.kind, sources, targets)])
     count = len(solution.place)
     not_tried = np.array([u * count + o for u, o in refused], dtype=np.int64)
     younger, older = np.divmod(np.setdiff1d(pairs[:, 0] * count + pairs[:, 1], not_tried), count)
@@ -120,7 +113,7 @@ def propose_merges(
     group = np.full(count, -1)
     group[order] = np.arange(len(order)) // GROUP
     one, other = group[younger], group[older]
-    other = np.where(one <= other, other, -1)  # not once more with a source that comes before the younger one
+    other = np.where(one <= other, other, -1)  # not again with a source before the younger one
     groups = [np.flatnonzero((one == k) | (other == k)) for k in range(-(-len(order) // GROUP))]
     groups = [mine for mine in groups if len(mine)]
     merges = list[tuple[int, int]]()
@@ -134,20 +127,20 @@ def propose_merges(
 
 
 def _batches(groups: list[IntArray], younger: IntArray, older: IntArray) -> Iterator[list[IntArray]]:
-    """Groups of rows of pairs, one after the other, as long as what they compare is few landmarks."""
-    some, there = list[IntArray](), np.zeros(0, dtype=np.int64)
+    """Consecutive groups of rows of pairs, together up to `MOST_TOGETHER` landmarks."""
+    some, held = list[IntArray](), np.zeros(0, dtype=np.int64)
     for mine in groups:
-        more = np.union1d(there, np.append(younger[mine], older[mine]))
+        more = np.union1d(held, np.append(younger[mine], older[mine]))
         if some and len(more) > MOST_TOGETHER:
             yield some
             some, more = [], np.unique(np.append(younger[mine], older[mine]))
-        some, there = [*some, mine], more
+        some, held = [*some, mine], more
     if some:
         yield some
 
 
 def _without_contradictions(merges: list[tuple[int, int]], kind: IntArray) -> list[tuple[int, int]]:
-    """Pairs without those that make two names, or classes, one by way of a third landmark that has none."""
+    """Pairs without those that join two names or classes through a third landmark without one."""
     part, label, kept = np.arange(len(kind)), kind.copy(), list[tuple[int, int]]()
     for one, other in merges:
         a, b = part[one], part[other]
@@ -159,16 +152,17 @@ def _without_contradictions(merges: list[tuple[int, int]], kind: IntArray) -> li
 
 
 def _named(kind: IntArray, sources: IntArray, targets: IntArray) -> IntArray:
-    """Different pairs (younger, older) of a source and a target with the same name, wherever they are."""
+    """Different pairs (younger, older) of a source and a target with the same name, at any distance."""
     row, column = np.nonzero(same_name(kind[sources][:, None], kind[targets][None]) & (sources[:, None] != targets))
     pairs = np.column_stack([sources[row], targets[column]])
     return np.column_stack([pairs.max(axis=1, initial=-1), pairs.min(axis=1, initial=len(kind))])
 
 
-def _near(place: FloatArray, covariance: FloatArray, sources: IntArray, targets: IntArray) -> IntArray:
-    """Different pairs (younger, older) of a source and a target that may be one for all that their own spreads say."""
+def _near(solution: Solution, sources: IntArray, targets: IntArray) -> IntArray:
+    """Different pairs (younger, older) of a source and a target within the loose gate of their own covariances."""
+    place, covariance = solution.place, solution.covariance
     spread = np.sqrt(2.0 * np.linalg.eigvalsh(covariance)[:, -1])
-    gate = math.sqrt(LOOSE_GATE)
+    gate = math.sqrt(solution.settings.loose_gate)
     tree = KDTree(place[targets])
     count = min(MOST_NEAR + 1, len(targets))
     away, column = (np.reshape(each, (len(sources), count)) for each in tree.query(place[sources], k=count))
@@ -182,13 +176,15 @@ def _near(place: FloatArray, covariance: FloatArray, sources: IntArray, targets:
 def _agreed(
     solution: Solution, younger: IntArray, older: IntArray, found: Differences, probability: float, *, last: bool
 ) -> list[tuple[int, int]]:
-    """Pairs (younger, older) of a group that are one for certain."""
+    """Pairs (younger, older) of a group that are the same with certainty."""
+    settings = solution.settings
     gap, own = found.gap, found.covariance
     squared = np.einsum("ki,ki->k", gap, np.linalg.solve(own, gap[..., None])[..., 0])
     together, in_turn = (entries(each, younger, older) for each in (solution.together, solution.in_turn))
-    against = found.log_density + DOUBLE_NATS * together - np.minimum(IN_TURN_NATS * in_turn, MOST_IN_TURN_NATS)
+    one_seen = np.minimum(settings.in_turn_nats * in_turn, settings.most_in_turn_nats)
+    against = found.log_density + settings.double_nats * together - one_seen
     alone = -0.5 * (squared + np.log(np.linalg.det(own))) - against
-    inside = np.flatnonzero((squared < LOOSE_GATE) & (together < 3))
+    inside = np.flatnonzero((squared < settings.loose_gate) & (together < 3))
     inside = inside[np.argsort(-alone[inside], kind="stable")[:MOST_PAIRS]]
     if not len(inside):
         return []
@@ -196,14 +192,15 @@ def _agreed(
     conflict = _conflicts(younger, older, solution.together, solution.kind)
     ends = np.unique(np.column_stack([younger, older]), return_inverse=True)[1].reshape(-1, 2)
     candidates = Candidates(gap[inside], found.joint(inside), against[inside], conflict, ends)
-    best: Consensus = consensus(candidates, gate=gates(1, CONFIDENCE, gap.shape[1])[1], loose=LOOSE_GATE)
-    least = math.log(probability / (1.0 - probability)) if last or len(best.pairs) > FREE else FEW_NATS
+    gate = gates(1, settings.gate_confidence, gap.shape[1])[1]
+    best: Consensus = consensus(candidates, gate=gate, loose=settings.loose_gate)
+    least = math.log(probability / (1.0 - probability)) if last or len(best.pairs) > FREE else settings.few_nats
     sure = best.pairs[best.margin >= least]
     return [(int(younger[k]), int(older[k])) for k in sure]
 
 
 def _conflicts(younger: IntArray, older: IntArray, together: sparse.csr_array, kind: IntArray) -> BoolArray:
-    """(P, P) pairs that cannot both be one: a landmark would be two others that were seen together, or named apart."""
+    """(P, P) pairs that exclude each other: they join two landmarks seen in one frame, or with different labels."""
     conflict = np.zeros((len(younger), len(younger)), dtype=bool)
     np.fill_diagonal(conflict, True)
     for mine, other in ((younger, older), (older, younger)):
@@ -226,7 +223,7 @@ def entries(matrix: sparse.csr_array, row: IntArray, column: IntArray) -> FloatA
 
 
 def in_reach(place: FloatArray, at: FloatArray, reach_m: float) -> tuple[IntArray, IntArray]:
-    """Return rows of points and rows of places that are nearer to each other than this, sorted."""
+    """Return rows of points and rows of places within this distance of each other, sorted."""
     near: Any = KDTree(place).query_ball_point(at, reach_m, return_sorted=True)
     count = np.fromiter(map(len, near), dtype=np.int64, count=len(near))
     column = np.fromiter(chain.from_iterable(near), dtype=np.int64, count=int(count.sum()))

@@ -1,11 +1,11 @@
-"""Who is who by particles: whole histories of associations are drawn, and weighed by how well they predicted the rest.
+"""Association by particles: whole histories are drawn, and weighted by how well they predict the remaining detections.
 
 FastSLAM (Montemerlo and Thrun 2003: FastSLAM 2.0 and its association for each particle): a particle is a path; given
-it, landmarks are independent, so each has its own. A detection is of a landmark, of a new one or of none, drawn by its
-likelihoods, and moves the path before the next is weighed. A wrong choice dies out when what follows contradicts it: a
-filter of one Gaussian has no such way back, and a batch solution finds none where a whole group of landmarks was taken
-for its neighbours. Particles forget their past and take errors for independent, so that what they draw is a start for
-the batch solution, which decides (`identify`).
+it, landmarks are independent, so each has its own. A detection is assigned to a landmark, a new one or none, drawn by
+likelihood, and corrects the path before the next is weighed. A wrong choice dies out when later detections contradict
+it. A filter with one Gaussian cannot recover from it, nor can a batch solution if a whole group of landmarks was
+mistaken for its neighbours. Particles forget their past and assume independent errors, so their result is only an
+initial value for the batch solution, which decides (`identify`).
 """
 
 from __future__ import annotations
@@ -17,38 +17,54 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from evermap.slam.association.assignment import FEWEST_SIGHTINGS, FORGET_S, NAMED_NATS, NOBODY, Assignment
-from evermap.slam.association.features import MOST_READINGS, Likeness, Traits, Variances, same_nats
+from evermap.config import SlamConfig
+from evermap.slam.association.assignment import NOBODY, Assignment
+from evermap.slam.association.features import Likeness, Traits, Variances, same_nats
 from evermap.slam.association.jcbb import gates
 from evermap.slam.filter_kernels import vectorised
 from evermap.slam.kernels import composed, kernel, wrapped
 from evermap.slam.problem import Estimate
+from evermap.slam.streaming import USUAL
 from evermap.types import UNKNOWN, FloatArray, IntArray
 
 MOST_PARTICLES, FEWEST_PARTICLES = 300, 30
+"""Bounds of the number of particles: more do not find more, fewer degenerate."""
 WORK = 1e8
-"""Pairs of detections and landmarks that are looked at in a run, at most, as long as there are particles enough."""
-NONE_NATS = 7.0
-"""By which a detection of no landmark is less likely than a perfect one of a landmark."""
-NEW_NATS = NONE_NATS + math.log(20.0)
-"""The same for one of a landmark that was not met before: of detections of none that is known, one in twenty."""
-WIDER = 1.2, 1.5
-"""Of the noise of sightings, in turn: errors of one place are alike, so that they tell less than if they were not."""
-BENT = 0.3
-"""Standard deviation of landmarks that are known at the start, relative to the way to the next: a group of them may be
-beside where it belongs, by less than what takes one for another."""
+"""Maximum number of compared pairs of detections and landmarks per run, given enough particles."""
 GATE = float(gates(1, 1.0 - 1e-4)[1])
+"""Squared distance beyond which a landmark is no candidate: its likelihood is negligible."""
 WIDE_GATE = GATE * (1.0 + 1e-6)
-"""By more than is rounded where part of it is tested ahead."""
+"""The same for tests of a part of it: wider by more than rounding."""
 ROOM = 2, 64
-"""Landmarks of a particle at most: so many for each that is known, and more."""
-FEWEST_EFFECTIVE = 0.5
-"""Share of particles that count, below which they are drawn anew."""
+"""Maximum number of landmarks of a particle: a multiple of the known ones, and a constant."""
+EFFECTIVE_SHARE = 0.5
+"""Effective share of particles below which they are resampled: usual in particle filters."""
+
+
+class _Rules(NamedTuple):
+    """Settings: sightings of a landmark, time after which it is forgotten without them, log odds of a common name, of
+    clutter and of a new landmark against a perfect match, and readings that a visit counts as.
+    """
+
+    fewest_sightings: int
+    forget_s: float
+    name_nats: float
+    none_nats: float
+    new_nats: float
+    most_readings: int
+
+    @classmethod
+    def of(cls, settings: SlamConfig) -> _Rules:
+        rules, none_nats = settings.association, settings.outlier_log_odds
+        return cls(
+            settings.fewest_sightings, rules.forget_s, rules.name_nats, none_nats,
+            none_nats + rules.particles.new_nats, rules.readings.most_readings,
+        )  # fmt: skip
 
 
 class _Seen(NamedTuple):
-    """Detections: rows of each frame (N + 1,), readings, variances and labels (M, 2), stamps of frames (N,); what they
-    are like (M, C), variances of that by readings (K, C), and how it spreads.
+    """Detections: rows of each frame (N + 1,), readings, variances and labels (M, 2), stamps of frames (N,); their
+    traits (M, C), variances of these by number of readings (K, C), and those between landmarks; and settings.
     """
 
     first: IntArray
@@ -59,6 +75,7 @@ class _Seen(NamedTuple):
     like: FloatArray
     errors: FloatArray
     spread: Variances
+    rules: _Rules
 
 
 class _Sensor(NamedTuple):
@@ -69,8 +86,8 @@ class _Sensor(NamedTuple):
 
 
 class _Cloud(NamedTuple):
-    """P particles with room for L landmarks each: place (P, 2, L) and spread (P, 3, L), in columns to be compared fast;
-    `of` is which landmark a slot is of, -1 for none; `like` (P, L, C) what it is like, by as many readings as `read`.
+    """P particles with room for L landmarks each: place (P, 2, L) and spread (P, 3, L), in columns for fast comparison;
+    `of` is the landmark of a slot, -1 for none; `like` (P, L, C) its traits, from `read` readings.
     """
 
     pose: FloatArray
@@ -87,8 +104,8 @@ class _Cloud(NamedTuple):
 
 
 class _Options(NamedTuple):
-    """Landmarks that a detection may be of: slots, log likelihoods, innovations, their covariances and derivatives; and
-    room for what is taken, and out of reach.
+    """Candidate landmarks of a detection: slots, log likelihoods, innovations, their covariances and derivatives; and
+    buffers for those that are taken, or out of reach.
     """
 
     slot: IntArray
@@ -101,16 +118,18 @@ class _Options(NamedTuple):
 
 
 def drawn(
-    assignment: Assignment, odometry: FloatArray, seed: int, *, wider: float = WIDER[0]
+    assignment: Assignment, odometry: FloatArray, seed: int, *, wider: float | None = None
 ) -> tuple[Assignment, float]:
-    """Return who is who as the best of particles has it, and the log evidence of all of them, up to a constant.
+    """Draw an assignment: that of the best particle, with the log evidence of all particles up to a constant.
 
     Args:
-        assignment: at its optimum, with the noise of sightings; its landmarks are known to within `BENT`.
+        assignment: at its optimum, with the noise of sightings; its landmarks are the prior.
         odometry: (5,) noise levels of the odometry.
-        seed: of what is drawn.
-        wider: of the noise of sightings.
+        seed: of the draws.
+        wider: factor on the noise of sightings; None for the first of `slam.association.particles.wider`.
     """
+    settings = assignment.settings
+    wider = settings.association.particles.wider[0] if wider is None else wider
     problem, states = assignment.measured, assignment.estimate.states
     count = np.clip(WORK / (len(problem.reading) * max(assignment.n_landmarks, 1)), FEWEST_PARTICLES, MOST_PARTICLES)
     motion = problem.drive.between(problem.stamp_s, states)
@@ -118,13 +137,14 @@ def drawn(
     noise = np.concatenate([np.eye(3)[None] / problem.start_information, spread])
     steps = np.vstack([problem.start_pose, motion.increment])
     first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
-    traits = assignment.traits or Traits.none(len(problem.reading))
+    traits = assignment.traits or Traits.none(len(problem.reading), settings)
     variance = (wider * problem.sigma_given) ** 2
     seen = _Seen(
-        first, problem.reading, variance, assignment.kind, problem.stamp_s, traits.value, traits.errors, traits.spread
-    )
+        first, problem.reading, variance, assignment.kind, problem.stamp_s, traits.value, traits.errors, traits.spread,
+        _Rules.of(settings),
+    )  # fmt: skip
     like = assignment.like() or traits.nothing(assignment.n_landmarks)
-    cloud = _begun(assignment.estimate.landmark, assignment.of_kind, like, int(count))
+    cloud = _begun(assignment.estimate.landmark, assignment.of_kind, like, int(count), settings)
     row, pose, evidence = _run(seen, _Sensor(problem.mount, states), steps, noise, cloud, seed)
     met, row[row >= 0] = np.unique(row[row >= 0], return_inverse=True)
     estimate = Estimate(pose, np.zeros((len(met), 2)), states.copy())
@@ -136,18 +156,20 @@ def drawn(
 
 
 def warm_up() -> None:
-    """Compile what `drawn` needs."""
+    """Compile the kernels of `drawn`."""
     one, two = np.zeros((1, 2)), np.ones((2, 2))
     traits = Traits.none(2)
     seen = _Seen(
-        np.arange(3), two, two, np.full((2, 2), UNKNOWN), np.arange(2.0), traits.value, traits.errors, traits.spread
-    )
-    cloud = _begun(one, np.full((1, 2), UNKNOWN), traits.nothing(1), 2)
+        np.arange(3), two, two, np.full((2, 2), UNKNOWN), np.arange(2.0), traits.value, traits.errors, traits.spread,
+        _Rules.of(USUAL),
+    )  # fmt: skip
+    cloud = _begun(one, np.full((1, 2), UNKNOWN), traits.nothing(1), 2, USUAL)
     _run(seen, _Sensor(np.zeros(3), np.zeros(9)), np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), cloud, 0)
 
 
-def _begun(place: FloatArray, label: IntArray, like: Likeness, count: int) -> _Cloud:
-    """Particles that know landmarks (L, 2), each about where it is."""
+def _begun(place: FloatArray, label: IntArray, like: Likeness, count: int, settings: SlamConfig) -> _Cloud:
+    """Particles with a prior of landmarks (L, 2)."""
+    bent, most = settings.association.particles.bent, settings.association.readings.most_readings
     n = len(place)
     room = ROOM[0] * n + ROOM[1]
     cloud = _Cloud(
@@ -159,9 +181,9 @@ def _begun(place: FloatArray, label: IntArray, like: Likeness, count: int) -> _C
     if n:
         away = np.ravel(KDTree(place).query(place, [2])[0]) if n > 1 else np.ones(1)
         cloud.place[:, :, :n], cloud.label[:, :n], cloud.of[:, :n] = place.T, label, np.arange(n)
-        cloud.spread[:, 0, :n] = cloud.spread[:, 2, :n] = (BENT * away) ** 2
-        cloud.sightings[:, :n] = FEWEST_SIGHTINGS
-        cloud.like[:, :n], cloud.read[:, :n] = like.value, np.minimum(like.readings, MOST_READINGS)
+        cloud.spread[:, 0, :n] = cloud.spread[:, 2, :n] = (bent * away) ** 2
+        cloud.sightings[:, :n] = settings.fewest_sightings
+        cloud.like[:, :n], cloud.read[:, :n] = like.value, np.minimum(like.readings, most)
     return cloud
 
 
@@ -169,7 +191,7 @@ def _begun(place: FloatArray, label: IntArray, like: Likeness, count: int) -> _C
 def _run(
     seen: Any, sensor: Any, steps: FloatArray, noise: FloatArray, cloud: Any, seed: int
 ) -> tuple[IntArray, FloatArray, float]:
-    """Frame by frame all particles, then back along the ancestors of the best."""
+    """Process all particles frame by frame, then go back along the ancestors of the best."""
     np.random.seed(seed)  # noqa: NPY002 - of the compiled code, in this thread
     frames, count, room = len(steps), len(cloud.pose), cloud.of.shape[1]
     path, parent = np.zeros((frames, count, 3)), np.zeros((frames, count), dtype=np.int32)
@@ -191,7 +213,7 @@ def _run(
             _move(pose, steps[t])
             for d in range(start, end):
                 n = _weigh(seen, d, sensor, pose, covariance, cloud, i, t * count + i, options)
-                k, gained = _draw(options.score, n, seen.variance[d])
+                k, gained = _draw(options.score, n, seen.variance[d], seen.rules)
                 weight[i] += gained
                 if k < n:
                     _correct(pose, covariance, options, k, across, gain, step)
@@ -205,7 +227,7 @@ def _run(
             path[t, i], parent[t, i] = cloud.pose[i], i
         top = weight.max()
         share = np.exp(weight - top)
-        if t < frames - 1 and share.sum() ** 2 < FEWEST_EFFECTIVE * count * (share * share).sum():
+        if t < frames - 1 and share.sum() ** 2 < EFFECTIVE_SHARE * count * (share * share).sum():
             evidence += top + np.log(share.mean())
             weight[:] = 0.0
             _resample(cloud, share / share.sum(), parent[t])
@@ -225,7 +247,7 @@ def _run(
 def _weigh(
     seen: Any, d: int, sensor: Any, pose: FloatArray, covariance: FloatArray, cloud: Any, i: int, now: int, options: Any
 ) -> int:
-    """Landmarks of particle `i` in whose gate detection `d` is, with all that an update needs; their number."""
+    """Fill `options` with the candidate landmarks of detection `d` in particle `i`; return their number."""
     mount, states, label = sensor.mount, sensor.states, seen.label[d]
     c, s, cm, sm = math.cos(pose[2]), math.sin(pose[2]), math.cos(mount[2]), math.sin(mount[2])
     bearing = seen.reading[d, 1] - states[4]
@@ -261,7 +283,7 @@ def _weigh(
             for q in range(3):
                 v11 += g[1, p] * covariance[p, q] * g[1, q]
         if (sb * ux - cb * uy) ** 2 > WIDE_GATE * v11:
-            continue  # no angle is less than its sine
+            continue  # an angle is not less than its sine
         expected = math.atan2(uy, ux)
         gain = 1.0 + states[1] + states[2] * expected + states[3] * expected**2
         e0, e1 = seen.reading[d, 0] - states[0] - gain * r, wrapped(bearing - expected)
@@ -281,7 +303,7 @@ def _weigh(
         sightings = cloud.sightings[i, k]
         score = math.log(sightings / (sightings + 1.0)) - 0.5 * (distance + math.log(det))
         if seen.like.shape[1] > 0:
-            read = min(int(cloud.read[i, k]), MOST_READINGS)
+            read = min(int(cloud.read[i, k]), seen.rules.most_readings)
             score += same_nats(
                 seen.like[d],
                 seen.errors[1],
@@ -290,7 +312,7 @@ def _weigh(
                 min(1.0, cloud.read[i, k]),
                 seen.spread,
             )
-        options.slot[n], options.score[n] = k, score + (NAMED_NATS if named else 0.0)
+        options.slot[n], options.score[n] = k, score + (seen.rules.name_nats if named else 0.0)
         options.innovation[n, 0], options.innovation[n, 1] = e0, e1
         options.covariance[n, 0], options.covariance[n, 1], options.covariance[n, 2] = v00, v01, v11
         n += 1
@@ -301,7 +323,7 @@ def _weigh(
 def _in_gate(
     place: FloatArray, spread: FloatArray, count: int, x: float, y: float, range_m: float, own: float, out: FloatArray
 ) -> None:
-    """Positive for landmarks whose distance cannot be what was measured: the gate of `_weigh`, a millionth wider."""
+    """Positive for landmarks whose distance contradicts the measured one: the gate of `_weigh`, a millionth wider."""
     squared, width = range_m * range_m, 2.0 * WIDE_GATE
     for k in range(count):
         dx, dy = place[0, k] - x, place[1, k] - y
@@ -311,10 +333,10 @@ def _in_gate(
 
 
 @kernel
-def _draw(score: FloatArray, n: int, variance: FloatArray) -> tuple[int, float]:
-    """One of `n` landmarks, none (n) or a new one (n + 1), by their likelihoods; and the log of their sum."""
+def _draw(score: FloatArray, n: int, variance: FloatArray, rules: Any) -> tuple[int, float]:
+    """Draw one of `n` landmarks, none (n) or a new one (n + 1), by likelihood; and the log of the sum of these."""
     perfect = -0.5 * math.log(variance[0] * variance[1])
-    score[n], score[n + 1] = perfect - NONE_NATS, perfect - NEW_NATS
+    score[n], score[n + 1] = perfect - rules.none_nats, perfect - rules.new_nats
     top, total = score[: n + 2].max(), 0.0
     for k in range(n + 2):
         total += math.exp(score[k] - top)
@@ -332,7 +354,7 @@ def _correct(
     pose: FloatArray, covariance: FloatArray, options: Any, k: int, across: FloatArray, gain: FloatArray,
     step: FloatArray,
 ) -> None:  # fmt: skip
-    """Update the pose, its error in its own frame, with option `k`, its place marginalised; with room for products."""
+    """Update the pose, with its error in its own frame, by option `k`, the landmark marginalised; with buffers."""
     h, e, v = options.by_pose[k], options.innovation[k], options.covariance[k]
     det = v[0] * v[2] - v[1] * v[1]
     for p in range(3):
@@ -358,7 +380,7 @@ def _move(pose: FloatArray, step: FloatArray) -> None:
 
 @kernel
 def _sample(pose: FloatArray, covariance: FloatArray, step: FloatArray) -> None:
-    """Draw a pose from a Gaussian in its own frame, in place; the covariance becomes its Cholesky factor."""
+    """Draw a pose from a Gaussian in its own frame, in place; overwrites the covariance with its Cholesky factor."""
     for p in range(3):
         for q in range(p + 1):
             value = covariance[p, q]
@@ -375,7 +397,7 @@ def _sample(pose: FloatArray, covariance: FloatArray, step: FloatArray) -> None:
 
 @kernel
 def _place(seen: Any, d: int, stamp_s: float, sensor: Any, cloud: Any, i: int, slot: int) -> int:
-    """Update the landmark in a slot with a detection, or start one (-2); return which it is, -1 for none."""
+    """Update the landmark in a slot with a detection, or start one (-2); return the landmark, -1 for none."""
     if slot == -1:
         return -1
     pose, mount, states, variance = cloud.pose[i], sensor.mount, sensor.states, seen.variance[d]
@@ -383,7 +405,7 @@ def _place(seen: Any, d: int, stamp_s: float, sensor: Any, cloud: Any, i: int, s
     bearing = seen.reading[d, 1] - states[4]
     gain = 1.0 + states[1] + states[2] * bearing + states[3] * bearing**2
     if slot == -2:
-        slot = _free_slot(cloud, i, stamp_s)
+        slot = _free_slot(cloud, i, stamp_s, seen.rules)
         if slot < 0:
             return -1
         r, angle = (seen.reading[d, 0] - states[0]) / gain, bearing + at[2]
@@ -432,10 +454,10 @@ def _place(seen: Any, d: int, stamp_s: float, sensor: Any, cloud: Any, i: int, s
 
 
 @kernel
-def _free_slot(cloud: Any, i: int, stamp_s: float) -> int:
-    """A slot that is free, as what was in it was seen too seldom; -1 where there is none."""
+def _free_slot(cloud: Any, i: int, stamp_s: float, rules: Any) -> int:
+    """A free slot, or that of a landmark with too few sightings; -1 if there is none."""
     for k in range(cloud.slots[i]):
-        if cloud.sightings[i, k] < FEWEST_SIGHTINGS and stamp_s - cloud.last_s[i, k] > FORGET_S:
+        if cloud.sightings[i, k] < rules.fewest_sightings and stamp_s - cloud.last_s[i, k] > rules.forget_s:
             return k
     if cloud.slots[i] == cloud.of.shape[1]:
         return -1
@@ -445,7 +467,7 @@ def _free_slot(cloud: Any, i: int, stamp_s: float) -> int:
 
 @kernel
 def _resample(cloud: Any, share: FloatArray, parent: IntArray) -> None:
-    """Draw particles by their shares (P,), with one random number (systematic); those that are not drawn give way."""
+    """Resample particles by their shares (P,), with one random number (systematic), in place."""
     count = len(share)
     copies, drawn_to, free, j = np.zeros(count, dtype=np.int64), share[0], 0, 0
     at = np.random.random() / count  # noqa: NPY002

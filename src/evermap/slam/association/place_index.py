@@ -1,10 +1,10 @@
-"""Where a local map may lie in a large one: an index over constellations, triangles of near places by their sides.
+"""Alignment of a local map with a large one: an index of constellations, triangles of near places by their sides.
 
-Trying every pair of places is quadratic in the map. A triangle of near landmarks has three lengths that no motion
-changes; a k-d tree of the triangles of the map answers which of them have the lengths of one of the local map. Each is
-a motion, and counts the landmarks of the local map that come to lie at a place. The best of them, one for each part of
-the map, are weighed exactly (`constellation`): where two are nearly as good, as in aisles that repeat, or where what
-agrees may do so by chance somewhere in a map of this size, the answer is that nothing is known.
+Trying every pair of places is quadratic in the map. The three lengths of a triangle of near landmarks are invariant to
+motions; a k-d tree of the triangles of the map finds those with the lengths of one of the local map. Each match gives a
+motion, scored by the number of landmarks of the local map near a place. The best motions, one per part of the map, are
+weighed exactly (`constellation`). If two are similar, as in repeating aisles, or if the agreement may be by chance in a
+map of this size, no pairs are returned.
 """
 
 from __future__ import annotations
@@ -17,60 +17,45 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
+from evermap.config import ConstellationConfig, SlamConfig
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
-from evermap.slam.association.constellation import (
-    CERTAIN_NATS,
-    MAX_MOTIONS,
-    MIN_SPAN_M,
-    MOTION_SIGMA,
-    NEAR_M,
-    LocalMap,
-    agreed_pairs,
-)
+from evermap.slam.association.constellation import MAX_MOTIONS, LocalMap, agreed_pairs
+from evermap.slam.streaming import USUAL
 from evermap.types import BoolArray, FloatArray, IntArray
 
 NEIGHBOURS = 7
-"""Places, the nearest, that make triangles with each place."""
-LONGEST_M = 25.0
-"""Longest side of a triangle."""
+"""Number of nearest places that form triangles with each place: bounds the size of the index."""
 FLATTEST = 0.05
-"""Least area of a triangle over its longest side squared: what lies on a line fixes no turn."""
+"""Least area of a triangle over its longest side squared: a tolerance, since points on a line determine no rotation."""
 LOOKED_UP = 80
-"""Triangles of the local map that are looked up, at most."""
+"""Maximum number of triangles of the local map that are looked up: bounds the work."""
 MOST_MATCHES = 30_000
-"""Matches of these that are followed."""
-SIDE_SIGMAS, SIDE_SLACK_M = 3.4, 0.02
-"""Three lengths within both maps differ by this many standard deviations in all, and a little, in 99 of 100 cases."""
-PART_M = 5.0
-"""Motions that take the local map this near to each other are one place of the map."""
+"""Maximum number of their matches that are used: bounds the work."""
 PATCH = 20
-"""Landmarks of the local map, those around the first, that are laid over the map at a time."""
+"""Number of neighbouring landmarks of the local map that are aligned together: bounds the work."""
 TRIES = 3
-"""Patches that are looked for in the whole map, at most."""
-LEAD_NATS = 20.0
-"""By which a place must beat all others, about three landmarks. In aisles that resemble each other the best of wrong
-places is ahead of the next by some nats, by 8 in a tenth of the cases and by up to 15 in 320."""
-SEEN_AGAIN = 0.4
-"""Share of a patch that has to be found in the map."""
-REACH_M = 15.0
-"""How far around a patch places are compared, once it is known where in the map it is."""
+"""Maximum number of patches that are searched for in the whole map: bounds the work."""
 
 
 class PlaceIndex:
-    """Places (P, 2) of a map with covariances (P, 2, 2) each; it keeps about 1 kB a place.
+    """Places (P, 2) of a map with covariances (P, 2, 2) each; uses about 1 kB per place.
 
-    `most_matches` of triangles are followed, those of the rarest first.
+    Up to `most_matches` of triangles are used, those of the rarest first.
     """
 
-    def __init__(self, position_m: FloatArray, covariance_m2: FloatArray, *, most_matches: int = MOST_MATCHES) -> None:
+    def __init__(
+        self, position_m: FloatArray, covariance_m2: FloatArray, *, most_matches: int = MOST_MATCHES,
+        settings: SlamConfig = USUAL,
+    ) -> None:  # fmt: skip
+        self._settings, self._rules = settings, settings.association.constellation
         self._most_matches = most_matches
         self._position, self._covariance = np.ascontiguousarray(position_m), covariance_m2
         self._tree = KDTree(self._position)
         self._sigma_m = (
             math.sqrt(float(np.median(np.trace(covariance_m2, axis1=1, axis2=2)))) if len(position_m) else 0.0
         )
-        self._corners = _triangles(self._position, self._tree, NEIGHBOURS)
+        self._corners = _triangles(self._position, self._tree, NEIGHBOURS, self._rules)
         sides, order = _sides(self._position[self._corners])
         self._corners = np.take_along_axis(self._corners, order, axis=1)
         self._by_sides = KDTree(sides, balanced_tree=False)
@@ -78,13 +63,13 @@ class PlaceIndex:
     def pairs(
         self, source: LocalMap, *, density: float, probability: float, given: Sequence[tuple[int, int]] = ()
     ) -> list[tuple[int, int]]:
-        """Return landmarks (rows of `source`) that surely stand at places of the map; none where that is not sure.
+        """Return pairs (row of `source`, row of the map) that are certain; empty if there are none.
 
         Args:
-            source: the local map, its landmarks in order of trust.
-            density: landmarks a square metre that one expects where they are not the same.
-            probability: least probability of a pair beside all overlays that differ in it alone.
-            given: pairs that are sure, as by name: where the others are looked for; none to look everywhere.
+            source: the local map, its best known landmarks first.
+            density: expected landmarks per square metre, if they are not the same.
+            probability: least probability of a pair, against all alignments that differ in this pair only.
+            given: certain pairs, for example by name, around which the others are searched; empty to search everywhere.
         """
         done = np.zeros(len(source.place), dtype=bool)
         if given:
@@ -105,53 +90,46 @@ class PlaceIndex:
         return []
 
     def motions(self, place: FloatArray, sigma_m: float) -> FloatArray:
-        """Return (K, 3) motions that take places (n, 2), `sigma_m` off, to the map; the best in each part of it."""
-        corners = _triangles(place, KDTree(place), min(NEIGHBOURS + 2, len(place) - 1))
+        """Return (K, 3) motions that align places (n, 2), of error `sigma_m`, with the map; the best of each part."""
+        corners = _triangles(place, KDTree(place), min(NEIGHBOURS + 2, len(place) - 1), self._rules)
         sides, order = _sides(place[corners])
         corners = np.take_along_axis(corners, order, axis=1)
-        within = SIDE_SIGMAS * math.hypot(sigma_m, self._sigma_m) + SIDE_SLACK_M
+        within = self._rules.side_sigmas * math.hypot(sigma_m, self._sigma_m) + self._rules.side_slack_m
         mine, theirs = self._alike(corners, sides, within)
         motion = rigid(place[mine], self._position[theirs])
         best = np.zeros(0, dtype=np.int64)
-        count, error = np.zeros(len(motion)), np.zeros(len(motion))
+        count, error, near_m = np.zeros(len(motion)), np.zeros(len(motion)), self._rules.near_m
         for begin in range(0, len(motion), 4096):
             part = slice(begin, begin + 4096)
-            gap = self._tree.query(se2.transform(motion[part, None], place), distance_upper_bound=NEAR_M)[0]
+            gap = self._tree.query(se2.transform(motion[part, None], place), distance_upper_bound=near_m)[0]
             count[part] = np.sum(np.isfinite(gap), axis=1)
-            error[part] = np.sum(np.minimum(gap, NEAR_M), axis=1)
+            error[part] = np.sum(np.minimum(gap, near_m), axis=1)
         middle = se2.transform(motion, place.mean(axis=0))
         left = np.lexsort((error, -count))
         while len(left) and len(best) < MAX_MOTIONS:
             best = np.append(best, left[0])
-            left = left[np.hypot(*(middle[left] - middle[left[0]]).T) > PART_M]
+            left = left[np.hypot(*(middle[left] - middle[left[0]]).T) > self._rules.same_place_m]
         return motion[best]
 
     def _first(self, source: LocalMap, rows: IntArray, density: float, probability: float) -> list[tuple[int, int]]:
-        """Pairs of some landmarks, wherever in the map they are."""
-        local, fewest = source.part(rows), max(3, SEEN_AGAIN * len(rows))
+        """Pairs of some landmarks, anywhere in the map."""
+        rules = self._rules
+        local, fewest = source.part(rows), max(3, rules.least_found * len(rows))
         motions = self.motions(local.place, local.beside_m)
         best = se2.transform(motions[:1, None], local.place)
-        if np.isfinite(self._tree.query(best, distance_upper_bound=NEAR_M)[0]).sum() < fewest:
+        if np.isfinite(self._tree.query(best, distance_upper_bound=rules.near_m)[0]).sum() < fewest:
             return []
-        places = self.around(se2.transform(motions[:, None], local.place).reshape(-1, 2), 2.0 * NEAR_M)
+        places = self.around(se2.transform(motions[:, None], local.place).reshape(-1, 2), 2.0 * rules.near_m)
         area_m2 = float(np.prod(np.ptp(self._position, axis=0)))
-        elsewhere = math.log(max(1.0, area_m2 / (2.0 * math.pi * MOTION_SIGMA[0] * MOTION_SIGMA[1])))
-        least = CERTAIN_NATS + elsewhere
-        found = self._agreed(
-            local,
-            places,
-            list(motions),
-            density=density,
-            probability=probability,
-            least_nats=least,
-            lead_nats=LEAD_NATS,
-        )
+        elsewhere = math.log(max(1.0, area_m2 / (2.0 * math.pi * rules.free_m * rules.free_m)))
+        margins = rules.certain_nats + elsewhere, rules.lead_nats
+        found = self._agreed(local, places, list(motions), density, probability, margins)
         return [(int(rows[k]), m) for k, m in found] if len(found) >= fewest else []
 
     def _further(
         self, source: LocalMap, mine: IntArray, theirs: IntArray, done: BoolArray, density: float, probability: float
     ) -> list[tuple[int, int]]:
-        """Pairs of the other landmarks, patch after patch outwards from those that were found."""
+        """Pairs of the other landmarks, patch by patch outwards from the known pairs."""
         found: list[tuple[int, int]] = []
         at, to = mine, theirs
         while not done.all():
@@ -163,8 +141,8 @@ class PlaceIndex:
             near = np.argsort(np.hypot(*(source.place[at] - start).T), kind="stable")[:PATCH]
             motion = rigid(source.place[at[near]], self._position[to[near]])
             rows = np.append(at[near], new)
-            places = self.around(se2.transform(motion, source.place[rows]), REACH_M)
-            pairs = self._agreed(source.part(rows), places, [motion], density=density, probability=probability)
+            places = self.around(se2.transform(motion, source.place[rows]), self._rules.reach_m)
+            pairs = self._agreed(source.part(rows), places, [motion], density, probability)
             fresh = [(int(rows[k]), m) for k, m in pairs if k >= len(near) and m not in to]
             if fresh:
                 found += fresh
@@ -172,24 +150,29 @@ class PlaceIndex:
         return found
 
     def around(self, at_m: FloatArray, reach_m: float) -> IntArray:
-        """Return rows of the places near any of some points (n, 2), sorted."""
+        """Return rows of the places near any point (n, 2), sorted."""
         near: Any = self._tree.query_ball_point(at_m, reach_m)
         return np.unique(np.fromiter(itertools.chain.from_iterable(near), dtype=np.int64))
 
     def _agreed(
-        self, local: LocalMap, places: IntArray, motions: list[FloatArray], **rules: float
-    ) -> list[tuple[int, int]]:
+        self, local: LocalMap, places: IntArray, motions: list[FloatArray], density: float, probability: float,
+        margins_nats: tuple[float, float] | None = None,
+    ) -> list[tuple[int, int]]:  # fmt: skip
+        """Pairs (row of `local`, row of the map) that are certain, among some places; see `agreed_pairs`."""
         joint = np.zeros((len(places), 2, len(places), 2))
         rows = np.arange(len(places))
         joint[rows, :, rows, :] = self._covariance[places]
         target = LocalMap(self._position[places], joint.reshape(2 * len(places), 2 * len(places)))
         allowed = np.ones((len(local.place), len(places)), dtype=bool)
-        pairs = agreed_pairs(local, target, allowed, motions=motions, **rules)
+        pairs = agreed_pairs(
+            local, target, allowed, density=density, probability=probability, motions=motions,
+            margins_nats=margins_nats, settings=self._settings,
+        )  # fmt: skip
         return [(k, int(places[m])) for k, m in pairs]
 
     def _alike(self, corners: IntArray, sides: FloatArray, within: float) -> tuple[IntArray, IntArray]:
-        """(K, 3) corners of local triangles and (K, 3) of those of the map that are alike; of the rarest first."""
-        # spread over the landmarks: what is new here, or gone there, is in none of some
+        """(K, 3) corners of local triangles and (K, 3) of matching ones of the map; the rarest first."""
+        # spread over the landmarks: some triangles are without new or vanished ones
         chosen = np.arange(len(corners))[:: max(1, len(corners) // LOOKED_UP)][:LOOKED_UP]
         looked: Any = self._by_sides.query_ball_point(sides[chosen][:, _TURNS], within)
         count = np.vectorize(len, otypes=[np.int64])(looked) if len(chosen) else np.zeros((0, len(_TURNS)), np.int64)
@@ -202,11 +185,11 @@ class PlaceIndex:
 
 
 _TURNS = np.array(list(itertools.permutations(range(3))))
-"""Ways in which corners may correspond: sides of nearly one length may be either."""
+"""Permutations of corners: sides of nearly equal length may be exchanged."""
 
 
-def _triangles(place: FloatArray, tree: KDTree, neighbours: int) -> IntArray:
-    """(T, 3) corners of different triangles of each place with two of its nearest, none too large, small or flat."""
+def _triangles(place: FloatArray, tree: KDTree, neighbours: int, rules: ConstellationConfig) -> IntArray:
+    """(T, 3) corners of different triangles of each place with two of its nearest; not too large, small or flat."""
     n = len(place)
     if n < 3:
         return np.zeros((0, 3), dtype=np.int64)
@@ -221,20 +204,21 @@ def _triangles(place: FloatArray, tree: KDTree, neighbours: int) -> IntArray:
     area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     length = np.linalg.norm(at - np.roll(at, 1, axis=1), axis=2)
     longest = length.max(axis=1)
-    good = (longest < LONGEST_M) & (length.min(axis=1) > MIN_SPAN_M) & (area > FLATTEST * longest**2)
+    good = (longest < rules.longest_side_m) & (length.min(axis=1) > rules.least_span_m)
+    good &= area > FLATTEST * longest**2
     kept: IntArray = corners[good]
     return kept
 
 
 def _sides(at: FloatArray) -> tuple[FloatArray, IntArray]:
-    """(T, 3) lengths of the sides of triangles (T, 3, 2), falling, and (T, 3) the corners opposite to them."""
+    """(T, 3) lengths of the sides of triangles (T, 3, 2), longest first, and (T, 3) the corners opposite to them."""
     length = np.linalg.norm(np.roll(at, -1, axis=1) - np.roll(at, -2, axis=1), axis=2)
     order = np.argsort(-length, axis=1, kind="stable")
     return np.take_along_axis(length, order, axis=1), order
 
 
 def _patch(place: FloatArray, start: FloatArray, done: BoolArray) -> IntArray:
-    """Rows of the nearest landmarks around a point that are not done."""
+    """Rows of the landmarks nearest to a point that are not done."""
     away = np.where(done, np.inf, np.hypot(*(place - start).T))
     near = np.argsort(away, kind="stable")[:PATCH]
     rows: IntArray = near[np.isfinite(away[near])]

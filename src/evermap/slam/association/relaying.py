@@ -1,9 +1,9 @@
-"""Stretches of a recording that lie beside where they belong: recognised by their constellation, and laid there.
+"""Displaced stretches of a recording: recognised by their constellation, and realigned.
 
-Where a loop was closed wrongly, or not closed because the robot had turned farther than it knew, everything met from
-then on is in the map twice, and each half agrees with itself: no gate finds that. But landmarks met one after the other
-have the shape of others that were met long before. Such a stretch is laid over those together with the poses since
-then, and what held it elsewhere is cut: a start from which the solver finds an optimum that can be compared.
+After a loop that was closed wrongly, or not closed because the heading error was too large, all landmarks since then
+are in the map twice, and each half is consistent: no gate detects that. But consecutive landmarks have the same
+constellation as others that were mapped long before. Such a stretch is aligned with those, together with the poses
+since then, and its other associations are removed: an initial value from which the solver finds an optimum to compare.
 """
 
 from __future__ import annotations
@@ -18,29 +18,26 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.slam.association.assignment import Assignment, alike
 from evermap.slam.association.constellation import LocalMap
-from evermap.slam.association.features import MISREAD_NATS
 from evermap.slam.association.merging import entries
 from evermap.slam.association.place_index import PATCH, PlaceIndex
 from evermap.slam.problem import Marginals
 from evermap.types import BoolArray, FloatArray, IntArray
 
 MATCHES = 4_000
-"""Triangles that are followed: nearly all of a stretch that was met before are there."""
-FEWEST = 4
-"""Landmarks of a stretch that must be found, seen in no frame beside those that they are."""
+"""Maximum number of matching triangles: bounds the work, since nearly all of a returning stretch match."""
 SAMPLED = 100
-"""Landmarks by which it is told how well neighbours are known beside each other, about."""
+"""Number of landmarks, about, from which the uncertainty between neighbours is estimated: bounds the work."""
 GROWN = 1.25
-"""Landmarks, relative to those at the last time, at which the older ones are indexed anew."""
+"""Growth of the number of landmarks after which the older ones are indexed again: bounds the work."""
 
 
 class Displaced(NamedTuple):
-    """Landmarks that were first met between two stamps and lie beside older ones that they probably are.
+    """Landmarks that were first detected between two stamps and are probably displaced copies of older ones.
 
     Attributes:
         younger, older: (K,) their rows.
         since_s, until_s: the stamps.
-        motion: (3,) from where they lie to where they belong.
+        motion: (3,) that corrects the displacement.
     """
 
     younger: IntArray
@@ -53,15 +50,17 @@ class Displaced(NamedTuple):
 def displaced_stretches(
     assignment: Assignment, marginals: Marginals, trusted: BoolArray, *, density: float, probability: float
 ) -> list[Displaced]:
-    """Return stretches of landmarks, met one after the other, with the shape of older ones; most landmarks first.
+    """Return stretches of consecutive landmarks with the constellation of older ones; those with most landmarks first.
 
     Args:
         assignment: at its optimum.
         marginals: covariances at it.
-        trusted: (L,) landmarks that are looked at.
-        density: landmarks a square metre that one expects.
+        trusted: (L,) landmarks that are used.
+        density: expected landmarks per square metre.
         probability: least probability of a pair.
     """
+    settings = assignment.settings
+    rules = settings.association
     place, first_s, found = assignment.estimate.landmark, assignment.first_seen_s, list[Displaced]()
     order = np.flatnonzero(trusted)[np.argsort(first_s[trusted], kind="stable")]
     shared, together, kind = assignment.shared_variance, assignment.together, assignment.of_kind
@@ -75,7 +74,8 @@ def displaced_stretches(
         if begin >= GROWN * indexed:
             older, indexed = order[:begin], begin
             variance = shared[older] + local(_with_nearest(place, older)).beside_m ** 2
-            index = PlaceIndex(place[older], variance[:, None, None] * np.eye(2), most_matches=MATCHES)
+            spread = variance[:, None, None] * np.eye(2)
+            index = PlaceIndex(place[older], spread, most_matches=MATCHES, settings=settings)
         some = order[begin : begin + PATCH]
         pairs = index.pairs(local(some), density=density, probability=probability)
         mine, theirs = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
@@ -83,28 +83,28 @@ def displaced_stretches(
         apart = (entries(together, younger, older) == 0) & alike(kind[younger], kind[older])
         younger, older = younger[apart], older[apart]
         if assignment.traits is not None and like is not None:
-            alike_too = assignment.traits.same(like.part(younger), like.part(older)) >= -MISREAD_NATS
+            alike_too = assignment.traits.same(like.part(younger), like.part(older)) >= -rules.readings.misread_nats
             younger, older = younger[alike_too], older[alike_too]
-        if len(younger) >= FEWEST:
+        if len(younger) >= rules.fewest_displaced:
             motion = rigid(place[younger], place[older])
             found.append(Displaced(younger, older, first_s[some[0]], first_s[some[-1]], motion))
     return sorted(found, key=lambda each: -len(each.younger))
 
 
 def _with_nearest(place: FloatArray, rows: IntArray) -> IntArray:
-    """Some rows, spread over all, each with the one whose place is nearest."""
+    """A sample of rows, each with its nearest neighbour."""
     some = rows[:: max(1, len(rows) // SAMPLED)]
     nearest = np.asarray(KDTree(place[rows]).query(place[some], k=2)[1])[:, 1]
     return np.unique(np.concatenate([some, rows[nearest]]))
 
 
 def laid(assignment: Assignment, stretch: Displaced, before: float) -> Assignment:
-    """Return the assignment with a stretch where it belongs, all since then with it.
+    """Return the assignment with a stretch realigned, and everything since then with it.
 
     Args:
         assignment: at its optimum.
-        stretch: what lies beside where it belongs.
-        before: how long before it landmarks that were met again are not believed to be those, relative to its length.
+        stretch: to be realigned.
+        before: duration before the stretch, relative to its length, in which associations with older landmarks are cut.
     """
     since_s = stretch.since_s - before * (stretch.until_s - stretch.since_s)
     row, stamp_s = assignment.landmark_row, assignment.measured.stamp_s[assignment.measured.pose_row]

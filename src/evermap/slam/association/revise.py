@@ -1,9 +1,9 @@
-"""Every detection compared once more with the smoothed map: who it belongs to, and who was overlooked.
+"""Reassignment of every detection with the smoothed map, and landmarks that were overlooked.
 
-Given all poses, detections no longer share much of an error, so each is compared by itself. What the estimate owes to a
-detection is known from the factorisation (`Marginals.explained_detections`); it is taken for that of the landmarks
-beside, too. Of a frame's detections a landmark takes one. Detections that are left and lie together, from frames
-enough, are a landmark that was overlooked.
+Given all poses, the errors of detections are almost independent, so each is compared by itself. The part of a residual
+that the uncertainty of the estimate explains is known from the factorisation (`Marginals.explained_detections`); it is
+also used for neighbouring landmarks. A landmark takes one detection per frame. Clusters of remaining detections, from
+enough frames, are overlooked landmarks.
 """
 
 from __future__ import annotations
@@ -15,31 +15,29 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.special import gammainc
 
-from evermap.slam.association.assignment import FEWEST_SIGHTINGS, NOBODY, Assignment, alike, same_name
-from evermap.slam.association.jcbb import CONFIDENCE, gates
+from evermap.slam.association.assignment import NOBODY, Assignment, alike, same_name
+from evermap.slam.association.jcbb import gates
 from evermap.slam.association.merging import in_reach
 from evermap.slam.kernels import kernel
 from evermap.slam.linearise import detection_residuals
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
-P_OWN = 0.5
-"""Least probability of the landmark that a detection is given to."""
-LEAST_SEEN = 1.0 / 3.0
-"""Share of the sightings of a typical landmark that lies as it does, below which something is none."""
 LOOK_BINS = 12
-"""Classes of range with as many detections each, within which landmarks are typically seen alike."""
+"""Number of bins of range, with equal numbers of detections, in which the usual rate of sightings is estimated."""
 ROUNDS = 20
+"""Maximum number of rounds of rates and landmarks; they converge within a few."""
 
 
 def reassigned(assignment: Assignment, explained: FloatArray, *, density: float) -> Assignment:
-    """Return the assignment with every detection given to the landmark that it most probably is of, or to none.
+    """Return the assignment with every detection assigned to its most probable landmark, or to none.
 
     Args:
         assignment: at its optimum.
-        explained: (M, 2, 2) whitened part of the residuals of detections with a landmark that the estimate's own
-            uncertainty explains, in the order of `assignment.problem()`.
-        density: landmarks a square metre that one expects, known or not.
+        explained: (M, 2, 2) whitened part of the residuals of assigned detections that the uncertainty of the estimate
+            explains, in the order of `assignment.problem()`.
+        density: expected landmarks per square metre, mapped or not.
     """
+    settings = assignment.settings.association
     problem, estimate = assignment.measured, assignment.estimate
     sigma = problem.sigma_given
     if assignment.n_landmarks == 0:
@@ -50,7 +48,7 @@ def reassigned(assignment: Assignment, explained: FloatArray, *, density: float)
     spread = np.where(np.isfinite(spread), spread, np.nanmedian(spread) if used.any() else 1.0)
     at = assignment.points()
     wide = np.hypot(sigma[:, 0], problem.reading[:, 0] * sigma[:, 1]) * np.sqrt(1.0 + spread)
-    gate = gates(1, CONFIDENCE)[1]
+    gate = gates(1, settings.gate_confidence)[1]
     seen, row = in_reach(estimate.landmark, at, float(np.sqrt(gate) * np.quantile(wide, 0.99)))
     same = may_be_of(assignment.kind[seen], assignment.of_kind[row])
     seen, row = seen[same], row[same]
@@ -58,7 +56,7 @@ def reassigned(assignment: Assignment, explained: FloatArray, *, density: float)
     residual = detection_residuals(compared, estimate)
     variance = sigma[seen] ** 2 * (1.0 + spread[seen])[:, None]
     squared = (residual**2 / variance).sum(axis=1)
-    # a square metre has r dr db
+    # area element r dr db
     new = np.log(density * np.maximum(problem.reading[seen, 0], 0.1))
     score = -0.5 * (squared + np.log(variance).sum(axis=1)) - np.log(2.0 * np.pi) - new
     like = assignment.like()
@@ -66,39 +64,42 @@ def reassigned(assignment: Assignment, explained: FloatArray, *, density: float)
         score += assignment.traits.same(assignment.traits.singly(seen), like.part(row))
     inside = (squared < gate) & (score > 0.0)
     seen, row, score = seen[inside], row[inside], score[inside]
-    found = most_probable(seen, row, score, problem.pose_row, assignment.n_landmarks)
-    named = assignment.kind[:, -1] != UNKNOWN  # a name ties the ends of a loop, however far off they are
+    found = most_probable(seen, row, score, problem.pose_row, assignment.n_landmarks, settings.p_own)
+    named = assignment.kind[:, -1] != UNKNOWN  # a name closes a loop at any distance
     return replace(assignment, landmark_row=np.where((found == NOBODY) & named, assignment.landmark_row, found))
 
 
 def may_be_of(detection: IntArray, landmark: IntArray) -> BoolArray:
-    """Return which detections may be of landmarks by labels (K, P) of both: one with a name of one with that name."""
+    """Return which pairs are compatible by labels (K, P) of both; a detection with a name needs a landmark with it."""
     named = detection[:, -1] != UNKNOWN
     found: BoolArray = alike(detection, landmark) & (~named | same_name(detection, landmark))
     return found
 
 
-def most_probable(seen: IntArray, row: IntArray, score: FloatArray, frame: IntArray, n_landmarks: int) -> IntArray:
-    """Return (M,) the landmark that each detection most probably is of, `NOBODY` for none; one a landmark and frame.
+def most_probable(
+    seen: IntArray, row: IntArray, score: FloatArray, frame: IntArray, n_landmarks: int, p_own: float
+) -> IntArray:
+    """Return (M,) the most probable landmark of each detection, `NOBODY` for none; one per landmark and frame.
 
     Args:
         seen: (K,) detections.
-        row: (K,) landmarks that they may be of.
-        score: (K,) log odds of each against being new.
+        row: (K,) candidate landmarks.
+        score: (K,) log odds of each over a new landmark.
         frame: (M,) of all detections.
-        n_landmarks: how many there are.
+        n_landmarks: number of landmarks.
+        p_own: least probability.
     """
     weight = np.exp(np.minimum(score, 500.0))
     share = weight / (1.0 + np.bincount(seen, weight, len(frame))[seen])
     order = np.lexsort((-score, frame[seen]))
-    return _given(seen[order], row[order], frame, share[order] > P_OWN, len(frame), n_landmarks)
+    return _given(seen[order], row[order], frame, share[order] > p_own, len(frame), n_landmarks)
 
 
 @kernel
 def _given(
     seen: IntArray, row: IntArray, pose_row: IntArray, sure: BoolArray, n_detections: int, n_landmarks: int
 ) -> IntArray:
-    """(M,) landmark of every detection: candidates in order of frame and score, one detection a landmark and frame."""
+    """(M,) landmark of every detection: candidates in order of frame and score, one per landmark and frame."""
     taken = np.full(n_detections, -1)
     last = np.full(n_landmarks, -1)
     for k in range(len(seen)):
@@ -109,45 +110,46 @@ def _given(
 
 
 def with_overlooked(assignment: Assignment) -> Assignment:
-    """Return the assignment with new landmarks where detections of none lie together in frames enough."""
-    problem = assignment.measured
+    """Return the assignment with a new landmark per cluster of unassigned detections from enough frames."""
+    problem, fewest = assignment.measured, assignment.settings.fewest_sightings
     left = np.flatnonzero(assignment.landmark_row == NOBODY)
-    if len(left) < FEWEST_SIGHTINGS:
+    if len(left) < fewest:
         return assignment
     at, sigma = assignment.points()[left], problem.sigma_given[left]
     wide = np.hypot(sigma[:, 0], problem.reading[left, 0] * sigma[:, 1])
     row, places = assignment.landmark_row.copy(), [assignment.estimate.landmark]
-    for mine in lying_together(at, wide, assignment.kind[left], problem.pose_row[left]):
+    for mine in lying_together(at, wide, assignment.kind[left], problem.pose_row[left], fewest):
         row[left[mine]] = assignment.n_landmarks + len(places) - 1
         places.append(_middle(at[mine], wide[mine])[None])
     estimate = replace(assignment.estimate, landmark=np.concatenate(places))
     return replace(assignment, landmark_row=row, estimate=estimate)
 
 
-def lying_together(at: FloatArray, wide: FloatArray, kind: IntArray, frame: IntArray) -> list[IntArray]:
-    """Return groups of detections that lie together in `FEWEST_SIGHTINGS` frames or more, one of each frame.
+def lying_together(at: FloatArray, wide: FloatArray, kind: IntArray, frame: IntArray, fewest: int) -> list[IntArray]:
+    """Return clusters of detections from at least `fewest` frames, one detection per frame.
 
     Args:
-        at: (M, D) places in the world.
+        at: (M, D) positions in the world.
         wide: (M,) their standard deviations.
         kind: (M, P) classes and names.
         frame: (M,) frames.
+        fewest: frames of a cluster, at least.
     """
     free, found = np.ones(len(at), dtype=bool), []
     tree = KDTree(at)
     found_near: Any = tree.query_ball_point(at, 3.0 * wide, return_sorted=False)
     near = [np.array(each, dtype=np.int64) for each in found_near]
     for k in np.argsort([-len(each) for each in near], kind="stable").tolist():
-        if not free[k] or np.count_nonzero(free[near[k]]) < FEWEST_SIGHTINGS:
+        if not free[k] or np.count_nonzero(free[near[k]]) < fewest:
             continue
         mine = near[k][free[near[k]] & alike(kind[near[k]], kind[k])]
         mine = mine[alike(kind[mine], _most_frequent(kind[mine]))]
         mine = mine[np.unique(frame[mine], return_index=True)[1]]
-        if len(mine) < FEWEST_SIGHTINGS:
+        if len(mine) < fewest:
             continue
         off = np.linalg.norm(at[mine] - _middle(at[mine], wide[mine]), axis=1)
         mine = mine[off < 3.0 * wide[mine]]
-        if len(mine) < FEWEST_SIGHTINGS:
+        if len(mine) < fewest:
             continue
         free[mine] = False
         found.append(mine)
@@ -155,7 +157,7 @@ def lying_together(at: FloatArray, wide: FloatArray, kind: IntArray, frame: IntA
 
 
 def _most_frequent(kind: IntArray) -> IntArray:
-    """(P,) the label that most detections (M, P) have in each column, `UNKNOWN` where none has one."""
+    """(P,) the most frequent label of detections (M, P) in each column, `UNKNOWN` for none."""
     found = np.full(kind.shape[1], UNKNOWN)
     for column, values in enumerate(kind.T):
         known, count = np.unique(values[values != UNKNOWN], return_counts=True)
@@ -165,19 +167,19 @@ def _most_frequent(kind: IntArray) -> IntArray:
 
 
 def _middle(at: FloatArray, wide: FloatArray) -> FloatArray:
-    """Weighted mean of places."""
+    """Weighted mean of positions."""
     weight = 1.0 / wide**2
     return np.asarray((weight[:, None] * at).sum(axis=0) / weight.sum())
 
 
 def likely_real(assignment: Assignment) -> BoolArray:
-    """Return (L,) landmarks that are seen as often as they should be; ghosts and corners of cars are seen too seldom.
+    """Return (L,) whether a landmark is detected often enough; ghosts and corners of cars are detected too seldom.
 
-    The sightings of a landmark are Poisson, with a mean that is its own share of what is expected: of the frames that
-    have it in view, as many as see a typical landmark at that range. Something is no landmark if its share is rather
-    below `LEAST_SEEN` than above (posterior with a flat prior; what is none tells nothing about what is typical).
+    The number of sightings of a landmark is Poisson, with its own share of the expected number as the mean: the frames
+    with its place in view, times the usual rate of sightings at that range. It is no landmark if its share is probably
+    below `slam.association.least_seen` (posterior with a flat prior; the usual rate is that of the landmarks only).
     """
-    real = np.ones(assignment.n_landmarks, dtype=bool)
+    real, least = np.ones(assignment.n_landmarks, dtype=bool), assignment.settings.association.least_seen
     used = assignment.landmark_row >= 0
     if not used.any():
         return real
@@ -191,7 +193,7 @@ def likely_real(assignment: Assignment) -> BoolArray:
     np.add.at(hits, (assignment.landmark_row[used], which), 1.0)
     for _ in range(ROUNDS):
         rate = hits[real].sum(axis=0) / np.maximum(looks[real].sum(axis=0), 1.0)
-        before, real = real, gammainc(hits.sum(axis=1) + 1.0, LEAST_SEEN * (looks @ rate)) <= 0.5
+        before, real = real, gammainc(hits.sum(axis=1) + 1.0, least * (looks @ rate)) <= 0.5
         if np.array_equal(before, real):
             break
     return real
@@ -199,7 +201,7 @@ def likely_real(assignment: Assignment) -> BoolArray:
 
 @kernel
 def _looks(pose: FloatArray, place: FloatArray, edges: FloatArray, view: FloatArray) -> FloatArray:
-    """(L, B) poses that have a place in view, by range."""
+    """(L, B) number of poses with a place in view, by range."""
     looks = np.zeros((len(place), len(edges) - 1))
     for k in range(len(place)):
         for n in range(len(pose)):

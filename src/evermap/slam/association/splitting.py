@@ -1,9 +1,9 @@
-"""Landmarks that are two: visits whose detections contradict the rest of the recording, though the map was bent to fit.
+"""Landmarks to be split: visits whose detections contradict the rest of the recording in spite of the fit.
 
-Detections that were given to a landmark wrongly bend the map until it fits, and the residuals look small. If the
-detections of one visit had a landmark of their own, the optimum would put it at `d = V L' b` from that of the others,
-with `V^-1 = L' (I - A S A') L` (a score test: `A x + L d = b` are these detections, linearised and whitened, `S` the
-covariance of the solution). No other solution is needed for that.
+Wrongly assigned detections distort the map until it fits, and leave small residuals. If the detections of one visit had
+a landmark of their own, the optimum would place it at `d = V L' b` from that of the others, with
+`V^-1 = L' (I - A S A') L` (a score test: `A x + L d = b` are these detections, linearised and whitened, `S` the
+covariance of the solution). No further solution is needed.
 """
 
 from __future__ import annotations
@@ -19,29 +19,28 @@ from evermap.slam.problem import Marginals
 from evermap.types import BoolArray, FloatArray, IntArray
 
 LEAST_M2 = 1e-6
-"""Information [1/m^2] of what ties a visit to nothing else."""
-
+"""Information [1/m^2] that keeps an unobservable visit regular: a tolerance."""
 LEAST_SHARE = 1e-6
-"""Share of what is known of a landmark by other visits, at least."""
+"""Least share of the information on a landmark from its other visits: a tolerance against cancellation."""
 TOGETHER = 32
-"""Visits that are weighed at a time."""
+"""Number of visits per batch: bounds the memory."""
 
 
 class Visits(NamedTuple):
-    """Stretches of time in which a landmark was seen, of landmarks that have several; V of them.
+    """Visits of landmarks that have several; V of them.
 
     Attributes:
         rows: (V,) of the detections of each.
-        landmark: (V,) that they were given to.
-        squared: (V,) normalised squared distance from where the others put it.
-        told: (V,) by what they are like, that both are one [nats].
-        evidence: (V,) that both are one, over being two [nats], with that.
+        landmark: (V,) of each.
+        squared: (V,) normalised squared distance from the position by the other visits.
+        by_traits: (V,) evidence of the traits that both are the same landmark [nats].
+        evidence: (V,) that both are the same, over two landmarks, including the traits [nats].
     """
 
     rows: list[IntArray]
     landmark: IntArray
     squared: FloatArray
-    told: FloatArray
+    by_traits: FloatArray
     evidence: FloatArray
 
 
@@ -52,27 +51,25 @@ def weighed_visits(
     *,
     among: BoolArray,
     density: float,
-    pause_s: float,
 ) -> Visits:
-    """Return how well each visit agrees with all that is known without it.
+    """Weigh each visit against the estimate without it.
 
     Args:
         assignment: at its optimum.
         marginals: covariances at it.
         linear: (M, 2, 11) detections with a landmark, linearised there (`Smoother.detections`).
         among: (L,) landmarks whose visits are weighed.
-        density: landmarks a square metre that one expects.
-        pause_s: time without a detection that ends a visit.
+        density: expected landmarks per square metre.
     """
     used = np.flatnonzero(assignment.landmark_row >= 0)
     row, pose = assignment.landmark_row[used], assignment.measured.pose_row[used]
-    number = assignment.visits(pause_s)[used]
+    number = assignment.of_visits()[0][used]
     of = row[np.unique(number, return_index=True)[1]]
     wanted = (np.bincount(of, minlength=assignment.n_landmarks) > 1) & among
     every = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
     every = [every[k] for k in np.flatnonzero(wanted[of])]
     landmark = np.array([row[visit[0]] for visit in every], dtype=np.int64)
-    in_time = np.argsort([visit[0] for visit in every], kind="stable")  # what is near in time shares its way
+    in_time = np.argsort([visit[0] for visit in every], kind="stable")  # near in time: common poses
     shared = 2.0 * assignment.shared_variance[landmark]
     gap, own = np.empty((len(every), 2)), np.empty((len(every), 2, 2))
     for at in range(0, len(every), TOGETHER):
@@ -81,13 +78,13 @@ def weighed_visits(
     own += shared[:, None, None] * np.eye(2)
     squared = np.einsum("va,va->v", gap, np.linalg.solve(own, gap[:, :, None])[:, :, 0])
     evidence = -0.5 * (squared + np.linalg.slogdet(2.0 * np.pi * own)[1]) - math.log(density)
-    told = told_by_others(assignment, pause_s)[wanted[of]]
-    return Visits([used[visit] for visit in every], landmark, squared, told, evidence + told)
+    by_traits = traits_against_others(assignment)[wanted[of]]
+    return Visits([used[visit] for visit in every], landmark, squared, by_traits, evidence + by_traits)
 
 
-def told_by_others(assignment: Assignment, pause_s: float) -> FloatArray:
-    """Return (W,) nats for each visit to be to the landmark of its others, by what it is like; 0 where it has none."""
-    visit, landmark = assignment.of_visits(pause_s)
+def traits_against_others(assignment: Assignment) -> FloatArray:
+    """Return (W,) evidence of the traits that each visit is to the landmark of its others [nats]; 0 without others."""
+    visit, landmark = assignment.of_visits()
     if assignment.traits is None:
         return np.zeros(len(landmark))
     one = assignment.traits.of_visits(visit, len(landmark))
@@ -103,7 +100,7 @@ def told_by_others(assignment: Assignment, pause_s: float) -> FloatArray:
 def _apart(
     linear: FloatArray, pose: IntArray, visits: list[IntArray], landmark: IntArray, marginals: Marginals
 ) -> tuple[FloatArray, FloatArray]:
-    """(V, 2) from each visit's landmark to that of the others, were they two, and the covariances (V, 2, 2)."""
+    """(V, 2) from the landmark of each visit to that of the others, if they are two, and the covariances (V, 2, 2)."""
     rows, of = np.concatenate(visits), np.repeat(np.arange(len(visits)), [len(visit) for visit in visits])
     (poses, at), (places, which) = (np.unique(each, return_inverse=True) for each in (pose[rows], landmark))
     tie, n = linear[rows][:, :, 3:5], 3 * len(poses)
