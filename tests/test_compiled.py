@@ -277,3 +277,80 @@ def test_blas_has_one_thread_while_any_thread_asks_for_it_and_then_what_it_had()
     code = [sys.executable, "-c", ONE_THREAD]
     done = subprocess.run(code, capture_output=True, text=True, env=environment, check=False)
     assert (done.stderr, done.stdout) == ("", "done\n")
+
+
+SHARED = """
+import sys
+from pathlib import Path
+
+from evermap.compiled import kept, shared_with
+
+@kept()
+def one(x):
+    return x + 1.0
+
+@kept()
+def two(x):
+    return x + 2.0
+
+if __name__ == "__main__":
+    Path("second").write_text(str(two(1.0)))
+else:
+    with shared_with("halves"):
+        one(1.0)
+    two(1.0)
+    print(bool(two.stats.cache_hits), Path("second").exists())
+"""
+
+
+def test_a_second_process_compiles_the_other_half_only_where_something_is_missing(tmp_path: Path) -> None:
+    """When the block ends, both halves are kept. Where they are, no process is started."""
+    if (os.cpu_count() or 1) < 2:
+        pytest.skip("one core: no second process")
+    (tmp_path / "halves.py").write_text(SHARED)
+
+    def run() -> str:
+        command = [sys.executable, "-c", "import halves"]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.strip()
+
+    assert run() == "True True"
+    (tmp_path / "second").unlink()
+    assert run() == "True False"
+
+
+FAILING = """
+import time
+from pathlib import Path
+
+from evermap.compiled import kept, shared_with
+
+@kept()
+def one(x):
+    return x + 1.0
+
+with shared_with("slow"):
+    one(1.0)
+    while not (Path("pid").exists() and Path("pid").read_text()):
+        time.sleep(0.01)
+    raise KeyboardInterrupt
+"""
+SLOW = """
+import os, time
+from pathlib import Path
+
+Path("pid").write_text(str(os.getpid()))
+time.sleep(600)
+"""
+
+
+def test_the_second_process_ends_with_a_block_that_fails(tmp_path: Path) -> None:
+    """As by Ctrl-C."""
+    if (os.cpu_count() or 1) < 2:
+        pytest.skip("one core: no second process")
+    (tmp_path / "failing.py").write_text(FAILING)
+    (tmp_path / "slow.py").write_text(SLOW)
+    command = [sys.executable, "-c", "import failing"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "KeyboardInterrupt" in done.stderr
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)

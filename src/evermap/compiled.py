@@ -9,6 +9,7 @@ import hashlib
 import os
 import pickle  # nosec  # B403: for the name of its error: the index of kept code is numba's, in a folder of this user
 import stat
+import subprocess
 import sys
 import tempfile
 import threading
@@ -60,6 +61,39 @@ def _set_threads(library: Any, number: int) -> None:
     """Also after another thread has done so, which threadpoolctl 3.8 ignores without a word."""
     getattr(library, "_real_set_num_threads", library.set_num_threads)(number)
 
+
+@contextlib.contextmanager
+def shared_with(module: str) -> Iterator[None]:
+    """Run a second process that compiles one half of the kernels, while this one compiles the other.
+
+    The process is started when a kernel turns out not to be kept, unless there is one core only. The block waits for
+    it at its end; an exception kills it. Whatever it leaves undone is compiled at its first call.
+
+    Args:
+        module: run as `python -m MODULE`; it calls kernels that the block does not.
+    """
+    second: list[subprocess.Popen[bytes]] = []
+
+    def start() -> None:
+        quiet = subprocess.DEVNULL
+        with contextlib.suppress(OSError):
+            second.append(subprocess.Popen([sys.executable, "-m", module], stdin=quiet, stdout=quiet, stderr=quiet))
+
+    if (os.cpu_count() or 1) > 1:
+        _AT_FIRST_MISSING.append(start)
+    try:
+        yield
+        for process in second:
+            process.wait()
+    finally:
+        _AT_FIRST_MISSING.clear()
+        for process in second:
+            process.kill()
+            process.wait()
+
+
+_AT_FIRST_MISSING: list[Callable[[], None]] = []
+"""What is called, once, when a kernel is not kept."""
 
 UNREADABLE = (AttributeError, ImportError, EOFError, pickle.UnpicklingError)
 """Errors of a cache index that names types missing in this evermap, or that is truncated."""
@@ -168,10 +202,13 @@ def _keeper() -> Callable[[Any], Any]:
             with _locked(Path(self.cache_path)):
                 self._stamp()
                 try:
-                    return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+                    found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
                 except UNREADABLE:
                     self.flush()  # type: ignore[no-untyped-call]
-                    return None
+                    found = None
+            while found is None and _AT_FIRST_MISSING:
+                _AT_FIRST_MISSING.pop()()
+            return found
 
         def save_overload(self, sig: Any, data: Any) -> None:
             with _locked(Path(self.cache_path)):

@@ -7,9 +7,12 @@ from typing import Literal
 
 import numpy as np
 
+from evermap.compiled import shared_with
 from evermap.config import Config
+from evermap.existence.lifetimes import log_death_odds
 from evermap.geometry.se3 import NO_TURN
 from evermap.pipeline import run_session, run_slam
+from evermap.survival import GeneralPurpose
 from evermap.types import (
     UNKNOWN,
     Detections,
@@ -66,10 +69,14 @@ def warm_up(
 
         of_the_localizer()
         return
-    from evermap.slam.warmup import warm_up as of_the_estimator
+    from evermap.slam import warmup
 
     config = Config(slam={"unknown_ids": unknown_ids})
-    of_the_estimator(search=search or sessions)
+    with shared_with("evermap.cli.warmup"):
+        warmup.filtered()
+        if search or sessions:
+            warmup.searched()
+        log_death_odds((GeneralPurpose(1e-8, 1.0),), np.zeros(1, dtype=np.int64), np.zeros(1), np.ones(1))
     if unknown_ids:
         from evermap.slam.association.consensus import warm_up as of_the_association
         from evermap.slam.association.particles import warm_up as of_the_particles
@@ -140,3 +147,10 @@ def _flight(start_s: float) -> SpatialRecording:
     )
     odometry = SpatialOdometry(planar.frames.stamp_s, pose, np.full((FRAMES, 6), np.nan))
     return SpatialRecording("warm-up", odometry, planar.frames, detections, (SpatialSensor(),))
+
+
+if __name__ == "__main__":  # the second process: what is left when the first has compiled the filter and the search
+    from evermap.slam.warmup import smoothed
+
+    smoothed()
+    run_slam(_drive(0.0))

@@ -8,17 +8,24 @@ import numpy as np
 from scipy import sparse
 
 from evermap.config import ChangesConfig
+from evermap.sensing.visibility import NominalField
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import WindowEvidence, compare
 from evermap.slam.changes.search import find_changes
-from evermap.slam.noise import START
-from evermap.slam.problem import Drive, Problem
+from evermap.slam.noise import START, refine_noise
+from evermap.slam.problem import Drive, Estimate, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.sparse.elimination import curvature
-from evermap.slam.sparse.system import System
+from evermap.slam.sparse.system import System, exhausted
 from evermap.slam.sparse.tree import Factors
 from evermap.slam.streaming import FIRST_RELINEARISATION, StreamingSlam
+from evermap.types import Sensor
+
+FORWARD_MPS = 0.1
+PLACE = (3.0, 1.0)
+"""[m], of the landmark that the drive along x passes."""
+FRAMES_FILTERED = 3
 
 
 def warm_up(*, search: bool = True) -> None:
@@ -29,58 +36,83 @@ def warm_up(*, search: bool = True) -> None:
     Args:
         search: those of the search for changes, too; see `changes.joint.may_search`.
     """
-    _drive()
+    filtered()
     if search:
-        _search()
+        searched()
+    smoothed()
+    _finished()
 
 
 @functools.cache
-def _drive() -> None:
-    """Drive past one landmark, through everything that is compiled."""
+def filtered() -> None:
+    """Compile the filter, what interpolates its poses, and the field of view: frames before a relinearisation."""
+    problem = _drive()
+    slam = _slam(problem)
+    for _ in range(FRAMES_FILTERED):
+        slam.step()
+    stamps = problem.stamp_s[:2]
+    covariance, cross = np.tile(np.eye(3), (2, 1, 1)), np.zeros((1, 3, 3))
+    bridged(stamps, stamps, np.zeros((2, 3)), covariance, cross, problem.drive, problem.prior.mean, START)
+    dead_reckoned(stamps, problem.drive, problem.prior.mean, START)
+    NominalField(Sensor(range_max_m=5.0)).p_detect(np.zeros((1, 3)), np.array([PLACE]))
+
+
+@functools.cache
+def searched() -> None:
+    """Compile the search for changes: three landmarks at their places."""
+    place, sure, count = 3.0 * np.eye(3, 2), np.eye(6), 3
+    evidence = WindowEvidence(np.arange(count), np.zeros(count, dtype=np.int64), place, sure, np.zeros(6), 0.0)
+    comparison = compare(evidence, place, np.tile(np.eye(2), (count, 1, 1)), np.ones(count, dtype=np.bool_))
+    find_changes(evidence, comparison, place, 1, ChangesConfig())
+
+
+@functools.cache
+def smoothed() -> None:
+    """Compile the batch solution: the whole drive, from where it is known to lead."""
+    problem = _drive()
+    smoother = Smoother(problem, START)
+    pose = np.pad(FORWARD_MPS * problem.stamp_s[:, None], ((0, 0), (0, 2)))
+    start = Estimate(pose, np.array([PLACE]), problem.prior.mean)
+    estimate, marginals = exhausted(smoother.solved_in_slices(start, iterations=1))
+    refine_noise(problem, estimate, marginals, smoother.inlier_probability(estimate), START)
+    smoother.worth(estimate, marginals)
+    _ = marginals.pose, marginals.consecutive
+    smoother.information(estimate, np.array([0, len(pose) - 1]))
+    one = np.ones(1, dtype=np.int64)
+    alone = System(one, Factors(np.arange(2), 0 * one, one, 0 * one), np.zeros((1, 3)), np.zeros(0, dtype=np.int64))
+    curvature(alone.tree, alone.factors, np.zeros(2))  # only steps that are damped ask for it
+
+
+@functools.cache
+def _finished() -> None:
+    """Drive all the way, through what the parts may have left out."""
+    problem = _drive()
+    slam = _slam(problem)
+    for _ in problem.stamp_s:
+        slam.step()
+    slam.finish()
+
+
+def _slam(problem: Problem) -> StreamingSlam:
+    return StreamingSlam(problem, START, problem.prior)
+
+
+def _drive() -> Problem:
+    """Return a drive past one landmark, a little longer than to the first relinearisation."""
     count = FIRST_RELINEARISATION + 2
     stamps = np.linspace(0.0, 0.1 * count, count)
-    prior = CalibrationPrior.from_settings(calibrated=True)
-    forward = 0.1 * stamps
-    problem = Problem(
+    forward = FORWARD_MPS * stamps
+    return Problem(
         stamp_s=stamps,
-        drive=Drive.from_rows(stamps, np.tile([0.1, 0.0, 0.0], (count, 1))),
+        drive=Drive.from_rows(stamps, np.tile([FORWARD_MPS, 0.0, 0.0], (count, 1))),
         pose_row=np.arange(count),
         landmark_row=np.zeros(count, dtype=np.int64),
-        reading=np.column_stack([np.hypot(3.0 - forward, 1.0), np.arctan2(1.0, 3.0 - forward)]),
+        reading=np.column_stack([np.hypot(PLACE[0] - forward, PLACE[1]), np.arctan2(PLACE[1], PLACE[0] - forward)]),
         sigma_given=np.full((count, 2), np.nan),
         mount=np.zeros(3),
-        prior=prior,
+        prior=CalibrationPrior.from_settings(calibrated=True),
         start_pose=np.zeros(3),
         start_information=1e8,
         landmark_mean=np.zeros((1, 2)),
         landmark_information=sparse.csr_array((2, 2)),
     )
-    slam = StreamingSlam(problem, START, prior)
-    for _ in range(count):
-        slam.step()
-    outcome = slam.finish()
-    Smoother(problem, START).information(outcome.graph_estimate, np.array([0, count - 1]))
-    one = np.ones(1, dtype=np.int64)
-    alone = System(one, Factors(np.arange(2), 0 * one, one, 0 * one), np.zeros((1, 3)), np.zeros(0, dtype=np.int64))
-    curvature(alone.tree, alone.factors, np.zeros(2))  # only steps that are damped ask for it
-    marginals = outcome.graph_marginals
-    bridged(
-        stamps[:2],
-        stamps,
-        outcome.graph_estimate.pose,
-        marginals.pose,
-        marginals.consecutive,
-        problem.drive,
-        outcome.graph_estimate.states,
-        START,
-    )
-    dead_reckoned(stamps[:2], problem.drive, prior.mean, START)
-
-
-@functools.cache
-def _search() -> None:
-    """Three landmarks at their places, searched for changes."""
-    place, sure, count = 3.0 * np.eye(3, 2), np.eye(6), 3
-    evidence = WindowEvidence(np.arange(count), np.zeros(count, dtype=np.int64), place, sure, np.zeros(6), 0.0)
-    comparison = compare(evidence, place, np.tile(np.eye(2), (count, 1, 1)), np.ones(count, dtype=np.bool_))
-    find_changes(evidence, comparison, place, 1, ChangesConfig())
