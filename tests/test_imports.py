@@ -42,7 +42,7 @@ RULES = {
     "live": "errors compiled types config geometry valid io maps runs slam",
     "server": "errors types config io maps runs",
     "cli": (
-        "errors interrupts plugins types config geometry stamps survival valid io existence tracking viz slam "
+        "errors interrupts compiled plugins types config geometry stamps survival valid io existence tracking viz slam "
         "maps pipeline runs live server"
     ),
 }
