@@ -488,7 +488,7 @@ class Associator:
         return None
 
     def _solved(self, assignment: Assignment, noise: Noise | None = None) -> _Solved:
-        """Optimum, covariances and cost; also learns the noise of sightings."""
+        """Optimum, covariances and cost; also learns the noise of sightings, even if the solution is rejected later."""
         problem = assignment.problem()
         noise = self.noise if noise is None else noise
         smoother = Smoother(problem, noise, heavy=True)
