@@ -62,9 +62,9 @@ class Robot:
         return [one for one in self.readings if isinstance(one, kind)]
 
 
-def robot(stated: Path | None = None, *, numbered: bool = False) -> tuple[Robot, list[str]]:
+def robot(stated: Path | None = None) -> tuple[Robot, list[str]]:
     said: list[str] = []
-    return Robot(Listener(SENSOR, numbered, stated, said.append)), said
+    return Robot(Listener(SENSOR, stated, said.append)), said
 
 
 def where(k: int, tag: int) -> np.ndarray:
@@ -89,7 +89,7 @@ def test_poses_become_velocities_and_detections_lie_on_the_floor() -> None:
     looks = one.of(SensorLook)
     assert len(looks) == 20
     for k, look in enumerate(looks):
-        assert look.landmark_id == ["3", "gate"]
+        assert look.landmark_id == [3, "gate"]
         assert look.class_name == ["chair", "chair"]
         pose = np.array([*path_of(k)[:2], 0.01 * k])
         at = [se2.transform(se2.inverse(se2.compose(pose, np.array([0.2, 0.0, 0.0]))), TAGS[tag][:2]) for tag in TAGS]
@@ -103,8 +103,8 @@ def test_poses_become_velocities_and_detections_lie_on_the_floor() -> None:
     assert one.listener.odometry_at(3.0) == ("base_link", None)
 
 
-def test_a_frame_without_detections_is_a_look_and_numbers_are_numbers_where_the_map_has_them() -> None:
-    one, _ = robot(numbered=True)
+def test_a_frame_without_detections_is_a_look_and_a_text_of_digits_is_a_number() -> None:
+    one, _ = robot()
     for k in range(20):
         one.odometry(k, path_of(k))
         one.boxes(k, {} if k % 2 else {"3": np.array([2.0, 0.0, 0.0]), "3b": np.array([1.0, 1.0, 0.0])}, "base_link")

@@ -70,7 +70,7 @@ class Bridge:
         self.steps: list[Now] = []
         self.step_s: list[float] = []
         self.heard: list[str] = []
-        self.listener = Listener(live.sensor, live.numbered, topics, self.said.append)
+        self.listener = Listener(live.sensor, topics, self.said.append)
         self.wires = wires(self.mailbox)
         self._teller = Teller(live, self.wires)
         self._stop = False

@@ -233,7 +233,7 @@ class _Drive:
 
         if isinstance(self._recording, Recording):
             return replayed(self._recording, paced=realtime)
-        self._listener = Listener(engine.sensor, engine.numbered, self._topics, say)
+        self._listener = Listener(engine.sensor, self._topics, say)
         if self._recording is not None:
             return spoken(self._recording, self._listener, shown.refused, paced=realtime)
         assert self._mailbox is not None

@@ -53,6 +53,8 @@ METADATA = "metadata.yaml"
 """Metadata file of a folder that is a ROS 2 bag."""
 FEWEST_LOOKS = 20
 """Messages above which a detector without any empty one is assumed to publish only detections."""
+MOST_DIGITS = 15
+"""Of a text that is a number; larger ones are not exact in float64."""
 LATE_S = 0.5
 """Difference between the delays of two topics from stamp to arrival that indicates different clocks."""
 SINCE_1970_S = 1e8
@@ -417,16 +419,18 @@ def mounted_sensor(
 
 
 def _identities(seen: list[tuple[int, Seen]], settings: BagSettings, names: dict[int, str]) -> IntArray:
-    """(M,) identities of detections, by what their sensor's settings say; `names` gets those that are texts."""
+    """(M,) identities of detections, by what their sensor's settings say; `names` gets those that are texts. A text of
+    digits is a number, as in tables: `vision_msgs` has no other way to say one.
+    """
     kinds = [one.identity for one in settings.sensors.values()]
     identity = np.full(len(seen), UNKNOWN)
     for row, (k, one) in enumerate(seen):
         said = one.identity if kinds[k] == "id" else one.label or None if kinds[k] == "class" else None
-        if isinstance(said, str):
+        if isinstance(said, str) and not (said.isascii() and said.isdigit() and len(said) <= MOST_DIGITS):
             identity[row] = landmark_id_of(said)
             names[int(identity[row])] = said
         elif said is not None:
-            identity[row] = said
+            identity[row] = int(said)
     return identity
 
 

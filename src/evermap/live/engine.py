@@ -119,12 +119,6 @@ class Engine:
         return self._sensor
 
     @property
-    def numbered(self) -> bool:
-        """Whether the map knows landmarks by numbers, not by texts only."""
-        names = self._living.members.landmark_id
-        return any(one not in self._living.landmark_names for one in names.tolist())
-
-    @property
     def late(self) -> int:
         """Readings that were refused because they came too late."""
         return self._inbox.n_late

@@ -88,7 +88,6 @@ class Listener:
 
     Args:
         sensor: of the engine: it says where the sensor is on the robot, where no message does.
-        numbered: whether landmarks are known by numbers; else a number is a text, as in a bag.
         stated: file that states what topics are; None to guess.
         say: called with a remark, once.
 
@@ -96,8 +95,8 @@ class Listener:
         InputError: the file is missing or wrong.
     """
 
-    def __init__(self, sensor: Sensor, numbered: bool, stated: Path | None, say: Callable[[str], None]) -> None:
-        self._mount, self._numbered, self._say = np.array(sensor.mount_robot_sensor), numbered, say
+    def __init__(self, sensor: Sensor, stated: Path | None, say: Callable[[str], None]) -> None:
+        self._mount, self._say = np.array(sensor.mount_robot_sensor), say
         self._types, self._content = Cdr(ros2_types()), BagContent()
         self._handlers: dict[str, Any] = {}
         self._sources: dict[str, object] = {}
@@ -249,16 +248,10 @@ class Listener:
         sigma_bearing = np.sqrt(np.einsum("ni,nij,nj->n", across, spread, across)) / np.maximum(range_m, 1e-9)
         for k, stamp_s in enumerate(stamps.tolist()):
             rows = np.flatnonzero(ranged & (found.frame == k))
-            ids = [self._identity(one, names) for one in found.landmark_id[rows].tolist()]
+            ids = [names.get(one, one) for one in found.landmark_id[rows].tolist()]
             classes = [labels[row] if row != UNKNOWN else None for row in found.class_id[rows].tolist()]
             sigmas = sigma_range[rows], sigma_bearing[rows]
             yield SensorLook(stamp_s, ids, range_m[rows], bearing_rad[rows], classes, *sigmas)
-
-    def _identity(self, number: int, names: dict[int, str]) -> int | str:
-        text = names.get(number)
-        if text is None:
-            return number
-        return int(text) if self._numbered and text.isascii() and text.isdigit() and len(text) < 16 else text
 
 
 def heard(mailbox: Mailbox, listener: Listener, refused: Callable[[str], None]) -> Iterator[Reading | None]:
