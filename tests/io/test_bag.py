@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from evermap.geometry import se3
 from evermap.geometry.camera import project, unproject
 from evermap.io import list_robots, read_recording, reader_for
 from evermap.io.bag import bag_settings, read_bag, settings_path
+from evermap.io.rosbag import UNSTATED
 from evermap.types import UNKNOWN, SpatialRecording, landmark_id_of
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
@@ -292,3 +295,50 @@ def test_settings_of_another_bag_are_taken_by_an_option(tmp_path: Path) -> None:
     no_bag = run(app, ["slam", str(out), "--topics", str(file)])
     assert no_bag.exit_code == 2
     assert "native: has no topics" in no_bag.output
+
+
+PROTOBUF = {1: "float64", 8: "bool", 9: "string", 12: "uint8[]", 13: "uint32", 14: "uint8", 7: "uint32"}
+"""Types of fields by their numbers in descriptors: `bytes` and enumerations are numbers in ROS."""
+
+
+def fields_of(raw: bytes) -> list[tuple[int, Any]]:
+    """Fields of a message in protobuf's encoding, numbers and bytes only."""
+
+    def varint(at: int) -> tuple[int, int]:
+        value = shift = 0
+        while True:
+            value |= (raw[at] & 127) << shift
+            at, shift = at + 1, shift + 7
+            if raw[at - 1] < 128:
+                return value, at
+
+    found, at = [], 0
+    while at < len(raw):
+        key, at = varint(at)
+        value, at = varint(at)
+        if key & 7 == 2:
+            found.append((key >> 3, raw[at : at + value]))
+            at += value
+        else:
+            found.append((key >> 3, value))
+    return found
+
+
+def test_scenes_are_as_foxglove_defines_them() -> None:
+    """Field by field, against the descriptors that Foxglove's own package carries."""
+    messages = pytest.importorskip("foxglove.messages", reason="the extra live is not installed")
+    stated: dict[str, list[str]] = {}
+    for number, file in fields_of(messages.SceneUpdate.get_schema().data):
+        assert number == 1
+        for kind in (value for field, value in fields_of(file) if field == 4):
+            name = next(value.decode() for field, value in fields_of(kind) if field == 1)
+            columns = [dict(fields_of(value)) for field, value in fields_of(kind) if field == 2]
+            for one in sorted(columns, key=lambda column: column[3]):
+                called = one.get(6, b"").decode().rsplit(".", 1)[-1]
+                text = PROTOBUF.get(one[5], called) + ("[]" if one[4] == 3 else "")
+                stated.setdefault(name, []).append(f"{text} {one[1].decode()}")
+    ours = {name.rsplit("/", 1)[-1]: text for name, text in UNSTATED.items() if name.startswith("foxglove_msgs")}
+    assert len(ours) == 13
+    for name, text in ours.items():
+        plain = [re.sub(r"^\w+/", "", line) for line in text.splitlines() if line]
+        assert [line.replace("Point[]", "Point3[]").replace("Time ", "Timestamp ") for line in plain] == stated[name]

@@ -330,12 +330,12 @@ class _Shown:
             return "waiting for odometry and detections"
         x, y, theta = now.pose_world_robot.tolist()
         before, self._before = self._before, (now.stamp_s, x, y)
-        speed = math.nan
-        if before is not None and now.stamp_s > before[0]:
-            speed = math.hypot(x - before[1], y - before[2]) / (now.stamp_s - before[0])
+        speed = ""
+        if before is not None and now.stamp_s > before[0] and not math.isnan(x - before[1]):
+            speed = f"  {math.hypot(x - before[1], y - before[2]) / (now.stamp_s - before[0]):.1f} m/s"
         place = "searching" if now.lost else f"x {x:.2f} m  y {y:.2f} m  heading {math.degrees(theta):.0f} deg"
         lost = f"  {self._n_lost} messages lost" if self._n_lost else ""
-        return f"{place}  {speed:.1f} m/s  {len(now.in_view)} landmarks in view  {self._n_changes} changes{lost}"
+        return f"{place}{speed}  {len(now.in_view)} landmarks in view  {self._n_changes} changes{lost}"
 
 
 def _pose(now: Now) -> dict[str, Any]:
