@@ -40,14 +40,13 @@ def warm_up(*, search: bool = True) -> None:
     if search:
         searched()
     smoothed()
-    _finished()
 
 
 @functools.cache
 def filtered() -> None:
     """Compile the filter, what interpolates its poses, and the field of view: frames before a relinearisation."""
     problem = _drive()
-    slam = _slam(problem)
+    slam = StreamingSlam(problem, START, problem.prior)
     for _ in range(FRAMES_FILTERED):
         slam.step()
     stamps = problem.stamp_s[:2]
@@ -81,20 +80,6 @@ def smoothed() -> None:
     one = np.ones(1, dtype=np.int64)
     alone = System(one, Factors(np.arange(2), 0 * one, one, 0 * one), np.zeros((1, 3)), np.zeros(0, dtype=np.int64))
     curvature(alone.tree, alone.factors, np.zeros(2))  # only steps that are damped ask for it
-
-
-@functools.cache
-def _finished() -> None:
-    """Drive all the way, through what the parts may have left out."""
-    problem = _drive()
-    slam = _slam(problem)
-    for _ in problem.stamp_s:
-        slam.step()
-    slam.finish()
-
-
-def _slam(problem: Problem) -> StreamingSlam:
-    return StreamingSlam(problem, START, problem.prior)
 
 
 def _drive() -> Problem:

@@ -14,7 +14,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -34,7 +33,7 @@ from evermap.maps.sessions.box_search import (
     regained,
 )
 from evermap.maps.sessions.box_visit import BoxVisit, SeenBoxes, seen_boxes
-from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, around
+from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, around, one_to_one
 from evermap.maps.sessions.spatial import SpatialVisit, localised_in_space
 from evermap.maps.sessions.witnessed import Witnessed
 from evermap.slam.space.estimate import SpatialOptimum, converged
@@ -313,10 +312,7 @@ def _matched(
         away = np.linalg.norm(seen.position_m[:, None, :2] - held_m, axis=2).min(axis=1)
         loose_m = np.minimum(settings.drift_share * away, settings.most_drift_m)
     odds = _log_odds(seen, known, loose_m)
-    mine, theirs = linear_sum_assignment(np.minimum(-odds, 0.0))
-    good = odds[mine, theirs] > 0.0
-    chosen = np.full(len(seen.place), -1)
-    chosen[mine[good]] = theirs[good]
+    chosen = one_to_one(odds)
     for k in np.flatnonzero(chosen < 0).tolist():
         other = int(np.argmax(odds[k])) if odds.shape[1] else 0
         if not odds.shape[1] or odds[k, other] <= 0.0:

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
-from scipy.optimize import linear_sum_assignment
 
 from evermap.config import Config, OverlayConfig
 from evermap.geometry import se2
@@ -26,7 +25,7 @@ from evermap.maps.living import EXISTS, LivingMap
 from evermap.maps.sessions.believe import aged
 from evermap.maps.sessions.box_search import TESTED_M2
 from evermap.maps.sessions.gaussian import drifted
-from evermap.maps.sessions.placing import SMALLEST_P
+from evermap.maps.sessions.placing import SMALLEST_P, one_to_one
 from evermap.slam.association.assignment import alike
 from evermap.slam.association.associator import density_of_unmet
 from evermap.slam.association.consensus import Candidates, consensus
@@ -348,12 +347,12 @@ class _Assigned:
         np.maximum.at(table, (k, stood.landmark[m]), stands)
         held = np.flatnonzero(place >= 0)
         table[held], table[held, stood.landmark[place[held]]] = -np.inf, HELD_NATS
-        member = self._with_parts(_one_to_one(table), table)
+        member = self._with_parts(one_to_one(table), table)
         # what is left may have been moved a little
         table = np.full(table.shape, -np.inf)
         np.maximum.at(table, (k, stood.landmark[m]), moved)
         table[member >= 0], table[:, member[member >= 0]] = -np.inf, -np.inf
-        return np.where(member >= 0, member, _one_to_one(table))
+        return np.where(member >= 0, member, one_to_one(table))
 
     def _with_parts(self, member: IntArray, table: FloatArray) -> IntArray:
         """Return the same with further copies of assigned landmarks: those never seen together with them."""
@@ -363,15 +362,6 @@ class _Assigned:
             if not together[[k]][:, np.flatnonzero(found == one)].sum():
                 found[k] = one
         return found
-
-
-def _one_to_one(odds: FloatArray) -> IntArray:
-    """(K,) columns that rows are assigned to with most odds in sum, -1 for none."""
-    column = np.full(len(odds), -1, dtype=np.int64)
-    mine, theirs = linear_sum_assignment(-np.maximum(odds, 0.0))
-    good = odds[mine, theirs] > 0.0
-    column[mine[good]] = theirs[good]
-    return column
 
 
 def _windows(rows: IntArray) -> list[IntArray]:

@@ -444,3 +444,14 @@ def _placed(problem: Problem, start: Estimate, row: IntArray, settings: FitConfi
     for j in np.setdiff1d(problem.landmark_row, row):
         landmark[j] = np.median(anew[problem.landmark_row == j], axis=0)
     return Estimate(pose, landmark, start.states)
+
+
+def one_to_one(odds: FloatArray) -> IntArray:
+    """Return (K,) columns of odds (K, N) that rows are assigned to, with most positive odds in sum; -1 for none."""
+    from scipy.optimize import linear_sum_assignment
+
+    row, column = linear_sum_assignment(-np.maximum(odds, 0.0))
+    assigned = np.full(len(odds), -1, dtype=np.int64)
+    good = odds[row, column] > 0.0
+    assigned[row[good]] = column[good]
+    return assigned

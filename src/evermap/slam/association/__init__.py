@@ -11,13 +11,13 @@ def with_identities(recording: AnyRecording, settings: SlamConfig, prior_map: La
 
     Errors are those of `identify.identified` in the plane, and of `in_space.identified_in_space`.
     """
+    if not settings.unknown_ids:
+        return recording
     from evermap.slam.association.identify import identified
     from evermap.slam.association.in_space import identified_in_space
     from evermap.slam.intake import beliefs
 
     keep_ids = settings.unknown_ids == "empty"
-    if not settings.unknown_ids:
-        return recording
     if isinstance(recording, SpatialRecording):
         return identified_in_space(recording, settings, prior_map, keep_ids=keep_ids)
     believed = beliefs(recording.sensor, settings)

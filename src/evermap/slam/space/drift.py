@@ -22,7 +22,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
 
 from evermap.config import SpaceConfig, StillConfig, TrafficConfig
 from evermap.geometry import se3
@@ -143,6 +142,8 @@ def _shared_growth(problem: SpatialProblem, at: FloatArray, stamp_s: FloatArray)
 
 def _least_growth(curve: _Curve) -> float:
     """Return the unbounded growth of a curve, in addition to persistent errors."""
+    from scipy.optimize import nnls
+
     columns = np.column_stack([*_columns(curve, PERSIST_S[:-2]), curve.lag_s])
     found, _ = nnls(columns / curve.square[:, None], np.ones(len(curve.lag_s)))
     return float(found[-1])
@@ -157,6 +158,8 @@ def _fitted(curve: _Curve, persist_s: Sequence[float], growth: float) -> tuple[F
     """Parts of a curve, white and persistent for each of some times, beside what grows by the second; and their log
     likelihood (squares are Gamma distributed; reweighted by what is fitted).
     """
+    from scipy.optimize import nnls
+
     columns, known = np.column_stack(_columns(curve, persist_s)), growth * curve.lag_s
     found, fitted = np.zeros(columns.shape[1]), curve.square
     for _ in range(ROUNDS_OF_FIT):
