@@ -75,9 +75,10 @@ def shared_with(module: str) -> Iterator[None]:
     second: list[subprocess.Popen[bytes]] = []
 
     def start() -> None:
-        quiet = subprocess.DEVNULL
+        command, quiet = [sys.executable, "-m", module], subprocess.DEVNULL
         with contextlib.suppress(OSError):
-            second.append(subprocess.Popen([sys.executable, "-m", module], stdin=quiet, stdout=quiet, stderr=quiet))
+            process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)  # nosec  # B603: ourselves
+            second.append(process)
 
     if (os.cpu_count() or 1) > 1:
         _AT_FIRST_MISSING.append(start)
