@@ -72,7 +72,7 @@ def warm_up(
     from evermap.slam import warmup
 
     config = Config(slam={"unknown_ids": unknown_ids})
-    with shared_with("evermap.cli.warmup"):
+    with shared_with("evermap.cli.warmup"):  # about half of the time here, the other half at the end of this file
         warmup.filtered()
         if search or sessions:
             warmup.searched()
