@@ -160,18 +160,27 @@ def _votes(
     """
     own, others = np.zeros(len(at), dtype=np.int64), np.zeros(len(at), dtype=np.int64)
     count = np.zeros(name.max() + 1 if len(name) else 0, dtype=np.int64)
+    counted = np.empty(len(at), dtype=np.int64)
     for k in range(len(at)):
+        n_counted = 0
         for j in range(near[k, 0], near[k, 1]):
+            limit = 4.0 * gate * gate * (variance[j] + variance[k])
+            if (at[j, 0] - at[k, 0]) ** 2 >= limit:  # most are
+                continue
             squared = _squared(at, variance, j, k)
+            if squared >= 4.0 * gate * gate:
+                continue
             if name[j] == name[k]:
-                own[k] += j != k and squared < 4.0 * gate * gate
-            elif view[j] == view[k]:
-                count[name[j]] -= len(at) if squared < 4.0 * gate * gate else 0
-            elif squared < gate * gate:
-                count[name[j]] += 1
-        for j in range(near[k, 0], near[k, 1]):
-            others[k] = max(others[k], count[name[j]])
-            count[name[j]] = 0
+                own[k] += j != k
+                continue
+            beside = view[j] == view[k]
+            if beside or squared < gate * gate:
+                count[name[j]] += -len(at) if beside else 1
+                counted[n_counted] = name[j]
+                n_counted += 1
+        for j in counted[:n_counted]:
+            others[k] = max(others[k], count[j])
+            count[j] = 0
     return own, others
 
 
