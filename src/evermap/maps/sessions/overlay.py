@@ -212,19 +212,40 @@ class _Options:
         chosen = chosen.copy()
         seen = {chosen.tobytes()}
         for _ in range(MOST_FLIPS):
-            table = self._scores(chosen)
-            gain, clique, option = 0.0, -1, ELSEWHERE
-            for c, scores in enumerate(table):
-                for site, score in scores.items():
-                    if score - scores[int(chosen[c])] > gain + 1e-9:
-                        gain, clique, option = score - scores[int(chosen[c])], c, site
-            if clique < 0:
+            flips = []
+            for c, scores in enumerate(self._scores(chosen)):
+                best = max(scores, key=lambda o: scores[o])
+                if (gain := scores[best] - scores[int(chosen[c])]) > 1e-9:
+                    flips.append((gain, c, best))
+            if not flips:
                 break
-            chosen[clique] = option
+            chosen = self._flipped(chosen, sorted(flips, key=lambda flip: -flip[0]))
             if chosen.tobytes() in seen:  # two that hold each other: the rest of the way leads back
                 break
             seen.add(chosen.tobytes())
         return chosen
+
+    def _flipped(self, chosen: IntArray, flips: list[tuple[float, int, int]]) -> IntArray:
+        """Return the assignment with the first flip; others that add a clique are made with it, if all are better.
+
+        Cliques are taken away one at a time: what contradicts a wrong one is right.
+        """
+        first, *others = flips
+        more = [flip for flip in others if chosen[flip[1]] == ELSEWHERE] if chosen[first[1]] == ELSEWHERE else []
+
+        def after(count: int) -> IntArray:
+            flipped = chosen.copy()
+            for _, clique, option in (first, *more[:count]):
+                flipped[clique] = option
+            return flipped
+
+        alone, count = after(0), len(more)
+        least = self.log_probability(alone) if count else 0.0
+        while count:
+            if self.log_probability(flipped := after(count)) > least:
+                return flipped
+            count //= 2
+        return alone
 
     def gated(self, chosen: IntArray) -> IntArray:
         """Return (C,) every clique by itself, at the motion that was agreed on."""
