@@ -19,7 +19,9 @@ PLANE, SPACE = (3, 2, 9), (6, 3, 12)
 class World:
     """A chain of poses that see places of a grid, all of them sharing calibration states, with random numbers."""
 
-    def __init__(self, seed: int, n_poses: int, n_places: int, dims: tuple[int, int, int], leaf: int = 3) -> None:
+    def __init__(
+        self, seed: int, n_poses: int, n_places: int, dims: tuple[int, int, int], leaf: int = 3, *, known: bool = False
+    ) -> None:
         random = np.random.default_rng(seed)
         pose, place, shared = dims
         at_shared = n_poses + n_places
@@ -37,6 +39,10 @@ class World:
         rows += [pose, *[place] * n_places, shared]
         first_seen = {tie[1]: leaf for tie, leaf in reversed(list(zip(ties, leaves, strict=False)))}
         leaves += [0, *(first_seen.get(n_poses + j, 0) for j in range(n_places)), 0]
+        if known:  # from a map, in which all places depend on each other
+            ties.append(list(range(n_poses, n_poses + n_places)))
+            rows.append(place * n_places)
+            leaves.append(max(leaves) // 2)
         self.dim = np.array([pose] * n_poses + [place] * n_places + [shared])
         self.factors = Factors(
             np.append(0, np.cumsum([len(tie) for tie in ties])),
@@ -81,15 +87,18 @@ def close(found: np.ndarray, expected: np.ndarray) -> bool:
     return bool(np.abs(found - expected).max() <= 1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("large", [0.0, sparse_system.LARGE], ids=["all fronts by BLAS", "none"])
 @pytest.mark.parametrize("dims", [PLANE, SPACE], ids=["plane", "space"])
 @settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 10**6), n_poses=st.integers(1, 40), n_places=st.integers(1, 12), leaf=st.integers(1, 7))
-def test_solution_and_covariances_are_those_of_dense_algebra(dims, seed, n_poses, n_places, leaf):
+def test_solution_and_covariances_are_those_of_dense_algebra(large, dims, seed, n_poses, n_places, leaf):
     world = World(seed, n_poses, n_places, dims, leaf)
     information, right, jacobians = world.dense()
     covariance = np.linalg.inv(information)
     shared = len(world.dim) - 1
-    solved = world.solved(np.array([shared]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sparse_system, "LARGE", large)
+        solved = world.solved(np.array([shared]))
     assert close(exhausted(solved.solution()), covariance @ right)
     spread = exhausted(solved.spread(n_poses - 1))
     for v, (first, last) in enumerate(zip(spread.own_first[:-1], spread.own_first[1:], strict=True)):
@@ -108,6 +117,30 @@ def test_solution_and_covariances_are_those_of_dense_algebra(dims, seed, n_poses
     by = random.normal(size=(3, 2, len(at)))
     assert close(solved.each(some, by), by @ covariance[np.ix_(at, at)] @ by.transpose(0, 2, 1))
     assert close(solved.columns(some), covariance[:, at])
+
+
+def test_places_that_all_depend_on_each_other_are_solved_as_by_dense_algebra():
+    world = World(5, 30, 150, PLANE, known=True)
+    information, right, _ = world.dense()
+    covariance = np.linalg.inv(information)
+    solved = world.solved(np.array([len(world.dim) - 1]))
+    assert np.count_nonzero(solved.system._large) >= 2
+    assert close(exhausted(solved.solution()), covariance @ right)
+    spread = exhausted(solved.spread())
+    own = [covariance[np.ix_(at, at)].ravel() for at in map(world.numbers, np.arange(len(world.dim))[:, None])]
+    assert close(spread.own, np.concatenate(own))
+
+
+@pytest.mark.parametrize("large", [0.0, sparse_system.LARGE], ids=["all fronts by BLAS", "none"])
+def test_a_direction_that_rounding_alone_determines_ends_in_no_error_before_the_border(large, monkeypatch):
+    """Both ways give the pivots that rounding made the same least size."""
+    monkeypatch.setattr(sparse_system, "LARGE", large)
+    world = World(7, 12, 4, PLANE)
+    world.values[:] = 0.0
+    world.extra[:] = 0.0
+    solved = world.solved(np.array([len(world.dim) - 1]))
+    with pytest.raises(NumericalError, match="do not determine"):
+        exhausted(solved.solution())
 
 
 @pytest.mark.parametrize("dims", [PLANE, SPACE], ids=["plane", "space"])

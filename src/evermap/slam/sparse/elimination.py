@@ -11,6 +11,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
 from evermap.compiled import kept
 from evermap.slam.sparse.tree import Factors, Tree
@@ -20,6 +21,9 @@ TINY = 1e-12
 """Share of its own information below which a pivot is rounding."""
 BLOCK = 4
 """Rows that are eliminated at once: as many as fit into registers beside what they change."""
+
+LARGE_FACTOR = 64
+"""Rows of a factor from which on `eliminate_large` computes its information by BLAS, and `spread` nothing."""
 
 kernel = kept(effort=3, error_model="numpy", fastmath={"contract"})
 
@@ -31,7 +35,8 @@ class Spread(NamedTuple):
         own: covariance of each variable by itself, one after the other, in rows.
         own_first: (V + 1,) where they begin.
         with_border: (numbers, B) covariance of every number with those of the border.
-        of_factors: `A S A'` of each factor with Jacobian A, (rows, rows) each, one after the other.
+        of_factors: `A S A'` of each factor with Jacobian A, (rows, rows) each, one after the other; none of factors
+            with `LARGE_FACTOR` rows, as of a map.
         of_factors_first: (F + 1,) where they begin.
         pairs: (P, a, b) covariances of the first two variables of each of the first P factors.
         held: room for the covariances of the fronts from the root to one of them.
@@ -123,69 +128,119 @@ def eliminate(
         high: front after the first.
         low: the last front.
     """
-    stored, right, waiting, where, whose = state.stored, state.right, state.waiting, state.where, state.whose
-    front, n_waiting = state.front, state.n_waiting[0]
-    diagonal, index = np.zeros(len(front)), np.empty(len(front) + 1, np.int64)
-    position = np.empty(len(front) + 1, np.int64)
+    diagonal = np.zeros(len(state.front))
     for node in range(high - 1, low - 1, -1):
-        size, own = tree.size[node], tree.own[node]
-        for i in range(size):
-            for j in range(i, size):
-                front[i, j] = 0.0
-            front[i, size] = 0.0
-        for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
-            v = tree.variable[k]
-            for a in range(tree.dim[v]):
-                front[tree.at[k] + a, tree.at[k] + a] = extra[tree.begin[v] + a]
-        for j in range(tree.factor_first[node], tree.factor_first[node + 1]):
-            f = tree.factor[j]
-            width = _of_factor(tree, factors, f, index)
-            begin = tree.value_first[f]
-            for _ in range(factors.rows[f]):
-                b = values[begin + width]
-                for a in range(width):
-                    value, i = values[begin + a], index[a]
-                    if value == 0.0:
-                        continue
-                    front[i, size] += value * b
-                    for c in range(a, width):
-                        j2 = index[c]
-                        if i <= j2:
-                            front[i, j2] += value * values[begin + c]
-                        else:
-                            front[j2, i] += value * values[begin + c]
-                begin += width + 1
-        while n_waiting > 0 and tree.parent[whose[n_waiting - 1]] == node:
-            n_waiting -= 1
-            child = whose[n_waiting]
-            left = _passed_on(tree, child, position)
-            at = where[n_waiting]
-            for i in range(left):
-                for j in range(i, left):
-                    front[position[i], position[j]] += waiting[at + j]
-                front[position[i], size] += waiting[at + left]
-                at += left + 1
-        for i in range(own):
-            diagonal[i] = front[i, i]
-        _eliminate_rows(front, diagonal, own, size)
-        at = tree.stored[node]
-        for i in range(own):
-            for j in range(i, size):
-                stored[at + j] = front[i, j]
-            at += size
-        for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
-            v = tree.variable[k]
-            for a in range(tree.dim[v]):
-                right[tree.begin[v] + a] = front[tree.at[k] + a, size]
-        left, at = size - own, where[n_waiting]
+        _gather(tree, factors, values, extra, state, node, np.inf)
+        for i in range(tree.own[node]):
+            diagonal[i] = state.front[i, i]
+        _eliminate_rows(state.front, diagonal, tree.own[node], tree.size[node])
+        _pass_on(tree, state, node)
+
+
+def eliminate_large(
+    tree: Tree, factors: Factors, values: FloatArray, extra: FloatArray, state: Elimination, node: int
+) -> None:
+    """Eliminate a front as `eliminate` does, by BLAS: from some hundred numbers on that is several times as fast.
+
+    Raises:
+        LinAlgError: it is not positive definite beyond rounding; the state is as before, but for its front.
+    """
+    own, size, n_waiting = int(tree.own[node]), int(tree.size[node]), int(state.n_waiting[0])
+    _gather(tree, factors, values, extra, state, node, LARGE_FACTOR)
+    front = state.front[:size, : size + 1]
+    for f in tree.factor[tree.factor_first[node] : tree.factor_first[node + 1]].tolist():
+        if factors.rows[f] < LARGE_FACTOR:
+            continue
+        of_factor = slice(factors.first[f], factors.first[f + 1])
+        dim = tree.dim[factors.variable[of_factor]]
+        index = np.append(np.repeat(tree.factor_at[of_factor] - np.cumsum(dim) + dim, dim) + np.arange(dim.sum()), size)
+        jacobian = values[tree.value_first[f] : tree.value_first[f + 1]].reshape(factors.rows[f], -1)
+        front[np.ix_(index[:-1], index)] += jacobian[:, :-1].T @ jacobian
+    try:
+        root = cholesky(front[:own, :own], check_finite=False)
+    except LinAlgError:
+        state.n_waiting[0] = n_waiting
+        raise
+    front[:own, :own] = root
+    rest = solve_triangular(root, front[:own, own:], trans="T", check_finite=False)
+    front[:own, own:] = rest
+    front[own:, own:] -= rest[:, :-1].T @ rest
+    _pass_on(tree, state, node)
+
+
+@kernel
+def _gather(
+    tree: Tree, factors: Factors, values: FloatArray, extra: FloatArray, state: Elimination, node: int, below: float
+) -> None:
+    """Write into `state.front` the information of a front's factors, of those with fewer rows than `below`, and what
+    its children pass on.
+    """
+    waiting, where, whose, front = state.waiting, state.where, state.whose, state.front
+    index, n_waiting = np.empty(len(front) + 1, np.int64), state.n_waiting[0]
+    size = tree.size[node]
+    for i in range(size):
+        for j in range(i, size):
+            front[i, j] = 0.0
+        front[i, size] = 0.0
+    for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
+        v = tree.variable[k]
+        for a in range(tree.dim[v]):
+            front[tree.at[k] + a, tree.at[k] + a] = extra[tree.begin[v] + a]
+    for j in range(tree.factor_first[node], tree.factor_first[node + 1]):
+        f = tree.factor[j]
+        if factors.rows[f] >= below:
+            continue
+        width = _of_factor(tree, factors, f, index)
+        begin = tree.value_first[f]
+        for _ in range(factors.rows[f]):
+            b = values[begin + width]
+            for a in range(width):
+                value, i = values[begin + a], index[a]
+                if value == 0.0:
+                    continue
+                front[i, size] += value * b
+                for c in range(a, width):
+                    j2 = index[c]
+                    if i <= j2:
+                        front[i, j2] += value * values[begin + c]
+                    else:
+                        front[j2, i] += value * values[begin + c]
+            begin += width + 1
+    while n_waiting > 0 and tree.parent[whose[n_waiting - 1]] == node:
+        n_waiting -= 1
+        child = whose[n_waiting]
+        left = _passed_on(tree, child, index)
+        at = where[n_waiting]
         for i in range(left):
-            for j in range(i, left + 1):
-                waiting[at + j] = front[own + i, own + j]
+            for j in range(i, left):
+                front[index[i], index[j]] += waiting[at + j]
+            front[index[i], size] += waiting[at + left]
             at += left + 1
-        whose[n_waiting] = node
-        n_waiting += 1
-        where[n_waiting] = at
     state.n_waiting[0] = n_waiting
+
+
+@kernel
+def _pass_on(tree: Tree, state: Elimination, node: int) -> None:
+    """Keep the rows of an eliminated front, and what waits for its parent."""
+    stored, right, waiting, where, front = state.stored, state.right, state.waiting, state.where, state.front
+    size, own, n_waiting = tree.size[node], tree.own[node], state.n_waiting[0]
+    at = tree.stored[node]
+    for i in range(own):
+        for j in range(i, size):
+            stored[at + j] = front[i, j]
+        at += size
+    for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
+        v = tree.variable[k]
+        for a in range(tree.dim[v]):
+            right[tree.begin[v] + a] = front[tree.at[k] + a, size]
+    left, at = size - own, where[n_waiting]
+    for i in range(left):
+        for j in range(i, left + 1):
+            waiting[at + j] = front[own + i, own + j]
+        at += left + 1
+    state.whose[n_waiting] = node
+    where[n_waiting + 1] = at
+    state.n_waiting[0] = n_waiting + 1
 
 
 @kernel
@@ -275,7 +330,7 @@ def spread_room(tree: Tree, factors: Factors, border: FloatArray, n_pairs: int) 
         n_pairs: factors, from the first, whose first two variables' covariance is wanted; all of the same two sizes.
     """
     own_first = np.append(0, np.cumsum(tree.dim**2))
-    of_first = np.append(0, np.cumsum(factors.rows**2))
+    of_first = np.append(0, np.cumsum(np.where(factors.rows < LARGE_FACTOR, factors.rows**2, 0)))
     shape = tree.dim[factors.variable[factors.first[0] : factors.first[0] + 2]] if n_pairs else np.zeros(2, np.int64)
     room = Spread(
         np.zeros(own_first[-1]),
@@ -347,6 +402,8 @@ def spread(
                             out.with_border[tree.begin[v] + a, to + b] = cov[at + a, tree.at[j] + b]
         for j in range(tree.factor_first[node], tree.factor_first[node + 1]):
             f = tree.factor[j]
+            if factors.rows[f] >= LARGE_FACTOR:
+                continue
             width = _of_factor(tree, factors, f, index)
             for r in range(factors.rows[f]):
                 begin = tree.value_first[f] + r * (width + 1)

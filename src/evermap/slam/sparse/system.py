@@ -19,6 +19,7 @@ from evermap.slam.sparse.elimination import (
     back_substitute,
     columns_of_inverse,
     eliminate,
+    eliminate_large,
     spread,
     spread_room,
     ways_to_border,
@@ -32,6 +33,8 @@ Slices: TypeAlias = Generator[float, None, _Result]
 
 SLICE = 1e6
 """Multiplications of a slice."""
+LARGE = 1e7
+"""Multiplications of a front, or of the information of one of its factors, from which on BLAS is faster."""
 
 
 def exhausted(slices: Slices[_Result]) -> _Result:
@@ -196,6 +199,10 @@ class System:
         self.node_of = np.full(len(dim), -1)
         own = self.tree.up < 0
         self.node_of[self.tree.variable[own]] = node
+        rows = np.zeros(len(self.tree.parent), dtype=np.int64)
+        node = np.repeat(np.arange(len(rows)), np.diff(self.tree.factor_first))
+        np.maximum.at(rows, node, factors.rows[self.tree.factor])
+        self._large = np.maximum(self.tree.own, rows) * self.tree.size**2 >= LARGE
 
     def cuts(self, work: ArrayLike) -> list[tuple[int, int, float]]:
         """Return ranges of fronts with about a slice of work (T,) each, and the share of a slice that each takes."""
@@ -203,6 +210,17 @@ class System:
         _, first = np.unique(np.floor(total[:-1]), return_index=True)
         bounds = [*first.tolist(), len(total) - 1]
         return [(low, high, float(total[high] - total[low])) for low, high in pairwise(bounds)]
+
+    def _eliminate(self, values: FloatArray, extra: FloatArray, state: Elimination, high: int, low: int) -> None:
+        """Eliminate fronts as `eliminate` does, large ones by BLAS as far as rounding lets it."""
+        for node in (low + np.flatnonzero(self._large[low:high]))[::-1].tolist():
+            eliminate(self.tree, self.factors, values, extra, state, high, node + 1)
+            try:
+                eliminate_large(self.tree, self.factors, values, extra, state, node)
+                high = node
+            except LinAlgError:
+                high = node + 1
+        eliminate(self.tree, self.factors, values, extra, state, high, low)
 
     def factorised(
         self,
@@ -224,7 +242,7 @@ class System:
         extra = np.zeros(tree.begin[-1]) if extra is None else extra
         state = Elimination.of(tree)
         for low, high, share in reversed(self.cuts(tree.own * tree.size**2 + 2 * tree.size**2)):
-            eliminate(tree, self.factors, values, extra, state, high, low)
+            self._eliminate(values, extra, state, high, low)
             yield share
         border = state.border(tree)
         information = np.triu(border[:, :-1])
