@@ -6,23 +6,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from PIL import Image
 
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
 from evermap.io.grid import write_grid, write_speed_mask
-from evermap.io.yaml import parse_yaml
 from evermap.types import Landmarks
 
 
 def grid_of(path: Path) -> tuple[np.ndarray, float, np.ndarray]:
-    """Occupancy (H, W) from south to north by the rules of map_server, the edge of a cell, and the origin."""
-    about = parse_yaml(path.read_bytes(), path)
+    """Occupancy (H, W) from south to north by the rules of map_server, the edge of a cell, and the origin.
+
+    Image and YAML are read by Pillow and PyYAML, not by evermap.
+    """
+    about = yaml.safe_load(path.read_text(encoding="utf-8"))
     assert about["mode"] == "scale"
-    kind, shape, most, pixels = (path.parent / about["image"]).read_bytes().split(b"\n", 3)
-    assert (kind, most) == (b"P5", b"255")
-    width, height = map(int, shape.split())
-    shade = np.frombuffer(pixels, dtype=np.uint8).reshape(height, width)[::-1] / 255.0
-    p = 1.0 - shade
+    assert about["negate"] == 0
+    with Image.open(path.parent / about["image"]) as image:
+        assert (image.format, image.mode) == ("PPM", "L")
+        p = 1.0 - np.asarray(image)[::-1] / 255.0
     low, high = about["free_thresh"], about["occupied_thresh"]
     scaled = np.clip((p - low) / (high - low), 0.0, 1.0)
     return scaled, about["resolution"], np.array(about["origin"][:2])

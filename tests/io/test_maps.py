@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import shapely.geometry
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -95,6 +96,23 @@ def test_geojson_as_others_see_it(tmp_path: Path) -> None:
     assert point["properties"]["class_id"] == "door"
     assert point["properties"]["p_exists"] == 0.99
     assert document["features"][4]["properties"]["first_seen_s"] is None
+
+
+def test_geojson_as_shapely_sees_it(tmp_path: Path) -> None:
+    landmarks = a_map()
+    document = json.loads(write_map_geojson(landmarks, tmp_path / "map.geojson").read_text())
+    drawn = [
+        (one["properties"]["landmark_id"], shapely.geometry.shape(one["geometry"])) for one in document["features"]
+    ]
+    points = {name: one for name, one in drawn if one.geom_type == "Point"}
+    assert {name: list(one.coords[0]) for name, one in points.items()} == dict(
+        zip(landmarks.landmark_id.tolist(), landmarks.position_m.tolist(), strict=True)
+    )
+    for name, ellipse in drawn:
+        if ellipse.geom_type == "Polygon":
+            assert ellipse.is_valid
+            assert ellipse.exterior.is_ccw
+            assert ellipse.centroid.distance(points[name]) < 1e-9
 
 
 def test_ellipses_lie_at_two_sigmas_and_turn_left() -> None:

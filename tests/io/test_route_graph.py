@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely.geometry
 
 from evermap.errors import InputError
 from evermap.geometry import se3
@@ -68,6 +69,11 @@ def test_edges_are_closed_or_cost_more_by_what_stands_near(tmp_path: Path) -> No
     assert "metadata" not in edges[12]
     document = json.loads((tmp_path / "out.geojson").read_text())
     assert document["evermap"]["closed_edges"] == [10, 14]
+    # what is left is clear of what surely stands, by shapely
+    ways = [one["geometry"] for one in document["features"] if one["geometry"]["type"].endswith("LineString")]
+    sure = shapely.geometry.MultiPoint(landmarks.position_m[landmarks.p_exists > 0.5])
+    assert len(ways) == 3
+    assert all(shapely.geometry.shape(way).distance(sure) > 0.5 for way in ways)
     assert document["name"] == "site"
 
 

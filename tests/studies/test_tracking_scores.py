@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
+import io
 from itertools import permutations
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.errors import DataError
+from evermap.runs.track.detections import read_input
+from evermap.runs.track.write import write_track
+from evermap.tracking.run import run_track
 from evermap_studies.lifetimes.tracking_scores import Points, TrackingScores, score_tracks
 
 GATE_M = 1.0
@@ -62,6 +70,46 @@ def test_equals_py_motmetrics(seed: int) -> None:
     counts = (s.n_true, s.n_reported, s.switches, s.fragmentations, s.n_missed, s.n_false)
     assert (*counts, s.n_identified) == (*expected[:6], expected[9])
     np.testing.assert_allclose([s.motp_m, s.mota, s.idf1], expected[6:9], rtol=1e-12)
+
+
+def by_trackeval(truth: list[Points], tracks: list[Points]) -> tuple[int, int, int, float]:
+    """Matched, missed and false positions, and IDF1, by TrackEval; points are similar from half the gate on."""
+    quiet = {"THRESHOLD": 0.5, "PRINT_CONFIG": False}
+    with contextlib.redirect_stdout(io.StringIO()):  # it warns of what is not built in it
+        from trackeval.metrics import CLEAR, Identity
+    names: dict[str, Any] = {}
+    for kind, points in (("gt", truth), ("tracker", tracks)):
+        known, row = np.unique(np.concatenate([ids for ids, _ in points]), return_inverse=True)
+        names[f"num_{kind}_ids"], names[f"num_{kind}_dets"] = len(known), len(row)
+        names[f"{kind}_ids"] = np.split(row, np.cumsum([len(ids) for ids, _ in points])[:-1])
+    gap = [np.linalg.norm(a[:, None] - b[None], axis=2) for (_, a), (_, b) in zip(truth, tracks, strict=True)]
+    data = {**names, "similarity_scores": [np.maximum(1.0 - 0.5 * one / GATE_M, 0.0) for one in gap]}
+    data["num_timesteps"] = len(truth)
+    clear, identity = CLEAR(quiet).eval_sequence(data), Identity(quiet).eval_sequence(data)
+    return int(clear["CLR_TP"]), int(clear["CLR_FN"]), int(clear["CLR_FP"]), float(identity["IDF1"])
+
+
+def test_written_tracks_are_scored_by_trackeval_as_by_us(tmp_path: Path) -> None:
+    """From detections to `tracks.csv`, and from there to both."""
+    truth, rng = wild_frames(5)[0], np.random.default_rng(1)
+    lines = ["stamp_s,x_m,y_m,z_m"]
+    for k, (_, position) in enumerate(truth):
+        seen = position[rng.random(len(position)) < 0.9] + rng.normal(0.0, 0.05, (1, 3))
+        seen = np.vstack([seen, rng.uniform(0, 8, (rng.poisson(0.5), 3))])
+        lines += [",".join([f"{0.1 * k:.1f}", *(f"{x:.4f}" for x in row)]) for row in seen]
+    (tmp_path / "detections.csv").write_text("\n".join(lines) + "\n")
+    write_track(tmp_path / "run", run_track(read_input(tmp_path / "detections.csv")))
+    with (tmp_path / "run" / "tracks.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if float(row["p_exists"]) >= 0.5]
+    frame = np.array([round(10.0 * float(row["stamp_s"])) for row in rows])
+    name = np.array([int(row["track_id"]) for row in rows])
+    at = np.array([[float(row[axis]) for axis in ("x_m", "y_m", "z_m")] for row in rows])
+    tracks = [(name[frame == k], at[frame == k]) for k in range(len(truth))]
+    ours = score(truth, tracks)
+    assert ours.n_matched > 0.5 * ours.n_true
+    matched, missed, false, idf1 = by_trackeval(truth, tracks)
+    assert (ours.n_matched, ours.n_missed, ours.n_false) == (matched, missed, false)
+    assert ours.idf1 == pytest.approx(idf1, abs=1e-12)
 
 
 def test_perfect_tracks() -> None:
