@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bags import CAMERA, MOUNT, SIZE_M, START_S, STEPS, TAGS, in_camera, path_of, write
+from mcap.writer import Writer
 from typer.testing import CliRunner
 
 from evermap.cli.main import app
@@ -295,6 +296,18 @@ def test_settings_of_another_bag_are_taken_by_an_option(tmp_path: Path) -> None:
     no_bag = run(app, ["slam", str(out), "--topics", str(file)])
     assert no_bag.exit_code == 2
     assert "native: has no topics" in no_bag.output
+
+
+def test_a_bag_with_topics_in_protobuf_says_how_to_keep_the_others(tmp_path: Path) -> None:
+    with (tmp_path / "mixed.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "foxglove")
+        schema = writer.register_schema("foxglove.SceneUpdate", "protobuf", b"\n\x00")
+        writer.add_message(writer.register_channel("/scene", "protobuf", schema), 0, b"\n\x00", 0)
+        writer.finish()
+    with pytest.raises(InputError, match="topics with messages in protobuf") as caught:
+        read_bag(tmp_path / "mixed.mcap")
+    assert str(caught.value.hint).startswith("keep those of ROS: mcap filter")
 
 
 PROTOBUF = {1: "float64", 8: "bool", 9: "string", 12: "uint8[]", 13: "uint32", 14: "uint8", 7: "uint32"}

@@ -108,6 +108,10 @@ def read_tag_bag(
     return seen, _odometry(odometry)
 
 
+NOT_OF_ROS = ("protobuf", "jsonschema", "flatbuffer")
+"""Encodings of MCAP schemas that `rosbags` fails at, as the key of a `KeyError`."""
+
+
 def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Handler]]) -> dict[str, Topic]:
     """Hand the messages of some topics of a bag, in the order in which they were recorded, to what handles them.
 
@@ -147,8 +151,11 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
     except InputError:
         raise
     except Exception as error:  # the package has no error that all of its errors are
-        hint = "check it with ros2 bag info, or rosbag check"
-        raise InputError(f"cannot be read as a bag: {reason(error)}", path=path, hint=hint) from error
+        problem, hint = f"cannot be read as a bag: {reason(error)}", "check it with ros2 bag info, or rosbag check"
+        if isinstance(error, KeyError) and error.args[0] in NOT_OF_ROS:
+            problem = f"has topics with messages in {error.args[0]}, beside which none is read"
+            hint = "keep those of ROS: mcap filter BAG.mcap -o ROS.mcap --include-topic-regex '/odom|/detections'"
+        raise InputError(problem, path=path, hint=hint) from error
     return topics
 
 
