@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from evermap.geometry import se2, se3
 from evermap.geometry.rigid import consensus
-from evermap.maps.sessions.overlay import ELSEWHERE, Known, Overlay, Sighted, lay_over
+from evermap.maps.sessions.overlay import ELSEWHERE, USUAL, Known, Overlay, Sighted, _Options, lay_over
 
 from .worlds import Densely, World, sites_of, world
 
@@ -98,6 +98,19 @@ def test_probability_is_that_of_a_clique_given_the_others(seed: int) -> None:
         share = np.exp(np.array(list(scores.values())) - max(scores.values()))
         want = share[list(scores).index(int(chosen[clique]))] / share.sum()
         np.testing.assert_allclose(found.probability[one.sighted.clique == clique], want, atol=1e-6)
+
+
+def test_what_agrees_with_what_stands_is_added_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From three of sixty to all of them in a few steps, not in sixty: sessions have hundreds."""
+    one = world(np.random.default_rng(8), [1] * 60, [1] * 60, [0] * 60)
+    options = _Options(one.sighted, one.known, agreed(one), USUAL)
+    asked = []
+    scores = options._scores
+    monkeypatch.setattr(options, "_scores", lambda chosen: asked.append(chosen) or scores(chosen))
+    every = options.likeliest_sites()
+    start = np.where(np.arange(60) < 3, every, ELSEWHERE)
+    np.testing.assert_array_equal(options.climb(start), every)
+    assert len(asked) <= 8
 
 
 @settings(max_examples=25)
