@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from evermap.io.rosbag import UNSTATED
 from evermap.types import UNKNOWN, SpatialRecording, landmark_id_of
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
+
+from rosbags.highlevel import AnyReader
 
 
 def state_size(bag: Path) -> None:
@@ -298,16 +301,58 @@ def test_settings_of_another_bag_are_taken_by_an_option(tmp_path: Path) -> None:
     assert "native: has no topics" in no_bag.output
 
 
-def test_a_bag_with_topics_in_protobuf_says_how_to_keep_the_others(tmp_path: Path) -> None:
-    with (tmp_path / "mixed.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "foxglove")
-        schema = writer.register_schema("foxglove.SceneUpdate", "protobuf", b"\n\x00")
-        writer.add_message(writer.register_channel("/scene", "protobuf", schema), 0, b"\n\x00", 0)
+def with_protobuf(bag: Path, to: Path, profile: str, **how: Any) -> Path:
+    """The messages of a bag, and scenes as Foxglove's own recorders write them, as an MCAP file."""
+    scene = pytest.importorskip("foxglove.messages", reason="the extra live is not installed").SceneUpdate
+    with AnyReader([bag]) as ros, to.open("wb") as file:
+        writer = Writer(file, **how)
+        writer.start(profile, "test")
+        schema = writer.register_schema("foxglove.SceneUpdate", "protobuf", scene.get_schema().data)
+        drawn = writer.register_channel("/scene", "protobuf", schema)
+        text, data = ("ros2msg", "cdr") if ros.is2 else ("ros1msg", "ros1")
+        channels = {}
+        for one in ros.connections:
+            kind = one.msgtype if ros.is2 else one.msgtype.replace("/msg/", "/")
+            schema = writer.register_schema(kind, text, one.msgdef.data.encode())
+            channels[one.topic] = writer.register_channel(one.topic, data, schema)
+        for one, stamp_ns, raw in ros.messages():
+            writer.add_message(channels[one.topic], stamp_ns, raw, stamp_ns)
+            writer.add_message(drawn, stamp_ns, scene().encode(), stamp_ns)
         writer.finish()
-    with pytest.raises(InputError, match="topics with messages in protobuf") as caught:
-        read_bag(tmp_path / "mixed.mcap")
-    assert str(caught.value.hint).startswith("keep those of ROS: mcap filter")
+    return to
+
+
+@pytest.mark.parametrize("profile", ["ros2", "", "ros1"])
+@pytest.mark.parametrize("how", [{}, {"use_chunking": False, "use_statistics": False}], ids=["chunks", "plain"])
+def test_topics_of_ros_are_read_beside_those_in_protobuf(tmp_path: Path, profile: str, how: dict[str, Any]) -> None:
+    bag = write(tmp_path / ("drive.bag" if profile == "ros1" else "drive"), "apriltag_ros")
+    plain, mixed = read_bag(bag), read_bag(with_protobuf(bag, tmp_path / "mixed.mcap", profile, **how))
+    warning = "topics passed over, since only messages of ROS are read, in protobuf: /scene"
+    assert [one for one in mixed.warnings if one not in plain.warnings] == [warning]
+    assert plain.odometry is not None
+    assert mixed.odometry is not None
+    for ours, theirs in ((mixed.odometry, plain.odometry), (mixed.detections, plain.detections)):
+        for one in fields(ours):
+            np.testing.assert_array_equal(getattr(ours, one.name), getattr(theirs, one.name))
+    np.testing.assert_array_equal(mixed.frames.stamp_s, plain.frames.stamp_s)
+    assert mixed.sensors == plain.sensors
+    shown = CliRunner().invoke(app, ["info", str(tmp_path / "mixed.mcap"), "--json"])
+    assert json.loads(shown.stdout)["topics"]["/scene"]["messages"] > 2 * STEPS
+    settings = bag_settings(tmp_path / "mixed.mcap")
+    assert "#   /scene  foxglove.SceneUpdate (protobuf)  " in settings
+
+
+def test_a_file_without_topics_of_ros_is_refused_in_one_line(tmp_path: Path) -> None:
+    with (tmp_path / "scene.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("", "foxglove")
+        for encoding in ("protobuf", "json"):
+            schema = writer.register_schema("foxglove.SceneUpdate", {"json": "jsonschema"}.get(encoding, encoding), b"")
+            writer.add_message(writer.register_channel(f"/{encoding}", encoding, schema), 0, b"", 0)
+        writer.finish()
+    told = CliRunner().invoke(app, ["slam", str(tmp_path / "scene.mcap"), "--out", str(tmp_path / "run")])
+    assert told.exit_code == 2
+    assert "has messages in json, protobuf only" in " ".join(told.output.split())
 
 
 PROTOBUF = {1: "float64", 8: "bool", 9: "string", 12: "uint8[]", 13: "uint32", 14: "uint8", 7: "uint32"}

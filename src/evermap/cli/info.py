@@ -171,7 +171,7 @@ def _topics(path: Path) -> dict[str, tuple[str, int]]:
     """Type and number of messages of every topic; no message is read."""
     from evermap.io.rosbag import scan
 
-    return {name: (one.kind, one.messages) for name, one in scan(path, lambda _: {}).items()}
+    return {name: (one.text, one.messages) for name, one in scan(path, lambda _: {}).items()}
 
 
 def _map(path: Path) -> Described:

@@ -151,7 +151,7 @@ def bag_settings(path: str | Path) -> str:
     for name, one in settings.sensors.items():
         given: dict[str, Any] = {key: getattr(one, key) for key in _OF_SENSOR}
         sections[f"camera.{name}"] = given if one.camera_info else given | {"rectified": None}
-    listed = "\n".join(f"#   {name}  {one.kind}  {one.messages}" for name, one in sorted(content.topics.items()))
+    listed = "\n".join(f"#   {name}  {one.text}  {one.messages}" for name, one in sorted(content.topics.items()))
     return f"{_HEAD}{toml_text(sections)}\n# All topics, with the type and number of their messages:\n{listed}\n"
 
 
@@ -279,11 +279,13 @@ def _check_topic(reader: TomlReader, section: str, key: str, topic: str, held: M
 
 
 def _recording(path: Path, content: BagContent, settings: BagSettings, *, guessed: bool) -> SpatialRecording:
+    passed_over = content.passed_over()
     if not settings.sensors:
-        kinds = ", ".join(sorted({one.kind for one in content.topics.values()})) or "no topics"
+        kinds = ", ".join(sorted({one.kind for one in content.topics.values() if not one.encoding})) or "no topics"
+        kinds += f"; {passed_over}" if passed_over else ""
         hint = "detections of apriltag_msgs, vision_msgs, aruco or fiducial_msgs, or markers in a frame of the robot"
         raise InputError(f"contains no detections of landmarks; it contains {kinds}", path=path, hint=hint)
-    warnings: list[str] = []
+    warnings = [passed_over] if passed_over else []
     if guessed:
         read = ", ".join(one.topic for one in settings.sensors.values())
         moved = f"odometry {settings.odometry}" if settings.odometry else "no odometry"

@@ -53,6 +53,14 @@ class BagContent:
         """Return the type of a topic without its package."""
         return self.topics[topic].kind.rsplit("/", 1)[-1] if topic in self.topics else ""
 
+    def passed_over(self) -> str:
+        """Return which topics are not read since their messages are not of ROS, as a sentence; '' for none."""
+        by: dict[str, list[str]] = {}
+        for name, one in sorted(self.topics.items()):
+            by.setdefault(one.encoding, []).append(name)
+        parts = [f"in {encoding}: {', '.join(names)}" for encoding, names in by.items() if encoding]
+        return f"topics passed over, since only messages of ROS are read, {'; '.join(parts)}" if parts else ""
+
     def mount(self, base: str, sensor: str) -> FloatArray | None:
         """Return the pose (7,) of one frame in another, along frames that do not move; None without such a way."""
         ways: dict[str, list[tuple[str, FloatArray]]] = {}
@@ -89,7 +97,7 @@ def scanned(path: Path) -> BagContent:
 
 def handler_of(content: BagContent, topic: str) -> Handler | None:
     """Return what adds a message of a topic to the content, and when it was received [s]; None for other kinds."""
-    kind = content.kind(topic)
+    kind = "" if content.topics[topic].encoding else content.kind(topic)
     if kind in POSES + TWISTS:
         return _motion_of(content, topic)
     if kind in _DETECTIONS:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import bz2
 import functools
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -22,10 +24,16 @@ MOST_HAMMING = 2
 
 
 class Topic(NamedTuple):
-    """Type of a topic's messages, such as 'nav_msgs/msg/Odometry', and how many there are."""
+    """Type of a topic's messages, such as 'nav_msgs/msg/Odometry', how many, and the encoding if it is not of ROS."""
 
     kind: str
     messages: int
+    encoding: str = ""
+
+    @property
+    def text(self) -> str:
+        """The type, with the encoding if it is not of ROS."""
+        return f"{self.kind} ({self.encoding})".strip() if self.encoding else self.kind
 
 
 class TagSightings(NamedTuple):
@@ -108,10 +116,6 @@ def read_tag_bag(
     return seen, _odometry(odometry)
 
 
-NOT_OF_ROS = ("protobuf", "jsonschema", "flatbuffer")
-"""Encodings of MCAP schemas that `rosbags` fails at, as the key of a `KeyError`."""
-
-
 def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Handler]]) -> dict[str, Topic]:
     """Hand the messages of some topics of a bag, in the order in which they were recorded, to what handles them.
 
@@ -124,20 +128,18 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
         All topics by name.
 
     Raises:
-        InputError: the bag is missing or damaged, or a message is not what its type says.
-        MissingExtraError: `rosbags` is not installed.
+        InputError: the bag is missing or damaged, has no topic of ROS, or a message is not what its type says.
+        MissingExtraError: `rosbags` or `mcap` is not installed.
     """
+    ros2_types()
     try:
-        from rosbags.highlevel import AnyReader
-    except ImportError:
-        raise MissingExtraError("bags need the package rosbags", path=path, hint="pip install evermap[ros]") from None
-    usual = ros2_types()
-    try:
-        with (
-            tempfile.TemporaryDirectory() as folder,
-            AnyReader([_unpacked(path, Path(folder))], default_typestore=usual) as bag,
-        ):
-            topics = {name: Topic(str(one.msgtype), one.msgcount) for name, one in bag.topics.items()}
+        with tempfile.TemporaryDirectory() as folder, _opened(_unpacked(path, Path(folder))) as bag:
+            foreign: dict[str, Topic] = getattr(bag, "foreign", {})
+            if foreign and not bag.connections:
+                encodings = ", ".join(sorted({one.encoding for one in foreign.values()}))
+                hint = "record topics of ROS, such as by ros2 bag record -s mcap"
+                raise InputError(f"has messages in {encodings} only", path=path, hint=hint)
+            topics = foreign | {name: Topic(str(one.msgtype), one.msgcount) for name, one in bag.topics.items()}
             wanted = handlers(topics)
             held = [one for one in bag.connections if one.topic in wanted]
             for one, received_ns, raw in bag.messages(connections=held) if held else ():
@@ -148,14 +150,11 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
                     hint = "record it as MCAP, which contains the message definitions"
                     raise InputError(problem, path=path, hint=hint) from error
                 wanted[one.topic](message, 1e-9 * received_ns)
-    except InputError:
+    except (InputError, MissingExtraError):
         raise
     except Exception as error:  # the package has no error that all of its errors are
-        problem, hint = f"cannot be read as a bag: {reason(error)}", "check it with ros2 bag info, or rosbag check"
-        if isinstance(error, KeyError) and error.args[0] in NOT_OF_ROS:
-            problem = f"has topics with messages in {error.args[0]}, beside which none is read"
-            hint = "keep those of ROS: mcap filter BAG.mcap -o ROS.mcap --include-topic-regex '/odom|/detections'"
-        raise InputError(problem, path=path, hint=hint) from error
+        hint = "check it with ros2 bag info, or rosbag check"
+        raise InputError(f"cannot be read as a bag: {reason(error)}", path=path, hint=hint) from error
     return topics
 
 
@@ -175,6 +174,100 @@ def ros2_types() -> Any:
     for name, text in UNSTATED.items():
         types.register(get_types_from_msg(text, name))
     return types
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The reader of a bag; that of `rosbags` fails at MCAP files with other messages than those of ROS 2."""
+    from rosbags.highlevel import AnyReader, AnyReaderError
+
+    bag: Any = AnyReader([path], default_typestore=ros2_types())
+    try:
+        bag.open()
+    except (AnyReaderError, KeyError, UnicodeDecodeError) as error:
+        damaged = isinstance(error, AnyReaderError) and "Profile" not in str(error)
+        if damaged or path.suffix != ".mcap":
+            raise
+        bag = _Mixed(path)
+    with closing(bag):
+        yield bag
+
+
+class _Channel(NamedTuple):
+    topic: str
+    msgtype: str
+    msgcount: int
+
+
+_OF_ROS = {"ros1msg": "ros1", "ros2msg": "cdr", "ros2idl": "cdr", "omgidl": "cdr"}
+"""Encodings of messages by those of their schemas."""
+
+
+class _Mixed:
+    """Channels of ROS in an MCAP file of any profile, with what `scan` needs of `rosbags.highlevel.AnyReader`.
+
+    Attributes:
+        topics: by name, those of ROS only.
+        connections: their channels.
+        foreign: topics in other encodings.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from mcap.reader import make_reader
+        except ImportError:
+            problem = "MCAP files with other messages than those of ROS 2 need the package mcap"
+            raise MissingExtraError(problem, path=path, hint="pip install 'evermap[ros]'") from None
+        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+        counts = Counter[int]()
+        with path.open("rb") as file:
+            about = make_reader(file).get_summary()
+            if about is None or about.statistics is None:  # the recorder was killed before it wrote them
+                channels = {}
+                for schema, one, _ in make_reader(file).iter_messages(log_time_order=False):
+                    channels[one.id] = (schema, one)
+                    counts[one.id] += 1
+            else:
+                channels = {key: (about.schemas.get(one.schema_id), one) for key, one in about.channels.items()}
+                counts.update(about.statistics.channel_message_counts)
+        self._path, self._types = path, get_typestore(Stores.EMPTY)
+        self._channels: dict[int, _Channel] = {}
+        self._of_ros1: set[str] = set()
+        self.foreign: dict[str, Topic] = {}
+        types: dict[str, Any] = {}
+        for key, (schema, one) in channels.items():
+            kind, encoding = (schema.name, schema.encoding) if schema else ("", "")
+            if schema is None or _OF_ROS.get(encoding) != one.message_encoding:
+                self.foreign[one.topic] = Topic(kind, counts[key], one.message_encoding or encoding or "no encoding")
+                continue
+            kind, text = kind if "/msg/" in kind else kind.replace("/", "/msg/"), schema.data.decode()
+            if encoding.endswith("msg"):
+                types |= get_types_from_msg(text, kind)
+            else:  # of each type, where it is of ROS, a line with its name comes first
+                parts = [part for part in text.split("=" * 80 + "\n") if part.strip()]
+                bare = [part.partition("\n")[2] if part.startswith("IDL: ") else part for part in parts]
+                types.update(one for part in bare for one in get_types_from_idl(part).items())
+            self._channels[key] = _Channel(one.topic, kind, counts[key])
+            self._of_ros1 |= {kind} if encoding == "ros1msg" else set()
+        self._types.register(types)
+        self.connections = list(self._channels.values())
+        self.topics = {one.topic: one for one in self.connections}
+
+    def messages(self, connections: list[_Channel]) -> Iterator[tuple[_Channel, int, bytes]]:
+        from mcap.reader import make_reader
+
+        with self._path.open("rb") as file:
+            for _, channel, message in make_reader(file).iter_messages(topics=[one.topic for one in connections]):
+                if channel.id in self._channels:
+                    yield self._channels[channel.id], message.log_time, message.data
+
+    def deserialize(self, raw: bytes, kind: str) -> Any:
+        types = self._types
+        return types.deserialize_ros1(raw, kind) if kind in self._of_ros1 else types.deserialize_cdr(raw, kind)
+
+    def close(self) -> None:
+        """Leave it: no file is open but while messages are read."""
 
 
 def seconds(stamp: Any) -> float:
