@@ -123,6 +123,10 @@ class Browser:
             assert time.monotonic() < end, f"{expression} is never true; the page says\n{shown}"
             time.sleep(0.05)
 
+    def painted(self) -> None:
+        """Wait for the frames that are asked for: what moves the map is drawn with the next one."""
+        self.value("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done())))")
+
     def text(self, which: str) -> str:
         return str(self.value(f"document.querySelector({which!r}).textContent"))
 
@@ -284,7 +288,7 @@ def test_an_operator_deletes_with_the_evidence_before_them(site: Site, browser: 
     browser("Input.insertText", text=name)
     browser.press("Enter")
     browser.wait("document.querySelector('#why svg')")
-    assert browser.value("document.activeElement.id") == "why-head"
+    browser.wait("document.activeElement.id === 'why-head'")
     assert browser.value("document.querySelectorAll('#why .there, #why .vanished').length") > 1
     browser.tab_to("#word-note")
     browser("Input.insertText", text=HOSTILE)
@@ -302,6 +306,22 @@ def test_an_operator_deletes_with_the_evidence_before_them(site: Site, browser: 
     browser.wait("document.getElementById('number').textContent === '3'")
     browser.value("document.getElementById('reverts').click()")
     browser.wait("document.getElementById('said').textContent === 'revision 7 restores revision 3'")
+
+
+def test_what_an_operator_chooses_is_kept_while_the_page_reads_the_newest(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["approve"])
+    browser.value(
+        "(() => { const plain = fetch, gate = new Promise((go) => { window.release = go; });"
+        " window.fetch = async (...what) => { const answer = await plain(...what); await gate; return answer; };"
+        " window.refreshed = refresh(true);"
+        " document.querySelector('#candidates li:last-child button').click(); })()"
+    )
+    assert browser.text("#number") == "3"
+    browser.value("release()")
+    browser.value("refreshed.then(() => 0)")
+    assert browser.text("#number") == "3"
+    browser.wait("document.getElementById('revision').value === '3'")
 
 
 def test_who_only_reads_has_no_buttons_that_change(site: Site, browser: Browser) -> None:
@@ -336,6 +356,7 @@ def test_the_map_is_moved_and_asked_by_finger_and_by_key(site: Site, browser: Br
         touch("touchMove", (x - step, y), (x + step, y))
     touch("touchEnd")
     browser.wait(f"{width} < {whole} / 2.5")
+    browser.painted()
     mark = browser.value(
         "(() => { const far = (one) => Math.hypot(one.x - innerWidth / 2, one.y - innerHeight / 2);"
         " return [...document.querySelectorAll('.mark')].map((one) => one.getBoundingClientRect())"

@@ -5,7 +5,7 @@ const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
 let token = sessionStorage.getItem("evermap-token") || "";
 let site = "", revisions = [], follows = null, asked = 0, compares = false; // with another than the one before
-let operator = false, approved = 0, chosen = null;
+let operator = false, approved = 0, chosen = null, picks = 0; // how often a revision was chosen
 let placed = [], told = [], whole = null, view = null, tile = null; // what is drawn, and which part of it
 
 async function get(path, how = {}) {
@@ -288,6 +288,7 @@ function candidates() {
 }
 
 function compare(number, before) {
+  picks += 1;
   [compares, $("revision").value, $("before").max, $("before").value] = [before !== number - 1, String(number), String(number - 1), String(before)];
   show().catch((error) => say(error.message));
 }
@@ -310,11 +311,11 @@ function stays(lifetimes) {
 }
 
 async function refresh(newest) {
-  const [log, learned] = await Promise.all([json(of("revisions")), json(of("lifetimes"))]);
+  const before = picks, [log, learned] = await Promise.all([json(of("revisions")), json(of("lifetimes"))]);
   revisions = log;
   const head = revisions.length ? revisions[revisions.length - 1].revision : 0;
   $("revision").max = String(head);
-  if (newest) $("revision").value = String(head);
+  if (newest && picks === before) $("revision").value = String(head); // not if one was chosen meanwhile
   stays(learned.lifetimes);
   await show();
 }
@@ -408,6 +409,9 @@ $("before").addEventListener("input", () => {
   compares = $("before").value !== $("before").max;
   show().catch((error) => say(error.message));
 });
-$("revision").addEventListener("input", () => show().catch((error) => say(error.message)));
+$("revision").addEventListener("input", () => {
+  picks += 1;
+  show().catch((error) => say(error.message));
+});
 handle();
 if (token) start();
