@@ -14,7 +14,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpotri
 
 from evermap.config import OverlayConfig
 from evermap.geometry import se2
@@ -285,9 +286,11 @@ class _Options:
 
     def _log_standing(self, chosen: IntArray) -> tuple[float, int]:
         """Return the log probability of the options, with the density of landmarks at their sites, and their number."""
-        error, inverse, rows = self._field(chosen)
-        log_volume = float(np.linalg.slogdet(inverse)[1]) if len(rows) else 0.0
-        total = 0.5 * log_volume - 0.5 * float(error @ inverse @ error) - 0.5 * len(error) * math.log(2.0 * math.pi)
+        rows = self._chosen_rows(chosen)
+        error, factor = self._factored(rows)
+        log_volume = 2.0 * float(np.log(np.diagonal(factor)).sum())
+        squared = float(error @ cho_solve((factor, True), error)) if len(rows) else 0.0
+        total = -0.5 * (log_volume + squared + len(error) * math.log(2.0 * math.pi))
         for clique, sites in enumerate(self.sites):
             if sites:
                 site = int(chosen[clique])
@@ -430,14 +433,17 @@ class _Options:
     def _field(self, chosen: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
         """Differences, inverse of their covariance, and rows of all places that are chosen."""
         rows = self._chosen_rows(chosen)
-        return (*self._whitened(rows), rows)
-
-    def _whitened(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        error = (self.landmark_m[self.known.landmark[rows]] - self.known.position_m[rows]).ravel()
+        error, factor = self._factored(rows)
         if not len(rows):
-            return error, np.zeros((0, 0))
-        factor = cho_factor(self._covariance(rows, rows), lower=True)
-        return error, np.asarray(cho_solve(factor, np.eye(len(error))))
+            return error, factor, rows
+        inverse = np.tril(dpotri(factor, lower=True)[0])
+        return error, inverse + np.tril(inverse, -1).T, rows
+
+    def _factored(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Differences of places, and the lower Cholesky factor of their covariance."""
+        error = (self.landmark_m[self.known.landmark[rows]] - self.known.position_m[rows]).ravel()
+        factor: FloatArray = np.linalg.cholesky(self._covariance(rows, rows)) if len(rows) else np.zeros((0, 0))
+        return error, factor
 
     def _covariance(self, a: IntArray, b: IntArray) -> FloatArray:
         """Between the differences of two sets of places."""
