@@ -442,8 +442,7 @@ class _Options:
     def _factored(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Differences of places, and the lower Cholesky factor of their covariance."""
         error = (self.landmark_m[self.known.landmark[rows]] - self.known.position_m[rows]).ravel()
-        factor: FloatArray = np.linalg.cholesky(self._covariance(rows, rows)) if len(rows) else np.zeros((0, 0))
-        return error, factor
+        return error, np.asarray(np.linalg.cholesky(self._covariance(rows, rows)))
 
     def _covariance(self, a: IntArray, b: IntArray) -> FloatArray:
         """Between the differences of two sets of places."""
