@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from evermap.config import Config
 
 ConfigFile = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="TOML file; see --show-config.", show_default=False)
+    Path | None, typer.Option("--config", metavar="FILE", help="TOML file; see slam --show-config.", show_default=False)
 ]
 Settings = Annotated[
     list[str] | None,

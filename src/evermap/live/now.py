@@ -80,4 +80,5 @@ def check_fits(living: LivingMap, clock: Clock) -> None:
         )
     if len(living.places) and living.clock != clock:
         problem = f"stamps are on the clock '{clock}', those of the map on '{living.clock}'"
-        raise InputError(problem, field="clock", hint=f"evermap.Engine(..., clock='{living.clock}')")
+        hint = f"clock = '{living.clock}' in sensor.toml, or evermap.Engine(..., clock='{living.clock}')"
+        raise InputError(problem, field="clock", hint=hint)
