@@ -131,7 +131,10 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
         InputError: the bag is missing or damaged, has no topic of ROS, or a message is not what its type says.
         MissingExtraError: `rosbags` or `mcap` is not installed.
     """
-    ros2_types()
+    try:
+        import rosbags.highlevel  # noqa: F401 (asked here: an error below is one of the bag)
+    except ImportError:
+        raise MissingExtraError("bags need the package rosbags", path=path, hint="pip install evermap[ros]") from None
     try:
         with tempfile.TemporaryDirectory() as folder, _opened(_unpacked(path, Path(folder))) as bag:
             foreign: dict[str, Topic] = getattr(bag, "foreign", {})
