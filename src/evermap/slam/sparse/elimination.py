@@ -134,7 +134,7 @@ def eliminate(
         for i in range(tree.own[node]):
             diagonal[i] = state.front[i, i]
         _eliminate_rows(state.front, diagonal, tree.own[node], tree.size[node])
-        _pass_on(tree, state, node)
+        _store(tree, state, node)
 
 
 def eliminate_large(
@@ -148,12 +148,10 @@ def eliminate_large(
     own, size, n_waiting = int(tree.own[node]), int(tree.size[node]), int(state.n_waiting[0])
     _gather(tree, factors, values, extra, state, node, LARGE_FACTOR)
     front = state.front[:size, : size + 1]
-    for f in tree.factor[tree.factor_first[node] : tree.factor_first[node + 1]].tolist():
-        if factors.rows[f] < LARGE_FACTOR:
-            continue
+    mine = tree.factor[tree.factor_first[node] : tree.factor_first[node + 1]]
+    for f in mine[factors.rows[mine] >= LARGE_FACTOR].tolist():
         of_factor = slice(factors.first[f], factors.first[f + 1])
-        dim = tree.dim[factors.variable[of_factor]]
-        index = np.append(np.repeat(tree.factor_at[of_factor] - np.cumsum(dim) + dim, dim) + np.arange(dim.sum()), size)
+        index = np.append(numbers_of(tree.factor_at[of_factor], tree.dim[factors.variable[of_factor]]), size)
         jacobian = values[tree.value_first[f] : tree.value_first[f + 1]].reshape(factors.rows[f], -1)
         front[np.ix_(index[:-1], index)] += jacobian[:, :-1].T @ jacobian
     try:
@@ -161,11 +159,15 @@ def eliminate_large(
     except LinAlgError:
         state.n_waiting[0] = n_waiting
         raise
-    front[:own, :own] = root
     rest = solve_triangular(root, front[:own, own:], trans="T", check_finite=False)
-    front[:own, own:] = rest
+    front[:own] = np.hstack([root, rest])
     front[own:, own:] -= rest[:, :-1].T @ rest
-    _pass_on(tree, state, node)
+    _store(tree, state, node)
+
+
+def numbers_of(first: IntArray, dim: IntArray) -> IntArray:
+    """Return the positions of all numbers of variables (V,) that begin at `first` and have `dim` each."""
+    return np.asarray(np.repeat(first - np.cumsum(dim) + dim, dim) + np.arange(dim.sum()))
 
 
 @kernel
@@ -176,8 +178,7 @@ def _gather(
     its children pass on.
     """
     waiting, where, whose, front = state.waiting, state.where, state.whose, state.front
-    index, n_waiting = np.empty(len(front) + 1, np.int64), state.n_waiting[0]
-    size = tree.size[node]
+    index, size, n_waiting = np.empty(len(front) + 1, np.int64), tree.size[node], state.n_waiting[0]
     for i in range(size):
         for j in range(i, size):
             front[i, j] = 0.0
@@ -220,7 +221,7 @@ def _gather(
 
 
 @kernel
-def _pass_on(tree: Tree, state: Elimination, node: int) -> None:
+def _store(tree: Tree, state: Elimination, node: int) -> None:
     """Keep the rows of an eliminated front, and what waits for its parent."""
     stored, right, waiting, where, front = state.stored, state.right, state.waiting, state.where, state.front
     size, own, n_waiting = tree.size[node], tree.own[node], state.n_waiting[0]

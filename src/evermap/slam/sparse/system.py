@@ -20,6 +20,7 @@ from evermap.slam.sparse.elimination import (
     columns_of_inverse,
     eliminate,
     eliminate_large,
+    numbers_of,
     spread,
     spread_room,
     ways_to_border,
@@ -200,8 +201,8 @@ class System:
         own = self.tree.up < 0
         self.node_of[self.tree.variable[own]] = node
         rows = np.zeros(len(self.tree.parent), dtype=np.int64)
-        node = np.repeat(np.arange(len(rows)), np.diff(self.tree.factor_first))
-        np.maximum.at(rows, node, factors.rows[self.tree.factor])
+        fronts = np.repeat(np.arange(len(rows)), np.diff(self.tree.factor_first))
+        np.maximum.at(rows, fronts, factors.rows[self.tree.factor])
         self._large = np.maximum(self.tree.own, rows) * self.tree.size**2 >= LARGE
 
     def cuts(self, work: ArrayLike) -> list[tuple[int, int, float]]:
@@ -248,8 +249,7 @@ class System:
         information = np.triu(border[:, :-1])
         information += np.triu(information, 1).T
         right = border[:, -1].copy()
-        first, dim = tree.begin[tree.border], tree.dim[tree.border]
-        at = np.repeat(first - tree.in_border[tree.border], dim) + np.arange(len(right))
+        at = numbers_of(tree.begin[tree.border], tree.dim[tree.border])
         information[np.diag_indices(len(right))] += extra[at]
         if border_information is not None:
             information = information + border_information
