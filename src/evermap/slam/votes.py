@@ -164,11 +164,10 @@ def _votes(
     for k in range(len(at)):
         n_counted = 0
         for j in range(near[k, 0], near[k, 1]):
-            limit = 4.0 * gate * gate * (variance[j] + variance[k])
-            if (at[j, 0] - at[k, 0]) ** 2 >= limit:  # most are
+            if (at[j, 0] - at[k, 0]) ** 2 >= 4.0 * gate * gate * (variance[j] + variance[k]):  # most are
                 continue
             squared = _squared(at, variance, j, k)
-            if squared >= 4.0 * gate * gate:
+            if not squared < 4.0 * gate * gate:
                 continue
             if name[j] == name[k]:
                 own[k] += j != k

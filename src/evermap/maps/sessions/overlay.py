@@ -227,7 +227,7 @@ class _Options:
         return chosen
 
     def _flipped(self, chosen: IntArray, flips: list[tuple[float, int, int]]) -> IntArray:
-        """Return the assignment with the first flip; others that add a clique are made with it, if all are better.
+        """Return the assignment with the first flip, and with as many others as make the whole more probable.
 
         Cliques are taken away one at a time: what contradicts a wrong one is right.
         """
