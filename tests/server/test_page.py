@@ -41,7 +41,7 @@ from evermap_studies.sim import BuildingConfig, simulate_building
 NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 AXE = Path(__file__).resolve().parents[2] / "out/browser/axe_playwright_python/axe.min.js"
 HOSTILE = "<img src=x onerror=\"document.title='broken'\">"
-WAIT_S = 180.0
+WAIT_S = 60.0
 LOOKS = {
     "light": (1280, 900, "light", False),
     "dark": (1280, 900, "dark", False),
