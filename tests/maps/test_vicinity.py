@@ -86,6 +86,21 @@ def test_a_part_that_nothing_happened_to_is_put_back_as_it_was() -> None:
     np.testing.assert_allclose(again.covariance_m2.each_m2, living.covariance_m2.each_m2, atol=1e-9)
 
 
+def test_a_part_of_which_looks_alone_are_told_keeps_the_covariance_of_the_map() -> None:
+    living = lived(large=True)[-1].living
+    some = np.unique(living.members.clique_id)[::3]
+    vicinity = Vicinity.of(living, some, em.Config().living, jointly=False)
+    assert not isinstance(vicinity.part.covariance_m2, ChunkedCovariance)
+    assert vicinity.part.covariance_m2.shape == (len(vicinity.place), 2, 2)
+    assert vicinity.put_back(vicinity.part).covariance_m2 is living.covariance_m2
+    gone = vicinity.part.places.landmark_id[:1]
+    again, rest = vicinity.put_back(vicinity.part.without(gone)), living.without(gone)
+    np.testing.assert_array_equal(again.places.landmark_id, rest.places.landmark_id)
+    every = np.arange(len(rest.places))
+    now, then = of_places(again.covariance_m2, every), of_places(rest.covariance_m2, every)
+    np.testing.assert_array_equal(now, then)
+
+
 def test_beliefs_age_from_when_somebody_was_near() -> None:
     living = lived(large=False)[-1].living
     later_s = living.stamp_s + 86_400.0

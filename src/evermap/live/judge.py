@@ -168,9 +168,9 @@ def _around(living: LivingMap, glances: Sequence[_Glance], sensor: Sensor, confi
     path_m = np.array([one.pose[:2] for one in glances])
     reach_m = sensor.range_max_m + 1.0
     if not np.isfinite(reach_m):
-        return Vicinity.of(living, np.unique(living.sites.clique_id), config)
+        return Vicinity.of(living, np.unique(living.sites.clique_id), config, jointly=False)
     cliques, box = near(living, path_m, reach_m)
-    return Vicinity.of(living, cliques, config, box)
+    return Vicinity.of(living, cliques, config, box, jointly=False)
 
 
 def warm_up(config: Config) -> None:

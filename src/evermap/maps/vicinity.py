@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from evermap.config import LivingConfig
-from evermap.geometry.chunked import ChunkedCovariance, Update, of_places
+from evermap.geometry.chunked import ChunkedCovariance, Update, blocks, of_places
 from evermap.maps.living import Dated, LivingMap
 from evermap.maps.sessions.believe import aged
 from evermap.maps.shelves import Sight, key_of, rows, spliced
@@ -30,16 +30,24 @@ class Vicinity:
             the whole.
         place: (P,) rows of the whole's places that the part has.
         cells: (N,) columns of the floor of which the part has the views.
+        jointly: whether the part has the joint covariance of its places.
     """
 
     whole: LivingMap
     part: LivingMap
     place: IntArray
     cells: IntArray
+    jointly: bool = True
 
     @classmethod
     def of(
-        cls, living: LivingMap, cliques: IntArray, config: LivingConfig, views_within: FloatArray | None = None
+        cls,
+        living: LivingMap,
+        cliques: IntArray,
+        config: LivingConfig,
+        views_within: FloatArray | None = None,
+        *,
+        jointly: bool = True,
     ) -> Vicinity:
         """Take some cliques of a map.
 
@@ -48,6 +56,7 @@ class Vicinity:
             cliques: (C,) their ids, of any order.
             config: by which beliefs age.
             views_within: (4,) `(x_min, y_min, x_max, y_max)` of the views that matter; None for none of them.
+            jointly: with the joint covariance of the places; False for looks alone, which move none: each by itself.
         """
         part, place = _of_cliques(living, cliques)
         sight = _sight(living)
@@ -66,9 +75,9 @@ class Vicinity:
         )
         if len(part.dated):
             part = replace(part, sites=aged(part, config, living.stamp_s), dated=Dated.empty())
-        return cls(
-            living, replace(part, covariance_m2=of_places(living.covariance_m2, place, living.dim)), place, cells
-        )
+        joint = living.covariance_m2
+        covariance = of_places(joint, place, living.dim) if jointly else blocks(joint, living.dim)[place]
+        return cls(living, replace(part, covariance_m2=covariance), place, cells, jointly)
 
     def put_back(self, part: LivingMap) -> LivingMap:
         """Return the whole map with what a session made of the part."""
@@ -101,6 +110,8 @@ class Vicinity:
             return _chunked(whole)
         row = LivingMap.place_row(replace(part, places=places), part.places.landmark_id, part.places.site_id)
         was = whole.place_row(places.landmark_id, places.site_id)
+        if not self.jointly:  # places were dropped, none is known better
+            return _chunked(whole).taken(was)
         learned = of_places(part.covariance_m2, np.arange(len(part.places)), part.dim)
         return _chunked(whole).updated(Update(places.position_m, was, row, learned))
 
