@@ -90,7 +90,7 @@ def odds_of(log_odds: Any) -> Any:
 def aged(inverse_odds: Any, death_odds: Any) -> Any:
     """Return the inverse odds after a gap; `death_odds` is `(1 - q) / q`, infinite for certain death."""
     after = inverse_odds + (1.0 + inverse_odds) * death_odds
-    bounded = min(LARGEST, after)
+    bounded = after if after < LARGEST else LARGEST  # noqa: FURB136  (a call takes a tenth of an update)
     return bounded if (inverse_odds < INF) & (death_odds < INF) else INF
 
 
