@@ -35,11 +35,20 @@ from evermap.tracking.rows import (
 )
 from evermap.tracking.scores import MISSED, update_level
 from evermap.tracking.shape import update_shape
-from evermap.tracking.tracklets import EventKind, EventTable, Rules, SpellTable, Tracklets, TrackState
+from evermap.tracking.tracklets import (
+    ALIVE,
+    BIRTH,
+    DEAD,
+    LOST,
+    WORKING_SET,
+    EventKind,
+    EventTable,
+    Rules,
+    SpellTable,
+    Tracklets,
+)
 from evermap.types import BoolArray, FloatArray, IntArray
 
-BIRTH, ALIVE, LOST = int(TrackState.BIRTH), int(TrackState.ALIVE), int(TrackState.LOST)
-WORKING_SET, DEAD = int(TrackState.WORKING_SET), int(TrackState.DEAD)
 EVENT_BORN, EVENT_LOST, EVENT_FOUND = int(EventKind.BORN), int(EventKind.LOST), int(EventKind.FOUND)
 EVENT_STORED, EVENT_DIED = int(EventKind.STORED), int(EventKind.DIED)
 NOTHING = -1

@@ -19,10 +19,9 @@ from evermap.tracking.frame import Frame
 from evermap.tracking.kalman import distance_and_log_det, inlined, kernel, sum_of, update
 from evermap.tracking.scores import LEVEL, begin_level, log_odds_real
 from evermap.tracking.shape import begin_shape
-from evermap.tracking.tracklets import YAW, Rules, SpellTable, Tracklets, TrackState
+from evermap.tracking.tracklets import ALIVE, BIRTH, YAW, Rules, SpellTable, Tracklets
 from evermap.types import FloatArray, IntArray
 
-BIRTH, ALIVE = int(TrackState.BIRTH), int(TrackState.ALIVE)
 LEAST = 1e-12
 """Bound of inverse odds: however long an object was watched, a dozen misses may undo it."""
 MIDDLE = 2.366
@@ -183,8 +182,11 @@ def reset_filter(t: Tracklets, i: int, frame: Frame, j: int, rules: Rules) -> No
 def start_all(
     t: Tracklets, n: int, next_id: int, frame: Frame, free: IntArray, confusion: FloatArray,
     rules: Rules, track_of_detection: IntArray,
-) -> None:  # fmt: skip
-    """Begin a tracklet behind row `n` with each of the detections `free`."""
+) -> int:  # fmt: skip
+    """Begin a tracklet behind row `n` with each of the detections `free`; return how many are ALIVE at once."""
+    n_alive = 0
     for k in range(free.shape[0]):
         start(t, n + k, next_id + k, frame, free[k], confusion, rules)
         track_of_detection[free[k]] = next_id + k
+        n_alive += t.state[n + k] == ALIVE
+    return n_alive

@@ -19,10 +19,12 @@ from evermap.survival import GeneralPurpose, LifetimePrior
 from evermap.tracking.frame import Frame, appearances, boxes, classes, covariances, positions, probabilities
 from evermap.tracking.record import Event, Followed, SpellLog, StaticSpells
 from evermap.tracking.tracklets import (
+    ALIVE,
     N_DETECTED,
     N_FILTERED,
     N_LEVEL,
     VARIANCE,
+    WORKING_SET,
     YAW,
     EventKind,
     EventTable,
@@ -290,7 +292,7 @@ class Tracker(Shown):
                 self._bound_arrival(row)
         self._spells.add(self._spell_table, n_spells)
         if n_gone:
-            leaving = np.flatnonzero(t.state[:n] == TrackState.WORKING_SET)
+            leaving = np.flatnonzero(t.state[:n] == WORKING_SET)
             if len(leaving):
                 self.working_set.insert(t, leaving, frame.stamp_s)
             self._n = sweep(t, n)
@@ -372,14 +374,14 @@ class Tracker(Shown):
             return
         free = free[np.lexsort(frame.position[free].T)]
         self._reserve(self._n + len(free))
-        self._rows.start_all(
+        n_alive = self._rows.start_all(
             self._tracklets, self._n, self._next_id, frame, free, self._likelihood.confusion, self._rules,
             track_of_detection,
         )  # fmt: skip
-        at_once = self._n + np.flatnonzero(self._tracklets.state[self._n : self._n + len(free)] == TrackState.ALIVE)
-        self._n += len(free)
-        self._next_id += len(free)
-        for row in at_once.tolist():
+        first, self._n, self._next_id = self._n, self._n + len(free), self._next_id + len(free)
+        if not n_alive:
+            return
+        for row in (first + np.flatnonzero(self._tracklets.state[first : self._n] == ALIVE)).tolist():
             events.append(Event(frame.stamp_s, EventKind.BORN, int(self._tracklets.track_id[row])))
             self._bound_arrival(row)
 

@@ -25,6 +25,10 @@ class TrackState(IntEnum):
     """Given up."""
 
 
+BIRTH, ALIVE, LOST, WORKING_SET, DEAD = map(int, TrackState)
+"""The same as numbers, which kernels read, and loops faster than attributes of an enumeration."""
+
+
 class EventKind(IntEnum):
     """Events of tracklets."""
 
@@ -140,9 +144,12 @@ def grown(tracklets: Tracklets, n: int) -> Tracklets:
 
 def sweep(tracklets: Tracklets, n: int) -> int:
     """Remove those of the first `n` that are no longer active, by moving the last ones there; how many are left."""
-    active = tracklets.state[:n] < TrackState.WORKING_SET
+    active = tracklets.state[:n] < WORKING_SET
     left = int(np.count_nonzero(active))
-    gaps, movers = np.flatnonzero(~active[:left]), left + np.flatnonzero(active[left:])[::-1]
+    gaps = np.flatnonzero(~active[:left])
+    if not len(gaps):  # the last ones went, as false alarms do
+        return left
+    movers = left + np.flatnonzero(active[left:])[::-1]
     for column in tracklets:
         column[gaps] = column[movers]
     return left
