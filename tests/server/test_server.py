@@ -153,6 +153,7 @@ def test_nobody_is_answered_without_a_token(fleet: Fleet) -> None:
 @pytest.mark.parametrize(
     ("method", "path", "least"),
     [
+        ("GET", "/sites", Role.READ),
         ("GET", "/maps", Role.READ),
         ("GET", "/jobs", Role.READ),
         ("POST", "/maps/ward/sessions", Role.UPLOAD),
@@ -270,6 +271,18 @@ def test_an_answer_is_sent_again_only_once_the_map_is_newer(fleet: Fleet, zips: 
     newer = fleet.client.get("/maps/ward/landmarks", headers=known)
     assert (newer.status_code, newer.json()["revision"]) == (200, 2)
     assert fleet.client.get("/maps/ward/landmarks", headers={**known, "Authorization": ""}).status_code == 401
+
+
+def test_sites_are_listed_by_name_and_maps_by_pages(fleet: Fleet) -> None:
+    sites = fleet.server.sites
+    for name in ("b", "c", "a"):
+        with sites.store(name, create=True):
+            pass
+    assert fleet("GET", "/sites").json() == ["a", "b", "c"]
+    for query, found in (("most=2", ["a", "b"]), ("most=2&after=b", ["c"]), ("after=c", []), ("site=b", ["b"])):
+        assert [one["site"] for one in fleet("GET", f"/maps?{query}").json()] == found, query
+    assert fleet("GET", "/maps?site=d").status_code == 404
+    assert fleet("GET", "/maps?most=0").status_code == 422
 
 
 @pytest.mark.parametrize("where", ["postgresql"], indirect=True)

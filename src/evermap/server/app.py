@@ -10,6 +10,7 @@ import asyncio
 import json
 import math
 import time
+from bisect import bisect_right
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -280,11 +281,21 @@ def page(request: Request) -> Response:
     return HTMLResponse(text, media_type=_PAGE[name])
 
 
+@router.get("/sites")
+def list_sites(server: Answering, _: Reader) -> list[str]:
+    """List the names of all sites."""
+    return server.sites.names()
+
+
 @router.get("/maps")
-def list_maps(server: Answering, _: Reader, site: OfSite = None) -> list[dict[str, Any]]:
-    """List the sites, or one of them, with the newest revision and the approved one."""
+def list_maps(
+    server: Answering, _: Reader, site: OfSite = None, after: OfSite = None,
+    most: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """List one site, or the first `most` of those after a name, with the newest revision and the approved one."""
+    names = server.sites.names() if site is None else [site]
     told = []
-    for name in server.sites.names() if site is None else [site]:
+    for name in names[bisect_right(names, after or "") if site is None else 0 :][:most]:
         with server.sites.store(name) as store:
             told.append({"site": name, "head": store.head(), "approved": server.database.approved(name)})
     return told

@@ -377,13 +377,13 @@ async function choose() {
 
 async function start() {
   try {
-    const [maps, who] = await Promise.all([json("/maps"), json("/whoami")]);
+    const [sites, who] = await Promise.all([json("/sites"), json("/whoami")]);
     sessionStorage.setItem("evermap-token", token);
     operator = ["approve", "admin"].includes(who.role);
     $("enter").hidden = true;
     $("approve").hidden = !operator;
-    if (!maps.length) { say("no map yet: upload a session"); return; }
-    $("site").replaceChildren(...maps.map((one) => new Option(one.site)));
+    if (!sites.length) { say("no map yet: upload a session"); return; }
+    $("site").replaceChildren(...sites.map((name) => new Option(name)));
     $("choose").hidden = false;
     document.querySelector("main").hidden = false;
     await choose();

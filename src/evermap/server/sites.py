@@ -14,7 +14,7 @@ from typing import TypeVar
 from evermap.errors import ConfigError, InputError
 from evermap.maps.living import LivingMap
 from evermap.maps.store import is_address, open_store
-from evermap.maps.store.postgres import SITE, address_of, sites_in
+from evermap.maps.store.postgres import SITE, address_of, has_site, sites_in
 from evermap.maps.store.sql import SqlStore
 from evermap.maps.store.sqlite import snapshot
 
@@ -78,6 +78,9 @@ class SiteStores:
             return sites_in(str(self._where))
         return sorted(path.stem for path in Path(self._where).glob(f"*{ENDING}") if SITE.fullmatch(path.stem))
 
+    def _has(self, site: str) -> bool:
+        return has_site(str(self._where), site) if is_address(self._where) else Path(self.address(site)).is_file()
+
     @contextmanager
     def store(self, site: str, *, create: bool = False) -> Iterator[SqlStore]:
         """Yield a store for exclusive use; its cached history is kept for the next user.
@@ -90,8 +93,8 @@ class SiteStores:
             idle = self._open.get(site)
             store = idle.pop() if idle else None
         if store is None:
-            if not create and site not in self.names():
-                raise NoSuchSiteError("there is no such map", field="site", hint="GET /maps lists them")
+            if not create and not self._has(site):
+                raise NoSuchSiteError("there is no such map", field="site", hint="GET /sites lists them")
             opened = open_store(address, create=create)
             assert isinstance(opened, SqlStore)
             store = opened

@@ -80,6 +80,12 @@ def sites_in(database: str) -> list[str]:
     return sorted(name.removeprefix(PREFIX) for name in schemas if name.startswith(PREFIX))
 
 
+def has_site(database: str, site: str) -> bool:
+    """Return whether a site is in a database, without a look at the others."""
+    with engine_of(database, "public").connect() as connection:
+        return inspect(connection).has_schema(PREFIX + site)
+
+
 def engine_of(database: str, schema: str) -> Engine:
     """Return an engine whose transactions see one schema of a database; all share the connections of this process.
 
