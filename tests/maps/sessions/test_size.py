@@ -303,3 +303,14 @@ def test_a_bent_session_says_little_of_its_size() -> None:
     size, bent_variance = log_ratio(session_m, covariance, map_m, covariance)
     assert np.sqrt(variance) < 1e-3
     assert abs(size) < 3.0 * np.sqrt(bent_variance)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_session_that_has_nothing_to_do_with_the_map_says_nothing_of_its_size(seed: int) -> None:
+    """Landmarks are mixed up, with the correlated errors of a long drive."""
+    rng = np.random.default_rng(seed)
+    session_m, map_m = rng.uniform(-10.0, 10.0, (2, 10, 2))
+    walk = np.repeat(np.cumsum(rng.normal(size=(10, 20)), axis=0), 2, axis=0) * rng.normal(size=(20, 1))
+    size, variance = log_ratio(session_m, walk @ walk.T + 1e-4 * np.eye(20), map_m, 1e-4 * np.eye(20))
+    assert abs(size) < 10.0
+    assert np.sqrt(variance) > 0.1

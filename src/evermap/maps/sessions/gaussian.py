@@ -362,25 +362,29 @@ def log_ratio(
         map_m: (K, 2) the same in the map.
         map_m2: (2 K, 2 K) covariance of these.
     """
-    if len(session_m) < 2:  # a point has no size
+    middle = session_m.mean(axis=0)
+    if not (session_m != middle).any():  # a point has no size
         return 0.0, np.inf
-    size = float(
-        np.sqrt(((map_m - map_m.mean(0)) ** 2).sum() / max(((session_m - session_m.mean(0)) ** 2).sum(), 1e-12))
-    )
-    motion, log_size, variance = np.zeros(3), np.log(size), np.inf
-    motion = rigid(size * session_m, map_m)
+    near_m, map_m = session_m - middle, map_m - map_m.mean(axis=0)
+    # linear in (x, y, a, b): a similarity scales by hypot(a, b), and turns by atan2(b, a)
+    columns = np.column_stack([np.tile(np.eye(2), (len(near_m), 1)), near_m.ravel(), _to_the_left(near_m).ravel()])
+    angle = rigid(near_m, map_m)[2]
+    a, b = np.sqrt((map_m**2).sum() / (near_m**2).sum()) * np.array([np.cos(angle), np.sin(angle)])
+    log_size, variance = 0.0, np.inf
     for _ in range(ITERATIONS):
-        factor = np.exp(log_size)
-        turned = se2.transform(np.array([0.0, 0.0, motion[2]]), session_m) * factor
-        turn = factor * np.kron(np.eye(len(session_m)), se2.rotation(motion[2]))
-        columns = np.column_stack([se2.rigid_directions(turned), turned.ravel()])
-        rest = (map_m - turned - motion[:2]).ravel()
-        weighed = np.linalg.solve(turn @ session_m2 @ turn.T + map_m2, np.column_stack([columns, rest]))
+        turn = np.kron(np.eye(len(near_m)), np.array([[a, -b], [b, a]]))
+        weighed = np.linalg.solve(turn @ session_m2 @ turn.T + map_m2, np.column_stack([columns, map_m.ravel()]))
         information = columns.T @ weighed[:, :4]
-        step = np.linalg.solve(information, columns.T @ weighed[:, 4])
-        motion, log_size = motion + step[:3], log_size + step[3]
-        squared = float(rest @ weighed[:, 4] - step @ information @ step)
-        variance = float(np.linalg.inv(information)[3, 3]) * max(1.0, squared / max(len(rest) - 4, 1))
-        if np.abs(step).max() < 1e-9:
+        found = np.linalg.solve(information, columns.T @ weighed[:, 4])
+        squared = float((map_m.ravel() - columns @ found) @ (weighed[:, 4] - weighed[:, :4] @ found))
+        change, (a, b) = np.abs(found[2:] - (a, b)).max(), found[2:]
+        log_size, by = float(np.log(np.hypot(a, b))), np.array([0.0, 0.0, a, b]) / (a**2 + b**2)
+        variance = float(by @ np.linalg.solve(information, by)) * max(1.0, squared / max(len(columns) - 4, 1))
+        if change < 1e-9:
             break
-    return float(log_size), variance
+    return log_size, variance
+
+
+def _to_the_left(at: FloatArray) -> FloatArray:
+    """(K, 2) points turned by a quarter about the origin."""
+    return np.column_stack([-at[:, 1], at[:, 0]])
