@@ -21,9 +21,11 @@ import evermap as em
 from evermap.config import Config, SlamConfig
 from evermap.errors import ConfigError, InputError
 from evermap.live.judge import Judge
+from evermap.live.spool import Spool
 from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store
 from evermap.maps.store.measured import RECORDING, unpack_recording
+from evermap.runs.sessions import Entered, enter_session
 from evermap.slam.localize import Localizer
 from evermap.types import ChangeKind, Clock, Landmarks, Sensor
 
@@ -299,6 +301,30 @@ def test_a_session_that_is_of_another_place_is_set_aside(tmp_path: Path, two_ses
     assert len(em.read_recording(aside).frames) == len(recording.frames)
     with open_store(path) as store:
         assert store.head() == 2
+
+
+def test_a_session_that_meets_a_bug_stops_none_behind_it(
+    tmp_path: Path, two_sessions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = copied(two_sessions, tmp_path)
+    for recording in SESSIONS[2:4]:
+        spool = Spool(path)
+        spool.write(recording)
+        spool.close()
+    entered = iter([np.linalg.LinAlgError("Singular matrix")])
+
+    def enter(*given: Any) -> Entered:
+        if (bug := next(entered, None)) is not None:
+            raise bug
+        return enter_session(*given)
+
+    monkeypatch.setattr("evermap.live.spool.enter_session", enter)
+    aside, brought = em.recover(path)
+    assert "a bug in evermap: LinAlgError: Singular matrix; its readings are in " in aside.problem
+    (kept,) = path.with_name("site.evermap.live").glob("aside-*")
+    assert len(em.read_recording(kept).frames) == len(SESSIONS[2].frames)
+    assert brought.revision == 3
+    assert em.recover(path) == ()
 
 
 def test_frames_that_are_left_out_change_no_pose_of_the_others(tmp_path: Path) -> None:

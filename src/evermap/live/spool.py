@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from evermap.config import Config, parse_config, to_toml
-from evermap.errors import ConfigError, DataError, InputError, NumericalError
+from evermap.errors import ConfigError, DataError, EvermapError, InputError, NumericalError
 from evermap.io import write_native
 from evermap.live.inbox import joined
 from evermap.maps.store import StaleRevisionError, open_store
@@ -182,6 +182,11 @@ def _entered(map_file: Path, recording: Recording, config: Config, path: Path) -
             problem = error.problem
         except (DataError, InputError, NumericalError) as error:
             problem = error.problem
+            break
+        except (EvermapError, OSError, MemoryError):  # the next attempt may have what this one lacked
+            raise
+        except Exception as error:  # a bug must not stop the sessions behind it
+            problem = f"a bug in evermap: {type(error).__name__}: {error}"
             break
     aside = path.with_name(f"aside-{path.stem}")
     with suppress(InputError):
