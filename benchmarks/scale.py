@@ -120,6 +120,7 @@ def plain_config(noise: PlainNoise) -> em.Config:
         slam=SlamConfig(
             method="nohyp",
             sensor_model="plain",
+            vote_ids=False,
             robust=False,
             estimate_noise=False,
             noise=NoiseConfig(sigma_range_m=sigma_range_m, sigma_bearing_rad=sigma_bearing_rad, **levels),

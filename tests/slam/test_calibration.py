@@ -327,15 +327,22 @@ def test_average_of_as_stated_and_estimated_is_the_optimum_of_the_narrower_prior
     prior = default_prior()
     p, data, seen = np.linspace(0.05, 0.95, 9), np.linspace(3.0, 900.0, 9) / prior.sigma**2, 0.7 * prior.sigma
     variance = 1.0 / (data + 1.0 / prior.sigma**2)
-    averaged = prior.averaged(p, variance, np.ones(9))
     estimated = variance * data * seen
+    states = prior.mean + estimated
+    averaged, means = prior.averaged(p, states, variance, np.ones(9))
     assert data * seen / (data + 1.0 / averaged.sigma**2) == pytest.approx(p * estimated)
+    assert means - prior.mean == pytest.approx(p * estimated)
     # where ten readings are worth one, the prior counts ten times as much
-    fewer = prior.averaged(p, variance, np.full(9, 10.0))
+    fewer, means = prior.averaged(p, states, variance, np.full(9, 10.0))
     less = 0.1 * data * seen / (0.1 * data + 1.0 / prior.sigma**2)
     assert data * seen / (data + 1.0 / fewer.sigma**2) == pytest.approx(p * less)
-    assert not prior.averaged(np.full(9, 0.001), variance, np.ones(9)).free.any()
-    assert prior.averaged(np.ones(9), variance, np.ones(9)).sigma.tolist() == pytest.approx(prior.sigma.tolist())
+    assert means - prior.mean == pytest.approx(p * less)
+    spared, means = prior.averaged(np.full(9, 0.001), states, variance, np.ones(9))
+    assert not spared.free.any()
+    assert np.array_equal(means, prior.mean)
+    same, means = prior.averaged(np.ones(9), states, variance, np.ones(9))
+    assert same.sigma.tolist() == pytest.approx(prior.sigma.tolist())
+    assert means == pytest.approx(states)
 
 
 def test_jitter_of_reported_velocities_is_told_from_their_changes():

@@ -20,6 +20,7 @@ sheet says how far off it may be.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -29,6 +30,7 @@ from scipy.special import logsumexp
 from evermap.config import CalibrationConfig
 from evermap.errors import ConfigError
 from evermap.geometry import se2
+from evermap.slam.kernels import adjoint, composed, inverted
 from evermap.types import BoolArray, FloatArray, Sensor, SensorKind
 
 
@@ -147,16 +149,20 @@ class CalibrationPrior:
             p_sensor=p_needed,
         )
 
-    def averaged(self, p_needed: FloatArray, variance: FloatArray, worth: FloatArray) -> CalibrationPrior:
-        """Return the prior under which each estimate is the mean over 'as stated' and 'drawn from this prior'.
+    def averaged(
+        self, p_needed: FloatArray, states: FloatArray, variance: FloatArray, worth: FloatArray
+    ) -> tuple[CalibrationPrior, FloatArray]:
+        """Return the prior under which each estimate is the mean over 'as stated' and 'drawn from this prior', and
+        these means (9,), as far as the readings are linear in each state.
 
         Such a mean lies nearer to what is stated, by the probability of the latter, and the more so the less the
         readings are worth; that of a Gaussian does where its prior is narrower. So nothing jumps where the evidence is
-        in doubt.
+        in doubt. The optimum is sought from these means: a step to a delay far away would leave what is linear.
 
         Args:
             p_needed: (9,) as `needed` returns it.
-            variance: (9,) of the states, as estimated under this prior.
+            states: (9,) as estimated under this prior.
+            variance: (9,) of them.
             worth: (9,) variances by the errors as they were found, in those of independent errors.
         """
         asked = self.free & ~np.isnan(p_needed)
@@ -164,7 +170,9 @@ class CalibrationPrior:
         data = np.maximum(1.0 / np.where(self.free, variance, self.sigma**2) - before, 1e-9 * before)
         told = data / worth
         information = np.where(asked, data * ((told + before) / (p * told) - 1.0), before)
-        return replace(self.spared(p_needed), sigma=1.0 / np.sqrt(information))
+        prior = replace(self.spared(p_needed), sigma=1.0 / np.sqrt(information))
+        share = np.where(prior.free, (data + before) / (data + information), 0.0)
+        return prior, self.mean + share * (states - self.mean)
 
     def spared(self, p_needed: FloatArray) -> CalibrationPrior:
         """Return the prior with those states held as stated that hardly need to be free, by `p_needed` (9,)."""
@@ -304,16 +312,20 @@ class CalibrationPrior:
         askew = self._askew(states)
         if askew == 0.0:
             return np.zeros(3)
-        turned = se2.compose(se2.compose(mount, np.array([0.0, 0.0, -askew])), se2.inverse(mount))
-        return np.asarray(turned, dtype=np.float64)
+        c, s, x, y = math.cos(askew), math.sin(askew), float(mount[0]), float(mount[1])
+        return np.array([x - c * x - s * y, y + s * x - c * y, -askew])  # turned about the sensor
 
 
 def from_front(pose: FloatArray, covariance: FloatArray, front: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return poses (..., 3) and covariances (..., 3, 3), in their own frames, of the front (3,) that each one sees."""
+    """Return poses (..., 3) and covariances (..., 3, 3), in their own frames, of the front (3,) that each one sees.
+
+    The heading of a single pose is not wrapped.
+    """
     if not front.any():
         return pose.copy(), covariance.copy()
-    turned = se2.adjoint(se2.inverse(front))
-    return se2.compose(pose, front), turned @ covariance @ turned.T
+    turned = adjoint(inverted(front))
+    seen = composed(pose, front) if pose.ndim == 1 else se2.compose(pose, front)
+    return seen, turned @ covariance @ turned.T
 
 
 def needed(prior: CalibrationPrior, states: FloatArray, covariance: FloatArray, worth: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from evermap.errors import NumericalError
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior, from_front, needed
+from evermap.slam.kernels import composed, inverted, wrapped
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.motion import Motion
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
@@ -188,7 +189,8 @@ class StreamingSlam:
         front = self._prior.front(self._filter.states, self._problem.mount)
         pose, covariance = from_front(pose, covariance, front)
         if not self._aligned and front.any():
-            pose = se2.compose(se2.inverse(front), pose)
+            pose = composed(inverted(front), pose)
+        pose[2] = wrapped(pose[2])
         pose[:2] *= self._scale
         covariance[:2] *= self._scale
         covariance[:, :2] *= self._scale
@@ -287,9 +289,8 @@ class StreamingSlam:
         worth = smoother.worth(estimate, marginals)
         p_needed = needed(problem.prior, estimate.states, marginals.states, worth)
         if not np.all(np.isnan(p_needed)):
-            prior = problem.prior.averaged(p_needed, np.diag(marginals.states), worth)
-            problem = replace(problem, prior=prior)
-            estimate = replace(estimate, states=np.where(prior.free, estimate.states, prior.mean))
+            prior, states = problem.prior.averaged(p_needed, estimate.states, np.diag(marginals.states), worth)
+            problem, estimate = replace(problem, prior=prior), replace(estimate, states=states)
             smoother, estimate, fit = self._converged(problem, estimate, fit.noise)
             solved = self._optimum(problem, estimate, fit)
         return divided(solved, self._prior, p_needed, fit, revision, aligned=self._aligned)

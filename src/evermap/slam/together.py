@@ -314,10 +314,9 @@ def _as_needed(joint: Together, estimate: Estimate) -> tuple[Together, Estimate,
     for robot, own, part in parts:
         worth, prior = robot.worth(own, part), robot.problem.prior
         p_needed.append(needed(prior, own.states, part.states, worth))
-        if not np.all(np.isnan(p_needed[-1])):
-            prior = prior.averaged(p_needed[-1], np.diag(part.states), worth)
+        prior, mean = prior.averaged(p_needed[-1], own.states, np.diag(part.states), worth)
         robots.append(Smoother(replace(robot.problem, prior=prior), robot.noise, robust=robot.robust))
-        states.append(np.where(prior.free, own.states, prior.mean))
+        states.append(mean)
     return joint.of(robots, joint.sigma), replace(estimate, states=np.concatenate(states)), p_needed
 
 
