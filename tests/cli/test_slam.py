@@ -257,6 +257,30 @@ def test_interrupted_run_is_written_and_says_so(
     assert (tmp_path / "run" / "map.parquet").is_file()
 
 
+def test_a_condensed_session_gives_the_map_of_the_recording(template: Path, tmp_path: Path) -> None:
+    file = tmp_path / "session.zip"
+    options = ("--out", tmp_path / "run", "--force", "--offline-session", file, *QUICK)
+    result = run("slam", template, *options)
+    assert result.exit_code == 0, result.stderr
+    assert f"wrote the session for a map to {file}" in result.stderr
+    assert read_recording(file).truth is None
+    maps = []
+    for name, recording in (("whole", template), ("condensed", file)):
+        result = run("slam", recording, "--map", tmp_path / f"{name}.evermap", "--out", tmp_path / name, *QUICK)
+        assert result.exit_code == 0, result.stderr
+        maps.append(read_landmarks(tmp_path / name / "map.parquet"))
+    np.testing.assert_array_equal(maps[0].landmark_id, maps[1].landmark_id)
+    np.testing.assert_allclose(maps[0].position_m, maps[1].position_m, atol=0.01)
+    np.testing.assert_allclose(maps[0].p_exists, maps[1].p_exists, atol=0.01)
+    for arguments, said in (
+        (("slam", template, "--offline-session", file), "--offline-session': "),
+        (("slam", template, template, "--map", tmp_path / "m", "--offline-session", file), "is for one recording"),
+    ):
+        result = run(*arguments)
+        assert result.exit_code == 2
+        assert said in result.stderr
+
+
 def test_robots_of_one_time_are_solved_together(template: Path, tmp_path: Path) -> None:
     """Two robots that drove and saw the same: both in the first one's frame, and as it is alone."""
     first, second = tmp_path / "first", tmp_path / "second"

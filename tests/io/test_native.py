@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from hypothesis.extra import numpy as hnp
 from scipy.linalg import expm
 
 from evermap.errors import ConfigError, DataError, InputError
+from evermap.geometry import se2
 from evermap.io import read_native, read_recording, write_native
+from evermap.io.native_write import LONGEST_S, write_session
 from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap.types import (
     Clock,
@@ -475,3 +478,51 @@ def test_nothing_is_overwritten_unasked(native: Files, lay_out: Callable, tmp_pa
     with pytest.raises(ConfigError, match="xlsx"):
         write_native(recording, tmp_path / "other", "xlsx")  # type: ignore[arg-type]
     assert sorted(child.name for child in tmp_path.iterdir()) == ["MRCLAM_Test", "target"]
+
+
+def _driven(odometry: Odometry, start_s: float, stop_s: float) -> np.ndarray:
+    """(3,) motion between two stamps, row by row."""
+    pose, ends = np.zeros(3), np.append(odometry.stamp_s[1:], np.inf)
+    for k, (begin_s, end_s) in enumerate(zip(odometry.stamp_s, ends, strict=True)):
+        held_s = min(stop_s, end_s) - max(start_s, begin_s)
+        if held_s > 0.0:
+            twist = [odometry.forward_mps[k], odometry.lateral_mps[k], odometry.angular_radps[k]]
+            pose = se2.compose(pose, se2.exp(np.array(twist) * held_s))
+    return pose
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_condensed_session_has_the_motion_between_frames_and_the_silences(tmp_path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stamp_s = np.cumsum(np.where(rng.uniform(size=2000) < 0.005, 3.0, 0.02))
+    driven = Odometry(stamp_s, *(rng.normal(size=(3, 2000)).cumsum(axis=1) * 0.03))
+    at = np.sort(rng.choice(stamp_s[1:-1], 40, replace=False))
+    count = 100
+    recording = Recording(
+        name="drive",
+        odometry=driven,
+        frames=Frames(at),
+        detections=Detections(
+            frame=np.sort(rng.integers(0, 40, count)),
+            landmark_id=rng.integers(0, 9, count),
+            range_m=rng.uniform(1.0, 9.0, count),
+            bearing_rad=rng.uniform(-1.0, 1.0, count),
+            class_id=np.full(count, -1),
+            sigma_range_m=np.full(count, np.nan),
+            sigma_bearing_rad=np.full(count, np.nan),
+            source_line=np.zeros(count, dtype=np.int64),
+        ),
+    )
+    again = read_recording(write_session(recording, tmp_path / "session.zip"))
+    assert isinstance(again, Recording)
+    few = again.odometry
+    assert len(few) < 0.2 * len(driven)
+    assert np.isin(few.stamp_s, stamp_s).all()
+    for start_s, stop_s in pairwise(at):
+        assert _driven(few, start_s, stop_s) == pytest.approx(_driven(driven, start_s, stop_s), abs=1e-5)
+    silent = np.flatnonzero(np.diff(stamp_s) > LONGEST_S)
+    assert len(silent)
+    assert np.isin(stamp_s[[*silent, *(silent + 1)]], few.stamp_s).all()
+    assert np.array_equal(again.frames.stamp_s, at)
+    assert np.array_equal(again.detections.landmark_id, recording.detections.landmark_id)
+    assert again.detections.range_m == pytest.approx(recording.detections.range_m, rel=1e-6)

@@ -27,6 +27,7 @@ from evermap.io import (
     write_tum,
 )
 from evermap.io.landmarks import write_map_csv
+from evermap.io.native_write import write_session
 from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap.types import ANY_RANGE_M2, UNKNOWN, Landmarks, Recording, SpatialRecording, landmark_id_of
 from evermap.valid import validate_spatial
@@ -455,6 +456,21 @@ def test_written_and_read_again(
         first = read_recording(lay_out(request.getfixturevalue(made)))
     again = read_recording(write_native(first, tmp_path / "again", kind))
     assert_equal(first, again)
+
+
+def test_a_condensed_session_has_the_poses_around_frames(tmp_path: Path) -> None:
+    first = read_recording(write_template(tmp_path / "template", in_space=True))
+    again = read_recording(write_session(first, tmp_path / "session.zip"))
+    assert isinstance(first, SpatialRecording)
+    assert isinstance(again, SpatialRecording)
+    assert first.odometry is not None
+    assert again.odometry is not None
+    rows = np.searchsorted(first.odometry.stamp_s, again.odometry.stamp_s)
+    np.testing.assert_allclose(again.odometry.pose_world_robot, first.odometry.pose_world_robot[rows], atol=1e-6)
+    after = np.searchsorted(first.odometry.stamp_s, first.frames.stamp_s, side="right")
+    assert np.isin([*(after - 1), *np.minimum(after, len(first.odometry) - 1)], rows).all()
+    np.testing.assert_allclose(again.detections.corner_px, first.detections.corner_px, atol=1e-3)
+    assert again.truth is None
 
 
 def test_symmetries_of_classes(lay_out: Callable, space: Files, tmp_path: Path) -> None:

@@ -134,6 +134,14 @@ Together = Annotated[
     ),
 ]
 Realtime = Annotated[bool, typer.Option("--realtime", help="Process at the pace of the recording.")]
+OfflineSession = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE.zip",
+        help="Also write what a map needs of the recording, condensed, for a later upload to a server.",
+        show_default=False,
+    ),
+]
 Template = Annotated[
     Path | None,
     typer.Option(metavar="DIR", help="Write a commented template of a recording and exit.", show_default=False),
@@ -158,6 +166,7 @@ Examples:
   evermap slam --init my-flight --3d
   evermap slam my-recording --out out/mine
   evermap slam monday.mcap
+  evermap slam monday --offline-session monday.zip
   evermap slam MRCLAM_Dataset6.zip --robot 1 --out out/robot1
   evermap slam MRCLAM_Dataset6.zip --together --out out/all
   evermap slam MRCLAM_Dataset6.zip --prior-map truth --shift "11,12,13:+1.0" --method viterbi
@@ -187,6 +196,7 @@ def slam(
     shift: Shifts = None,
     together: Together = False,
     realtime: Realtime = False,
+    offline_session: OfflineSession = None,
     as_json: AsJson = False,
     force: Force = False,
     init: Template = None,
@@ -203,6 +213,8 @@ def slam(
     if not (paths := input or []):
         hint = "a folder, zip or ROS bag; --init DIR writes an example"
         raise ConfigError("a recording is needed", field="input", hint=hint)
+    if offline_session is not None and (together or len(paths) > 1):
+        raise ConfigError("is for one recording", field="offline_session", hint="a file for each, one after the other")
     if together:
         _check_together(map_file=map_file, prior_map=prior_map, robot=robot, realtime=realtime or None, topics=topics)
         _each_together(paths, out, chosen, {"as_json": as_json, "force": force, "inputs": [*paths, config]})
@@ -210,7 +222,12 @@ def slam(
     _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, shift=shift, prior=prior)
     from evermap.io import parse_shift, read_recording, shifted
 
-    read = partial(read_recording, robot=robot, topics=topics)
+    def read(path: Path) -> AnyRecording:
+        recording = read_recording(path, robot=robot, topics=topics)
+        if offline_session is not None:
+            _write_session(recording, offline_session, force=force)
+        return recording
+
     shifts = [parse_shift(text) for text in shift or []]
 
     def known(recording: AnyRecording) -> Landmarks | None:
@@ -426,6 +443,18 @@ def _check_together(**given: object) -> None:
     for field, value in given.items():
         if value is not None:
             raise ConfigError("is for one robot at a time", field=field, hint="omit it or --together")
+
+
+def _write_session(recording: AnyRecording, file: Path, *, force: bool) -> None:
+    """Write a recording condensed: repaired first, as before it enters a map."""
+    from evermap.io.native_write import write_session
+    from evermap.slam.cleaning import clean
+    from evermap.types import Recording
+
+    if file.exists() and not force:
+        raise ConfigError(f"{file} is there already", field="offline_session", hint="another name, or --force")
+    write_session(clean(recording) if isinstance(recording, Recording) else recording, file)
+    say(f"wrote the session for a map to {file} ({file.stat().st_size / 1e3:.0f} kB)")
 
 
 def _write_what_is_to_edit(folder: Path | None, bag: Path | None, *, in_space: bool) -> None:
