@@ -210,24 +210,16 @@ def slam(
         return
     given = {"sensor_model": sensor_model, "method": method, "unknown_ids": _associated(unknown_ids, empty_ids)}
     chosen = configured(config, settings, given, within="slam", show=show_config)
-    if not (paths := input or []):
-        hint = "a folder, zip or ROS bag; --init DIR writes an example"
-        raise ConfigError("a recording is needed", field="input", hint=hint)
-    if offline_session is not None and (together or len(paths) > 1):
-        raise ConfigError("is for one recording", field="offline_session", hint="a file for each, one after the other")
+    paths = _recordings(input, one=offline_session is not None)
     if together:
-        _check_together(map_file=map_file, prior_map=prior_map, robot=robot, realtime=realtime or None, topics=topics)
+        single = {"realtime": realtime or None, "topics": topics, "offline_session": offline_session}
+        _check_together(map_file=map_file, prior_map=prior_map, robot=robot, **single)
         _each_together(paths, out, chosen, {"as_json": as_json, "force": force, "inputs": [*paths, config]})
         return
     _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, shift=shift, prior=prior)
-    from evermap.io import parse_shift, read_recording, shifted
+    from evermap.io import parse_shift, shifted
 
-    def read(path: Path) -> AnyRecording:
-        recording = read_recording(path, robot=robot, topics=topics)
-        if offline_session is not None:
-            _write_session(recording, offline_session, force=force)
-        return recording
-
+    read = partial(_read, robot=robot, topics=topics, session=offline_session, force=force)
     shifts = [parse_shift(text) for text in shift or []]
 
     def known(recording: AnyRecording) -> Landmarks | None:
@@ -445,16 +437,30 @@ def _check_together(**given: object) -> None:
             raise ConfigError("is for one robot at a time", field=field, hint="omit it or --together")
 
 
-def _write_session(recording: AnyRecording, file: Path, *, force: bool) -> None:
-    """Write a recording condensed: repaired first, as before it enters a map."""
+def _recordings(given: list[Path] | None, *, one: bool) -> list[Path]:
+    """Return the recordings that were given: `one` is for a condensed session."""
+    if not given:
+        hint = "a folder, zip or ROS bag; --init DIR writes an example"
+        raise ConfigError("a recording is needed", field="input", hint=hint)
+    if one and len(given) > 1:
+        raise ConfigError("is for one recording", field="offline_session", hint="a file for each, one after the other")
+    return given
+
+
+def _read(path: Path, *, robot: int | None, topics: Path | None, session: Path | None, force: bool) -> AnyRecording:
+    """Read a recording, and write it condensed to `session`: repaired first, as before it enters a map."""
+    from evermap.io import read_recording
     from evermap.io.native_write import write_session
     from evermap.slam.cleaning import clean
     from evermap.types import Recording
 
-    if file.exists() and not force:
-        raise ConfigError(f"{file} is there already", field="offline_session", hint="another name, or --force")
-    write_session(clean(recording) if isinstance(recording, Recording) else recording, file)
-    say(f"wrote the session for a map to {file} ({file.stat().st_size / 1e3:.0f} kB)")
+    if session is not None and session.exists() and not force:
+        raise ConfigError(f"{session} is there already", field="offline_session", hint="another name, or --force")
+    recording = read_recording(path, robot=robot, topics=topics)
+    if session is not None:
+        write_session(clean(recording) if isinstance(recording, Recording) else recording, session)
+        say(f"wrote the session for a map to {session} ({session.stat().st_size / 1e3:.0f} kB)")
+    return recording
 
 
 def _write_what_is_to_edit(folder: Path | None, bag: Path | None, *, in_space: bool) -> None:
