@@ -410,6 +410,14 @@ def _motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]:
     return found
 
 
+def unrelated(recording: Recording, settings: CheckConfig) -> bool:
+    """Return whether landmarks move by the odometry of a recording, and no single mistake explains it."""
+    pairs = pairs_of(recording, settings)
+    if pairs is None or pairs.still or np.median(off(pairs.residual(HONEST))) <= settings.off:
+        return False
+    return any(finding.code == "landmarks-move" for finding in _motion(recording, settings))
+
+
 def valid(recording: Recording, sensor: SensorConfig, prior_map: Landmarks | None = None) -> Recording:
     """Return the recording with the sensor that the configuration states.
 

@@ -288,6 +288,24 @@ def test_a_session_elsewhere_leaves_the_map_as_it_was(still: tuple[BuildingSimul
     assert session.slam.landmarks.frame == "first_pose"
 
 
+@pytest.mark.parametrize("late_s", [7.0, 15.0, 30.0])
+def test_a_session_whose_odometry_is_of_another_drive_is_not_believed(
+    late_s: float, still: tuple[BuildingSimulation, list[Session]]
+) -> None:
+    """By it, no landmark that is seen twice within seconds stands still."""
+    world, sessions = still
+    other = world.sessions[1]
+    driven = other.odometry
+    rows = np.searchsorted(
+        driven.stamp_s, (driven.stamp_s + late_s * np.floor(driven.stamp_s / 11.0)) % driven.stamp_s[-1]
+    )
+    mixed = replace(driven, **{name: getattr(driven, name)[rows] for name in ("forward_mps", "angular_radps")})
+    session = run_session(replace(other, odometry=mixed), sessions[0].living, settings())
+    assert not session.found
+    assert "contradict the map or each other" in session.set_aside[0]
+    assert_same_bytes(session.living, sessions[0].living)
+
+
 @pytest.mark.parametrize("seed", [5, 6, 7, 8])
 def test_another_building_with_the_same_identities_is_not_this_one(
     seed: int, still: tuple[BuildingSimulation, list[Session]]

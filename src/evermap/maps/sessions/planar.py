@@ -42,6 +42,7 @@ from evermap.maps.sessions.placing import (
 from evermap.maps.sessions.witnessed import Witnessed
 from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.slam import result as of_slam
+from evermap.slam.check import unrelated
 from evermap.slam.cleaning import some_frames
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.streaming import Outcome, silent_links
@@ -184,6 +185,9 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
         cut: solve without doubtful frames (`doubtful`), if there are any.
     """
     settings, lost = config.living, Localised.lost(PlanarVisit(alone), living, CONTRADICTED)
+    joint = settings.search == "joint"
+    if joint and cut and len(living.places) and unrelated(alone.recording, config.slam.check):
+        return lost
     large = len(living.places) > settings.whole_places
     vicinity, where = near_session(living, alone, settings) if large else (None, None)
     part, visit = living if vicinity is None else vicinity.part, alone
@@ -194,7 +198,7 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
     if where is not None:
         in_part = vicinity is not None
         part, where, visit = refit(part, p_site, where, alone, settings, robust=config.slam.robust, part=in_part)
-    if settings.search == "joint":
+    if joint:
         if cut:
             some = without(visit, doubtful(visit, where, settings))
             if some is None:
