@@ -30,7 +30,6 @@ from scipy.special import logsumexp
 from evermap.config import CalibrationConfig
 from evermap.errors import ConfigError
 from evermap.geometry import se2
-from evermap.slam.kernels import adjoint, composed, inverted
 from evermap.types import BoolArray, FloatArray, Sensor, SensorKind
 
 
@@ -317,15 +316,13 @@ class CalibrationPrior:
 
 
 def from_front(pose: FloatArray, covariance: FloatArray, front: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return poses (..., 3) and covariances (..., 3, 3), in their own frames, of the front (3,) that each one sees.
-
-    The heading of a single pose is not wrapped.
-    """
+    """Return poses (..., 3) and covariances (..., 3, 3), in their own frames, of the front (3,) that each one sees."""
     if not front.any():
         return pose.copy(), covariance.copy()
-    turned = adjoint(inverted(front))
-    seen = composed(pose, front) if pose.ndim == 1 else se2.compose(pose, front)
-    return seen, turned @ covariance @ turned.T
+    x, y, turn = front.tolist()
+    c, s = math.cos(turn), math.sin(turn)
+    turned = np.array([[c, s, s * x - c * y], [-s, c, c * x + s * y], [0.0, 0.0, 1.0]])  # adjoint of the inverse
+    return se2.compose(pose, front), turned @ covariance @ turned.T
 
 
 def needed(prior: CalibrationPrior, states: FloatArray, covariance: FloatArray, worth: FloatArray) -> FloatArray:

@@ -19,7 +19,6 @@ from evermap.errors import NumericalError
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior, from_front, needed
-from evermap.slam.kernels import composed, inverted, wrapped
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.motion import Motion
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
@@ -189,8 +188,7 @@ class StreamingSlam:
         front = self._prior.front(self._filter.states, self._problem.mount)
         pose, covariance = from_front(pose, covariance, front)
         if not self._aligned and front.any():
-            pose = composed(inverted(front), pose)
-        pose[2] = wrapped(pose[2])
+            pose = se2.compose(se2.inverse(front), pose)
         pose[:2] *= self._scale
         covariance[:2] *= self._scale
         covariance[:, :2] *= self._scale
