@@ -10,7 +10,6 @@ import asyncio
 import json
 import math
 import time
-from bisect import bisect_right
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -293,9 +292,9 @@ def list_maps(
     most: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """List one site, or the first `most` of those after a name, with the newest revision and the approved one."""
-    names = server.sites.names() if site is None else [site]
+    names = [site] if site is not None else [name for name in server.sites.names() if name > (after or "")]
     told = []
-    for name in names[bisect_right(names, after or "") if site is None else 0 :][:most]:
+    for name in names[:most]:
         with server.sites.store(name) as store:
             told.append({"site": name, "head": store.head(), "approved": server.database.approved(name)})
     return told

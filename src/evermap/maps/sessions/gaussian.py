@@ -366,8 +366,8 @@ def log_ratio(
     if not (session_m != middle).any():  # a point has no size
         return 0.0, np.inf
     near_m, map_m = session_m - middle, map_m - map_m.mean(axis=0)
-    # linear in (x, y, a, b): a similarity scales by hypot(a, b), and turns by atan2(b, a)
-    columns = np.column_stack([np.tile(np.eye(2), (len(near_m), 1)), near_m.ravel(), _to_the_left(near_m).ravel()])
+    # linear in (x, y, b, a): a similarity scales by hypot(a, b), and turns by atan2(b, a)
+    columns = np.column_stack([se2.rigid_directions(near_m), near_m.ravel()])
     angle = rigid(near_m, map_m)[2]
     a, b = np.sqrt((map_m**2).sum() / (near_m**2).sum()) * np.array([np.cos(angle), np.sin(angle)])
     log_size, variance = 0.0, np.inf
@@ -377,14 +377,9 @@ def log_ratio(
         information = columns.T @ weighed[:, :4]
         found = np.linalg.solve(information, columns.T @ weighed[:, 4])
         squared = float((map_m.ravel() - columns @ found) @ (weighed[:, 4] - weighed[:, :4] @ found))
-        change, (a, b) = np.abs(found[2:] - (a, b)).max(), found[2:]
-        log_size, by = float(np.log(np.hypot(a, b))), np.array([0.0, 0.0, a, b]) / (a**2 + b**2)
+        change, (b, a) = np.abs(found[2:] - (b, a)).max(), found[2:]
+        log_size, by = float(np.log(np.hypot(a, b))), np.array([0.0, 0.0, b, a]) / (a**2 + b**2)
         variance = float(by @ np.linalg.solve(information, by)) * max(1.0, squared / max(len(columns) - 4, 1))
         if change < 1e-9:
             break
     return log_size, variance
-
-
-def _to_the_left(at: FloatArray) -> FloatArray:
-    """(K, 2) points turned by a quarter about the origin."""
-    return np.column_stack([-at[:, 1], at[:, 0]])
