@@ -132,6 +132,32 @@ def drive_on(
 
 
 @kernel
+def told(
+    pose: FloatArray, covariance: FloatArray, front: FloatArray, scale: float, in_map: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return the pose (3,) of the robot's front in metres, and its covariance (3, 3), in its own frame.
+
+    Args:
+        pose: (3,) of the state.
+        covariance: of the state, the pose first.
+        front: (3,) seen from the pose.
+        scale: metres in a unit of the state.
+        in_map: True in the frame of the poses, False in that of the front at the first of them.
+    """
+    seen, back = composed(pose, front), inverted(front)
+    if not in_map:
+        seen = composed(back, seen)
+    carry = adjoint(back)
+    spread = carry @ covariance[:3, :3].copy() @ carry.T
+    for k in range(2):
+        seen[k] *= scale
+        spread[k] *= scale
+        spread[:, k] *= scale
+    seen[2] = wrapped(seen[2])
+    return seen, spread
+
+
+@kernel
 def innovations(
     pose: FloatArray, states: FloatArray, covariance: FloatArray, place: FloatArray, slot: Any, own: FloatArray,
     reading: FloatArray, sigma: FloatArray, mount: FloatArray, free: Any,

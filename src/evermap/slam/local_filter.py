@@ -142,7 +142,7 @@ class LocalFilter:
         """Return the pose (3,) after a motion, and its covariance (3, 3); the filter stays where it is."""
         pose, covariance = self.pose.copy(), self.covariance[:AT_PLACES, :AT_PLACES].copy()
         drive_on(pose, covariance, motion.increment, motion.by_states, motion.covariance)
-        return pose, covariance[:3, :3]
+        return pose, covariance[:3, :3].copy()
 
     def spread(self, rows: IntArray) -> FloatArray:
         """Return (k, 2, 2) covariance of places (k,) that are in the covariance."""

@@ -180,7 +180,7 @@ class Problem:
 
     def detections_of(self, pose: int) -> IntArray:
         """Return the rows of the detections of a pose."""
-        first, last = np.searchsorted(self.pose_row, (pose, pose + 1))
+        first, last = self.pose_row.searchsorted((pose, pose + 1)).tolist()
         return np.arange(first, last)
 
     @property

@@ -97,9 +97,15 @@ class Smoother:
         """(9,) standard deviations of the prior of the calibration states."""
         return self.problem.prior.sigma
 
-    def under(self, noise: Noise, *, heavy: bool) -> Smoother:
-        """Return the smoother of the same problem at other noise; its structure is kept."""
-        other = Smoother(self.problem, noise, heavy=heavy, robust=self.robust)
+    def under(self, noise: Noise, *, heavy: bool, problem: Problem | None = None) -> Smoother:
+        """Return the smoother at other noise; its structure is kept.
+
+        Args:
+            noise: standard deviations.
+            heavy: as of the class.
+            problem: one that differs only in its start and in the prior of the calibration states; None: the same.
+        """
+        other = Smoother(self.problem if problem is None else problem, noise, heavy=heavy, robust=self.robust)
         other._structure = self._structure
         return other
 

@@ -18,7 +18,8 @@ from evermap.config import SlamConfig
 from evermap.errors import NumericalError
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
-from evermap.slam.calibration import CalibrationPrior, from_front, needed
+from evermap.slam.calibration import CalibrationPrior, needed
+from evermap.slam.filter_kernels import told
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.motion import Motion
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
@@ -40,7 +41,7 @@ DISPUTED_AT = (2, 4, 8, 16)
 """Comparisons of a landmark after which it is asked whether most of them were surprising."""
 ALIGNED_INFORMATION = 1e-2
 """Once in a prior map the first pose is free: held to 10 m only, so that the linear system stays well conditioned."""
-FINAL_ROUNDS = 12
+FINAL_ROUNDS, FINAL_STEPS = 12, 30
 MOST_BREAKS = 8
 """Silences of the odometry after which the parts are laid over each other."""
 ELSEWHERE = 0.1
@@ -179,20 +180,12 @@ class StreamingSlam:
             self.work()
         if self._prior_map is not None and not self._aligned and self._can_align():
             self._enter_map()
-        self.online_pose[row], self.online_covariance[row] = self._told(
-            self._filter.pose, self._filter.covariance[:3, :3]
-        )
+        self.online_pose[row], self.online_covariance[row] = self._told(self._filter.pose, self._filter.covariance)
 
     def _told(self, pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """A pose and its covariance in metres, of the robot's front, in the frame of the first one or of the map."""
         front = self._prior.front(self._filter.states, self._problem.mount)
-        pose, covariance = from_front(pose, covariance, front)
-        if not self._aligned and front.any():
-            pose = se2.compose(se2.inverse(front), pose)
-        pose[:2] *= self._scale
-        covariance[:2] *= self._scale
-        covariance[:, :2] *= self._scale
-        return pose, covariance
+        return told(pose, covariance, front, self._scale, self._aligned)
 
     @property
     def states(self) -> FloatArray:
@@ -283,14 +276,15 @@ class StreamingSlam:
                 break
             problem = revision.problem
             smoother, estimate, fit = self._converged(problem, revision.estimate, fit.noise)
-        solved = smoother, estimate, marginals = self._optimum(problem, estimate, fit)
+        # near enough to tell which states are needed; then all of them are sought together
+        smoother, estimate, marginals = self._optimum(smoother, problem, estimate, fit, most=1)
         worth = smoother.worth(estimate, marginals)
-        p_needed = needed(problem.prior, estimate.states, marginals.states, worth)
+        p_needed, problem = needed(problem.prior, estimate.states, marginals.states, worth), smoother.problem
         if not np.all(np.isnan(p_needed)):
             prior, states = problem.prior.averaged(p_needed, estimate.states, np.diag(marginals.states), worth)
             problem, estimate = replace(problem, prior=prior), replace(estimate, states=states)
-            smoother, estimate, fit = self._converged(problem, estimate, fit.noise)
-            solved = self._optimum(problem, estimate, fit)
+            smoother, estimate, fit = self._converged(problem, estimate, fit.noise, near=smoother)
+        solved = self._optimum(smoother, problem, estimate, fit)
         return divided(solved, self._prior, p_needed, fit, revision, aligned=self._aligned)
 
     def _ahead(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
@@ -303,21 +297,32 @@ class StreamingSlam:
         pose, landmark = se2.compose(turn, estimate.pose), se2.transform(turn, estimate.landmark)
         return replace(problem, start_pose=start), Estimate(pose, landmark, estimate.states)
 
-    def _optimum(self, problem: Problem, estimate: Estimate, fit: NoiseFit) -> tuple[Smoother, Estimate, Marginals]:
-        """The final optimum at the noise that was found, and its covariances."""
+    def _optimum(
+        self, smoother: Smoother, problem: Problem, estimate: Estimate, fit: NoiseFit, *, most: int = FINAL_STEPS
+    ) -> tuple[Smoother, Estimate, Marginals]:
+        """The final optimum at the noise that was found, after so many steps at most, and its covariances."""
         problem, estimate = self._ahead(problem, estimate)
-        smoother = Smoother(problem, fit.noise, robust=self._robust)
-        solved = smoother.solved_in_slices(estimate, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN)
+        smoother = smoother.under(fit.noise, heavy=False, problem=problem)
+        solved = smoother.solved_in_slices(estimate, iterations=most, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN)
         return smoother, *exhausted(solved)
 
-    def _converged(self, problem: Problem, estimate: Estimate, noise: Noise) -> tuple[Smoother, Estimate, NoiseFit]:
-        """The optimum and its noise levels, in turns until neither changes."""
+    def _converged(
+        self, problem: Problem, estimate: Estimate, noise: Noise, near: Smoother | None = None
+    ) -> tuple[Smoother, Estimate, NoiseFit]:
+        """The optimum and its noise levels, in turns until neither changes.
+
+        Args:
+            problem: the measurements.
+            estimate: where to begin.
+            noise: levels to begin with.
+            near: of the same problem but for its prior, where these were found: it is known what is an outlier.
+        """
         fit, ahead = None, Extrapolation()
-        smoother = Smoother(problem, noise, robust=self._robust)
-        heavy = True  # come close with the kernel that never lets go, then decide what is an outlier
+        smoother = Smoother(problem, noise, robust=self._robust) if near is None else near
+        heavy = near is None  # come close with the kernel that never lets go, then decide what is an outlier
         steps, settled = STEPS_A_ROUND, NEAR_NOISE_GAIN * len(problem.pose_row)
         for round_ in range(FINAL_ROUNDS):
-            smoother = smoother.under(noise, heavy=heavy)
+            smoother = smoother.under(noise, heavy=heavy, problem=problem)
             # values and noise levels settle together: no need for the optimum of levels that will not stay
             solved = smoother.solved_in_slices(estimate, iterations=steps, tolerance=NEAR_NOISE, settled=settled)
             estimate, marginals = exhausted(solved)
