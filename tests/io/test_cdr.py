@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evermap.io.bag_messages import KINDS
+from evermap.io.bag_messages import KINDS, OBJECT_FIELDS
 from evermap.io.cdr import Cdr
 from evermap.io.rosbag import ros2_types
 
@@ -82,6 +82,74 @@ def test_a_damaged_message_is_refused_where_rosbags_refuses_it(kind: str) -> Non
         some = bytes(raw[: int(rng.integers(len(raw) + 1))] if rng.random() < 0.5 else raw)
         one, other = read(TYPES.deserialize_cdr, some), read(reader.decode, some)
         assert repr(one) == repr(other)
+
+
+OBJECTS = "vision_msgs/msg/Detection3DArray"
+
+
+def at(part: Any, field: str) -> Any:
+    for name in field.split("/"):
+        part = getattr(part[0] if isinstance(part, list) else part, name)
+    if isinstance(part, str | np.ndarray):
+        return part
+    if not hasattr(part, "__dataclass_fields__"):
+        return np.array([part])
+    return np.concatenate([at(part, name) for name in part.__dataclass_fields__ if name[0] != "_"])
+
+
+def objects(rng: np.random.Generator, results: int = 1) -> Any:
+    """Objects with so many hypotheses each."""
+    message = drawn(OBJECTS, rng)
+    result = [drawn("vision_msgs/msg/ObjectHypothesisWithPose", rng) for _ in range(results)]
+    found = [drawn("vision_msgs/msg/Detection3D", rng) for _ in range(int(rng.integers(5)))]
+    message.detections = [type(one)(one.header, result, one.bbox, one.id) for one in found]
+    return message
+
+
+def test_columns_of_parts_are_what_the_parts_hold() -> None:
+    rng, reader = np.random.default_rng(9), Cdr(TYPES)
+    for _ in range(40):
+        message = objects(rng)
+        parts = reader.parts(bytes(TYPES.serialize_cdr(message, OBJECTS)), OBJECTS, OBJECT_FIELDS)
+        assert parts is not None
+        stamp = message.header.stamp
+        assert parts.stamp_s == stamp.sec + 1e-9 * stamp.nanosec
+        assert parts.frame == message.header.frame_id
+        assert {*parts.numbers, *parts.texts} == set(OBJECT_FIELDS)
+        for field, column in (parts.numbers | parts.texts).items():
+            assert len(column) == len(message.detections)
+            for found, one in zip(column, message.detections, strict=True):
+                np.testing.assert_array_equal(found, at(one, field))
+
+
+def test_columns_are_none_where_a_message_has_to_be_decoded() -> None:
+    rng, reader = np.random.default_rng(10), Cdr(TYPES)
+    whole = objects(rng)
+    while len(whole.detections) < 2:
+        whole = objects(rng)
+    raw = bytes(TYPES.serialize_cdr(whole, OBJECTS))
+    assert reader.parts(raw, OBJECTS, OBJECT_FIELDS) is not None
+    assert reader.parts(raw + bytes(8), OBJECTS, OBJECT_FIELDS) is None
+    assert all(reader.parts(raw[:end], OBJECTS, OBJECT_FIELDS) is None for end in range(4, len(raw) - 4))
+    assert reader.parts(bytes(TYPES.serialize_cdr(whole, OBJECTS, little_endian=False)), OBJECTS, OBJECT_FIELDS) is None
+    for results in (0, 2):
+        whole.detections[1].results[:] = [drawn("vision_msgs/msg/ObjectHypothesisWithPose", rng)] * results
+        assert reader.parts(bytes(TYPES.serialize_cdr(whole, OBJECTS)), OBJECTS, OBJECT_FIELDS) is None
+    assert Cdr(TYPES).parts(raw, OBJECTS, ["other"]) is None
+    pose = bytes(TYPES.serialize_cdr(drawn("geometry_msgs/msg/PoseStamped", rng), "geometry_msgs/msg/PoseStamped"))
+    assert reader.parts(pose, "geometry_msgs/msg/PoseStamped", OBJECT_FIELDS) is None
+
+
+def test_damaged_columns_are_none_or_those_of_the_damaged_message() -> None:
+    rng, reader = np.random.default_rng(11), Cdr(TYPES)
+    for _ in range(300):
+        raw = bytearray(TYPES.serialize_cdr(objects(rng), OBJECTS))
+        for _ in range(int(rng.integers(1, 4))):
+            raw[int(rng.integers(4, len(raw)))] = int(rng.integers(256))
+        if (parts := reader.parts(bytes(raw), OBJECTS, OBJECT_FIELDS)) is not None:
+            message = TYPES.deserialize_cdr(bytes(raw), OBJECTS)
+            for field, column in (parts.numbers | parts.texts).items():
+                np.testing.assert_array_equal(list(column), [at(one, field) for one in message.detections])
 
 
 def test_a_type_that_is_not_known_is_a_key_error() -> None:

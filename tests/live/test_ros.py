@@ -113,6 +113,43 @@ def test_a_frame_without_detections_is_a_look_and_a_text_of_digits_is_a_number()
     assert looks[0].range_m == pytest.approx([1.8, np.hypot(0.8, 1.0)])  # from the sensor, .2 m ahead
 
 
+def test_objects_by_columns_are_the_objects_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sizes and covariances that are said or not, texts of any kind, and hypotheses that only `decode` takes."""
+
+    def drive() -> list[Any]:
+        one, rng = robot()[0], np.random.default_rng(3)
+        one.frames()
+        for k in range(30):
+            one.odometry(k, path_of(k))
+            if k < 12:
+                one.boxes(k, {"3": where(k, 3)})
+                continue
+            ros, found = one.ros, []
+            header = ros.header(0.0 if k == 20 else START_S + 0.1 * k, "camera")
+            for name in rng.permutation(["", "3", "gate", "käse"])[: rng.integers(5)].tolist():
+                at = ros.pose(np.append(rng.normal(size=3) + [0.0, 0.0, 5.0], [0.0, 0.0, 0.0, 1.0]))
+                spread = np.diag([4e-4] * 3 + [0.0] * 3) * rng.integers(2)
+                posed = ros.make("geometry_msgs/PoseWithCovariance", at, spread.ravel())
+                label = rng.choice(["", "chair", "7"])
+                hypothesis = ros.make("vision_msgs/ObjectHypothesis", str(label), rng.random())
+                result = ros.make("vision_msgs/ObjectHypothesisWithPose", hypothesis, posed)
+                size = ros.make("geometry_msgs/Vector3", *rng.integers(2, size=3).astype(float).tolist())
+                box = ros.make("vision_msgs/BoundingBox3D", ros.pose(np.array([1, 2, 3, 0, 0, 0, 1.0])), size)
+                found.append(ros.make("vision_msgs/Detection3D", header, [result] * (1 + (k == 25)), box, name))
+            message = ros.make("vision_msgs/Detection3DArray", header, found)
+            one.say(k, "/seen", "vision_msgs/msg/Detection3DArray", message)
+        return one.readings
+
+    by_columns = drive()
+    monkeypatch.setattr("evermap.io.cdr.Cdr.parts", lambda *_: None)
+    one_by_one = drive()
+    assert len(by_columns) == len(one_by_one) == 29 + 30
+    for mine, other in zip(by_columns, one_by_one, strict=True):
+        assert type(mine) is type(other)
+        for a, b in zip(mine, other, strict=True):
+            np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+
+
 def test_where_no_message_says_where_the_sensor_is_its_file_does() -> None:
     one, said = robot()
     for k in range(15):

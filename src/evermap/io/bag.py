@@ -26,7 +26,7 @@ import numpy as np
 from evermap.errors import DataError, InputError, suggestion
 from evermap.geometry import se3
 from evermap.io.assemble import SAME_STAMP_S, finish_recording
-from evermap.io.bag_messages import POSES, TWISTS, BagContent, Seen, scanned
+from evermap.io.bag_messages import POSES, TWISTS, BagContent, SeenColumns, scanned
 from evermap.io.files import Reader
 from evermap.io.rig_toml import Rig, cameras
 from evermap.io.rosbag import BAG_ENDINGS
@@ -298,12 +298,13 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     clock = Clock.UNIX if looked[0] > SINCE_1970_S else Clock.RECORDING
     messages = sum(len({one.look for one in content.seen[sensor.topic]}) for sensor in settings.sensors.values())
     names: dict[int, str] = {}
-    seen = [(k, one) for k, sensor in enumerate(settings.sensors.values()) for one in content.seen[sensor.topic]]
-    labels = tuple(sorted({one.label for _, one in seen} - {""}))
-    stamp_s = np.array([stamps[k][one.look] for k, one in seen])
+    rows = [(k, one) for k, sensor in enumerate(settings.sensors.values()) for one in content.seen[sensor.topic]]
+    of, seen = np.array([k for k, _ in rows], dtype=np.int64), SeenColumns.of([one for _, one in rows])
+    labels = tuple(sorted(set(seen.label) - {""}))
+    stamp_s = np.array([stamps[k][one.look] for k, one in rows])
     frame = np.clip(np.searchsorted(looked, stamp_s + SAME_STAMP_S) - 1, 0, None)
     frame = np.asarray(frame, dtype=np.int64)
-    detections = detections_of(path, settings, sensors, (seen, frame, labels, names), warnings)
+    detections = detections_of(path, settings, sensors, (seen, of, frame, labels, names), warnings)
     finite = np.asarray(np.isfinite(detections.position_sensor_m).all(axis=1))
     if not finite.all():
         warnings.append(f"{counted(int((~finite).sum()), 'detection')} without a finite position left out")
@@ -328,7 +329,7 @@ def detections_of(
     path: Path,
     settings: BagSettings,
     sensors: tuple[SpatialSensor, ...],
-    seen: tuple[list[tuple[int, Seen]], IntArray, Sequence[str], dict[int, str]],
+    seen: tuple[SeenColumns, IntArray, IntArray, Sequence[str], dict[int, str]],
     warnings: list[str],
 ) -> SpatialDetections:
     """Return the detections of messages, with poses, corners and directions.
@@ -337,21 +338,22 @@ def detections_of(
         path: of the bag, for errors.
         settings: how its topics are read.
         sensors: of these topics.
-        seen: detections with the numbers of their sensors; (M,) frames; classes, and names by ids, which get those
-            that are texts.
+        seen: M detections; (M,) numbers of their sensors; (M,) frames; classes, and names by ids, which get those that
+            are texts.
         warnings: gets what is left out.
 
     Raises:
         DataError: the size of a tag, or the calibration of a camera, is not known.
     """
-    ones, frame, labels, names = seen
+    ones, sensor, frame, labels, names = seen
+    number = {label: row for row, label in enumerate(labels)} | {"": UNKNOWN}
     found = spatial_detections(
         frame,
-        sensor=np.array([k for k, _ in ones], dtype=np.int64),
-        landmark_id=_identities(ones, settings, names),
-        class_id=np.array([labels.index(one.label) if one.label else UNKNOWN for _, one in ones], dtype=np.int64),
-        score=np.array([one.score for _, one in ones]),
-        size_m=np.array([one.size for _, one in ones]).reshape(-1, 3),
+        sensor=sensor,
+        landmark_id=_identities(ones, sensor, settings, names),
+        class_id=np.array([number[label] for label in ones.label], dtype=np.int64),
+        score=ones.score,
+        size_m=ones.size,
     )
     return with_tag_poses(_placed(path, found, ones, sensors, settings), sensors, warnings)
 
@@ -420,14 +422,14 @@ def mounted_sensor(
     )
 
 
-def _identities(seen: list[tuple[int, Seen]], settings: BagSettings, names: dict[int, str]) -> IntArray:
+def _identities(seen: SeenColumns, sensor: IntArray, settings: BagSettings, names: dict[int, str]) -> IntArray:
     """(M,) identities of detections, by what their sensor's settings say; `names` gets those that are texts. A text of
     digits is a number, as in tables: `vision_msgs` has no other way to say one.
     """
     kinds = [one.identity for one in settings.sensors.values()]
-    identity = np.full(len(seen), UNKNOWN)
-    for row, (k, one) in enumerate(seen):
-        said = one.identity if kinds[k] == "id" else one.label or None if kinds[k] == "class" else None
+    identity = np.full(len(sensor), UNKNOWN)
+    for row, (k, own, label) in enumerate(zip(sensor.tolist(), seen.identity, seen.label, strict=True)):
+        said = own if kinds[k] == "id" else label or None if kinds[k] == "class" else None
         if isinstance(said, str) and not (said.isascii() and said.isdigit() and len(said) <= MOST_DIGITS):
             identity[row] = landmark_id_of(said)
             names[int(identity[row])] = said
@@ -439,7 +441,7 @@ def _identities(seen: list[tuple[int, Seen]], settings: BagSettings, names: dict
 def _placed(
     path: Path,
     found: SpatialDetections,
-    seen: list[tuple[int, Seen]],
+    seen: SeenColumns,
     sensors: tuple[SpatialSensor, ...],
     settings: BagSettings,
 ) -> SpatialDetections:
@@ -448,9 +450,7 @@ def _placed(
     Raises:
         DataError: the size of a tag, or the calibration of a camera, is not known.
     """
-    pose = np.array([one.pose for _, one in seen]).reshape(-1, 7)
-    corner = np.array([one.corners for _, one in seen]).reshape(-1, 4, 2)
-    pixel = np.array([one.pixel for _, one in seen]).reshape(-1, 2)
+    pose, corner, pixel = seen.pose.copy(), seen.corners, seen.pixel
     cornered, aimed = np.isfinite(corner[:, 0, 0]), np.isfinite(pixel[:, 0])
     size = settings.rig.size_of(found.landmark_id)
     if (cornered & np.isnan(size)).all() and cornered.any():
@@ -464,11 +464,10 @@ def _placed(
     unturned = np.isnan(pose).any(axis=1) | ~(np.linalg.norm(pose[:, 3:], axis=1) > 1e-6)
     pose[unturned, 3:] = np.nan
     position, covariance = pose[:, :3].copy(), found.covariance_sensor_m2.copy()
-    told = np.array([row for row, (_, one) in enumerate(seen) if one.covariance is not None], dtype=np.int64)
+    told = np.flatnonzero(~np.isnan(seen.covariance[:, 0, 0]))
     if len(told):
-        spread = np.array([seen[row][1].covariance for row in told])
-        stated = is_covariance(spread)
-        covariance[told[stated]] = spread[stated]
+        stated = told[is_covariance(seen.covariance[told])]
+        covariance[stated] = seen.covariance[stated]
     rays, spread = directions(pixel, found.sensor, sensors)
     position[aimed], covariance[aimed] = rays[aimed], spread[aimed]
     return replace(

@@ -6,16 +6,19 @@ or its corners; class and score of an object in the forms of three releases of `
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from evermap.geometry import se3
 from evermap.io.rosbag import MOST_HAMMING, Handler, Topic, pose_of, scan, seconds, stamp_of
-from evermap.types import FloatArray
+from evermap.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from evermap.io.cdr import Parts
 
 POSES = ("Odometry", "PoseWithCovarianceStamped", "PoseStamped", "TransformStamped")
 TWISTS = ("TwistWithCovarianceStamped", "TwistStamped")
@@ -34,6 +37,48 @@ class Seen(NamedTuple):
     corners: tuple[float, ...] = (np.nan,) * 8
     size: tuple[float, ...] = (np.nan,) * 3
     pixel: tuple[float, float] = (np.nan, np.nan)
+
+
+class SeenColumns(NamedTuple):
+    """M detections by columns, as `Seen` has them; numbers that a message does not say are nan.
+
+    Attributes:
+        look: (M,).
+        identity: M, None where it is not said.
+        label: M, '' where it is not said.
+        score: (M,).
+        pose: (M, 7).
+        covariance: (M, 3, 3).
+        corners: (M, 4, 2).
+        size: (M, 3).
+        pixel: (M, 2).
+    """
+
+    look: IntArray
+    identity: Sequence[int | str | None]
+    label: Sequence[str]
+    score: FloatArray
+    pose: FloatArray
+    covariance: FloatArray
+    corners: FloatArray
+    size: FloatArray
+    pixel: FloatArray
+
+    @classmethod
+    def of(cls, rows: Sequence[Seen]) -> SeenColumns:
+        """Return the columns of some detections."""
+        unknown = np.full((3, 3), np.nan)
+        return cls(
+            np.array([one.look for one in rows], dtype=np.int64),
+            [one.identity for one in rows],
+            [one.label for one in rows],
+            np.array([one.score for one in rows], dtype=np.float64),
+            np.array([one.pose for one in rows], dtype=np.float64).reshape(-1, 7),
+            np.array([unknown if one.covariance is None else one.covariance for one in rows]).reshape(-1, 3, 3),
+            np.array([one.corners for one in rows], dtype=np.float64).reshape(-1, 4, 2),
+            np.array([one.size for one in rows], dtype=np.float64).reshape(-1, 3),
+            np.array([one.pixel for one in rows], dtype=np.float64).reshape(-1, 2),
+        )
 
 
 @dataclass(slots=True)
@@ -221,6 +266,32 @@ def _objects(message: Any, look: int) -> Iterator[Seen]:
             yield Seen(*known, pose_of(_inner(best.pose)), spread if said else None)
         else:
             yield Seen(*known, pose_of(one.bbox.center), size=size if sized else (np.nan,) * 3)
+
+
+OBJECT_FIELDS = (
+    "id", "results/hypothesis/class_id", "results/hypothesis/score", "results/pose/pose", "results/pose/covariance",
+    "bbox/center", "bbox/size",
+)  # fmt: skip
+"""What a detection of `vision_msgs` in space says (`Cdr.parts`)."""
+
+
+def objects_in_space(parts: Parts) -> SeenColumns:
+    """Return detections of `vision_msgs` in space, with one hypothesis each, as `handler_of` adds them."""
+    size, score = parts.numbers["bbox/size"], parts.numbers["results/hypothesis/score"][:, 0]
+    sized, count = np.all(size > 0.0, axis=1), len(size)
+    spread = parts.numbers["results/pose/covariance"].reshape(-1, 6, 6)[:, :3, :3]
+    said = ~sized & (np.trace(spread, axis1=1, axis2=2) > 0.0)
+    return SeenColumns(
+        np.zeros(count, dtype=np.int64),
+        [one or None for one in parts.texts["id"]],
+        parts.texts["results/hypothesis/class_id"],
+        score,
+        np.where(sized[:, None], parts.numbers["bbox/center"], parts.numbers["results/pose/pose"]),
+        np.where(said[:, None, None], spread, np.nan),
+        np.full((count, 4, 2), np.nan),
+        np.where(sized[:, None], size, np.nan),
+        np.full((count, 2), np.nan),
+    )
 
 
 def _score(result: Any) -> float:

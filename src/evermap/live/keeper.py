@@ -63,7 +63,7 @@ class Keeper:
         self._jobs: dict[str, Future[None]] = {}
         self._spool: Spool | None = None
         self._child: subprocess.Popen[str] | None = None
-        self._tried: list[Path] = []
+        self._waits = False
         self._written_s = time.monotonic()
         self._name, self.n_sessions = inbox.name, 1
         self.revision = 0
@@ -159,19 +159,17 @@ class Keeper:
             self._jobs.pop("write").result()
         self._write(last=True)
         self._spool.finish()
-        self.n_sessions += 1
+        self.n_sessions, self._waits = self.n_sessions + 1, True
         self._inbox.cut(f"{self._name} {self.n_sessions}")
 
     def enter_if_waiting(self) -> bool:
         """Enter waiting sessions in parallel; returns whether that is done already."""
-        waiting = [] if self._spool is None or self._child is not None else self._spool.waiting()
-        if not waiting or waiting == self._tried:
+        if not self._waits or self._spool is None or self._child is not None:
             return False
-        self._tried = waiting
+        self._waits = False
         if self._pool is None:
             self.enter(self.file)
             return True
-        assert self._spool is not None
         self._child = self._spool.enter_beside()
         return False
 

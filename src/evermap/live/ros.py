@@ -27,7 +27,7 @@ from evermap.io.bag import (
     stamps_of,
     stated_settings,
 )
-from evermap.io.bag_messages import POSES, BagContent, handler_of
+from evermap.io.bag_messages import OBJECT_FIELDS, POSES, BagContent, SeenColumns, handler_of, objects_in_space
 from evermap.io.cdr import Cdr
 from evermap.io.rosbag import Topic, pose_of, ros2_types, seconds, stamp_of
 from evermap.live.engine import Engine
@@ -128,6 +128,8 @@ class Listener:
         if (handler := self._handlers[message.topic]) is None:
             return []
         self._sources[message.topic] = message.source
+        if (looks := self._objects(message)) is not None:
+            return looks
         try:
             handler(self._types.decode(message.raw, message.kind), message.received_s)
         except KeyError:
@@ -143,9 +145,25 @@ class Listener:
             if topic == self.settings.odometry:
                 found += self._velocities(topic)
             elif topic in [one.topic for one in self.settings.sensors.values()]:
-                found += self._looks(topic)
+                found += self._looks(topic, SeenColumns.of(self._content.seen[topic]))
             self._forget(topic, 0)
         return sorted(found, key=lambda one: one.stamp_s)
+
+    def _objects(self, message: Message) -> list[Reading] | None:
+        """Return the look at objects in space that a message is, by columns; None for others."""
+        topic, content = message.topic, self._content
+        if content.kind(topic) != "Detection3DArray" or self.settings is None:
+            return None
+        if topic not in [one.topic for one in self.settings.sensors.values()]:
+            return []
+        if (parts := self._types.parts(message.raw, message.kind, OBJECT_FIELDS)) is None:
+            return None
+        content.stamps[topic].append((parts.stamp_s, message.received_s))
+        if parts.frame:
+            content.frames.setdefault(topic, parts.frame.lstrip("/"))
+        looks: list[Reading] = list(self._looks(topic, objects_in_space(parts)))
+        self._forget(topic, 0)
+        return looks
 
     def odometry_at(self, stamp_s: float) -> tuple[str, FloatArray | None]:
         """Return the frame of the odometry, and the pose (3,) in it at a stamp; else the robot's frame, and None."""
@@ -209,10 +227,10 @@ class Listener:
                 forward, lateral, turn = se2.log(se2.between(before[2], here)) / (stamp_s - before[1])
                 yield Velocity(before[1], float(forward), float(lateral), float(turn), stamp_s)
 
-    def _looks(self, topic: str) -> Iterator[SensorLook]:
+    def _looks(self, topic: str, seen: SeenColumns) -> Iterator[SensorLook]:
         assert self.settings is not None
         content, remarks = self._content, list[str]()
-        stamps, seen = stamps_of(content, topic, self.settings.clock), content.seen[topic]
+        stamps = stamps_of(content, topic, self.settings.clock)
         name = next(name for name, one in self.settings.sensors.items() if one.topic == topic)
         how = self.settings.sensors[name]
         if not how.frame and topic in content.frames:
@@ -221,11 +239,10 @@ class Listener:
         sensor = mounted_sensor(_NO_PATH, content, settings, name, remarks)
         placed = how.stated_mount or not remarks  # else where `sensor.toml` says
         names: dict[int, str] = {}
-        labels = sorted({one.label for one in seen} - {""})
-        message = np.array([one.look for one in seen], dtype=np.int64)
+        labels = sorted(set(seen.label) - {""})
         try:
             found = detections_of(
-                _NO_PATH, settings, (sensor,), ([(0, one) for one in seen], message, labels, names), remarks
+                _NO_PATH, settings, (sensor,), (seen, np.zeros_like(seen.look), seen.look, labels, names), remarks
             )
         except EvermapError as error:
             raise InputError(f"{topic}: {error.problem}", hint=error.hint) from None

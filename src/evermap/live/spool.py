@@ -102,10 +102,6 @@ class Spool:
         self.finish()
         self._lock.close()
 
-    def waiting(self) -> list[Path]:
-        """Return the sessions that wait, in order."""
-        return sorted(self.folder.glob("*.readings"))
-
     def enter_beside(self) -> subprocess.Popen[str]:
         """Enter waiting sessions in a separate process, which prints a line of JSON for each."""
         command = [sys.executable, "-c", "import sys; from evermap.live.spool import _main; _main(*sys.argv[1:])"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from evermap.config import OdometryConfig
 from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.kernels import kernel
 from evermap.slam.preintegration import Intervals, Preintegration
 from evermap.slam.sparse.elimination import Spread
 from evermap.slam.sparse.system import Factorised, Slices, exhausted
@@ -25,6 +25,7 @@ TURN_ROWS = 5
 """Rows of odometry in a span from which its jitter is told."""
 SPANS = 2
 """Spans `turn_s` until a row, of which the calmest tells the jitter: a turn that begins or ends is none."""
+LEAST_SQUARE = float(np.finfo(np.float64).tiny)
 TRIMMED = 0.6234
 """Mean of a squared standard normal below its 90 % quantile."""
 
@@ -104,19 +105,32 @@ def beyond_jitter(stamp_s: FloatArray, turn_radps: FloatArray, settings: Odometr
         turn_radps: (n,) as reported [rad/s].
         settings: `turn_s` and `stands_out`.
     """
-    end = np.arange(1, len(stamp_s) + 1)
-    spans = [end, *(np.searchsorted(stamp_s, stamp_s - k * settings.turn_s, side="right") for k in range(1, SPANS + 1))]
-    turned = np.append(0.0, np.cumsum(turn_radps))
-    changed = np.append(np.zeros(min(len(stamp_s), 2) + 1), np.cumsum(np.diff(turn_radps, n=2) ** 2))
-    jitter = np.full(len(stamp_s), np.inf)
-    for last, first in pairwise(spans):
-        rows = last - np.maximum(first, 2)
-        variance = (changed[last] - changed[first]) / (6.0 * np.maximum(rows, 1))
-        jitter = np.where(rows >= TURN_ROWS, np.minimum(jitter, variance), jitter)
-    rows = end - spans[1]
-    mean = (turned[end] - turned[spans[1]]) / rows
-    doubt = settings.stands_out**2 * np.where(np.isfinite(jitter), jitter, 0.0) / rows
-    beyond: FloatArray = turn_radps * np.maximum(1.0 - doubt / np.maximum(mean**2, np.finfo(float).tiny), 0.0)
+    turn = np.ascontiguousarray(turn_radps, dtype=np.float64)
+    return _beyond(np.ascontiguousarray(stamp_s, dtype=np.float64), turn, settings.turn_s, settings.stands_out)
+
+
+@kernel
+def _beyond(stamp: FloatArray, turn: FloatArray, turn_s: float, stands_out: float) -> FloatArray:
+    """`beyond_jitter` of contiguous arrays."""
+    count = len(stamp)
+    beyond, turned, changed = np.empty(count), np.zeros(count + 1), np.zeros(count + 1)
+    spans = np.zeros(SPANS + 1, np.int64)
+    for row in range(count):
+        turned[row + 1] = turned[row] + turn[row]
+        if row > 1:
+            changed[row + 1] = changed[row] + ((turn[row] - turn[row - 1]) - (turn[row - 1] - turn[row - 2])) ** 2
+        spans[0], jitter = row + 1, np.inf
+        for k in range(1, SPANS + 1):
+            while stamp[spans[k]] <= stamp[row] - k * turn_s:
+                spans[k] += 1
+            rows = spans[k - 1] - max(spans[k], 2)
+            if rows >= TURN_ROWS:
+                jitter = min(jitter, (changed[spans[k - 1]] - changed[spans[k]]) / (6.0 * rows))
+        rows = row + 1 - spans[1]
+        mean, doubt = (turned[row + 1] - turned[spans[1]]) / rows, 0.0
+        if jitter < np.inf:
+            doubt = stands_out**2 * jitter / rows
+        beyond[row] = turn[row] * max(1.0 - doubt / max(mean**2, LEAST_SQUARE), 0.0)
     return beyond
 
 
