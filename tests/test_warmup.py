@@ -106,3 +106,22 @@ def test_all_kernels_of_a_job_are_ready_when_it_begins(folder: Path, tmp_path: P
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert not done.stdout.strip(), done.stdout
+
+
+LARGE = """
+from evermap.slam.sparse import elimination, system
+from evermap.slam.warmup import warm_up
+import evermap as em
+from evermap_studies.sim import simulate_warehouse
+
+warm_up()
+before = [kernel.signatures[:] for kernel in (elimination._gather, elimination._store)]
+system.LARGE = 0.0  # every front is large
+em.run_slam(simulate_warehouse(30))
+assert before == [kernel.signatures for kernel in (elimination._gather, elimination._store)]
+assert all(before)
+"""
+
+
+def test_no_frame_of_a_large_problem_waits_for_a_kernel() -> None:
+    subprocess.run([sys.executable, "-c", LARGE], check=True)

@@ -16,7 +16,7 @@ from evermap.slam.changes.search import find_changes
 from evermap.slam.noise import START, refine_noise
 from evermap.slam.problem import Drive, Estimate, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.sparse.elimination import curvature
+from evermap.slam.sparse.elimination import Elimination, curvature, eliminate_large
 from evermap.slam.sparse.system import System, exhausted
 from evermap.slam.sparse.tree import Factors
 from evermap.slam.streaming import FIRST_RELINEARISATION, StreamingSlam
@@ -79,7 +79,9 @@ def smoothed() -> None:
     smoother.information(estimate, np.array([0, len(pose) - 1]))
     one = np.ones(1, dtype=np.int64)
     alone = System(one, Factors(np.arange(2), 0 * one, one, 0 * one), np.zeros((1, 3)), np.zeros(0, dtype=np.int64))
-    curvature(alone.tree, alone.factors, np.zeros(2))  # only steps that are damped ask for it
+    # only steps that are damped ask for the one, and only large problems for the other
+    curvature(alone.tree, alone.factors, np.zeros(2))
+    eliminate_large(alone.tree, alone.factors, np.ones(2), np.ones(1), Elimination.of(alone.tree), 0)
 
 
 def _drive() -> Problem:
