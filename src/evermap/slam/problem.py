@@ -25,7 +25,6 @@ TURN_ROWS = 5
 """Rows of odometry in a span from which its jitter is told."""
 SPANS = 2
 """Spans `turn_s` until a row, of which the calmest tells the jitter: a turn that begins or ends is none."""
-LEAST_SQUARE = float(np.finfo(np.float64).tiny)
 TRIMMED = 0.6234
 """Mean of a squared standard normal below its 90 % quantile."""
 
@@ -130,7 +129,7 @@ def _beyond(stamp: FloatArray, turn: FloatArray, turn_s: float, stands_out: floa
         mean, doubt = (turned[row + 1] - turned[spans[1]]) / rows, 0.0
         if jitter < np.inf:
             doubt = stands_out**2 * jitter / rows
-        beyond[row] = turn[row] * max(1.0 - doubt / max(mean**2, LEAST_SQUARE), 0.0)
+        beyond[row] = turn[row] * max(1.0 - doubt / max(mean**2, 1e-300), 0.0)
     return beyond
 
 
