@@ -41,7 +41,7 @@ DISPUTED_AT = (2, 4, 8, 16)
 """Comparisons of a landmark after which it is asked whether most of them were surprising."""
 ALIGNED_INFORMATION = 1e-2
 """Once in a prior map the first pose is free: held to 10 m only, so that the linear system stays well conditioned."""
-FINAL_ROUNDS, FINAL_STEPS = 12, 30
+FINAL_ROUNDS = 12
 MOST_BREAKS = 8
 """Silences of the odometry after which the parts are laid over each other."""
 ELSEWHERE = 0.1
@@ -298,7 +298,7 @@ class StreamingSlam:
         return replace(problem, start_pose=start), Estimate(pose, landmark, estimate.states)
 
     def _optimum(
-        self, smoother: Smoother, problem: Problem, estimate: Estimate, fit: NoiseFit, *, most: int = FINAL_STEPS
+        self, smoother: Smoother, problem: Problem, estimate: Estimate, fit: NoiseFit, *, most: int = 30
     ) -> tuple[Smoother, Estimate, Marginals]:
         """The final optimum at the noise that was found, after so many steps at most, and its covariances."""
         problem, estimate = self._ahead(problem, estimate)
