@@ -19,7 +19,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import breadth_first_order
 
 from evermap.geometry import se2
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -34,6 +34,8 @@ MOST_GIVEN = 6
 """Chunks, all neighbours of each other, given which a chunk is independent of those before."""
 TOLERATED = 1e-6
 """Share of a chunk's variance by which blocks may contradict each other."""
+MOST_FOLLOWED = 256
+"""Regressions of a chunk on others that are kept: some 10 MB."""
 FLOOR_M2 = 1e-10
 """Variance by which matrices that are inverted are kept definite: a hundredth of a millimetre."""
 
@@ -305,14 +307,16 @@ class ChunkedCovariance:
         """Chunks, and those between them without which they would not hang together."""
         graph = self._index.graph
         while True:
-            count, part = connected_components(graph[chunks][:, chunks], directed=False)
-            if count == 1:
+            near, inside, front = self._near(chunks), set[int](), chunks[:1].tolist()
+            while front:
+                inside.add(here := front.pop())
+                front += near[here] & near.keys() - inside
+            others = np.array([c for c in near if c not in inside], dtype=np.int64)
+            if not len(others):
                 return chunks
-            order, before = breadth_first_order(graph, int(chunks[part == 0][0]), directed=False)
-            others = chunks[part != 0]
+            order, before = breadth_first_order(graph, int(chunks[0]), directed=False)
             rank = np.full(graph.shape[0], graph.shape[0], dtype=np.int64)
             rank[order] = np.arange(len(order))
-            inside = set(chunks[part == 0].tolist())
             at = int(others[np.argmin(rank[others])])
             way = []
             while at >= 0 and at not in inside:
@@ -352,6 +356,21 @@ class ChunkedCovariance:
 
         Blocks that were told at different times may contradict each other: then the farthest others are left out.
         """
+        key = c, *given
+        if (known := self._followed.get(key)) is not None:
+            return known
+        found = self._regressed(c, given)
+        if len(self._followed) >= MOST_FOLLOWED:
+            self._followed.clear()
+        self._followed[key] = found
+        return found
+
+    @functools.cached_property
+    def _followed(self) -> dict[tuple[int, ...], tuple[list[int], FloatArray, FloatArray]]:
+        """What `_follows` has found: a robot asks for the same chunks for some time."""
+        return {}
+
+    def _regressed(self, c: int, given: list[int]) -> tuple[list[int], FloatArray, FloatArray]:
         own = self._between(c, c)
         while given:
             among = np.block([[self._between(g, h) for h in given] for g in given])
