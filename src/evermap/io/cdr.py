@@ -52,7 +52,7 @@ class Cdr:
 
     def __init__(self, types: Any) -> None:
         self._types, self._decoders = types, dict[str, Decoder]()
-        self._layouts = dict[str, "_Layout | None"]()
+        self._layouts: dict[str, _Layout | None] = {}
 
     def decode(self, raw: bytes, kind: str) -> Any:
         """Return a message as `types.deserialize_cdr` does, with the errors of that.
@@ -90,14 +90,14 @@ class Cdr:
         if kind not in self._layouts:
             self._layouts[kind] = _Layout.of(self._types, kind, fields)
         layout = self._layouts[kind]
-        return layout.read(raw) if layout is not None and raw[:2] == b"\x00\x01" else None
+        return layout.read(raw) if layout is not None and raw[:2] == b"\x00\x01" and len(raw) >= 4 else None
 
 
 class _Layout:
-    """Where the fields of a message stand that is a header and a list of parts.
+    """Positions of the fields of a message that is a header and a list of parts.
 
     Attributes:
-        steps: (K, 3) of `_read`.
+        steps: K of `_read`.
         names: of the numbers of a part in their order, with what they are in.
         texts: of its texts.
         ones: which of the numbers are lengths of lists.
@@ -109,7 +109,7 @@ class _Layout:
         (_, header), (_, (_, listed)) = types.fielddefs[kind][1]
         self._field("", *header)
         self._begin = len(self.names) + 1, len(self.texts)
-        self.names, self.texts = [], []
+        self.names, self.texts, self.ones = [], [], []
         self._list("", *listed[0])
         self._steps = np.array(self.steps, dtype=np.int64)
         self._columns: dict[str, IntArray] = {}
