@@ -279,14 +279,17 @@ def heard(mailbox: Mailbox, listener: Listener, refused: Callable[[str], None]) 
         listener: reads them.
         refused: called with one line for a message that is not taken.
     """
+    stepped = False
     while True:
         if (message := mailbox.take()) is None:
-            yield None
+            if not stepped:
+                yield None
+            stepped = False
             mailbox.wait(WAIT_S)
             continue
         for reading in _read(listener, message, refused):
             yield reading
-            if isinstance(reading, SensorLook):
+            if stepped := isinstance(reading, SensorLook):
                 yield None
 
 

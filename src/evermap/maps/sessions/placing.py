@@ -17,9 +17,10 @@ from evermap.maps.living import LivingMap, Places
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.maps.vicinity import Vicinity, cliques_of, near
 from evermap.slam.calibration import FORWARD, N_STATES, SLOPE, CalibrationPrior
-from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_TOLERANCE, Outcome, divided, sighted_at
+from evermap.slam.sparse.system import exhausted
+from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_GAIN, FINAL_TOLERANCE, Outcome, divided, sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
 
 VisitT = TypeVar("VisitT")
@@ -360,14 +361,13 @@ def refitted(
     """
     problem, start = _in_map(outcome, prior, pose_map_session, size, *held)
     noise = outcome.noise.noise
-    smoother, estimate = _solved(problem, noise, start, robust=robust)
+    solved = smoother, estimate, _ = _solved(problem, noise, start, robust=robust)
     straightened = False
     if smoother.inlier_probability(estimate).mean() < (1.0 - settings.most_lost) * outcome.inlier.mean():
         # a blind stretch bent the session by more than a descent can take back: every stretch placed by itself
-        other, straight = _solved(problem, noise, _placed(problem, start, held.row, settings), robust=robust)
-        if other.cost(straight) < smoother.cost(estimate):
-            smoother, estimate, straightened = other, straight, True
-    solved = smoother, estimate, smoother.marginals(estimate)
+        other = _solved(problem, noise, _placed(problem, start, held.row, settings), robust=robust)
+        if other[0].cost(other[1]) < smoother.cost(estimate):
+            solved, straightened = other, True
     return divided(solved, prior, outcome.p_needed, outcome.noise, outcome.revision, aligned=True), straightened
 
 
@@ -407,13 +407,13 @@ def _in_map(
     return problem, start
 
 
-def _solved(problem: Problem, noise: Noise, start: Estimate, *, robust: bool) -> tuple[Smoother, Estimate]:
-    """The optimum near `start`."""
+def _solved(problem: Problem, noise: Noise, start: Estimate, *, robust: bool) -> tuple[Smoother, Estimate, Marginals]:
+    """The optimum near `start`, and its covariances."""
     # first with the kernel that never lets go: what was near the session's own map need not be near this one
     near = Smoother(problem, noise, heavy=True, robust=robust)
     start = near.optimum(start, iterations=HEAVY_STEPS, tolerance=1e-3)
     smoother = near.under(noise, heavy=False)
-    return smoother, smoother.optimum(start, tolerance=FINAL_TOLERANCE)
+    return smoother, *exhausted(smoother.solved_in_slices(start, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN))
 
 
 def _placed(problem: Problem, start: Estimate, row: IntArray, settings: FitConfig) -> Estimate:
