@@ -26,7 +26,7 @@ RULES = {
     "stamps": "types",
     "survival": "errors show types",
     "valid": "errors types",
-    "io": "errors interrupts types geometry valid",
+    "io": "errors compiled interrupts types geometry valid",
     "metrics": "errors show types geometry",
     "sensing": "errors compiled types config geometry",
     "existence": "errors compiled show types survival io sensing",
