@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evermap.errors import InputError
+from evermap.errors import DataError, InputError
 from evermap.geometry import se2, se3
 from evermap.live.feed import SensorLook, Velocity
 
@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "io"))
 
 from bags import MOUNT, TAGS, Ros, path_of
 
+from evermap.live import ros
 from evermap.live.ros import Listener
 from evermap.live.wires import Message
 from evermap.types import Sensor
@@ -148,6 +149,28 @@ def test_objects_by_columns_are_the_objects_one_by_one(monkeypatch: pytest.Monke
         assert type(mine) is type(other)
         for a, b in zip(mine, other, strict=True):
             np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+
+
+@pytest.mark.parametrize("columns", [True, False])
+def test_a_look_that_cannot_be_read_leaves_the_next_alone(columns: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not columns:
+        monkeypatch.setattr("evermap.io.cdr.Cdr.parts", lambda *_: None)
+    one, real, bad = robot()[0], ros.detections_of, [False]
+
+    def read(*given: Any) -> Any:
+        if bad[0]:
+            raise DataError("cannot be read")
+        return real(*given)
+
+    monkeypatch.setattr(ros, "detections_of", read)
+    for k in range(20):
+        one.odometry(k, path_of(k))
+        bad[0] = k == 15
+        with pytest.raises(InputError) if bad[0] else contextlib.nullcontext():
+            one.boxes(k, {"3": where(k, 3)})
+    looks = one.of(SensorLook)
+    assert [round(10 * (look.stamp_s - START_S)) for look in looks] == [*range(15), *range(16, 20)]
+    assert all(look.landmark_id == [3] for look in looks)
 
 
 def test_where_no_message_says_where_the_sensor_is_its_file_does() -> None:

@@ -356,13 +356,11 @@ class ChunkedCovariance:
 
         Blocks that were told at different times may contradict each other: then the farthest others are left out.
         """
-        key = c, *given
-        if (known := self._followed.get(key)) is not None:
-            return known
-        found = self._regressed(c, given)
-        if len(self._followed) >= MOST_FOLLOWED:
-            self._followed.clear()
-        self._followed[key] = found
+        found = self._followed.get(key := (c, *given))
+        if found is None:
+            if len(self._followed) >= MOST_FOLLOWED:
+                self._followed.clear()
+            found = self._followed[key] = self._regressed(c, given)
         return found
 
     @functools.cached_property

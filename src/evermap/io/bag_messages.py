@@ -106,6 +106,13 @@ class BagContent:
         parts = [f"in {encoding}: {', '.join(names)}" for encoding, names in by.items() if encoding]
         return f"topics passed over, since only messages of ROS are read, {'; '.join(parts)}" if parts else ""
 
+    def take_look(self, topic: str, stamp_s: float, received_s: float, frame: str) -> int:
+        """Take a message of detections, stamped [s] and seen in a frame ('' for unknown); return its number."""
+        self.stamps[topic].append((stamp_s, received_s))
+        if frame:
+            self.frames.setdefault(topic, _plain(frame))
+        return len(self.stamps[topic]) - 1
+
     def mount(self, base: str, sensor: str) -> FloatArray | None:
         """Return the pose (7,) of one frame in another, along frames that do not move; None without such a way."""
         ways: dict[str, list[tuple[str, FloatArray]]] = {}
@@ -180,15 +187,12 @@ def _motion_of(content: BagContent, topic: str) -> Handler:
 
 
 def _seen_of(content: BagContent, topic: str, parts: Callable[[Any, int], Iterator[Seen]]) -> Handler:
-    rows, stamps = content.seen.setdefault(topic, []), content.stamps.setdefault(topic, [])
+    rows = content.seen.setdefault(topic, [])
+    content.stamps.setdefault(topic, [])
 
     def handle(message: Any, received_s: float) -> None:
         stamp_s, frame = _said(message)
-        look = len(stamps)
-        stamps.append((stamp_s, received_s))
-        rows.extend(parts(message, look))
-        if frame:
-            content.frames.setdefault(topic, _plain(frame))
+        rows.extend(parts(message, content.take_look(topic, stamp_s, received_s, frame)))
 
     return handle
 
@@ -275,14 +279,14 @@ OBJECT_FIELDS = (
 """What a detection of `vision_msgs` in space says (`Cdr.parts`)."""
 
 
-def objects_in_space(parts: Parts) -> SeenColumns:
-    """Return detections of `vision_msgs` in space, with one hypothesis each, as `handler_of` adds them."""
+def objects_in_space(parts: Parts, look: int) -> SeenColumns:
+    """Return objects in space of the message number `look`, as `handler_of` adds them."""
     size, score = parts.numbers["bbox/size"], parts.numbers["results/hypothesis/score"][:, 0]
     sized, count = np.all(size > 0.0, axis=1), len(size)
     spread = parts.numbers["results/pose/covariance"].reshape(-1, 6, 6)[:, :3, :3]
     said = ~sized & (np.trace(spread, axis1=1, axis2=2) > 0.0)
     return SeenColumns(
-        np.zeros(count, dtype=np.int64),
+        np.full(count, look, dtype=np.int64),
         [one or None for one in parts.texts["id"]],
         parts.texts["results/hypothesis/class_id"],
         score,

@@ -2,7 +2,7 @@
 
 What `rosbags` generates calls a function for every part of every message. Here a message is one function: the parts are
 written out in it, and numbers that follow each other, of whatever part, are unpacked at once. A message of a hundred
-detections is read in a third of the time. As columns, without an object for each part, it takes a tenth of that.
+detections is read in a third of the time, and as columns, without an object for each part, several times as fast.
 """
 
 from __future__ import annotations
@@ -201,10 +201,8 @@ def _read(raw: Any, steps: IntArray, numbers: FloatArray, spans: IntArray) -> tu
     Returns:
         Numbers of both, and where the message ends; -1 where it is damaged.
     """
-    bits, left = np.empty(1, np.uint64), np.zeros(_DEPTH, np.int64)
-    real, at, n, t, depth, k = bits.view(np.float64), 0, 0, 0, 0, 0
-    single = np.empty(1, np.uint32)
-    small = single.view(np.float32)
+    bits, single, left = np.empty(1, np.uint64), np.empty(1, np.uint32), np.zeros(_DEPTH, np.int64)
+    real, small, at, n, t, depth, k = bits.view(np.float64), single.view(np.float32), 0, 0, 0, 0, 0
     while k < len(steps):
         code, size, more = steps[k, 0], steps[k, 1], steps[k, 2]
         k += 1

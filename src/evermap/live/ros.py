@@ -142,11 +142,13 @@ class Listener:
         found: list[Reading] = []
         assert self.settings is not None
         for topic in [topic for topic, stamps in self._content.stamps.items() if stamps]:
-            if topic == self.settings.odometry:
-                found += self._velocities(topic)
-            elif topic in [one.topic for one in self.settings.sensors.values()]:
-                found += self._looks(topic, SeenColumns.of(self._content.seen[topic]))
-            self._forget(topic, 0)
+            try:
+                if topic == self.settings.odometry:
+                    found += self._velocities(topic)
+                elif topic in [one.topic for one in self.settings.sensors.values()]:
+                    found += self._looks(topic, SeenColumns.of(self._content.seen[topic]))
+            finally:  # what cannot be read is not asked again with the next message
+                self._forget(topic, 0)
         return sorted(found, key=lambda one: one.stamp_s)
 
     def _objects(self, message: Message) -> list[Reading] | None:
@@ -158,12 +160,11 @@ class Listener:
             return []
         if (parts := self._types.parts(message.raw, message.kind, OBJECT_FIELDS)) is None:
             return None
-        content.stamps[topic].append((parts.stamp_s, message.received_s))
-        if parts.frame:
-            content.frames.setdefault(topic, parts.frame.lstrip("/"))
-        looks: list[Reading] = list(self._looks(topic, objects_in_space(parts)))
-        self._forget(topic, 0)
-        return looks
+        look = content.take_look(topic, parts.stamp_s, message.received_s, parts.frame)
+        try:
+            return list(self._looks(topic, objects_in_space(parts, look)))
+        finally:
+            self._forget(topic, 0)
 
     def odometry_at(self, stamp_s: float) -> tuple[str, FloatArray | None]:
         """Return the frame of the odometry, and the pose (3,) in it at a stamp; else the robot's frame, and None."""

@@ -319,9 +319,7 @@ def from_front(pose: FloatArray, covariance: FloatArray, front: FloatArray) -> t
     """Return poses (..., 3) and covariances (..., 3, 3), in their own frames, of the front (3,) that each one sees."""
     if not front.any():
         return pose.copy(), covariance.copy()
-    x, y, turn = front.tolist()
-    c, s = math.cos(turn), math.sin(turn)
-    turned = np.array([[c, s, s * x - c * y], [-s, c, c * x + s * y], [0.0, 0.0, 1.0]])  # adjoint of the inverse
+    turned = se2.adjoint(se2.inverse(front))
     return se2.compose(pose, front), turned @ covariance @ turned.T
 
 

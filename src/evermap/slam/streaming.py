@@ -278,8 +278,8 @@ class StreamingSlam:
             smoother, estimate, fit = self._converged(problem, revision.estimate, fit.noise)
         # near enough to tell which states are needed; then all of them are sought together
         smoother, estimate, marginals = self._optimum(smoother, problem, estimate, fit, most=1)
-        worth = smoother.worth(estimate, marginals)
-        p_needed, problem = needed(problem.prior, estimate.states, marginals.states, worth), smoother.problem
+        problem, worth = smoother.problem, smoother.worth(estimate, marginals)
+        p_needed = needed(problem.prior, estimate.states, marginals.states, worth)
         if not np.all(np.isnan(p_needed)):
             prior, states = problem.prior.averaged(p_needed, estimate.states, np.diag(marginals.states), worth)
             problem, estimate = replace(problem, prior=prior), replace(estimate, states=states)
