@@ -746,6 +746,8 @@ def main() -> int:
         folder = Path(where)
         made = kinds(folder)
         chosen = [name for name in made if name.startswith(tuple(asked.kind) or "")]
+        if not chosen:
+            parser.error(f"no such kind: {', '.join(asked.kind)}; there are {', '.join(made)}")
         for name in chosen:
             (folder / name).mkdir()
             counts = run(made[name](), asked.files, asked.seed, folder / name, verbose=asked.verbose)
