@@ -254,7 +254,8 @@ class Sensor:
         mount_robot_sensor: pose (x, y, theta) of the sensor in the robot's frame.
         kind: what it is; None = unknown.
         sigma_scale: standard deviation of the scale of its ranges, as a share; sigma_offset_m: of what is added to all;
-            sigma_angle_rad: of its angle in the mount. None: as usual for the kind.
+            sigma_angle_rad: of its angle in the mount; sigma_position_m: of its position there, along each axis. None:
+            as usual for the kind.
         sigma_odometer_scale: standard deviation of the scale of the odometer; sigma_askew_rad: of the direction in
             which the robot drives, from its front. None: unknown.
     """
@@ -272,6 +273,7 @@ class Sensor:
     sigma_scale: float | None = None
     sigma_offset_m: float | None = None
     sigma_angle_rad: float | None = None
+    sigma_position_m: float | None = None
     sigma_odometer_scale: float | None = None
     sigma_askew_rad: float | None = None
 

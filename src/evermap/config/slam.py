@@ -18,6 +18,8 @@ SIGMAS = {
     "range_skew_per_rad": 0.1,
     "range_curvature_per_rad2": 0.5,
     "bearing_bias_rad": 0.05,
+    "mount_forward_m": 0.1,
+    "mount_left_m": 0.1,
     "odometry_delay_s": 0.3,
     "odometry_forward_scale": 0.05,
     "odometry_turn_scale": 0.1,
@@ -45,7 +47,7 @@ class CalibrationConfig(Section):
     )
     kinds: dict[SensorKind, OfSensor] = Field(
         default_factory=lambda: dict(KINDS),
-        description="those of the first five, which are the sensor's, where its kind is stated",
+        description="those of the first five, which depend on the kind of sensor, where it is stated",
     )
     sigma_askew_rad: Positive = Field(
         default=0.03, description="of the direction in which a robot drives, from its front, if unstated [rad]"
@@ -53,6 +55,9 @@ class CalibrationConfig(Section):
     p_needed: Share = Field(default=0.5, description="prior probability that a state is not as stated")
     p_needed_known: Share = Field(
         default=0.9, description="the same of a sensor that is stated to be of another kind than a laser"
+    )
+    p_needed_mount: Share = Field(
+        default=0.1, description="the same of each coordinate of the mount, which one measures, if it has no data sheet"
     )
     p_spare: Share = Field(default=0.01, description="probability to be needed below which a state is held as stated")
 
@@ -687,6 +692,9 @@ class SensorConfig(Section):
     )
     sigma_angle_rad: float | None = Field(
         default=None, ge=0, le=6.3, description="standard deviation of its mounting angle [rad]"
+    )
+    sigma_position_m: float | None = Field(
+        default=None, ge=0, le=1e3, description="standard deviation of its position on the robot, along each axis [m]"
     )
     sigma_odometer_scale: float | None = Field(
         default=None, ge=0, le=1, description="relative standard deviation of the scale of the odometer"

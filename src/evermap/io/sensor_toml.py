@@ -28,7 +28,12 @@ _LIMITS: dict[str, dict[str, tuple[float, float]]] = {
     "noise": {"sigma_range_m": (1e-9, 1e6), "sigma_bearing_rad": (1e-9, 1e3)},
     "mount": {"x_m": (-1e3, 1e3), "y_m": (-1e3, 1e3), "theta_rad": (-2 * pi, 2 * pi)},
     "detection": {"p_detect": (0.0, 1.0), "p_false": (0.0, 1.0)},
-    "sensor": {"sigma_scale": (0.0, 1.0), "sigma_offset_m": (0.0, 1e3), "sigma_angle_rad": (0.0, 2 * pi)},
+    "sensor": {
+        "sigma_scale": (0.0, 1.0),
+        "sigma_offset_m": (0.0, 1e3),
+        "sigma_angle_rad": (0.0, 2 * pi),
+        "sigma_position_m": (0.0, 1e3),
+    },
     "odometry": {"sigma_odometer_scale": (0.0, 1.0), "sigma_askew_rad": (0.0, 2 * pi)},
 }
 _RECORDING = ("format_version", "name", "robot", "clock", "frames_complete", "class_names")

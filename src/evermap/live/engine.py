@@ -26,6 +26,7 @@ from evermap.live.now import Now, recording_of, trajectory_of
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import aged
 from evermap.runs.sessions import Entered
+from evermap.slam.calibration import DELAY
 from evermap.slam.intake import beliefs
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import FrameSightings, Localizer, Located
@@ -185,7 +186,7 @@ class Engine:
         with self._lock:
             if self._keeper.collect():
                 self._keeper.beside("load", self._go_on)
-            ready = self._inbox.ready(0.0 if self._filter is None else float(self._filter.states[5]))
+            ready = self._inbox.ready(0.0 if self._filter is None else float(self._filter.states[DELAY]))
             for frame, odometry, kept in ready:
                 self._process(frame, odometry, kept=kept)
             if isinstance(self._filter, Mapper) and not any(kept for *_, kept in ready):

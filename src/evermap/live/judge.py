@@ -75,7 +75,7 @@ class Judge:
         return after if vicinity is None else vicinity.put_back(after)
 
     def look(self, frame: LiveFrame, located: Located, states: FloatArray) -> None:
-        """Take the looks of a frame, with (9,) calibration states; a subset of dense frames."""
+        """Take the looks of a frame, with (11,) calibration states; a subset of dense frames."""
         if located.lost or not len(located.expected):
             return
         if self._glances and frame.stamp_s < self._glances[-1].stamp_s + self._config.live.look_s:

@@ -45,7 +45,7 @@ def bridged(
         covariance: (N, 3, 3) of each.
         consecutive: (N, 3, 3) of pose i with pose i + 1.
         drive: odometry.
-        states: (9,) calibration states.
+        states: (11,) calibration states.
         noise: odometry noise.
 
     Returns:

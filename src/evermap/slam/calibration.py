@@ -1,11 +1,12 @@
 """Calibration states: systematic errors of the sensors, and their priors.
 
 The range law is `z_r = a0 + r (1 + a1 + a2 b + a3 b^2)` with true range `r` and bearing `b`; `a3 = -1/2` is a camera
-that reports depth. A bearing reads `z_b = b + b0`. Between two instants the robot moves by the odometry between the two
-instants shifted by `tau`, with velocities `k_v v - k_s |w|` and `k_w w`; of the turn rate `w` the scale acts on what is
-no jitter of its report (`problem.beyond_jitter`).
+that reports depth. A bearing reads `z_b = b + b0`. Both are seen from where the sensor sits, `(m_x, m_y)` off its
+stated mount, along the robot's axes. Between two instants the robot moves by the odometry between the two instants
+shifted by `tau`, with velocities `k_v v - k_s |w|` and `k_w w`; of the turn rate `w` the scale acts on what is no
+jitter of its report (`problem.beyond_jitter`).
 
-All nine states form one vector, in the order of `SPECS`. Priors say what a decent camera, laser or wheel encoder does
+All eleven states form one vector, in the order of `SPECS`. Priors say what a decent camera, laser or wheel encoder does
 out of the box; a kind of sensor (`kinds`) or its data sheet (`Sensor`) makes those of the sensor narrower. None was
 fitted to a recording.
 
@@ -30,6 +31,7 @@ from scipy.special import logsumexp
 from evermap.config import CalibrationConfig
 from evermap.errors import ConfigError
 from evermap.geometry import se2
+from evermap.slam.kernels import N_STATES
 from evermap.types import BoolArray, FloatArray, Sensor, SensorKind
 
 
@@ -49,15 +51,16 @@ SPECS: tuple[Spec, ...] = (
     Spec("range_skew_per_rad", 0.0, "1/rad", "range error that grows to one side of the field of view"),
     Spec("range_curvature_per_rad2", 0.0, "1/rad^2", "-0.5: the sensor reports depth, not distance"),
     Spec("bearing_bias_rad", 0.0, "rad", "constant added to every bearing"),
+    Spec("mount_forward_m", 0.0, "m", "the sensor sits this much farther ahead than stated"),
+    Spec("mount_left_m", 0.0, "m", "and this much farther to the left"),
     Spec("odometry_delay_s", 0.0, "s", "odometry stamps minus the stamps of the motion they describe"),
     Spec("odometry_forward_scale", 1.0, "1", "true over reported forward speed"),
     Spec("odometry_turn_scale", 1.0, "1", "true over reported turn rate"),
     Spec("odometry_turn_slip_m", 0.0, "m", "forward speed lost per turn rate"),
 )
 USUAL = CalibrationConfig()
-N_STATES, N_SENSOR = len(SPECS), 5
 NAMES = tuple(spec.name for spec in SPECS)
-BIAS, SLOPE, SKEW, CURVATURE, BEARING, DELAY, FORWARD, SLIP = 0, 1, 2, 3, 4, 5, 6, 8
+BIAS, SLOPE, SKEW, CURVATURE, BEARING, AHEAD, ASIDE, DELAY, FORWARD, SLIP = 0, 1, 2, 3, 4, 5, 6, 7, 8, 10
 LEAST_SIGMA = 1e-6
 """Standard deviation for a data sheet without errors, to avoid division by zero."""
 
@@ -67,12 +70,13 @@ class CalibrationPrior:
     """Independent Gaussians on the calibration states; those that are not `free` stay at their mean.
 
     Attributes:
-        mean, sigma: (9,) in the order of `SPECS`.
-        free: (9,) which states are estimated.
+        mean, sigma: (11,) in the order of `SPECS`.
+        free: (11,) which states are estimated.
         slope_share: of what range slope and odometer scale show together, that is the sensor's; None: by their sigmas.
         angle_share: of what bearing bias and driving askew show together, that is the sensor's.
         askew_sigma: standard deviation of the latter [rad].
-        p_sensor: probability of each of the sensor's states, the first five, to be another than stated.
+        p_sensor: probability of each of the first five states to be another than stated; p_mount: of each coordinate of
+            the mount.
         settings: that it is of.
     """
 
@@ -83,6 +87,7 @@ class CalibrationPrior:
     angle_share: float = 1.0
     askew_sigma: float = 0.0
     p_sensor: float = USUAL.p_needed
+    p_mount: float = USUAL.p_needed_mount
     settings: CalibrationConfig = USUAL
 
     @classmethod
@@ -110,7 +115,13 @@ class CalibrationPrior:
                 )
             mean[NAMES.index(name)] = value
             free[NAMES.index(name)] = False
-        prior = cls(mean, np.array([settings.sigma[name] for name in NAMES]), free, settings=settings)
+        prior = cls(
+            mean,
+            np.array([settings.sigma[name] for name in NAMES]),
+            free,
+            p_mount=settings.p_needed_mount,
+            settings=settings,
+        )
         return prior if sensor is None else prior._as_stated(sensor)
 
     def _as_stated(self, sensor: Sensor) -> CalibrationPrior:
@@ -119,11 +130,13 @@ class CalibrationPrior:
             BIAS: sensor.sigma_offset_m,
             SLOPE: sensor.sigma_scale,
             BEARING: sensor.sigma_angle_rad,
+            AHEAD: sensor.sigma_position_m,
+            ASIDE: sensor.sigma_position_m,
             FORWARD: sensor.sigma_odometer_scale,
         }
         sigma = self.sigma.copy()
         if sensor.kind is not None:
-            sigma[:N_SENSOR] = self.settings.kinds[sensor.kind]
+            sigma[: BEARING + 1] = self.settings.kinds[sensor.kind]
         for state, value in sheet.items():
             if value is not None:
                 sigma[state] = max(value, LEAST_SIGMA)
@@ -146,23 +159,24 @@ class CalibrationPrior:
             angle_share=angle_share,
             askew_sigma=askew,
             p_sensor=p_needed,
+            p_mount=self.settings.p_needed_mount if sensor.sigma_position_m is None else self.settings.p_needed,
         )
 
     def averaged(
         self, p_needed: FloatArray, states: FloatArray, variance: FloatArray, worth: FloatArray
     ) -> tuple[CalibrationPrior, FloatArray]:
         """Return the prior under which each estimate is the mean over 'as stated' and 'drawn from this prior', and
-        these means (9,), as far as the readings are linear in each state.
+        these means (11,), as far as the readings are linear in each state.
 
         Such a mean lies nearer to what is stated, by the probability of the latter, and the more so the less the
         readings are worth; that of a Gaussian does where its prior is narrower. So nothing jumps where the evidence is
         in doubt. The optimum is sought from these means: a step to a delay far away would leave what is linear.
 
         Args:
-            p_needed: (9,) as `needed` returns it.
-            states: (9,) as estimated under this prior.
-            variance: (9,) of them.
-            worth: (9,) variances by the errors as they were found, in those of independent errors.
+            p_needed: (11,) as `needed` returns it.
+            states: (11,) as estimated under this prior.
+            variance: (11,) of them.
+            worth: (11,) variances by the errors as they were found, in those of independent errors.
         """
         asked = self.free & ~np.isnan(p_needed)
         p, before = np.where(asked, np.clip(p_needed, self.settings.p_spare, 1.0), 1.0), 1.0 / self.sigma**2
@@ -174,11 +188,11 @@ class CalibrationPrior:
         return prior, self.mean + share * (states - self.mean)
 
     def spared(self, p_needed: FloatArray) -> CalibrationPrior:
-        """Return the prior with those states held as stated that hardly need to be free, by `p_needed` (9,)."""
+        """Return the prior with those states held as stated that hardly need to be free, by `p_needed` (11,)."""
         return replace(self, free=self.free & ~(p_needed < self.settings.p_spare))
 
     def doubt(self, p_needed: FloatArray, states: FloatArray) -> FloatArray:
-        """Return (9,) variances between 'as stated' and 'drawn from this prior', given their means (9,): `averaged`."""
+        """Return (11,) variances between 'as stated' and 'drawn from the prior', given their means: `averaged`."""
         odds = np.where(p_needed >= self.settings.p_spare, 1.0 / np.maximum(p_needed, self.settings.p_spare) - 1.0, 0.0)
         return odds * (states - self.mean) ** 2
 
@@ -213,8 +227,8 @@ class CalibrationPrior:
         """Return the log factor by which the graph's lengths are too long according to a robot's priors.
 
         Args:
-            states: (9,) estimate in which nothing but these priors says what a metre is.
-            covariance: (9, 9) of it.
+            states: (11,) estimate in which nothing but these priors says what a metre is.
+            covariance: (11, 11) of it.
 
         Returns:
             The logarithm; the variance that it has from the estimate; and the precision that the priors give it.
@@ -238,8 +252,8 @@ class CalibrationPrior:
         """Divide the product of range and odometry scale between its two factors, by their priors.
 
         Args:
-            states: (9,) estimate made with `without_scale`.
-            covariance: (9, 9) of it.
+            states: (11,) estimate made with `without_scale`.
+            covariance: (11, 11) of it.
             others: what other robots say (`metre`) whose lengths are the same; their mean counts, by precision.
 
         Returns:
@@ -256,7 +270,7 @@ class CalibrationPrior:
         log_slope, variance = float(weight @ told[:, 0]), spread + float(weight**2 @ told[:, 1])
         states[SLOPE] = (1.0 + states[SLOPE]) * np.exp(log_slope) - 1.0
         states[FORWARD] *= np.exp(-log_slope)
-        for state, power in ((SLIP, -1.0), (SKEW, 1.0), (CURVATURE, 1.0)):
+        for state, power in ((SLIP, -1.0), (AHEAD, -1.0), (ASIDE, -1.0), (SKEW, 1.0), (CURVATURE, 1.0)):
             if self.free[state]:
                 states[state] *= np.exp(power * log_slope)
         # the unobservable part keeps the prior's spread; the product has its own
@@ -270,8 +284,8 @@ class CalibrationPrior:
         """Divide what the graph holds as bearing bias between the angle of the sensor and the robot's driving askew.
 
         Args:
-            states: (9,) estimate.
-            covariance: (9, 9) of it.
+            states: (11,) estimate.
+            covariance: (11, 11) of it.
 
         Returns:
             States and covariance with the sensor's part alone; the robot's part [rad], to the left of its front where
@@ -305,14 +319,23 @@ class CalibrationPrior:
         that drives askew, its front is turned the other way. Where the sensor is stays as it was.
 
         Args:
-            states: (9,) estimate, as the graph has it.
-            mount: (3,) pose of the sensor on the robot.
+            states: (11,) estimate, as the graph has it.
+            mount: (3,) stated pose of the sensor on the robot.
         """
         askew = self._askew(states)
         if askew == 0.0:
             return np.zeros(3)
-        c, s, x, y = math.cos(askew), math.sin(askew), float(mount[0]), float(mount[1])
+        c, s = math.cos(askew), math.sin(askew)
+        x, y = seated(mount, states)[:2].tolist()
         return np.array([x - c * x - s * y, y + s * x - c * y, -askew])  # turned about the sensor
+
+
+def seated(mount: FloatArray, states: FloatArray) -> FloatArray:
+    """Return the pose (3,) of the sensor on the robot, of a stated mount (3,) and calibration states (11,).
+
+    The angle is as stated: that of bearings is `bearing_bias_rad`.
+    """
+    return np.array([mount[0] + states[AHEAD], mount[1] + states[ASIDE], mount[2]])
 
 
 def from_front(pose: FloatArray, covariance: FloatArray, front: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -324,16 +347,16 @@ def from_front(pose: FloatArray, covariance: FloatArray, front: FloatArray) -> t
 
 
 def needed(prior: CalibrationPrior, states: FloatArray, covariance: FloatArray, worth: FloatArray) -> FloatArray:
-    """Return the (9,) probability that each free state differs from its stated value, nan for others.
+    """Return the (11,) probability that each free state differs from its stated value, nan for others.
 
     Every subset of states is weighed by its evidence against all as stated: of a Gaussian likelihood of the states,
     which the estimate under the priors holds, in closed form (Savage and Dickey's ratio).
 
     Args:
         prior: under which they were estimated.
-        states: (9,) estimate.
-        covariance: (9, 9) of it.
-        worth: (9,) variances by the errors as they were found, in those of independent errors (`Smoother.worth`).
+        states: (11,) estimate.
+        covariance: (11, 11) of it.
+        worth: (11,) variances by the errors as they were found, in those of independent errors (`Smoother.worth`).
     """
     free = np.flatnonzero(prior.free)
     probability = np.full(N_STATES, np.nan)
@@ -350,13 +373,14 @@ def needed(prior: CalibrationPrior, states: FloatArray, covariance: FloatArray, 
     data = weaker[:, None] * data * weaker
     pull = data @ told
     every = np.array(list(product((False, True), repeat=len(free))))
-    p = np.where(free < N_SENSOR, prior.p_sensor, prior.settings.p_needed)
+    p = np.full(N_STATES, prior.settings.p_needed)
+    p[: BEARING + 1], p[AHEAD : ASIDE + 1] = prior.p_sensor, prior.p_mount
+    p = p[free]
     log_odds = np.log(p / (1.0 - p))
-    weight = np.empty(len(every))
-    for k, some in enumerate(every):
-        inside = np.flatnonzero(some)
-        whole = np.eye(len(inside)) + data[np.ix_(inside, inside)]
-        gain = 0.5 * pull[inside] @ np.linalg.solve(whole, pull[inside]) if len(inside) else 0.0
-        weight[k] = gain - 0.5 * np.linalg.slogdet(whole)[1] + log_odds[inside].sum()
+    # of those that are left out, one times one: no part of a determinant, and no pull
+    whole = np.eye(len(free)) + data * (every[:, :, None] & every[:, None, :])
+    pulls = np.where(every, pull, 0.0)
+    gain = 0.5 * np.einsum("ka,ka->k", pulls, np.linalg.solve(whole, pulls[..., None])[..., 0])
+    weight = gain - 0.5 * np.linalg.slogdet(whole)[1] + every @ log_odds
     probability[free] = np.exp(weight - logsumexp(weight)) @ every
     return probability

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.slam.kernels import detection_residual, inlier_weight, kernel, outlier_loss
+from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES, detection_residual, inlier_weight, kernel, outlier_loss
 from evermap.slam.linearise import DETECTION, ODOMETRY
 from evermap.slam.problem import Block, Estimate, Marginals
 from evermap.slam.smoother import POSES_A_LEAF, Equations, Linearised, Smoother
@@ -22,8 +22,9 @@ from evermap.slam.sparse.system import Factorised, Slices, System
 from evermap.slam.sparse.tree import Factors
 from evermap.types import BoolArray, FloatArray, IntArray
 
-ENCOUNTER = 24
-"""Numbers of an encounter: two rows by two poses and five states; and the right side."""
+OF_ENCOUNTER = 3 + 3 + N_SENSOR + 1
+ENCOUNTER = 2 * OF_ENCOUNTER
+"""Numbers of a row, by two poses and the states of the sensor, and the right side; and of an encounter, of two rows."""
 
 
 class Encounters(NamedTuple):
@@ -44,7 +45,7 @@ class Encounters(NamedTuple):
 class _Eyes(NamedTuple):
     """Sensor data for the encounters.
 
-    Of each robot (R, 9) states and which are free, (R, 3) mounts, (R, 2) standard deviations, and (R,) as for
+    Of each robot (R, 11) states and which are free, (R, 3) mounts, (R, 2) standard deviations, and (R,) as for
     `kernels.inlier_weight`.
     """
 
@@ -69,7 +70,7 @@ def linearise_encounters(pose: FloatArray, met: Encounters, eyes: Any, values: F
         weight: (S,) inlier weights; filled in.
     """
     cost, at = 0.0, 0
-    z, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    z, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     for m in range(len(met.observer)):
         r, other = met.robot[m], pose[met.observed[m]]
         detection_residual(
@@ -88,17 +89,17 @@ def linearise_encounters(pose: FloatArray, met: Encounters, eyes: Any, values: F
             values[at + 3] = scale * (jl[row, 0] * c + jl[row, 1] * s)
             values[at + 4] = scale * (jl[row, 1] * c - jl[row, 0] * s)
             values[at + 5] = 0.0
-            for a in range(5):
+            for a in range(N_SENSOR):
                 values[at + 6 + a] = scale * jc[row, a] if eyes.free[r, a] else 0.0
-            values[at + 11] = -scale * z[row]
-            at += 12
+            values[at + OF_ENCOUNTER - 1] = -scale * z[row]
+            at += OF_ENCOUNTER
     return cost
 
 
 class Together(Smoother):
     """Optimum and covariances of several problems that share places, and of encounters.
 
-    Its estimates are those of all robots: (N, 3) poses one robot after the other, (P, 2) places, (9 R,) states. What
+    Its estimates are those of all robots: (N, 3) poses one robot after the other, (P, 2) places, (11 R,) states. What
     its marginals explain of detections is of the encounters; `parts` has those of each robot.
 
     Args:
@@ -131,13 +132,13 @@ class Together(Smoother):
 
     @property
     def states_sigma(self) -> FloatArray:
-        """(9 R,) standard deviations of the priors of all calibration states."""
+        """(11 R,) standard deviations of the priors of all calibration states."""
         return np.concatenate([robot.states_sigma for robot in self.robots])
 
     def estimates(self, estimate: Estimate) -> list[Estimate]:
         """Return the estimate of each robot."""
         if self._own is None or self._own[0] is not estimate:
-            states = estimate.states.reshape(-1, 9)
+            states = estimate.states.reshape(-1, N_STATES)
             parts = zip(pairwise(self.first), self.places, states, strict=True)
             own = [Estimate(estimate.pose[a:b], estimate.landmark[places], mine) for (a, b), places, mine in parts]
             self._own = (estimate, own)
@@ -161,7 +162,7 @@ class Together(Smoother):
             kinds.append(np.split(part.values, [driven, driven + DETECTION * len(robot.problem.pose_row)]))
             alone.append(part)
         eyes = _Eyes(
-            estimate.states.reshape(-1, 9),
+            estimate.states.reshape(-1, N_STATES),
             np.array([robot.problem.prior.free for robot in self.robots]),
             np.array([robot.problem.mount for robot in self.robots]),
             self.sigma,
@@ -182,7 +183,7 @@ class Together(Smoother):
     def squares(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
         """Return squared residuals (S, 2) of encounters, times their inlier probability, and the latter (S,)."""
         now, count = self.linearised(estimate), len(self.met.robot)
-        right = now.values[len(now.values) - ENCOUNTER * count :].reshape(-1, 2, 12)[..., 11]
+        right = now.values[len(now.values) - ENCOUNTER * count :].reshape(-1, 2, OF_ENCOUNTER)[..., -1]
         return (right * self.sigma[self.met.robot]) ** 2, now.weights
 
     def _marginals(self, estimate: Estimate, solved: Factorised) -> Marginals:
@@ -219,7 +220,7 @@ class Together(Smoother):
         leaf = np.array(leaves)[self.met.robot] + np.minimum(row, last) // POSES_A_LEAF
         met = Factors(np.full(len(row), 3), tied, np.full(len(row), 2), leaf)
         width, *rest = (np.concatenate(column) for column in zip(*kinds[0], *kinds[1], *kinds[2], met, strict=True))
-        dim = np.concatenate([np.full(n, 3), np.full(border - n, 2), np.tile([5, 4], n_robots)])
+        dim = np.concatenate([np.full(n, 3), np.full(border - n, 2), np.tile([N_SENSOR, N_MOTION], n_robots)])
         coordinate = np.concatenate(coordinates)
         factors = Factors(np.append(0, np.cumsum(width)), *rest)
         system = System(dim, factors, coordinate, border + np.arange(2 * n_robots))

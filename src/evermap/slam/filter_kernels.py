@@ -1,6 +1,6 @@
 """The steps of the local filter, compiled: predict, compare a frame with places, update by all of it at once.
 
-A state is the newest pose, the calibration states and the places in slots: covariance (12 + 2 K, 12 + 2 K) in this
+A state is the newest pose, the calibration states and the places in slots: covariance (14 + 2 K, 14 + 2 K) in this
 order, rows of slots that are free zero. Everything is in place.
 """
 
@@ -14,6 +14,9 @@ import numpy as np
 from evermap.compiled import kept
 from evermap.slam.kernels import (
     AT_PLACES,
+    N_MOTION,
+    N_SENSOR,
+    N_STATES,
     adjoint,
     composed,
     detection_residual,
@@ -25,6 +28,8 @@ from evermap.slam.kernels import (
 )
 from evermap.types import FloatArray, IntArray
 
+DRIVEN, BY_PLACE, WIDTH = 3 + N_SENSOR, 3 + N_SENSOR, 3 + N_SENSOR + 2
+"""Where the states of the odometry begin in the covariance; and in what a detection depends on, its place, and all."""
 ITERATIONS = 10
 SMALL_STEP = 1e-4
 """Iterations of an update at most, and the step (m, rad or 1) that ends them."""
@@ -51,11 +56,11 @@ def linearise_frame(
     pose: FloatArray, states: FloatArray, place: FloatArray, start: FloatArray, start_place: FloatArray, slot: IntArray,
     reading: FloatArray, mount: FloatArray, free: Any, residual: FloatArray, jacobian: FloatArray, column: IntArray,
 ) -> None:  # fmt: skip
-    """Compute residuals (2 M,), derivatives (2 M, 10) and which numbers of the state (M, 10) these are by.
+    """Compute residuals (2 M,), derivatives (2 M, 12) and which numbers of the state (M, 12) these are by.
 
     Derivatives are by the errors at the start of the update, which `_turn_on` carries to where pose and places are now.
     """
-    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     c, s = math.cos(start[2] - pose[2]), math.sin(start[2] - pose[2])
     for m in range(len(reading)):
         x = place[slot[m], 0] - start_place[slot[m], 0] - pose[0] + start[0]
@@ -67,12 +72,12 @@ def linearise_frame(
             jacobian[row, 0] = c * jx[k, 0] + s * jx[k, 1]
             jacobian[row, 1] = -s * jx[k, 0] + c * jx[k, 1]
             jacobian[row, 2] = jx[k, 2] + x * jl[k, 1] - y * jl[k, 0]
-            for a in range(5):
+            for a in range(N_SENSOR):
                 jacobian[row, 3 + a] = jc[k, a] if free[a] else 0.0
-            jacobian[row, 8], jacobian[row, 9] = jl[k, 0], jl[k, 1]
-        for a in range(8):
+            jacobian[row, BY_PLACE], jacobian[row, BY_PLACE + 1] = jl[k, 0], jl[k, 1]
+        for a in range(BY_PLACE):
             column[m, a] = a
-        column[m, 8], column[m, 9] = AT_PLACES + 2 * slot[m], AT_PLACES + 2 * slot[m] + 1
+        column[m, BY_PLACE], column[m, BY_PLACE + 1] = AT_PLACES + 2 * slot[m], AT_PLACES + 2 * slot[m] + 1
 
 
 @kernel
@@ -82,16 +87,17 @@ def spread_of_frame(
     """Compute `H P` (2 M, size) and `H P H'` (2 M, 2 M)."""
     gain[:] = 0.0
     for row in range(len(jacobian)):
-        for a in range(10):
+        for a in range(WIDTH):
             by, at = jacobian[row, a], column[row // 2, a]
             if by != 0.0:
                 for k in range(len(covariance)):
                     gain[row, k] += by * covariance[at, k]
-    np.dot(np.ascontiguousarray(gain[:, :8]), np.ascontiguousarray(jacobian[:, :8].T), spread)
+    np.dot(np.ascontiguousarray(gain[:, :BY_PLACE]), np.ascontiguousarray(jacobian[:, :BY_PLACE].T), spread)
     for row in range(len(jacobian)):
         for other in range(row + 1):
-            x, y = column[other // 2, 8], column[other // 2, 9]
-            total = spread[row, other] + gain[row, x] * jacobian[other, 8] + gain[row, y] * jacobian[other, 9]
+            x, y = column[other // 2, BY_PLACE], column[other // 2, BY_PLACE + 1]
+            total = spread[row, other] + gain[row, x] * jacobian[other, BY_PLACE]
+            total += gain[row, y] * jacobian[other, BY_PLACE + 1]
             spread[row, other] = spread[other, row] = total
 
 
@@ -120,14 +126,14 @@ def drive_on(
         covariance[0, k] = carry[0, 0] * x + carry[0, 1] * y + carry[0, 2] * turn
         covariance[1, k] = carry[1, 0] * x + carry[1, 1] * y + carry[1, 2] * turn
     block = covariance[:3, :3].copy()
-    cross = covariance[:3, 8:12].copy() @ by_states.T
-    own, more = carry @ block @ carry.T, by_states @ covariance[8:12, 8:12].copy() @ by_states.T
+    cross = covariance[:3, DRIVEN:AT_PLACES].copy() @ by_states.T
+    own, more = carry @ block @ carry.T, by_states @ covariance[DRIVEN:AT_PLACES, DRIVEN:AT_PLACES].copy() @ by_states.T
     for a in range(3):
         for k in range(3):
             covariance[a, k] = own[a, k] + cross[a, k] + cross[k, a] + noise[a, k] + more[a, k]
         for k in range(3, size):
-            for b in range(4):
-                covariance[a, k] += by_states[a, b] * covariance[8 + b, k]
+            for b in range(N_MOTION):
+                covariance[a, k] += by_states[a, b] * covariance[DRIVEN + b, k]
             covariance[k, a] = covariance[a, k]
 
 
@@ -166,7 +172,7 @@ def innovations(
 
     Args:
         pose: (3,) of the state.
-        states: (9,) of it.
+        states: (11,) of it.
         covariance: of it.
         place: (K, 2).
         slot: (K,) where the place stands in the covariance, -1 where it does not.
@@ -174,28 +180,34 @@ def innovations(
         reading: (K, 2) range and bearing.
         sigma: (K, 2) their noise.
         mount: (3,) pose of the sensor on the robot.
-        free: (9,) which calibration states are estimated.
+        free: (11,) which calibration states are estimated.
 
     Returns:
-        (K,) squared Mahalanobis distance, (K,) `log |S|`, (K, 2) residual and (K, 2, 10) its derivatives by pose,
+        (K,) squared Mahalanobis distance, (K,) `log |S|`, (K, 2) residual and (K, 2, 12) its derivatives by pose,
         sensor states and place.
     """
     count = len(reading)
-    nis, log_det, residual, by = np.empty(count), np.empty(count), np.empty((count, 2)), np.zeros((count, 2, 10))
-    jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-    part, h_part, s, at = np.zeros((10, 10)), np.zeros((2, 10)), np.zeros((2, 2)), np.arange(10)
+    nis, log_det, residual, by = np.empty(count), np.empty(count), np.empty((count, 2)), np.zeros((count, 2, WIDTH))
+    jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
+    part, h_part, s, at = np.zeros((WIDTH, WIDTH)), np.zeros((2, WIDTH)), np.zeros((2, 2)), np.arange(WIDTH)
     for m in range(count):
-        e, h, at[8], at[9] = residual[m], by[m], AT_PLACES + 2 * slot[m], AT_PLACES + 2 * slot[m] + 1
+        e, h = residual[m], by[m]
+        at[BY_PLACE], at[BY_PLACE + 1] = AT_PLACES + 2 * slot[m], AT_PLACES + 2 * slot[m] + 1
         detection_residual(pose, place[m], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
         for a in range(2):
-            for b in range(10):
-                h[a, b] = jx[a, b] if b < 3 else jl[a, b - 8] if b >= 8 else jc[a, b - 3] if free[b - 3] else 0.0
-        for a in range(10):
-            for b in range(10):
-                if slot[m] >= 0 or max(a, b) < 8:
+            for b in range(WIDTH):
+                if b < 3:
+                    h[a, b] = jx[a, b]
+                elif b >= BY_PLACE:
+                    h[a, b] = jl[a, b - BY_PLACE]
+                else:
+                    h[a, b] = jc[a, b - 3] if free[b - 3] else 0.0
+        for a in range(WIDTH):
+            for b in range(WIDTH):
+                if slot[m] >= 0 or max(a, b) < BY_PLACE:
                     part[a, b] = covariance[at[a], at[b]]
                 else:
-                    part[a, b] = own[m, a - 8, b - 8] if min(a, b) >= 8 else 0.0
+                    part[a, b] = own[m, a - BY_PLACE, b - BY_PLACE] if min(a, b) >= BY_PLACE else 0.0
         sandwich(h, part, h_part, s)
         a, b, d = s[0, 0] + sigma[m, 0] ** 2, s[0, 1], s[1, 1] + sigma[m, 1] ** 2
         nis[m] = _squared(a, b, d, e[0], e[1])
@@ -221,7 +233,7 @@ def update(
 
     Args:
         pose: (3,) in and out.
-        states: (9,) in and out.
+        states: (11,) in and out.
         covariance: in and out.
         position: (L, 2) in and out, of all places.
         row: (K,) which of them is in each slot, negative in a free one.
@@ -230,7 +242,7 @@ def update(
         sigma: (M, 2) their noise.
         log_odds: (M,) for 'no outlier' where a detection is exactly where it is expected, for `BY_OTHERS`.
         mount: (3,) pose of the sensor on the robot.
-        free: (9,) which calibration states are estimated.
+        free: (11,) which calibration states are estimated.
         considered: whether places stay where they are.
         weighing: how detections are weighed.
 
@@ -254,7 +266,7 @@ def update(
     start, start_states, start_place = pose.copy(), states.copy(), place.copy()
     moving, before, step = AT_PLACES if considered else size, np.zeros(size), np.zeros(size)
     innovation, pull = np.zeros(2 * count), np.zeros(2 * count)
-    jacobian, column = np.zeros((2 * count, 10)), np.zeros((count, 10), dtype=np.int64)
+    jacobian, column = np.zeros((2 * count, WIDTH)), np.zeros((count, WIDTH), dtype=np.int64)
     root, gain, spread = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, size)), np.zeros((0, 0))
     unsure = False
     for iteration in range(1 if weighing == GATED else ITERATIONS):
@@ -278,7 +290,7 @@ def update(
         for each in range(2 * count):
             root[each, each] += sigma[each // 2, each % 2] ** 2 / weight[each // 2]
             # innovation at the step so far, expressed at the start
-            for a in range(10):
+            for a in range(WIDTH):
                 innovation[each] -= jacobian[each, a] * step[column[each // 2, a]]
         if unsure:
             spread = root.copy()
@@ -292,7 +304,7 @@ def update(
         c, s = math.cos(start[2]), math.sin(start[2])
         x, y = along_turn(c * step[0] - s * step[1], s * step[0] + c * step[1], step[2])
         pose[0], pose[1], pose[2] = start[0] + x, start[1] + y, wrapped(start[2] + step[2])
-        for k in range(9):
+        for k in range(N_STATES):
             states[k] = start_states[k] + step[3 + k]
         for k in range(0 if considered else count):
             x, y = along_turn(step[AT_PLACES + 2 * k], step[AT_PLACES + 2 * k + 1], step[2])
@@ -308,7 +320,7 @@ def update(
     lever[0], lever[1] = s * x - c * y, c * x + s * y
     white = np.zeros((2 * count, len(covariance) + 1))
     for k in range(2 * count):
-        column[k // 2, 8 + k % 2], white[k, -1] = where[AT_PLACES + k], innovation[k]
+        column[k // 2, BY_PLACE + k % 2], white[k, -1] = where[AT_PLACES + k], innovation[k]
     _across(covariance, jacobian, column, white)
     if considered:
         _consider(covariance, root, white)
@@ -339,8 +351,8 @@ def _surprises(
         nis[m] = _squared(a, b, d, residual[2 * m], residual[2 * m + 1])
         # its value if only the reading and the place were uncertain
         xx, xy, yy = part[x, x], part[x, x + 1], part[x + 1, x + 1]
-        i, j = jacobian[2 * m, 8], jacobian[2 * m, 9]
-        k, n = jacobian[2 * m + 1, 8], jacobian[2 * m + 1, 9]
+        i, j = jacobian[2 * m, BY_PLACE], jacobian[2 * m, BY_PLACE + 1]
+        k, n = jacobian[2 * m + 1, BY_PLACE], jacobian[2 * m + 1, BY_PLACE + 1]
         own_a = i * i * xx + 2.0 * i * j * xy + j * j * yy + r
         own_b = i * k * xx + (i * n + j * k) * xy + j * n * yy
         own_d = k * k * xx + 2.0 * k * n * xy + n * n * yy + q
@@ -417,7 +429,7 @@ vectorised = kept(effort=3, error_model="numpy", fastmath={"contract"})
 def _across(covariance: FloatArray, jacobian: FloatArray, column: Any, out: FloatArray) -> None:
     """Add `H P`, (2 M, size), to the first columns of `out`."""
     for row in range(len(out)):
-        for a in range(10):
+        for a in range(WIDTH):
             by, at = jacobian[row, a], column[row // 2, a]
             for k in range(len(covariance) if by != 0.0 else 0):
                 out[row, k] += by * covariance[at, k]

@@ -30,8 +30,11 @@ FLOOR_TURN_RAD = 0.001
 FLOOR_VARIANCE = 1e-8
 """And once for every interval, however short: 0.1 mm and 0.1 mrad."""
 MAX_STEP_S = 0.1
-AT_PLACES = 12
-"""Where places begin in a joint covariance: behind the newest pose (3) and the calibration states (9)."""
+N_SENSOR, N_MOTION = 7, 4
+"""Calibration states of the sensor and, behind them, of the odometry (`calibration.SPECS`)."""
+N_STATES = N_SENSOR + N_MOTION
+AT_PLACES = 3 + N_STATES
+"""Where places begin in a joint covariance: behind the newest pose and the calibration states."""
 
 kernel = kept(effort=1, error_model="numpy")
 """Matrices of two to fifteen rows: there is nothing to vectorise, and much to compile."""
@@ -119,13 +122,13 @@ def integrate_odometry(
         unknown: (N,) extra noise variance per second where the odometry is silent.
         start: first instant, on the detections' clock.
         stop: second instant.
-        states: (9,) calibration states.
+        states: (11,) calibration states.
         increment: (3,) out, pose at `stop` seen from `start`.
         jacobian: (3, 4) out, right perturbation of the increment by delay, forward scale, turn scale, slip.
         noise: (5, 3, 3) out, covariance for unit noise of each kind in `NOISE_NAMES`.
         floor: (3, 3) out, covariance that is always there.
     """
-    delay, scale_v, scale_w, slip = states[5], states[6], states[7], states[8]
+    delay, scale_v, scale_w, slip = states[N_SENSOR], states[N_SENSOR + 1], states[N_SENSOR + 2], states[N_SENSOR + 3]
     begin = start + delay
     end = stop + delay
     count = len(stamp)
@@ -296,9 +299,9 @@ def odometry_residual(
 @kernel
 def residual_by_states(motion: FloatArray, residual: FloatArray, free: Any) -> None:
     """Turn the increment's derivatives (3, 4) by its states, in place, into the residual's; zero where not free."""
-    for k in range(4):
+    for k in range(N_MOTION):
         forward, left, turn = motion[0, k], motion[1, k], motion[2, k]
-        on = 1.0 if free[5 + k] else 0.0
+        on = 1.0 if free[N_SENSOR + k] else 0.0
         motion[0, k] = on * (turn * residual[1] - forward)
         motion[1, k] = -on * (turn * residual[0] + left)
         motion[2, k] = -on * turn
@@ -309,9 +312,12 @@ def detection_residual(
     pose: FloatArray, landmark: FloatArray, states: FloatArray, mount: FloatArray, range_m: float, bearing_rad: float,
     residual: FloatArray, j_pose: FloatArray, j_landmark: FloatArray, j_states: FloatArray,
 ) -> None:  # fmt: skip
-    """Compute (range, bearing) measured minus predicted, derivatives by pose (2, 3), landmark (2, 2), states (2, 5)."""
+    """Compute (range, bearing) measured minus predicted, derivatives by pose (2, 3), landmark (2, 2), and the
+    sensor's states (2, 7).
+    """
     c, s = np.cos(pose[2]), np.sin(pose[2])
-    lever_x, lever_y = c * mount[0] - s * mount[1], s * mount[0] + c * mount[1]
+    x, y = mount[0] + states[5], mount[1] + states[6]
+    lever_x, lever_y = c * x - s * y, s * x + c * y
     dx, dy = landmark[0] - pose[0] - lever_x, landmark[1] - pose[1] - lever_y
     r = max(np.sqrt(dx * dx + dy * dy), 1e-6)
     b = wrapped(np.arctan2(dy, dx) - pose[2] - mount[2])
@@ -333,6 +339,13 @@ def detection_residual(
     j_states[:] = 0.0
     j_states[0, 0], j_states[0, 1], j_states[0, 2], j_states[0, 3] = -1.0, -r, -r * b, -r * b * b
     j_states[1, 4] = -1.0
+    # where the sensor sits moves it as the robot does, along the robot's axes
+    j_states[0, 5], j_states[0, 6], j_states[1, 5], j_states[1, 6] = (
+        j_pose[0, 0],
+        j_pose[0, 1],
+        j_pose[1, 0],
+        j_pose[1, 1],
+    )
 
 
 @kernel

@@ -7,20 +7,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.slam.kernels import detection_residual, inlier_weight, kernel, outlier_loss
+from evermap.slam.kernels import N_MOTION, N_SENSOR, detection_residual, inlier_weight, kernel, outlier_loss
 from evermap.slam.preintegration import Intervals, linearise_interval
 from evermap.slam.problem import Estimate, Problem
 from evermap.types import BoolArray, FloatArray, IntArray
 
-ODOMETRY, DETECTION = 33, 22
-"""Numbers of one factor: three rows by two poses and four states, two rows by pose, place and five states; and the
+OF_INTERVAL, OF_DETECTION = 3 + 3 + N_MOTION + 1, 3 + 2 + N_SENSOR + 1
+"""Numbers of a row: by two poses and the states of the odometry, by pose, place and the states of the sensor; and the
 right side."""
+ODOMETRY, DETECTION = 3 * OF_INTERVAL, 2 * OF_DETECTION
+"""Numbers of one factor, of three rows and of two."""
 
 
 class Readings(NamedTuple):
     """Detections as the kernel reads them: (M,) rows of pose and place, (M, 2) readings and sigmas; (3,) mount.
 
-    `free` (9,) are the calibration states that are estimated; `log_odds` and `heavy` as for `kernels.inlier_weight`.
+    `free` (11,) are the calibration states that are estimated; `log_odds` and `heavy` as for `kernels.inlier_weight`.
     """
 
     pose_row: IntArray
@@ -54,7 +56,7 @@ def linearise(
     Args:
         pose: (N, 3) values of poses.
         place: (P, 2) of places.
-        states: (9,) of the calibration.
+        states: (11,) of the calibration.
         driven: odometry between the poses.
         variance: (5,) of its kinds of noise.
         seen: all detections.
@@ -70,12 +72,12 @@ def linearise(
     """
     cost, at = 0.0, ODOMETRY * begin
     information, e, root = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
-    j = np.zeros((3, 10))
+    j = np.zeros((3, OF_INTERVAL - 1))
     for i in range(begin, end):
         linearise_interval(driven, i, pose, variance, seen.free, e, j, information)
         root_of(information, root)
         for a in range(3):
-            for b in range(10):
+            for b in range(OF_INTERVAL - 1):
                 total = 0.0
                 for k in range(a, 3):
                     total += root[a, k] * j[k, b]
@@ -83,11 +85,11 @@ def linearise(
             total = 0.0
             for k in range(a, 3):
                 total += root[a, k] * e[k]
-            values[at + 10] = -total
+            values[at + OF_INTERVAL - 1] = -total
             cost += 0.5 * total * total
-            at += 11
+            at += OF_INTERVAL
     at = ODOMETRY * (len(pose) - 1) + DETECTION * first
-    z, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    z, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     for m in range(first, last):
         detection_residual(
             pose[seen.pose_row[m]], place[seen.place[m]], states, seen.mount, seen.reading[m, 0], seen.reading[m, 1],
@@ -102,10 +104,10 @@ def linearise(
                 values[at + a] = scale * jx[row, a]
             for a in range(2):
                 values[at + 3 + a] = scale * jl[row, a]
-            for a in range(5):
+            for a in range(N_SENSOR):
                 values[at + 5 + a] = scale * jc[row, a] if seen.free[a] else 0.0
-            values[at + 10] = -scale * z[row]
-            at += 11
+            values[at + OF_DETECTION - 1] = -scale * z[row]
+            at += OF_DETECTION
     return cost
 
 
@@ -124,7 +126,7 @@ def _detection_residuals(
     pose: FloatArray, landmark: FloatArray, states: FloatArray, pose_row: Any, landmark_row: Any, reading: FloatArray,
     mount: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     for m in range(len(pose_row)):
         detection_residual(
             pose[pose_row[m]],

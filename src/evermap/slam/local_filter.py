@@ -24,7 +24,7 @@ import numpy as np
 
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.filter_kernels import BELIEVED, drive_on, innovations, update
-from evermap.slam.kernels import AT_PLACES
+from evermap.slam.kernels import AT_PLACES, N_STATES
 from evermap.slam.motion import Motion
 from evermap.slam.problem import Estimate, Marginals
 from evermap.types import UNKNOWN, FloatArray, IntArray
@@ -76,7 +76,7 @@ class LocalFilter:
         self.pose = np.full(3, np.nan)
         """(3,) the newest pose."""
         self.states = prior.mean.copy()
-        """(9,) calibration states."""
+        """(11,) calibration states."""
         self.covariance = np.zeros((AT_PLACES, AT_PLACES))
         """(12 + 2 K, 12 + 2 K) of pose, in its own frame, states, and places in K slots, zero in free ones."""
         self.covariance[3:, 3:] = np.diag((prior.sigma * prior.free) ** 2)
@@ -128,7 +128,7 @@ class LocalFilter:
         """Begin anew at a pose of a batch solution, with some of its places; the others are taken from there."""
         joint = marginals.joint(rows, poses=np.array([pose_row]), states=True)
         end = 3 + 2 * len(rows)
-        order = np.concatenate([np.arange(3), end + np.arange(9), np.arange(3, end)])
+        order = np.concatenate([np.arange(3), end + np.arange(N_STATES), np.arange(3, end)])
         covariance = joint[np.ix_(order, order)]
         self.hold(estimate.pose[pose_row], estimate.states, covariance, rows, estimate.landmark.copy())
         self.lean_on(estimate.landmark, marginals.joint)
@@ -193,7 +193,7 @@ class LocalFilter:
         Args:
             row: of all places, behind those of the map.
             place: (2,) where it is.
-            by_pose: (2, 12) its derivatives by the pose and the calibration states.
+            by_pose: (2, 14) its derivatives by the pose and the calibration states.
             spread: (2, 2) covariance by the reading's own noise.
         """
         self.know_of(row + 1)

@@ -21,7 +21,7 @@ from evermap.sensing.visibility import NominalField
 from evermap.show import Shown
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.filter_kernels import BY_OTHERS
-from evermap.slam.kernels import AT_PLACES
+from evermap.slam.kernels import AT_PLACES, N_SENSOR
 from evermap.slam.known_places import KnownPlaces, LocalTrack, Neighbourhood, Placed
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
 from evermap.slam.motion import Motion
@@ -126,12 +126,12 @@ class Localizer(Shown):
 
     @property
     def states(self) -> FloatArray:
-        """(9,) calibration states."""
+        """(11,) calibration states."""
         return self._filter.states.copy()
 
     @property
     def states_covariance(self) -> FloatArray:
-        """(9, 9) of them."""
+        """(11, 11) of them."""
         return self._filter.covariance[3:AT_PLACES, 3:AT_PLACES].copy()
 
     @property
@@ -332,14 +332,14 @@ STEP = 1e-6
 def _placed_by(
     pose: FloatArray, reading: FloatArray, states: FloatArray, mount: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(2,) where a reading (2,) points to, its derivatives (2, 12) by pose, in its own frame, and states, and (2, 2) by
+    """(2,) where a reading (2,) points to, its derivatives (2, 14) by pose, in its own frame, and states, and (2, 2) by
     the reading.
     """
     place = sighted_at(pose, reading, states, mount)
     by_pose, by_reading = np.zeros((2, AT_PLACES)), np.zeros((2, 2))
     for k, step in enumerate(STEP * np.eye(3)):
         by_pose[:, k] = (sighted_at(se2.retract(pose, step), reading, states, mount) - place) / STEP
-    for k, step in enumerate(STEP * np.eye(len(states))[:5]):
+    for k, step in enumerate(STEP * np.eye(len(states))[:N_SENSOR]):
         by_pose[:, 3 + k] = (sighted_at(pose, reading, states + step, mount) - place) / STEP
     for k, step in enumerate(STEP * np.eye(2)):
         by_reading[:, k] = (sighted_at(pose, reading + step, states, mount) - place) / STEP

@@ -87,7 +87,7 @@ class Mapper:
 
     @property
     def states(self) -> FloatArray:
-        """(9,) calibration states."""
+        """(11,) calibration states."""
         return self._slam.states
 
     def skip(self, odometry: FloatArray) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.slam.kernels import N_NOISE, integrate_odometry, kernel, odometry_covariance
+from evermap.slam.kernels import N_MOTION, N_NOISE, N_SENSOR, integrate_odometry, kernel, odometry_covariance
 from evermap.slam.problem import Drive, Noise, Problem
 from evermap.types import BoolArray, FloatArray
 
@@ -37,7 +37,7 @@ class Motion:
     def over(
         cls, drive: Drive, start_s: float, stop_s: float, states: FloatArray, free: BoolArray, noise: Noise
     ) -> Motion:
-        """Return between two instants, with (9,) calibration states of which some are `free`."""
+        """Return between two instants, with (11,) calibration states of which some are `free`."""
         odometry = drive.stamp_s, drive.velocity, drive.unknown
         return cls(*_driven(*odometry, start_s, stop_s, states, free, noise.odometry))
 
@@ -48,11 +48,11 @@ def _driven(
     free: Any, sigma: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Increment, derivatives by states that are free, and covariance of the motion between two instants."""
-    increment, by_states = np.zeros(3), np.zeros((3, 4))
+    increment, by_states = np.zeros(3), np.zeros((3, N_MOTION))
     kinds, covariance = np.zeros((N_NOISE, 3, 3)), np.zeros((3, 3))
     integrate_odometry(stamp, velocity, unknown, start_s, stop_s, states, increment, by_states, kinds, covariance)
     odometry_covariance(kinds, covariance, sigma**2, covariance)
-    for k in range(4):
-        if not free[5 + k]:
+    for k in range(N_MOTION):
+        if not free[N_SENSOR + k]:
             by_states[:, k] = 0.0
     return increment, by_states, covariance

@@ -12,7 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.slam.kernels import (
+    N_MOTION,
     N_NOISE,
+    N_SENSOR,
     integrate_odometry,
     invert_3x3,
     kernel,
@@ -58,21 +60,23 @@ class Preintegration:
 
         Args:
             stamp_s: (N,) instants of the poses.
-            states: (9,) calibration states.
+            states: (11,) calibration states.
             odometry: stamps (n,), velocities (n, 3) and unknown variance (n,), the same at every call.
         """
         kept = self._intervals
-        if kept is not None and np.array_equal(self._motion_states, states[5:]):
+        if kept is not None and np.array_equal(self._motion_states, states[N_SENSOR:]):
             first = int(np.searchsorted(self._stamp_s, stamp_s[0]))
             if np.array_equal(self._stamp_s[first : first + len(stamp_s)], stamp_s):
                 rows = slice(first, first + len(stamp_s) - 1)
                 return Intervals(*(part[rows] for part in kept))
         n = len(stamp_s) - 1
-        room = Intervals(np.empty((n, 3)), np.empty((n, 3, 4)), np.empty((n, N_NOISE, 3, 3)), np.empty((n, 3, 3)))
+        room = Intervals(
+            np.empty((n, 3)), np.empty((n, 3, N_MOTION)), np.empty((n, N_NOISE, 3, 3)), np.empty((n, 3, 3))
+        )
         for first in range(0, n, A_SLICE):
             _integrate(stamp_s, *odometry, states, room, first, min(first + A_SLICE, n))
             yield min(A_SLICE, n - first) / A_SLICE
-        self._stamp_s, self._motion_states, self._intervals = stamp_s.copy(), states[5:].copy(), room
+        self._stamp_s, self._motion_states, self._intervals = stamp_s.copy(), states[N_SENSOR:].copy(), room
         return room
 
 
@@ -100,7 +104,7 @@ def linearise_interval(
         i: which interval.
         pose: (N, 3) all poses.
         variance: (5,) of each kind of noise.
-        free: (9,) which calibration states are.
+        free: (11,) which calibration states are.
         residual: (3,) out, that of `kernels.odometry_residual`.
         jacobian: (3, 10) out, its derivatives by both poses and by delay, scales and slip.
         information: (3, 3) out, inverse covariance.
@@ -109,6 +113,6 @@ def linearise_interval(
     invert_3x3(information, information)
     odometry_residual(pose[i], pose[i + 1], intervals.increment[i], residual, jacobian[:, :3], jacobian[:, 3:6])
     for a in range(3):
-        for k in range(4):
+        for k in range(N_MOTION):
             jacobian[a, 6 + k] = intervals.by_states[i, a, k]
     residual_by_states(jacobian[:, 6:], residual, free)

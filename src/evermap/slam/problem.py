@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from evermap.config import OdometryConfig
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.kernels import kernel
+from evermap.slam.kernels import N_STATES, kernel
 from evermap.slam.preintegration import Intervals, Preintegration
 from evermap.slam.sparse.elimination import Spread
 from evermap.slam.sparse.system import Factorised, Slices, exhausted
@@ -57,7 +57,7 @@ class Drive:
         return np.asarray(square.mean(axis=0) / (6.0 * TRIMMED))
 
     def between(self, stamp_s: FloatArray, states: FloatArray) -> Intervals:
-        """Return motion between each two consecutive of the (N,) stamps, for (9,) calibration states."""
+        """Return motion between each two consecutive of the (N,) stamps, for (11,) calibration states."""
         return exhausted(self.in_slices(stamp_s, states))
 
     def in_slices(self, stamp_s: FloatArray, states: FloatArray) -> Slices[Intervals]:
@@ -302,7 +302,7 @@ class Estimate:
     Attributes:
         pose: (N, 3) poses in the world.
         landmark: (L, 2) positions; nan where never seen.
-        states: (9,) calibration states.
+        states: (11,) calibration states.
     """
 
     pose: FloatArray
@@ -420,20 +420,20 @@ class Marginals:
 
     @cached_property
     def states(self) -> FloatArray:
-        """(9, 9) covariance of the calibration states."""
+        """(11, 11) covariance of the calibration states."""
         tree = self._solved.system.tree
-        at = tree.in_border[self._block.border] + np.arange(9)
+        at = tree.in_border[self._block.border] + np.arange(N_STATES)
         return self._solved.border_covariance()[np.ix_(at, at)]
 
     @property
     def with_states(self) -> FloatArray:
-        """(G, 9) covariance of everything with the calibration states: poses, known landmarks, states."""
+        """(G, 11) covariance of everything with the calibration states: poses, known landmarks, states."""
         begin, part = self._solved.system.tree.begin, self._block
         first, states = begin[part.first], begin[part.border]
         rows = [
             np.arange(first, first + 3 * self._n),
             (begin[part.landmarks][:, None] + np.arange(2)).ravel(),
-            np.arange(states, states + 9),
+            np.arange(states, states + N_STATES),
         ]
         found: FloatArray = self._solved.columns(part.border + np.arange(2))[np.concatenate(rows)]
         return found
@@ -468,7 +468,7 @@ class Marginals:
         if known.all():
             return found
         n_poses = 3 * len(every[0])
-        kept = np.concatenate([np.ones(n_poses, bool), np.repeat(known, 2), np.ones(9 if states else 0, bool)])
+        kept = np.concatenate([np.ones(n_poses, bool), np.repeat(known, 2), np.ones(N_STATES if states else 0, bool)])
         joint = np.zeros((len(kept), len(kept)))
         joint[np.ix_(kept, kept)] = found
         return joint
@@ -479,7 +479,7 @@ class Marginals:
         Args:
             landmarks: (L,) rows, all known.
             poses: (P,) rows.
-            by: (V, R, 3 P + 2 L + 9) the matrices.
+            by: (V, R, 3 P + 2 L + 11) the matrices.
         """
         part, rank = self._block, np.cumsum(self.known) - 1
         every = [part.first + poses, part.landmarks[rank[landmarks]], part.border + np.arange(2)]
@@ -499,7 +499,7 @@ class Marginals:
     def pose_shared(self) -> FloatArray:
         """(N, 3, G) of all poses with all landmarks and the states: dense, for few landmarks."""
         n = self._n
-        kept = np.append(np.repeat(self.known, 2), np.ones(9, dtype=bool))
+        kept = np.append(np.repeat(self.known, 2), np.ones(N_STATES, dtype=bool))
         cross = np.zeros((n, 3, len(kept)))
         found = self._solved.columns(np.append(self._block.landmarks, self._block.border + np.arange(2)))
         first = self._solved.system.tree.begin[self._block.first]

@@ -223,7 +223,7 @@ def described(
     p_needed: FloatArray | None = None,
     undivided: bool = False,
 ) -> tuple[ParameterEstimate, ...]:
-    """Return calibration states (9,) with their covariance (9, 9), driving askew, and noise levels, as records.
+    """Return calibration states (11,) with their covariance (11, 11), driving askew, and noise levels, as records.
 
     For errors that are only observable together the meanings give both interpretations. With `undivided`, the scale is
     of that kind.

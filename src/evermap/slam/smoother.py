@@ -15,7 +15,8 @@ from scipy.sparse.csgraph import connected_components
 from evermap.errors import NumericalError
 from evermap.geometry import se2
 from evermap.slam.calibration import DELAY
-from evermap.slam.linearise import DETECTION, ODOMETRY, Readings, linearise
+from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES
+from evermap.slam.linearise import DETECTION, ODOMETRY, OF_DETECTION, OF_INTERVAL, Readings, linearise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, between_rows
 from evermap.slam.sparse.elimination import curvature
 from evermap.slam.sparse.system import Factorised, Slices, System, exhausted
@@ -44,7 +45,7 @@ class Linearised:
         values: Jacobians and right sides of all factors.
         weights: (M,) inlier probability of every detection.
         cost: negative log posterior up to a constant.
-        states_right: (9,) pull of the prior of the calibration.
+        states_right: (11,) pull of the prior of the calibration.
     """
 
     values: FloatArray
@@ -94,7 +95,7 @@ class Smoother:
 
     @property
     def states_sigma(self) -> FloatArray:
-        """(9,) standard deviations of the prior of the calibration states."""
+        """(11,) standard deviations of the prior of the calibration states."""
         return self.problem.prior.sigma
 
     def under(self, noise: Noise, *, heavy: bool, problem: Problem | None = None) -> Smoother:
@@ -185,7 +186,7 @@ class Smoother:
         return Marginals(solved, len(estimate.pose), len(self.problem.pose_row), estimate.known)
 
     def worth(self, estimate: Estimate, marginals: Marginals) -> FloatArray:
-        """Return (9,) variances of the states with correlated residuals, relative to those of independent ones.
+        """Return (11,) variances of the states with correlated residuals, relative to those of independent ones.
 
         What each stretch of the recording adds to the states is summed before it is squared, which makes no assumption
         on how errors hang together within it: White's covariance (1980), with stretches as clusters (Liang and Zeger
@@ -193,26 +194,30 @@ class Smoother:
         """
         problem, n = self.problem, len(estimate.pose)
         if not problem.prior.free.any():
-            return np.ones(9)
+            return np.ones(N_STATES)
         now, structure, with_states = self.linearised(estimate), self._structure_of(estimate), marginals.with_states
-        pose, place, states = with_states[: 3 * n].reshape(n, 3, 9), with_states[3 * n : -9], with_states[-9:]
-        place = place.reshape(-1, 2, 9)
-        driven, seen = now.values[: ODOMETRY * (n - 1)].reshape(-1, 3, 11), self.detections(estimate)
+        pose, place, states = (
+            with_states[: 3 * n].reshape(n, 3, N_STATES),
+            with_states[3 * n : -N_STATES],
+            with_states[-N_STATES:],
+        )
+        place = place.reshape(-1, 2, N_STATES)
+        driven, seen = now.values[: ODOMETRY * (n - 1)].reshape(-1, 3, OF_INTERVAL), self.detections(estimate)
         of_driven = (
             np.einsum("nra,nas->nrs", driven[..., :3], pose[:-1])
             + np.einsum("nra,nas->nrs", driven[..., 3:6], pose[1:])
-            + driven[..., 6:10] @ states[5:]
+            + driven[..., 6:-1] @ states[N_SENSOR:]
         )
         of_seen = (
             np.einsum("nra,nas->nrs", seen[..., :3], pose[problem.pose_row])
             + np.einsum("nra,nas->nrs", seen[..., 3:5], place[structure.rank[problem.landmark_row]])
-            + seen[..., 5:10] @ states[:5]
+            + seen[..., 5:-1] @ states[:N_SENSOR]
         )
         stamp = problem.stamp_s - problem.stamp_s[0]
         stretch = np.minimum((stamp / max(stamp[-1], 1e-9) * STRETCHES).astype(np.int64), STRETCHES - 1)
-        pull = np.zeros((STRETCHES, 9))
-        np.add.at(pull, stretch[:-1], np.einsum("nrs,nr->ns", of_driven, driven[..., 10]))
-        np.add.at(pull, stretch[problem.pose_row], np.einsum("nrs,nr->ns", of_seen, seen[..., 10]))
+        pull = np.zeros((STRETCHES, N_STATES))
+        np.add.at(pull, stretch[:-1], np.einsum("nrs,nr->ns", of_driven, driven[..., -1]))
+        np.add.at(pull, stretch[problem.pose_row], np.einsum("nrs,nr->ns", of_seen, seen[..., -1]))
         independent = (of_driven**2).sum(axis=(0, 1)) + (of_seen**2).sum(axis=(0, 1))
         found = (pull**2).sum(axis=0) * STRETCHES / (STRETCHES - 1.0)
         free = problem.prior.free & (independent > 0.0)
@@ -224,16 +229,16 @@ class Smoother:
         return worth
 
     def detections(self, estimate: Estimate) -> FloatArray:
-        """Return (M, 2, 11) detections, linearised and whitened: by pose, place, sensor states; and the right side."""
+        """Return (M, 2, 13) detections, linearised and whitened: by pose, place, sensor states; and the right side."""
         begin = ODOMETRY * (len(estimate.pose) - 1)
         values = self.linearised(estimate).values[begin : begin + DETECTION * len(self.problem.pose_row)]
-        return values.reshape(-1, 2, 11)
+        return values.reshape(-1, 2, OF_DETECTION)
 
     def information(self, estimate: Estimate, poses: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the information on some poses, the known landmarks and the states, with all other poses marginalised.
 
         Returns:
-            (n, n) and (n,), n = 3 poses + 2 known landmarks + 9: information and right side of a step from `estimate`.
+            (n, n) and (n,), n = 3 poses + 2 known landmarks + 11: information and right side of a step from `estimate`.
         """
         now, structure = self.linearised(estimate), self._structure_of(estimate)
         system, n = structure.system, len(estimate.pose)
@@ -241,8 +246,8 @@ class Smoother:
         above = System(system.tree.dim, system.factors, structure.coordinate, kept)
         solved = exhausted(above.factorised(now.values, extra=self._extra(above, n)))
         information, right = solved.information, solved.right
-        information[-9:, -9:] += np.diag(1.0 / self.problem.prior.sigma**2)
-        right[-9:] += now.states_right
+        information[-N_STATES:, -N_STATES:] += np.diag(1.0 / self.problem.prior.sigma**2)
+        right[-N_STATES:] += now.states_right
         return information, right
 
     def linearised(self, estimate: Estimate) -> Linearised:
@@ -350,7 +355,7 @@ class Smoother:
             np.concatenate([leaf_of_pose[steps], leaf_of_pose[problem.pose_row], [0], prior_leaf]).astype(np.int64),
         )
         yield MS * len(place)
-        dim = np.concatenate([np.full(n, 3), np.full(count, 2), [5, 4]])
+        dim = np.concatenate([np.full(n, 3), np.full(count, 2), [N_SENSOR, N_MOTION]])
         at = np.zeros((n_leaves, 3))
         at[:, 0] = np.arange(n_leaves)
         weight = np.bincount(leaf_of_pose, minlength=n_leaves)

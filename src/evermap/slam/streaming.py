@@ -13,13 +13,15 @@ from itertools import count as counted
 from itertools import pairwise
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from evermap.config import SlamConfig
 from evermap.errors import NumericalError
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
-from evermap.slam.calibration import CalibrationPrior, needed
+from evermap.slam.calibration import CalibrationPrior, needed, seated
 from evermap.slam.filter_kernels import told
+from evermap.slam.kernels import N_STATES
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.motion import Motion
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
@@ -46,6 +48,10 @@ MOST_BREAKS = 8
 """Silences of the odometry after which the parts are laid over each other."""
 ELSEWHERE = 0.1
 """Motion (m or rad) of a part that the optimum near it does not take back."""
+REJECTED = 5
+"""Sightings of one landmark in a row that are rejected: no outliers that happen here and there."""
+WIDER = (10.0, 3.0)
+"""Noise of detections on the way back to them, in that of the sensor."""
 SLICES_A_FRAME = 3.0
 """Work on a relinearisation in every frame, in milliseconds of a usual core."""
 CAUGHT_UP_MS, OF_PAIR_MS = 0.15, 5e-4
@@ -79,9 +85,9 @@ class Outcome:
 
     Attributes:
         estimate: smoothed values.
-        states_covariance: (9, 9) of its calibration states, what cannot be divided included.
+        states_covariance: (11, 11) of its calibration states, what cannot be divided included.
         prior: of the states, free those that are needed, as the user means it.
-        p_needed: (9,) probability of each state to be another than stated; nan where it was not asked.
+        p_needed: (11,) probability of each state to be another than stated; nan where it was not asked.
         askew: direction in which the robot drives, from its front, and its standard deviation [rad].
         problem: with the start and priors that the optimum belongs to, in the graph's metres.
         graph_estimate, graph_marginals: values and covariances as the graph holds them, before the scale was divided.
@@ -189,7 +195,7 @@ class StreamingSlam:
 
     @property
     def states(self) -> FloatArray:
-        """(9,) present calibration states."""
+        """(11,) present calibration states."""
         return self._filter.states.copy()
 
     def ahead(self, stamp_s: float, drive: Drive) -> tuple[FloatArray, FloatArray]:
@@ -266,7 +272,7 @@ class StreamingSlam:
             )
         smoother, estimate, fit = self._converged(problem, estimate, self._noise)
         if self._robust:
-            better = _rejoined(smoother, estimate, self._settings)
+            better = _readmitted(smoother, _rejoined(smoother, estimate, self._settings))
             if better is not estimate:
                 smoother, estimate, fit = self._converged(problem, better, fit.noise)
         problem, estimate = self._ahead(problem, estimate)
@@ -284,6 +290,8 @@ class StreamingSlam:
             prior, states = problem.prior.averaged(p_needed, estimate.states, np.diag(marginals.states), worth)
             problem, estimate = replace(problem, prior=prior), replace(estimate, states=states)
             smoother, estimate, fit = self._converged(problem, estimate, fit.noise, near=smoother)
+            if self._robust and (better := _readmitted(smoother, estimate)) is not estimate:  # the states moved it far
+                smoother, estimate, fit = self._converged(problem, better, fit.noise, near=smoother)
         solved = self._optimum(smoother, problem, estimate, fit)
         return divided(solved, self._prior, p_needed, fit, revision, aligned=self._aligned)
 
@@ -447,7 +455,9 @@ class StreamingSlam:
             smoother = smoother.under(self._noise, heavy=True)
         marginals = yield from smoother.marginals_in_slices(estimate)
         if learn:
-            self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, np.zeros((9, 9)))[2]
+            self._scale = (
+                1.0 if self._aligned else self._prior.split_scale(estimate.states, np.zeros((N_STATES, N_STATES)))[2]
+            )
         following = SessionFilter(self._problem, self._noise, robust=self._robust)
         following.restart(estimate, self._noise, self._problem, marginals)
         yield 1.0
@@ -534,7 +544,7 @@ def divided(
     Args:
         solved: the final optimum, in the graph's metres.
         prior: of the calibration states as the user means it.
-        p_needed: (9,) probability of each state to be another than stated.
+        p_needed: (11,) probability of each state to be another than stated.
         noise: levels at which it was solved.
         revision: the method's last word.
         aligned: True where lengths and frame are those of a map.
@@ -586,7 +596,7 @@ def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount:
     gain = 1.0 + states[1] + states[2] * bearing + states[3] * bearing**2
     range_m = (reading[..., 0] - states[0]) / gain
     in_sensor = np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1)
-    return se2.transform(se2.compose(pose, mount), in_sensor)
+    return se2.transform(se2.compose(pose, seated(mount, states)), in_sensor)
 
 
 def _voted(smoother: Smoother, estimate: Estimate, fewest: int) -> Slices[Estimate]:
@@ -629,6 +639,38 @@ def _rejoined(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> E
         if smoother.cost(other) < cost - COST_SLACK:
             estimate, cost = other, smoother.cost(other)
     return estimate
+
+
+def _readmitted(smoother: Smoother, estimate: Estimate) -> Estimate:
+    """Return a better optimum where a landmark was rejected several times in a row, if narrowing noise leads to one.
+
+    Where odometry alone led astray, the sightings that contradict it are rejected together, and none of them can pull
+    back. To noise that is many times wider few of them are outliers; it narrows to what it is (graduated
+    non-convexity: Yang et al. 2020, "Graduated Non-Convexity for Robust Spatial Perception").
+    """
+    problem = smoother.problem
+    if not _rejected_in_a_row(problem, smoother.inlier_probability(estimate) < 0.5):
+        return estimate
+    other = estimate
+    try:
+        for times in WIDER:
+            noise = replace(smoother.noise, detection=times * smoother.noise.detection)
+            wider = smoother.under(
+                noise, heavy=False, problem=replace(problem, sigma_given=times * problem.sigma_given)
+            )
+            other = wider.optimum(other, tolerance=NEAR)
+        other = smoother.optimum(other, tolerance=NEAR)
+    except NumericalError:
+        return estimate
+    return other if smoother.cost(other) < smoother.cost(estimate) - COST_SLACK else estimate
+
+
+def _rejected_in_a_row(problem: Problem, rejected: BoolArray) -> bool:
+    """Return whether `REJECTED` sightings of one landmark in a row are rejected; those of a pose in any order."""
+    order = np.lexsort((problem.pose_row, problem.landmark_row))
+    row, out = problem.landmark_row[order], rejected[order]
+    together = sliding_window_view(out, REJECTED).all(axis=1) if len(out) >= REJECTED else np.zeros(0, dtype=bool)
+    return bool(np.any(together & (row[REJECTED - 1 :] == row[: len(together)])))
 
 
 def silent_links(problem: Problem, estimate: Estimate, loose_rad: float) -> BoolArray:

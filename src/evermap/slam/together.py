@@ -22,6 +22,7 @@ from evermap.slam.calibration import SLOPE, needed
 from evermap.slam.encounters import Encounters, Together
 from evermap.slam.estimate import Solved
 from evermap.slam.intake import beliefs
+from evermap.slam.kernels import N_STATES
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.result import online as told_online
@@ -159,7 +160,7 @@ def _extended(member: Member, stamp_s: FloatArray) -> tuple[Problem, Estimate]:
         stamp_s, problem.stamp_s, graph.pose, spread.pose, spread.consecutive, problem.drive, graph.states,
         outcome.noise.noise,
     )  # fmt: skip
-    states, _, scale, _ = member.alone.prior.split_scale(graph.states, np.zeros((9, 9)))
+    states, _, scale, _ = member.alone.prior.split_scale(graph.states, np.zeros((N_STATES, N_STATES)))
     count = len(graph.landmark)
     extended = replace(
         problem,
@@ -323,7 +324,7 @@ def _as_needed(joint: Together, estimate: Estimate) -> tuple[Together, Estimate,
 def _ahead(first: Member, joint: Together, estimate: Estimate) -> tuple[Together, Estimate]:
     """Return the same, rotated so that the first robot's first pose has its front ahead."""
     problem = joint.robots[0].problem
-    start = se2.inverse(first.alone.prior.front(estimate.states[:9], problem.mount))
+    start = se2.inverse(first.alone.prior.front(estimate.states[:N_STATES], problem.mount))
     turn, robots = se2.compose(start, se2.inverse(problem.start_pose)), []
     for robot in joint.robots:
         turned = replace(robot.problem, start_pose=se2.compose(turn, robot.problem.start_pose))

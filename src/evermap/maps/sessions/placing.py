@@ -16,7 +16,8 @@ from evermap.geometry.symmetry import Symmetries
 from evermap.maps.living import LivingMap, Places
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.maps.vicinity import Vicinity, cliques_of, near
-from evermap.slam.calibration import FORWARD, N_STATES, SLOPE, CalibrationPrior
+from evermap.slam.calibration import FORWARD, SLOPE, CalibrationPrior
+from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.sparse.system import exhausted

@@ -23,6 +23,7 @@ from evermap.slam.association.particles import drawn
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
+from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import USUAL, StreamingSlam
@@ -72,7 +73,7 @@ class Associated:
         marginals = Smoother(assignment.problem(), self.noise, heavy=True).marginals(assignment.estimate)
         _, _, scale, log_sigma = prior.split_scale(assignment.estimate.states, marginals.states)
         place = assignment.estimate.landmark * scale
-        covariance: FloatArray = assignment.with_shared_errors(marginals.shared)[:-9, :-9] * scale**2
+        covariance: FloatArray = assignment.with_shared_errors(marginals.shared)[:-N_STATES, :-N_STATES] * scale**2
         return LocalMap(place, covariance + log_sigma**2 * np.outer(place.ravel(), place.ravel()))
 
     def named(self, recording: Recording, landmark_id: IntArray) -> Recording:

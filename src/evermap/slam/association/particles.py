@@ -21,8 +21,9 @@ from evermap.config import SlamConfig
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.features import Likeness, Traits, Variances, same_nats
 from evermap.slam.association.jcbb import gates
+from evermap.slam.calibration import seated
 from evermap.slam.filter_kernels import vectorised
-from evermap.slam.kernels import composed, kernel, wrapped
+from evermap.slam.kernels import N_STATES, composed, kernel, wrapped
 from evermap.slam.problem import Estimate
 from evermap.slam.streaming import USUAL
 from evermap.types import UNKNOWN, FloatArray, IntArray
@@ -79,7 +80,7 @@ class _Seen(NamedTuple):
 
 
 class _Sensor(NamedTuple):
-    """Mount (3,) and calibration states (9,)."""
+    """Mount (3,) and calibration states (11,)."""
 
     mount: FloatArray
     states: FloatArray
@@ -145,7 +146,7 @@ def drawn(
     )  # fmt: skip
     like = assignment.like() or traits.nothing(assignment.n_landmarks)
     cloud = _begun(assignment.estimate.landmark, assignment.of_kind, like, int(count), settings)
-    row, pose, evidence = _run(seen, _Sensor(problem.mount, states), steps, noise, cloud, seed)
+    row, pose, evidence = _run(seen, _Sensor(seated(problem.mount, states), states), steps, noise, cloud, seed)
     met, row[row >= 0] = np.unique(row[row >= 0], return_inverse=True)
     estimate = Estimate(pose, np.zeros((len(met), 2)), states.copy())
     found = replace(assignment, landmark_row=row, estimate=estimate)
@@ -164,7 +165,7 @@ def warm_up() -> None:
         _Rules.of(USUAL),
     )  # fmt: skip
     cloud = _begun(one, np.full((1, 2), UNKNOWN), traits.nothing(1), 2, USUAL)
-    _run(seen, _Sensor(np.zeros(3), np.zeros(9)), np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), cloud, 0)
+    _run(seen, _Sensor(np.zeros(3), np.zeros(N_STATES)), np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), cloud, 0)
 
 
 def _begun(place: FloatArray, label: IntArray, like: Likeness, count: int, settings: SlamConfig) -> _Cloud:

@@ -15,6 +15,7 @@ import numpy as np
 
 from evermap.slam.association.assignment import Assignment
 from evermap.slam.association.features import Likeness
+from evermap.slam.kernels import N_SENSOR, N_STATES
 from evermap.slam.problem import Marginals
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -57,7 +58,7 @@ def weighed_visits(
     Args:
         assignment: at its optimum.
         marginals: covariances at it.
-        linear: (M, 2, 11) detections with a landmark, linearised there (`Smoother.detections`).
+        linear: (M, 2, 13) detections with a landmark, linearised there (`Smoother.detections`).
         among: (L,) landmarks whose visits are weighed.
         density: expected landmarks per square metre.
     """
@@ -104,17 +105,17 @@ def _apart(
     rows, of = np.concatenate(visits), np.repeat(np.arange(len(visits)), [len(visit) for visit in visits])
     (poses, at), (places, which) = (np.unique(each, return_inverse=True) for each in (pose[rows], landmark))
     tie, n = linear[rows][:, :, 3:5], 3 * len(poses)
-    tied = np.einsum("kra,krb->kba", linear[rows][:, :, :10], tie)
-    through = np.zeros((len(visits), 2, n + 2 * len(places) + 9))
+    tied = np.einsum("kra,krb->kba", linear[rows][:, :, :-1], tie)
+    through = np.zeros((len(visits), 2, n + 2 * len(places) + N_STATES))
     for b in range(3):
         np.add.at(through, (of[:, None], np.arange(2), 3 * at[:, None] + b), tied[:, :, b])
-    own = np.zeros((len(visits), 2, 7))
+    own = np.zeros((len(visits), 2, 2 + N_SENSOR))
     np.add.at(own, of, tied[:, :, 3:])
     for b in range(2):
         through[np.arange(len(visits)), :, n + 2 * which + b] = own[:, :, b]
-    through[:, :, n + 2 * len(places) : n + 2 * len(places) + 5] = own[:, :, 2:]
+    through[:, :, n + 2 * len(places) : n + 2 * len(places) + N_SENSOR] = own[:, :, 2:]
     explained = marginals.each(places, poses, through)
     covariance = np.asarray(np.linalg.inv(own[:, :, :2] - explained + LEAST_M2 * np.eye(2)), dtype=np.float64)
     force = np.zeros((len(visits), 2))
-    np.add.at(force, of, np.einsum("kra,kr->ka", tie, linear[rows][:, :, 10]))
+    np.add.at(force, of, np.einsum("kra,kr->ka", tie, linear[rows][:, :, -1]))
     return np.einsum("vab,vb->va", covariance, force), covariance

@@ -16,7 +16,8 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
-from evermap.slam.calibration import FORWARD, N_STATES, SKEW, SLIP, SLOPE, CalibrationPrior
+from evermap.slam.calibration import FORWARD, SKEW, SLIP, SLOPE, CalibrationPrior
+from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import sighted_at

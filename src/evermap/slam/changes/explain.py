@@ -15,7 +15,7 @@ from scipy import sparse
 
 from evermap.config import ChangesConfig
 from evermap.geometry import se2
-from evermap.slam.kernels import detection_residual, kernel, outlier_loss
+from evermap.slam.kernels import N_SENSOR, detection_residual, kernel, outlier_loss
 from evermap.slam.problem import Estimate, Noise, Problem, between_rows, embedded, independent, padded
 from evermap.slam.smoother import Smoother
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -236,7 +236,7 @@ def _losses(
     out: Any,
 ) -> None:
     """Negative log likelihood of every reading of a landmark at `place`, outliers included."""
-    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     for m in range(len(reading)):
         detection_residual(pose[m], place[m], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
         squared = (e[0] / sigma[m, 0]) ** 2 + (e[1] / sigma[m, 1]) ** 2
