@@ -122,7 +122,7 @@ class DensePosterior:
     def linearised(self) -> tuple[np.ndarray, np.ndarray]:
         """Inverse of `J' W J` at `around`, and the Gauss-Newton step that is left there; J by central differences.
 
-        Both in (3 N + 2 L + 9): poses, all landmarks, all states. Entries of unknown landmarks are zero, fixed states
+        Both in (3 N + 2 L + 11): poses, all landmarks, all states. Entries of unknown landmarks are zero, fixed states
         keep the variance of their prior.
         """
         jacobian, residual = self.jacobian()

@@ -19,7 +19,7 @@ ODOMETRY_S = 0.05
 FRAME_S = 0.2
 NOISE = Noise(detection=np.array([0.05, 0.02]), odometry=np.array([0.03, 0.02, 0.02, 0.01, 0.03]), outlier_log_odds=7.0)
 SENSOR = Sensor(range_max_m=6.0, bearing_min_rad=-2.0, bearing_max_rad=2.0, p_detect=0.9)
-SPREAD = np.array([0.05, 0.01, 0.02, 0.05, 0.02, 0.05, 0.02, 0.05, 0.01])
+SPREAD = np.array([0.05, 0.01, 0.02, 0.05, 0.02, 0.02, 0.02, 0.05, 0.02, 0.05, 0.01])
 """Of the calibration states: small enough that no reading leaves the model's linear range."""
 
 
@@ -57,7 +57,7 @@ def driven(
     count = n_frames * per_frame + 40
     default = prior()
     if states is None:
-        states = default.mean + SPREAD * rng.normal(size=9)
+        states = default.mean + SPREAD * rng.normal(size=11)
     stamps = ODOMETRY_S * np.arange(count) - 1.0
     pose = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]) if start is None else start.astype(float)
     wander, (x, y, heading) = 0.0, pose.tolist()
@@ -73,8 +73,8 @@ def driven(
         across = sigma[2] ** 2 * 0.6 + FLOOR_FORWARD_M**2
         about = sigma[3] ** 2 + sigma[4] ** 2 * abs(turn) + FLOOR_TURN_RAD**2
         unit = [math.sqrt(each * ODOMETRY_S) * one for each, one in zip((along, across, about), noise, strict=True)]
-        ahead = (scale[6] * 0.6 - scale[8] * abs(turn)) * ODOMETRY_S + unit[0]
-        turned = scale[7] * turn * ODOMETRY_S + unit[2]
+        ahead = (scale[8] * 0.6 - scale[10] * abs(turn)) * ODOMETRY_S + unit[0]
+        turned = scale[9] * turn * ODOMETRY_S + unit[2]
         sinc, cosc = (math.sin(turned) / turned, (1.0 - math.cos(turned)) / turned) if turned else (1.0, 0.0)
         right, up = sinc * ahead - cosc * unit[1], cosc * ahead + sinc * unit[1]
         x, y = (
@@ -84,7 +84,7 @@ def driven(
         heading = math.remainder(heading + turned, 2.0 * math.pi)
         truth[k + 1] = x, y, heading
     frame_s = FRAME_S * np.arange(n_frames)
-    poses = _at(truth, stamps, frame_s + states[5])
+    poses = _at(truth, stamps, frame_s + states[7])
     away = se2.transform(se2.inverse(poses)[:, None], landmark)
     sightings = [_seen(rng, one, states) for one in away]
     return World(landmark, poses, states, Drive.from_rows(stamps, velocity), frame_s, sightings)
@@ -103,6 +103,7 @@ def seen_from(rng: np.random.Generator, pose: np.ndarray, landmark: np.ndarray, 
 
 def _seen(rng: np.random.Generator, away: np.ndarray, states: np.ndarray) -> FrameSightings:
     """What is detected of landmarks (N, 2) in the robot's frame."""
+    away = away - states[5:7]
     r, b = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
     seen = np.flatnonzero((r > 0.3) & (r < SENSOR.range_max_m) & (np.abs(b) < 2.0) & (rng.random(len(r)) < 0.9))
     r, b = r[seen], b[seen]

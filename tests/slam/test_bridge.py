@@ -15,7 +15,7 @@ from evermap.slam.smoother import Smoother
 
 # where a closing error of centimetres and hundredths of a radian is as linear as the bridge takes it to be
 CALM = replace(QUIET, detection=0.2 * QUIET.detection, odometry=0.2 * QUIET.odometry)
-PLAIN = replace(default_prior(), free=np.zeros(9, dtype=bool))
+PLAIN = replace(default_prior(), free=np.zeros(11, dtype=bool))
 
 
 def smoothed(world: World, start: Estimate):

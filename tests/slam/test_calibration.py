@@ -55,7 +55,7 @@ def posterior_of_product(
 @pytest.mark.parametrize("sigma", [1e-4, 0.004, 0.03])
 def test_scale_is_divided_by_the_closed_form_posterior(product, sigma):
     prior = default_prior()
-    states, covariance = prior.mean.copy(), np.diag(np.full(9, 1e-4))
+    states, covariance = prior.mean.copy(), np.diag(np.full(11, 1e-4))
     states[FORWARD], covariance[FORWARD, FORWARD] = product, sigma**2
     mean, spread = posterior_of_product(prior, product, sigma)
     divided, after, factor, log_sigma = prior.split_scale(states, covariance)
@@ -72,7 +72,7 @@ def test_the_metre_of_several_robots_is_their_mean(share):
     """In lengths that are too long by a logarithm, by least squares over all slopes and scales."""
     prior = replace(default_prior(), slope_share=share)
     slope, forward = np.array([0.0, 0.013, -0.02]), np.array([1.04, 1.02, 0.99])
-    states, nothing = np.tile(prior.mean, (3, 1)), np.zeros((9, 9))
+    states, nothing = np.tile(prior.mean, (3, 1)), np.zeros((11, 11))
     states[:, SLOPE], states[:, FORWARD] = slope, forward
     told = [prior.metre(own, nothing) for own in states]
     weight = np.array([1.0 / prior.sigma[SLOPE] ** 2, 1.0 / prior.sigma[FORWARD] ** 2 if share is None else 0.0])
@@ -89,8 +89,8 @@ def test_the_metre_of_several_robots_is_their_mean(share):
 def test_division_explains_every_reading_as_well():
     """Graph and divided solution predict the same ranges and the same motion, in their own metres."""
     prior = default_prior()
-    states = np.array([0.03, 0.0, 0.05, -0.4, 0.02, 0.1, 0.94, 1.05, 0.03])
-    divided, _, factor, _ = prior.split_scale(states, np.eye(9) * 1e-6)
+    states = np.array([0.03, 0.0, 0.05, -0.4, 0.02, 0.05, -0.04, 0.1, 0.94, 1.05, 0.03])
+    divided, _, factor, _ = prior.split_scale(states, np.eye(11) * 1e-6)
     r, b, v, w = 3.7, 0.4, 0.8, -0.6
 
     def reading(s, r):
@@ -106,7 +106,7 @@ def test_division_explains_every_reading_as_well():
 def test_where_the_slope_is_fixed_nothing_is_divided():
     prior = default_prior(range_slope=0.01)
     assert prior.without_scale() is prior
-    states, covariance = prior.mean + 0.01, np.eye(9) * 1e-4
+    states, covariance = prior.mean + 0.01, np.eye(11) * 1e-4
     divided, after, factor, log_sigma = prior.split_scale(states, covariance)
     assert divided.tolist() == states.tolist()
     assert np.array_equal(after, covariance)
@@ -117,7 +117,7 @@ def test_the_graph_never_sees_the_slope_but_its_uncertainty():
     prior = default_prior()
     graph = prior.without_scale()
     assert not graph.free[SLOPE]
-    assert graph.free.sum() == 8
+    assert graph.free.sum() == 10
     assert graph.sigma[FORWARD] == pytest.approx(np.hypot(0.05, 0.02))
     assert prior.free.all()  # not changed in place
 
@@ -152,7 +152,7 @@ def test_with_the_odometers_scale_given_the_recording_tells_the_slope():
 @pytest.mark.parametrize(("slope", "forward"), [(0.0, 1.0), (0.02, 0.95), (-0.015, 1.04)])
 def test_metres_are_right_when_the_priors_are_told_the_truth(slope, forward):
     """Exact measurements of a sensor with a wrong scale by an odometer with another."""
-    truth = np.array([0.05, slope, 0.0, -0.2, 0.01, 0.2, forward, 1.05, 0.02])
+    truth = np.array([0.05, slope, 0.0, -0.2, 0.01, 0.03, -0.02, 0.2, forward, 1.05, 0.02])
     prior = replace(default_prior(), mean=truth)
     world = make_world(32, noisy=0.0, states=truth, prior=prior)
     problem = replace(world.problem, prior=prior.without_scale())
@@ -169,14 +169,14 @@ def test_evidence_of_states_is_that_of_a_gaussian_by_brute_force():
     rng = np.random.default_rng(0)
     prior = replace(default_prior(range_slope=0.0, odometry_delay_s=0.0), p_sensor=0.8)
     free = np.flatnonzero(prior.free)
-    design = rng.normal(size=(12, 9)) / prior.sigma * [0.3, 1, 3, 0.5, 2, 1, 0.1, 4, 1]
-    truth = np.where(rng.random(9) < 0.5, prior.sigma * rng.normal(size=9), 0.0) * prior.free
+    design = rng.normal(size=(12, 11)) / prior.sigma * [0.3, 1, 3, 0.5, 2, 1, 4, 1, 0.1, 4, 1]
+    truth = np.where(rng.random(11) < 0.5, prior.sigma * rng.normal(size=11), 0.0) * prior.free
     reading = design @ truth + rng.normal(size=12)
     odds, inside = [], []
     for some in product((False, True), repeat=len(free)):
         on = free[np.array(some)]
         covariance = np.eye(12) + (design[:, on] * prior.sigma[on] ** 2) @ design[:, on].T
-        p = np.where(free < 5, 0.8, 0.5)
+        p = np.select([free < 5, free < 7], [0.8, 0.1], 0.5)
         odds.append(
             multivariate_normal(np.zeros(12), covariance).logpdf(reading) + np.log(np.where(some, p, 1 - p)).sum()
         )
@@ -184,16 +184,15 @@ def test_evidence_of_states_is_that_of_a_gaussian_by_brute_force():
     weight = np.exp(np.array(odds) - np.max(odds))
     expected = weight @ np.array(inside) / weight.sum()
     information = np.diag(1.0 / prior.sigma[free] ** 2) + design[:, free].T @ design[:, free]
-    covariance, states = np.zeros((9, 9)), prior.mean.copy()
+    covariance, states = np.zeros((11, 11)), prior.mean.copy()
     covariance[np.ix_(free, free)] = np.linalg.inv(information)
     states[free] += covariance[np.ix_(free, free)] @ design[:, free].T @ reading
-    found = needed(prior, states, covariance, np.ones(9))
+    found = needed(prior, states, covariance, np.ones(11))
     assert found[free] == pytest.approx(expected, abs=1e-7)
     assert np.isnan(found[~prior.free]).all()
     # readings that are worth a hundredth tell less
-    assert np.all(
-        np.abs(needed(prior, states, covariance, np.full(9, 1e6))[free] - np.where(free < 5, 0.8, 0.5)) < 0.05
-    )
+    before = np.select([free < 5, free < 7], [0.8, 0.1], 0.5)
+    assert np.all(np.abs(needed(prior, states, covariance, np.full(11, 1e6))[free] - before) < 0.05)
 
 
 def test_readings_that_repeat_themselves_are_worth_one():
@@ -223,9 +222,9 @@ def test_influence_of_each_residual_on_the_states_is_the_dense_one():
     found = smoother.optimum(world.near_truth(np.random.default_rng(0)), tolerance=1e-9)
     with_states = smoother.marginals(found).with_states
     dense = smoother.marginals(found)
-    assert with_states[-9:] == pytest.approx(dense.states, abs=1e-12)
-    assert with_states[: 3 * 60].reshape(60, 3, 9) == pytest.approx(dense.pose_shared[:, :, -9:], abs=1e-12)
-    assert with_states[3 * 60 : -9] == pytest.approx(dense.shared[:-9, -9:], abs=1e-12)
+    assert with_states[-11:] == pytest.approx(dense.states, abs=1e-12)
+    assert with_states[: 3 * 60].reshape(60, 3, 11) == pytest.approx(dense.pose_shared[:, :, -11:], abs=1e-12)
+    assert with_states[3 * 60 : -11] == pytest.approx(dense.shared[:-11, -11:], abs=1e-12)
 
 
 def stated(**what) -> CalibrationPrior:
@@ -238,7 +237,7 @@ def test_kind_and_data_sheet_narrow_the_priors():
     assert (unknown.slope_share, laser.slope_share) == (0.0, None)
     exact = stated(kind=SensorKind.CAMERA, sigma_scale=0.001, sigma_offset_m=0.02, sigma_odometer_scale=0.1)
     assert exact.sigma[[0, 1, FORWARD]].tolist() == [0.02, 0.001, 0.1]
-    states, covariance = exact.mean.copy(), np.eye(9) * 1e-6
+    states, covariance = exact.mean.copy(), np.eye(11) * 1e-6
     states[FORWARD] = 1.05
     assert exact.split_scale(states, covariance)[0][SLOPE] == pytest.approx(0.05 * 0.001**2 / 0.1**2, rel=0.05)
     assert unknown.split_scale(states, covariance)[0][SLOPE] == 0.0
@@ -255,7 +254,7 @@ def test_kind_and_data_sheet_narrow_the_priors():
 )
 def test_angle_is_the_robots_unless_the_data_sheet_says_otherwise(what, share):
     prior = stated(**what)
-    states, covariance = prior.mean.copy(), np.diag(np.full(9, 1e-6))
+    states, covariance = prior.mean.copy(), np.diag(np.full(11, 1e-6))
     states[BEARING] = 0.08
     after, _, askew, sigma = prior.split_angle(states, covariance)
     assert after[BEARING] == pytest.approx(0.08 * share, abs=1e-6)
@@ -325,22 +324,22 @@ def test_heading_is_that_of_the_sensor_as_stated():
 
 def test_average_of_as_stated_and_estimated_is_the_optimum_of_the_narrower_prior():
     prior = default_prior()
-    p, data, seen = np.linspace(0.05, 0.95, 9), np.linspace(3.0, 900.0, 9) / prior.sigma**2, 0.7 * prior.sigma
+    p, data, seen = np.linspace(0.05, 0.95, 11), np.linspace(3.0, 900.0, 11) / prior.sigma**2, 0.7 * prior.sigma
     variance = 1.0 / (data + 1.0 / prior.sigma**2)
     estimated = variance * data * seen
     states = prior.mean + estimated
-    averaged, means = prior.averaged(p, states, variance, np.ones(9))
+    averaged, means = prior.averaged(p, states, variance, np.ones(11))
     assert data * seen / (data + 1.0 / averaged.sigma**2) == pytest.approx(p * estimated)
     assert means - prior.mean == pytest.approx(p * estimated)
     # where ten readings are worth one, the prior counts ten times as much
-    fewer, means = prior.averaged(p, states, variance, np.full(9, 10.0))
+    fewer, means = prior.averaged(p, states, variance, np.full(11, 10.0))
     less = 0.1 * data * seen / (0.1 * data + 1.0 / prior.sigma**2)
     assert data * seen / (data + 1.0 / fewer.sigma**2) == pytest.approx(p * less)
     assert means - prior.mean == pytest.approx(p * less)
-    spared, means = prior.averaged(np.full(9, 0.001), states, variance, np.ones(9))
+    spared, means = prior.averaged(np.full(11, 0.001), states, variance, np.ones(11))
     assert not spared.free.any()
     assert np.array_equal(means, prior.mean)
-    same, means = prior.averaged(np.ones(9), states, variance, np.ones(9))
+    same, means = prior.averaged(np.ones(11), states, variance, np.ones(11))
     assert same.sigma.tolist() == pytest.approx(prior.sigma.tolist())
     assert means == pytest.approx(states)
 

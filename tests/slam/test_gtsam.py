@@ -169,7 +169,7 @@ def test_joint_covariances_are_gtsams(run):
         )
         theirs = np.block([[whole.at(a, b) for b in keys[:2]] for a in keys[:2]])
         assert_same_covariance(ours, theirs)
-        columns = [2 * j, 2 * j + 1, *range(marginals.shared.shape[0] - 9, marginals.shared.shape[0])]
+        columns = [2 * j, 2 * j + 1, *range(marginals.shared.shape[0] - 11, marginals.shared.shape[0])]
         theirs = np.hstack([whole.at(keys[0], keys[2]), whole.at(keys[0], STATES_KEY)])
         sigma = np.outer(np.sqrt(np.diag(marginals.pose[row])), np.sqrt(np.diag(marginals.shared))[columns])
         assert np.abs((marginals.pose_shared[row][:, columns] - theirs) / sigma).max() < 1e-4
@@ -220,14 +220,14 @@ def test_innovations_are_those_of_gtsams_marginals(robust):
             at = se2.compose(pose, se2.exp(step[:3]))
             return slow_detection(at, optimum.landmark[j] + step[3:5], states, whole.mount)
 
-        h = np.stack([(predicted(1e-6 * d) - predicted(-1e-6 * d)) / 2e-6 for d in np.eye(14)], axis=1)
+        h = np.stack([(predicted(1e-6 * d) - predicted(-1e-6 * d)) / 2e-6 for d in np.eye(16)], axis=1)
         s = h @ full @ h.T + np.diag(NOISE.detection**2)
-        innovation = whole.reading[m] - predicted(np.zeros(14))
+        innovation = whole.reading[m] - predicted(np.zeros(16))
         innovation[1] = se2.wrap(innovation[1])
         assert nis[k] == pytest.approx(innovation @ np.linalg.solve(s, innovation), rel=1e-3)
         assert log_det[k] == pytest.approx(np.linalg.slogdet(s)[1], abs=1e-3)
     assert local.bring(known).tolist() == list(range(len(known)))
     keys = [pose_key(row - 1), STATES_KEY, *map(landmark_key, known.tolist())]
     joint = marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
-    size = 12 + 2 * len(known)
+    size = 14 + 2 * len(known)
     assert_same_covariance(before[:size, :size], np.block([[joint.at(a, b) for b in keys] for a in keys]))

@@ -50,6 +50,8 @@ states = st.tuples(
     st.floats(-0.3, 0.3),
     st.floats(-0.6, 0.3),
     st.floats(-0.2, 0.2),
+    st.floats(-0.3, 0.3),
+    st.floats(-0.3, 0.3),
     st.floats(-0.4, 0.6),
     st.floats(0.8, 1.2),
     st.floats(0.8, 1.2),
@@ -81,7 +83,7 @@ def central(function, at, step=1e-6):
 
 
 def detected(pose, landmark, states, mount, reading=(3.0, 0.2)):
-    e, jx, jl, jc = np.full(2, 7.0), np.full((2, 3), 7.0), np.full((2, 2), 7.0), np.full((2, 5), 7.0)
+    e, jx, jl, jc = np.full(2, 7.0), np.full((2, 3), 7.0), np.full((2, 2), 7.0), np.full((2, 7), 7.0)
     detection_residual(pose, landmark, states, mount, *reading, e, jx, jl, jc)
     return e, jx, jl, jc
 
@@ -118,8 +120,8 @@ def test_detection_derivatives(pose, landmark, states, mount, bearing_rad):
     by_states = central(lambda at: detected(pose, landmark, at, mount, reading)[0], states)
     assert jx == pytest.approx(by_pose, rel=1e-5, abs=1e-6)
     assert jl == pytest.approx(by_landmark, rel=1e-5, abs=1e-6)
-    assert jc == pytest.approx(by_states[:, :5], rel=1e-5, abs=1e-6)
-    assert by_states[:, 5:] == pytest.approx(0.0)
+    assert jc == pytest.approx(by_states[:, :7], rel=1e-5, abs=1e-6)
+    assert by_states[:, 7:] == pytest.approx(0.0)
 
 
 def test_landmark_on_the_sensor_stays_finite():
@@ -169,16 +171,16 @@ def test_increment_is_a_product_of_matrix_exponentials(drive, states, start, pas
 @given(drives(), states, st.floats(-0.5, 2.0), st.floats(1e-2, 2.5))
 def test_increment_derivatives(drive, states, start, passed):
     """By delay, forward scale, turn scale and slip, as right perturbations of the increment."""
-    edges = np.array([start, start + passed])[:, None] + states[5] - drive.stamp_s
+    edges = np.array([start, start + passed])[:, None] + states[7] - drive.stamp_s
     assume(np.abs(edges).min() > 1e-4)  # a corner of the delay's derivative
     out = integrated(drive, start, start + passed, states)
 
     def perturbation(values):
         moved = states.copy()
-        moved[5:] = values
+        moved[7:] = values
         return se2.log(se2.between(out.increment, slow_increment(drive, start, start + passed, moved)))
 
-    assert out.jacobian == pytest.approx(central(perturbation, states[5:]), rel=1e-4, abs=1e-6)
+    assert out.jacobian == pytest.approx(central(perturbation, states[7:]), rel=1e-4, abs=1e-6)
 
 
 @few
@@ -190,7 +192,7 @@ def test_two_adjacent_windows_make_the_whole(drive, states, start, passed, share
     assert se2.between(whole.increment, se2.compose(first.increment, second.increment)) == pytest.approx(0.0, abs=1e-9)
     carry = se2.adjoint(se2.inverse(second.increment))
     jacobian = carry @ first.jacobian + second.jacobian
-    edges = np.array([start, middle, stop])[:, None] + states[5] - drive.stamp_s
+    edges = np.array([start, middle, stop])[:, None] + states[7] - drive.stamp_s
     if np.abs(edges).min() > 1e-9:
         assert whole.jacobian == pytest.approx(jacobian, rel=1e-7, abs=1e-9)
     # a cut within a step changes where in the step the noise is thought to come: of second order in its length
@@ -259,7 +261,7 @@ def test_covariance_is_that_of_thousands_of_sampled_drives(name):
     sigma, count = MIXES[name], 8000
     rng = np.random.default_rng(42)
     drive = wandering_drive(rng, 4.0)
-    states = np.array([0.0, 0, 0, 0, 0, 0.0, 1.05, 0.95, 0.02])
+    states = np.array([0.0, 0, 0, 0, 0, 0, 0, 0.0, 1.05, 0.95, 0.02])
     start, stop = 0.03, 3.47
     out = integrated(drive, start, stop, states)
     samples = sampled_drives(drive, start, stop, states, sigma, rng, count)

@@ -32,7 +32,7 @@ def beliefs(turn_scale: float) -> CalibrationPrior:
 @cache
 def drawn(seed: int, turn_scale: float) -> World:
     rng, believed = np.random.default_rng(seed), beliefs(turn_scale)
-    states = believed.mean + believed.sigma * believed.free * rng.normal(size=9)
+    states = believed.mean + believed.sigma * believed.free * rng.normal(size=11)
     return driven(rng, place_randomly(rng, 40, 14.0), n_frames=150, states=states)
 
 
@@ -73,7 +73,7 @@ def test_new_landmarks_tell_nothing_of_a_heading_that_was_lost():
     """Not by however many updates at however wrong a heading: they only show where the robot is among them."""
     rng, believed = np.random.default_rng(0), prior()
     landmark, still = rng.uniform(-5.0, 5.0, (6, 2)), np.zeros((3, 4))
-    local = LocalFilter(np.zeros(3), CalibrationPrior(believed.mean, believed.sigma, np.zeros(9, dtype=np.bool_)))
+    local = LocalFilter(np.zeros(3), CalibrationPrior(believed.mean, believed.sigma, np.zeros(11, dtype=np.bool_)))
     lost = np.zeros((12, 12))
     lost[:3, :3] = np.diag([0.1, 0.1, 0.3]) ** 2
     local.hold(np.zeros(3), believed.mean, lost, np.arange(0), np.full((6, 2), np.nan))

@@ -109,7 +109,7 @@ CASES = {
     "fixed states": lambda: make_world(
         4, prior=default_prior(odometry_delay_s=0.1, range_bias_m=0.02, range_slope=0.0)
     ),
-    "plain": lambda: make_world(5, prior=replace(default_prior(), free=np.zeros(9, dtype=bool))),
+    "plain": lambda: make_world(5, prior=replace(default_prior(), free=np.zeros(11, dtype=bool))),
     "never seen": lambda: with_unknown_landmark(make_world(6)),
     "duplicates": lambda: with_duplicates(make_world(7)),
     "tied": lambda: elsewhere(tied(make_world(9, n_mapped=5))),
@@ -172,7 +172,7 @@ def test_all_marginals_are_blocks_of_the_dense_inverse(solved, dense):
     _, smoother, optimum = solved
     _, covariance, _ = dense
     marginals = smoother.marginals(optimum)
-    n, g = len(optimum.pose), 2 * len(optimum.landmark) + 9
+    n, g = len(optimum.pose), 2 * len(optimum.landmark) + 11
     sigma = np.sqrt(np.diag(covariance))
     sigma[sigma == 0.0] = 1.0
     pose_rows, shared = np.arange(3 * n).reshape(n, 3), np.arange(3 * n, 3 * n + g)
@@ -194,7 +194,7 @@ def test_all_marginals_are_blocks_of_the_dense_inverse(solved, dense):
     at = 3 * n + 2 * np.arange(len(optimum.landmark))
     for j, k in enumerate(at):
         compare(marginals.landmark[j], [k, k + 1], [k, k + 1])
-    compare(marginals.states, shared[-9:], shared[-9:])
+    compare(marginals.states, shared[-11:], shared[-11:])
 
 
 def test_fixed_states_stay():
@@ -207,7 +207,7 @@ def test_fixed_states_stay():
 
 def test_exact_measurements_give_the_exact_truth():
     """Priors told the truth, no noise: the optimum is where everything came from."""
-    states = np.array([0.05, 0.02, 0.1, -0.4, 0.03, 0.25, 0.95, 1.08, 0.03])
+    states = np.array([0.05, 0.02, 0.1, -0.4, 0.03, 0.04, -0.03, 0.25, 0.95, 1.08, 0.03])
     prior = replace(default_prior(), mean=states)
     world = make_world(11, noisy=0.0, states=states, prior=prior)
     found = Smoother(world.problem, world.noise).optimum(world.near_truth(np.random.default_rng(3), by=0.05))

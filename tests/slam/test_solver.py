@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from problems import QUIET, World, make_world
+from problems import QUIET, World, default_prior, make_world, mounted
 from test_smoother import elsewhere, tied
 
 from evermap.config import SlamConfig
@@ -73,17 +73,18 @@ def without_landmark_until_the_end(world: World, row: int) -> World:
 
 
 PRECISE = replace(QUIET, detection=QUIET.detection / 30, odometry=QUIET.odometry / 30)
-"""So good that one linearisation is enough."""
+MOUNTED = mounted(default_prior(), 0.003)
+"""So good, and so well mounted, that one linearisation is enough."""
 
 WORLDS = {
-    "free": lambda: make_world(1, noise=PRECISE),
-    "map": lambda: elsewhere(make_world(3, noise=PRECISE, n_mapped=3, sigma_map_m=0.01)),
-    "new landmark": lambda: without_landmark_until_the_end(make_world(4, noise=PRECISE), 1),
+    "free": lambda: make_world(1, noise=PRECISE, prior=MOUNTED),
+    "map": lambda: elsewhere(make_world(3, noise=PRECISE, prior=MOUNTED, n_mapped=3, sigma_map_m=0.01)),
+    "new landmark": lambda: without_landmark_until_the_end(make_world(4, noise=PRECISE, prior=MOUNTED), 1),
     "new landmark of the map": lambda: without_landmark_until_the_end(
-        elsewhere(make_world(5, noise=PRECISE, n_mapped=3, sigma_map_m=0.01)), 1
+        elsewhere(make_world(5, noise=PRECISE, prior=MOUNTED, n_mapped=3, sigma_map_m=0.01)), 1
     ),
     "new landmark of a group": lambda: without_landmark_until_the_end(
-        elsewhere(tied(make_world(6, noise=PRECISE, n_mapped=5))), 2
+        elsewhere(tied(make_world(6, noise=PRECISE, prior=MOUNTED, n_mapped=5))), 2
     ),
 }
 
@@ -102,7 +103,7 @@ def covariance_around(solver: Any, places: np.ndarray) -> np.ndarray:
     joint, place, column = solver.around(places)
     for j, at in zip(places, column, strict=True):
         assert place[at] == pytest.approx(solver.landmark(int(j)))
-    rows = np.append(np.arange(12), (12 + 2 * column[:, None] + [0, 1]).ravel())
+    rows = np.append(np.arange(14), (14 + 2 * column[:, None] + [0, 1]).ravel())
     return joint[np.ix_(rows, rows)]
 
 
@@ -136,7 +137,7 @@ def test_a_step_from_an_optimum_leads_to_the_next(solver_of, name):
     spread = np.sqrt(np.einsum("lii->li", marginals.landmark))
     assert np.abs((found.landmark - after.landmark)[known] / spread[known]).max() < 0.1
     rows = np.concatenate(
-        [np.arange(len(marginals.shared) - 9, len(marginals.shared)), *([2 * j, 2 * j + 1] for j in known)]
+        [np.arange(len(marginals.shared) - 11, len(marginals.shared)), *([2 * j, 2 * j + 1] for j in known)]
     )
     expected = np.block(
         [
@@ -154,7 +155,7 @@ def test_a_step_from_an_optimum_leads_to_the_next(solver_of, name):
 
 def test_detections_may_be_given_to_a_new_place_between_two_steps(solver_of):
     """Only those to come: what was added stays with the old place."""
-    world = make_world(7, noise=PRECISE)
+    world = make_world(7, noise=PRECISE, prior=MOUNTED)
     problem, n = world.problem, len(world.problem.stamp_s)
     before = optimum_of(world, n - 1)
     solver = solver_of(problem, world.noise)
@@ -280,8 +281,8 @@ def test_places_that_are_only_considered_stay_and_the_rest_gets_the_best_gain():
     mount, n = np.array([0.2, -0.1, 0.3]), 4
     prior = CalibrationPrior.from_settings(calibrated=True)
     place = rng.uniform(2.0, 5.0, (n, 2))
-    spread = rng.normal(size=(12 + 2 * n, 12 + 2 * n))
-    spread = 1e-6 * (spread @ spread.T + np.eye(12 + 2 * n))
+    spread = rng.normal(size=(14 + 2 * n, 14 + 2 * n))
+    spread = 1e-6 * (spread @ spread.T + np.eye(14 + 2 * n))
     sigma = np.full((n, 2), 2e-3)
     states, pose = prior.mean, np.array([0.3, 0.1, 0.5])
     held = {}
@@ -292,16 +293,16 @@ def test_places_that_are_only_considered_stay_and_the_rest_gets_the_best_gain():
         away = se2.transform(se2.inverse(se2.compose(true_pose, mount)), place)
         reading = np.column_stack([np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])])
         nis, _, residual, by = local.compare(np.arange(n), reading, sigma)
-        h = np.zeros((2 * n, 12 + 2 * n))
+        h = np.zeros((2 * n, 14 + 2 * n))
         for m in range(n):
-            h[2 * m : 2 * m + 2, :8], h[2 * m : 2 * m + 2, 12 + 2 * m : 14 + 2 * m] = by[m, :, :8], by[m, :, 8:]
+            h[2 * m : 2 * m + 2, :10], h[2 * m : 2 * m + 2, 14 + 2 * m : 16 + 2 * m] = by[m, :, :10], by[m, :, 10:]
         s = h @ spread @ h.T + np.diag(sigma.ravel() ** 2)
         for m in range(n):
             mine = slice(2 * m, 2 * m + 2)
             assert nis[m] == pytest.approx(residual[m] @ np.linalg.solve(s[mine, mine], residual[m]))
         gain = np.linalg.solve(s, h @ spread).T
         if considered:
-            gain[12:] = 0.0
+            gain[14:] = 0.0
         expected = spread - gain @ h @ spread - (gain @ h @ spread).T + gain @ s @ gain.T
         moved = -gain @ residual.ravel()
         local.update(np.arange(n), reading, sigma)
@@ -309,7 +310,7 @@ def test_places_that_are_only_considered_stay_and_the_rest_gets_the_best_gain():
         scale = np.outer(size, size)
         assert np.abs((local.covariance[: len(scale), : len(scale)] - expected) / scale).max() < 5e-3
         np.testing.assert_allclose(se2.log(se2.between(pose, local.pose)), moved[:3], atol=2e-5)
-        np.testing.assert_allclose(local.position - place, moved[12:].reshape(-1, 2), atol=2e-5)
+        np.testing.assert_allclose(local.position - place, moved[14:].reshape(-1, 2), atol=2e-5)
         held[considered] = local.position
     np.testing.assert_array_equal(held[True], place)
     assert np.abs(held[False] - place).max() > 1e-5

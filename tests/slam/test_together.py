@@ -91,7 +91,7 @@ class DenseTogether:
 
     def encounters(self, estimate: Estimate) -> np.ndarray:
         """(S, 2) over sigma."""
-        seen, states = self.three.met, estimate.states.reshape(-1, 9)
+        seen, states = self.three.met, estimate.states.reshape(-1, 11)
         e = np.array(
             [
                 z
@@ -139,7 +139,7 @@ def test_optimum_and_covariances_are_those_of_a_dense_solver(seed: int, wrong: f
     estimate = joint.optimum(near, iterations=100, tolerance=1e-9)
     marginals = joint.marginals(estimate)
     dense = DenseTogether(three, estimate)
-    nowhere = np.zeros(3 * len(estimate.pose) + 2 * 9 + 27)
+    nowhere = np.zeros(3 * len(estimate.pose) + 2 * 9 + 33)
     assert joint.cost(estimate) == pytest.approx(0.5 * np.sum(dense.residuals(nowhere) ** 2), rel=1e-6)
     covariance, left = dense.linearised()
     assert np.abs(left / np.sqrt(np.diag(covariance))).max() < SMALL
@@ -147,7 +147,7 @@ def test_optimum_and_covariances_are_those_of_a_dense_solver(seed: int, wrong: f
     for r, own in enumerate(joint.parts(estimate, marginals)):
         rows = np.arange(joint.first[r], joint.first[r + 1])
         places = 3 * n + 2 * three.places[r]
-        states = 3 * n + 18 + 9 * r + np.arange(9)
+        states = 3 * n + 18 + 11 * r + np.arange(11)
         for k, row in enumerate(rows):
             block = covariance[3 * row : 3 * row + 3, 3 * row : 3 * row + 3]
             np.testing.assert_allclose(own.pose[k], block, atol=1e-3 * np.abs(block).max())

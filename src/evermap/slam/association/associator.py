@@ -24,7 +24,7 @@ from evermap.slam.association.merging import Differences, Solution, propose_merg
 from evermap.slam.association.relaying import displaced_stretches, laid
 from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
 from evermap.slam.association.splitting import weighed_visits
-from evermap.slam.filter_kernels import GATED, spread_of_frame
+from evermap.slam.filter_kernels import BY_PLACE, GATED, WIDTH, spread_of_frame
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
 from evermap.slam.motion import Motion
@@ -623,11 +623,11 @@ def pairings_of_frame(
     wider = 2.0 * math.log(settings.followed**2)
     followed = log_det[inside] <= 2.0 * np.log(sigma[seen[inside]]).sum(axis=1) + wider
     source, target, seen, count = source[inside], target[inside], seen[inside], len(inside)
-    at, joint = np.empty((count, 10), dtype=np.int64), np.empty((2 * count, 2 * count))
-    at[:, :8], at[:, 8:] = np.arange(8), columns(local.bring(target)).reshape(-1, 2)
+    at, joint = np.empty((count, WIDTH), dtype=np.int64), np.empty((2 * count, 2 * count))
+    at[:, :BY_PLACE], at[:, BY_PLACE:] = np.arange(BY_PLACE), columns(local.bring(target)).reshape(-1, 2)
     if count:
         scratch = np.empty((2 * count, len(local.covariance)))
-        spread_of_frame(local.covariance, by[inside].reshape(2 * count, 10), at, scratch, joint)
+        spread_of_frame(local.covariance, by[inside].reshape(2 * count, WIDTH), at, scratch, joint)
     joint[np.diag_indices(2 * count)] += (sigma[seen] ** 2).ravel()
     # area element r dr db
     new = np.log(np.where(followed, settings.unmet_share, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from evermap.geometry import se2
+from evermap.slam.kernels import N_STATES
 from evermap.slam.motion import Motion
 from evermap.slam.problem import ConditionalPrior, Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
@@ -108,7 +109,7 @@ class IncrementalSmoother:
         return np.array([pose.x(), pose.y(), pose.theta()])
 
     def states(self) -> FloatArray:
-        """(9,) calibration states."""
+        """(11,) calibration states."""
         if self._n_poses == 0:
             return self.problem.prior.mean
         return np.asarray(self._isam.calculateEstimateVector(STATES_KEY))
@@ -209,7 +210,7 @@ def landmark_factor(row: int, prior: ConditionalPrior, landmark_mean: FloatArray
 def _summary_factor(row: int, landmarks: IntArray, at: Estimate, root: FloatArray, right: FloatArray) -> Any:
     """`|R x - d|^2 / 2` of the step `x` that pose `row`, some landmarks and the states make from where they were."""
     keys = [_pose_key(row), *(_landmark_key(int(j)) for j in landmarks), STATES_KEY]
-    bounds = np.cumsum([0, 3, *([2] * len(landmarks)), 9])
+    bounds = np.cumsum([0, 3, *([2] * len(landmarks)), N_STATES])
     pose, points, states = gtsam.Pose2(*at.pose[row]), at.landmark[landmarks], at.states
 
     def error(_this: Any, values: Any, jacobians: Any) -> FloatArray:
@@ -256,7 +257,7 @@ def _frame_error(
         pose = np.array([at.x(), at.y(), at.theta()])
         points = np.array([values.atPoint2(k) for k in landmark_keys]).reshape(-1, 2)
         residual = np.zeros(size)
-        by_states, by_pose = np.zeros((size, 9)), np.zeros((size, 3))
+        by_states, by_pose = np.zeros((size, N_STATES)), np.zeros((size, 3))
         by_points = np.zeros((len(landmarks), size, 2))
         whitened_detections(
             pose, points, states, mount, reading, sigma, column, free, heavy, residual, by_pose, by_points, by_states

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from evermap.slam.kernels import (
+    N_SENSOR,
     detection_residual,
     inlier_weight,
     integrate_odometry,
@@ -46,7 +47,7 @@ def whitened_odometry(
     by_before[:] = white @ j1
     by_pose[:] = white @ j2
     residual_by_states(motion, e, free)
-    by_states[:, 5:] = white @ motion
+    by_states[:, N_SENSOR:] = white @ motion
 
 
 @kernel
@@ -66,7 +67,7 @@ def whitened_detections(
     by_states: FloatArray,
 ) -> None:
     """Whiten the detection residuals, with the root of their robust weight; two rows a detection."""
-    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     for m in range(len(reading)):
         detection_residual(pose, points[column[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
         squared = (e[0] / sigma[m, 0]) ** 2 + (e[1] / sigma[m, 1]) ** 2
@@ -79,6 +80,6 @@ def whitened_detections(
                 by_pose[row, a] = scale * jx[k, a]
             for a in range(2):
                 by_points[column[m], row, a] = scale * jl[k, a]
-            for a in range(5):
+            for a in range(N_SENSOR):
                 if free[a]:
                     by_states[row, a] = scale * jc[k, a]

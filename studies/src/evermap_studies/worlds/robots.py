@@ -36,7 +36,7 @@ class Robot:
 
     Attributes:
         kind: of its sensor, see `slam.calibration.kinds`.
-        states: (9,) its true calibration, in the order of `slam.calibration.SPECS`.
+        states: (11,) its true calibration, in the order of `slam.calibration.SPECS`.
         askew_rad: its wheels drive this much to the left of where its front is.
         range_max_m, field_of_view_rad, rate_hz, p_detect: what the sensor sees.
         sigma_range_m: noise of ranges near by; sigma_range_share: what is added to it, as a share of the range.
@@ -117,7 +117,8 @@ def draw_robot(seed: int) -> Robot:
     late = rng.normal() * 0.1 if rng.random() < 0.5 else 0.0
     wheels = np.array([late, 1.0 + 0.03 * rng.normal(), 1.0 + 0.05 * rng.normal(), 0.02 * rng.normal()])
     askew = 0.02 * rng.normal() if rng.random() < 0.5 else 0.0
-    states = np.append(np.zeros(5) if good else sensor, [0.0, 1.0, 1.0, 0.0] if good_wheels else wheels)
+    mount = 0.04 * np.random.default_rng([seed, 22]).normal(size=2) * (0.0 if good else 1.0)
+    states = np.concatenate([np.zeros(5) if good else sensor, mount, [0.0, 1.0, 1.0, 0.0] if good_wheels else wheels])
     range_max_m = float(rng.uniform(*make.range_max_m))
     return Robot(
         kind=kind,
@@ -153,9 +154,9 @@ def simulate_robot(robot: Robot, seed: int) -> Recording:
     frames = np.sort(rng.uniform(stamp[20], stamp[-20], int(robot.rate_hz * robot.duration_s)))
     detections = _detections(robot, landmark, _at(pose, stamp, velocity, frames), frames, rng)
     states = robot.states
-    forward = (reported[:, 0] + states[8] * np.abs(reported[:, 1])) / states[6]
-    turn = reported[:, 1] / states[7]
-    odometry = Odometry(stamp + states[5], forward, np.zeros(len(stamp)), turn)
+    forward = (reported[:, 0] + states[10] * np.abs(reported[:, 1])) / states[8]
+    turn = reported[:, 1] / states[9]
+    odometry = Odometry(stamp + states[7], forward, np.zeros(len(stamp)), turn)
     moved = se2.compose(pose, np.array([0.0, 0.0, -robot.askew_rad]))
     half = robot.field_of_view_rad / 2
     true = Landmarks.at(np.arange(1, robot.n_landmarks + 1), landmark)
@@ -224,7 +225,7 @@ def _detections(
     robot: Robot, landmark: FloatArray, wheels: FloatArray, stamp: FloatArray, rng: np.random.Generator
 ) -> Detections:
     front = se2.compose(wheels, np.array([0.0, 0.0, -robot.askew_rad]))
-    seen = se2.transform(se2.inverse(front)[:, None], landmark[None])
+    seen = se2.transform(se2.inverse(front)[:, None], landmark[None]) - robot.states[5:7]
     range_m, bearing = np.hypot(seen[..., 0], seen[..., 1]), np.arctan2(seen[..., 1], seen[..., 0])
     views = (range_m < robot.range_max_m) & (range_m > 0.3) & (np.abs(bearing) < robot.field_of_view_rad / 2)
     hit: BoolArray = views & (rng.random(views.shape) < robot.p_detect)
