@@ -296,7 +296,7 @@ def test_nothing_ties_robots() -> None:
 
 def test_a_landmark_that_moves_is_each_robots_own() -> None:
     """Its displacement is told in the frame of all."""
-    recordings = drives_together(7, moves_m=(1.5, -1.0))
+    recordings = drives_together(11, moves_m=(1.5, -1.0))
     results = run_together(dict(enumerate(recordings, start=1)))
     assert scored(recordings, list(results.values()), 0)[:, 0].max() < 0.4
     start = recordings[0].truth.pose_world_robot[0]

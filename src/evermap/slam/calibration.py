@@ -218,6 +218,12 @@ class CalibrationPrior:
         sigma[SLOPE], free[SLOPE] = max(slope_sigma, LEAST_SIGMA), slope_sigma > 0.0
         return replace(self, sigma=sigma, free=free)
 
+    def mounted_as_stated(self) -> CalibrationPrior:
+        """Return the prior with the sensor where it is stated to sit."""
+        free = self.free.copy()
+        free[AHEAD : ASIDE + 1] = False
+        return replace(self, free=free)
+
     @property
     def shares_scale(self) -> bool:
         """True where neither the range slope nor the forward scale is given, so that only their product shows."""
