@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 SOURCE = Path(__file__).resolve().parents[1] / "src"
@@ -12,7 +13,13 @@ MODULES = {
     ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__"): path
     for path in sorted(SOURCE.rglob("*.py"))
 }
-TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
+
+
+@cache
+def tree_of(name: str) -> ast.Module:
+    """Parsed when it is asked for: whoever only collects tests need not wait for 300 modules."""
+    return ast.parse(MODULES[name].read_text(encoding="utf-8"))
+
 
 MOST_MODULES = 303
 MOST_LINES = 77_920
@@ -89,8 +96,8 @@ BACKWARDS = {("evermap.maps.living", "evermap.maps.sessions.believe")}
 
 
 def functions() -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-    for name, tree in TREES.items():
-        for node in ast.walk(tree):
+    for name in MODULES:
+        for node in ast.walk(tree_of(name)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 yield name, node
 
@@ -105,7 +112,7 @@ def decorators(function: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
 def imported(name: str) -> set[str]:
     """Modules of ours that a module imports anywhere, inside functions and for type checking too."""
     found: set[str] = set()
-    for node in ast.walk(TREES[name]):
+    for node in ast.walk(tree_of(name)):
         if isinstance(node, ast.ImportFrom) and node.module:
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
         elif isinstance(node, ast.Import):
@@ -165,16 +172,16 @@ def test_public_docstrings_begin_with_a_verb() -> None:
 def numbers() -> Iterator[tuple[str, bool]]:
     """Numeric constants of the settled packages, and whether their definition says what they are."""
     settled = (*(f"evermap.{name}." for name in SETTLED), *(f"evermap.slam.{name}." for name in SETTLED_MODULES))
-    for module, tree in TREES.items():
+    for module in MODULES:
         if not f"{module}.".startswith(settled):
             continue
-        for row, node in enumerate(tree.body):
+        for row, node in enumerate(tree_of(module).body):
             if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
                 continue
             kinds = {type(one.value) for one in ast.walk(node.value) if isinstance(one, ast.Constant)}
             if not kinds & {int, float} or str in kinds:
                 continue
-            rest = (one for one in tree.body[row:] if not isinstance(one, ast.Assign | ast.AnnAssign))
+            rest = (one for one in tree_of(module).body[row:] if not isinstance(one, ast.Assign | ast.AnnAssign))
             told = isinstance(after := next(rest, None), ast.Expr) and isinstance(after.value, ast.Constant)
             target = node.targets[0] if isinstance(node, ast.Assign) else node.target
             for one in target.elts if isinstance(target, ast.Tuple) else [target]:

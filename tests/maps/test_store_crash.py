@@ -8,7 +8,7 @@ import signal
 import sqlite3
 import time
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -21,15 +21,22 @@ from evermap.maps.store import MapStore, Provenance, PrunedRevisionError, open_s
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 
 
+@cache
 def the_map(number: int):
     """What revision `number` holds in these tests."""
     return random_map(number, cliques=6 + number % 5, stamp_s=1000.0 * number)
 
 
+@cache
+def the_evidence(number: int):
+    """What was looked at in its session."""
+    return random_evidence(number, the_map(number))
+
+
 def commit_next(store: MapStore) -> None:
     number = store.head() + 1
     living = the_map(number)
-    changes, evidence = random_changes(number, living), random_evidence(number, living)
+    changes, evidence = random_changes(number, living), the_evidence(number)
     store.commit(living, Provenance(recording=f"session {number}"), changes, evidence, parent=number - 1)
 
 
@@ -60,7 +67,7 @@ def check_all(path: Path) -> int:
             living = the_map(number)
             assert_same(store.load(number), living)
             assert len(store.changes(number)) == 2
-        looks = [len(random_evidence(number, the_map(number))) for number in range(1, head + 1)]
+        looks = [len(the_evidence(number)) for number in range(1, head + 1)]
         assert len(store.evidence()) == sum(looks)
         assert [r.provenance.recording for r in store.log()] == [f"session {k}" for k in range(1, head + 1)]
     with sqlite3.connect(path) as database:
@@ -151,7 +158,7 @@ def pruned(path: Path, head: int) -> bool:
     assert len(checked.intact) + len(checked.pruned) == head
     with open_store(path) as store:
         assert [r.provenance.recording for r in store.log()] == [f"session {k}" for k in range(1, head + 1)]
-        assert len(store.evidence()) == sum(len(random_evidence(k, the_map(k))) for k in range(1, head + 1))
+        assert len(store.evidence()) == sum(len(the_evidence(k)) for k in range(1, head + 1))
         assert_same(store.load(), the_map(head))
         for number in range(1, head):
             if checked.pruned:

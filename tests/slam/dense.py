@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-from problems import closed_increment, integrated, slow_detection
+from problems import closed_increments, integrated, slow_detection
 
 from evermap.geometry import se2
 from evermap.slam.problem import Estimate, Noise, Problem
@@ -59,9 +59,7 @@ class DensePosterior:
         """(N - 1, 3), whitened."""
         increments = self._increments.setdefault(estimate.states.tobytes(), np.empty((0, 3)))
         if len(increments) == 0:
-            increments = np.array(
-                [closed_increment(self.problem.drive, a, b, estimate.states) for a, b in pairwise(self.problem.stamp_s)]
-            )
+            increments = closed_increments(self.problem.drive, self.problem.stamp_s, estimate.states)
             self._increments[estimate.states.tobytes()] = increments
         e = se2.between(increments, se2.between(estimate.pose[:-1], estimate.pose[1:]))
         return np.einsum("nij,nj->ni", self.white, e)

@@ -85,7 +85,7 @@ def test_landmarks_that_the_map_lacks_tell_nothing_of_where_in_it_the_robot_is()
     """Behind six seconds in which it saw nothing all it sees is new, and its heading stays as unknown as it was."""
     of_pose, of_heading, runs = 0.0, 0.0, 40
     for seed in range(runs):
-        rng, true = world(seed, n_frames=300)
+        rng, true = world(seed, n_frames=200)
         places = surveyed(rng, true.landmark, 0.05)
         for k, seen in enumerate(true.sightings[50:], start=50):
             kept = slice(None if k >= 80 else 0)

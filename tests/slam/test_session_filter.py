@@ -33,7 +33,7 @@ def beliefs(turn_scale: float) -> CalibrationPrior:
 def drawn(seed: int, turn_scale: float) -> World:
     rng, believed = np.random.default_rng(seed), beliefs(turn_scale)
     states = believed.mean + believed.sigma * believed.free * rng.normal(size=11)
-    return driven(rng, place_randomly(rng, 40, 14.0), n_frames=150, states=states)
+    return driven(rng, place_randomly(rng, 40, 14.0), n_frames=120, states=states)
 
 
 def told(seed: int, turn_scale: float, *, blind: bool, view_rad: float = np.pi) -> tuple[np.ndarray, np.ndarray]:
@@ -63,7 +63,7 @@ def test_poses_are_as_uncertain_as_the_filter_says(turn_scale, blind, view_rad):
     error, covariance = zip(
         *(told(seed, turn_scale, blind=blind, view_rad=view_rad) for seed in range(runs)), strict=True
     )
-    for frame in (100, 149):
+    for frame in (100, 119):
         wrong, spread = np.array([one[frame] for one in error]), np.array([one[frame] for one in covariance])
         assert low < nees(wrong, spread).sum() < high
         assert heading_low < (wrong[:, 2] ** 2 / spread[:, 2, 2]).sum() < heading_high

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from identity_scores import identity_scores
 from problems import make_world
-from recordings import building
+from recordings import building, first_seconds
 from scipy.stats import multivariate_normal, norm
 
 from evermap.config import Config
@@ -194,7 +194,7 @@ def test_an_exchange_of_two_landmarks_is_seen() -> None:
 
 
 def test_a_useless_column_changes_nothing_and_a_good_one_no_identity() -> None:
-    recording = building(1).sessions[0]
+    recording = first_seconds(building(3).sessions[0], 45.0)
     seen, rng = recording.detections, np.random.default_rng(7)
     beliefs_of = beliefs(recording.sensor, Config().slam)
     plain = identified(recording, *beliefs_of).detections.landmark_id

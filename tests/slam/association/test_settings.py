@@ -37,7 +37,7 @@ def keys(section: Section, prefix: str) -> Iterator[str]:
 
 def test_every_key_is_read_from_the_settings_of_the_caller() -> None:
     """A park with some identities and a radius, again without these in a map of over 100 trees; and tags in space."""
-    wild = ParkConfig(drive_m=400.0, n_trees=110, n_cars=2, steering_noise_rad=0.05)  # as if wheels slip
+    wild = ParkConfig(drive_m=150.0, n_trees=105, n_cars=2, steering_noise_rad=0.05)  # as if wheels slip
     park, rng = simulate_park(wild), np.random.default_rng(0)
     seen, read = park.detections, set[str]()
     radius = 0.1 * rng.normal(size=seen.landmark_id.max() + 2)[seen.landmark_id] + 0.02 * rng.normal(size=len(seen))
@@ -47,14 +47,14 @@ def test_every_key_is_read_from_the_settings_of_the_caller() -> None:
     with_identities(replace(park, detections=mixed), settings, park.true_landmarks)
     settings = Watched(SlamConfig(unknown_ids=True), read)
     with_identities(park, settings, park.true_landmarks)
-    with_identities(tagged_corridor(0, n_frames=80).recording, settings)
+    with_identities(tagged_corridor(0, n_frames=40).recording, settings)
     every = {*keys(AssociationConfig(), "association."), "fewest_sightings", "outlier_log_odds"}
     assert every - read == set()
 
 
 def test_thresholds_that_are_changed_change_the_association() -> None:
     """Without merging, and with ten sightings to a landmark, other landmarks are found."""
-    park = simulate_park(ParkConfig(drive_m=250.0, n_trees=40, n_cars=0), seed=1)
+    park = simulate_park(ParkConfig(drive_m=250.0, n_trees=40, n_cars=0), seed=2)
     plain = SlamConfig(unknown_ids=True)
     few = SlamConfig(unknown_ids=True, fewest_sightings=10)
     apart = SlamConfig(unknown_ids=True, association={"p_match": 1.0 - 1e-12, "p_return": 1.0 - 1e-12})

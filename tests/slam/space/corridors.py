@@ -193,29 +193,39 @@ def _seen(
     at: np.ndarray, turn: Rotation, place: np.ndarray, facing: Rotation
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frames, tags and exact corners of all sightings, by the pinhole formula."""
-    frames, tags, corners = [], [], []
-    for row in range(len(at)):
-        camera, origin = turn[row] * MOUNT, at[row] + turn[row].apply(MOUNT_AT)
-        for k in range(len(place)):
-            ahead = camera.inv().apply(place[k] + facing[k].apply(SQUARE) - origin)
-            if ahead[:, 2].min() < 0.3:
-                continue
-            pixel = FOCAL * ahead[:, :2] / ahead[:, 2:] + CENTRE
-            if pixel.min() > 0.0 and (pixel < 2.0 * np.array(CENTRE)).all():
-                frames.append(row)
-                tags.append(k)
-                corners.append(pixel)
-    return np.array(frames), np.array(tags), np.array(corners)
+    camera = (turn * MOUNT).inv().as_matrix()
+    origin = at + turn.apply(MOUNT_AT)
+    edge = place[:, None] + np.stack([facing.apply(corner) for corner in SQUARE], axis=1)
+    ahead = np.einsum("fij,ftcj->ftci", camera, edge[None] - origin[:, None, None])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixel = FOCAL * ahead[..., :2] / ahead[..., 2:] + CENTRE
+    inside = ((pixel > 0.0) & (pixel < 2.0 * np.array(CENTRE))).all(axis=(2, 3))
+    frame, tag = np.nonzero(inside & (ahead[..., 2].min(axis=2) >= 0.3))
+    return frame, tag, pixel[frame, tag]
 
 
 def _drifting(pose: np.ndarray, stamp_s: np.ndarray, drift: float, random: np.random.Generator) -> SpatialOdometry:
+    return drifting(
+        pose, stamp_s, drift, random, np.array([5.0, -3.0, 1.0]), Rotation.from_euler("xyz", [0.1, -0.2, 1.0])
+    )
+
+
+def drifting(
+    pose: np.ndarray,
+    stamp_s: np.ndarray,
+    drift: float,
+    random: np.random.Generator,
+    start: np.ndarray,
+    facing: Rotation,
+) -> SpatialOdometry:
+    """Odometry of a drive: each step with noise of `drift` metres, and a third in radians, for the root of a second."""
     at, turn = pose[:, :3], Rotation.from_quat(pose[:, 3:])
-    found_at, found = [np.array([5.0, -3.0, 1.0])], [Rotation.from_euler("xyz", [0.1, -0.2, 1.0])]
+    noise = drift * np.sqrt(np.diff(stamp_s))[:, None, None] * random.normal(size=(len(at) - 1, 2, 3))
+    back = turn[:-1].inv()
+    step = back.apply(np.diff(at, axis=0)) + noise[:, 0]
+    bend = (back * turn[1:] * Rotation.from_rotvec(noise[:, 1] / 3.0)).as_matrix()
+    found_at, found = np.tile(start, (len(at), 1)), np.tile(facing.as_matrix(), (len(at), 1, 1))
     for k in range(len(at) - 1):
-        root = np.sqrt(stamp_s[k + 1] - stamp_s[k])
-        step = turn[k].inv().apply(at[k + 1] - at[k]) + random.normal(0.0, drift * root, 3)
-        bend = turn[k].inv() * turn[k + 1] * Rotation.from_rotvec(random.normal(0.0, drift / 3.0 * root, 3))
-        found_at.append(found_at[-1] + found[-1].apply(step))
-        found.append(found[-1] * bend)
-    whole = poses(np.array(found_at), Rotation.concatenate(found))
-    return SpatialOdometry(stamp_s, whole, np.full((len(at), 6), np.nan))
+        found_at[k + 1] = found_at[k] + found[k] @ step[k]
+        found[k + 1] = found[k] @ bend[k]
+    return SpatialOdometry(stamp_s, poses(found_at, Rotation.from_matrix(found)), np.full((len(at), 6), np.nan))

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evermap.io.spatial import spatial_detections
-from evermap.types import Frames, Landmarks, SpatialOdometry, SpatialRecording, SpatialSensor, Trajectory
+from evermap.types import Frames, Landmarks, SpatialRecording, SpatialSensor, Trajectory
 
-from .corridors import poses
+from .corridors import drifting, poses
 
 SYMMETRIES = {
     "brick": ("180:z", "180:x"),
@@ -84,25 +84,27 @@ class Room:
         sway = np.column_stack([0.1 * np.sin(stamp_s), 0.1 * np.cos(stamp_s), np.zeros(n_frames)])
         turn = Rotation.from_euler("z", angle[:, None]) * Rotation.from_euler("xyz", sway)
         eye = turn * MOUNT
-        frames, things, seen_at, seen = [], [], [], []
+        ahead = np.einsum("fij,fkj->fki", eye.inv().as_matrix(), self.place[None] - at[:, None])
+        inside = (ahead[..., 2] > 0.5) & (np.abs(ahead[..., :2]) < ahead[..., 2:]).all(axis=2)
+        things, noises = [], []
         for row in range(n_frames):
-            ahead = eye[row].inv().apply(self.place - at[row])
-            inside = (ahead[:, 2] > 0.5) & (np.abs(ahead[:, :2]) < ahead[:, 2:]).all(axis=1)
-            for k in np.flatnonzero(inside & (random.random(len(inside)) < 0.9)):
-                noise = Rotation.from_rotvec(random.normal(0.0, SIGMA_RAD, 3))
-                frames.append(row)
-                things.append(k)
-                seen_at.append(ahead[k] + random.normal(0.0, SIGMA_M, 3))
-                seen.append(noise * eye[row].inv() * self.turn[k])
-        pose, frame, thing = poses(at, turn), np.array(frames), np.array(things)
-        driven = _drifting(pose, stamp_s, drift, random)
-        orientation = Rotation.concatenate(seen)
+            things.append(np.flatnonzero(inside[row] & (random.random(len(self.place)) < 0.9)))
+            noises.append(random.normal(size=(len(things[-1]), 2, 3)))
+        frame = np.repeat(np.arange(n_frames), [len(each) for each in things])
+        thing, noise = np.concatenate(things), np.concatenate(noises)
+        pose = poses(at, turn)
+        driven = drifting(pose, stamp_s, drift, random, np.zeros(3), Rotation.identity())
+        orientation = Rotation.from_rotvec(SIGMA_RAD * noise[:, 0]) * eye[frame].inv() * self.turn[thing]
         if ambiguous:
-            turns = [same_looking(CLASSES[self.kind[k]], 1, random)[0] for k in thing]
-            orientation = orientation * Rotation.concatenate(turns)
+            turns = np.empty((len(thing), 4))
+            for kind in np.unique(self.kind[thing]):
+                rows = np.flatnonzero(self.kind[thing] == kind)
+                turns[rows] = same_looking(CLASSES[kind], len(rows), random).as_quat()
+            orientation = orientation * Rotation.from_quat(turns)
         count = len(frame)
         detections = spatial_detections(
-            frame, landmark_id=thing, class_id=self.kind[thing], position_sensor_m=np.array(seen_at),
+            frame, landmark_id=thing, class_id=self.kind[thing],
+            position_sensor_m=ahead[frame, thing] + SIGMA_M * noise[:, 1],
             rotation=orientation.as_quat(), sigma_rad=np.full(count, SIGMA_RAD),
             covariance_sensor_m2=np.tile(SIGMA_M**2 * np.eye(3), (count, 1, 1)),
         )  # fmt: skip
@@ -120,15 +122,3 @@ class Room:
         return Landmarks.in_space(
             names, self.place.copy(), rotation=self.turn.as_quat(), class_id=self.kind, class_names=CLASSES
         )
-
-
-def _drifting(pose: np.ndarray, stamp_s: np.ndarray, drift: float, random: np.random.Generator) -> SpatialOdometry:
-    turn, found_at, found = Rotation.from_quat(pose[:, 3:]), [np.zeros(3)], [Rotation.identity()]
-    for k in range(len(pose) - 1):
-        root = np.sqrt(stamp_s[k + 1] - stamp_s[k])
-        step = turn[k].inv().apply(pose[k + 1, :3] - pose[k, :3]) + random.normal(0.0, drift * root, 3)
-        bend = turn[k].inv() * turn[k + 1] * Rotation.from_rotvec(random.normal(0.0, drift / 3.0 * root, 3))
-        found_at.append(found_at[-1] + found[-1].apply(step))
-        found.append(found[-1] * bend)
-    whole = poses(np.array(found_at), Rotation.concatenate(found))
-    return SpatialOdometry(stamp_s, whole, np.full((len(pose), 6), np.nan))
