@@ -6,9 +6,19 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from evermap.cli.options import AsJson, Cluster, ConfigFile, Force, Settings, ShowConfig, Workers, configured, one_of
+from evermap.cli.options import (
+    AsJson,
+    Cluster,
+    ConfigFile,
+    Force,
+    Settings,
+    ShowConfig,
+    Workers,
+    argument,
+    configured,
+    one_of,
+    option,
+)
 from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say
 from evermap.errors import ConfigError
 
@@ -37,21 +47,18 @@ Examples:
 
 
 Maps = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="MAP", help="Files, or postgresql://user@host/database/SITE.", show_default=False),
+    list[str] | None, argument("Files, or postgresql://user@host/database/SITE.", metavar="MAP", default=False)
 ]
 Store = Annotated[
     str | None,
-    typer.Option(
-        metavar="WHERE", help="All maps of a server: folder, or postgresql://user@host/database.", show_default="none"
-    ),
+    option("All maps of a server: folder, or postgresql://user@host/database.", metavar="WHERE", default="none"),
 ]
 
 
 def learn(
     maps: Maps = None,
     store: Store = None,
-    out: Annotated[Path, typer.Option(help="Folder for the lifetimes.")] = Path("evermap-out/lifetimes"),
+    out: Annotated[Path, option("Folder for the lifetimes.")] = Path("evermap-out/lifetimes"),
     workers: Workers = None,
     cluster: Cluster = None,
     force: Force = False,
