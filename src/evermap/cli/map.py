@@ -285,8 +285,8 @@ def _writer(
         ConfigError: no map is written to such a file.
     """
     from evermap.io import write_map_geojson, write_map_parquet
-    from evermap.io.grid import write_grid
     from evermap.io.landmarks import write_map_csv
+    from evermap.io.nav2 import write_grid
 
     if out is None:
         return lambda *_: {}
@@ -323,7 +323,7 @@ def _speed_mask(
     """Write where to drive slowly, since the map may be wrong by then."""
     import numpy as np
 
-    from evermap.io.grid import write_speed_mask
+    from evermap.io.nav2 import write_speed_mask
 
     then = living.landmarks(at=living.stamp_s + ahead_s) if len(landmarks) else landmarks
     p_then = then.p_exists[np.isin(then.landmark_id, landmarks.landmark_id)]
@@ -337,7 +337,7 @@ def _speed_mask(
 
 def _route_graph(out: Path, graph: Path, clearance_m: float, _: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
     """Write a route graph; return its closed and its uncertain edges."""
-    from evermap.io.route_graph import write_route_graph
+    from evermap.io.nav2 import write_route_graph
 
     edges = write_route_graph(landmarks, graph, out, clearance_m=clearance_m)
     doubtful = {str(edge.number): edge.p_blocked for edge in edges if edge.p_blocked and not edge.closed}
