@@ -132,8 +132,9 @@ def _stored(store: str) -> list[tuple[str, str]]:
 
 
 def _half_gone_s(lifetimes: Lifetimes) -> float | None:
-    half_s = float(lifetimes.stay.quantile(0.5))
-    return half_s if math.isfinite(half_s) else None
+    from evermap.types import json_number
+
+    return json_number(lifetimes.stay.quantile(0.5))
 
 
 def _written(folder: RunFolder, company: Company, names: list[str]) -> dict[str, Any]:

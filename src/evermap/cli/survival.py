@@ -323,10 +323,12 @@ def _learned_lines(choice: Choice) -> list[tuple[str, str]]:
 
 def lifetime_numbers(prior: LifetimePrior) -> dict[str, float | None]:
     """Return quartiles and mean in seconds, None for what never comes; and the share that never leaves."""
+    from evermap.types import json_number
+
     quartiles = [float(prior.quantile(p)) for p in (0.25, 0.5, 0.75)]
     values = dict(zip(("quarter_gone_s", "half_gone_s", "three_quarters_gone_s"), quartiles, strict=True))
     values["mean_stay_s"] = prior.mean()
-    return {k: v if math.isfinite(v) else None for k, v in values.items()} | {"p_never_leaves": prior.p_never_leaves}
+    return {k: json_number(v) for k, v in values.items()} | {"p_never_leaves": prior.p_never_leaves}
 
 
 def lifetime_lines(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -13,7 +13,7 @@ from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, Evidence, LivingMap, clique_rows
 from evermap.maps.sessions import believe, decide
-from evermap.maps.sessions.extend import Extended, Found, extended
+from evermap.maps.sessions.extend import Extended, Found, extended, first_and_last
 from evermap.maps.sessions.looks import PlaceLooks, arrivals, looked_at
 from evermap.maps.sessions.placing import Laid, Localised
 from evermap.maps.sessions.planar import PlanarVisit
@@ -227,10 +227,7 @@ def believed(
         n_hits=living.places.n_hits + np.bincount(seen.place[hit], minlength=len(living.places)),
         n_misses=living.places.n_misses + np.bincount(seen.place[missed], minlength=len(living.places)),
     )
-    count = len(living.sites)
-    first, last = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(first, rows.site[hit], rows.stamp_s[hit])
-    np.maximum.at(last, rows.site[hit], rows.stamp_s[hit])
+    first, last = first_and_last(rows.site[hit], rows.stamp_s[hit], len(living.sites))
     sites = living.sites
     if config.existence:
         beliefs = believe.believed(living, entry.p_start, seen, sensor, config, start_s, end_s)
