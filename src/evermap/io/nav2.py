@@ -17,8 +17,8 @@ import numpy as np
 
 from evermap.errors import ConfigError, DataError, InputError
 from evermap.geometry import se3
-from evermap.io.files import unpacked, write_atomic
-from evermap.io.text import decode_text, reason
+from evermap.io.files import content_of, write_atomic
+from evermap.io.text import parse_json
 from evermap.types import FloatArray, Landmarks
 
 MOST_CELLS = 50_000_000
@@ -214,14 +214,7 @@ def write_route_graph(
 
 def _read(path: Path) -> dict[str, Any]:
     """The document, with a list of features that have a geometry and properties."""
-    try:
-        document = json.loads(decode_text(unpacked(path.read_bytes(), path), path), parse_constant=_refuse)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
-    except json.JSONDecodeError as error:
-        raise InputError(f"not valid JSON: {error.msg}", path=path, line=error.lineno) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"not valid JSON: {reason(error)}", path=path) from None
+    document = parse_json(content_of(path), path, parse_constant=_refuse)
     features = document.get("features") if isinstance(document, dict) else None
     if not isinstance(features, list):
         raise InputError("no GeoJSON feature collection", path=path, field="features", hint=_HINT)

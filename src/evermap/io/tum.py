@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from evermap.errors import DataError, InputError
+from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.io.assemble import check_forward, last_of_equal
-from evermap.io.files import unpacked, write_atomic
+from evermap.io.files import content_of, write_atomic
 from evermap.io.rows import Rows, parse_rows
 from evermap.io.spatial import unit
 from evermap.types import Clock, FloatArray, Trajectory
@@ -53,11 +53,7 @@ def read_tum(
         DataError: it contains no pose.
     """
     path = Path(path)
-    try:
-        data = unpacked(path.read_bytes(), path)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
-    rows = pose_rows(data, path, [])
+    rows = pose_rows(content_of(path), path, [])
     stamps, pose = poses_in_order(rows, [])
     if in_space:
         return Trajectory(stamps, pose, np.zeros((len(pose), 6, 6)), frame=frame, clock=clock)
