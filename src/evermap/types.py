@@ -856,8 +856,13 @@ class SlamResult(Shown):
 
 def json_number(value: Any) -> float | None:
     """Return a number as JSON has it: a finite float; None for nan, infinity and None."""
-    number = math.nan if value is None else float(value)
+    number = or_nan(value)
     return number if math.isfinite(number) else None
+
+
+def or_nan(value: Any) -> float:
+    """Return a number from JSON; nan for null."""
+    return math.nan if value is None else float(value)
 
 
 _Table = TypeVar("_Table", bound="DataclassInstance")

@@ -11,7 +11,7 @@ from PIL import Image
 
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
-from evermap.io.grid import write_grid, write_speed_mask
+from evermap.io.nav2 import write_grid, write_speed_mask
 from evermap.types import Landmarks
 
 

@@ -12,7 +12,7 @@ import shapely.geometry
 
 from evermap.errors import InputError
 from evermap.geometry import se3
-from evermap.io.route_graph import write_route_graph
+from evermap.io.nav2 import write_route_graph
 from evermap.types import Landmarks
 
 NODES = {0: (0.0, 0.0), 1: (10.0, 0.0), 2: (10.0, 6.0), 7: (0.0, 6.0)}

@@ -15,7 +15,7 @@ from evermap.maps.learning import ClassEvidence, ClassLives, with_priors
 from evermap.maps.lives import Lives
 from evermap.maps.living import LivingMap, Stays
 from evermap.runs.company import Company
-from evermap.survival.general_purpose import GeneralPurpose
+from evermap.survival.families import GeneralPurpose
 from evermap.types import UNKNOWN
 from evermap_studies.sim.config import DAY_S, DEFAULT_CLASSES, Duration, ObjectClass
 

@@ -7,8 +7,8 @@ import pytest
 
 from evermap.tracking.record import StaticSpells
 from evermap.types import Clock
+from evermap.viz.plots import MOST_SPELLS, plot_objects
 from evermap.viz.style import ALERT, class_looks
-from evermap.viz.track_figures import MOST_SPELLS, plot_objects
 
 HOUR_S = 3600.0
 

@@ -9,8 +9,7 @@ import pytest
 
 from evermap.errors import MissingExtraError
 from evermap.viz.rerun_scene import log_tracks
-from evermap.viz.style import house_style, new_figure
-from evermap.viz.track_figures import DYNAMIC, STATIC
+from evermap.viz.style import DYNAMIC, STATIC, house_style, new_figure
 from evermap_studies.lifetimes.tracks_now import ARROW_S, TracksNow, draw_tracks
 
 POSITION = np.array([[0.0, 1.0, 0.0], [5.0, 2.0, 0.0], [9.0, -3.0, 1.0]])

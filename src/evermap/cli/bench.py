@@ -11,30 +11,25 @@ from typing import Annotated
 
 import typer
 
+from evermap.cli.options import option
 from evermap.cli.terminal import print_json
 from evermap.errors import InputError
 
 
 def bench(
-    as_json: Annotated[bool, typer.Option("--json", help="Print the measurements as JSON.")] = False,
-    update_baseline: Annotated[
-        bool, typer.Option("--update-baseline", help="Make these measurements the new baseline.")
-    ] = False,
+    as_json: Annotated[bool, option("--json", "Print the measurements as JSON.")] = False,
+    update_baseline: Annotated[bool, option("--update-baseline", "Make these measurements the new baseline.")] = False,
     only: Annotated[
         str | None,
-        typer.Option(
-            help="Measure one part: slam, persistence, selectors, cliques, npmle, tracking, kitti, localize, scale, "
+        option(
+            "Measure one part: slam, persistence, selectors, cliques, npmle, tracking, kitti, localize, scale, "
             "space, association, fleet."
         ),
     ] = None,
     sizes: Annotated[
-        str | None,
-        typer.Option(help="Numbers of landmarks for 'scale', separated by commas; also measures DLR and maps."),
+        str | None, option("Numbers of landmarks for 'scale', separated by commas; also measures DLR and maps.")
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Folder for the tables and figures of 'scale', 'kitti' or 'space'."),
-    ] = None,
+    out: Annotated[Path | None, option("Folder for the tables and figures of 'scale', 'kitti' or 'space'.")] = None,
 ) -> None:
     """Compare speed and memory with the baseline.
 

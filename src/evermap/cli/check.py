@@ -7,14 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from evermap.cli.options import AsJson, ConfigFile, Robot, Settings, ShowConfig, configured
+from evermap.cli.options import AsJson, ConfigFile, Robot, Settings, ShowConfig, argument, configured
 from evermap.cli.terminal import fail, print_json, print_table, say, warn
 
 EXIT_NOT_USABLE = 2
 
 
 def check(
-    input: Annotated[Path, typer.Argument(metavar="INPUT", help="Folder in the native format, zip or ROS bag.")],
+    input: Annotated[Path, argument("Folder in the native format, zip or ROS bag.", metavar="INPUT")],
     robot: Robot = None,
     config: ConfigFile = None,
     settings: Settings = None,

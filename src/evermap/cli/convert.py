@@ -6,9 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from evermap.cli.options import Topics
+from evermap.cli.options import Topics, argument, option
 from evermap.cli.terminal import print_json, say, warn
 
 
@@ -20,18 +18,13 @@ class TableFormat(StrEnum):
 
 
 def convert(
-    recording_path: Annotated[Path, typer.Argument(metavar="INPUT", help="Recording in any format that can be read.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write.")],
-    robot: Annotated[
-        int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)
-    ] = None,
+    recording_path: Annotated[Path, argument("Recording in any format that can be read.", metavar="INPUT")],
+    out: Annotated[Path, argument("Folder to write.", metavar="OUT")],
+    robot: Annotated[int | None, option("Robot of a recording that has several.", default=False)] = None,
     topics: Topics = None,
-    table_format: Annotated[TableFormat, typer.Option("--format", help="Format of the tables.")] = TableFormat.CSV,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
-    force: Annotated[
-        bool,
-        typer.Option("--force", help="Write into OUT even if it is not empty; other files are kept."),
-    ] = False,
+    table_format: Annotated[TableFormat, option("--format", "Format of the tables.")] = TableFormat.CSV,
+    as_json: Annotated[bool, option("--json", "Print the result as JSON.")] = False,
+    force: Annotated[bool, option("--force", "Write into OUT even if it is not empty; other files are kept.")] = False,
 ) -> None:
     """Write any readable recording in the native format.
 

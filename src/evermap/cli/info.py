@@ -9,9 +9,7 @@ from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import typer
-
-from evermap.cli.options import AsJson, Robot
+from evermap.cli.options import AsJson, Robot, argument
 from evermap.cli.terminal import print_json, print_table, warn
 from evermap.errors import ConfigError, EvermapError, InputError
 
@@ -41,7 +39,7 @@ class Described(NamedTuple):
 
 
 def info(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help=f"Files that evermap reads or writes: {_KNOWN}.")],
+    path: Annotated[Path, argument(f"Files that evermap reads or writes: {_KNOWN}.", metavar="PATH")],
     robot: Robot = None,
     as_json: AsJson = False,
 ) -> None:

@@ -6,9 +6,19 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from evermap.cli.options import AsJson, Cluster, ConfigFile, Force, Settings, ShowConfig, Workers, configured, one_of
+from evermap.cli.options import (
+    AsJson,
+    Cluster,
+    ConfigFile,
+    Force,
+    Settings,
+    ShowConfig,
+    Workers,
+    argument,
+    configured,
+    one_of,
+    option,
+)
 from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say
 from evermap.errors import ConfigError
 
@@ -37,21 +47,18 @@ Examples:
 
 
 Maps = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="MAP", help="Files, or postgresql://user@host/database/SITE.", show_default=False),
+    list[str] | None, argument("Files, or postgresql://user@host/database/SITE.", metavar="MAP", default=False)
 ]
 Store = Annotated[
     str | None,
-    typer.Option(
-        metavar="WHERE", help="All maps of a server: folder, or postgresql://user@host/database.", show_default="none"
-    ),
+    option("All maps of a server: folder, or postgresql://user@host/database.", metavar="WHERE", default="none"),
 ]
 
 
 def learn(
     maps: Maps = None,
     store: Store = None,
-    out: Annotated[Path, typer.Option(help="Folder for the lifetimes.")] = Path("evermap-out/lifetimes"),
+    out: Annotated[Path, option("Folder for the lifetimes.")] = Path("evermap-out/lifetimes"),
     workers: Workers = None,
     cluster: Cluster = None,
     force: Force = False,
@@ -125,8 +132,9 @@ def _stored(store: str) -> list[tuple[str, str]]:
 
 
 def _half_gone_s(lifetimes: Lifetimes) -> float | None:
-    half_s = float(lifetimes.stay.quantile(0.5))
-    return half_s if math.isfinite(half_s) else None
+    from evermap.types import json_number
+
+    return json_number(lifetimes.stay.quantile(0.5))
 
 
 def _written(folder: RunFolder, company: Company, names: list[str]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.options import ConfigFile, Robot, Settings, Topics, configured
+from evermap.cli.options import ConfigFile, Robot, Settings, Topics, configured, option
 from evermap.cli.terminal import echo, print_table, say, warm_up, warn
 from evermap.errors import ConfigError
 from evermap.interrupts import kept, watched
@@ -40,26 +40,18 @@ MMAP_THRESHOLD, LARGE = -3, 2**18
 
 MapFile = Annotated[
     str | None,
-    typer.Option(
-        "--map", metavar="FILE", help="Living map, created if it does not exist; without it, only --replay is sent."
-    ),
+    option("--map", "Living map, created if it does not exist; without it, only --replay is sent.", metavar="FILE"),
 ]
-Replay = Annotated[Path | None, typer.Option(metavar="INPUT", help="A recording or bag to replay in place of a robot.")]
-SensorFile = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Sensor description, as the sensor.toml of a recording.")
-]
+Replay = Annotated[Path | None, option("A recording or bag to replay in place of a robot.", metavar="INPUT")]
+SensorFile = Annotated[Path | None, option("Sensor description, as the sensor.toml of a recording.", metavar="FILE")]
 ZenohEndpoint = Annotated[
     str | None,
-    typer.Option(
-        metavar="ENDPOINT", help="ROS 2 over Zenoh: tcp/localhost:7447, listen=tcp/0.0.0.0:7447, or FILE.json5."
-    ),
+    option("ROS 2 over Zenoh: tcp/localhost:7447, listen=tcp/0.0.0.0:7447, or FILE.json5.", metavar="ENDPOINT"),
 ]
-FoxglovePort = Annotated[
-    str | None, typer.Option(metavar="[HOST:]PORT", help="Serve Foxglove's WebSocket at this port, as 8765.")
-]
-OnlyLocalize = Annotated[bool, typer.Option("--localize", help="Only localise; the map is not changed.")]
-Paced = Annotated[bool, typer.Option("--realtime", help="Replay at the pace of the recording.")]
-Lines = Annotated[bool, typer.Option("--json", help="Print poses and changes at once, one JSON object per line.")]
+FoxglovePort = Annotated[str | None, option("Serve Foxglove's WebSocket at this port, as 8765.", metavar="[HOST:]PORT")]
+OnlyLocalize = Annotated[bool, option("--localize", "Only localise; the map is not changed.")]
+Paced = Annotated[bool, option("--realtime", "Replay at the pace of the recording.")]
+Lines = Annotated[bool, option("--json", "Print poses and changes at once, one JSON object per line.")]
 
 
 def live(

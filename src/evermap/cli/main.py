@@ -16,7 +16,7 @@ from typer.core import TyperGroup
 from evermap import __version__, interrupts, plugins
 from evermap.cli import bench, check, convert, info, learn, live, persist, reproduce, serve, slam, survival, track, view
 from evermap.cli import map as living_map
-from evermap.cli.options import Verb
+from evermap.cli.options import Verb, option
 from evermap.cli.terminal import fail, say, warn
 from evermap.errors import EvermapError, EvermapWarning
 
@@ -137,9 +137,9 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+        bool, option("--version", "Print the version and exit.", callback=_print_version, is_eager=True)
     ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a bug.")] = False,
+    debug: Annotated[bool, option("--debug", "Show the traceback of a bug.")] = False,
 ) -> None:
     """Take the options of all verbs; they are read in `Verbs.invoke`."""
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evermap.cli.map_edits import AsJson, MapFile, delete, gc, pin, reenter, revert, undelete, unpin, verify
+from evermap.cli.options import argument, option
 from evermap.cli.terminal import check_picture, echo, print_json, print_table, say, write_picture
 from evermap.errors import ConfigError
 
@@ -24,9 +25,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-_AtRevision = Annotated[
-    int | None, typer.Option("--revision", metavar="N", help="Use this revision.", show_default="newest")
-]
+_AtRevision = Annotated[int | None, option("--revision", "Use this revision.", metavar="N", default="newest")]
 
 
 @app.command("log")
@@ -64,9 +63,9 @@ def log(file: MapFile, as_json: AsJson = False) -> None:
 def show(
     file: MapFile,
     revision: _AtRevision = None,
-    ahead: Annotated[str, typer.Option(help="Time of the forecast, as 12h or 3d.")] = "1d",
-    everything: Annotated[bool, typer.Option("--all", help="Also list landmarks that are believed gone.")] = False,
-    figure: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the map.", show_default="none")] = None,
+    ahead: Annotated[str, option("Time of the forecast, as 12h or 3d.")] = "1d",
+    everything: Annotated[bool, option("--all", "Also list landmarks that are believed gone.")] = False,
+    figure: Annotated[Path | None, option("Draw the map.", metavar="FILE.png", default="none")] = None,
     as_json: AsJson = False,
 ) -> None:
     """List the landmarks.
@@ -115,8 +114,8 @@ def show(
 @app.command("diff")
 def diff(
     file: MapFile,
-    a: Annotated[int, typer.Argument(metavar="A", help="The earlier revision; 0 is the empty map.")],
-    b: Annotated[int | None, typer.Argument(metavar="B", help="The later one.", show_default="newest")] = None,
+    a: Annotated[int, argument("The earlier revision; 0 is the empty map.", metavar="A")],
+    b: Annotated[int | None, argument("The later one.", metavar="B", default="newest")] = None,
     as_json: AsJson = False,
 ) -> None:
     """List the changes between two revisions.
@@ -150,45 +149,36 @@ def diff(
 
 _ExportOut = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Where to write the landmarks: .parquet, .geojson, .csv, or .yaml for a grid.",
-        show_default=False,
+    option(
+        "Where to write the landmarks: .parquet, .geojson, .csv, or .yaml for a grid.", metavar="FILE", default=False
     ),
 ]
 _ExportLifetimes = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.json", help="Where to write the lifetimes by class.", show_default=False),
+    Path | None, option("Where to write the lifetimes by class.", metavar="FILE.json", default=False)
 ]
 _PLeast = Annotated[
     float | None,
-    typer.Option(
+    option(
+        "Leave out landmarks with a smaller P(exists).",
         min=0.0,
         max=1.0,
-        help="Leave out landmarks with a smaller P(exists).",
-        show_default="0.5; 0 for Nav2's speed mask and route graph",
+        default="0.5; 0 for Nav2's speed mask and route graph",
     ),
 ]
-_SpeedMask = Annotated[
-    bool, typer.Option("--speed-mask", help="Write --out FILE.yaml as the mask of Nav2's speed filter.")
-]
+_SpeedMask = Annotated[bool, option("--speed-mask", "Write --out FILE.yaml as the mask of Nav2's speed filter.")]
 _RouteGraph = Annotated[
     Path | None,
-    typer.Option(
-        metavar="IN.geojson",
-        help="Write this route graph of Nav2 to --out, without blocked edges.",
-        show_default=False,
-    ),
+    option("Write this route graph of Nav2 to --out, without blocked edges.", metavar="IN.geojson", default=False),
 ]
-_MapAge = Annotated[str, typer.Option(help="With --speed-mask: age of the map when it is used.")]
-_CellM = Annotated[float, typer.Option(min=1e-3, max=1e3, help="Edge of a cell of the grid [m].")]
+_MapAge = Annotated[str, option("With --speed-mask: age of the map when it is used.")]
+_CellM = Annotated[float, option("Edge of a cell of the grid [m].", min=1e-3, max=1e3)]
 _RadiusM = Annotated[
     float | None,
-    typer.Option(
+    option(
+        "Radius around a landmark in the grid, clearance of an edge [m].",
         min=0.0,
         max=1e3,
-        help="Radius around a landmark in the grid, clearance of an edge [m].",
-        show_default="0.25; 1 for the speed mask; 0.5 for the route graph",
+        default="0.25; 1 for the speed mask; 0.5 for the route graph",
     ),
 ]
 
@@ -256,11 +246,9 @@ def export(
 @app.command("why")
 def why(
     file: MapFile,
-    landmark: Annotated[str, typer.Argument(metavar="LANDMARK", help="Its id, or its name.")],
+    landmark: Annotated[str, argument("Its id, or its name.", metavar="LANDMARK")],
     revision: _AtRevision = None,
-    figure: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Draw its belief over time.", show_default="none")
-    ] = None,
+    figure: Annotated[Path | None, option("Draw its belief over time.", metavar="FILE.png", default="none")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Explain why a landmark is believed to exist or gone.
@@ -297,8 +285,8 @@ def _writer(
         ConfigError: no map is written to such a file.
     """
     from evermap.io import write_map_geojson, write_map_parquet
-    from evermap.io.grid import write_grid
     from evermap.io.landmarks import write_map_csv
+    from evermap.io.nav2 import write_grid
 
     if out is None:
         return lambda *_: {}
@@ -335,7 +323,7 @@ def _speed_mask(
     """Write where to drive slowly, since the map may be wrong by then."""
     import numpy as np
 
-    from evermap.io.grid import write_speed_mask
+    from evermap.io.nav2 import write_speed_mask
 
     then = living.landmarks(at=living.stamp_s + ahead_s) if len(landmarks) else landmarks
     p_then = then.p_exists[np.isin(then.landmark_id, landmarks.landmark_id)]
@@ -349,7 +337,7 @@ def _speed_mask(
 
 def _route_graph(out: Path, graph: Path, clearance_m: float, _: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
     """Write a route graph; return its closed and its uncertain edges."""
-    from evermap.io.route_graph import write_route_graph
+    from evermap.io.nav2 import write_route_graph
 
     edges = write_route_graph(landmarks, graph, out, clearance_m=clearance_m)
     doubtful = {str(edge.number): edge.p_blocked for edge in edges if edge.p_blocked and not edge.closed}

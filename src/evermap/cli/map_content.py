@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from evermap.cli.terminal import echo, print_table, write_picture
 from evermap.runs.map_dicts import AXES
 from evermap.stamps import between_text, stamp_text
-from evermap.types import Clock, MapChange
+from evermap.types import Clock, MapChange, or_nan
 
 if TYPE_CHECKING:
     from evermap.maps.store import Revision
@@ -60,15 +60,11 @@ def landmark_row(content: dict[str, Any], clock: Clock) -> list[str]:
         "-" if ahead is None else probability_text(ahead),
         f"({', '.join(f'{content[axis]:.2f}' for axis in AXES if axis in content)})" if placed else "-",
         f"{100 * content['sigma_m']:.1f} cm" if placed else "-",
-        stamp_text(_or_nan(content["since_s"]), clock),
-        stamp_text(_or_nan(content["seen_s"]), clock),
+        stamp_text(or_nan(content["since_s"]), clock),
+        stamp_text(or_nan(content["seen_s"]), clock),
         str(content["sites"]),
         flags,
     ]
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def print_why(answer: Answer) -> None:

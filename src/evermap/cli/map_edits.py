@@ -8,22 +8,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from evermap.cli.learn import Maps, Store, sites_of
-from evermap.cli.options import Cluster, ConfigFile, Settings, Workers, configured, one_of
+from evermap.cli.options import Cluster, ConfigFile, Settings, Workers, argument, configured, one_of, option
 from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say
 from evermap.errors import ConfigError, EvermapError
 
-MapFile = Annotated[str, typer.Argument(metavar="FILE", help="The map, as `evermap slam --map FILE` writes it.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
-_Ids = Annotated[list[str], typer.Argument(metavar="LANDMARK...", help="Ids of landmarks, or their names.")]
-_Note = Annotated[str, typer.Option(help="A note for the log.")]
+MapFile = Annotated[str, argument("The map, as `evermap slam --map FILE` writes it.", metavar="FILE")]
+AsJson = Annotated[bool, option("--json", "Print as JSON.")]
+_Ids = Annotated[list[str], argument("Ids of landmarks, or their names.", metavar="LANDMARK...")]
+_Note = Annotated[str, option("A note for the log.")]
 
 
 def revert(
     file: MapFile,
-    revision: Annotated[int, typer.Argument(metavar="N", help="Revision to restore; 0 is the empty map.")],
+    revision: Annotated[int, argument("Revision to restore; 0 is the empty map.", metavar="N")],
     note: _Note = "",
     as_json: AsJson = False,
 ) -> None:
@@ -89,8 +87,8 @@ def verify(file: MapFile, as_json: AsJson = False) -> None:
 
 def gc(
     file: MapFile,
-    keep: Annotated[int, typer.Option(min=1, metavar="N", help="Newest revisions to keep complete.")] = 10,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would be deleted.")] = False,
+    keep: Annotated[int, option("Newest revisions to keep complete.", min=1, metavar="N")] = 10,
+    dry_run: Annotated[bool, option("--dry-run", "Only list what would be deleted.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Prune old revisions: delete their content, and shrink the file.
@@ -121,8 +119,8 @@ def gc(
 def reenter(
     maps: Maps = None,
     store: Store = None,
-    out: Annotated[Path, typer.Option(help="Folder of the copies, to continue from.")] = Path("evermap-out/reentered"),
-    adopt: Annotated[bool, typer.Option("--adopt", help="Append them to the maps, each at once.")] = False,
+    out: Annotated[Path, option("Folder of the copies, to continue from.")] = Path("evermap-out/reentered"),
+    adopt: Annotated[bool, option("--adopt", "Append them to the maps, each at once.")] = False,
     workers: Workers = None,
     cluster: Cluster = None,
     config: ConfigFile = None,

@@ -16,40 +16,51 @@ from evermap.errors import ConfigError, EvermapError
 if TYPE_CHECKING:
     from evermap.config import Config
 
+
+def option(*texts: str, default: bool | str = True, **how: Any) -> Any:
+    """Describe an option of a verb: its names, where they are not those of the argument, and its help.
+
+    Args:
+        texts: names, then the help.
+        default: shown as the default; False for none.
+        how: as of `typer.Option`.
+    """
+    *names, help_text = texts
+    return typer.Option(*names, help=help_text, show_default=default, **how)
+
+
+def argument(help_text: str, *, default: bool | str = True, **how: Any) -> Any:
+    """Describe an argument of a verb; as `option`."""
+    return typer.Argument(help=help_text, show_default=default, **how)
+
+
 ConfigFile = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="TOML file; see slam --show-config.", show_default=False)
+    Path | None, option("--config", "TOML file; see slam --show-config.", metavar="FILE", default=False)
 ]
 Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Override one setting, as section.key=value; repeatable."),
+    list[str] | None, option("--set", "Override one setting, as section.key=value; repeatable.", metavar="KEY=VALUE")
 ]
-ShowConfig = Annotated[
-    bool, typer.Option("--show-config", help="Print the configuration in force as commented TOML and exit.")
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
-Force = Annotated[bool, typer.Option("--force", help="Write into --out even if it holds other files; these are kept.")]
-Robot = Annotated[int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)]
+ShowConfig = Annotated[bool, option("--show-config", "Print the configuration in force as commented TOML and exit.")]
+AsJson = Annotated[bool, option("--json", "Print the summary as JSON.")]
+Force = Annotated[bool, option("--force", "Write into --out even if it holds other files; these are kept.")]
+Robot = Annotated[int | None, option("Robot of a recording that has several.", default=False)]
 Topics = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Settings file of the topics, as slam --init-bag writes it.", show_default=False),
+    Path | None, option("Settings file of the topics, as slam --init-bag writes it.", metavar="FILE", default=False)
 ]
-TableOut = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<input>")]
+TableOut = Annotated[Path | None, option("Folder for the results.", default="evermap-out/<input>")]
 Workers = Annotated[
     int | None,
-    typer.Option(
-        min=1, max=1024, help="Processes here; 1 needs no Dask.", show_default="one per core, if Dask is installed"
-    ),
+    option("Processes here; 1 needs no Dask.", min=1, max=1024, default="one per core, if Dask is installed"),
 ]
 Cluster = Annotated[
-    str | None,
-    typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler whose workers do it.", show_default="none"),
+    str | None, option("Dask scheduler whose workers do it.", metavar="tcp://HOST:PORT", default="none")
 ]
 Priors = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
+        "Prior of the lifetimes, as in `evermap survival plot --help`; repeatable for classes.",
         metavar="[CLASS=]PRIOR",
-        help="Prior of the lifetimes, as in `evermap survival plot --help`; repeatable for classes.",
-        show_default="unknown:1min..10y",
+        default="unknown:1min..10y",
     ),
 ]
 

@@ -8,8 +8,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from evermap.cli.options import (
     AsJson,
     Cluster,
@@ -20,10 +18,12 @@ from evermap.cli.options import (
     ShowConfig,
     TableOut,
     Workers,
+    argument,
     configured,
     default_out,
     duration_s,
     one_of,
+    option,
     priors_by_class,
 )
 from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say, warm_up, warn
@@ -44,61 +44,33 @@ class StampsCount(StrEnum):
 
 Looks = Annotated[
     Path | None,
-    typer.Argument(
-        metavar="INPUT", help="Table of looks: .csv, .csv.gz or .parquet, or a folder of .parquet.", show_default=False
-    ),
+    argument("Table of looks: .csv, .csv.gz or .parquet, or a folder of .parquet.", metavar="INPUT", default=False),
 ]
 Recurrent = Annotated[
-    str | None,
-    typer.Option(
-        metavar="KIND", help="How features return: none, auto, or a kind of model to learn.", show_default="none"
-    ),
+    str | None, option("How features return: none, auto, or a kind of model to learn.", metavar="KIND", default="none")
 ]
 Per = Annotated[
-    str | None,
-    typer.Option(
-        metavar="all|class|feature", help="Which features share a learned model.", show_default="by the table"
-    ),
+    str | None, option("Which features share a learned model.", metavar="all|class|feature", default="by the table")
 ]
-Model = Annotated[Path | None, typer.Option(metavar="FILE", help="Model learned by an earlier run (its model.json).")]
-LearnFrom = Annotated[
-    int | None, typer.Option(help="Maximum number of looks that --recurrent learns from.", show_default="100000")
-]
+Model = Annotated[Path | None, option("Model learned by an earlier run (its model.json).", metavar="FILE")]
+LearnFrom = Annotated[int | None, option("Maximum number of looks that --recurrent learns from.", default="100000")]
 Query = Annotated[
-    str | None,
-    typer.Option(
-        metavar="times|grid", help="Beliefs at the times of the rows, or at regular times.", show_default="times"
-    ),
+    str | None, option("Beliefs at the times of the rows, or at regular times.", metavar="times|grid", default="times")
 ]
-Step = Annotated[float | None, typer.Option(help="Step of the grid and of the forecasts [s].", show_default="chosen")]
+Step = Annotated[float | None, option("Step of the grid and of the forecasts [s].", default="chosen")]
 Horizon = Annotated[
     str | None,
-    typer.Option(
-        "--horizon",
-        metavar="DURATION",
-        help="How far to forecast, as 3d.",
-        show_default="a quarter of the looks' span",
-    ),
+    option("--horizon", "How far to forecast, as 3d.", metavar="DURATION", default="a quarter of the looks' span"),
 ]
-PMiss = Annotated[
-    float | None, typer.Option(help="P(no detection | there) if the table has no p_miss.", show_default="0.1")
-]
-PFalse = Annotated[
-    float | None, typer.Option(help="P(detection | not there) if the table has no p_false.", show_default="0.1")
-]
-Confidence = Annotated[float | None, typer.Option(help="Belief above which a change is reported.", show_default="0.9")]
+PMiss = Annotated[float | None, option("P(no detection | there) if the table has no p_miss.", default="0.1")]
+PFalse = Annotated[float | None, option("P(detection | not there) if the table has no p_false.", default="0.1")]
+Confidence = Annotated[float | None, option("Belief above which a change is reported.", default="0.9")]
 TruthTable = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Table with stamp_s, feature_id, present, to score the beliefs.")
+    Path | None, option("Table with stamp_s, feature_id, present, to score the beliefs.", metavar="FILE")
 ]
-Figures = Annotated[
-    int | None, typer.Option(min=0, help="Number of features with an individual figure.", show_default="12")
-]
-ShownClock = Annotated[
-    StampsCount | None, typer.Option(help="Clock of the stamps, for the figures.", show_default="by their size")
-]
-Example = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Write a commented example table and exit.", show_default=False)
-]
+Figures = Annotated[int | None, option("Number of features with an individual figure.", min=0, default="12")]
+ShownClock = Annotated[StampsCount | None, option("Clock of the stamps, for the figures.", default="by their size")]
+Example = Annotated[Path | None, option("Write a commented example table and exit.", metavar="FILE", default=False)]
 
 
 HELP = """\

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 import typer
 
-from evermap.cli.options import AsJson, ConfigFile, Settings, configured
+from evermap.cli.options import AsJson, ConfigFile, Settings, argument, configured, option
 from evermap.cli.terminal import print_json, print_table, say, warm_up
 from evermap.errors import ConfigError, EvermapError, MissingExtraError, printable
 
@@ -33,11 +33,8 @@ app = typer.Typer(
 
 Store = Annotated[
     str,
-    typer.Option(
-        "--store",
-        metavar="WHERE",
-        help="Folder of the maps, or postgresql://user@host/database.",
-        envvar="EVERMAP_STORE",
+    option(
+        "--store", "Folder of the maps, or postgresql://user@host/database.", metavar="WHERE", envvar="EVERMAP_STORE"
     ),
 ]
 _DEFAULT = "evermap-maps"
@@ -52,17 +49,13 @@ _ASK_S = 5.0
 def serve(
     ctx: typer.Context,
     store: Store = _DEFAULT,
-    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for all.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on.")] = 8080,
-    workers: Annotated[
-        int, typer.Option(min=0, max=64, help="Worker processes that enter sessions, see evermap work.")
-    ] = 1,
+    host: Annotated[str, option("Address to listen on; 0.0.0.0 for all.")] = "127.0.0.1",
+    port: Annotated[int, option("Port to listen on.", min=0, max=65535)] = 8080,
+    workers: Annotated[int, option("Worker processes that enter sessions, see evermap work.", min=0, max=64)] = 1,
     certificate: Annotated[
-        Path | None, typer.Option("--tls-cert", metavar="FILE", help="TLS certificate chain.", show_default="no TLS")
+        Path | None, option("--tls-cert", "TLS certificate chain.", metavar="FILE", default="no TLS")
     ] = None,
-    key: Annotated[
-        Path | None, typer.Option("--tls-key", metavar="FILE", help="Key of the certificate.", show_default=False)
-    ] = None,
+    key: Annotated[Path | None, option("--tls-key", "Key of the certificate.", metavar="FILE", default=False)] = None,
 ) -> None:
     """Serve the maps of a fleet: sessions are uploaded, queued, and entered by workers.
 
@@ -109,11 +102,9 @@ def serve(
 
 @app.command("token")
 def token(
-    name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="Name of the robot or person.", show_default=False)
-    ] = None,
-    role: Annotated[str, typer.Option(metavar="read|upload|approve|admin", help="Its permissions.")] = "upload",
-    revoke: Annotated[bool, typer.Option("--revoke", help="Revoke the token of this name.")] = False,
+    name: Annotated[str | None, argument("Name of the robot or person.", metavar="NAME", default=False)] = None,
+    role: Annotated[str, option("Its permissions.", metavar="read|upload|approve|admin")] = "upload",
+    revoke: Annotated[bool, option("--revoke", "Revoke the token of this name.")] = False,
     store: Store = _DEFAULT,
     as_json: AsJson = False,
 ) -> None:
@@ -159,7 +150,7 @@ def token(
 def doctor(
     store: Store = _DEFAULT,
     url: Annotated[
-        str, typer.Option(metavar="URL", help="Address at which robots reach the server; '' to skip this check.")
+        str, option("Address at which robots reach the server; '' to skip this check.", metavar="URL")
     ] = "http://127.0.0.1:8080",
     as_json: AsJson = False,
 ) -> None:
@@ -246,13 +237,11 @@ def work(
     store: Store = _DEFAULT,
     config: ConfigFile = None,
     settings: Settings = None,
-    drain: Annotated[bool, typer.Option("--drain", help="Exit as soon as no session waits.")] = False,
+    drain: Annotated[bool, option("--drain", "Exit as soon as no session waits.")] = False,
     lease_s: Annotated[
-        float, typer.Option(min=1.0, max=3600.0, help="Time after which another worker takes over a session [s].")
+        float, option("Time after which another worker takes over a session [s].", min=1.0, max=3600.0)
     ] = 60.0,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the result of each, one JSON object per line.")
-    ] = False,
+    as_json: Annotated[bool, option("--json", "Print the result of each, one JSON object per line.")] = False,
 ) -> None:
     """Enter the sessions that were uploaded to a server.
 

@@ -19,8 +19,10 @@ from evermap.cli.options import (
     Settings,
     ShowConfig,
     Topics,
+    argument,
     configured,
     default_out,
+    option,
     priors_by_class,
 )
 from evermap.cli.terminal import command_line, echo, fail, print_json, print_table, progress_bar, say, warm_up, warn
@@ -51,111 +53,101 @@ _ROWS = (
 
 Recorded = Annotated[
     list[Path] | None,
-    typer.Argument(
-        metavar="INPUT...",
-        help="Folder in the native format, zip or ROS bag; with --map also several, in the order of their sessions, "
+    argument(
+        "Folder in the native format, zip or ROS bag; with --map also several, in the order of their sessions, "
         "and with --together one per robot.",
-        show_default=False,
+        metavar="INPUT...",
+        default=False,
     ),
 ]
 Out = Annotated[
     Path | None,
-    typer.Option(
-        help="Folder for the results; for several recordings, one subfolder each.",
-        show_default="evermap-out/<recording>",
-    ),
+    option("Folder for the results; for several recordings, one subfolder each.", default="evermap-out/<recording>"),
 ]
 SensorModel = Annotated[
     str | None,
-    typer.Option(
-        metavar="calibrated|plain",
-        help="Estimate sensor and odometry errors, or trust the readings.",
-        show_default="calibrated",
+    option(
+        "Estimate sensor and odometry errors, or trust the readings.", metavar="calibrated|plain", default="calibrated"
     ),
 ]
 HowMoved = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "Method that finds moved landmarks; nohyp: the world is static.",
         metavar="joint|nohyp|max-mixture|nn|em|mcts|viterbi",
-        help="Method that finds moved landmarks; nohyp: the world is static.",
-        show_default="joint",
+        default="joint",
     ),
 ]
 UnknownIds = Annotated[
-    bool, typer.Option("--unknown-ids", help="Ignore the landmark ids of the detections; associate by geometry.")
+    bool, option("--unknown-ids", "Ignore the landmark ids of the detections; associate by geometry.")
 ]
 EmptyIds = Annotated[
-    bool,
-    typer.Option("--empty-ids", help="Associate detections with an empty landmark id by geometry; others keep theirs."),
+    bool, option("--empty-ids", "Associate detections with an empty landmark id by geometry; others keep theirs.")
 ]
 PriorMap = Annotated[
-    str | None,
-    typer.Option(metavar="FILE|truth", help="Start from this landmark map, or from the recording's surveyed one."),
+    str | None, option("Start from this landmark map, or from the recording's surveyed one.", metavar="FILE|truth")
 ]
 PriorSigma = Annotated[
-    float,
-    typer.Option(min=1e-6, help="Standard deviation of the surveyed map, or of a map without sigmas [m]."),
+    float, option("Standard deviation of the surveyed map, or of a map without sigmas [m].", min=1e-6)
 ]
 LivingMapFile = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--map",
-        metavar="FILE",
-        help="Continue or begin this living map: localise in it, find what changed, extend it. A file, or "
+        "Continue or begin this living map: localise in it, find what changed, extend it. A file, or "
         "postgresql://user@host/database/SITE.",
-        show_default=False,
+        metavar="FILE",
+        default=False,
     ),
 ]
 MapPriors = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="[CLASS=]PRIOR|FILE.json",
-        help="With --map: lifetimes, as 'cart=weibull:scale=3d,shape=1.5', or a file of survival fit, "
+    option(
+        "With --map: lifetimes, as 'cart=weibull:scale=3d,shape=1.5', or a file of survival fit, "
         "survival learn or map export --lifetimes; worth living.prior_stays stays; repeatable.",
+        metavar="[CLASS=]PRIOR|FILE.json",
     ),
 ]
 Localize = Annotated[
-    bool,
-    typer.Option("--localize", help="With --map: only localise, at a fixed cost per frame; the map is not changed."),
+    bool, option("--localize", "With --map: only localise, at a fixed cost per frame; the map is not changed.")
 ]
 Shifts = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
+        "Move landmarks of the prior map, e.g. 11,12,13:+1.0 [m, m, degrees]; for experiments; repeatable.",
         metavar="IDS:DX[,DY[,TURN]]",
-        help="Move landmarks of the prior map, e.g. 11,12,13:+1.0 [m, m, degrees]; for experiments; repeatable.",
     ),
 ]
 Together = Annotated[
     bool,
-    typer.Option(
+    option(
         "--together",
-        help="The inputs are simultaneous recordings of robots 1, 2, ..., or one input has several robots: solve them "
+        "The inputs are simultaneous recordings of robots 1, 2, ..., or one input has several robots: solve them "
         "as one problem.",
     ),
 ]
-Realtime = Annotated[bool, typer.Option("--realtime", help="Process at the pace of the recording.")]
+Realtime = Annotated[bool, option("--realtime", "Process at the pace of the recording.")]
 OfflineSession = Annotated[
     Path | None,
-    typer.Option(
+    option(
+        "Also write what a map needs of the recording, condensed, for a later upload to a server.",
         metavar="FILE.zip",
-        help="Also write what a map needs of the recording, condensed, for a later upload to a server.",
-        show_default=False,
+        default=False,
     ),
 ]
 Template = Annotated[
-    Path | None,
-    typer.Option(metavar="DIR", help="Write a commented template of a recording and exit.", show_default=False),
+    Path | None, option("Write a commented template of a recording and exit.", metavar="DIR", default=False)
 ]
 
 InitBag = Annotated[
     Path | None,
-    typer.Option(
+    option(
+        "Write the topics that are read from a ROS bag, and how, to BAG.toml for editing, and exit.",
         metavar="BAG",
-        help="Write the topics that are read from a ROS bag, and how, to BAG.toml for editing, and exit.",
-        show_default=False,
+        default=False,
     ),
 ]
-InSpace = Annotated[bool, typer.Option("--3d", help="With --init: a recording in space, of a camera that sees tags.")]
+InSpace = Annotated[bool, option("--3d", "With --init: a recording in space, of a camera that sees tags.")]
 
 HELP = """\
 Estimate the trajectory and the map of landmarks.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.options import AsJson, ConfigFile, Settings, ShowConfig, configured, duration_s
+from evermap.cli.options import AsJson, ConfigFile, Settings, ShowConfig, argument, configured, duration_s, option
 from evermap.cli.persist import Per, PFalse, PMiss, Recurrent
 from evermap.cli.terminal import check_picture, print_json, print_table, progress_bar, say, warn, write_picture
 from evermap.errors import ConfigError
@@ -92,14 +92,11 @@ app = typer.Typer(name="survival", help="How long features stay.", no_args_is_he
 
 @app.command("plot", help=PLOT)
 def plot(
-    priors: Annotated[list[str], typer.Argument(metavar="PRIOR...", help="Lifetime priors, in the forms below.")],
-    out: Annotated[Path, typer.Option(help="Figure to write, .png or .svg.")] = Path("lifetimes.png"),
-    until: Annotated[
-        str | None, typer.Option(help="End of the time axis, as 30d.", show_default="when nearly all have left")
-    ] = None,
+    priors: Annotated[list[str], argument("Lifetime priors, in the forms below.", metavar="PRIOR...")],
+    out: Annotated[Path, option("Figure to write, .png or .svg.")] = Path("lifetimes.png"),
+    until: Annotated[str | None, option("End of the time axis, as 30d.", default="when nearly all have left")] = None,
     log_time: Annotated[
-        bool | None,
-        typer.Option("--log/--linear", help="Axis of time.", show_default="by the span of the lifetimes"),
+        bool | None, option("--log/--linear", "Axis of time.", default="by the span of the lifetimes")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -120,24 +117,16 @@ def plot(
     say(f"drawn in {out}")
 
 
-Lifetimes = Annotated[
-    Path, typer.Argument(metavar="FILE", help="Table of lifetimes: .csv, .csv.gz or .parquet.", show_default=False)
-]
+Lifetimes = Annotated[Path, argument("Table of lifetimes: .csv, .csv.gz or .parquet.", metavar="FILE", default=False)]
 By = Annotated[
-    str | None,
-    typer.Option(metavar="class,chunk", help="Estimate classes, places or both separately.", show_default="all as one"),
+    str | None, option("Estimate classes, places or both separately.", metavar="class,chunk", default="all as one")
 ]
-Estimator = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Estimator, one of the list below.", show_default="npmle")
-]
-ChunkSide = Annotated[float | None, typer.Option(help="Side of the squares of --by chunk [m].", show_default="10")]
+Estimator = Annotated[str | None, option("Estimator, one of the list below.", metavar="NAME", default="npmle")]
+ChunkSide = Annotated[float | None, option("Side of the squares of --by chunk [m].", default="10")]
 PriorsFile = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.json", help="File for the priors, for `evermap persist --model`.", show_default="none"),
+    Path | None, option("File for the priors, for `evermap persist --model`.", metavar="FILE.json", default="none")
 ]
-Curves = Annotated[
-    Path | None, typer.Option(metavar="FILE.png", help="Draw the survival functions.", show_default="none")
-]
+Curves = Annotated[Path | None, option("Draw the survival functions.", metavar="FILE.png", default="none")]
 
 
 @app.command("fit", help=FIT)
@@ -196,12 +185,10 @@ def fit(
 
 @app.command("learn", help=LEARN)
 def learn(
-    input: Annotated[
-        Path, typer.Argument(metavar="INPUT", help="Table of looks, as `evermap persist` reads it.", show_default=False)
-    ],
-    out: Annotated[Path, typer.Option(help="File for the model.")] = Path("model.json"),
+    input: Annotated[Path, argument("Table of looks, as `evermap persist` reads it.", metavar="INPUT", default=False)],
+    out: Annotated[Path, option("File for the model.")] = Path("model.json"),
     figure: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Figure of the model's predictions.", show_default="none")
+        Path | None, option("Figure of the model's predictions.", metavar="FILE.png", default="none")
     ] = None,
     recurrent: Recurrent = None,
     per: Per = None,
@@ -336,10 +323,12 @@ def _learned_lines(choice: Choice) -> list[tuple[str, str]]:
 
 def lifetime_numbers(prior: LifetimePrior) -> dict[str, float | None]:
     """Return quartiles and mean in seconds, None for what never comes; and the share that never leaves."""
+    from evermap.types import json_number
+
     quartiles = [float(prior.quantile(p)) for p in (0.25, 0.5, 0.75)]
     values = dict(zip(("quarter_gone_s", "half_gone_s", "three_quarters_gone_s"), quartiles, strict=True))
     values["mean_stay_s"] = prior.mean()
-    return {k: v if math.isfinite(v) else None for k, v in values.items()} | {"p_never_leaves": prior.p_never_leaves}
+    return {k: json_number(v) for k, v in values.items()} | {"p_never_leaves": prior.p_never_leaves}
 
 
 def lifetime_lines(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from evermap.cli.options import (
     AsJson,
     ConfigFile,
@@ -17,8 +15,10 @@ from evermap.cli.options import (
     Settings,
     ShowConfig,
     TableOut,
+    argument,
     configured,
     default_out,
+    option,
     priors_by_class,
 )
 from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say, warm_up, warn
@@ -29,43 +29,30 @@ if TYPE_CHECKING:
 
 Seen = Annotated[
     Path | None,
-    typer.Argument(
-        metavar="INPUT",
-        help="Table of detections (.csv, .csv.gz, .parquet), or a folder with one and poses.",
-        show_default=False,
+    argument(
+        "Table of detections (.csv, .csv.gz, .parquet), or a folder with one and poses.", metavar="INPUT", default=False
     ),
 ]
-Reach = Annotated[
-    float | None,
-    typer.Option(help="Range of the sensor [m]: misses within it are evidence.", show_default="unknown"),
-]
+Reach = Annotated[float | None, option("Range of the sensor [m]: misses within it are evidence.", default="unknown")]
 Speeds = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="CLASS=MPS",
-        help="Speed above which a class counts as moving [m/s]; repeatable.",
-        show_default="0.5 for all",
-    ),
+    option("Speed above which a class counts as moving [m/s]; repeatable.", metavar="CLASS=MPS", default="0.5 for all"),
 ]
 Confusion = Annotated[
     Path | None,
-    typer.Option(
+    option(
+        "Table of P(detected class | true class): class_id, and one column per class.",
         metavar="FILE",
-        help="Table of P(detected class | true class): class_id, and one column per class.",
-        show_default="5 % mistakes",
+        default="5 % mistakes",
     ),
 ]
-MinScore = Annotated[float | None, typer.Option(help="Ignore detections with a lower score.", show_default="none")]
+MinScore = Annotated[float | None, option("Ignore detections with a lower score.", default="none")]
 Gap = Annotated[
     float | None,
-    typer.Option(
-        help="A longer time between two frames counts as a gap without looks [s].", show_default="ten times the usual"
-    ),
+    option("A longer time between two frames counts as a gap without looks [s].", default="ten times the usual"),
 ]
-Scene = Annotated[bool, typer.Option("--scene/--no-scene", help="Write scene.rrd for the rerun viewer.")]
-Example = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Write a commented example table and exit.", show_default=False)
-]
+Scene = Annotated[bool, option("--scene/--no-scene", "Write scene.rrd for the rerun viewer.")]
+Example = Annotated[Path | None, option("Write a commented example table and exit.", metavar="FILE", default=False)]
 
 HELP = """\
 Track objects in space, and learn how long they stay.

@@ -11,9 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from evermap.cli.options import AsJson
+from evermap.cli.options import AsJson, argument, option
 from evermap.cli.terminal import print_json, say, warn
 from evermap.errors import ConfigError, InputError
 from evermap.interrupts import watched
@@ -22,17 +20,15 @@ from evermap.interrupts import watched
 def view(
     path: Annotated[
         str,
-        typer.Argument(
+        argument(
+            "A living map, the folder of a run of slam, or the Zenoh endpoint of `evermap live`.",
             metavar="MAP|RUN|LIVE",
-            help="A living map, the folder of a run of slam, or the Zenoh endpoint of `evermap live`.",
         ),
     ],
     save: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Save as .rrd for rerun or .mcap for Foxglove instead of opening a viewer.",
-            show_default=False,
+        option(
+            "Save as .rrd for rerun or .mcap for Foxglove instead of opening a viewer.", metavar="FILE", default=False
         ),
     ] = None,
     as_json: AsJson = False,

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
 from evermap.config.living import (
     BoxesConfig,
@@ -33,7 +33,7 @@ from evermap.config.living import (
     OverlayConfig,
     SightConfig,
 )
-from evermap.config.section import Section, config_error
+from evermap.config.section import Section, config_error, part
 from evermap.config.slam import (
     AssociationConfig,
     CalibrationConfig,
@@ -60,14 +60,14 @@ from evermap.errors import ConfigError
 class Config(Section):
     """The whole configuration, one section a table of the TOML file."""
 
-    slam: SlamConfig = Field(default_factory=SlamConfig, description="the estimator")
-    living: LivingConfig = Field(default_factory=LivingConfig, description="a living map")
-    sensor: SensorConfig = Field(default_factory=SensorConfig, description="overrides of the recording's sensor")
-    output: OutputConfig = Field(default_factory=OutputConfig, description="additional outputs")
-    persist: PersistConfig = Field(default_factory=PersistConfig, description="a table of looks")
-    track: TrackConfig = Field(default_factory=TrackConfig, description="a table of detections")
-    survival: SurvivalConfig = Field(default_factory=SurvivalConfig, description="a table of lifetimes")
-    live: LiveConfig = Field(default_factory=LiveConfig, description="a live session")
+    slam: SlamConfig = part(SlamConfig, "the estimator")
+    living: LivingConfig = part(LivingConfig, "a living map")
+    sensor: SensorConfig = part(SensorConfig, "overrides of the recording's sensor")
+    output: OutputConfig = part(OutputConfig, "additional outputs")
+    persist: PersistConfig = part(PersistConfig, "a table of looks")
+    track: TrackConfig = part(TrackConfig, "a table of detections")
+    survival: SurvivalConfig = part(SurvivalConfig, "a table of lifetimes")
+    live: LiveConfig = part(LiveConfig, "a live session")
 
 
 def load_config(

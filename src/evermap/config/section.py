@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
@@ -21,6 +21,19 @@ Probability = Annotated[float, Field(ge=0, le=1)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 """A probability that is neither zero nor one."""
 Count = Annotated[int, Field(ge=1)]
+
+
+def key(default: Any, meaning: str, **bounds: Any) -> Any:
+    """Define a key of a section: its default, one line of meaning with the unit, and bounds as of pydantic's `Field`.
+
+    A default that can be changed is copied for every section.
+    """
+    return Field(default=default, description=meaning, **bounds)
+
+
+def part(section: Callable[[], Section], meaning: str) -> Any:
+    """Define a section within a section."""
+    return Field(default_factory=section, description=meaning)
 
 
 class _RaisesOurErrors(ModelMetaclass):

@@ -95,7 +95,7 @@ class SiteChain(NamedTuple):
     Attributes:
         seat: (C + 1,) rows of the seats of each clique.
         first_frame: (C + 1,) frames of each clique; at least one.
-        log_route, log_rest, log_leave: as in `site_chains.Transitions`.
+        log_route, log_rest, log_leave: as in `sites.Transitions`.
     """
 
     seat: IntArray

@@ -161,6 +161,18 @@ def _zip_sets(path: Path) -> list[FileSet]:
     return [FileSet(path, folder, members, zipped=True) for folder, members in folders.items()]
 
 
+def content_of(path: Path) -> bytes:
+    """Return the content of a file, unpacked where it is gzipped.
+
+    Raises:
+        InputError: it is missing, unreadable or damaged.
+    """
+    try:
+        return unpacked(path.read_bytes(), path)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
+
+
 def unpacked(data: bytes, path: Path) -> bytes:
     """Return the content of a gzipped file, and that of any other as it is.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import repeats
-from evermap.io.files import unpacked, write_atomic
+from evermap.io.files import content_of, write_atomic
 from evermap.io.spatial import (
     AT,
     BOX,
@@ -28,7 +28,7 @@ from evermap.io.spatial import (
 )
 from evermap.io.table import Table, csv_text, parquet_bytes, parse_csv, parse_parquet
 from evermap.io.tag_maps import is_wpilib, map_of_survey, tags_of_fiducials, tags_of_tagslam, tags_of_wpilib
-from evermap.io.text import decode_text, reason
+from evermap.io.text import parse_json
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, rows_of
 from evermap.valid import FEATURES, STAMP_S, X_M, Y_M, Quantity
 
@@ -88,10 +88,7 @@ def read_prior_map(path: str | Path, sigma_m: float = 0.02, sigma_rad: float = 0
 def read_landmarks(path: str | Path, *, sigma_m: float = 0.0, sigma_rad: float = 0.0) -> Landmarks:
     """Return a map in the frame that its file states ('truth' where it states none). Arguments as `read_prior_map`."""
     path = _map_file(Path(path))
-    try:
-        data = unpacked(path.read_bytes(), path)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
+    data = content_of(path)
     ending = Path(path.name.lower().removesuffix(".gz")).suffix
     warnings: list[str] = []
     about: dict[str, Any] = {}
@@ -428,12 +425,7 @@ def parse_geojson(data: bytes, path: Path) -> tuple[Table, dict[str, Any]]:
     Raises:
         InputError: not JSON, no feature collection, a feature without a position, or coordinates of another system.
     """
-    try:
-        document = json.loads(decode_text(data, path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"not valid JSON: {error.msg}", path=path, line=error.lineno) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"not valid JSON: {reason(error)}", path=path) from None
+    document = parse_json(data, path)
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError("no GeoJSON feature collection", path=path, field="features")
     if "evermap" not in document:

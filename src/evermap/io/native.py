@@ -17,7 +17,7 @@ from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, fe
 from evermap.io.native_space import in_space, spatial_recording
 from evermap.io.rig_toml import CAMERA_FILE, SENSOR_FILE, read_rig
 from evermap.io.sensor_toml import Settings, parse_sensor_toml
-from evermap.io.table import Table, parse_csv, parse_parquet
+from evermap.io.table import ENDINGS, Table, parse_table
 from evermap.io.tagslam import is_tagslam
 from evermap.types import (
     Clock,
@@ -33,7 +33,6 @@ from evermap.types import (
 )
 
 TABLES = ("odometry", "detections", "frames", "truth", "landmarks", "robot_sightings", "objects")
-ENDINGS = (".csv", ".csv.gz", ".parquet")
 
 _VELOCITIES = ("forward_mps", "angular_radps")
 _INCREMENTS = ("dx_m", "dy_m", "dtheta_rad")
@@ -149,8 +148,7 @@ def _read_table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
             f"exists together with {present[1]}", path=files.path_of(present[0]), hint="remove one of them"
         )
     file = present[0]
-    data, path = files.read(file), files.path_of(file)
-    return parse_parquet(data, path) if file.endswith(".parquet") else parse_csv(data, path, warnings)
+    return parse_table(files.read(file), files.path_of(file), warnings)
 
 
 def _odometry(table: Table, clock: Clock, warnings: list[str]) -> Odometry:

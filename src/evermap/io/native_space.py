@@ -24,10 +24,12 @@ from evermap.io.spatial import (
     covariances,
     directions,
     integrated,
-    poses,
+    posed_odometry,
     positions,
     quaternions,
+    sensor_rows,
     spatial_detections,
+    true_poses,
     unit,
     with_tag_poses,
 )
@@ -156,17 +158,13 @@ def _odometry(table: Table | None, clock: Clock, warnings: list[str]) -> Spatial
         table.expect(("stamp_s", *given), VARIANCES)
     if len(table) == 0:
         raise DataError("contains no odometry", path=table.path)
+    if given is not TWIST:
+        return posed_odometry(table, VARIANCES, clock, warnings)
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
-    if given is TWIST:
-        zero = np.zeros(len(table))
-        twist = np.stack([table.numbers(axis) if axis.name in table else zero for axis in q.TWIST], axis=1)
-        return integrated(stamp_s[keep], twist[keep], clock)
-    unknown = np.full(len(table), np.nan)
-    variance = [
-        table.numbers(Quantity(name, 0.0, 1e12, optional=True)) if name in table else unknown for name in VARIANCES
-    ]
-    return SpatialOdometry(stamp_s[keep], poses(table)[keep], np.stack(variance, axis=1)[keep], clock=clock)
+    zero = np.zeros(len(table))
+    twist = np.stack([table.numbers(axis) if axis.name in table else zero for axis in q.TWIST], axis=1)
+    return integrated(stamp_s[keep], twist[keep], clock)
 
 
 def _in_space(odometry: Odometry) -> SpatialOdometry:
@@ -183,10 +181,7 @@ def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory
     if len(table) == 0:
         warnings.append(f"{table.path.name}: contains no pose, treated as missing")
         return None
-    stamp_s = forward_stamps(table)
-    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
-    pose = poses(table)[keep]
-    return Trajectory(stamp_s[keep], pose, np.zeros((len(pose), 6, 6)), frame="truth", clock=clock)
+    return true_poses(table, clock, warnings)
 
 
 def _by_sensor(table: Table) -> Table:
@@ -256,17 +251,12 @@ def _also(form: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _sensor_rows(table: Table, rig: Rig) -> IntArray:
-    known = {sensor.name: row for row, sensor in enumerate(rig.sensors)}
-    hint = "one of " + ", ".join(known)
-    if "sensor" not in table:
-        if len(known) > 1:
-            raise table.error("does not name its sensor", row=None, field="sensor", hint=hint)
-        return np.zeros(len(table), dtype=np.int64)
-    labels = table.labels("sensor")
-    unknown = next((row for row, label in enumerate(labels) if label not in known), None)
-    if unknown is not None:
-        raise table.error(f"no sensor '{labels[unknown]}' in {CAMERA_FILE}", row=unknown, field="sensor", hint=hint)
-    return np.array([known[label] for label in labels], dtype=np.int64)
+    if "sensor" in table:
+        return sensor_rows(table, "sensor", rig.sensors, CAMERA_FILE)
+    if len(rig.sensors) > 1:
+        hint = "one of " + ", ".join(sensor.name for sensor in rig.sensors)
+        raise table.error("does not name its sensor", row=None, field="sensor", hint=hint)
+    return np.zeros(len(table), dtype=np.int64)
 
 
 def _placed(table: Table) -> dict[str, FloatArray]:

@@ -11,6 +11,7 @@ import numpy as np
 from evermap.geometry import se3
 from evermap.geometry.camera import unproject
 from evermap.geometry.square import square_poses
+from evermap.io.assemble import forward_stamps, last_of_equal
 from evermap.io.table import Table
 from evermap.io.text import counted
 from evermap.types import (
@@ -22,6 +23,7 @@ from evermap.types import (
     SpatialDetections,
     SpatialOdometry,
     SpatialSensor,
+    Trajectory,
     rows_of,
 )
 from evermap.valid import QUATERNION as QUANTITIES
@@ -74,6 +76,40 @@ def unit(quaternion: FloatArray) -> FloatArray:
 def poses(table: Table) -> FloatArray:
     """Return the columns `x_m, y_m, z_m, qx, qy, qz, qw`. Shape (R, 7)."""
     return np.concatenate([positions(table), quaternions(table)], axis=1)
+
+
+def posed_odometry(table: Table, variances: tuple[str, ...], clock: Clock, warnings: list[str]) -> SpatialOdometry:
+    """Return the odometry in a table of poses, with the columns of their six variances as far as it has them."""
+    stamp_s = forward_stamps(table)
+    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
+    unknown = np.full(len(table), np.nan)
+    variance = [
+        table.numbers(Quantity(name, 0.0, 1e12, optional=True)) if name in table else unknown for name in variances
+    ]
+    return SpatialOdometry(stamp_s[keep], poses(table)[keep], np.stack(variance, axis=1)[keep], clock=clock)
+
+
+def true_poses(table: Table, clock: Clock, warnings: list[str]) -> Trajectory:
+    """Return the truth in a table of poses."""
+    stamp_s = forward_stamps(table)
+    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
+    pose = poses(table)[keep]
+    return Trajectory(stamp_s[keep], pose, np.zeros((len(pose), 6, 6)), frame="truth", clock=clock)
+
+
+def sensor_rows(table: Table, column: str, sensors: Sequence[SpatialSensor], file: str) -> IntArray:
+    """Return which of the sensors (R,) a column names.
+
+    Raises:
+        InputError: a name that `file` does not describe.
+    """
+    known = {sensor.name: row for row, sensor in enumerate(sensors)}
+    labels = table.labels(column)
+    unknown = next((row for row, label in enumerate(labels) if label not in known), None)
+    if unknown is not None:
+        hint = "one of " + ", ".join(known)
+        raise table.error(f"no {column} '{labels[unknown]}' in {file}", row=unknown, field=column, hint=hint)
+    return np.array([known[label] for label in labels], dtype=np.int64)
 
 
 def covariances(table: Table, names: tuple[str, ...], *, optional: bool = False) -> FloatArray | None:

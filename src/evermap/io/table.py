@@ -16,6 +16,7 @@ from evermap.io.text import clock_of_date, date_s, decode_text, parse_float, quo
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, landmark_id_of
 from evermap.valid import STAMP_S, Quantity
 
+ENDINGS = (".csv", ".csv.gz", ".parquet")
 _LARGEST_ID = 2**53
 """Whole numbers beyond this lose digits as float64, in which Parquet tables made by others often hold ids."""
 
@@ -170,6 +171,11 @@ class Table:
                 problem = f"{quote(cell)} has {'a' if other is Clock.UNIX else 'no'} zone, unlike the dates above"
                 raise self.error(problem, row=row, field=quantity.name, hint="a zone everywhere, or nowhere")
         return seconds
+
+
+def parse_table(data: bytes, path: Path, warnings: list[str]) -> Table:
+    """Return a table by the ending of its name: one of `ENDINGS`. Arguments and errors as `parse_csv`."""
+    return parse_parquet(data, path) if path.name.endswith(".parquet") else parse_csv(data, path, warnings)
 
 
 def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:

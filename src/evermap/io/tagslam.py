@@ -18,12 +18,13 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.geometry import se3
-from evermap.io.assemble import SAME_STAMP_S, finish_recording, forward_stamps, last_of_equal
+from evermap.io.assemble import SAME_STAMP_S, finish_recording, forward_stamps
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.landmarks import landmarks_from_table
+from evermap.io.native_space import CORNERS
 from evermap.io.rosbag import BAG_ENDINGS, MOST_HAMMING, TagSightings, read_tag_bag
-from evermap.io.spatial import of_rig, poses, spatial_detections, with_tag_poses
-from evermap.io.table import Table, parse_csv, parse_parquet
+from evermap.io.spatial import of_rig, posed_odometry, sensor_rows, spatial_detections, true_poses, with_tag_poses
+from evermap.io.table import ENDINGS, Table, parse_table
 from evermap.io.tag_maps import map_of_survey, pose_of
 from evermap.io.text import counted
 from evermap.io.yaml import parse_yaml
@@ -31,7 +32,6 @@ from evermap.types import (
     Clock,
     FloatArray,
     Frames,
-    IntArray,
     Landmarks,
     SpatialOdometry,
     SpatialRecording,
@@ -44,8 +44,6 @@ _MOST_TAGS = 100_000
 """Maximum tags of a board: no tag family has more."""
 
 CAMERAS, CAMERA_POSES, SETTINGS = "cameras.yaml", "camera_poses.yaml", "tagslam.yaml"
-_ENDINGS = (".csv", ".csv.gz", ".parquet")
-_CORNERS = tuple(f"{axis}{corner}_px" for corner in range(4) for axis in "uv")
 _VARIANCES = ("cxx", "cyy", "czz", "crr", "cpp", "cww")
 _MODELS = {"equidistant": "equidistant", "radtan": "radtan", "plumb_bob": "radtan", "pinhole": "pinhole"}
 
@@ -112,7 +110,7 @@ def is_tagslam(files: FileSet) -> bool:
 
 
 def _has_detections(files: FileSet) -> bool:
-    return any(f"detections{ending}" in files for ending in _ENDINGS)
+    return any(f"detections{ending}" in files for ending in ENDINGS)
 
 
 def _only_bag(files: FileSet) -> Path | None:
@@ -260,15 +258,15 @@ def _sizes(files: FileSet, bodies: Mapping[str, dict[str, Any]], default_body: A
 def _sightings(files: FileSet, setup: TagRig, warnings: list[str]) -> TagSightings:
     table = _table(files, "detections", warnings)
     assert table is not None
-    table.expect(("stamp_s", "camera", "tag_id", *_CORNERS), tuple(table.columns))
-    corner = np.stack([table.numbers(Quantity(name, -1e6, 1e6, hint="pixels")) for name in _CORNERS], axis=1)
+    table.expect(("stamp_s", "camera", "tag_id", *CORNERS), tuple(table.columns))
+    corner = np.stack([table.numbers(Quantity(name, -1e6, 1e6, hint="pixels")) for name in CORNERS], axis=1)
     stamp_s = forward_stamps(table)
     frames = _table(files, "frames", warnings)
     count = len(table)
     return TagSightings(
         looked_s=stamp_s if frames is None else forward_stamps(frames),
         stamp_s=stamp_s,
-        camera=_camera_rows(table, setup),
+        camera=sensor_rows(table, "camera", setup.sensors, CAMERAS),
         tag_id=table.ids("tag_id", optional=False),
         hamming=table.ids("hamming", optional=False) if "hamming" in table else np.zeros(count, dtype=np.int64),
         corner_px=corner.reshape(-1, 4, 2),
@@ -277,39 +275,18 @@ def _sightings(files: FileSet, setup: TagRig, warnings: list[str]) -> TagSightin
     )
 
 
-def _camera_rows(table: Table, setup: TagRig) -> IntArray:
-    known = {sensor.name: row for row, sensor in enumerate(setup.sensors)}
-    labels = table.labels("camera")
-    row = next((row for row, label in enumerate(labels) if label not in known), None)
-    if row is not None:
-        hint = "one of " + ", ".join(known)
-        raise table.error(f"no camera '{labels[row]}' in {CAMERAS}", row=row, field="camera", hint=hint)
-    return np.array([known[label] for label in labels], dtype=np.int64)
-
-
 def _odometry(files: FileSet, warnings: list[str]) -> SpatialOdometry | None:
     table = _table(files, "odometry", warnings)
     if table is None:
         return None
     if len(table) == 0:
         raise DataError("contains no odometry", path=table.path)
-    stamp_s = forward_stamps(table)
-    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
-    unknown = np.full(len(table), np.nan)
-    variance = [
-        table.numbers(Quantity(name, 0.0, 1e12, optional=True)) if name in table else unknown for name in _VARIANCES
-    ]
-    return SpatialOdometry(stamp_s[keep], poses(table)[keep], np.stack(variance, axis=1)[keep], clock=Clock.UNIX)
+    return posed_odometry(table, _VARIANCES, Clock.UNIX, warnings)
 
 
 def _reference(files: FileSet, warnings: list[str]) -> Trajectory | None:
     table = _table(files, "reference", warnings)
-    if table is None or len(table) == 0:
-        return None
-    stamp_s = forward_stamps(table)
-    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
-    pose = poses(table)[keep]
-    return Trajectory(stamp_s[keep], pose, np.zeros((len(pose), 6, 6)), frame="truth", clock=Clock.UNIX)
+    return None if table is None or len(table) == 0 else true_poses(table, Clock.UNIX, warnings)
 
 
 def _survey(files: FileSet, warnings: list[str]) -> Landmarks | None:
@@ -320,11 +297,8 @@ def _survey(files: FileSet, warnings: list[str]) -> Landmarks | None:
 
 
 def _table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
-    file = next((f"{name}{ending}" for ending in _ENDINGS if f"{name}{ending}" in files), None)
-    if file is None:
-        return None
-    data, path = files.read(file), files.path_of(file)
-    return parse_parquet(data, path) if file.endswith(".parquet") else parse_csv(data, path, warnings)
+    file = next((f"{name}{ending}" for ending in ENDINGS if f"{name}{ending}" in files), None)
+    return None if file is None else parse_table(files.read(file), files.path_of(file), warnings)
 
 
 def _yaml(files: FileSet, name: str) -> dict[str, Any]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from evermap.errors import InputError
 from evermap.types import Clock
@@ -55,6 +57,20 @@ def clock_of_date(cell: str) -> Clock | None:
         return Clock.UNIX if datetime.fromisoformat(cell.strip()).tzinfo else Clock.LOCAL_WALL
     except ValueError:
         return None
+
+
+def parse_json(data: bytes, path: Path, **how: Any) -> Any:
+    """Return a JSON document; arguments as of `json.loads`.
+
+    Raises:
+        InputError: it is none.
+    """
+    try:
+        return json.loads(decode_text(data, path), **how)
+    except json.JSONDecodeError as error:
+        raise InputError(f"not valid JSON: {error.msg}", path=path, line=error.lineno) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"not valid JSON: {reason(error)}", path=path) from None
 
 
 def counted(count: int, noun: str) -> str:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from evermap.errors import DataError, InputError
+from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.io.assemble import check_forward, last_of_equal
-from evermap.io.files import unpacked, write_atomic
+from evermap.io.files import content_of, write_atomic
 from evermap.io.rows import Rows, parse_rows
 from evermap.io.spatial import unit
-from evermap.types import Clock, Trajectory
+from evermap.types import Clock, FloatArray, Trajectory
 from evermap.valid import QUATERNION, STAMP_S, X_M, Y_M, Z_M
 
 _COLUMNS = (STAMP_S, X_M, Y_M, Z_M, *QUATERNION)
@@ -53,23 +53,28 @@ def read_tum(
         DataError: it contains no pose.
     """
     path = Path(path)
-    try:
-        data = unpacked(path.read_bytes(), path)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
-    rows = pose_rows(data, path, [])
-    if len(rows) == 0:
-        raise DataError("contains no pose", path=path)
-    check_forward(rows.column(0), path=path, line=rows.line)
-    values = rows.values[last_of_equal(rows.column(0), path=path, warnings=[])]
-    stamps = np.ascontiguousarray(values[:, 0])
+    rows = pose_rows(content_of(path), path, [])
+    stamps, pose = poses_in_order(rows, [])
     if in_space:
-        pose = np.ascontiguousarray(values[:, 1:])
-        return Trajectory(stamps, pose, np.zeros((len(values), 6, 6)), frame=frame, clock=clock)
-    qx, qy, qz, qw = values[:, 4:].T
+        return Trajectory(stamps, pose, np.zeros((len(pose), 6, 6)), frame=frame, clock=clock)
+    qx, qy, qz, qw = pose[:, 3:].T
     theta = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy**2 + qz**2))
-    pose = np.stack([values[:, 1], values[:, 2], theta], axis=1)
-    return Trajectory(stamps, pose, np.zeros((len(values), 3, 3)), frame=frame, clock=clock)
+    planar = np.stack([pose[:, 0], pose[:, 1], theta], axis=1)
+    return Trajectory(stamps, planar, np.zeros((len(pose), 3, 3)), frame=frame, clock=clock)
+
+
+def poses_in_order(rows: Rows, warnings: list[str]) -> tuple[FloatArray, FloatArray]:
+    """Return stamps (N,) and poses (N, 7) of the rows of a TUM file; `warnings` counts repeated stamps.
+
+    Raises:
+        InputError: time runs backwards.
+        DataError: there is no pose.
+    """
+    if len(rows) == 0:
+        raise DataError("contains no pose", path=rows.path)
+    check_forward(rows.column(0), path=rows.path, line=rows.line)
+    values = rows.values[last_of_equal(rows.column(0), path=rows.path, warnings=warnings)]
+    return np.ascontiguousarray(values[:, 0]), np.ascontiguousarray(values[:, 1:])
 
 
 def pose_rows(data: bytes, path: Path, warnings: list[str], *, zeros: bool = False) -> Rows:

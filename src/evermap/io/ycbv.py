@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from evermap.errors import DataError, InputError
+from evermap.errors import InputError
 from evermap.geometry import se3
-from evermap.io.assemble import SAME_STAMP_S, check_forward, finish_recording, last_of_equal
+from evermap.io.assemble import SAME_STAMP_S, finish_recording
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.rows import Rows
 from evermap.io.spatial import spatial_detections
 from evermap.io.text import counted
-from evermap.io.tum import pose_rows
+from evermap.io.tum import pose_rows, poses_in_order
 from evermap.types import (
     FloatArray,
     Frames,
@@ -58,7 +58,7 @@ def read_ycbv(path: str | Path, robot: int | None = None) -> SpatialRecording:
     warnings: list[str] = []
     names = sorted(match[1] for name in files.members if (match := _DETECTIONS.fullmatch(name)))
     rows = pose_rows(*_file(files, "odometry"), warnings)
-    stamp_s, pose = _in_order(rows, warnings)
+    stamp_s, pose = poses_in_order(rows, warnings)
     truth = _trajectory(files, "camera_truth", warnings)
     recording = SpatialRecording(
         name=f"YCB-Video {files.title}",
@@ -91,19 +91,10 @@ def _file(files: FileSet, name: str) -> tuple[bytes, Path]:
     return files.read(file), files.path_of(file)
 
 
-def _in_order(rows: Rows, warnings: list[str]) -> tuple[FloatArray, FloatArray]:
-    """Stamps (N,) and poses (N, 7)."""
-    if len(rows) == 0:
-        raise DataError("contains no pose", path=rows.path)
-    check_forward(rows.column(0), path=rows.path, line=rows.line)
-    values = rows.values[last_of_equal(rows.column(0), path=rows.path, warnings=warnings)]
-    return np.ascontiguousarray(values[:, 0]), np.ascontiguousarray(values[:, 1:])
-
-
 def _trajectory(files: FileSet, name: str, warnings: list[str]) -> Trajectory | None:
     if _name(files, name) is None:
         return None
-    stamp_s, pose = _in_order(pose_rows(*_file(files, name), warnings), warnings)
+    stamp_s, pose = poses_in_order(pose_rows(*_file(files, name), warnings), warnings)
     return Trajectory(stamp_s, pose, np.zeros((len(pose), 6, 6)), frame="truth")
 
 

@@ -13,7 +13,7 @@ from evermap.config import Config, LivingConfig
 from evermap.live.inbox import LiveFrame
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.looks import Sighting
-from evermap.maps.sessions.so_far import judged_so_far, lives_of
+from evermap.maps.sessions.session import judged_so_far, lives_of
 from evermap.maps.vicinity import Vicinity, near
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import Located

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from evermap.survival.base import LifetimePrior
-from evermap.survival.general_purpose import GeneralPurpose
+from evermap.survival.families import GeneralPurpose
 from evermap.types import UNKNOWN, FloatArray, IntArray
 
 DAY_S = 86_400.0

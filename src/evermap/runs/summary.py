@@ -6,7 +6,6 @@ Everything outside of `timing` and `versions` is a function of the inputs and th
 from __future__ import annotations
 
 import json
-import math
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from evermap import __version__
-from evermap.types import AnyRecording, ChangeKind, MapChange, ParameterEstimate, SlamResult, json_number
+from evermap.types import AnyRecording, ChangeKind, MapChange, ParameterEstimate, SlamResult, json_number, or_nan
 
 SUMMARY_SCHEMA_VERSION = "2"
 """Of `summary.json` of all verbs and studies. 2: `config` holds sections; `version` and `input` for all."""
@@ -181,18 +180,14 @@ def change_of(content: Mapping[str, Any]) -> MapChange:
     Raises:
         LookupError, ValueError, TypeError: they are others.
     """
-
-    def number(value: float | None) -> float:
-        return math.nan if value is None else float(value)
-
     return MapChange(
         landmark_ids=tuple(map(int, content["landmarks"])),
         kind=ChangeKind(content["kind"]),
-        stamp_from_s=number(content["stamp_from_s"]),
-        stamp_to_s=number(content["stamp_to_s"]),
-        displacement_m=tuple(map(number, content["displacement_m"])),
-        rotation_rad=number(content["rotation_rad"]),
-        probability=number(content["probability"]),
+        stamp_from_s=or_nan(content["stamp_from_s"]),
+        stamp_to_s=or_nan(content["stamp_to_s"]),
+        displacement_m=tuple(map(or_nan, content["displacement_m"])),
+        rotation_rad=or_nan(content["rotation_rad"]),
+        probability=or_nan(content["probability"]),
         n_hits=int(content["hits"]),
         n_misses=int(content["misses"]),
         names=tuple(content["names"] or ()),

@@ -1,14 +1,12 @@
 """Lifetime priors: how long features stay (MATH.md section 1, Rosen 2016 section V)."""
 
 from evermap.survival.base import LifetimePrior, Seed
-from evermap.survival.families import Exponential, Gamma, LogNormal, Uniform, Weibull
-from evermap.survival.general_purpose import GeneralPurpose
+from evermap.survival.families import Exponential, Gamma, GeneralPurpose, LogNormal, Mixture, Uniform, Weibull
 from evermap.survival.hazards import (
     PeriodicHazard,
     PiecewiseConstantHazard,
     gone_daily,
 )
-from evermap.survival.mixture import Mixture
 from evermap.survival.step import StepLifetime, never_leaves
 from evermap.survival.text import parse_prior
 

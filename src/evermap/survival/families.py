@@ -1,18 +1,25 @@
-"""Families of lifetimes in closed form: exponential, uniform, Weibull, log-normal and gamma."""
+"""Families of lifetimes: exponential, uniform, Weibull, log-normal, gamma, an unknown rate, and mixtures of them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.survival.base import Lifetime, SmoothLifetime, check_positive
-from evermap.survival.logmath import log_one_minus_exp, log_ratio
-from evermap.types import FloatArray
+from evermap.survival.base import Lifetime, LifetimePrior, Seed, SmoothLifetime, check_positive
+from evermap.survival.logmath import (
+    entire_exponential_integral,
+    gauss_legendre,
+    log_one_minus_exp,
+    log_ratio,
+    log_sum_exp,
+    scaled_e1,
+)
+from evermap.types import BoolArray, FloatArray
 
 
 class _OfPositives(Lifetime):
@@ -264,3 +271,167 @@ def _log_or_else(values: FloatArray, x: FloatArray, series: Callable[[FloatArray
     if tiny.any():
         result[tiny] = series(x[tiny])
     return result
+
+
+_NARROW = 2.0
+"""Below this `log(high / low)` the integral over the rate is taken numerically where its integrand is smooth."""
+
+
+@dataclass(frozen=True, slots=True)
+class GeneralPurpose(SmoothLifetime):
+    """`S(t) = (E1(low t) - E1(high t)) / log(high / low)`: an exponential whose rate is log-uniform.
+
+    Three forms, each where it keeps all digits, with `D(t) = int_low^high exp(-(rate - low) t) / rate d rate`:
+    quadrature over a narrow range of rates, `Ein` (E1 without its logarithm) for early times, scaled E1 for the rest.
+
+    Attributes:
+        low: smallest rate in 1/s, positive.
+        high: largest rate in 1/s, above `low`.
+    """
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        check_positive(self.low, "low")
+        check_positive(self.high, "high")
+        if not self.high > self.low:
+            raise ConfigError(f"rates must satisfy low < high, not {self.low!r} and {self.high!r}", field="high")
+
+    @classmethod
+    def from_mean_stays(cls, shortest_s: float, longest_s: float) -> Self:
+        """Return the prior of mean stays between `shortest_s` and `longest_s` seconds."""
+        check_positive(shortest_s, "shortest_s")
+        check_positive(longest_s, "longest_s")
+        return cls(1.0 / longest_s, 1.0 / shortest_s)
+
+    def mean(self) -> float:
+        return (self.high - self.low) / (self.low * self.high * self._span)
+
+    def sample(self, rng: Seed, size: int | tuple[int, ...] | None = None) -> FloatArray:
+        generator = np.random.default_rng(rng)
+        rate = self.low * np.exp(self._span * np.asarray(generator.random(size)))
+        return np.asarray(np.asarray(generator.standard_exponential(size)) / rate)[()]
+
+    @property
+    def _span(self) -> float:
+        """Return `log(high / low)`."""
+        return math.log1p((self.high - self.low) / self.low)
+
+    def _log_cumulative(self, t: FloatArray) -> FloatArray:
+        died = self._died(t)
+        late = self.low * t - (np.log(self._d(t)) - math.log(self._span))
+        return np.where(died < 0.5, np.log(-np.log1p(-np.minimum(died, 0.5))), np.log(late))
+
+    def _log_hazard(self, t: FloatArray) -> FloatArray:
+        # h = (exp(-low t) - exp(-high t)) / (t span S), both divided by exp(-low t)
+        later = log_one_minus_exp((self.high - self.low) * t) - np.log(t) - np.log(self._d(t))
+        return np.where(t > 0.0, later, math.log((self.high - self.low) / self._span))
+
+    def _is_smooth(self, t: FloatArray) -> BoolArray:
+        return np.asarray(((self.high - self.low) * t < 2.0) & (self._span < _NARROW))
+
+    def _died(self, t: FloatArray) -> FloatArray:
+        """Return `1 - S(t)`."""
+        wide = np.asarray(entire_exponential_integral(self.high * t) - entire_exponential_integral(self.low * t))
+        wide /= self._span
+        smooth = self._is_smooth(t)
+        if smooth.any():
+            wide[smooth] = -self._mean_over_rates(lambda rate: np.expm1(-rate * t[smooth][:, None]))
+        return wide
+
+    def _d(self, t: FloatArray) -> FloatArray:
+        """Return `S(t) span exp(low t)`."""
+        value = np.asarray(scaled_e1(self.low * t) - np.exp(-(self.high - self.low) * t) * scaled_e1(self.high * t))
+        early = self.high * t < 1.0
+        if early.any():
+            value[early] = np.exp(self.low * t[early]) * self._span * (1.0 - self._died(t[early]))
+        smooth = self._is_smooth(t)
+        if smooth.any():
+            value[smooth] = self._span * self._mean_over_rates(
+                lambda rate: np.exp(-(rate - self.low) * t[smooth][:, None])
+            )
+        return value
+
+    def _mean_over_rates(self, function: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Average a smooth function over the log-uniform rate; meaningless unless the range of rates is narrow."""
+        nodes, weights = gauss_legendre(24)
+        rate = self.low * np.exp(min(self._span, _NARROW) * nodes)
+        return np.asarray(function(rate) @ weights)
+
+
+@dataclass(frozen=True, slots=True)
+class Mixture(Lifetime):
+    """`S(t) = sum_i weights[i] S_i(t)`; every sum below is of positive terms, so nothing cancels.
+
+    Attributes:
+        components: the priors, at least one.
+        weights: their probabilities, positive, of sum 1.
+    """
+
+    components: tuple[LifetimePrior, ...]
+    weights: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.components) == 0 or len(self.components) != len(self.weights):
+            raise ConfigError(f"{len(self.components)} components need as many weights (at least one)", field="weights")
+        if not all(math.isfinite(w) and w > 0.0 for w in self.weights):
+            raise ConfigError(f"weights must be finite and positive, not {self.weights}", field="weights")
+        if abs(math.fsum(self.weights) - 1.0) > 1e-9:
+            raise ConfigError(f"weights must sum to 1, not {math.fsum(self.weights)!r}", field="weights")
+
+    @classmethod
+    def of(cls, components: Sequence[LifetimePrior], shares: Sequence[float]) -> Self:
+        """Mix priors in proportion to `shares`, which need not sum to 1."""
+        total = math.fsum(shares)
+        if not (math.isfinite(total) and total > 0.0):
+            raise ConfigError(f"shares must be positive, not {tuple(shares)}", field="shares")
+        return cls(tuple(components), tuple(share / total for share in shares))
+
+    @property
+    def p_never_leaves(self) -> float:
+        return math.fsum(w * c.p_never_leaves for w, c in zip(self.weights, self.components, strict=True))
+
+    def mean(self) -> float:
+        return sum(w * c.mean() for w, c in zip(self.weights, self.components, strict=True))
+
+    def sample(self, rng: Seed, size: int | tuple[int, ...] | None = None) -> FloatArray:
+        generator = np.random.default_rng(rng)
+        chosen = np.asarray(
+            generator.choice(len(self.weights), size=size, p=np.divide(self.weights, sum(self.weights)))
+        )
+        lifetime = np.empty(chosen.shape)
+        for index, component in enumerate(self.components):
+            mine = chosen == index
+            lifetime[mine] = component.sample(generator, int(mine.sum()))
+        return lifetime[()]
+
+    def _integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        weights = self._log_weights_at(a)
+        died = self._log_died(weights, a, b)
+        survival = [c.log_conditional_survival(a, b) for c in self.components]
+        lived = log_sum_exp(weights + np.stack(survival, axis=-1))
+        return np.where(died < math.log(0.5), -np.log1p(-np.exp(died)), np.maximum(-lived, 0.0))
+
+    def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        died = self._log_died(self._log_weights_at(a), a, b)
+        # Where 1 - q is tiny, H = 1 - q to the last digit, and only its logarithm may be representable.
+        return np.where(died < -40.0, died, np.log(self._integrated_hazard(a, b)))
+
+    def _log_hazard(self, t: FloatArray) -> FloatArray:
+        hazards = np.stack([np.log(c.hazard(t)) for c in self.components], axis=-1)
+        weights = self._log_weights_at(t)
+        # A component with S(t) = 0 has an infinite hazard, and weight 0.
+        alive = np.where(np.isneginf(weights), -np.inf, weights + hazards)
+        return np.where(np.isneginf(weights).all(axis=-1), np.inf, log_sum_exp(alive))
+
+    def _log_weights_at(self, t: FloatArray) -> FloatArray:
+        """Return log probabilities (..., components) given survival until `t`; all -inf if `S(t) = 0`."""
+        joint = np.stack([np.asarray(c.log_survival(t)) for c in self.components], axis=-1) + np.log(self.weights)
+        total = log_sum_exp(joint)
+        return np.where(np.isneginf(total)[..., None], -np.inf, joint - total[..., None])
+
+    def _log_died(self, weights: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+        died = log_sum_exp(weights + np.stack([c.log_conditional_death(a, b) for c in self.components], axis=-1))
+        void = np.isneginf(weights).all(axis=-1)
+        return np.where(void, np.where(a == b, -np.inf, 0.0), died)

@@ -23,9 +23,7 @@ from numpy.typing import ArrayLike
 from evermap.errors import ConfigError, DataError, NumericalError
 from evermap.survival.base import LifetimePrior, SurvivalEstimate, check_open_share
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.families import Exponential, Gamma, LogNormal, Weibull
-from evermap.survival.general_purpose import GeneralPurpose
-from evermap.survival.mixture import Mixture
+from evermap.survival.families import Exponential, Gamma, GeneralPurpose, LogNormal, Mixture, Weibull
 from evermap.survival.step import never_leaves
 from evermap.types import FloatArray
 

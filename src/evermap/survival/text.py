@@ -15,10 +15,8 @@ from typing import Any
 from evermap.errors import ConfigError, suggestion
 from evermap.survival.base import LifetimePrior
 from evermap.survival.durations import parse_duration_s, parse_hour, parse_number, parse_positive, parse_rate_hz
-from evermap.survival.families import Exponential, Gamma, LogNormal, Uniform, Weibull
-from evermap.survival.general_purpose import GeneralPurpose
+from evermap.survival.families import Exponential, Gamma, GeneralPurpose, LogNormal, Mixture, Uniform, Weibull
 from evermap.survival.hazards import PeriodicHazard, PiecewiseConstantHazard, gone_daily
-from evermap.survival.mixture import Mixture
 from evermap.survival.step import StepLifetime, never_leaves
 
 Values = Mapping[str, Any]

@@ -25,6 +25,7 @@ from evermap.tracking.frame import Frame
 from evermap.tracking.kalman import kernel, update
 from evermap.tracking.rows import (
     LEAST,
+    MISSED,
     believed,
     displacement,
     end_spell,
@@ -32,8 +33,8 @@ from evermap.tracking.rows import (
     reset_filter,
     settle,
     start_rest,
+    update_level,
 )
-from evermap.tracking.scores import MISSED, update_level
 from evermap.tracking.shape import update_shape
 from evermap.tracking.tracklets import (
     ALIVE,

@@ -73,12 +73,12 @@ class Tracker(Shown):
         scored: bool = False,
         priors: LifetimePrior | Sequence[LifetimePrior] | None = None,
     ) -> None:
-        from evermap.tracking import association, kalman, life, rows, scores, shape
+        from evermap.tracking import association, kalman, life, rows, shape
 
         if n_classes < 1:
             raise ConfigError(f"{n_classes} classes", field="n_classes", hint="at least 1")
         self._association, self._kalman, self._life, self._rows = association, kalman, life, rows
-        self._scores, self._shape = scores, shape
+        self._shape = shape
         self.settings = s = settings or TrackerConfig()
         self._n_classes, self._n_appearance = n_classes, n_appearance
         self._boxes, self._scored = boxes, scored
@@ -141,7 +141,7 @@ class Tracker(Shown):
             position_m: (M, 3) detected centroids, in the world.
             class_id: (M,) detected classes, `UNKNOWN` for none; all unknown where None.
             box: (M, 4) length, width, height [m] and heading in the world [rad], of a tracker of boxes.
-            p_real: (M,) probabilities by the detector's scores to be real (`scores.p_real_of`), nan for none.
+            p_real: (M,) probabilities by the detector's scores to be real (`frame.p_real_of`), nan for none.
             covariance_m2: (M, 3, 3) of the positions; the settings' noise where None.
             appearance: (M, A) vectors of any length, zeros where there is none.
             view: what can be seen. Without it all that is followed is in view, and nothing is learned about the
@@ -167,7 +167,7 @@ class Tracker(Shown):
     def followed(self) -> Followed:
         """Return the active tracklets after the last frame."""
         t, n = self._tracklets, self._n
-        p_real = self._scores.p_real(t, n, self._rules) if self._scored else 1.0
+        p_real = self._rows.p_real(t, n, self._rules) if self._scored else 1.0
         return Followed(
             stamp_s=self._stamp_s,
             track_id=t.track_id[:n].copy(),

@@ -29,8 +29,7 @@ from evermap.types import (
 )
 from evermap.viz.map_figure import class_names_of, moves
 from evermap.viz.panels import box_sizes, corners_of, landmark_poses, long_gaps, moved_map
-from evermap.viz.style import ALERT, ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, PAPER, class_looks
-from evermap.viz.track_figures import DYNAMIC, STATIC
+from evermap.viz.style import ALERT, DYNAMIC, ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, PAPER, STATIC, class_looks
 
 
 def require_rerun() -> None:

@@ -41,6 +41,8 @@ ONLINE = "#cc79a7"
 GROUP = "#882255"
 SKY = "#56b4e9"
 SAND = "#c8b560"
+STATIC, DYNAMIC = ESTIMATE, GROUP
+"""Blue, and wine instead of the thesis' purple, which colour-blind readers confuse with blue."""
 
 ROLES = {
     INK: ("ink", "#e7ebef"),

@@ -43,6 +43,14 @@ class Found:
     rotation_covariance: FloatArray | None = None
 
 
+def first_and_last(row: IntArray, stamp_s: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return (`count`,) the first and the last of the stamps of each row; inf and -inf where there is none."""
+    first, last = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(first, row, stamp_s)
+    np.maximum.at(last, row, stamp_s)
+    return first, last
+
+
 @dataclass(frozen=True, slots=True)
 class Extended:
     """The map with the session's sites, before its beliefs are updated.
@@ -62,6 +70,13 @@ class Extended:
     place: IntArray
     p_start: FloatArray
     is_new: BoolArray
+
+    def places_of(self, landmark_id: IntArray) -> IntArray:
+        """Return (N,) rows of the map's places at which landmarks stand, -1 for those that the session has not."""
+        place = np.full(len(landmark_id), -1, dtype=np.int64)
+        _, here, there = np.intersect1d(landmark_id, self.landmark_id, return_indices=True)
+        place[here] = self.place[there]
+        return place
 
 
 def extended(living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig, drift_m: float) -> Extended:

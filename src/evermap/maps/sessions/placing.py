@@ -66,6 +66,15 @@ class Laid:
         return replace(self, place=place, assumed=np.zeros(len(place), dtype=np.bool_))
 
 
+def places_in(where: Laid | None, landmark_id: IntArray) -> tuple[IntArray, FloatArray]:
+    """Return (N,) places of landmarks of a session, and their probabilities; -1 and 1 for those that have none."""
+    place, probability = np.full(len(landmark_id), -1, dtype=np.int64), np.ones(len(landmark_id))
+    if where is not None:
+        _, here, there = np.intersect1d(landmark_id, where.landmark_id, return_indices=True)
+        place[here], probability[here] = where.place[there], where.probability[there]
+    return place, probability
+
+
 @dataclass(frozen=True, slots=True)
 class Localised(Generic[VisitT]):
     """A session in a map.

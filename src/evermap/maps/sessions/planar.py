@@ -14,7 +14,7 @@ from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap, Metres
 from evermap.maps.sessions import believe
-from evermap.maps.sessions.extend import Extended, Found
+from evermap.maps.sessions.extend import Extended, Found, first_and_last
 from evermap.maps.sessions.gaussian import (
     Size,
     drifted,
@@ -34,6 +34,7 @@ from evermap.maps.sessions.placing import (
     Localised,
     all_at_home,
     laid_over,
+    places_in,
     refitted,
     unbent,
     widened,
@@ -123,18 +124,13 @@ class PlanarVisit:
         detection, landmark = _inliers(visit, config.fit.inlier)
         stamps = visit.recording.frames.stamp_s[visit.recording.detections.frame[detection]]
         count = len(visit.prepared.landmark_id)
-        first, last = np.full(count, np.inf), np.full(count, -np.inf)
-        np.minimum.at(first, landmark, stamps)
-        np.maximum.at(last, landmark, stamps)
+        first, last = first_and_last(landmark, stamps, count)
         kind = np.full(count, UNKNOWN, dtype=np.int64)
         kind[landmark] = visit.recording.detections.class_id[detection]
         seen = np.flatnonzero(np.isfinite(last[own.row]))
         row = own.row[seen]
         names = visit.prepared.landmark_id[row]
-        place, probability = np.full(len(names), -1, dtype=np.int64), np.ones(len(names))
-        if where is not None:
-            _, here, there = np.intersect1d(names, where.landmark_id, return_indices=True)
-            place[here], probability[here] = where.place[there], where.probability[there]
+        place, probability = places_in(where, names)
         covariance = own.begun(seen, config.whole_places) if begins else of_places(own.covariance_m2, seen)
         body = np.full(len(names), UNKNOWN, dtype=np.int64)
         _, here, there = np.intersect1d(names, visit.recording.objects[:, 0], return_indices=True)
@@ -152,9 +148,7 @@ class PlanarVisit:
         frames = np.flatnonzero((stamps >= visit.start_s) & (stamps <= visit.end_s + 1e-9)).astype(np.int64)
         pose = trajectory.pose_world_robot[of_slam.rows_at(trajectory, recording, frames)]
         detection, landmark = _inliers(visit, config.fit.inlier)
-        place_of = np.full(len(prepared.landmark_id), -1, dtype=np.int64)
-        _, rows, found = np.intersect1d(prepared.landmark_id, entry.landmark_id, return_indices=True)
-        place_of[rows] = entry.place[found]
+        place_of = entry.places_of(prepared.landmark_id)
         _place_glimpsed(place_of, entry, visit, config.fit.glimpse_m)
         hit = place_of[landmark]
         frame = np.searchsorted(frames, recording.detections.frame[detection])

@@ -13,8 +13,8 @@ from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, Evidence, LivingMap, clique_rows
 from evermap.maps.sessions import believe, decide
-from evermap.maps.sessions.extend import Extended, Found, extended
-from evermap.maps.sessions.looks import PlaceLooks, arrivals, looked_at
+from evermap.maps.sessions.extend import Extended, Found, extended, first_and_last
+from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Sighting, Watch, arrivals, looked_at
 from evermap.maps.sessions.placing import Laid, Localised
 from evermap.maps.sessions.planar import PlanarVisit
 from evermap.maps.sessions.spatial import SpatialVisit
@@ -227,10 +227,7 @@ def believed(
         n_hits=living.places.n_hits + np.bincount(seen.place[hit], minlength=len(living.places)),
         n_misses=living.places.n_misses + np.bincount(seen.place[missed], minlength=len(living.places)),
     )
-    count = len(living.sites)
-    first, last = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(first, rows.site[hit], rows.stamp_s[hit])
-    np.maximum.at(last, rows.site[hit], rows.stamp_s[hit])
+    first, last = first_and_last(rows.site[hit], rows.stamp_s[hit], len(living.sites))
     sites = living.sites
     if config.existence:
         beliefs = believe.believed(living, entry.p_start, seen, sensor, config, start_s, end_s)
@@ -406,3 +403,41 @@ def _as_seen(living: LivingMap, hit_site: IntArray, last_s: FloatArray) -> Float
         p_here[mine] = 0.0
         p_here[mine[np.argmax(last_s[mine])]] = 1.0
     return p_here
+
+
+def judged_so_far(
+    living: LivingMap, sighting: Sighting, sensor: Sensor, config: LivingConfig, classes: ClassLives | None = None
+) -> tuple[LivingMap, tuple[MapChange, ...]]:
+    """Return the map with beliefs after a part of a drive, from the causal poses, and the changes since the last
+    report; without places that the map does not have yet, and bodies.
+
+    Args:
+        living: the map before it.
+        sighting: what was seen of its places.
+        sensor: of the robot.
+        config: which parts of the engine are on.
+        classes: how long things stay, as `lives_of` tells; None where nothing is known of it.
+    """
+    start_s, end_s = (max(float(stamp_s), living.stamp_s) for stamp_s in sighting.stamp_s[[0, -1]])
+    living = replace(living, sightlines=replace(living.sightlines, rules=config.sight))
+    aged = believe.aged(living, config, start_s)
+    living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
+    looks = config.looks.model_copy(update={"settled_s": min(config.looks.settled_online_s, config.looks.settled_s)})
+    config = config.model_copy(update={"looks": looks})
+    seen = looked_at(living, aged.p_here, Watch.of(sighting, living.places.position_m, sensor, looks), config)
+    none = np.zeros(0, dtype=np.int64)
+    entry = Extended(living, living, none, none, aged.p_here, np.zeros(len(living.sites), dtype=np.bool_))
+    now = believed(entry, seen, sensor, (start_s, end_s), config)
+    nowhere = Arrivals(none, np.zeros(0), np.zeros(0))
+    settings = config.decisions
+    after, changes = decide.decided(
+        living, now.living, seen, now.log_evidence, nowhere, start_s, classes, settings=settings
+    )
+    return after, tuple(change.named(after.landmark_names) for change in changes)
+
+
+def lives_of(living: LivingMap, config: LivingConfig) -> ClassLives | None:
+    """Return the lifetimes from the history of a map; None if nothing is learned or given."""
+    if not (config.learn_lifetimes and len(living.stays) and len(living.lives.looks_s)):
+        return None
+    return ClassLives.of(living.stays, living.lives, None, config.lifetimes)

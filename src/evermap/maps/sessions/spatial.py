@@ -18,10 +18,10 @@ from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.maps.living import EXISTS, Dated, LivingMap
 from evermap.maps.sessions.believe import aged
-from evermap.maps.sessions.extend import Extended, Found
+from evermap.maps.sessions.extend import Extended, Found, first_and_last
 from evermap.maps.sessions.gaussian import anchored, drifted
 from evermap.maps.sessions.looks import Watch
-from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, Turned, laid_over, widened
+from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, Turned, laid_over, places_in, widened
 from evermap.maps.sessions.witnessed import Witnessed
 from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.sensing import learned
@@ -176,18 +176,12 @@ class SpatialVisit:
         problem, place = self.optimum.smoother.problem, self.optimum.estimate.place
         names, count = self.landmark_id, len(place)
         good = np.flatnonzero(self.inlier >= settings.inlier)
-        laid = np.full(count, -1, dtype=np.int64)
-        probability, alone = np.ones(count), by_itself(self.optimum)
-        if where is not None:
-            _, here, there = np.intersect1d(names, where.landmark_id, return_indices=True)
-            laid[here], probability[here] = where.place[there], where.probability[there]
+        (laid, probability), alone = places_in(where, names), by_itself(self.optimum)
         least = np.where(laid >= 0, settings.sightings_in_place, settings.sightings)
         seen = np.bincount(problem.place[good], minlength=count) > 0
         row, rotation = self.told((self.n_fit >= least) & seen)
         stamps = self.recording.frames.stamp_s[self.recording.detections.frame[self.intake.used[good]]]
-        first, last = np.full(count, np.inf), np.full(count, -np.inf)
-        np.minimum.at(first, problem.place[good], stamps)
-        np.maximum.at(last, problem.place[good], stamps)
+        first, last = first_and_last(problem.place[good], stamps, count)
         at = se2.xy_rows(row, 3)
         position, covariance = place[row, :3] + alone.shift_m[row], alone.covariance_m2[np.ix_(at, at)]
         if where is None:
@@ -255,9 +249,7 @@ class SpatialVisit:
         views = views[self.located[0][views // n_sensors]]
         row, sensor = views // n_sensors, views % n_sensors
         eye = se3.compose(optimum.estimate.pose[row], optimum.estimate.mount(problem)[sensor])
-        place_of = np.full(len(problem.oriented), -1, dtype=np.int64)
-        _, here, there = np.intersect1d(self.landmark_id, entry.landmark_id, return_indices=True)
-        place_of[here] = entry.place[there]
+        place_of = entry.places_of(self.landmark_id)
         hit = np.flatnonzero((self.inlier >= config.fit.inlier) & (place_of[problem.place] >= 0) & np.isin(view, views))
         at = np.searchsorted(views, view[hit]), place_of[problem.place[hit]]
         return eye, sensor, self.intake.start_s + problem.stamp_s[row], at

@@ -16,7 +16,7 @@ from typing import Any
 
 from evermap.maps.store.content import Chunk, DamagedError, json_object, name_of, text_chunk
 from evermap.maps.store.protocol import Attachment, Provenance, Revision, RevisionKind
-from evermap.types import ChangeKind, MapChange
+from evermap.types import ChangeKind, MapChange, or_nan
 
 FORMAT, IN_SPACE = 1, 2
 """Of records; those with changes in space an older evermap cannot read."""
@@ -99,7 +99,7 @@ class Record:
     def revision(self, config: str) -> Revision:
         """Return it as a `Revision` of the history."""
         row = {**self.about, "kind": RevisionKind(self.about["kind"]), "config": config}
-        row |= {name: _or_nan(row[name]) for name in _MAY_BE_NAN}
+        row |= {name: or_nan(row[name]) for name in _MAY_BE_NAN}
         provenance = Provenance(**{item.name: row[item.name] for item in fields(Provenance)})
         told = {item.name: row[item.name] for item in fields(Revision) if item.name in row}
         counts = dict(Counter(change.kind for change in self.changes))
@@ -225,7 +225,7 @@ def _change_to_list(change: MapChange) -> list[Any]:
 
 def _change_from_list(values: Iterable[Any]) -> MapChange:
     kind, names, *numbers = values
-    from_s, to_s, *step_m, rotation_rad, probability, n_hits, n_misses = map(_or_nan, numbers)
+    from_s, to_s, *step_m, rotation_rad, probability, n_hits, n_misses = map(or_nan, numbers)
     if len(step_m) not in (2, 3):
         raise ValueError(f"a displacement of {len(step_m)} numbers")
     return MapChange(
@@ -252,7 +252,3 @@ def _hex(name: bytes | None) -> str | None:
 def _no_nan(value: float) -> float | None:
     """Of JSON, which has no nan."""
     return None if math.isnan(value) else float(value)
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else float(value)

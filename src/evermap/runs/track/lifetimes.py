@@ -5,7 +5,6 @@ Lifetimes are grouped by class or place; every estimator also gives a prior that
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from evermap.io.columns import Columns, csv_bytes, named, read_columns
 from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.text import prior_text
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, json_number
 from evermap.valid import X_M, Y_M, Quantity
 
 if TYPE_CHECKING:
@@ -314,7 +313,7 @@ def _npmle(data: CensoredLifetimes) -> LifetimeEstimate:
         "kkt_violation": fitted.kkt_violation,
         "iterations": fitted.iterations,
         "support_left": fitted.support_left.tolist(),
-        "support_right": _nulls(fitted.support_right),
+        "support_right": [*map(json_number, fitted.support_right)],
         "mass": fitted.mass.tolist(),
     }
     return _with_prior(NPMLE, fitted, fitted.prior(), numbers)
@@ -345,7 +344,7 @@ def _parametric(name: str, data: CensoredLifetimes) -> LifetimeEstimate:
         "aic": fitted.aic,
         "bic": fitted.bic,
         "parameters": dict(zip(fitted.names, fitted.parameters.tolist(), strict=True)),
-        "standard_errors": dict(zip(fitted.names, _nulls(fitted.standard_errors), strict=True)),
+        "standard_errors": dict(zip(fitted.names, map(json_number, fitted.standard_errors), strict=True)),
     }
     return _with_prior(fitted.kind, fitted, fitted.prior, numbers)
 
@@ -379,8 +378,3 @@ def _with_prior(
     name: str, fitted: Npmle | KaplanMeier | ParametricFit | HazardDraws, prior: LifetimePrior, numbers: dict[str, Any]
 ) -> LifetimeEstimate:
     return LifetimeEstimate(name, fitted, prior, prior_text(prior), numbers)
-
-
-def _nulls(values: FloatArray) -> list[float | None]:
-    """Replace infinities by null for JSON."""
-    return [value if math.isfinite(value) else None for value in values.tolist()]

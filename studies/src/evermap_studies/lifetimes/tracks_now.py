@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.types import BoolArray, FloatArray
-from evermap.viz.style import INK, MUTED, SHADE
-from evermap.viz.track_figures import DYNAMIC, STATIC
+from evermap.viz.style import DYNAMIC, INK, MUTED, SHADE, STATIC
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
