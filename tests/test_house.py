@@ -21,8 +21,8 @@ def tree_of(name: str) -> ast.Module:
     return ast.parse(MODULES[name].read_text(encoding="utf-8"))
 
 
-MOST_MODULES = 303
-MOST_LINES = 77_920
+MOST_MODULES = 296
+MOST_LINES = 77_493
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8

@@ -307,6 +307,24 @@ def test_errors_are_found_where_they_are():
         assert abs(found[name].value - value) < 3.5 * found[name].sigma
 
 
+def test_a_sensor_that_sits_elsewhere_is_found_there():
+    """Poses and map are as good as if the mount were stated right, which they are not where it is held."""
+    off = {"mount_forward_m": 0.2, "mount_left_m": -0.1}
+    recording = robot(SensorKind.STEREO, 0, **off)
+    result = run_slam(recording)
+    found = {parameter.name: parameter for parameter in result.parameters}
+    for name, value in off.items():
+        assert found[name].p_needed > 0.99
+        assert abs(found[name].value - value) < 3.5 * found[name].sigma
+    stated = replace(recording, sensor=replace(recording.sensor, mount_robot_sensor=(0.2, -0.1, 0.0)))
+    held = run_slam(recording, Config(slam={"calibration": {"fix": dict.fromkeys(off, 0.0)}}))
+    as_found, as_stated, as_held = (
+        evaluate_trajectory(each.trajectory, recording.truth).rmse_m for each in (result, run_slam(stated), held)
+    )
+    assert as_found < 1.2 * as_stated
+    assert as_held > 1.5 * as_stated
+
+
 def test_heading_is_that_of_the_sensor_as_stated():
     """What an estimate without calibration has; both readings are told."""
     recording = robot(SensorKind.LASER, 5, bearing_bias_rad=0.08)

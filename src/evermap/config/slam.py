@@ -446,6 +446,12 @@ class SlamConfig(Section):
         7.0, "an outlier is as likely as an inlier at a squared normalised residual of twice this", gt=0, le=50
     )
     fewest_sightings: Count = key(3, "fewest sightings that locate a landmark: one or two may have a wrong identity")
+    rejected_in_a_row: Count = key(
+        5, "sightings of a landmark in a row, rejected as outliers, from which another optimum is sought"
+    )
+    narrowing: tuple[Positive, ...] = key(
+        (10.0, 3.0), "noise of detections on the way to that optimum, as multiples of what it is"
+    )
     estimate_noise: bool = key(True, "learn noise levels from the recording; off: keep the nominal ones")
     odometry_noise_factor: Positive = key(1.0, "factor on the initial odometry noise, kept if estimate_noise is off")
     seed: int = key(0, "random seed", ge=0)

@@ -48,10 +48,6 @@ MOST_BREAKS = 8
 """Silences of the odometry after which the parts are laid over each other."""
 ELSEWHERE = 0.1
 """Motion (m or rad) of a part that the optimum near it does not take back."""
-REJECTED = 5
-"""Sightings of one landmark in a row that are rejected: no outliers that happen here and there."""
-WIDER = (10.0, 3.0)
-"""Noise of detections on the way back to them, in that of the sensor."""
 SLICES_A_FRAME = 3.0
 """Work on a relinearisation in every frame, in milliseconds of a usual core."""
 CAUGHT_UP_MS, OF_PAIR_MS = 0.15, 5e-4
@@ -272,7 +268,7 @@ class StreamingSlam:
             )
         smoother, estimate, fit = self._converged(problem, estimate, self._noise)
         if self._robust:
-            better = _readmitted(smoother, _rejoined(smoother, estimate, self._settings))
+            better = _readmitted(smoother, _rejoined(smoother, estimate, self._settings), self._settings)
             if better is not estimate:
                 smoother, estimate, fit = self._converged(problem, better, fit.noise)
         problem, estimate = self._ahead(problem, estimate)
@@ -290,7 +286,9 @@ class StreamingSlam:
             prior, states = problem.prior.averaged(p_needed, estimate.states, np.diag(marginals.states), worth)
             problem, estimate = replace(problem, prior=prior), replace(estimate, states=states)
             smoother, estimate, fit = self._converged(problem, estimate, fit.noise, near=smoother)
-            if self._robust and (better := _readmitted(smoother, estimate)) is not estimate:  # the states moved it far
+            if (
+                self._robust and (better := _readmitted(smoother, estimate, self._settings)) is not estimate
+            ):  # the states moved it far
                 smoother, estimate, fit = self._converged(problem, better, fit.noise, near=smoother)
         solved = self._optimum(smoother, problem, estimate, fit)
         return divided(solved, self._prior, p_needed, fit, revision, aligned=self._aligned)
@@ -641,7 +639,7 @@ def _rejoined(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> E
     return estimate
 
 
-def _readmitted(smoother: Smoother, estimate: Estimate) -> Estimate:
+def _readmitted(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> Estimate:
     """Return a better optimum where a landmark was rejected several times in a row, if narrowing noise leads to one.
 
     Where odometry alone led astray, the sightings that contradict it are rejected together, and none of them can pull
@@ -649,11 +647,11 @@ def _readmitted(smoother: Smoother, estimate: Estimate) -> Estimate:
     non-convexity: Yang et al. 2020, "Graduated Non-Convexity for Robust Spatial Perception").
     """
     problem = smoother.problem
-    if not _rejected_in_a_row(problem, smoother.inlier_probability(estimate) < 0.5):
+    if not _in_a_row(problem, smoother.inlier_probability(estimate) < 0.5, settings.rejected_in_a_row):
         return estimate
     other = estimate
     try:
-        for times in WIDER:
+        for times in settings.narrowing:
             noise = replace(smoother.noise, detection=times * smoother.noise.detection)
             wider = smoother.under(
                 noise, heavy=False, problem=replace(problem, sigma_given=times * problem.sigma_given)
@@ -665,12 +663,14 @@ def _readmitted(smoother: Smoother, estimate: Estimate) -> Estimate:
     return other if smoother.cost(other) < smoother.cost(estimate) - COST_SLACK else estimate
 
 
-def _rejected_in_a_row(problem: Problem, rejected: BoolArray) -> bool:
-    """Return whether `REJECTED` sightings of one landmark in a row are rejected; those of a pose in any order."""
+def _in_a_row(problem: Problem, rejected: BoolArray, count: int) -> bool:
+    """Return whether so many sightings of one landmark in a row are rejected; those of a pose in any order."""
     order = np.lexsort((problem.pose_row, problem.landmark_row))
     row, out = problem.landmark_row[order], rejected[order]
-    together = sliding_window_view(out, REJECTED).all(axis=1) if len(out) >= REJECTED else np.zeros(0, dtype=bool)
-    return bool(np.any(together & (row[REJECTED - 1 :] == row[: len(together)])))
+    if len(out) < count:
+        return False
+    together: BoolArray = np.all(sliding_window_view(out, count), axis=1)
+    return bool(np.any(together & (row[count - 1 :] == row[: len(together)])))
 
 
 def silent_links(problem: Problem, estimate: Estimate, loose_rad: float) -> BoolArray:

@@ -106,7 +106,7 @@ def associated(
     given = recording.detections
     nameless = replace(recording, detections=replace(given, landmark_id=np.zeros_like(given.landmark_id)))
     prepared = prepare(nameless, settings=settings.odometry)
-    # a few centimetres of its mount confuse nothing, a doubt about them would: gates get wider, in which others stand
+    # a few centimetres of the mount confuse nothing; a doubt about them would widen the gates
     problem = replace(prepared.problem, prior=prior.mounted_as_stated().without_scale())
     name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
     kind = np.column_stack([given.class_id, name])[prepared.used]
