@@ -25,7 +25,7 @@ def test_readings_follow_the_law_of_the_robots_states() -> None:
     assert recording.true_landmarks is not None
     at = np.column_stack([np.interp(frames, truth.stamp_s, column) for column in truth.pose_world_robot.T])
     place = recording.true_landmarks.position_m[seen.landmark_id - 1]
-    local = se2.transform(se2.inverse(at[seen.frame]), place)
+    local = se2.transform(se2.inverse(at[seen.frame]), place) - drawn.states[5:7]
     r, b = np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])
     a0, a1, a2, a3, b0 = drawn.states[:5]
     assert seen.range_m == pytest.approx(a0 + r * (1 + a1 + a2 * b + a3 * b**2), abs=2e-3)
@@ -38,10 +38,10 @@ def test_odometry_reports_the_motion_by_the_robots_states() -> None:
     assert recording.truth is not None
     pose, odometry = recording.truth.pose_world_robot, recording.odometry
     step = se2.between(pose[:-1], pose[1:])
-    assert recording.truth.stamp_s == pytest.approx(odometry.stamp_s - drawn.states[5])
+    assert recording.truth.stamp_s == pytest.approx(odometry.stamp_s - drawn.states[7])
     turn = step[:, 2] * ODOMETRY_HZ
-    assert odometry.angular_radps[:-1] * drawn.states[7] == pytest.approx(turn, abs=0.025)
-    forward = odometry.forward_mps[:-1] * drawn.states[6] - drawn.states[8] * np.abs(turn)
+    assert odometry.angular_radps[:-1] * drawn.states[9] == pytest.approx(turn, abs=0.025)
+    forward = odometry.forward_mps[:-1] * drawn.states[8] - drawn.states[10] * np.abs(turn)
     # the floor of the noise, 2 mm and 1 mrad a root of a second, stays
     assert np.abs(forward - step[:, 0] * ODOMETRY_HZ).max() < 0.06
     assert np.abs(forward - step[:, 0] * ODOMETRY_HZ).mean() < 0.015

@@ -20,7 +20,7 @@ def books(draw: st.DrawFn) -> tuple[Modes, Estimate]:
     landmark = np.array([*range(count), *extra])
     known = np.array(draw(st.lists(st.booleans(), min_size=len(landmark), max_size=len(landmark))))
     at = np.where(known[:, None], 1.0, np.nan) * np.ones((1, 2))
-    return Modes(landmark, count), Estimate(np.zeros((1, 3)), at, np.zeros(9))
+    return Modes(landmark, count), Estimate(np.zeros((1, 3)), at, np.zeros(11))
 
 
 @given(books())

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from evermap.slam.kernels import detection_residual, kernel
+from evermap.slam.filter_kernels import WIDTH
+from evermap.slam.kernels import N_SENSOR, N_STATES, detection_residual, kernel
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, between_rows
 from evermap.slam.streaming import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -216,7 +217,7 @@ def _distance_to(
 def _residual(
     problem: Problem, estimate: Estimate, m: int, at: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     pose = estimate.pose[problem.pose_row[m]]
     range_m, bearing_rad = problem.reading[m]
     detection_residual(pose, at, estimate.states, problem.mount, range_m, bearing_rad, e, jx, jl, jc)
@@ -238,13 +239,13 @@ def _distances(
     cov_cross: FloatArray,
     cov_shared: FloatArray,
 ) -> FloatArray:
-    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-    j, cov = np.zeros((2, 10)), np.zeros((10, 10))
+    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
+    j, cov = np.zeros((2, WIDTH)), np.zeros((WIDTH, WIDTH))
     out = np.zeros(len(place))
     for m in range(len(place)):
         i = pose_row[m]
         detection_residual(pose[i], landmark[place[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
-        for k in range(5):
+        for k in range(N_SENSOR):
             if not free[k]:
                 jc[:, k] = 0.0
         j[:, :3], j[:, 3:5], j[:, 5:] = jx, jl, jc
@@ -259,12 +260,12 @@ def _distances(
 def _joint_covariance(
     pose: int, place: int, cov_pose: FloatArray, cov_cross: FloatArray, cov_shared: FloatArray, out: FloatArray
 ) -> None:
-    """Compute the covariance (10, 10) of one pose, one place and the five sensor states, from `Marginals`."""
-    at_states = len(cov_shared) - 9
+    """Compute the covariance (12, 12) of one pose, one place and the seven sensor states, from `Marginals`."""
+    at_states = len(cov_shared) - N_STATES
     out[:3, :3] = cov_pose[pose]
-    for a in range(7):
+    for a in range(2 + N_SENSOR):
         row = 2 * place + a if a < 2 else at_states + a - 2
         for b in range(3):
             out[3 + a, b] = out[b, 3 + a] = cov_cross[pose, b, row]
-        for b in range(7):
+        for b in range(2 + N_SENSOR):
             out[3 + a, 3 + b] = cov_shared[row, 2 * place + b if b < 2 else at_states + b - 2]

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from evermap.slam.kernels import N_SENSOR
 from evermap.types import FloatArray, IntArray
 from evermap_studies.nielsen2024.selectors.compiled import detection_residual, kernel
 
@@ -30,7 +31,7 @@ def predict_rows(
 ) -> None:
     """Fill the fields of `likelihood.Predicted` where there is a mode; arguments as in `likelihood.Readings`."""
     h = np.zeros(2)
-    by_pose, by_landmark, by_states = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    by_pose, by_landmark, by_states = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     for row in range(len(landmark)):
         for k in range(mode.shape[1]):
             position = mode[landmark[row], k]
