@@ -14,6 +14,7 @@ import pytest
 from evermap import check_recording, run_session, run_slam
 from evermap.errors import DataError, InputError
 from evermap.io import list_robots, read_mrclam, read_recording, write_template
+from evermap.slam.calibration import SPECS
 from evermap.slam.check import USUAL, far_off
 from evermap.types import ParameterEstimate, Recording
 from evermap_studies.sim import BuildingConfig, simulate_building
@@ -259,3 +260,11 @@ def test_lists_become_arrays() -> None:
     same = readings(range_m=lambda r: r.tolist(), landmark_id=lambda i: i.astype(float).tolist())(recording)
     np.testing.assert_array_equal(same.detections.range_m, recording.detections.range_m)
     assert same.detections.landmark_id.dtype == np.int64
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.name)
+def test_every_state_that_is_far_off_has_a_cause(spec) -> None:
+    found = ParameterEstimate(spec.name, spec.mean + 1.0, 0.001, spec.mean, 0.01, spec.unit)
+    (told,) = far_off([found])
+    assert told.startswith(f"{spec.name} = ")
+    assert told.partition("prior of sensors: ")[2]

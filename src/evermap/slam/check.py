@@ -159,7 +159,9 @@ _CAUSES = {
     "odometry_turn_scale": "turn rates in another unit or with the wrong sign, or a wrong wheel base",
     "odometry_askew_rad": "the sensor's angle differs from [mount] theta_rad, or the robot drives at an angle to its "
     "front",
-    "odometry_turn_slip_m": "the sensor's position differs from [mount] x_m, y_m, or bearings have the wrong sign",
+    "mount_forward_m": "[mount] x_m is missing or wrong, or the odometry is that of another point than the base",
+    "mount_left_m": "[mount] y_m is missing or wrong, or the odometry is that of another point than the base",
+    "odometry_turn_slip_m": "bearings have the wrong sign, or turning costs this robot much of its speed",
 }
 
 
