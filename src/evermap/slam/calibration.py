@@ -252,6 +252,20 @@ class CalibrationPrior:
         believed = self.sigma[SLOPE] ** 2 / (self.sigma[SLOPE] ** 2 + self.sigma[FORWARD] ** 2)
         return float(believed if self.slope_share is None else self.slope_share)
 
+    def resized(self, states: FloatArray, factor: float) -> FloatArray:
+        """Return states (11,) that explain every reading as well where all lengths are so many times as long.
+
+        Those that are held stay, but the two that are only known as a product: range slope and odometer scale.
+        """
+        states = states.copy()
+        states[SLOPE] = (1.0 + states[SLOPE]) / factor - 1.0
+        states[FORWARD] *= factor
+        for state in (SLIP, AHEAD, ASIDE):
+            states[state] *= factor if self.free[state] else 1.0
+        for state in (SKEW, CURVATURE):
+            states[state] /= factor if self.free[state] else 1.0
+        return states
+
     def split_scale(
         self, states: FloatArray, covariance: FloatArray, others: tuple[tuple[float, float, float], ...] = ()
     ) -> tuple[FloatArray, FloatArray, float, float]:
@@ -268,17 +282,13 @@ class CalibrationPrior:
         """
         if not (self.shares_scale or others):
             return states, covariance, 1.0, 0.0
-        states, covariance = states.copy(), covariance.copy()
+        covariance = covariance.copy()
         if not others:  # the slope was held
             covariance[SLOPE] = covariance[:, SLOPE] = 0.0
         told = np.array([self.metre(states, covariance), *others])
         weight, spread = told[:, 2] / told[:, 2].sum(), 1.0 / told[:, 2].sum()
         log_slope, variance = float(weight @ told[:, 0]), spread + float(weight**2 @ told[:, 1])
-        states[SLOPE] = (1.0 + states[SLOPE]) * np.exp(log_slope) - 1.0
-        states[FORWARD] *= np.exp(-log_slope)
-        for state, power in ((SLIP, -1.0), (AHEAD, -1.0), (ASIDE, -1.0), (SKEW, 1.0), (CURVATURE, 1.0)):
-            if self.free[state]:
-                states[state] *= np.exp(power * log_slope)
+        states = self.resized(states, float(np.exp(-log_slope)))
         # the unobservable part keeps the prior's spread; the product has its own
         by_forward, by_slope = weight[0] * self._slope_share, weight[0] * (1.0 - self._slope_share)
         own, drives = covariance[SLOPE, SLOPE], covariance[FORWARD, FORWARD]

@@ -340,12 +340,8 @@ def detection_residual(
     j_states[0, 0], j_states[0, 1], j_states[0, 2], j_states[0, 3] = -1.0, -r, -r * b, -r * b * b
     j_states[1, 4] = -1.0
     # where the sensor sits moves it as the robot does, along the robot's axes
-    j_states[0, 5], j_states[0, 6], j_states[1, 5], j_states[1, 6] = (
-        j_pose[0, 0],
-        j_pose[0, 1],
-        j_pose[1, 0],
-        j_pose[1, 1],
-    )
+    for row in range(2):
+        j_states[row, 5], j_states[row, 6] = j_pose[row, 0], j_pose[row, 1]
 
 
 @kernel

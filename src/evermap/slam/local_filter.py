@@ -78,7 +78,7 @@ class LocalFilter:
         self.states = prior.mean.copy()
         """(11,) calibration states."""
         self.covariance = np.zeros((AT_PLACES, AT_PLACES))
-        """(12 + 2 K, 12 + 2 K) of pose, in its own frame, states, and places in K slots, zero in free ones."""
+        """(14 + 2 K, 14 + 2 K) of pose, in its own frame, states, and places in K slots, zero in free ones."""
         self.covariance[3:, 3:] = np.diag((prior.sigma * prior.free) ** 2)
         self.position = np.zeros((0, 2))
         """(L, 2) all places, those that wait as they were when they left; nan where one was never met."""

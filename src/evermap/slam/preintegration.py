@@ -70,9 +70,8 @@ class Preintegration:
                 rows = slice(first, first + len(stamp_s) - 1)
                 return Intervals(*(part[rows] for part in kept))
         n = len(stamp_s) - 1
-        room = Intervals(
-            np.empty((n, 3)), np.empty((n, 3, N_MOTION)), np.empty((n, N_NOISE, 3, 3)), np.empty((n, 3, 3))
-        )
+        noise = np.empty((n, N_NOISE, 3, 3))
+        room = Intervals(np.empty((n, 3)), np.empty((n, 3, N_MOTION)), noise, np.empty((n, 3, 3)))
         for first in range(0, n, A_SLICE):
             _integrate(stamp_s, *odometry, states, room, first, min(first + A_SLICE, n))
             yield min(A_SLICE, n - first) / A_SLICE

@@ -196,12 +196,8 @@ class Smoother:
         if not problem.prior.free.any():
             return np.ones(N_STATES)
         now, structure, with_states = self.linearised(estimate), self._structure_of(estimate), marginals.with_states
-        pose, place, states = (
-            with_states[: 3 * n].reshape(n, 3, N_STATES),
-            with_states[3 * n : -N_STATES],
-            with_states[-N_STATES:],
-        )
-        place = place.reshape(-1, 2, N_STATES)
+        pose, states = with_states[: 3 * n].reshape(n, 3, N_STATES), with_states[-N_STATES:]
+        place = with_states[3 * n : -N_STATES].reshape(-1, 2, N_STATES)
         driven, seen = now.values[: ODOMETRY * (n - 1)].reshape(-1, 3, OF_INTERVAL), self.detections(estimate)
         of_driven = (
             np.einsum("nra,nas->nrs", driven[..., :3], pose[:-1])

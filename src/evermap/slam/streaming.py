@@ -286,10 +286,10 @@ class StreamingSlam:
             prior, states = problem.prior.averaged(p_needed, estimate.states, np.diag(marginals.states), worth)
             problem, estimate = replace(problem, prior=prior), replace(estimate, states=states)
             smoother, estimate, fit = self._converged(problem, estimate, fit.noise, near=smoother)
-            if (
-                self._robust and (better := _readmitted(smoother, estimate, self._settings)) is not estimate
-            ):  # the states moved it far
-                smoother, estimate, fit = self._converged(problem, better, fit.noise, near=smoother)
+            if self._robust:  # means may lie so far from the estimate that true sightings are rejected on the way
+                better = _readmitted(smoother, estimate, self._settings)
+                if better is not estimate:
+                    smoother, estimate, fit = self._converged(problem, better, fit.noise, near=smoother)
         solved = self._optimum(smoother, problem, estimate, fit)
         return divided(solved, self._prior, p_needed, fit, revision, aligned=self._aligned)
 
@@ -453,9 +453,8 @@ class StreamingSlam:
             smoother = smoother.under(self._noise, heavy=True)
         marginals = yield from smoother.marginals_in_slices(estimate)
         if learn:
-            self._scale = (
-                1.0 if self._aligned else self._prior.split_scale(estimate.states, np.zeros((N_STATES, N_STATES)))[2]
-            )
+            unknown = np.zeros((N_STATES, N_STATES))
+            self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, unknown)[2]
         following = SessionFilter(self._problem, self._noise, robust=self._robust)
         following.restart(estimate, self._noise, self._problem, marginals)
         yield 1.0
@@ -649,18 +648,16 @@ def _readmitted(smoother: Smoother, estimate: Estimate, settings: SlamConfig) ->
     problem = smoother.problem
     if not _in_a_row(problem, smoother.inlier_probability(estimate) < 0.5, settings.rejected_in_a_row):
         return estimate
-    other = estimate
+    cost, other = smoother.cost(estimate), estimate
     try:
         for times in settings.narrowing:
             noise = replace(smoother.noise, detection=times * smoother.noise.detection)
-            wider = smoother.under(
-                noise, heavy=False, problem=replace(problem, sigma_given=times * problem.sigma_given)
-            )
-            other = wider.optimum(other, tolerance=NEAR)
+            wider = replace(problem, sigma_given=times * problem.sigma_given)
+            other = smoother.under(noise, heavy=False, problem=wider).optimum(other, tolerance=NEAR)
         other = smoother.optimum(other, tolerance=NEAR)
     except NumericalError:
         return estimate
-    return other if smoother.cost(other) < smoother.cost(estimate) - COST_SLACK else estimate
+    return other if smoother.cost(other) < cost - COST_SLACK else estimate
 
 
 def _in_a_row(problem: Problem, rejected: BoolArray, count: int) -> bool:

@@ -12,7 +12,7 @@ from references import log_group_prior, log_normal, random_covariance, static_ev
 from test_gain import gain_of
 
 from evermap.config import ChangesConfig
-from evermap.slam.calibration import FORWARD, SKEW, SLIP, SLOPE
+from evermap.slam.calibration import AHEAD, ASIDE, FORWARD, SKEW, SLIP, SLOPE
 from evermap.slam.changes.evidence import WindowEvidence, compare, in_sensor_metres, landmark_evidence
 from evermap.slam.problem import Estimate, Problem, independent
 
@@ -117,7 +117,7 @@ def test_range_slope_is_a_choice_of_metres(grow: float) -> None:
     pose[:, :2] = centre + grow * (pose[:, :2] - centre)
     states[SLOPE] = (1.0 + states[SLOPE]) / grow - 1.0
     states[FORWARD] *= grow
-    states[SLIP] *= grow
+    states[[AHEAD, ASIDE, SLIP]] *= grow
     states[SKEW : SKEW + 2] /= grow
     other = Estimate(pose, centre + grow * (truth.landmark - centre), states)
     ours, theirs = evidence_of(world, [0, 12, 24]), evidence_of(world, [0, 12, 24], other)

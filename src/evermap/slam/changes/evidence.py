@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
-from evermap.slam.calibration import FORWARD, SKEW, SLIP, SLOPE, CalibrationPrior
+from evermap.slam.calibration import SLOPE, CalibrationPrior
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
@@ -291,11 +291,7 @@ def in_sensor_metres(estimate: Estimate, prior: CalibrationPrior) -> Estimate:
     if prior.without_scale() is prior:
         return estimate
     grow = (1.0 + estimate.states[SLOPE]) / (1.0 + prior.mean[SLOPE])
-    states = estimate.states.copy()
-    states[SLOPE] = prior.mean[SLOPE]
-    states[FORWARD] *= grow
-    states[SLIP] *= grow
-    states[SKEW : SKEW + 2] /= grow
+    states = prior.resized(estimate.states, grow)
     centre = estimate.landmark[estimate.known].mean(axis=0)
     pose = estimate.pose.copy()
     pose[:, :2] = centre + grow * (pose[:, :2] - centre)
