@@ -195,6 +195,14 @@ def test_evidence_of_states_is_that_of_a_gaussian_by_brute_force():
     assert np.all(np.abs(needed(prior, states, covariance, np.full(11, 1e6))[free] - before) < 0.05)
 
 
+def test_the_gaussian_of_the_prior_has_the_variance_of_the_mixture():
+    prior = stated(kind=SensorKind.CAMERA)
+    rng = np.random.default_rng(0)
+    drawn = rng.normal(0.0, prior.sigma, (200_000, len(NAMES))) * (rng.random((200_000, len(NAMES))) < prior.p_needed)
+    assert prior.gaussian().sigma == pytest.approx(drawn.std(axis=0), rel=0.02)
+    assert prior.p_needed[NAMES.index("mount_left_m")] == 0.1
+
+
 def test_readings_that_repeat_themselves_are_worth_one():
     """Each detection four times over: the states look four times better known than they are."""
     world = make_world(41, n_poses=400, n_landmarks=12, prior=default_prior(range_slope=0.0))

@@ -297,8 +297,9 @@ class Engine:
 
     def _localizer(self, places: KnownPlaces, *, learn: bool) -> Localizer:
         settings, looks = self._config.slam, self._config.living.looks
-        believed = beliefs(self._sensor, settings)
-        return Localizer(places, self._sensor, *believed, settings=settings.localize, looks=looks, learn=learn)
+        prior, noise = beliefs(self._sensor, settings)
+        prior = prior.gaussian()
+        return Localizer(places, self._sensor, prior, noise, settings=settings.localize, looks=looks, learn=learn)
 
     def _places(self, living: LivingMap, stamp_s: float) -> KnownPlaces:
         rows = living.sighted_rows(aged(living, self._config.living, stamp_s).p_here)

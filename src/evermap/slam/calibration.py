@@ -225,6 +225,20 @@ class CalibrationPrior:
         return replace(self, free=free)
 
     @property
+    def p_needed(self) -> FloatArray:
+        """(11,) prior probability of each state to be another than stated."""
+        p = np.full(N_STATES, self.settings.p_needed)
+        p[: BEARING + 1], p[AHEAD : ASIDE + 1] = self.p_sensor, self.p_mount
+        return p
+
+    def gaussian(self) -> CalibrationPrior:
+        """Return the prior for an estimator that does not average over 'as stated' and 'drawn from this prior'.
+
+        Each state has the mean and variance of that mixture.
+        """
+        return replace(self, sigma=self.sigma * np.sqrt(self.p_needed))
+
+    @property
     def shares_scale(self) -> bool:
         """True where neither the range slope nor the forward scale is given, so that only their product shows."""
         return bool(self.free[SLOPE] and self.free[FORWARD])
@@ -389,9 +403,7 @@ def needed(prior: CalibrationPrior, states: FloatArray, covariance: FloatArray, 
     data = weaker[:, None] * data * weaker
     pull = data @ told
     every = np.array(list(product((False, True), repeat=len(free))))
-    p = np.full(N_STATES, prior.settings.p_needed)
-    p[: BEARING + 1], p[AHEAD : ASIDE + 1] = prior.p_sensor, prior.p_mount
-    p = p[free]
+    p = prior.p_needed[free]
     log_odds = np.log(p / (1.0 - p))
     # of those that are left out, one times one: no part of a determinant, and no pull
     whole = np.eye(len(free)) + data * (every[:, :, None] & every[:, None, :])

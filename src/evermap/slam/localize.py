@@ -75,7 +75,7 @@ class Localizer(Shown):
     Args:
         places: the map.
         sensor: limits, mounting and detection probability. Where it has no largest range, all of the map is expected.
-        prior: of the calibration states.
+        prior: of the calibration states, a Gaussian (`CalibrationPrior.gaussian`).
         noise: standard deviations of detections and odometry; they are not estimated.
         settings: when its place in the map is known, and when it is lost.
         looks: how soft the edges of the field of view are, and what is worth a look.

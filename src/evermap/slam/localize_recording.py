@@ -79,7 +79,7 @@ def localize(
     landmarks, places = _existing(landmarks, joint_m2)
     warm_up()
     localizer = Localizer(
-        places, recording.sensor, prior, noise, settings=config.slam.localize, looks=config.living.looks
+        places, recording.sensor, prior.gaussian(), noise, settings=config.slam.localize, looks=config.living.looks
     )
     frame = np.flatnonzero((stamps >= start_s) & (stamps <= odometry.stamp_s[-1]))
     run = _feed(localizer, recording, frame, drive, realtime=realtime, progress=progress)
