@@ -364,6 +364,9 @@ class SpaceConfig(Section):
     mount_sigma_rad: float = key(
         0.0, "standard deviation of the mounts' orientations [rad]; 0: exactly as stated", ge=0, le=3
     )
+    scale_sigma: float = key(
+        0.005, "standard deviation of the odometry's scale, where tags of known sizes tell it; 0: exact", ge=0, le=1
+    )
     delay_sigma_s: float = key(
         0.0, "standard deviation of the delay of the sensors' stamps [s]; 0: no delay", ge=0, le=10
     )
@@ -398,7 +401,9 @@ class SpaceConfig(Section):
     outlier_log_odds: tuple[Positive, Positive, Positive] = key(
         (10.5, 14.0, 16.0), "half the squared residual at which positions, poses and corners are as likely outliers"
     )
-    jump_log_odds: Positive = key(14.0, "the same of odometry, which may slip")
+    jump_log_odds: Positive = key(
+        28.0, "the same of odometry, which may slip: six numbers, each a hundred times as wide"
+    )
     inlier: Share = key(0.5, "inlier probability, or sum of such, from which something was seen")
     field_margin_rad: NotNegative = key(0.02, "a field of view is as wide as what was seen in it, and this wider [rad]")
     range_margin: float = key(1.1, "nothing is expected farther than this times the farthest", ge=1.0)

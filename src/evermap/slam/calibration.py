@@ -181,8 +181,7 @@ class CalibrationPrior:
         asked = self.free & ~np.isnan(p_needed)
         p, before = np.where(asked, np.clip(p_needed, self.settings.p_spare, 1.0), 1.0), 1.0 / self.sigma**2
         data = np.maximum(1.0 / np.where(self.free, variance, self.sigma**2) - before, 1e-9 * before)
-        told = data / worth
-        information = np.where(asked, data * ((told + before) / (p * told) - 1.0), before)
+        information = np.where(asked, narrowed(p, before, data, data / worth), before)
         prior = replace(self.spared(p_needed), sigma=1.0 / np.sqrt(information))
         share = np.where(prior.free, (data + before) / (data + information), 0.0)
         return prior, self.mean + share * (states - self.mean)
@@ -358,6 +357,20 @@ class CalibrationPrior:
         c, s = math.cos(askew), math.sin(askew)
         x, y = seated(mount, states)[:2].tolist()
         return np.array([x - c * x - s * y, y + s * x - c * y, -askew])  # turned about the sensor
+
+
+def narrowed(
+    p_needed: FloatArray | float, before: FloatArray | float, data: FloatArray | float, told: FloatArray | float
+) -> FloatArray:
+    """Return the information of a prior whose estimate is the mean over 'as stated' and 'drawn from a wider prior'.
+
+    Args:
+        p_needed: probability of the latter.
+        before: information of that prior.
+        data: of the readings, as the estimator has it.
+        told: of the readings, as far as their errors are independent.
+    """
+    return np.asarray(data * ((told + before) / (p_needed * told) - 1.0))
 
 
 def seated(mount: FloatArray, states: FloatArray) -> FloatArray:

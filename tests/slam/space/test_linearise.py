@@ -130,12 +130,14 @@ def test_jacobians_of_odometry_are_those_of_differences():
     increment = se3.retract(se3.between(pose[:1], pose[1:]), random.normal(0.0, 0.1, (1, 6)))
     sigma = random.uniform(0.1, 0.5, (1, 6))
 
-    def at(both):
-        values, weight = np.zeros(78), np.zeros(1)
-        linearise_odometry(both, increment, sigma, 1e9, False, values, weight)
-        return values.reshape(6, 13)
+    def at(both, log_scale=0.1):
+        values, weight = np.zeros(84), np.zeros(1)
+        linearise_odometry(both, increment, log_scale, sigma, 1e9, False, values, weight)
+        return values.reshape(6, 14)
 
     block = at(pose)
+    by_scale = (at(pose, 0.1 + STEP) - at(pose, 0.1 - STEP))[:, 13] / (-2.0 * STEP)
+    assert block[:, 12] == pytest.approx(by_scale, abs=1e-4)
     for row in range(2):
         for k in range(6):
             ends = []
@@ -143,7 +145,7 @@ def test_jacobians_of_odometry_are_those_of_differences():
                 moved, by = pose.copy(), np.zeros(6)
                 by[k] = sign * STEP
                 moved[row] = se3.retract(pose[row], by)
-                ends.append(-at(moved)[:, 12])
+                ends.append(-at(moved)[:, 13])
             assert block[:, 6 * row + k] == pytest.approx((ends[0] - ends[1]) / (2.0 * STEP), abs=1e-4)
 
 

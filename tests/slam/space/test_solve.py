@@ -9,7 +9,7 @@ import pytest
 from corridors import World, as_directions, tagged_corridor
 from scipy.spatial.transform import Rotation
 
-from evermap import run_slam
+from evermap import Config, run_slam
 from evermap.errors import DataError
 from evermap.metrics.summary import compare_with_truth
 from evermap.types import Landmarks, SlamResult, SpatialSensor, rows_of
@@ -44,6 +44,22 @@ def test_a_drive_with_odometry_is_mapped_from_scratch(seed):
     assert tags < 0.06
     assert result.trajectory.frame == "first_pose"
     assert result.landmarks.rotation is not None
+
+
+def test_a_wrong_metre_of_the_odometry_is_found_where_it_is_not_believed():
+    config, off, wrong = Config(slam={"space": {"scale_sigma": 0.03}}), [], []
+    for seed in range(6):
+        world = tagged_corridor(seed, drift=0.03)
+        odometry = world.recording.odometry
+        longer = replace(odometry, pose_world_robot=odometry.pose_world_robot * ([1.04] * 3 + [1.0] * 4))
+        recording = replace(world.recording, odometry=longer)
+        found = run_slam(recording, config)
+        scale = next(one for one in found.parameters if one.name == "odometry_scale")
+        off.append((scale.value * 1.04 - 1.0) / scale.sigma)
+        wrong.append([errors(one, world)[1] for one in (found, run_slam(recording))])
+    assert np.mean(np.square(off)) < 2.5
+    found, believed = np.median(wrong, axis=0)
+    assert found < 0.7 * believed
 
 
 def test_noise_levels_are_those_of_the_world():

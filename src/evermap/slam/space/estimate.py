@@ -73,11 +73,11 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
     trace = _traces(smoother, spread.of_factors, spread.of_factors_first)
     levels, before, start = noise.levels.copy(), noise.levels, begun.levels
     # odometry: its whitened residuals are in the right sides of its rows, with the root of their weights
-    block = now.values[: ODOMETRY * n_steps].reshape(n_steps, 6, 13)
+    block = now.values[: ODOMETRY * n_steps].reshape(n_steps, 6, 14)
     weight = now.odometry_weight
     if problem.driven and not problem.steady:  # how fast a robot may move is no noise that shows in how it did
         for level, rows in ((TRANSLATION, slice(0, 3)), (ROTATION, slice(3, 6))):
-            total = float((block[:, rows, 12] ** 2).sum() + trace[0][:, rows].sum())
+            total = float((block[:, rows, 13] ** 2).sum() + trace[0][:, rows].sum())
             count = 3.0 * float(weight.sum())
             levels[level] = _level(before[level], start[level], total, count, worth)
     of_detection = trace[1]

@@ -73,6 +73,7 @@ def prepare_space(
     oriented = np.zeros(len(landmark_id), dtype=np.bool_)
     oriented[place[some.kind != POINT]] = True
     driven = recording.odometry is not None
+    by_corners = np.count_nonzero(some.kind == CORNERS) > 0.5 * len(some.kind)
     driven_pose, increment = _driven(recording, stamps[pose_frame])
     problem = SpatialProblem(
         stamp_s=stamps[pose_frame] - stamps[pose_frame[0]],
@@ -97,6 +98,7 @@ def prepare_space(
         symmetries=symmetries,
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
         mount_sigma=np.tile(_mount_sigma(settings), (len(recording.sensors), 1)),
+        scale_sigma=settings.scale_sigma if driven and by_corners else 0.0,
         settings=settings,
     )
     return SpatialIntake(

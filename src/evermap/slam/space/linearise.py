@@ -25,8 +25,8 @@ ROWS = np.array([3, 6, 8])
 """Residuals of each."""
 STATES = 7
 """Numbers of a sensor's calibration: a twist of its mount, and seconds by which its stamps are late."""
-ODOMETRY = 78
-"""Numbers of an odometry factor: six rows by two poses and the right side."""
+ODOMETRY = 84
+"""Numbers of an odometry factor: six rows by two poses, its scale and the right side."""
 TRANSLATION, ROTATION, ACROSS, ALONG, ORIENTATION, PIXEL = range(6)
 """Rows of the noise levels."""
 BEHIND = 0.02
@@ -97,27 +97,39 @@ def weighed(squared: float, log_odds: float, n_rows: int, share: float, heavy: b
 
 @kernel
 def linearise_odometry(
-    pose: FloatArray, increment: FloatArray, sigma: FloatArray, log_odds: float, heavy: bool, values: FloatArray,
-    weight: FloatArray,
+    pose: FloatArray, increment: FloatArray, log_scale: float, sigma: FloatArray, log_odds: float, heavy: bool,
+    values: FloatArray, weight: FloatArray,
 ) -> float:  # fmt: skip
     """Linearise the odometry between consecutive poses.
 
     Args:
         pose: (N, 7) poses.
         increment: (N - 1, 7) measured motions.
+        log_scale: logarithm of true over measured distances. It divides the true ones: multiplied by it, those that are
+            measured would be found too long by their noise (errors in variables).
         sigma: (N - 1, 6) their standard deviations.
         log_odds: beyond which half of the squared residual makes a jump of the odometry.
         heavy: tails that never let go, while the estimate may be far off.
-        values: filled in: 6 rows by two poses and the right side each.
+        values: filled in: 6 rows by two poses, the scale and the right side each.
         weight: (N - 1,) filled in.
 
     Returns:
         Negative log likelihood, up to a constant.
     """
-    e, j1, j2 = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
-    cost, at = 0.0, 0
+    e, j1, j2, ahead = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(3)
+    cost, at, shrunk, measured = 0.0, 0, math.exp(-log_scale), pose.copy()
+    measured[:, :3] *= shrunk
     for i in range(len(increment)):
-        odometry_residual(pose[i], pose[i + 1], increment[i], e, j1, j2)
+        odometry_residual(measured[i], measured[i + 1], increment[i], e, j1, j2)
+        r = matrix_of(pose[i])
+        for a in range(3):
+            ahead[a] = 0.0
+            for b in range(3):
+                ahead[a] += r[3 * b + a] * (pose[i + 1, b] - pose[i, b])
+        for a in range(6):
+            for b in range(3):
+                j1[a, b] *= shrunk
+                j2[a, b] *= shrunk
         squared = 0.0
         for a in range(6):
             squared += (e[a] / sigma[i, a]) ** 2
@@ -128,8 +140,10 @@ def linearise_odometry(
             for b in range(6):
                 values[at + b] = scale * j1[a, b]
                 values[at + 6 + b] = scale * j2[a, b]
-            values[at + 12] = -scale * e[a]
-            at += 13
+            # a shorter motion leaves what its first pose leaves that is so much farther ahead
+            values[at + 12] = scale * (j1[a, 0] * ahead[0] + j1[a, 1] * ahead[1] + j1[a, 2] * ahead[2])
+            values[at + 13] = -scale * e[a]
+            at += 14
     return cost
 
 

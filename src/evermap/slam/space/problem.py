@@ -98,6 +98,7 @@ class SpatialProblem:
         symmetries: (P,) turns after which places look the same.
         mount: (S, 7) nominal poses of the sensors on the robot.
         mount_sigma: (S, 7) standard deviations of its twist and of the delay of the stamps [s]; 0 where exact.
+        scale_sigma: standard deviation of the logarithm of the odometry's scale; 0 where it is exact.
         prior: on places.
         start_sigma: (6,) how firmly the first pose is held where it is.
         settings: what is believed of sensors and of a map.
@@ -127,6 +128,7 @@ class SpatialProblem:
     mount_sigma: FloatArray
     prior: PlacePrior = field(default_factory=PlacePrior.none)
     steady: bool = False
+    scale_sigma: float = 0.0
     start_sigma: FloatArray = field(default_factory=lambda: np.full(6, 1e-4))
     settings: SpaceConfig = USUAL
 
@@ -201,11 +203,13 @@ class SpatialEstimate:
         pose: (N, 7) of the robot.
         place: (P, 7) of places; of points the orientation is the identity.
         state: (S, 7) twist of each sensor's mount, and delay of its stamps [s].
+        log_scale: logarithm of true distances over those of the odometry.
     """
 
     pose: FloatArray
     place: FloatArray
     state: FloatArray
+    log_scale: float = 0.0
 
     def mount(self, problem: SpatialProblem) -> FloatArray:
         """Return (S, 7) the sensors' poses on the robot."""

@@ -33,6 +33,7 @@ from evermap.types import (
 )
 
 MOUNT = "correction of the sensor's stated mount, or delay of its stamps"
+SCALE = "true distances over those of the odometry, by the sizes of tags"
 _LEVELS = {
     TRANSLATION: ("sigma_odometry_m", "m/sqrt(s)", "noise of the odometry's translation"),
     ROTATION: ("sigma_odometry_rad", "rad/sqrt(s)", "noise of the odometry's rotation"),
@@ -214,7 +215,8 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
         if has[row]
     ]
     border = told.solved.optimum.smoother.factorised(told.solved.optimum.now).border_covariance()
-    sigma = np.sqrt(np.diag(border)).reshape(-1, 7)
+    *of_sensors, of_scale = np.sqrt(np.diag(border))
+    sigma = np.reshape(of_sensors, (-1, 7))
     parts = [*((f"mount_{axis}_m", "m") for axis in "xyz"), *((f"mount_r{axis}_rad", "rad") for axis in "xyz")]
     parts += [("delay_s", "s")]
     for row, sensor in enumerate(told.recording.sensors):
@@ -224,6 +226,10 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
                 value = float(told.solved.optimum.estimate.state[row, column])
                 name, spread = f"{sensor.name}_{part}", float(sigma[row, column])
                 found.append(ParameterEstimate(name, value, spread, 0.0, prior, unit, meaning=MOUNT))
+    if problem.scale_sigma > 0.0:
+        scale = float(np.exp(told.solved.optimum.estimate.log_scale))
+        told_sigma, prior = scale * float(of_scale), problem.scale_sigma
+        found.append(ParameterEstimate("odometry_scale", scale, told_sigma, 1.0, prior, "", meaning=SCALE))
     return tuple(found)
 
 

@@ -1,6 +1,7 @@
 """Batch smoothing in space: damped Gauss-Newton on the sparse normal equations, and the covariances there.
 
-The border of the elimination tree are the sensors' mounts and delays, which all detections share.
+The border of the elimination tree are the sensors' mounts and delays, which all detections share, and the scale of the
+odometry.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import numpy as np
 
 from evermap.errors import NumericalError
 from evermap.geometry import se3
+from evermap.slam.space.drift import STRETCHES
 from evermap.slam.space.linearise import ODOMETRY, ROWS, STATES, linearise_odometry, linearise_sightings
 from evermap.slam.space.problem import NO_JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.sparse.elimination import Spread, curvature
@@ -57,7 +59,7 @@ class SpatialSmoother:
         self.problem = problem
         self._seen = problem.sightings
         self._velocity = problem.velocity
-        self._states = _information(problem.mount_sigma).ravel()
+        self._states = _information(np.append(problem.mount_sigma, problem.scale_sigma))
         self._start = np.array(around[0])
         self.system = self._structured(around)
         axis = problem.symmetries.axis
@@ -108,8 +110,8 @@ class SpatialSmoother:
         odometry = ODOMETRY * (n - 1)
         jump = problem.settings.jump_log_odds if problem.driven else NO_JUMP_LOG_ODDS
         cost = linearise_odometry(
-            estimate.pose, problem.increment, sigma, jump, heavy,
-            values[:odometry], odometry_weight,
+            estimate.pose, problem.increment, estimate.log_scale, sigma, jump, heavy, values[:odometry],
+            odometry_weight,
         )  # fmt: skip
         end = odometry + int(self._seen.first[-1])
         cost += linearise_sightings(
@@ -121,12 +123,12 @@ class SpatialSmoother:
         block = np.column_stack([root[:, None] * se3.right_jacobian_inverse(held), -root * held])
         values[end : end + 42] = block.ravel()
         cost += 0.5 * float(np.sum((root * held) ** 2)) + self._priors(estimate, values, end + 42)
-        off = estimate.state.ravel()
+        off = np.append(estimate.state, estimate.log_scale)
         cost += 0.5 * float(off @ (self._states * off))
         return SpatialLinear(values, weight, odometry_weight, residual, -self._states * off, float(cost))
 
     def factorised(self, now: SpatialLinear, damping: float = 0.0) -> Factorised:
-        """Eliminate everything but the sensors' states."""
+        """Eliminate everything but the sensors' states and the scale of the odometry."""
         tree = self.system.tree
         extra = np.zeros(tree.begin[-1])
         extra[6 * len(self.problem.stamp_s) : -len(self._states)] = HELD
@@ -148,6 +150,37 @@ class SpatialSmoother:
         """Return (N, 6, 6)."""
         n = len(self.problem.stamp_s)
         return spread.own[: 36 * n].reshape(n, 6, 6)
+
+    def scale_by_stretches(self, now: SpatialLinear) -> tuple[float, float]:
+        """Return the variance of the odometry's scale, and what one with correlated residuals has over it, at least 1.
+
+        As of the states in the plane (`slam.smoother.Smoother.worth`): what each stretch of the drive adds is summed
+        before it is squared.
+        """
+        problem, tree, seen = self.problem, self.system.tree, self._seen
+        n, with_scale = len(problem.stamp_s), self.spread(now).with_border[:, -1]
+        begin, odometry = tree.begin, ODOMETRY * (n - 1)
+        share = problem.stamp_s / max(problem.stamp_s[-1], 1e-9)
+        stretch = np.minimum((STRETCHES * share).astype(np.int64), STRETCHES - 1)
+        pose, scale = with_scale[: 6 * n].reshape(n, 6), with_scale[-1:]
+        by = np.hstack([pose[:-1], pose[1:], np.tile(scale, (n - 1, 1))])
+        rows = now.values[:odometry].reshape(n - 1, 6, 14)
+        told = np.einsum("nra,na->nr", rows[..., :-1], by)
+        pull, independent = np.bincount(stretch[:-1], (told * rows[..., -1]).sum(axis=1), STRETCHES), (told**2).sum()
+        for kind, rows_of_kind in enumerate(ROWS.tolist()):
+            for dim in (3, 6):
+                some = np.flatnonzero((seen.kind == kind) & (seen.oriented == (dim == 6)))
+                width = 14 + dim
+                at = odometry + seen.first[some][:, None] + np.arange(rows_of_kind * width)
+                rows = now.values[at].reshape(len(some), rows_of_kind, width)
+                place = begin[n + seen.place[some]][:, None] + np.arange(dim)
+                sensor = begin[n + len(problem.oriented) + seen.sensor[some]][:, None] + np.arange(STATES)
+                by = np.hstack([pose[seen.pose_row[some]], with_scale[place], with_scale[sensor]])
+                told = np.einsum("mra,ma->mr", rows[..., :-1], by)
+                independent += (told**2).sum()
+                pull += np.bincount(stretch[seen.pose_row[some]], (told * rows[..., -1]).sum(axis=1), STRETCHES)
+        found = (pull**2).sum() * STRETCHES / (STRETCHES - 1.0)
+        return float(scale[0]), max(float(found / independent), 1.0)
 
     def _priors(self, estimate: SpatialEstimate, values: FloatArray, at: int) -> float:
         """Fill in what the given map says; returns its cost."""
@@ -171,7 +204,7 @@ class SpatialSmoother:
         dims = np.where(problem.oriented, 6, 3)
         leaf_of_pose = np.minimum(np.arange(n), max(n - 2, 0)) // POSES_A_LEAF
         tied = [
-            np.column_stack([steps, steps + 1]),
+            np.column_stack([steps, steps + 1, np.full(n - 1, n + count + len(problem.mount))]),
             np.column_stack([problem.pose_row, n + problem.place, n + count + problem.sensor]),
             np.zeros((1, 1), dtype=np.int64),
             (n + prior)[:, None],
@@ -194,8 +227,8 @@ class SpatialSmoother:
         for axis in range(3):
             total = np.bincount(leaf_of_pose, around[:, axis], minlength=n_leaves)
             at[:, 1 + axis] = total / np.maximum(weight, 1)
-        dim = np.concatenate([np.full(n, 6), dims, np.full(len(problem.mount), STATES)])
-        border = n + count + np.arange(len(problem.mount))
+        dim = np.concatenate([np.full(n, 6), dims, np.full(len(problem.mount), STATES), [1]])
+        border = n + count + np.arange(len(problem.mount) + 1)
         return System(dim, factors, at, border)
 
     def _moved(self, estimate: SpatialEstimate, step: FloatArray) -> tuple[SpatialEstimate, float]:
@@ -215,8 +248,9 @@ class SpatialSmoother:
         on = problem.oriented
         place[on] = se3.retract(place[on], share * turned[on])
         place[~on, :3] += share * turned[~on, :3]
-        state = estimate.state + share * step[tree.begin[n + count] :].reshape(-1, STATES)
-        return SpatialEstimate(se3.retract(estimate.pose, share * by), place, state), size
+        state = estimate.state + share * step[tree.begin[n + count] : -1].reshape(-1, STATES)
+        log_scale = estimate.log_scale + share * float(step[-1])
+        return SpatialEstimate(se3.retract(estimate.pose, share * by), place, state, log_scale), size
 
 
 def _odometry_sigma(problem: SpatialProblem, noise: SpatialNoise) -> FloatArray:

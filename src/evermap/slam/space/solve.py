@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.geometry import se3
+from evermap.slam.calibration import narrowed
 from evermap.slam.space.against_map import MapComparison, compared
 from evermap.slam.space.drift import drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, first_places, oriented
@@ -89,6 +90,9 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)
     optimum = repaired(converged(problem, estimate, noise))
+    if problem.scale_sigma > 0.0:
+        optimum = _with_averaged_scale(optimum)
+        problem = optimum.smoother.problem
     if problem.driven and len(problem.prior.place):
         optimum = unjumped(optimum)
         problem = optimum.smoother.problem
@@ -105,6 +109,21 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     if len(stated):
         optimum, from_map = compared(optimum, stated)
     return SpatialSolved(optimum, identity, number, from_map, rows, stepwise.pose, spread, step_s)
+
+
+def _with_averaged_scale(optimum: SpatialOptimum) -> SpatialOptimum:
+    """Return the optimum at the mean over an exact odometer and one whose scale is drawn from its prior.
+
+    Both are as probable beforehand; see `slam.calibration.narrowed`.
+    """
+    problem, before = optimum.smoother.problem, optimum.smoother.problem.scale_sigma**-2
+    variance, worth = optimum.smoother.scale_by_stretches(optimum.now)
+    data = max(1.0 / variance - before, 1e-9 * before)
+    told, best = data / worth, optimum.estimate.log_scale / (data * variance)
+    log_odds = 0.5 * (told * best) ** 2 / (told + before) - 0.5 * np.log1p(told / before)
+    information = narrowed(1.0 / (1.0 + np.exp(-log_odds)), before, data, told)
+    sober = replace(problem, scale_sigma=float(information**-0.5))
+    return converged(sober, optimum.estimate, optimum.noise, heavy_rounds=0)
 
 
 def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[SpatialProblem, FloatArray, IntArray]:
