@@ -13,7 +13,7 @@ from evermap.config import LooksConfig
 from evermap.existence.sites import SiteLooks
 from evermap.maps.lives import EVERYWHERE, Life, Lives
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.looks import Arrivals, PlaceLooks, arrivals
+from evermap.maps.sessions.looks import Arrivals, PlaceLooks, arrivals, came_after
 from evermap.sensing.sightlines import HEADINGS, SightLines, Views, nominal_lines
 from evermap.survival import Exponential
 from evermap.types import UNKNOWN, FloatArray, Sensor
@@ -91,7 +91,22 @@ def test_the_last_session_that_looked_enough_counts() -> None:
     assert LEAST_EXPECTED > 2 * 0.8
     assert come(before, seen_from_m=EYE[:2]).looked_s.tolist() == [900.0]
     again = replace(a_map(), views=views_from(other, 5, 950.0, views_from(EYE, 9, 900.0)))
-    assert come(again, seen_from_m=EYE[:2]).looked_s.tolist() == [950.0]
+    assert come(again, seen_from_m=EYE[:2], stamp_s=400_000.0).looked_s.tolist() == [950.0]
+    soon = come(again, seen_from_m=EYE[:2])
+    assert soon.p_appeared[0] < 0.9  # then the first look counts, after which it is most probable
+    assert soon.looked_s.tolist() == [900.0]
+
+
+def test_looks_of_several_sessions_say_together_what_draws_say() -> None:
+    random, n = np.random.default_rng(2), 400_000
+    since_s, p_missed, p_always = MEAN_S * np.array([2.0, 1.2, 0.3]), np.array([0.3, 0.6, 0.4]), 0.2
+    age = random.exponential(MEAN_S, n)
+    there = age[:, None] > since_s
+    by_chance = random.random((n, 3)) < (p_missed - p_always) / (1.0 - p_always)
+    hidden = by_chance | (random.random((n, 1)) < p_always)
+    unseen = (~there | hidden).all(axis=1)
+    drawn = (~there[unseen]).mean(axis=0)
+    assert came_after(np.exp(-since_s / MEAN_S), p_missed, p_always) == pytest.approx(drawn, abs=0.005)
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,14 @@
 
 A hit is a look anywhere. A miss is a look only along a line of sight that is known to be clear.
 
-A landmark that the map did not know has appeared if its place was seen empty: an earlier session looked at it from
-where it is seen now, or past it at something behind. With `t` the time since that look and `S` the survival of its
-class in this place,
+A landmark that the map did not know has appeared if its place was seen empty: earlier sessions looked at it from where
+it is seen now, or past it at something behind. With `t` the time since one of them and `S` the survival of its class in
+this place, it came after it with odds
 
     odds(appeared) = (1 - S(t)) / S(t) / P(all looks missed it | it was there)
 
 since the age of what one comes upon is distributed as a stay is, if hazards are constant (which of them is what is not
-known of a class). Without a look the map grew, and nothing has changed.
+known of a class); several sessions are weighed together. Without a look the map grew, and nothing has changed.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from evermap.sensing.visibility import LooksAt, NominalField, looks_at
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 USUAL = LooksConfig()
+SURE = 0.9
+"""Probability with which something is told to have come after a look rather than after an earlier one."""
 ROUNDS = 5
 """Of expectation and maximisation, at most."""
 
@@ -263,7 +265,8 @@ class Arrivals:
 
     Attributes:
         site: (A,) row of the new site.
-        looked_s: (A,) last time before this session at which its place was looked at; -inf for never.
+        looked_s: (A,) the last look at its place before this session after which it came with probability `SURE`, else
+            the first look; -inf for never.
         p_appeared: (A,) probability that it came after that; 0 without a look.
         came: by row of a site, until when what was seen to come there was not there, and how probably it came.
         left_s: by row of a site, when what came there was seen to leave again.
@@ -311,15 +314,29 @@ def arrivals(
                 expected[stamp] = expected.get(stamp, 0.0) + float(frames[then] @ rate[then])
                 missed = float(frames[then] @ np.log1p(-rate[then])) / settings.sticky
                 log_missed[stamp] = log_missed.get(stamp, 0.0) + missed
-        enough = [stamp for stamp, number in expected.items() if number >= settings.least_expected]
-        if not enough:
+        enough = np.array(sorted(stamp for stamp, number in expected.items() if number >= settings.least_expected))
+        if not len(enough):
             continue
-        looked[k] = max(enough)
-        p_missed = p_hidden + (1.0 - p_hidden) * np.exp(log_missed[looked[k]])
+        p_missed = p_hidden + (1.0 - p_hidden) * np.exp([log_missed[stamp] for stamp in enough.tolist()])
         stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
-        young = -float(np.expm1(stay.log_survival(after.stamp_s - looked[k])))
-        p_appeared[k] = young / (young + (1.0 - young) * p_missed)
+        p_after = came_after(np.exp(stay.log_survival(after.stamp_s - enough)), p_missed, settings.lasting * p_hidden)
+        at = int(np.flatnonzero(p_after >= SURE).max(initial=0))
+        looked[k], p_appeared[k] = enough[at], p_after[at]
     return Arrivals(new, looked, p_appeared)
+
+
+def came_after(survival: FloatArray, p_missed: FloatArray, p_always: float) -> FloatArray:
+    """Return the (K,) probability that something came after each look at its place, all of which missed it.
+
+    Args:
+        survival: (K,) of the times since the looks, the oldest first: of the ages that it may have.
+        p_missed: (K,) probability of each miss if it was there.
+        p_always: the part of these that they have in common: that it was hidden in all of them.
+    """
+    came = np.diff(survival, prepend=0.0, append=1.0)  # before the first look, between two, after the last
+    by_chance = np.cumprod(((p_missed - p_always) / (1.0 - p_always))[::-1])[::-1]
+    weight = came * np.append(p_always + (1.0 - p_always) * by_chance, 1.0)
+    return np.asarray(np.cumsum(weight[::-1])[::-1][1:] / weight.sum())
 
 
 @dataclass(frozen=True, slots=True)
