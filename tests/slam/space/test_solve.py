@@ -10,8 +10,12 @@ from corridors import World, as_directions, tagged_corridor
 from scipy.spatial.transform import Rotation
 
 from evermap import Config, run_slam
+from evermap.config import SpaceConfig
 from evermap.errors import DataError
+from evermap.geometry import se3
 from evermap.metrics.summary import compare_with_truth
+from evermap.slam.space.intake import prepare_space
+from evermap.slam.space.solve import solve_space
 from evermap.types import Landmarks, SlamResult, SpatialSensor, rows_of
 
 
@@ -60,6 +64,41 @@ def test_a_wrong_metre_of_the_odometry_is_found_where_it_is_not_believed():
     assert np.mean(np.square(off)) < 2.5
     found, believed = np.median(wrong, axis=0)
     assert found < 0.7 * believed
+
+
+@pytest.mark.parametrize(("differs", "bounds"), [(0.0, (1.0, 2.5)), (0.04, (4.0, 100.0))])
+def test_a_scale_that_differs_along_the_drive_is_worth_little(differs, bounds):
+    world = tagged_corridor(1, drift=0.01)
+    odometry = world.recording.odometry
+    pose = odometry.pose_world_robot
+    step = se3.between(pose[:-1], pose[1:])
+    part = np.arange(len(step)) * 10 // len(step)
+    step[:, :3] *= 1.0 + differs * (-1.0) ** part[:, None]
+    driven = [pose[0]]
+    for one in step:
+        driven.append(se3.compose(driven[-1], one))
+    recording = replace(world.recording, odometry=replace(odometry, pose_world_robot=np.array(driven)))
+    optimum = solve_space(prepare_space(recording, SpaceConfig()), None).optimum
+    smoother = optimum.smoother
+    variance, worth = smoother.scale_by_stretches(optimum.now)
+    border = smoother.factorised(optimum.now).border_covariance()
+    assert variance == pytest.approx(border[-1, -1], rel=1e-9)
+    assert bounds[0] <= worth < bounds[1]
+
+
+def test_a_robot_that_stands_says_nothing_of_its_odometry():
+    world = tagged_corridor(2)
+    count = len(world.recording.frames)
+    seen = world.recording.detections
+    first = rows_of(seen, np.flatnonzero(seen.frame == seen.frame[0]))
+    many = np.repeat(np.arange(len(first)), count)
+    still = replace(rows_of(first, many), frame=np.tile(np.arange(count), len(first)))
+    still = rows_of(still, np.argsort(still.frame, kind="stable"))
+    odometry = world.recording.odometry
+    pose = np.tile(odometry.pose_world_robot[:1], (len(odometry), 1))
+    found = run_slam(replace(world.recording, detections=still, odometry=replace(odometry, pose_world_robot=pose)))
+    scale = next(one for one in found.parameters if one.name == "odometry_scale")
+    assert scale.value == pytest.approx(1.0, abs=1e-3)
 
 
 def test_noise_levels_are_those_of_the_world():

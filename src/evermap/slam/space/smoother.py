@@ -180,7 +180,7 @@ class SpatialSmoother:
                 independent += (told**2).sum()
                 pull += np.bincount(stretch[seen.pose_row[some]], (told * rows[..., -1]).sum(axis=1), STRETCHES)
         found = (pull**2).sum() * STRETCHES / (STRETCHES - 1.0)
-        return float(scale[0]), max(float(found / independent), 1.0)
+        return float(scale[0]), max(float(found / max(independent, 1e-300)), 1.0)
 
     def _priors(self, estimate: SpatialEstimate, values: FloatArray, at: int) -> float:
         """Fill in what the given map says; returns its cost."""
