@@ -147,7 +147,7 @@ def _joint(options: _Options) -> IntArray:
         if np.sum(rest != ELSEWHERE) >= 2 and (at := options.log_probability(rest)) > score:  # two tell the motion
             chosen, score = rest, at
         score += k * math.log(settings.p_coarser)
-        if score > highest:  # any may still be better: with more drift other bodies stay
+        if score > highest:  # the next may still be better: with more drift other bodies stay
             best, highest, drift_m = chosen, score, options.drift_m
     options.drift_m = drift_m
     return best
