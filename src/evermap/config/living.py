@@ -140,6 +140,7 @@ class LooksConfig(Section):
     together_m: NotNegative = key(2.0, "cliques missed from places this close may be hidden by one object [m]")
     near_m: NotNegative = key(0.6, "a place is visible from positions this close to one from which it was seen [m]")
     least_expected: Positive = key(2.0, "minimum expected detections of earlier looks")
+    sure: Share = key(0.9, "probability from which something new is told to have come after a look, not an earlier one")
     lasting: Share = key(0.5, "share of the places hidden in a session that are hidden in all earlier ones")
     sticky: float = key(2.0, "consecutive frames that count as one independent one", ge=1.0)
 

@@ -29,8 +29,6 @@ from evermap.sensing.visibility import LooksAt, NominalField, looks_at
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 USUAL = LooksConfig()
-SURE = 0.9
-"""Probability with which something is told to have come after a look rather than after an earlier one."""
 ROUNDS = 5
 """Of expectation and maximisation, at most."""
 
@@ -265,8 +263,8 @@ class Arrivals:
 
     Attributes:
         site: (A,) row of the new site.
-        looked_s: (A,) the last look at its place before this session after which it came with probability `SURE`, else
-            the first look; -inf for never.
+        looked_s: (A,) the last look at its place before this session after which it surely came (`LooksConfig.sure`),
+            else the first look; -inf for never.
         p_appeared: (A,) probability that it came after that; 0 without a look.
         came: by row of a site, until when what was seen to come there was not there, and how probably it came.
         left_s: by row of a site, when what came there was seen to leave again.
@@ -320,7 +318,7 @@ def arrivals(
         p_missed = p_hidden + (1.0 - p_hidden) * np.exp([log_missed[stamp] for stamp in enough.tolist()])
         stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
         p_after = came_after(np.exp(stay.log_survival(after.stamp_s - enough)), p_missed, settings.lasting * p_hidden)
-        at = int(np.flatnonzero(p_after >= SURE).max(initial=0))
+        at = int(np.flatnonzero(p_after >= settings.sure).max(initial=0))
         looked[k], p_appeared[k] = enough[at], p_after[at]
     return Arrivals(new, looked, p_appeared)
 
