@@ -99,6 +99,7 @@ def test_a_robot_that_stands_says_nothing_of_its_odometry():
     found = run_slam(replace(world.recording, detections=still, odometry=replace(odometry, pose_world_robot=pose)))
     scale = next(one for one in found.parameters if one.name == "odometry_scale")
     assert scale.value == pytest.approx(1.0, abs=1e-3)
+    assert scale.prior_sigma == 0.005
 
 
 def test_noise_levels_are_those_of_the_world():

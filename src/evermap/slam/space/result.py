@@ -228,7 +228,7 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
                 found.append(ParameterEstimate(name, value, spread, 0.0, prior, unit, meaning=MOUNT))
     if problem.scale_sigma > 0.0:
         scale = float(np.exp(told.solved.optimum.estimate.log_scale))
-        told_sigma, prior = scale * float(of_scale), problem.scale_sigma
+        told_sigma, prior = scale * float(of_scale), problem.settings.scale_sigma  # before it was averaged
         found.append(ParameterEstimate("odometry_scale", scale, told_sigma, 1.0, prior, "", meaning=SCALE))
     return tuple(found)
 
