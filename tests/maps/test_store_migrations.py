@@ -6,6 +6,7 @@ import json
 import re
 import sqlite3
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from random_maps import assert_same, random_changes, random_evidence, random_map
 from sqlalchemy import create_engine, inspect
 
 from evermap.errors import InputError
+from evermap.maps.living import LivingMap
 from evermap.maps.store import Provenance, open_store, schema
 from evermap.maps.store import schema as migrations
 
@@ -60,6 +62,12 @@ def make_schema_1(path: Path) -> None:
     database.close()
 
 
+def assert_written_elsewhere(loaded: LivingMap, made: LivingMap) -> None:
+    """The same but for the last bits of the covariance: a product of matrices, which processors round differently."""
+    np.testing.assert_allclose(loaded.covariance_m2, made.covariance_m2, rtol=1e-12, atol=1e-16)
+    assert_same(replace(loaded, covariance_m2=made.covariance_m2), made)
+
+
 def tables(path: Path) -> object:
     """Columns, keys and indices of every table."""
     look = inspect(create_engine(f"sqlite:///{path}"))
@@ -85,7 +93,7 @@ def test_an_old_schema_becomes_that_of_today(tmp_path: Path, make: Callable[[Pat
         seen = 0
         for seed in range(3):
             living = random_map(seed, cliques=3, format_1=True)
-            assert_same(store.load(seed + 1), living)
+            assert_written_elsewhere(store.load(seed + 1), living)
             for mine, theirs in zip(store.changes(seed + 1), random_changes(seed, living), strict=True):
                 assert_same(mine, theirs)
             evidence = random_evidence(seed, living, looks=9)
@@ -120,7 +128,7 @@ def test_a_migration_that_fails_leaves_the_old_store(tmp_path: Path, monkeypatch
             open_store(path)
     assert tables(path) == before
     with open_store(path) as store:
-        assert_same(store.load(3), random_map(2, cliques=3, format_1=True))
+        assert_written_elsewhere(store.load(3), random_map(2, cliques=3, format_1=True))
 
 
 def test_there_is_a_step_from_every_schema_to_the_next() -> None:
