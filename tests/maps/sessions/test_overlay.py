@@ -66,16 +66,18 @@ def test_in_space_the_most_probable_of_all_assignments_is_found(seed: int) -> No
     assert (found is not None) == dense.is_this_place(best, best_drift_m)
     if found is None:
         return
-    np.testing.assert_array_equal(sites_of(found, one.known, one.sighted), best)
+    stands = np.where(best < dense.TURNED, best, ELSEWHERE)
+    np.testing.assert_array_equal(sites_of(found, one.known, one.sighted), stands)
     assert found.drift_m == best_drift_m
-    for clique, sites in enumerate(dense.sites):
-        each = []
-        for option in [*sites, ELSEWHERE]:
+    for clique in range(cliques):
+        options, each = dense.options(clique), []
+        for option in options:
             other = best.copy()
             other[clique] = option
             each.append(dense.log_probability(other, best_drift_m))
         share = np.exp(np.array(each) - max(each))
-        want = share[[*sites, ELSEWHERE].index(int(best[clique]))] / share.sum()
+        same = [option == stands[clique] or (option >= dense.TURNED and stands[clique] < 0) for option in options]
+        want = share[same].sum() / share.sum()
         np.testing.assert_allclose(found.probability[one.sighted.clique == clique], want, atol=1e-6)
 
 
@@ -253,3 +255,20 @@ def test_bodies_that_moved_together_by_less_than_agreement_do_not_bend_what_stan
     one = world(np.random.default_rng(seed), [1, 1, 1, 2, 2, 2, 2], [1] * 7, site, sigma_m=0.01, shift_m=shift)
     found = laid(one)
     np.testing.assert_array_equal(sites_of(found, one.known, one.sighted), one.site)
+
+
+@pytest.mark.parametrize("seed", [403, 405, 410, 411, 414, 416])
+def test_landmarks_that_are_turned_in_their_places_were_moved(seed: int) -> None:
+    """Their positions are as of what stands; the most probable of all assignments tells so by their orientations."""
+    random = np.random.default_rng(seed)
+    one = world(random, [1, 1, 1, 2, 1, 1], [1, 1, 2, 1, 1, 1], [0, 0, 0, 0, 0, 0], dim=3)
+    turned = np.flatnonzero(np.isin(one.known.landmark, [1, 6]))
+    one.known.log_turned[turned] = -25.0
+    dense = Densely(one.sighted, one.known, one.pose_map_session)
+    best, drift_m, _ = dense.best()
+    assert (best >= dense.TURNED).tolist() == [False, True, False, False, False, True]
+    found = lay_over(one.sighted, one.known, motion=one.pose_map_session)
+    assert found is not None
+    assert found.drift_m == drift_m
+    assert np.flatnonzero(found.place < 0).tolist() == [1, 6]
+    assert found.probability[[1, 6]].min() > 0.99

@@ -101,7 +101,9 @@ def world(
     of = np.concatenate([[c] * count for c, count in enumerate(n_sites)]).astype(np.int64)
     p = np.array([0.9 / n_sites[c] for c in of]) if p_site is None else np.array(p_site)
     away = np.array([max(1.0 - p[of == c].sum(), 1e-6) for c in range(len(sizes))])
-    turned = random.uniform(-1.0, 1.0, len(p)) if dim == 3 else np.zeros(len(p))
+    turned = np.zeros(len(landmark))
+    if dim == 3:
+        turned[np.unique(of_site, return_index=True)[1]] = random.uniform(-1.0, 1.0, len(p))
     known = Known(position, map_covariance, landmark, of_site, np.log(p), np.log(away), turned)
     return World(Sighted(seen, session_covariance, clique), known, motion, names)
 
@@ -118,6 +120,9 @@ class Densely:
     the map's, drift, and an unknown motion. What stands elsewhere has the density of a move instead.
     """
 
+    TURNED = 1000
+    """Added to a site: the option of being turned in place there."""
+
     def __init__(self, sighted: Sighted, known: Known, motion: FloatArray) -> None:
         self.sighted, self.known = sighted, known
         self.dim = dim = sighted.position_m.shape[1]
@@ -130,6 +135,8 @@ class Densely:
 
         free = np.array([USUAL.free_m] * dim + [USUAL.free_rad] * (3 if dim == 3 else 1))
         slope = np.column_stack([(moved(h) - moved(-h)) / 2e-6 for h in 1e-6 * np.eye(len(free))])
+        basis, _ = np.linalg.qr(slope)  # what the session says of its own motion is part of that freedom
+        turn = turn - basis @ basis.T @ turn
         self.spread = turn @ sighted.covariance_m2 @ turn.T + slope @ np.diag(free**2) @ slope.T
         both = np.vstack([self.at, known.position_m])
         extent = both.max(axis=0) - both.min(axis=0)
@@ -138,27 +145,43 @@ class Densely:
             self.room_m2 *= max(float(extent[2]), 1.0)
         clique = sighted.clique[known.landmark]
         self.sites = [sorted({int(s) for s in known.site[clique == c]}) for c in range(len(known.log_p_elsewhere))]
+        self.turned = {  # single landmarks that were perhaps turned in their place, as options of their own
+            self.TURNED + s: (int(p[0]), c)
+            for c, sites in enumerate(self.sites)
+            for s in sites
+            if len(p := np.flatnonzero(known.site == s)) == 1 and known.log_turned[p[0]] < 0.0
+        }
+
+    def options(self, clique: int) -> list[int]:
+        """Sites of a clique, elsewhere, and being turned at those of its sites where it may be."""
+        return [*self.sites[clique], ELSEWHERE, *(option for option, (_, c) in self.turned.items() if c == clique)]
 
     def assignments(self) -> Iterator[IntArray]:
-        for chosen in itertools.product(*([*sites, ELSEWHERE] for sites in self.sites)):
+        for chosen in itertools.product(*map(self.options, range(len(self.sites)))):
             yield np.array(chosen)
 
     def log_probability(self, chosen: IntArray, drift_m: float) -> float:
         known, dim = self.known, self.dim
         rows = np.flatnonzero(np.isin(known.site, chosen[chosen >= 0]))
+        turned = [self.turned[int(option)][0] for option in chosen if option >= self.TURNED]
+        wider = np.repeat([drift_m**2, drift_m**2 + USUAL.turned_m**2], [dim * len(rows), dim * len(turned)])
+        rows = np.append(rows, turned).astype(int)
         total = 0.0
         if len(rows):
             pick = np.zeros((dim * len(rows), dim * len(self.at)))
             for k, landmark in enumerate(known.landmark[rows]):
                 pick[dim * k : dim * k + dim, dim * landmark : dim * landmark + dim] = np.eye(dim)
             xy = np.column_stack([dim * rows + axis for axis in range(dim)]).ravel()
-            spread = pick @ self.spread @ pick.T + known.covariance_m2[np.ix_(xy, xy)] + drift_m**2 * np.eye(len(xy))
+            spread = pick @ self.spread @ pick.T + known.covariance_m2[np.ix_(xy, xy)] + np.diag(wider)
             error = (self.at[known.landmark[rows]] - known.position_m[rows]).ravel()
             _, log_volume = np.linalg.slogdet(2.0 * np.pi * spread)
             total -= 0.5 * float(log_volume + error @ np.linalg.solve(spread, error))
         for clique, site in enumerate(chosen):
-            if site >= 0:
-                total += float(known.log_p_site[site] + known.log_turned[site])
+            if site >= self.TURNED:
+                mine = [c for _, c in self.turned.values()].count(clique)
+                total += float(known.log_p_elsewhere[clique]) + math.log(USUAL.share_turned / mine)
+            elif site >= 0:
+                total += float(known.log_p_site[site] + known.log_turned[known.site == site].sum())
             elif self.sites[clique]:
                 total += float(known.log_p_elsewhere[clique]) + max(self._moved(s) for s in self.sites[clique])
         return total
@@ -166,7 +189,7 @@ class Densely:
     def is_this_place(self, chosen: IntArray, drift_m: float) -> bool:
         """Against another place, one session in a thousand, where what stands stands anywhere in the room."""
         moved = sum(max(self._moved(s) for s in self.sites[c]) for c, site in enumerate(chosen) if site < 0)
-        standing = int(np.isin(self.known.site, chosen[chosen >= 0]).sum())
+        standing = int(np.isin(self.known.site, chosen[chosen >= 0]).sum() + np.sum(chosen >= self.TURNED))
         return self.log_probability(chosen, drift_m) - moved > math.log(1e-3) - standing * math.log(self.room_m2)
 
     def best(self) -> tuple[IntArray, float, float]:

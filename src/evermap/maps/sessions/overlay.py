@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_solve
+from scipy.linalg import cho_solve, solve_triangular
 from scipy.linalg.lapack import dpotri
 
 from evermap.config import OverlayConfig
@@ -58,7 +59,7 @@ class Known:
         site: (P,) row of its site.
         log_p_site: (S,) log probability that each site is occupied, before this session.
         log_p_elsewhere: (C,) log probability that a clique occupies none of its sites.
-        log_turned: (S,) what the orientations of its landmarks say for standing there against having been moved.
+        log_turned: (P,) what the landmark's orientation says for standing there against a move; 0 if unknown.
     """
 
     position_m: FloatArray
@@ -68,6 +69,29 @@ class Known:
     log_p_site: FloatArray
     log_p_elsewhere: FloatArray
     log_turned: FloatArray
+
+    def with_turned(self, clique: IntArray, settings: OverlayConfig) -> Known:
+        """Return these with another site for every landmark that seems turned: turned in its place.
+
+        Args:
+            clique: (L,) of the session's landmarks.
+            settings: the share of moves that are such turns.
+        """
+        alone = np.bincount(self.site, minlength=len(self.log_p_site))[self.site] == 1
+        turned = np.flatnonzero(alone & (self.log_turned < 0.0))
+        of = clique[self.landmark[turned]]
+        share = settings.share_turned / np.bincount(of, minlength=len(self.log_p_elsewhere))[of]
+        every = np.append(np.arange(len(self.site)), turned)
+        rows = se2.xy_rows(every, self.position_m.shape[1])
+        return Known(
+            self.position_m[every],
+            self.covariance_m2[np.ix_(rows, rows)],
+            self.landmark[every],
+            np.append(self.site, len(self.log_p_site) + np.arange(len(turned))),
+            np.append(self.log_p_site, self.log_p_elsewhere[of] + np.log(share)),
+            self.log_p_elsewhere,
+            np.append(self.log_turned, np.zeros(len(turned))),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,27 +177,95 @@ def _joint(options: _Options) -> IntArray:
     return best
 
 
+class _Field(NamedTuple):
+    """What chosen places say of all others: the rows of N, with the covariance of their differences but the motion.
+
+    The motion is so free beside the differences that their joint covariance has no digits left for these.
+
+    Attributes:
+        row: (N,) of the places.
+        error: (dim N,) differences.
+        inverse: (dim N, dim N) of their covariance for a known motion.
+        freedom: (dim N, F) how they change with the motion, in its standard deviations.
+        drag: `inverse freedom`.
+        motion: (F,) the motion, as they have it.
+        root: lower Cholesky factor of its information (F, F).
+    """
+
+    row: IntArray
+    error: FloatArray
+    inverse: FloatArray
+    freedom: FloatArray
+    drag: FloatArray
+    motion: FloatArray
+    root: FloatArray
+
+    @classmethod
+    def of(cls, row: IntArray, error: FloatArray, inverse: FloatArray, freedom: FloatArray) -> _Field:
+        """Return the field with the posterior of the motion."""
+        drag = inverse @ freedom
+        root = np.asarray(np.linalg.cholesky(np.eye(freedom.shape[1]) + freedom.T @ drag))
+        return cls(row, error, inverse, freedom, drag, cho_solve((root, True), drag.T @ error), root)
+
+    def without(self, block: slice, dim: int) -> _Field:
+        """Return the same without the places whose differences are a block."""
+        kept = np.ones(len(self.error), dtype=np.bool_)
+        kept[block] = False
+        ties = self.inverse[np.ix_(kept, ~kept)]
+        rest = self.inverse[np.ix_(kept, kept)] - ties @ np.linalg.solve(self.inverse[block, block], ties.T)
+        return _Field.of(self.row[kept[::dim]], self.error[kept], rest, self.freedom[kept])
+
+    def log_at(self, error: FloatArray, covariance: FloatArray, across: FloatArray, freedom: FloatArray) -> float:
+        """Return the log density of differences of further places.
+
+        Args:
+            error: (M,) the differences.
+            covariance: (M, M) of these for a known motion.
+            across: (M, dim N) of these and the chosen.
+            freedom: (M, F) of these.
+        """
+        gain = across @ self.inverse
+        lever = freedom - gain @ self.freedom
+        off = error - gain @ self.error - lever @ self.motion
+        swing = solve_triangular(self.root, lever.T, lower=True)
+        return _log_density(off, covariance - gain @ across.T + swing.T @ swing)
+
+
+def _log_density(off: FloatArray, covariance: FloatArray) -> float:
+    """Log density of a Gaussian; minus infinity where rounding has left none."""
+    try:
+        root = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return -math.inf
+    whitened = solve_triangular(root, off, lower=True)
+    log_volume = 2.0 * float(np.log(np.diagonal(root)).sum())
+    return -0.5 * (float(whitened @ whitened) + log_volume + len(off) * math.log(2.0 * math.pi))
+
+
 class _Options:
     """Cliques with their options, linearised at one motion."""
 
     def __init__(self, sighted: Sighted, known: Known, motion: FloatArray, settings: OverlayConfig) -> None:
+        self.n_places, self.n_sites = len(known.site), len(known.log_p_site)
+        known = known.with_turned(sighted.clique, settings)
         self.settings = settings
         self.sighted, self.known, self.motion = sighted, known, motion
         self.dim = known.position_m.shape[1]
         group = PLANE if self.dim == PLANE.point_dim else SPACE
         self.landmark_m = group.transform(motion, sighted.position_m)
         turn = np.kron(np.eye(len(self.landmark_m)), group.rotation_of(motion))
-        # the session turned with the map, and the motion's own freedom
-        middle = self.landmark_m - self.landmark_m.mean(axis=0)
+        # the session turned with the map, without its own rigid motion: that is the motion's freedom
+        directions = group.rigid_directions(self.landmark_m - self.landmark_m.mean(axis=0))
+        onto = turn - directions @ (np.linalg.pinv(directions) @ turn)
+        self._session = onto @ sighted.covariance_m2 @ onto.T
         free = np.repeat([settings.free_m, settings.free_rad], [group.point_dim, group.dim - group.point_dim])
-        freedom = group.rigid_directions(middle) * free
-        self._session = turn @ sighted.covariance_m2 @ turn.T
-        self._freedom = freedom @ freedom.T
+        self._freedom = directions * free
+        self._turned_m2 = np.where(np.arange(len(known.site)) < self.n_places, 0.0, settings.turned_m**2)
         self.drift_m = settings.drifts_m[0]
         spread = np.ptp(np.vstack([self.landmark_m, known.position_m]), axis=0)
         height_m = float(np.prod(np.maximum(spread[2:], settings.lowest_room_m)))
         self._log_room = -math.log(max(float(np.prod(spread[:2])), settings.smallest_room_m2) * height_m)
-        self._log_site = known.log_p_site + known.log_turned
+        self._log_site = known.log_p_site + np.bincount(known.site, known.log_turned, len(known.log_p_site))
         self.sites: list[list[int]] = [[] for _ in known.log_p_elsewhere]
         order = np.argsort(known.site, kind="stable")
         parts = np.split(order, np.flatnonzero(np.diff(known.site[order])) + 1)
@@ -280,17 +372,23 @@ class _Options:
             for c, sites in enumerate(self.sites)
             if sites
         }
-        stand = [c for c in log_odds if chosen[c] != ELSEWHERE]
-        denied = [odds for c, odds in log_odds.items() if chosen[c] == ELSEWHERE]
+        stand = [c for c in log_odds if self._stands(chosen[c])]
+        denied = [odds for c, odds in log_odds.items() if not self._stands(chosen[c])]
         return len(stand) != 1 or not denied or log_odds[stand[0]] > sum(denied)
 
     def _log_standing(self, chosen: IntArray) -> tuple[float, int]:
         """Return the log probability of the options, with the density of landmarks at their sites, and their number."""
         rows = self._chosen_rows(chosen)
-        error, factor = self._factored(rows)
-        log_volume = 2.0 * float(np.log(np.diagonal(factor)).sum())
-        squared = float(error @ cho_solve((factor, True), error)) if len(rows) else 0.0
-        total = -0.5 * (log_volume + squared + len(error) * math.log(2.0 * math.pi))
+        total = 0.0
+        if len(rows):
+            error, factor = self._factored(rows)
+            both = np.column_stack([error, self._free(rows)])
+            error, freedom = (white := solve_triangular(factor, both, lower=True))[:, 0], white[:, 1:]
+            root = np.linalg.cholesky(np.eye(freedom.shape[1]) + freedom.T @ freedom)
+            motion = cho_solve((root, True), freedom.T @ error)
+            squared = float(((error - freedom @ motion) ** 2).sum() + motion @ motion)
+            log_volume = 2.0 * float(np.log(np.diagonal(factor)).sum() + np.log(np.diagonal(root)).sum())
+            total = -0.5 * (log_volume + squared + len(error) * math.log(2.0 * math.pi))
         for clique, sites in enumerate(self.sites):
             if sites:
                 site = int(chosen[clique])
@@ -299,7 +397,8 @@ class _Options:
 
     def n_standing(self, chosen: IntArray) -> int:
         """Return landmarks that are at their places in the map."""
-        return len(np.unique(self.known.landmark[self._chosen_rows(chosen)]))
+        rows = self._chosen_rows(chosen)
+        return len(np.unique(self.known.landmark[rows[rows < self.n_places]]))
 
     def concluded(self, chosen: IntArray, *, split: bool) -> Overlay:
         """Return the assignment by landmark, with bodies split whose members disagree."""
@@ -310,15 +409,18 @@ class _Options:
             values = np.array(list(scores.values()))
             share = np.exp(values - values.max())
             share /= share.sum()
-            best = int(chosen[clique])
+            best, moved = int(chosen[clique]), [not self._stands(option) for option in scores]
             mine = np.flatnonzero(self.sighted.clique == clique)
-            probability[mine] = share[list(scores).index(best)]
-            if best != ELSEWHERE:
+            if self._stands(best):
                 rows = self._rows[best]
                 place[self.known.landmark[rows]] = rows
-            elif split and len(mine) > 1:
+                probability[mine] = share[list(scores).index(best)]
+                continue
+            probability[mine] = share[moved].sum()
+            if split and len(mine) > 1:
                 self._split(clique, chosen, scores[ELSEWHERE], place)
         rows = self._chosen_rows(chosen)
+        rows = rows[rows < self.n_places]
         matched = self.known.landmark[rows]
         motion = self.motion
         if len(rows) >= 2 and self.dim == PLANE.point_dim:  # in space it is where it was said to be
@@ -327,13 +429,13 @@ class _Options:
 
     def _split(self, clique: int, chosen: IntArray, together: float, place: IntArray) -> None:
         """Return members that have not moved, while the body as a whole has."""
-        error, inverse, rows = self._field(chosen)
-        for site in self.sites[clique]:
+        field = self._field(chosen)
+        for site in filter(self._stands, self.sites[clique]):
             stay = []
             total = math.log(self.settings.p_split) + float(self.known.log_p_elsewhere[clique])
             for row in self._rows[site]:
                 one = np.array([row])
-                at_place = self._log_at(one, rows, error, inverse)
+                at_place = self._log_at(one, field) + float(self.known.log_turned[row])
                 moved = self._log_elsewhere(one)
                 stay.append(at_place > moved)
                 total += max(at_place, moved)
@@ -346,16 +448,21 @@ class _Options:
         parts = [self._rows[int(site)] for site in chosen if site != ELSEWHERE]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
+    def _stands(self, option: int) -> bool:
+        """Return whether an option of a clique is a site of the map."""
+        return ELSEWHERE < option < self.n_sites
+
     def _scores(self, chosen: IntArray) -> list[dict[int, float]]:
         """Return the log probability of the options of every clique, given the choices for the others."""
-        error, inverse, rows = self._field(chosen)
+        field = self._field(chosen)
         start = {}
         at = 0
         for site in chosen:
             if site != ELSEWHERE:
                 start[int(site)] = at
                 at += len(self._rows[int(site)])
-        pull = inverse @ error
+        whitened = solve_triangular(field.root, field.drag.T, lower=True)
+        pull = field.inverse @ field.error - field.drag @ field.motion
         table: list[dict[int, float]] = []
         for clique, sites in enumerate(self.sites):
             scores = {ELSEWHERE: float(self.known.log_p_elsewhere[clique])}
@@ -363,12 +470,13 @@ class _Options:
                 table.append(scores)
                 continue
             mine = int(chosen[clique])
-            others: tuple[IntArray, FloatArray, FloatArray] | None = None
+            others, block = field, slice(0)
+            if mine != ELSEWHERE:
+                block = slice(self.dim * start[mine], self.dim * (start[mine] + len(self._rows[mine])))
             for site in sites:
                 prior = float(self._log_site[site])
                 if site == mine:  # leave-one-out by the inverse alone
-                    block = slice(self.dim * start[site], self.dim * (start[site] + len(self._rows[site])))
-                    precision = inverse[block, block]
+                    precision = field.inverse[block, block] - whitened[:, block].T @ whitened[:, block]
                     squared = float(pull[block] @ np.linalg.solve(precision, pull[block]))
                     scores[site] = prior + 0.5 * float(np.linalg.slogdet(precision)[1]) - 0.5 * squared
                     scores[site] -= 0.5 * len(precision) * math.log(2.0 * math.pi)
@@ -376,9 +484,9 @@ class _Options:
                 if site in self._hopeless:
                     scores[site] = self._hopeless[site]
                     continue
-                if others is None:
-                    others = self._without(mine, rows, error, inverse, start)
-                scores[site] = prior + self._log_at(self._rows[site], *others)
+                if mine != ELSEWHERE and others is field:
+                    others = field.without(block, self.dim)
+                scores[site] = prior + self._log_at(self._rows[site], others)
                 if self._gap_m[site] > FAR_M and scores[site] < HOPELESS:
                     self._hopeless[site] = scores[site]
             best = max(sites, key=lambda site: scores[site])
@@ -386,36 +494,9 @@ class _Options:
             table.append(scores)
         return table
 
-    def _without(
-        self,
-        site: int,
-        rows: IntArray,
-        error: FloatArray,
-        inverse: FloatArray,
-        start: dict[int, int],
-    ) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Rows, errors and inverse covariance of all that is chosen, but one site."""
-        if site == ELSEWHERE:
-            return rows, error, inverse
-        kept = np.ones(len(rows), dtype=np.bool_)
-        kept[start[site] : start[site] + len(self._rows[site])] = False
-        both = np.repeat(kept, self.dim)
-        ties = inverse[np.ix_(both, ~both)]
-        rest = inverse[np.ix_(both, both)] - ties @ np.linalg.solve(inverse[np.ix_(~both, ~both)], ties.T)
-        return rows[kept], error[both], rest
-
-    def _log_at(self, of: IntArray, rows: IntArray, error: FloatArray, inverse: FloatArray) -> float:
-        """Log density of places `of`, being where their landmarks are, given those of `rows`."""
-        mine = (self.landmark_m[self.known.landmark[of]] - self.known.position_m[of]).ravel()
-        across = self._covariance(of, rows)
-        gain = across @ inverse
-        off = mine - gain @ error
-        spread = self._covariance(of, of) - gain @ across.T
-        sign, log_volume = np.linalg.slogdet(spread)
-        if sign <= 0:
-            return -math.inf
-        squared = float(off @ np.linalg.solve(spread, off))
-        return -0.5 * (squared + float(log_volume) + len(off) * math.log(2.0 * math.pi))
+    def _log_at(self, of: IntArray, field: _Field) -> float:
+        """Log density of places `of`, being where their landmarks are, given those of a field."""
+        return field.log_at(self._error(of), self._covariance(of, of), self._covariance(of, field.row), self._free(of))
 
     def _log_elsewhere(self, of: IntArray) -> float:
         """Log density of the landmarks of places `of`, if their body was moved."""
@@ -430,25 +511,30 @@ class _Options:
         still = 0.5 * float((rest**2).sum()) / turn_m**2 + 0.5 * count * math.log(2 * math.pi * turn_m**2)
         return float(log_density - still)
 
-    def _field(self, chosen: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Differences, inverse of their covariance, and rows of all places that are chosen."""
+    def _field(self, chosen: IntArray) -> _Field:
+        """What all places that are chosen say of the others."""
         rows = self._chosen_rows(chosen)
         error, factor = self._factored(rows)
-        if not len(rows):
-            return error, factor, rows
-        inverse = np.tril(dpotri(factor, lower=True)[0])
-        return error, inverse + np.tril(inverse, -1).T, rows
+        inverse = np.tril(dpotri(factor, lower=True)[0]) if len(rows) else factor
+        return _Field.of(rows, error, inverse + np.tril(inverse, -1).T, self._free(rows))
+
+    def _error(self, rows: IntArray) -> FloatArray:
+        """Return differences of places, interleaved."""
+        return np.asarray((self.landmark_m[self.known.landmark[rows]] - self.known.position_m[rows]).ravel())
+
+    def _free(self, rows: IntArray) -> FloatArray:
+        """Return how differences of places change with the motion, in its standard deviations."""
+        return np.asarray(self._freedom[se2.xy_rows(self.known.landmark[rows], self.dim)])
 
     def _factored(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Differences of places, and the lower Cholesky factor of their covariance."""
-        error = (self.landmark_m[self.known.landmark[rows]] - self.known.position_m[rows]).ravel()
-        return error, np.asarray(np.linalg.cholesky(self._covariance(rows, rows)))
+        """Differences of places, and the lower Cholesky factor of their covariance for a known motion."""
+        return self._error(rows), np.asarray(np.linalg.cholesky(self._covariance(rows, rows)))
 
     def _covariance(self, a: IntArray, b: IntArray) -> FloatArray:
-        """Between the differences of two sets of places."""
+        """Between the differences of two sets of places, for a known motion."""
         la, lb = (se2.xy_rows(self.known.landmark[rows], self.dim) for rows in (a, b))
         pa, pb = se2.xy_rows(a, self.dim)[:, None], se2.xy_rows(b, self.dim)
-        la = la[:, None]
-        both: FloatArray = self._session[la, lb] + self.known.covariance_m2[pa, pb] + self._freedom[la, lb]
-        both[pa == pb] += self.drift_m**2
+        both: FloatArray = self._session[la[:, None], lb] + self.known.covariance_m2[pa, pb]
+        same = np.nonzero(pa == pb)
+        both[same] += self.drift_m**2 + np.repeat(self._turned_m2[a], self.dim)[same[0]]
         return both

@@ -170,9 +170,9 @@ def laid_over(
     clique_ids, clique = np.unique(members.clique_id[at[seen]], return_inverse=True)
     used_sites, site = np.unique(places.site_id[used], return_inverse=True)
     site_rows = np.searchsorted(sites.site_id, used_sites)
-    log_turned = np.zeros(len(used_sites))
+    log_turned = np.zeros(len(used))
     if turned is not None:
-        np.add.at(log_turned, site.ravel(), turned.log_odds(seen[landmark], places[used], config.overlay))
+        log_turned = turned.log_odds(seen[landmark], places[used], config.overlay)
     total = np.zeros(len(clique_ids))
     of_known = np.isin(sites.clique_id, clique_ids)
     np.add.at(total, np.searchsorted(clique_ids, sites.clique_id[of_known]), p_site[of_known])

@@ -2,6 +2,8 @@
 
 The view of a single far tag has two explanations, and the optimum of one is no way to the other. So the poses that
 every detection by itself suggests, in both ways, are asked, and the orientations that all detections of a place vote.
+And a frame in which nothing but a wrong identity was read is seen from where the robot never was: between two jumps of
+the odometry, which are asked to be none.
 """
 
 from __future__ import annotations
@@ -19,22 +21,68 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 ROUNDS = 3
 """Times that other explanations are tried, at most."""
+MOST_JUMPS = 4
+"""Stretches between jumps that are asked together, at most."""
 
 
 def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
     """Return the optimum, or a better one that begins where other explanations lead."""
     problem = optimum.smoother.problem
     for _ in range(ROUNDS):
-        start, asked = other_explanations(problem, optimum)
-        if not asked:
+        before = optimum
+        for explain in (bridged, other_explanations):
+            if (start := explain(optimum)) is None:
+                continue
+            found = converged(problem, start, optimum.noise, heavy_rounds=0)
+            # at the same noise, or a level that fits worse would look better
+            cost = optimum.smoother.linearised(found.estimate, optimum.noise, heavy=False).cost
+            if cost < optimum.now.cost - problem.settings.repair.gain_nats:
+                optimum = found
+        if optimum is before:
             break
-        found = converged(problem, start, optimum.noise, heavy_rounds=0)
-        # at the same noise, or a level that fits worse would look better
-        cost = optimum.smoother.linearised(found.estimate, optimum.noise, heavy=False).cost
-        if cost > optimum.now.cost - problem.settings.repair.gain_nats:
-            break
-        optimum = found
     return optimum
+
+
+def bridged(optimum: SpatialOptimum) -> SpatialEstimate | None:
+    """Return the values with stretches of frames between jumps of the odometry where it has them, if that is cheaper.
+
+    What was seen in these frames was then seen wrongly. None if no stretch is better off.
+    """
+    smoother, now = optimum.smoother, optimum.now
+    bounds = np.flatnonzero(now.odometry_weight < 0.5) + 1
+    if not smoother.problem.driven or not len(bounds):
+        return None
+    ends = np.unique(np.append(bounds, [0, len(optimum.estimate.pose)]))
+    found: list[tuple[float, int, int]] = []
+    for k, first in enumerate(ends[:-1].tolist()):
+        for end in ends[k + 1 : k + 1 + MOST_JUMPS].tolist():
+            if 2 * (end - first) < len(optimum.estimate.pose):
+                trial = _bridged(smoother.problem, optimum.estimate, first, end)
+                found.append((smoother.linearised(trial, optimum.noise, heavy=False).cost - now.cost, first, end))
+    estimate, taken = optimum.estimate, np.zeros(len(optimum.estimate.pose), dtype=np.bool_)
+    for cost, first, end in sorted(found):
+        if cost < 0.0 and not taken[max(first - 1, 0) : end + 1].any():
+            estimate, taken[first:end] = _bridged(smoother.problem, estimate, first, end), True
+    return estimate if taken.any() else None
+
+
+def _bridged(problem: SpatialProblem, estimate: SpatialEstimate, first: int, end: int) -> SpatialEstimate:
+    """The values with some poses by the odometry, from the pose before them to the one after them."""
+    pose, last = estimate.pose.copy(), len(estimate.pose) - 1
+    step = problem.increment.copy()
+    step[:, :3] *= np.exp(estimate.log_scale)
+    if first == 0:
+        for k in range(end - 1, -1, -1):
+            pose[k] = se3.compose(pose[k + 1], se3.inverse(step[k]))
+        return replace(estimate, pose=pose)
+    for k in range(first, min(end, last) + 1):
+        pose[k] = se3.compose(pose[k - 1], step[k - 1])
+    if end <= last:
+        stamp = problem.stamp_s[first - 1 : end + 1]
+        share = (stamp - stamp[0]) / (stamp[-1] - stamp[0])
+        off = se3.local(pose[end], estimate.pose[end])
+        pose[first : end + 1] = se3.retract(pose[first : end + 1], share[1:, None] * off)
+    return replace(estimate, pose=pose)
 
 
 def unjumped(optimum: SpatialOptimum) -> SpatialOptimum:
@@ -96,14 +144,14 @@ def _as_driven(
     return cost + problem.settings.map.moved_nats * float(held.sum()), found
 
 
-def other_explanations(problem: SpatialProblem, optimum: SpatialOptimum) -> tuple[SpatialEstimate, bool]:
-    """Return the values with poses and orientations that fit better by themselves, and whether there are any."""
-    estimate, noise = optimum.estimate, optimum.noise
+def other_explanations(optimum: SpatialOptimum) -> SpatialEstimate | None:
+    """Return the values with poses and orientations that fit better by themselves; None if there are none."""
+    problem, estimate, noise = optimum.smoother.problem, optimum.estimate, optimum.noise
     voted = oriented(problem, estimate, optimum.now.weight)
     other = problem.symmetries.angle_between(voted, estimate.place) > problem.settings.repair.other_rad
     place = np.where(other[:, None], voted, estimate.place)
     pose, n_better = _better_poses(problem, replace(estimate, place=place), noise)
-    return replace(estimate, pose=pose, place=place), n_better + int(other.sum()) > 0
+    return replace(estimate, pose=pose, place=place) if n_better or other.any() else None
 
 
 def _better_poses(problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNoise) -> tuple[FloatArray, int]:
