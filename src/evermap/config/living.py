@@ -43,7 +43,7 @@ class OverlayConfig(Section):
     p_another_place: Share = key(1e-3, "probability that a session is from another place")
     smallest_room_m2: Positive = key(50.0, "minimum area in which moved bodies may be found [m^2]")
     drifts_m: tuple[Positive, ...] = key(
-        (0.01, 0.02, 0.04, 0.08),
+        (0.001, 0.003, 0.01, 0.02, 0.04, 0.08),
         "candidate standard deviations of unmoved landmarks from session to session [m]",
         min_length=1,
     )

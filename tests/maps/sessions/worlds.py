@@ -193,11 +193,12 @@ class Densely:
         return self.log_probability(chosen, drift_m) - moved > math.log(1e-3) - standing * math.log(self.room_m2)
 
     def best(self) -> tuple[IntArray, float, float]:
-        """The most probable assignment, the drift with it, and by how much the next one is less probable."""
+        """The most probable assignment in which something stands, its drift, and by how much the next is less probable."""
         scored = sorted(
             (
                 (self.log_probability(chosen, drift) + k * math.log(USUAL.p_coarser), tuple(chosen), drift)
                 for chosen in self.assignments()
+                if np.any(chosen >= 0)
                 for k, drift in enumerate(USUAL.drifts_m)
             ),
             reverse=True,
