@@ -43,8 +43,8 @@ class OverlayConfig(Section):
     p_another_place: Share = key(1e-3, "probability that a session is from another place")
     smallest_room_m2: Positive = key(50.0, "minimum area in which moved bodies may be found [m^2]")
     drifts_m: tuple[Positive, ...] = key(
-        (0.001, 0.003, 0.01, 0.02, 0.04, 0.08),
-        "candidate standard deviations of unmoved landmarks from session to session [m]",
+        (0.01, 0.02, 0.04, 0.08, 0.003, 0.001),
+        "candidate standard deviations of unmoved landmarks from session to session, the likeliest first [m]",
         min_length=1,
     )
     free_m: Positive = key(20.0, "standard deviation of a session's place around the one agreed on, each axis [m]")
@@ -56,7 +56,7 @@ class OverlayConfig(Section):
         min_length=1,
     )
     turned_rad: tuple[Positive, ...] = key((0.2, 1.0), "the same of landmarks that were moved [rad]", min_length=1)
-    p_coarser: Share = key(0.5, "probability of each of these, relative to the one before")
+    p_coarser: Share = key(0.5, "probability of each of these drifts, relative to the one before")
 
 
 class MetreConfig(Section):
