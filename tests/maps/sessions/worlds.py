@@ -193,7 +193,7 @@ class Densely:
         return self.log_probability(chosen, drift_m) - moved > math.log(1e-3) - standing * math.log(self.room_m2)
 
     def best(self) -> tuple[IntArray, float, float]:
-        """The most probable assignment in which something stands, its drift, and by how much the next one is less so."""
+        """The likeliest assignment in which something stands, its drift, and by how much the next is less probable."""
         scored = sorted(
             (
                 (self.log_probability(chosen, drift) + k * math.log(USUAL.p_coarser), tuple(chosen), drift)
