@@ -13,7 +13,8 @@ import pytest
 import evermap
 from evermap import types
 from evermap.errors import MissingExtraError
-from evermap.maps.living import Evidence, LivingMap
+from evermap.existence.sites import Evidence
+from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
 from evermap.metrics.landmarks import evaluate_landmarks
 from evermap.metrics.summary import compare_with_truth

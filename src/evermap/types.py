@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import lru_cache
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,26 @@ UNKNOWN: int = -1
 """Id of a landmark or class that is not known."""
 
 
-class _Columns(ShownTable):
+class Rows(ShownTable):
+    """Mixin of tables whose rows are taken and joined: all arrays have as many as the first; what is no array stays."""
+
+    __slots__ = ()
+
+    def __len__(self) -> int:
+        return len(getattr(self, next(iter(self.__dataclass_fields__))))
+
+    def __getitem__(self, rows: IntArray | BoolArray) -> Self:
+        """Some of the rows, by number or by a mask."""
+        return rows_of(self, rows)
+
+    def joined(self, *others: Self) -> Self:
+        """Return these rows, then those of others."""
+        names = [name for name in self.__dataclass_fields__ if isinstance(getattr(self, name), np.ndarray)]
+        every: dict[str, Any] = {name: [getattr(one, name) for one in (self, *others)] for name in names}
+        return replace(self, **{name: np.concatenate(columns) for name, columns in every.items()})
+
+
+class _Columns(Rows):
     """Mixin of dataclasses whose arrays are columns of N rows each, N being those of the first one.
 
     Raises:
@@ -52,9 +71,6 @@ class _Columns(ShownTable):
     """
 
     __slots__ = ()
-
-    def __len__(self) -> int:
-        return len(getattr(self, next(iter(self.__dataclass_fields__))))
 
     def __post_init__(self) -> None:
         first, count = "", -1

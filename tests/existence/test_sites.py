@@ -169,7 +169,7 @@ def test_one_site_and_no_return_is_the_persistence_filter(prior: Any) -> None:
         start_s=since, until_s=6e3, p_false=p_false, p_occluded=0.0,
     )  # fmt: skip
     order = np.lexsort((stamp, clique))
-    np.testing.assert_array_equal(found.trace.clique, clique[order])
+    np.testing.assert_array_equal(found.trace.clique_id, clique[order])
     np.testing.assert_allclose(found.trace.p_exists, posterior[order], rtol=1e-12)
     np.testing.assert_allclose(found.p_here, state.predict(6e3 - since), rtol=1e-12)
     np.testing.assert_array_equal(found.p_stayed, found.p_here)
@@ -514,7 +514,7 @@ def test_nothing_to_follow() -> None:
     found = follow_sites(
         np.zeros(0), none, known, looks([]), free(np.zeros(0), np.zeros(0)), start_s=0.0, until_s=1.0, p_false=0.1
     )
-    assert len(found.p_here) == len(found.weight) == len(found.trace.clique) == 0
+    assert len(found.p_here) == len(found.weight) == len(found.trace.clique_id) == 0
 
 
 @pytest.mark.parametrize(

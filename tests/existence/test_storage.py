@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import InputError
-from evermap.existence.models import load_model, model_of, save_model
+from evermap.existence.models import NamedModels, load_models, model_of, save_models
 from evermap.existence.one_stay import OneStay
 from evermap.existence.phase_type import PhaseType
 from evermap.existence.protocol import Instants, Looks, PresenceModel
@@ -32,8 +32,8 @@ MODELS: dict[str, PresenceModel] = {
 
 @pytest.mark.parametrize("name", MODELS)
 def test_what_is_read_answers_as_what_was_written(name: str, tmp_path: Path) -> None:
-    path = save_model(MODELS[name], tmp_path / "model.json")
-    again = load_model(path)
+    path = save_models(NamedModels({"": MODELS[name]}), tmp_path / "model.json")
+    again = load_models(path).models[""]
     looks = Looks.from_rows([0, 0, 0], [0.0, 50.0, 9000.0], [1, 0, 1], 0.1, 0.2)
     asked = Instants.same_for_all(1, [0.0, 20.0, 9000.0, 1e6])
     np.testing.assert_array_equal(again.track(looks, asked).p_present, MODELS[name].track(looks, asked).p_present)
@@ -62,13 +62,13 @@ def test_a_damaged_file_is_one_line(content: str, message: str, tmp_path: Path) 
     path = tmp_path / "model.json"
     path.write_text(content)
     with pytest.raises(InputError, match=message) as caught:
-        load_model(path)
+        load_models(path)
     assert str(path) in str(caught.value)
 
 
 def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
-        load_model(tmp_path / "none.json")
+        load_models(tmp_path / "none.json")
 
 
 def test_plain_numbers_are_enough() -> None:

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from evermap.existence.sites import Evidence
 from evermap.maps.lives import EVERYWHERE, Life, Lives
-from evermap.maps.living import Evidence, LivingMap, Members, Metres, Places, Sites, Stays
+from evermap.maps.living import LivingMap, Members, Metres, Places, Sites, Stays
 from evermap.sensing.sightlines import HEADINGS, SightLines, Views
 from evermap.survival import Exponential, GeneralPurpose, Mixture, PiecewiseConstantHazard, Weibull
 from evermap.types import UNKNOWN, ChangeKind, Clock, MapChange

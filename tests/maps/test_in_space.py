@@ -14,11 +14,12 @@ from typer.testing import CliRunner
 
 from evermap.cli.main import app
 from evermap.config import Config
+from evermap.existence.sites import Evidence
 from evermap.geometry import se3
 from evermap.geometry.chunked import ChunkedCovariance, of_places
 from evermap.io import read_landmarks
 from evermap.maps.diff import diff, motion_of, net
-from evermap.maps.living import Evidence, LivingMap, Members, Places, Sites, Stays
+from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
 from evermap.maps.store import Provenance, open_store
 from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap.maps.vicinity import Vicinity, in_chunks, near

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from evermap.errors import InputError
+from evermap.existence.sites import Evidence
 from evermap.maps.lives import EVERYWHERE, Life, Lives
-from evermap.maps.living import Evidence, LivingMap, Members, Places, Sites, Stays
+from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
 from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
 from evermap.maps.why import probability_text, why
 from evermap.survival import Exponential

@@ -333,6 +333,7 @@ class RepairConfig(Section):
 
     stretch_nats: Positive = key(6.0, "by which a stretch of frames must prefer other poses to try them [nats]")
     gain_nats: Positive = key(3.0, "by which all must be more probable in the end [nats]")
+    jumps: Count = key(4, "stretches between jumps of the odometry that are tried without these together, at most")
     other_rad: Positive = key(0.3, "orientations that differ by more are two [rad]")
     same_rad: Positive = key(0.05, "orientations that agree to within this are the same [rad]")
     together_m: Positive = key(0.5, "outliers of one identity that are this close are another landmark [m]")

@@ -177,23 +177,6 @@ def save_lifetimes(lifetimes: Mapping[str, Lifetimes], path: str | Path) -> Path
     )
 
 
-def save_model(model: PresenceModel, path: str | Path) -> Path:
-    """Write one model to a JSON file and return its path; errors as `save_models`."""
-    return save_models(NamedModels({"": model}), path)
-
-
-def load_model(path: str | Path) -> PresenceModel:
-    """Read the one model of a file.
-
-    Raises:
-        InputError: as `load_models`, or a file of several models.
-    """
-    models = load_models(path).models
-    if set(models) != {""}:
-        raise InputError("contains several models, not one", path=path, hint="load_models(), which reads all")
-    return models[""]
-
-
 def lifetimes_of(source: str | Path) -> dict[str, Lifetimes]:
     """Return the lifetimes given by a user, by class; '' is for every other class.
 

@@ -13,7 +13,7 @@ occluded, is not one that was left.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from evermap.existence.recursion import LOG_LARGEST
 from evermap.sensing.sightlines import Lines
 from evermap.show import Shown
 from evermap.survival.base import LifetimePrior
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray, Rows
 
 if TYPE_CHECKING:
     from evermap.existence.site_kernels import FrameEvidence
@@ -252,24 +252,31 @@ class SiteSensor(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class SiteTrace(Shown):
-    """Evidence on cliques, frame by frame: (E,) rows by clique, then by time.
+class Evidence(Rows):
+    """Evidence of looks at the places of cliques: (E,) rows, by clique, then by time.
 
     Attributes:
-        clique, stamp_s: which frame of which clique.
-        n_hits, n_misses: at its most probable site.
-        expected: mean number of detections, had it stood there.
-        log_odds: of the frame for 'at one of its sites' against 'away' [nats].
+        clique_id: whose; of `SiteBeliefs` the clique's row.
+        stamp_s: of the frame.
+        n_hits, n_misses: landmarks of it that were detected at its most probable site, and expected but not detected.
+        expected: mean number of hits, had it stood there.
+        log_odds: log likelihood ratio of the frame for 'it is at one of its sites' against 'it is away' [nats].
         p_exists: probability that it stands at one of its sites, after the frame.
     """
 
-    clique: IntArray
+    clique_id: IntArray
     stamp_s: FloatArray
     n_hits: IntArray
     n_misses: IntArray
     expected: FloatArray
     log_odds: FloatArray
     p_exists: FloatArray
+
+    @classmethod
+    def empty(cls) -> Self:
+        """Return none."""
+        number, none = np.zeros(0), np.zeros(0, dtype=np.int64)
+        return cls(none, number, none, none, number, number, number)
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,7 +300,7 @@ class SiteBeliefs(Shown):
     since_s: FloatArray
     weight: FloatArray
     log_evidence: FloatArray
-    trace: SiteTrace
+    trace: Evidence
 
 
 def _check_sites(
@@ -545,13 +552,13 @@ def _first_beliefs(
     return _FirstBeliefs(old, new, came, transitions(chains, seats, frames.clique, frames.stamp_s))
 
 
-def _trace(frames: CliqueFrames, said: FrameEvidence, log_after: FloatArray, log_odds: FloatArray) -> SiteTrace:
+def _trace(frames: CliqueFrames, said: FrameEvidence, log_after: FloatArray, log_odds: FloatArray) -> Evidence:
     """The frames in which something was looked at."""
     rows = np.flatnonzero(frames.is_look)
     at_sites = np.exp(log_after[rows]).sum(axis=1)[:, 1:]
     best = 1 + at_sites.argmax(axis=1) if len(rows) else rows
-    return SiteTrace(
-        clique=frames.clique[rows],
+    return Evidence(
+        clique_id=frames.clique[rows],
         stamp_s=frames.stamp_s[rows],
         n_hits=said.n_hits[rows, best],
         n_misses=said.n_misses[rows, best],

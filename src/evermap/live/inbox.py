@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from bisect import bisect_left, insort
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -86,8 +86,8 @@ class Inbox:
         self.first_s = np.inf
         """First stamp of the odometry."""
         self._stray: tuple[float, Callable[[], None]] | None = None
-        self.n_late = self.n_repeated = self.n_thinned = self.n_stray = 0
-        """Counts of late readings, repeated odometry stamps, frames not kept, and implausible stamps."""
+        self.n_late = 0
+        """Readings that came too late."""
         self._classes: list[str] = list(about.class_names)
         self._texts: dict[int, str] = dict(about.landmark_names)
         self._n_kept = self._n_written = 0
@@ -192,18 +192,14 @@ class Inbox:
         if stamp_s > self.newest_s + self._stray_s:  # the first one, too
             if before is None or abs(before[0] - stamp_s) > self._stray_s:
                 self._stray = stamp_s, put
-                self.n_stray += before is not None
                 return
             before[1]()
-        else:
-            self.n_stray += before is not None
         put()
         self.newest_s = max(self.newest_s, stamp_s)
 
     def _put_odometry(self, row: tuple[float, float, float, float], until_s: float) -> None:
         at, count = self._odometry_until(row[0]), self._n_odometry
         if at < count and self._odometry[0, at] == row[0]:
-            self.n_repeated += 1
             return
         if count == self._odometry.shape[1]:
             self._odometry = np.hstack([self._odometry, np.empty_like(self._odometry)])
@@ -237,7 +233,6 @@ class Inbox:
         since_s = min(frame.stamp_s - before_s, BURST_S)
         self._room = min(self._room + self._readings_hz * since_s, self._readings_hz * BURST_S)
         if self._room < 0.0:
-            self.n_thinned += 1
             return False
         self._room -= len(frame.rows)
         self._kept.append(frame)
@@ -292,19 +287,14 @@ class Inbox:
 
 def joined(parts: Sequence[Recording]) -> Recording:
     """Return one recording of consecutive parts."""
-
-    def all_of(tables: Sequence[Any], **columns: Any) -> Any:
-        names = [item.name for item in fields(tables[0]) if isinstance(getattr(tables[0], item.name), np.ndarray)]
-        found = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
-        return replace(tables[-1], **{**found, **columns})
-
+    begin, *rest = parts
     first = np.cumsum([0, *(len(part.frames) for part in parts[:-1])])
     frame = np.concatenate([part.detections.frame + k for part, k in zip(parts, first, strict=True)])
     return replace(
         parts[-1],
-        odometry=all_of([part.odometry for part in parts]),
-        frames=all_of([part.frames for part in parts]),
-        detections=all_of([part.detections for part in parts], frame=frame.astype(np.int64)),
+        odometry=begin.odometry.joined(*(part.odometry for part in rest)),
+        frames=begin.frames.joined(*(part.frames for part in rest)),
+        detections=replace(begin.detections.joined(*(part.detections for part in rest)), frame=frame.astype(np.int64)),
     )
 
 

@@ -23,8 +23,8 @@ from evermap.geometry.chunked import JointCovariance, blocks, taken
 from evermap.maps.lives import Lives
 from evermap.maps.shelves import Sight
 from evermap.sensing.sightlines import SightLines, Views, pair_rows
-from evermap.show import Shown, ShownTable, draw
-from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, landmark_id_of
+from evermap.show import Shown, draw
+from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, Rows, landmark_id_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,13 +43,10 @@ TURNS, AXES = {2: 0, 3: 4}, {2: 0, 3: 3}
 _DTYPES: dict[str, type] = {"IntArray": np.int64, "FloatArray": np.float64, "BoolArray": np.bool_}
 
 
-class _Rows(ShownTable):
+class _Rows(Rows):
     """Columns of equal length that are taken and joined together."""
 
     __slots__ = ()
-
-    def __len__(self) -> int:
-        return len(getattr(self, fields(self)[0].name))
 
     @classmethod
     def empty(cls, dim: int = 2) -> Self:
@@ -61,15 +58,6 @@ class _Rows(ShownTable):
             "rotation_covariance": (0, *2 * (AXES[dim],)),
         }
         return cls(*(np.zeros(shapes.get(f.name, (0,)), _DTYPES[str(f.type)]) for f in fields(cls)))
-
-    def __getitem__(self, rows: IntArray | BoolArray) -> Self:
-        """Some of the rows, by number or by a mask."""
-        return type(self)(*(getattr(self, item.name)[rows] for item in fields(self)))
-
-    def joined(self, other: Self) -> Self:
-        """Return these rows, then those of another."""
-        columns = [(getattr(self, item.name), getattr(other, item.name)) for item in fields(self)]
-        return type(self)(*(np.concatenate(both) for both in columns))
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,28 +149,6 @@ class Stays(_Rows):
     last_s: FloatArray
     gone_s: FloatArray
     p_gone: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class Evidence(_Rows):
-    """Evidence of looks at the places of cliques: (E,) rows, by clique, then by time.
-
-    Attributes:
-        clique_id: whose.
-        stamp_s: of the frame.
-        n_hits, n_misses: landmarks of it that were detected at its most probable site, and expected but not detected.
-        expected: mean number of hits, had it stood there.
-        log_odds: log likelihood ratio of the frame for 'it is there' against 'it is away' [nats].
-        p_exists: probability that it stands at one of its sites, after the frame.
-    """
-
-    clique_id: IntArray
-    stamp_s: FloatArray
-    n_hits: IntArray
-    n_misses: IntArray
-    expected: FloatArray
-    log_odds: FloatArray
-    p_exists: FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError, similar
+from evermap.existence.sites import Evidence
 from evermap.maps.diff import edits
-from evermap.maps.living import EXISTS, Evidence, LivingMap, Stays
+from evermap.maps.living import EXISTS, LivingMap, Stays
 from evermap.maps.store.protocol import MapStore, Revision, RevisionKind
 from evermap.show import Shown
 from evermap.stamps import stamp_text

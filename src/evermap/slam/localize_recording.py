@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -96,7 +96,7 @@ def _existing(landmarks: Landmarks, joint_m2: JointCovariance | None) -> tuple[L
     """Return the landmarks that may exist, and the same as the localiser wants them."""
     covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2
     places = KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists).existing()
-    return _rows(landmarks, np.flatnonzero(landmarks.p_exists > 0.0)), places
+    return landmarks[np.flatnonzero(landmarks.p_exists > 0.0)], places
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,19 +235,13 @@ def _with_counts(
     landmarks: Landmarks, recording: Recording, run: _Run, places: KnownPlaces, misses: Misses
 ) -> Landmarks:
     """Return one row per landmark, with the hits and misses of this recording."""
-    best = _rows(landmarks, np.argsort(landmarks.landmark_id, kind="stable")[places.most_probable()])
+    best = landmarks[np.argsort(landmarks.landmark_id, kind="stable")[places.most_probable()]]
     names, hit = best.landmark_id, run.detection[run.all("p_inlier") > 0.5]
     n_hits, n_misses = (
         np.bincount(np.searchsorted(names, seen), minlength=len(names)).astype(np.int64)
         for seen in (recording.detections.landmark_id[hit], misses.landmark_id)
     )
     return replace(best, n_hits=n_hits, n_misses=n_misses, frame="prior_map")
-
-
-def _rows(landmarks: Landmarks, rows: IntArray) -> Landmarks:
-    columns: dict[str, Any] = {item.name: getattr(landmarks, item.name) for item in fields(landmarks)}
-    columns = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
-    return replace(landmarks, **columns)
 
 
 def _warnings(recording: Recording, run: _Run, places: KnownPlaces) -> list[str]:

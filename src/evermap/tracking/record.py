@@ -8,20 +8,19 @@ found moved or gone at `gone_s`. What that says of lifetimes is in `survival.cen
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from evermap.errors import DataError
-from evermap.show import ShownTable
 from evermap.tracking.tracklets import EventKind, SpellTable, Tracklets, TrackState
 from evermap.tracking.working_set import Stored, WorkingSet
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray, Rows
 
 BOX_COLUMNS = ("length_m", "width_m", "height_m", "yaw_rad")
 
 
-class InSpace(ShownTable):
+class InSpace(Rows):
     """Mixin of tables of objects: positions and velocities are three columns each, states are words."""
 
     __slots__ = ()
@@ -110,10 +109,6 @@ class Tracks(_Objects):
         stamp_s: (R,) frames.
     """
 
-    def __getitem__(self, rows: IntArray | BoolArray) -> Self:
-        """Some of them, by number or by a mask."""
-        return type(self)(**{item.name: getattr(self, item.name)[rows] for item in fields(self)})
-
 
 class Recorder:
     """Collects what a tracker says, frame after frame."""
@@ -199,10 +194,6 @@ class StaticSpells(InSpace):
     last_s: FloatArray
     gone_s: FloatArray
 
-    def __getitem__(self, rows: IntArray | BoolArray) -> Self:
-        """Some of them, by number or by a mask."""
-        return type(self)(*(getattr(self, name)[rows] for name in self.__slots__))
-
 
 class SpellLog:
     """Static spells that have ended, in the order in which they did."""
@@ -229,10 +220,8 @@ class SpellLog:
         going_on = _spells(t, rows, t.class_p[:n].argmax(axis=1), t.rest_mean, np.inf)
         w = working_set.stored
         stored = working_set.rows[w.static[working_set.rows] == 1]
-        parts = [*self._parts, going_on, _spells(w, stored, w.class_id, w.position, np.inf)]
-        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in StaticSpells.__slots__}
-        order = np.lexsort((columns["first_s"], columns["track_id"]))
-        return StaticSpells(**columns)[order]
+        every = going_on.joined(_spells(w, stored, w.class_id, w.position, np.inf), *self._parts)
+        return every[np.lexsort((every.first_s, every.track_id))]
 
 
 def _spells(

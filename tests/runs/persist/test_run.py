@@ -12,7 +12,7 @@ import pytest
 from evermap.cli.options import priors_by_class
 from evermap.config import PersistConfig
 from evermap.errors import ConfigError, DataError, EvermapError, InputError
-from evermap.existence.models import save_model
+from evermap.existence.models import NamedModels, save_models
 from evermap.existence.one_stay import OneStay, PersistenceFilter
 from evermap.existence.phase_type import PhaseType
 from evermap.existence.protocol import Instants
@@ -145,7 +145,7 @@ def test_permuting_the_rows_permutes_the_answer(tmp_path: Path) -> None:
 def test_a_model_from_a_file_lets_features_return(tmp_path: Path) -> None:
     looks = table(tmp_path)
     model = PhaseType.two_state(1 / 300, 1 / 200)
-    path = save_model(model, tmp_path / "model.json")
+    path = save_models(NamedModels({"": model}), tmp_path / "model.json")
     result = run_persist(looks, PersistConfig(model=str(path)))
     for feature in range(looks.n_features):
         rows = np.flatnonzero(looks.feature == feature)
@@ -159,7 +159,7 @@ def test_a_model_from_a_file_lets_features_return(tmp_path: Path) -> None:
 def test_a_run_length_model_says_when_to_expect_what(tmp_path: Path) -> None:
     looks = table(tmp_path)
     model = RunLength(Exponential(1 / 300), Exponential(1 / 200), 10.0)
-    path = save_model(model, tmp_path / "model.json")
+    path = save_models(NamedModels({"": model}), tmp_path / "model.json")
     forecasts = run_persist(looks, PersistConfig(model=str(path))).forecasts
     np.testing.assert_allclose(forecasts.mean_stay_s, 300.0, rtol=0.02)  # memoryless, whatever the looks were
     np.testing.assert_allclose(forecasts.mean_absence_s, 200.0, rtol=0.02)
@@ -195,7 +195,7 @@ def test_an_impossible_look_is_named_with_feature_and_line(tmp_path: Path) -> No
     with pytest.raises(InputError, match=message):
         run_persist(looks, PersistConfig(prior="uniform:limit=1min"))
     path.write_text("stamp_s,feature_id,detected,p_miss,p_false\n0,a,0,0,0.5\n0,b,0,0,1\n")
-    save_model(PhaseType.two_state(0.1, 0.1), tmp_path / "m.json")
+    save_models(NamedModels({"": PhaseType.two_state(0.1, 0.1)}), tmp_path / "m.json")
     with pytest.raises(InputError, match=r"looks\.csv:3: field 'p_miss': 0 and p_false 1 make 1 or more"):
         run_persist(read_looks(path), PersistConfig(model=str(tmp_path / "m.json")))
 

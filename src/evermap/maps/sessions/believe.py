@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from evermap.config import LivingConfig
-from evermap.existence.sites import SiteBeliefs, SiteDynamics, SiteLooks, SiteSensor, follow_sites
+from evermap.existence.sites import Evidence, SiteBeliefs, SiteDynamics, SiteLooks, SiteSensor, follow_sites
 from evermap.maps.lives import Life
-from evermap.maps.living import Evidence, LivingMap, Sites, class_of, clique_rows, site_middles
+from evermap.maps.living import LivingMap, Sites, class_of, clique_rows, site_middles
 from evermap.maps.sessions.looks import PlaceLooks
 from evermap.sensing.sightlines import Lines, nominal_lines
 from evermap.survival.step import never_leaves
@@ -101,10 +101,7 @@ def believed(
 def evidence(living: LivingMap, beliefs: SiteBeliefs) -> Evidence:
     """Return the evidence on every clique, frame by frame."""
     cliques, _ = clique_rows(living.sites)
-    told = beliefs.trace
-    return Evidence(
-        cliques[told.clique], told.stamp_s, told.n_hits, told.n_misses, told.expected, told.log_odds, told.p_exists
-    )
+    return replace(beliefs.trace, clique_id=cliques[beliefs.trace.clique_id])
 
 
 def said(living: LivingMap, beliefs: SiteBeliefs) -> FloatArray:

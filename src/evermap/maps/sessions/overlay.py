@@ -71,12 +71,7 @@ class Known:
     log_turned: FloatArray
 
     def with_turned(self, clique: IntArray, settings: OverlayConfig) -> Known:
-        """Return these with another site for every landmark that seems turned: turned in its place.
-
-        Args:
-            clique: (L,) of the session's landmarks.
-            settings: the share of moves that are such turns.
-        """
+        """Return these with another site for every landmark that seems turned, of cliques (L,): turned in its place."""
         alone = np.bincount(self.site, minlength=len(self.log_p_site))[self.site] == 1
         turned = np.flatnonzero(alone & (self.log_turned < 0.0))
         of = clique[self.landmark[turned]]
@@ -178,18 +173,14 @@ def _joint(options: _Options) -> IntArray:
 
 
 class _Field(NamedTuple):
-    """What chosen places say of all others: the rows of N, with the covariance of their differences but the motion.
-
-    The motion is so free beside the differences that their joint covariance has no digits left for these.
+    """What N chosen places say of all others; the motion by itself, which is so free beside their differences that a
+    joint covariance has no digits left for these.
 
     Attributes:
-        row: (N,) of the places.
-        error: (dim N,) differences.
-        inverse: (dim N, dim N) of their covariance for a known motion.
+        row, error, inverse: (N,) the places, (dim N,) their differences, and inverse covariance for a known motion.
         freedom: (dim N, F) how they change with the motion, in its standard deviations.
         drag: `inverse freedom`.
-        motion: (F,) the motion, as they have it.
-        root: lower Cholesky factor of its information (F, F).
+        motion, root: (F,) the motion, as they have it, and the lower Cholesky factor of its information.
     """
 
     row: IntArray
@@ -216,14 +207,7 @@ class _Field(NamedTuple):
         return _Field.of(self.row[kept[::dim]], self.error[kept], rest, self.freedom[kept])
 
     def log_at(self, error: FloatArray, covariance: FloatArray, across: FloatArray, freedom: FloatArray) -> float:
-        """Return the log density of differences of further places.
-
-        Args:
-            error: (M,) the differences.
-            covariance: (M, M) of these for a known motion.
-            across: (M, dim N) of these and the chosen.
-            freedom: (M, F) of these.
-        """
+        """Return the log density of differences (M,) of further places, from covariances for a known motion."""
         gain = across @ self.inverse
         lever = freedom - gain @ self.freedom
         off = error - gain @ self.error - lever @ self.motion

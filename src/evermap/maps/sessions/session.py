@@ -9,9 +9,10 @@ import numpy as np
 
 from evermap.config import Config, LivingConfig
 from evermap.errors import DataError
+from evermap.existence.sites import Evidence
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
-from evermap.maps.living import EXISTS, Evidence, LivingMap, clique_rows
+from evermap.maps.living import EXISTS, LivingMap, clique_rows
 from evermap.maps.sessions import believe, decide
 from evermap.maps.sessions.extend import Extended, Found, extended, first_and_last
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Sighting, Watch, arrivals, looked_at

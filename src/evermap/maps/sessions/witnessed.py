@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evermap.maps.living import Evidence, LivingMap, clique_rows
+from evermap.existence.sites import Evidence
+from evermap.maps.living import LivingMap, clique_rows
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Watch
 from evermap.sensing.sightlines import KNOWN
 from evermap.types import FloatArray, IntArray, rows_of

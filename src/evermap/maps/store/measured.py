@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.maps.living import Evidence
+from evermap.existence.sites import Evidence
 from evermap.maps.store.content import Chunk, DamagedError, name_of, text_chunk
 from evermap.types import (
     AnyRecording,

@@ -10,7 +10,8 @@ from typing import Protocol, Self
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.maps.living import Evidence, LivingMap, Members
+from evermap.existence.sites import Evidence
+from evermap.maps.living import LivingMap, Members
 from evermap.types import ChangeKind, MapChange
 
 

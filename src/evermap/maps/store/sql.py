@@ -16,8 +16,9 @@ from sqlalchemy.schema import CreateSchema
 
 from evermap import __version__
 from evermap.errors import ConfigError, InputError, NumericalError
+from evermap.existence.sites import Evidence
 from evermap.maps.diff import grown
-from evermap.maps.living import Evidence, LivingMap, Members
+from evermap.maps.living import LivingMap, Members
 from evermap.maps.store import content, schema
 from evermap.maps.store.content import Chunk, DamagedError
 from evermap.maps.store.history import Record, about, lineage, pruned_to_text, ranges, read_pruned
@@ -349,7 +350,7 @@ class SqlStore(Shown):
             ]
             stored = self._fetched(connection, {row.name for row in rows})
             kept += [looks_of(row.clique_id, stored[row.name], row.name) for row in rows]
-        found = Evidence(*(np.concatenate([getattr(part, item.name) for part in kept]) for item in fields(Evidence)))
+        found = kept[0].joined(*kept[1:])
         found = found[found.stamp_s >= since_s]
         return found[np.argsort(found.stamp_s, kind="stable")]
 

@@ -15,7 +15,7 @@ from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries
 from evermap.slam.space.linearise import CORNERS, POINT, POSE
 from evermap.slam.space.problem import USUAL, SpatialProblem
-from evermap.types import ANY_RANGE_M2, UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
+from evermap.types import ANY_RANGE_M2, UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording, rows_of
 
 HARDLY = 1.0
 """Standard deviation with which it counts, as a share of the range: as good as nothing."""
@@ -68,7 +68,7 @@ def prepare_space(
     pose_frame = seen_in if recording.odometry is None else np.flatnonzero(moving)
     used = np.flatnonzero(usable)
     landmark_id, place = np.unique(detections.landmark_id[used], return_inverse=True)
-    some = where.rows(used)
+    some = rows_of(where, used)
     symmetries = _symmetries(recording, place, used, some.kind)
     oriented = np.zeros(len(landmark_id), dtype=np.bool_)
     oriented[place[some.kind != POINT]] = True
@@ -188,9 +188,6 @@ class _Where:
     corner_root: FloatArray
     other: FloatArray
     other_log_odds: FloatArray
-
-    def rows(self, rows: IntArray) -> _Where:
-        return _Where(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
 def _where(recording: SpatialRecording, usable: BoolArray, settings: SpaceConfig) -> tuple[_Where, BoolArray]:

@@ -21,8 +21,6 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 ROUNDS = 3
 """Times that other explanations are tried, at most."""
-MOST_JUMPS = 4
-"""Stretches between jumps that are asked together, at most."""
 
 
 def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
@@ -55,7 +53,7 @@ def bridged(optimum: SpatialOptimum) -> SpatialEstimate | None:
     ends = np.unique(np.append(bounds, [0, len(optimum.estimate.pose)]))
     found: list[tuple[float, int, int]] = []
     for k, first in enumerate(ends[:-1].tolist()):
-        for end in ends[k + 1 : k + 1 + MOST_JUMPS].tolist():
+        for end in ends[k + 1 : k + 1 + smoother.problem.settings.repair.jumps].tolist():
             if 2 * (end - first) < len(optimum.estimate.pose):
                 trial = _bridged(smoother.problem, optimum.estimate, first, end)
                 found.append((smoother.linearised(trial, optimum.noise, heavy=False).cost - now.cost, first, end))
@@ -68,20 +66,18 @@ def bridged(optimum: SpatialOptimum) -> SpatialEstimate | None:
 
 def _bridged(problem: SpatialProblem, estimate: SpatialEstimate, first: int, end: int) -> SpatialEstimate:
     """The values with some poses by the odometry, from the pose before them to the one after them."""
-    pose, last = estimate.pose.copy(), len(estimate.pose) - 1
-    step = problem.increment.copy()
-    step[:, :3] *= np.exp(estimate.log_scale)
+    pose = estimate.pose.copy()
+    step = problem.increment * np.append(np.full(3, np.exp(estimate.log_scale)), np.ones(4))
     if first == 0:
         for k in range(end - 1, -1, -1):
             pose[k] = se3.compose(pose[k + 1], se3.inverse(step[k]))
         return replace(estimate, pose=pose)
-    for k in range(first, min(end, last) + 1):
+    for k in range(first, min(end + 1, len(pose))):
         pose[k] = se3.compose(pose[k - 1], step[k - 1])
-    if end <= last:
-        stamp = problem.stamp_s[first - 1 : end + 1]
-        share = (stamp - stamp[0]) / (stamp[-1] - stamp[0])
-        off = se3.local(pose[end], estimate.pose[end])
-        pose[first : end + 1] = se3.retract(pose[first : end + 1], share[1:, None] * off)
+    if end < len(pose):
+        stamp, some = problem.stamp_s, slice(first, end + 1)
+        share = (stamp[some] - stamp[first - 1]) / (stamp[end] - stamp[first - 1])
+        pose[some] = se3.retract(pose[some], share[:, None] * se3.local(pose[end], estimate.pose[end]))
     return replace(estimate, pose=pose)
 
 
