@@ -44,7 +44,7 @@ UNKNOWN: int = -1
 """Id of a landmark or class that is not known."""
 
 
-class Rows(ShownTable):
+class Tabular(ShownTable):
     """Mixin of tables whose rows are taken and joined: all arrays have as many as the first; what is no array stays."""
 
     __slots__ = ()
@@ -63,7 +63,7 @@ class Rows(ShownTable):
         return replace(self, **{name: np.concatenate(columns) for name, columns in every.items()})
 
 
-class _Columns(Rows):
+class _Columns(Tabular):
     """Mixin of dataclasses whose arrays are columns of N rows each, N being those of the first one.
 
     Raises:

@@ -24,7 +24,7 @@ from evermap.existence.recursion import LOG_LARGEST
 from evermap.sensing.sightlines import Lines
 from evermap.show import Shown
 from evermap.survival.base import LifetimePrior
-from evermap.types import BoolArray, FloatArray, IntArray, Rows
+from evermap.types import BoolArray, FloatArray, IntArray, Tabular
 
 if TYPE_CHECKING:
     from evermap.existence.site_kernels import FrameEvidence
@@ -252,7 +252,7 @@ class SiteSensor(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence(Rows):
+class Evidence(Tabular):
     """Evidence of looks at the places of cliques: (E,) rows, by clique, then by time.
 
     Attributes:

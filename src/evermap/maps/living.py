@@ -24,7 +24,7 @@ from evermap.maps.lives import Lives
 from evermap.maps.shelves import Sight
 from evermap.sensing.sightlines import SightLines, Views, pair_rows
 from evermap.show import Shown, draw
-from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, Rows, landmark_id_of
+from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, Tabular, landmark_id_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,7 +43,7 @@ TURNS, AXES = {2: 0, 3: 4}, {2: 0, 3: 3}
 _DTYPES: dict[str, type] = {"IntArray": np.int64, "FloatArray": np.float64, "BoolArray": np.bool_}
 
 
-class _Rows(Rows):
+class _Rows(Tabular):
     """Columns of equal length that are taken and joined together."""
 
     __slots__ = ()

@@ -15,12 +15,12 @@ import numpy as np
 from evermap.errors import DataError
 from evermap.tracking.tracklets import EventKind, SpellTable, Tracklets, TrackState
 from evermap.tracking.working_set import Stored, WorkingSet
-from evermap.types import BoolArray, FloatArray, IntArray, Rows
+from evermap.types import BoolArray, FloatArray, IntArray, Tabular
 
 BOX_COLUMNS = ("length_m", "width_m", "height_m", "yaw_rad")
 
 
-class InSpace(Rows):
+class InSpace(Tabular):
     """Mixin of tables of objects: positions and velocities are three columns each, states are words."""
 
     __slots__ = ()
