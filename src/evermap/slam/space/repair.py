@@ -2,8 +2,7 @@
 
 The view of a single far tag has two explanations, and the optimum of one is no way to the other. So the poses that
 every detection by itself suggests, in both ways, are asked, and the orientations that all detections of a place vote.
-And a frame in which nothing but a wrong identity was read is seen from where the robot never was: between two jumps of
-the odometry, which are asked to be none.
+A wrong identity that is alone in view explains itself by two jumps of the odometry, which are asked to be none.
 """
 
 from __future__ import annotations
@@ -42,25 +41,26 @@ def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
 
 
 def bridged(optimum: SpatialOptimum) -> SpatialEstimate | None:
-    """Return the values with stretches of frames between jumps of the odometry where it has them, if that is cheaper.
-
-    What was seen in these frames was then seen wrongly. None if no stretch is better off.
-    """
-    smoother, now = optimum.smoother, optimum.now
-    bounds = np.flatnonzero(now.odometry_weight < 0.5) + 1
-    if not smoother.problem.driven or not len(bounds):
+    """Return the values with frames between jumps of the odometry where it has them, if that is cheaper; else None."""
+    smoother, now, estimate, problem = optimum.smoother, optimum.now, optimum.estimate, optimum.smoother.problem
+    bounds, n = np.flatnonzero(now.odometry_weight < 0.5) + 1, len(optimum.estimate.pose)
+    if not problem.driven or not len(bounds):
         return None
-    ends = np.unique(np.append(bounds, [0, len(optimum.estimate.pose)]))
+    ends = np.unique(np.append(bounds, [0, n]))
+    # at the odometry's poses all that is seen there is an outlier: no gain where that costs more than the jumps
+    seen, sightings = problem.pose_row, problem.sightings
+    lost = np.append(0.0, np.cumsum(np.bincount(seen, now.weight * sightings.log_odds[sightings.kind], minlength=n)))
     found: list[tuple[float, int, int]] = []
     for k, first in enumerate(ends[:-1].tolist()):
-        for end in ends[k + 1 : k + 1 + smoother.problem.settings.repair.jumps].tolist():
-            if 2 * (end - first) < len(optimum.estimate.pose):
-                trial = _bridged(smoother.problem, optimum.estimate, first, end)
+        for end in ends[k + 1 : k + 1 + problem.settings.repair.jumps].tolist():
+            jumps = np.count_nonzero((bounds >= first) & (bounds <= end))
+            if lost[end] - lost[first] < jumps * problem.settings.jump_log_odds:
+                trial = _bridged(problem, estimate, first, end)
                 found.append((smoother.linearised(trial, optimum.noise, heavy=False).cost - now.cost, first, end))
-    estimate, taken = optimum.estimate, np.zeros(len(optimum.estimate.pose), dtype=np.bool_)
+    taken = np.zeros(n, dtype=np.bool_)
     for cost, first, end in sorted(found):
         if cost < 0.0 and not taken[max(first - 1, 0) : end + 1].any():
-            estimate, taken[first:end] = _bridged(smoother.problem, estimate, first, end), True
+            estimate, taken[first:end] = _bridged(problem, estimate, first, end), True
     return estimate if taken.any() else None
 
 
