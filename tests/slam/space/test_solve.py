@@ -14,7 +14,9 @@ from evermap.config import SpaceConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.metrics.summary import compare_with_truth
+from evermap.slam.space.estimate import converged
 from evermap.slam.space.intake import prepare_space
+from evermap.slam.space.repair import repaired
 from evermap.slam.space.solve import solve_space
 from evermap.types import Landmarks, SlamResult, SpatialSensor, rows_of
 
@@ -100,6 +102,31 @@ def test_a_robot_that_stands_says_nothing_of_its_odometry():
     scale = next(one for one in found.parameters if one.name == "odometry_scale")
     assert scale.value == pytest.approx(1.0, abs=1e-3)
     assert scale.prior_sigma == 0.005
+
+
+def test_a_wrong_identity_alone_in_view_is_no_place_of_the_robot():
+    """Two jumps of the odometry explain it, from which no descent leads back."""
+    world = tagged_corridor(5)
+    seen, middle = world.recording.detections, len(world.recording.frames) // 2
+    alone = np.flatnonzero(seen.frame == middle)[0]
+    names = seen.landmark_id.copy()
+    tags = world.tags
+    away = np.linalg.norm(tags.position_m - tags.position_m[tags.landmark_id == names[alone]], axis=1)
+    names[alone] = tags.landmark_id[np.argsort(away)[1]]  # its neighbour
+    kept = (np.abs(seen.frame - middle) > 2) | (np.arange(len(names)) == alone)
+    recording = replace(world.recording, detections=rows_of(replace(seen, landmark_id=names), kept))
+    optimum = solve_space(prepare_space(recording, SpaceConfig()), None).optimum
+    problem, true = optimum.smoother.problem, optimum.estimate.pose
+    row = int(np.flatnonzero(problem.pose_row == middle)[0])
+    sensed = se3.compose(optimum.estimate.mount(problem)[problem.sensor[row]], problem.measured[row])
+    pose = true.copy()
+    pose[middle] = se3.compose(optimum.estimate.place[problem.place[row]], se3.inverse(sensed))
+    astray = converged(problem, replace(optimum.estimate, pose=pose), optimum.noise, heavy_rounds=0)
+    assert np.linalg.norm(astray.estimate.pose[middle, :3] - true[middle, :3]) > 1.0
+    assert (astray.now.odometry_weight < 0.5).sum() == 2
+    found = repaired(astray)
+    assert np.linalg.norm(found.estimate.pose[middle, :3] - true[middle, :3]) < 0.01
+    assert found.now.cost < astray.now.cost
 
 
 def test_noise_levels_are_those_of_the_world():
