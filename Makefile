@@ -112,10 +112,12 @@ $(DOCUMENTATION): requirements-docs.lock | $(VENV)/bin/python
 
 # For maintainers: renew the pins, under the oldest Python that users have (Debian's 3.11.2), which newer packages may
 # refuse. Index addresses are kept out of the files: they are the machine's business.
-COMPILE = $(VENV)/bin/pip-compile --quiet --upgrade --strip-extras --no-header --annotation-style=line \
+# evermap itself, which the studies need, is in no index
+COMPILE = PIP_FIND_LINKS=$(VENV)/wheels $(VENV)/bin/pip-compile --unsafe-package evermap --quiet --upgrade --strip-extras --no-header --annotation-style=line \
           --no-emit-index-url --no-emit-find-links --no-emit-trusted-host
 lock: $(DEVELOPMENT)
 	$(PIP_INSTALL) pip-tools
+	$(VENV)/bin/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir $(VENV)/wheels .
 	$(COMPILE) --extra rerun --extra ros --extra live --extra server --extra cluster --extra dev --build-deps-for editable --output-file requirements-dev.lock pyproject.toml studies/pyproject.toml
 	$(COMPILE) --extra rerun --extra ros --extra live --build-deps-for editable --constraint requirements-dev.lock --output-file requirements.lock pyproject.toml studies/pyproject.toml
 	$(VENV)/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"], sep="\n")' \
