@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
@@ -26,9 +25,6 @@ from evermap.types import FloatArray, IntArray
 
 ELSEWHERE = -1
 """Option of a clique at no known site."""
-FAR_M = 2.0
-HOPELESS = -200.0
-"""Distance from a site, and log density, beyond which a clique is not considered again."""
 USUAL = OverlayConfig()
 MOST_FLIPS = 400
 """Steps of one ascent, at most: it ends long before."""
@@ -172,58 +168,68 @@ def _joint(options: _Options) -> IntArray:
     return best
 
 
-class _Field(NamedTuple):
-    """What N chosen places say of all others; the motion by itself, which is so free beside their differences that a
-    joint covariance has no digits left for these.
+class _Field:
+    """What N chosen places say of all P; the motion by itself, which is so free beside their differences that a joint
+    covariance has no digits left for these.
 
-    Attributes:
-        row, error, inverse: (N,) the places, (dim N,) their differences, and inverse covariance for a known motion.
+    Args:
+        error: (dim N,) differences of the chosen.
+        factor: (dim N, dim N) lower Cholesky factor of their covariance for a known motion.
         freedom: (dim N, F) how they change with the motion, in its standard deviations.
-        drag: `inverse freedom`.
-        motion, root: (F,) the motion, as they have it, and the lower Cholesky factor of its information.
+        across: (dim P, dim N) covariance of the differences of all places and the chosen.
     """
 
-    row: IntArray
-    error: FloatArray
-    inverse: FloatArray
-    freedom: FloatArray
-    drag: FloatArray
-    motion: FloatArray
-    root: FloatArray
+    def __init__(self, error: FloatArray, factor: FloatArray, freedom: FloatArray, across: FloatArray) -> None:
+        inverse = np.tril(dpotri(factor, lower=True)[0]) if len(error) else factor
+        self._inverse = inverse + np.tril(inverse, -1).T
+        self._across, self._gain = across, across @ self._inverse
+        self._drag, self._pull = self._inverse @ freedom, self._inverse @ error
+        self._dragged, self._told = across @ self._drag, across @ self._pull
+        self._information, self._sum = np.eye(freedom.shape[1]) + freedom.T @ self._drag, self._drag.T @ error
 
-    @classmethod
-    def of(cls, row: IntArray, error: FloatArray, inverse: FloatArray, freedom: FloatArray) -> _Field:
-        """Return the field with the posterior of the motion."""
-        drag = inverse @ freedom
-        root = np.asarray(np.linalg.cholesky(np.eye(freedom.shape[1]) + freedom.T @ drag))
-        return cls(row, error, inverse, freedom, drag, cho_solve((root, True), drag.T @ error), root)
+    def log_at(
+        self, of: IntArray, error: FloatArray, covariance: FloatArray, freedom: FloatArray, out: IntArray
+    ) -> FloatArray:
+        """Return (K,) log densities of further places, each by all that are chosen but some.
 
-    def without(self, block: slice, dim: int) -> _Field:
-        """Return the same without the places whose differences are a block."""
-        kept = np.ones(len(self.error), dtype=np.bool_)
-        kept[block] = False
-        ties = self.inverse[np.ix_(kept, ~kept)]
-        rest = self.inverse[np.ix_(kept, kept)] - ties @ np.linalg.solve(self.inverse[block, block], ties.T)
-        return _Field.of(self.row[kept[::dim]], self.error[kept], rest, self.freedom[kept])
+        Args:
+            of: (K, M) rows of all differences.
+            error: (K, M) these.
+            covariance: (K, M, M) of them, for a known motion.
+            freedom: (K, M, F) how they change with it.
+            out: (K, B) rows of the chosen that are left out.
+        """
+        alone, drag, pull = np.linalg.inv(_square(self._inverse, out)), self._drag[out], self._pull[out][..., None]
+        back = np.swapaxes(drag, 1, 2) @ alone
+        information, mean = self._information - back @ drag, self._sum[:, None] - back @ pull
+        through = self._gain[of[:, :, None], out[:, None, :]]
+        lost = through @ alone
+        lever = freedom - self._dragged[of] + lost @ drag
+        swing = np.linalg.solve(information, np.concatenate([np.swapaxes(lever, 1, 2), mean], axis=2))
+        off = error - self._told[of] + (lost @ pull - lever @ swing[..., -1:])[..., 0]
+        known = self._gain[of] @ np.swapaxes(self._across[of], 1, 2) - lost @ np.swapaxes(through, 1, 2)
+        return _log_density(off, covariance - known + lever @ swing[..., :-1])
 
-    def log_at(self, error: FloatArray, covariance: FloatArray, across: FloatArray, freedom: FloatArray) -> float:
-        """Return the log density of differences (M,) of further places, from covariances for a known motion."""
-        gain = across @ self.inverse
-        lever = freedom - gain @ self.freedom
-        off = error - gain @ self.error - lever @ self.motion
-        swing = solve_triangular(self.root, lever.T, lower=True)
-        return _log_density(off, covariance - gain @ across.T + swing.T @ swing)
+    def log_there(self, block: IntArray) -> FloatArray:
+        """Return (K,) log densities of some of the chosen (K, B), each given the others."""
+        drag = self._drag[block]
+        swing = np.linalg.solve(self._information, np.swapaxes(drag, 1, 2))
+        pull = self._pull[block] - drag @ np.linalg.solve(self._information, self._sum)
+        own = np.linalg.inv(_square(self._inverse, block) - drag @ swing)
+        return _log_density((own @ pull[..., None])[..., 0], own)
 
 
-def _log_density(off: FloatArray, covariance: FloatArray) -> float:
-    """Log density of a Gaussian; minus infinity where rounding has left none."""
-    try:
-        root = np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        return -math.inf
-    whitened = solve_triangular(root, off, lower=True)
-    log_volume = 2.0 * float(np.log(np.diagonal(root)).sum())
-    return -0.5 * (float(whitened @ whitened) + log_volume + len(off) * math.log(2.0 * math.pi))
+def _square(matrix: FloatArray, rows: IntArray) -> FloatArray:
+    """(K, B, B) blocks of a matrix on its diagonal, of rows (K, B)."""
+    return np.asarray(matrix[rows[:, :, None], rows[:, None, :]])
+
+
+def _log_density(off: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(K,) log densities of Gaussians; minus infinity where rounding has left none."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + np.swapaxes(covariance, 1, 2)))
+    fine, values = values[:, 0] > 0.0, np.maximum(values, 1e-300)
+    squared = np.einsum("kab,ka->kb", vectors, off) ** 2 / values
+    return np.where(fine, -0.5 * (squared + np.log(2.0 * math.pi * values)).sum(axis=1), -np.inf)
 
 
 class _Options:
@@ -256,9 +262,9 @@ class _Options:
         self._rows = {int(known.site[part[0]]): part for part in parts if len(part)}
         gap = np.linalg.norm(self.landmark_m[known.landmark] - known.position_m, axis=1)
         self._gap_m = {site: float(gap[rows].max()) for site, rows in self._rows.items()}
-        self._hopeless: dict[int, float] = {}
         for site, rows in self._rows.items():
             self.sites[int(sighted.clique[known.landmark[rows[0]]])].append(site)
+        self._elsewhere = {site: self._log_elsewhere(rows) for site, rows in self._rows.items()}
 
     def likeliest_sites(self) -> IntArray:
         """Return (C,) for every clique its most probable site; `ELSEWHERE` where it is more probably away."""
@@ -415,16 +421,15 @@ class _Options:
         """Return members that have not moved, while the body as a whole has."""
         field = self._field(chosen)
         for site in filter(self._stands, self.sites[clique]):
-            stay = []
+            rows = self._rows[site]
+            moved = np.array([self._log_elsewhere(np.array([row])) for row in rows])
+            nothing = np.zeros((len(rows), 0), dtype=np.int64)
+            at_place = self._log_at(rows[:, None], field, nothing) + self.known.log_turned[rows]
+            stay = at_place > moved
             total = math.log(self.settings.p_split) + float(self.known.log_p_elsewhere[clique])
-            for row in self._rows[site]:
-                one = np.array([row])
-                at_place = self._log_at(one, field) + float(self.known.log_turned[row])
-                moved = self._log_elsewhere(one)
-                stay.append(at_place > moved)
-                total += max(at_place, moved)
-            if any(stay) and total > together:
-                kept = self._rows[site][np.array(stay)]
+            total += float(np.maximum(at_place, moved).sum())
+            if stay.any() and total > together:
+                kept = rows[stay]
                 place[self.known.landmark[kept]] = kept
                 return
 
@@ -438,49 +443,43 @@ class _Options:
 
     def _scores(self, chosen: IntArray) -> list[dict[int, float]]:
         """Return the log probability of the options of every clique, given the choices for the others."""
-        field = self._field(chosen)
-        start = {}
-        at = 0
-        for site in chosen:
-            if site != ELSEWHERE:
-                start[int(site)] = at
-                at += len(self._rows[int(site)])
-        whitened = solve_triangular(field.root, field.drag.T, lower=True)
-        pull = field.inverse @ field.error - field.drag @ field.motion
+        field, at = self._field(chosen), 0
+        asked: dict[tuple[int, int], list[tuple[int, IntArray]]] = {}
+        there: dict[int, list[tuple[int, IntArray]]] = {}
+        for clique, sites in enumerate(self.sites):
+            block = np.zeros(0, dtype=np.int64)
+            if (mine := int(chosen[clique])) != ELSEWHERE:
+                block = np.arange(at, at := at + self.dim * len(self._rows[mine]))
+                there.setdefault(len(block), []).append((mine, block))
+            for site in sites:
+                if site != mine:
+                    asked.setdefault((len(self._rows[site]), len(block)), []).append((site, block))
+        density: dict[int, float] = {}
+        for some in there.values():
+            density |= zip(
+                (site for site, _ in some), field.log_there(np.array([out for _, out in some])).tolist(), strict=True
+            )
+        for some in asked.values():
+            of, out = np.array([self._rows[site] for site, _ in some]), np.array([out for _, out in some])
+            density |= zip((site for site, _ in some), self._log_at(of, field, out).tolist(), strict=True)
         table: list[dict[int, float]] = []
         for clique, sites in enumerate(self.sites):
-            scores = {ELSEWHERE: float(self.known.log_p_elsewhere[clique])}
-            if not sites:
-                table.append(scores)
-                continue
-            mine = int(chosen[clique])
-            others, block = field, slice(0)
-            if mine != ELSEWHERE:
-                block = slice(self.dim * start[mine], self.dim * (start[mine] + len(self._rows[mine])))
-            for site in sites:
-                prior = float(self._log_site[site])
-                if site == mine:  # leave-one-out by the inverse alone
-                    precision = field.inverse[block, block] - whitened[:, block].T @ whitened[:, block]
-                    squared = float(pull[block] @ np.linalg.solve(precision, pull[block]))
-                    scores[site] = prior + 0.5 * float(np.linalg.slogdet(precision)[1]) - 0.5 * squared
-                    scores[site] -= 0.5 * len(precision) * math.log(2.0 * math.pi)
-                    continue
-                if site in self._hopeless:
-                    scores[site] = self._hopeless[site]
-                    continue
-                if mine != ELSEWHERE and others is field:
-                    others = field.without(block, self.dim)
-                scores[site] = prior + self._log_at(self._rows[site], others)
-                if self._gap_m[site] > FAR_M and scores[site] < HOPELESS:
-                    self._hopeless[site] = scores[site]
-            best = max(sites, key=lambda site: scores[site])
-            scores[ELSEWHERE] += self._log_elsewhere(self._rows[best])
-            table.append(scores)
+            scores = {site: float(self._log_site[site]) + density[site] for site in sites}
+            moved = max(
+                ((p, self._elsewhere[site]) for site, p in scores.items()), key=lambda one: one[0], default=(0, 0)
+            )
+            table.append({ELSEWHERE: float(self.known.log_p_elsewhere[clique]) + moved[1], **scores})
         return table
 
-    def _log_at(self, of: IntArray, field: _Field) -> float:
-        """Log density of places `of`, being where their landmarks are, given those of a field."""
-        return field.log_at(self._error(of), self._covariance(of, of), self._covariance(of, field.row), self._free(of))
+    def _log_at(self, of: IntArray, field: _Field, out: IntArray) -> FloatArray:
+        """(K,) log densities of places (K, M), being where their landmarks are, by all that are chosen but some."""
+        shape, landmark = of.shape, self.known.landmark[of]
+        rows, session = (se2.xy_rows(some.ravel(), self.dim).reshape(shape[0], -1) for some in (of, landmark))
+        covariance = _square(self._session, session) + _square(self.known.covariance_m2, rows)
+        wide = self.drift_m**2 + np.repeat(self._turned_m2[of], self.dim, axis=1)
+        covariance += wide[:, :, None] * np.eye(rows.shape[1])
+        error = (self.landmark_m[landmark] - self.known.position_m[of]).reshape(rows.shape)
+        return field.log_at(rows, error, covariance, self._freedom[session], out)
 
     def _log_elsewhere(self, of: IntArray) -> float:
         """Log density of the landmarks of places `of`, if their body was moved."""
@@ -498,13 +497,8 @@ class _Options:
     def _field(self, chosen: IntArray) -> _Field:
         """What all places that are chosen say of the others."""
         rows = self._chosen_rows(chosen)
-        error, factor = self._factored(rows)
-        inverse = np.tril(dpotri(factor, lower=True)[0]) if len(rows) else factor
-        return _Field.of(rows, error, inverse + np.tril(inverse, -1).T, self._free(rows))
-
-    def _error(self, rows: IntArray) -> FloatArray:
-        """Return differences of places, interleaved."""
-        return np.asarray((self.landmark_m[self.known.landmark[rows]] - self.known.position_m[rows]).ravel())
+        across = self._covariance(np.arange(len(self.known.site)), rows)
+        return _Field(*self._factored(rows), self._free(rows), across)
 
     def _free(self, rows: IntArray) -> FloatArray:
         """Return how differences of places change with the motion, in its standard deviations."""
@@ -512,7 +506,8 @@ class _Options:
 
     def _factored(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Differences of places, and the lower Cholesky factor of their covariance for a known motion."""
-        return self._error(rows), np.asarray(np.linalg.cholesky(self._covariance(rows, rows)))
+        error = (self.landmark_m[self.known.landmark[rows]] - self.known.position_m[rows]).ravel()
+        return error, np.asarray(np.linalg.cholesky(self._covariance(rows, rows)))
 
     def _covariance(self, a: IntArray, b: IntArray) -> FloatArray:
         """Between the differences of two sets of places, for a known motion."""
