@@ -43,9 +43,12 @@ class OverlayConfig(Section):
     p_another_place: Share = key(1e-3, "probability that a session is from another place")
     smallest_room_m2: Positive = key(50.0, "minimum area in which moved bodies may be found [m^2]")
     drifts_m: tuple[Positive, ...] = key(
-        (0.01, 0.02, 0.04, 0.08, 0.003, 0.001),
+        (0.01, 0.02, 0.04, 0.08),
         "candidate standard deviations of unmoved landmarks from session to session, the likeliest first [m]",
         min_length=1,
+    )
+    drifts_in_space_m: tuple[Positive, ...] = key(
+        (0.003, 0.001), "more of these in space, less likely than the others [m]"
     )
     free_m: Positive = key(20.0, "standard deviation of a session's place around the one agreed on, each axis [m]")
     free_rad: Positive = key(3.0, "the same of its heading [rad]")

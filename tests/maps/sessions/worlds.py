@@ -199,7 +199,7 @@ class Densely:
                 (self.log_probability(chosen, drift) + k * math.log(USUAL.p_coarser), tuple(chosen), drift)
                 for chosen in self.assignments()
                 if np.any(chosen >= 0)
-                for k, drift in enumerate(USUAL.drifts_m)
+                for k, drift in enumerate((*USUAL.drifts_m, *(USUAL.drifts_in_space_m if self.dim == 3 else ())))
             ),
             reverse=True,
         )

@@ -154,7 +154,8 @@ def _joint(options: _Options) -> IntArray:
     """The most probable assignment, and with it how well sessions agree at all."""
     settings = options.settings
     best, highest, drift_m = options.agreeing(), -math.inf, settings.drifts_m[0]
-    for k, options.drift_m in enumerate(settings.drifts_m):
+    more = settings.drifts_in_space_m if options.dim == SPACE.point_dim else ()
+    for k, options.drift_m in enumerate((*settings.drifts_m, *more)):
         chosen = options.climb(best)
         score = options.log_probability(chosen)
         # bodies that moved together agree, too, on a motion of their own: what stands may be the rest
