@@ -193,12 +193,11 @@ class Densely:
         return self.log_probability(chosen, drift_m) - moved > math.log(1e-3) - standing * math.log(self.room_m2)
 
     def best(self) -> tuple[IntArray, float, float]:
-        """The likeliest assignment in which something stands, its drift, and by how much the next is less probable."""
+        """The most probable assignment, the drift with it, and by how much the next one is less probable."""
         scored = sorted(
             (
                 (self.log_probability(chosen, drift) + k * math.log(USUAL.p_coarser), tuple(chosen), drift)
                 for chosen in self.assignments()
-                if np.any(chosen >= 0)
                 for k, drift in enumerate((*USUAL.drifts_m, *(USUAL.drifts_in_space_m if self.dim == 3 else ())))
             ),
             reverse=True,
