@@ -35,6 +35,7 @@ OPEN = ("/healthz", "/openapi.json")
 """Paths that need no token."""
 ENDLESS = "/maps/{site}/events"
 ROUND = 40
+"""Requests of one kind to one path in a row."""
 REFUSED = (400, 401, 422)
 """Answers without a token: none is there, or the request cannot be read at all."""
 STRANGERS: tuple[dict[str, str], ...] = ({}, {"Authorization": "Bearer nobody"}, {"Authorization": "Basic YTpi"})
@@ -86,15 +87,13 @@ def fuzz(
     """
     import schemathesis
 
-    found, paths = (
-        Found(),
-        [item.ok() for item in schemathesis.openapi.from_asgi("/openapi.json", app).get_all_operations()],
-    )
-    began = time.monotonic()
+    described = schemathesis.openapi.from_asgi("/openapi.json", app)
+    paths = [item.ok() for item in described.get_all_operations()]
+    found, began = Found(), time.monotonic()
     while found.n_requests < requests:
         for path in paths:
             for mode in schemathesis.GenerationMode:
-                _round(path.as_strategy(generation_mode=mode), path, tokens, (number, each), found)
+                _round(path.as_strategy(generation_mode=mode), path, tokens, number, each, found)
                 number += 1
         if progress:
             rate_hz = found.n_requests / (time.monotonic() - began)
@@ -102,8 +101,8 @@ def fuzz(
     return found
 
 
-def _round(cases: Any, path: Any, tokens: dict[str, str], number_each: tuple[int, int], found: Found) -> None:
-    (number, each), count = number_each, 0
+def _round(cases: Any, path: Any, tokens: dict[str, str], number: int, each: int, found: Found) -> None:
+    count = 0
 
     @seed(number)
     @settings(

@@ -44,7 +44,7 @@ _DTYPES: dict[str, type] = {"IntArray": np.int64, "FloatArray": np.float64, "Boo
 
 
 class _Rows(Tabular):
-    """Columns of equal length that are taken and joined together."""
+    """Tables of a map, in the plane or in space."""
 
     __slots__ = ()
 

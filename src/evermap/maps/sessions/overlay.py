@@ -70,6 +70,8 @@ class Known:
         """Return these with another site for every landmark that seems turned, of cliques (L,): turned in its place."""
         alone = np.bincount(self.site, minlength=len(self.log_p_site))[self.site] == 1
         turned = np.flatnonzero(alone & (self.log_turned < 0.0))
+        if not len(turned):
+            return self
         of = clique[self.landmark[turned]]
         share = settings.share_turned / np.bincount(of, minlength=len(self.log_p_elsewhere))[of]
         every = np.append(np.arange(len(self.site)), turned)
@@ -341,7 +343,7 @@ class _Options:
         total, _ = self._log_standing(chosen)
         for clique, sites in enumerate(self.sites):
             if sites and chosen[clique] == ELSEWHERE:
-                total += max(self._log_elsewhere(self._rows[other]) for other in sites)
+                total += max(self._elsewhere[other] for other in sites)
         return total
 
     def is_this_place(self, chosen: IntArray) -> bool:
@@ -466,10 +468,8 @@ class _Options:
         table: list[dict[int, float]] = []
         for clique, sites in enumerate(self.sites):
             scores = {site: float(self._log_site[site]) + density[site] for site in sites}
-            moved = max(
-                ((p, self._elsewhere[site]) for site, p in scores.items()), key=lambda one: one[0], default=(0, 0)
-            )
-            table.append({ELSEWHERE: float(self.known.log_p_elsewhere[clique]) + moved[1], **scores})
+            moved = self._elsewhere[max(sites, key=lambda site: scores[site])] if sites else 0.0
+            table.append({ELSEWHERE: float(self.known.log_p_elsewhere[clique]) + moved, **scores})
         return table
 
     def _log_at(self, of: IntArray, field: _Field, out: IntArray) -> FloatArray:
