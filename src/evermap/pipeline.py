@@ -41,13 +41,16 @@ def run_slam(
         ConfigError: settings that contradict each other or the recording.
         NumericalError: no finite optimum.
     """
-    from evermap.maps.sessions import session
+    from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check
     from evermap.slam.space.moving import has_traffic, run_in_traffic
 
     config = config or Config()
     recording, remarks = check.screened(recording, config, prior_map)
-    recording = association.with_identities(recording, config.slam, prior_map)
+    if config.slam.unknown_ids and prior_map is not None and isinstance(recording, SpatialRecording):
+        recording = nameless.numbered_in(recording, prior_map, config)
+    else:
+        recording = association.with_identities(recording, config.slam, prior_map)
     if has_traffic(recording):
         return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
     visit = session.solved(recording, config, prior_map, remarks, realtime=realtime, progress=progress)
@@ -114,15 +117,18 @@ def run_session(
         DataError: nothing can be estimated, or the session is earlier than the map.
         NumericalError: no finite optimum.
     """
-    from evermap.maps.sessions import boxes, session
+    from evermap.maps.sessions import boxes, nameless, session
     from evermap.slam import check
 
     config = config or Config()
     living = session.opened(living, recording)
     if not isinstance(recording, SpatialRecording):
         return bring_in(solve_alone(recording, living, config, progress=progress), living, config)
+    recording = nameless.without_ids(recording) if config.slam.unknown_ids is True else recording
     recording, remarks = check.screened(recording, config)
     recording, living = session.admitted(recording, living)
+    if config.slam.unknown_ids:
+        recording, living = session.admitted(nameless.named_in(recording, living, config), living)
     return session.brought_in(boxes.localised(recording, living, config, remarks, progress), living, config.living)
 
 

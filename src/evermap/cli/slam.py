@@ -543,10 +543,6 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
     in_space = isinstance(recording, SpatialRecording)
     if realtime and (in_space or not localize):
         raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
-    if config.slam.unknown_ids and in_space:
-        raise ConfigError(
-            "in a map is for the plane", field="slam.unknown_ids", hint="leave out --unknown-ids, or --map"
-        )
     common, by_class = priors_by_class(priors)
     said = priors_of(common, by_class)
     later = [name for name in said if name not in (by_class or {})]  # a file tells of classes of other sites, too

@@ -257,6 +257,7 @@ class AnonymousInSpaceConfig(Section):
     alike_rad: Positive = key(0.2, "spread of the orientations of landmarks on one wall [rad]")
     turn_sigmas: Positive = key(4.0, "standard deviations by which orientations of one landmark may differ ...")
     turn_floor_rad: Positive = key(0.1, "... where their least error is this [rad]")
+    same_turn_rad: Positive = key(0.5, "alignments with a map whose orientation differs by less are one [rad]")
     tail: float = key(5.0, "factor on the error of detections in the tail ...", ge=1)
     tail_share: Share = key(0.1, "... and their share")
     widened: Positive = key(1.5, "factor on the variance of a detection, for the uncertainty of the poses")

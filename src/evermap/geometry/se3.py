@@ -124,6 +124,12 @@ def local(pose: ArrayLike, other: ArrayLike) -> FloatArray:
     return log(between(pose, other))
 
 
+def turn(rotation: ArrayLike) -> FloatArray:
+    """Return poses (..., 7) at the origin with orientations (..., 4), nan of none."""
+    given = np.asarray(rotation, dtype=np.float64)
+    return np.concatenate([np.zeros((*given.shape[:-1], 3)), given], axis=-1)
+
+
 def angle_between(pose: ArrayLike, other: ArrayLike) -> FloatArray:
     """Return the angles [rad] between the orientations of poses (..., 7), broadcast."""
     a, b = np.asarray(pose, dtype=np.float64), np.asarray(other, dtype=np.float64)

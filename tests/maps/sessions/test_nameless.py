@@ -11,6 +11,7 @@ import pytest
 from evermap.config import Config, OverlayConfig
 from evermap.errors import ConfigError
 from evermap.geometry import se2
+from evermap.geometry.group import PLANE, SPACE, Group
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.nameless import held_at, without_ids
@@ -27,33 +28,34 @@ from .buildings import FIXED, building, lived_through
 NAMELESS = Config(slam=FIXED.model_copy(update={"unknown_ids": True}))
 
 
-def test_what_is_held_is_predicted_by_the_others() -> None:
+@pytest.mark.parametrize("group", [PLANE, SPACE], ids=["plane", "space"])
+def test_what_is_held_is_predicted_by_the_others(group: Group) -> None:
     """Against conditioning one at a time on the differences of all others, written down densely."""
-    rng = np.random.default_rng(0)
-    count, held = 6, np.array([0, 2, 3, 5])
-    place = rng.normal(0.0, 5.0, (count, 2))
-    root = rng.normal(0.0, 0.05, (2 * count, 2 * count))
-    local = LocalMap(place, root @ root.T + 1e-3 * np.eye(2 * count))
-    known = np.diag(rng.uniform(1e-4, 1e-2, 2 * len(held)))
-    motion = np.array([3.0, -1.0, 0.7])
-    at = se2.transform(motion, place)[held] + rng.normal(0.0, 0.05, (len(held), 2))
+    rng, dim = np.random.default_rng(0), group.point_dim
+    count, held = 7, np.array([0, 2, 3, 5, 6])
+    place = rng.normal(0.0, 5.0, (count, dim))
+    root = rng.normal(0.0, 0.05, (dim * count, dim * count))
+    local = LocalMap(place, root @ root.T + 1e-3 * np.eye(dim * count))
+    known = np.diag(rng.uniform(1e-4, 1e-2, dim * len(held)))
+    motion = group.exp(rng.normal(0.0, 1.0, group.dim))
+    at = group.transform(motion, place)[held] + rng.normal(0.0, 0.05, (len(held), dim))
     drift_m = 0.03
-    found = held_at(local, held, at, known, OverlayConfig(drifts_m=(drift_m,)))
+    found = held_at(local, held, at, known, OverlayConfig(drifts_m=(drift_m,), drifts_in_space_m=()))
     assert found.drift_m == drift_m
 
     about = rigid(place[held], at)
-    own = se2.transform(about, place)
-    turn = np.kron(np.eye(count), se2.rotation(about[2]))
-    free = se2.rigid_directions(own - own[held].mean(axis=0)) * np.array([20.0, 20.0, 3.0])
+    own = group.transform(about, place)
+    turn = np.kron(np.eye(count), group.rotation_of(about))
+    free = group.rigid_directions(own - own[held].mean(axis=0)) * np.repeat([20.0, 3.0], [dim, group.dim - dim])
     prior = turn @ local.covariance @ turn.T + free @ free.T
     noise = known + drift_m**2 * np.eye(len(known))
     for k in range(count):
         others = np.flatnonzero(held != k)
-        rows, of = se2.xy_rows(held[others]), se2.xy_rows(others)
+        rows, of = se2.xy_rows(held[others], dim), se2.xy_rows(others, dim)
         gain = prior[:, rows] @ np.linalg.inv(prior[np.ix_(rows, rows)] + noise[np.ix_(of, of)])
         mean = own.ravel() - gain @ (own[held[others]] - at[others]).ravel()
         spread = prior - gain @ prior[rows]
-        mine = slice(2 * k, 2 * k + 2)
+        mine = slice(dim * k, dim * k + dim)
         np.testing.assert_allclose(found.position_m[k], mean[mine], atol=1e-6)
         np.testing.assert_allclose(found.covariance_m2[k], spread[mine, mine], atol=1e-6)
 

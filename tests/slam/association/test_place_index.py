@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evermap.geometry import se2
+from evermap.geometry import se2, se3
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
 from evermap.slam.association.place_index import PlaceIndex
 from evermap_studies.sim.warehouse import WarehouseConfig, warehouse_landmarks
@@ -108,3 +108,38 @@ def test_few_landmarks_say_nothing(count):
     assert index.pairs(source, density=DENSITY, probability=P) == []
     small = PlaceIndex(rng.uniform(0, 5, (count, 2)), np.tile(np.eye(2), (count, 1, 1)))
     assert small.pairs(local_map(rng, np.arange(20.0).reshape(10, 2), 8)[0], density=DENSITY, probability=P) == []
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_part_of_a_map_in_space_is_found_in_it(seed):
+    """However it is turned; three of its landmarks are new."""
+    rng = np.random.default_rng(seed)
+    true, count = rng.uniform(0.0, 1.0, (80, 3)) * [25.0, 15.0, 4.0], 15
+    rows = np.argsort(np.linalg.norm(true - true[seed], axis=1))[:count]
+    place, anywhere = true[rows].copy(), se3.exp(rng.normal(0.0, [9.0, 9.0, 9.0, 1.0, 1.0, 1.0]))
+    place[-3:] = rng.uniform(place.min(axis=0), place.max(axis=0), (3, 3))
+    source = LocalMap(se3.transform(anywhere, place) + SIGMA_M * rng.normal(size=(count, 3)), 1e-3 * np.eye(3 * count))
+    index = PlaceIndex(true, np.tile(SIGMA_M**2 * np.eye(3), (len(true), 1, 1)))
+    motions = list(index.motions(source.place, source.beside_m))
+    target = LocalMap(true, SIGMA_M**2 * np.eye(3 * len(true)))
+    allowed = np.ones((count, len(true)), dtype=bool)
+    pairs = agreed_pairs(source, target, allowed, density=DENSITY, probability=P, motions=motions)
+    assert len(pairs) >= 9
+    assert all(rows[k] == m for k, m in pairs if k < count - 3)
+    assert all(k < count - 3 for k, _ in pairs)
+
+
+def test_orientations_decide_between_the_two_sides_of_a_wall():
+    """Points of a wall that are symmetric about its middle look the same after half a turn; tags on it do not."""
+    at = np.array([[-3.0, 0.0, 0.5], [-1.8, 0.0, -0.4], [-0.7, 0.0, 0.9], [1.0, 0.0, -0.7], [2.2, 0.0, 0.3]])
+    wall = np.vstack([at, at * [-1.0, 1.0, 1.0]])
+    facing = np.tile([0.5, -0.5, 0.5, -0.5], (len(wall), 1))
+    index = PlaceIndex(wall, np.tile(SIGMA_M**2 * np.eye(3), (len(wall), 1, 1)))
+    motions = list(index.motions(wall, SIGMA_M))
+    allowed = np.ones((len(wall), len(wall)), dtype=bool)
+    found = []
+    for rotation in (None, facing):
+        target = LocalMap(wall, SIGMA_M**2 * np.eye(3 * len(wall)), rotation)
+        found.append(agreed_pairs(target, target, allowed, density=DENSITY, probability=P, motions=motions))
+    assert found[0] == []
+    assert sorted(found[1]) == [(k, k) for k in range(len(wall))]

@@ -11,6 +11,7 @@ from space.corridors import tagged_corridor
 
 from evermap.config import AssociationConfig, Section, SlamConfig
 from evermap.slam.association import with_identities
+from evermap.slam.association.place_index import PlaceIndex
 from evermap.types import UNKNOWN
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
@@ -36,7 +37,9 @@ def keys(section: Section, prefix: str) -> Iterator[str]:
 
 
 def test_every_key_is_read_from_the_settings_of_the_caller() -> None:
-    """A park with some identities and a radius, again without these in a map of over 100 trees; and tags in space."""
+    """A park with some identities and a radius, again without these in a map of over 100 trees; tags, and points of a
+    map, in space.
+    """
     wild = ParkConfig(drive_m=150.0, n_trees=105, n_cars=2, steering_noise_rad=0.05)  # as if wheels slip
     park, rng = simulate_park(wild), np.random.default_rng(0)
     seen, read = park.detections, set[str]()
@@ -48,6 +51,8 @@ def test_every_key_is_read_from_the_settings_of_the_caller() -> None:
     settings = Watched(SlamConfig(unknown_ids=True), read)
     with_identities(park, settings, park.true_landmarks)
     with_identities(tagged_corridor(0, n_frames=40).recording, settings)
+    point = rng.uniform(0.0, 10.0, (20, 3))
+    PlaceIndex(point, np.tile(1e-4 * np.eye(3), (20, 1, 1)), settings=settings).motions(point, 0.01)
     every = {*keys(AssociationConfig(), "association."), "fewest_sightings", "outlier_log_odds"}
     assert every - read == set()
 

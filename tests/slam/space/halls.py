@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from evermap.geometry import se3
 from evermap.io.spatial import spatial_detections
-from evermap.types import Frames, Landmarks, SpatialRecording, SpatialSensor, Trajectory
+from evermap.types import Frames, Landmarks, SpatialRecording, SpatialSensor, Trajectory, rows_of
 
 from .corridors import _drifting, poses
 
@@ -69,3 +73,35 @@ def hall(
         Trajectory(stamp_s, pose, np.zeros((n_frames, 6, 6)), frame="truth"),
         Landmarks.in_space(np.arange(n_points), place), class_names=CLASSES,
     )  # fmt: skip
+
+
+def part_of_hall(
+    recording: SpatialRecording,
+    begin: int,
+    end: int,
+    frame: np.ndarray | None = None,
+    *,
+    without: Sequence[int] = (),
+    later_s: float = 0.0,
+) -> SpatialRecording:
+    """The frames from one to another, without truth and some landmarks; odometry starts at 0, or at a pose (7,)."""
+    seen, odometry = recording.detections, recording.odometry
+    assert odometry is not None
+    seen = rows_of(seen, (seen.frame >= begin) & (seen.frame < end) & ~np.isin(seen.landmark_id, without))
+    driven = rows_of(odometry, np.arange(begin, end))
+    start = se3.inverse(driven.pose_world_robot[0])
+    pose = se3.compose(se3.identity() if frame is None else frame, se3.compose(start, driven.pose_world_robot))
+    return replace(
+        recording,
+        odometry=replace(driven, stamp_s=driven.stamp_s + later_s, pose_world_robot=pose),
+        frames=replace(recording.frames, stamp_s=recording.frames.stamp_s[begin:end] + later_s),
+        detections=replace(seen, frame=seen.frame - begin),
+        truth=None,
+        true_landmarks=None,
+    )
+
+
+def tilt(seed: int) -> np.ndarray:
+    """Any pose (7,)."""
+    random = np.random.default_rng(seed)
+    return se3.exp(np.append(random.normal(0.0, 5.0, 3), random.normal(0.0, 1.0, 3)))

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from identity_scores import identity_scores
 
-from evermap import run_slam
+from evermap import run_session, run_slam
 from evermap.config import Config
-from evermap.errors import ConfigError, DataError
+from evermap.errors import DataError
+from evermap.maps.sessions.nameless import numbered_in
 from evermap.slam.association.in_space import identified_in_space
-from evermap.types import UNKNOWN, SpatialRecording
+from evermap.types import UNKNOWN, ChangeKind, SpatialRecording, rows_of
 
 from .corridors import tagged_corridor
-from .halls import hall
+from .halls import hall, part_of_hall, tilt
 from .rooms import Room
 
 SLAM = Config().slam
@@ -113,9 +114,59 @@ def test_tags_that_are_not_always_read():
     assert np.mean(found == true) > 0.99
 
 
-def test_what_it_cannot_do_is_refused():
+def test_without_odometry_it_is_refused():
     recording = tagged_corridor(0, n_frames=40, odometry=False).recording
     with pytest.raises(DataError, match="need odometry"):
         identified_in_space(recording, SLAM)
-    with pytest.raises(ConfigError, match="a fixed map"):
-        run_slam(tagged_corridor(0, n_frames=40).recording, NAMELESS, prior_map=recording.true_landmarks)
+
+
+def named_as(recording: SpatialRecording, found: SpatialRecording) -> dict[int, int]:
+    """What landmarks are called, by their true identities."""
+    name, true = found.detections.landmark_id, recording.detections.landmark_id
+    real = (name != UNKNOWN) & (true != UNKNOWN)
+    return {int(one): int(np.bincount(true[real & (name == one)]).argmax()) for one in np.unique(name[real])}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_points_are_found_in_a_fixed_map_from_anywhere_and_new_ones_get_numbers_of_their_own(seed):
+    """The odometry of the drive starts in a frame that is turned about all axes."""
+    drive = part_of_hall(hall(seed, n_points=60, n_frames=600, drift=0.05), 300, 600, tilt(seed))
+    true = hall(seed, n_points=60, n_frames=600, drift=0.05).true_landmarks
+    assert true is not None
+    survey = replace(rows_of(true, np.arange(60) >= 6), landmark_id=true.landmark_id[6:] + 100)
+    found = numbered_in(drive, survey, NAMELESS)
+    name = named_as(drive, found)
+    known = {one: real for one, real in name.items() if one >= 100}
+    assert all(one == real + 100 for one, real in known.items())
+    assert all(real < 6 for one, real in name.items() if one < 100)
+    assert len(known) >= 0.95 * np.isin(np.unique(drive.detections.landmark_id), true.landmark_id[6:]).sum()
+    result = run_slam(drive, NAMELESS, prior_map=survey)
+    assert result.trajectory.frame == "prior_map"
+    at = result.landmarks.position_m[np.isin(result.landmarks.landmark_id, survey.landmark_id)]
+    there = survey.position_m[np.isin(survey.landmark_id, result.landmarks.landmark_id)]
+    assert np.median(np.linalg.norm(at - there, axis=1)) < 0.05
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_points_keep_their_names_over_sessions_and_those_that_left_are_told(seed):
+    whole, gone = hall(seed, n_points=60, n_frames=600, drift=0.05), [3, 20, 41]
+    first = part_of_hall(whole, 0, 300)
+    begun = run_session(first, None, NAMELESS)
+    second = part_of_hall(whole, 300, 600, tilt(seed), without=gone, later_s=86_400.0)
+    session = run_session(second, begun.living, NAMELESS)
+    assert session.found
+    before, now = named_as(first, begun.recording), named_as(second, session.recording)
+    both = before.keys() & now.keys()
+    assert len(both) > 40
+    assert all(before[one] == now[one] for one in both)
+    assert {change.kind for change in session.changes} == {ChangeKind.VANISHED}
+    assert {before[one] for change in session.changes for one in change.landmark_ids} <= set(gone)
+    assert len(session.changes) >= 2
+
+
+def test_another_hall_is_refused():
+    begun = run_session(part_of_hall(hall(1, n_points=60, n_frames=600), 0, 300), None, NAMELESS)
+    other = part_of_hall(hall(7, n_points=60, n_frames=600), 0, 300, later_s=86_400.0)
+    session = run_session(other, begun.living, NAMELESS)
+    assert not session.found
+    assert len(session.living.places) == len(begun.living.places)

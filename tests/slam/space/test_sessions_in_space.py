@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
 from evermap.pipeline import run_session, run_slam
-from evermap.types import ChangeKind, Landmarks, landmark_id_of, rows_of
+from evermap.types import UNKNOWN, ChangeKind, Landmarks, landmark_id_of, rows_of
 
 from .corridors import Site
 
@@ -63,6 +64,38 @@ def test_what_was_moved_turned_taken_and_brought_back_is_told_when_it_is_seen(se
     assert changes(fifth) == [(ChangeKind.RETURNED, (14,))]
     p = dict(zip(fifth.living.members.landmark_id.tolist(), fifth.living.p_exists().tolist(), strict=True))
     assert min(p.values()) > 0.9
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_same_without_identities(seed: int) -> None:
+    """A tag that was moved by its neighbour's distance is another one; one that is turned in its place is the same."""
+    site, true = Site.of(seed), dict[int, int]()
+
+    def day(number: int, part: tuple[float, float], living: LivingMap | None) -> tuple[Session, list[Any]]:
+        patrol = site.patrol(seed, number, *part)
+        found = run_session(patrol, living, Config(slam={"unknown_ids": True}))
+        assert found.found
+        name, real = found.recording.detections.landmark_id, patrol.detections.landmark_id
+        assert not (name == UNKNOWN).any()
+        for one in np.unique(name).tolist():
+            assert true.setdefault(one, int(real[name == one][0])) == int(np.bincount(real[name == one]).argmax())
+        return found, [(kind, [true[one] for one in names]) for kind, names in changes(found)]
+
+    first, told = day(0, ALL, None)
+    assert told == []
+    second, told = day(1, WEST, first.living)
+    assert told == []
+    site.place[3] += [0.6, 0.0, 0.1]
+    site.present[14] = False
+    third, told = day(2, EAST, second.living)
+    assert told == [(ChangeKind.VANISHED, [14])]
+    site.turn(5, 1.0)
+    fourth, told = day(3, WEST, third.living)
+    expected = (ChangeKind.VANISHED, [3]), (ChangeKind.MOVED, [5]), (ChangeKind.APPEARED, [3])
+    assert sorted(told, key=str) == sorted(expected, key=str)
+    site.present[14] = True
+    _, told = day(4, EAST, fourth.living)
+    assert told == [(ChangeKind.RETURNED, [14])]
 
 
 @pytest.mark.slow

@@ -1,11 +1,12 @@
-"""Association of landmarks without identity with a map in the plane.
+"""Association of landmarks without identity with a map, in the plane and in space.
 
 A session is associated by itself (`slam.association`). Where it lies in the map follows from the constellation of what
 stands: one way to lay it over the map must be far better than all others, and than being elsewhere. From there its
 landmarks are assigned to those of the map, one to one, in the joint Gaussian of both, with all that is assigned held,
 against 'new': by class, by how probably each still stands at a place, and by how little a landmark that was moved may
 be off. What returns to its place is taken for what stood there, and two of a class that were exchanged for not moved:
-nothing can tell. With these names the session goes into the map as any other.
+nothing can tell. With these names the session goes into the map as any other. In space, landmarks that have an
+orientation are the same only if that agrees, too, but one may have been turned in its place.
 """
 
 from __future__ import annotations
@@ -16,25 +17,40 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.spatial import KDTree
 
 from evermap.config import Config, OverlayConfig
-from evermap.geometry import se2
+from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
+from evermap.geometry.group import SPACE, group_of
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import EXISTS, LivingMap
 from evermap.maps.sessions.believe import aged
 from evermap.maps.sessions.box_search import TESTED_M2
 from evermap.maps.sessions.gaussian import drifted
 from evermap.maps.sessions.placing import SMALLEST_P, one_to_one
-from evermap.slam.association.assignment import alike
-from evermap.slam.association.associator import density_of_unmet
+from evermap.maps.sessions.session import admitted
+from evermap.slam.association.assignment import alike, with_ids
 from evermap.slam.association.consensus import Candidates, consensus
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
-from evermap.slam.association.identify import ALL_TRIED, Associated, associated
+from evermap.slam.association.identify import ALL_TRIED, Associated, associated, numbered
+from evermap.slam.association.in_space import AssociatedInSpace, associated_in_space
 from evermap.slam.association.jcbb import gates
+from evermap.slam.association.merging import in_reach
 from evermap.slam.association.place_index import PlaceIndex
+from evermap.slam.association.revise import most_probable
 from evermap.slam.intake import beliefs
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Recording, landmark_id_of
+from evermap.types import (
+    UNKNOWN,
+    AnyRecording,
+    AnyRecordingT,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Landmarks,
+    SpatialRecording,
+    landmark_id_of,
+)
 
 WINDOW = 12
 """Landmarks, met one after the other, that are looked for in the map together."""
@@ -42,8 +58,10 @@ GROUP, MOST_HELD, MOST_PAIRS = 24, 100, 400
 """Landmarks that are assigned together, those near them that hold them, and pairs that are weighed, at most."""
 HELD_NATS = 100.0
 """Log odds of a certain match."""
-GATE = float(gates(1, 0.9999)[1])
-"""Squared distance beyond which a landmark is not at a place."""
+BESIDE = 3
+"""Landmarks next to a detection that tell how far the session is bent there."""
+GATE = {dim: float(gates(1, 0.9999, dim)[1]) for dim in (2, 3)}
+"""Squared distance beyond which a landmark is not at a place, by the coordinates of one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +70,8 @@ class _Stood:
 
     Attributes:
         row: of the map's places; landmark: (P,) row of the map's members.
-        position_m, covariance_m2: (P, 2), (P, 2, 2).
+        position_m, covariance_m2: (P, D), (P, D, D).
+        rotation: (P, 4) in space, nan for none; (P, 0) in the plane.
         class_id: of its landmark.
         p: probability that it is there when the session begins; p_away: that it is at no known place.
     """
@@ -61,6 +80,7 @@ class _Stood:
     landmark: IntArray
     position_m: FloatArray
     covariance_m2: FloatArray
+    rotation: FloatArray
     class_id: IntArray
     p: FloatArray
     p_away: FloatArray
@@ -73,17 +93,17 @@ class _Stood:
         p_away = np.clip(1.0 - living.p_of_sites(p_site)[member], SMALLEST_P, 1.0)
         p = np.clip(p_site[np.searchsorted(living.sites.site_id, places.site_id)], SMALLEST_P, 1.0)
         row = np.arange(len(places))
-        return cls(row, member, places.position_m, living.place_covariance_m2(row), members.class_id[member], p, p_away)
+        covariance = living.place_covariance_m2(row)
+        return cls(row, member, places.position_m, covariance, places.rotation, members.class_id[member], p, p_away)
 
 
-def without_ids(recording: Recording) -> Recording:
+def without_ids(recording: AnyRecordingT) -> AnyRecordingT:
     """Return a recording without the ids of its detections."""
-    detections = recording.detections
-    nobody = np.full_like(detections.landmark_id, UNKNOWN)
-    return replace(recording, detections=replace(detections, landmark_id=nobody), landmark_names={})
+    nobody = np.full(len(recording.detections), UNKNOWN)
+    return replace(with_ids(recording, nobody, nobody, nobody[:0]), landmark_names={})
 
 
-def named_in(recording: Recording, living: LivingMap, config: Config) -> Recording:
+def named_in(recording: AnyRecordingT, living: LivingMap, config: Config) -> AnyRecordingT:
     """Return a recording with landmark ids by geometry: those of a map where its landmarks were met, new ones else.
 
     Args:
@@ -92,27 +112,57 @@ def named_in(recording: Recording, living: LivingMap, config: Config) -> Recordi
         config: settings.
 
     Raises:
-        DataError: too few frames with detections, or too many for the memory.
+        DataError: too few frames with detections, or too many for the memory; in space, no odometry.
     """
-    found = associated(recording, *beliefs(recording.sensor, config.slam), keep_ids=True, settings=config.slam)
-    start_s = float(recording.frames.stamp_s[0])
-    landmark_id = found.assignment.name
-    if len(living.places):
-        p_site = aged(living, config.living, start_s).p_here
-        member = _Assigned(found, living, _Stood.of(living, p_site), config).members()
-        known = (member >= 0) & (landmark_id == UNKNOWN)
-        landmark_id[known] = living.members.landmark_id[member[known]]
-    names = _new_names(found, recording, landmark_id, start_s)
+    found, name, landmark_id = _met(recording, living, config)
+    names = _new_names(found, recording, landmark_id)
     for row, text in names.items():
         landmark_id[row] = landmark_id_of(text)
     texts = {landmark_id_of(text): text for text in names.values()}
-    return replace(found.named(recording, landmark_id), landmark_names={**recording.landmark_names, **texts})
+    named = with_ids(recording, found.landmark_row, name, landmark_id)
+    return replace(named, landmark_names={**recording.landmark_names, **texts})
 
 
-def _new_names(found: Associated, recording: Recording, landmark_id: IntArray, start_s: float) -> dict[int, str]:
+def numbered_in(recording: SpatialRecording, prior_map: Landmarks, config: Config) -> SpatialRecording:
+    """Return a recording in space with landmark ids by geometry: those of a fixed map, and numbers for new landmarks.
+
+    What `slam.association.identify.identified` does in the plane; arguments and errors are of the same kind.
+    """
+    living = replace(LivingMap.begun(prior_map), clock=recording.clock)
+    given = recording if config.slam.unknown_ids == "empty" else without_ids(recording)
+    of_map, living = admitted(given, living.from_now_on(float(recording.frames.stamp_s[0])))
+    found, name, landmark_id = _met(of_map, living, config)
+    taken = np.concatenate([prior_map.landmark_id, given.detections.landmark_id])
+    return with_ids(given, found.landmark_row, name, numbered(landmark_id, taken))
+
+
+def _met(
+    recording: AnyRecording, living: LivingMap, config: Config
+) -> tuple[Associated | AssociatedInSpace, IntArray, IntArray]:
+    """The association of a recording, (M,) ids of its detections, given or of glimpsed landmarks of a map, and (L,) ids
+    of its landmarks, `UNKNOWN` for new ones.
+    """
+    found: Associated | AssociatedInSpace
+    if isinstance(recording, SpatialRecording):
+        found = associated_in_space(recording, config.slam, keep_ids=True)
+    else:
+        found = associated(recording, *beliefs(recording.sensor, config.slam), keep_ids=True, settings=config.slam)
+    landmark_id, name = found.names, found.name.copy()
+    if len(living.places):
+        p_site = aged(living, config.living, float(recording.frames.stamp_s[0])).p_here
+        assigned = _Assigned(found, living, _Stood.of(living, p_site), config)
+        member, where = assigned.members()
+        known = (member >= 0) & (landmark_id == UNKNOWN)
+        landmark_id[known] = living.members.landmark_id[member[known]]
+        rows, glimpsed = assigned.glimpsed(member, where, recording.detections.frame)
+        name[rows] = living.members.landmark_id[glimpsed]
+    return found, name, landmark_id
+
+
+def _new_names(found: Associated | AssociatedInSpace, recording: AnyRecording, landmark_id: IntArray) -> dict[int, str]:
     """Return names of new landmarks: class, number in the session, and its first stamp."""
-    start = f"{start_s:.3f}".rstrip("0").rstrip(".")
-    kind, words = found.assignment.of_kind[:, 0], recording.class_names
+    start = f"{recording.frames.stamp_s[0]:.3f}".rstrip("0").rstrip(".")
+    kind, words = found.of_kind[:, 0], recording.class_names
     new = np.flatnonzero(landmark_id == UNKNOWN).tolist()
     return {row: f"{words[kind[row]] if kind[row] >= 0 else 'landmark'}-{row + 1}@{start}" for row in new}
 
@@ -121,15 +171,17 @@ class Where(NamedTuple):
     """Landmarks of a session in a map, each predicted by all matched ones except itself.
 
     Attributes:
-        position_m, covariance_m2: (K, 2), (K, 2, 2).
+        position_m, covariance_m2: (K, D), (K, D, D).
         drift_m: standard deviation of unmoved landmarks between sessions, each axis.
-        joint_m2: (2 K, 2 K) covariance of all, given all matched ones.
+        joint_m2: (D K, D K) covariance of all, given all matched ones.
+        rotation: (K, 4) in space, nan for none; (K, 0) in the plane.
     """
 
     position_m: FloatArray
     covariance_m2: FloatArray
     drift_m: float
     joint_m2: FloatArray
+    rotation: FloatArray
 
 
 def held_at(
@@ -143,32 +195,36 @@ def held_at(
     Args:
         local: the session, in a frame of its own.
         held: (H,) rows of those that are held.
-        position_m: (H, 2) their places.
-        covariance_m2: (2 H, 2 H) of these.
+        position_m: (H, D) their places.
+        covariance_m2: (D H, D H) of these.
         config: how far what stands may be off; the most probable is taken.
     """
-    motion = rigid(local.place[held], position_m)
-    at, count = se2.transform(motion, local.place), len(local.place)
-    turn = np.kron(np.eye(count), se2.rotation(motion[2]))
-    freedom = se2.rigid_directions(at - at[held].mean(axis=0)) * np.array(
-        [config.free_m, config.free_m, config.free_rad]
-    )
+    motion, dim = rigid(local.place[held], position_m), local.dim
+    group = group_of(motion)
+    at, count = group.transform(motion, local.place), len(local.place)
+    turn = np.kron(np.eye(count), group.rotation_of(motion))
+    free = np.repeat([config.free_m, config.free_rad], [dim, group.dim - dim])
+    freedom = group.rigid_directions(at - at[held].mean(axis=0)) * free
     spread = turn @ local.covariance @ turn.T + freedom @ freedom.T
-    rows, error = se2.xy_rows(held), (at[held] - position_m).ravel()
-    drift_m, inverse = _drifted(spread[np.ix_(rows, rows)] + covariance_m2, error, config)
+    rows, error = se2.xy_rows(held, dim), (at[held] - position_m).ravel()
+    drift_m, inverse = _drifted(spread[np.ix_(rows, rows)] + covariance_m2, error, dim, config)
     pull, gain = inverse @ error, spread[:, rows]
     joint = spread - gain @ inverse @ gain.T
-    position, covariance = at - (gain @ pull).reshape(-1, 2), blocks(joint).copy()
-    own = np.linalg.inv(blocks(inverse))
-    position[held] = position_m + (own @ pull.reshape(-1, 2, 1))[..., 0]
-    covariance[held] = own - blocks(covariance_m2) - drift_m**2 * np.eye(2)
-    return Where(position, covariance, drift_m, joint)
+    position, covariance = at - (gain @ pull).reshape(-1, dim), blocks(joint, dim).copy()
+    own = np.linalg.inv(blocks(inverse, dim))
+    position[held] = position_m + (own @ pull.reshape(-1, dim, 1))[..., 0]
+    covariance[held] = own - blocks(covariance_m2, dim) - drift_m**2 * np.eye(dim)
+    rotation = np.zeros((count, 0))
+    if local.rotation is not None:
+        rotation = se3.compose(motion, se3.turn(local.rotation))[:, 3:]
+    return Where(position, covariance, drift_m, joint, rotation)
 
 
-def _drifted(covariance: FloatArray, error: FloatArray, config: OverlayConfig) -> tuple[float, FloatArray]:
+def _drifted(covariance: FloatArray, error: FloatArray, dim: int, config: OverlayConfig) -> tuple[float, FloatArray]:
     """The drift that explains differences best, and the inverse of their covariance with it."""
     best, found = -math.inf, (0.0, covariance)
-    for k, drift_m in enumerate(config.drifts_m):
+    drifts_m = config.drifts_m if dim < SPACE.point_dim else (*config.drifts_m, *config.drifts_in_space_m)
+    for k, drift_m in enumerate(drifts_m):
         factor = cho_factor(drifted(covariance, drift_m), lower=True)
         told = -0.5 * float(error @ cho_solve(factor, error)) - float(np.log(np.diag(factor[0])).sum())
         told += k * math.log(config.p_coarser)
@@ -180,20 +236,20 @@ def _drifted(covariance: FloatArray, error: FloatArray, config: OverlayConfig) -
 class _Assigned:
     """Landmarks of a session (K,), to be assigned to those of a map."""
 
-    def __init__(self, found: Associated, living: LivingMap, stood: _Stood, config: Config) -> None:
+    def __init__(self, found: Associated | AssociatedInSpace, living: LivingMap, stood: _Stood, config: Config) -> None:
         self._found, self._living, self._stood, self._overlay = found, living, stood, config.living.overlay
         self._settings, self._slam = config.living.nameless, config.slam
         self._local, self._beside_m = found.in_metres, config.living.looks.beside_m
-        name, known = found.assignment.name, living.members.landmark_id[stood.landmark]
+        name, known = found.names, living.members.landmark_id[stood.landmark]
         # what has a name is the landmark with that name, and nothing else is
         same = np.where((name == UNKNOWN)[:, None], ~np.isin(known, name), name[:, None] == known)
-        self._alike = same & alike(found.assignment.of_kind[:, None, :1], stood.class_id[None, :, None])
+        self._alike = same & alike(found.of_kind[:, None, :1], stood.class_id[None, :, None])
         self._named = np.flatnonzero(np.isin(name, known))
-        self._density = density_of_unmet(self._local.place, config.slam)
+        self._density, self._dim, self._glimpse_m = found.density_of_unmet, living.dim, config.living.fit.glimpse_m
 
-    def members(self) -> IntArray:
-        """Return (K,) rows of the map's members, -1 for new ones."""
-        place = self._placed()
+    def members(self) -> tuple[IntArray, Where | None]:
+        """Return (K,) rows of the map's members, -1 for new ones; and where all lie, None if nothing matches."""
+        place, where = self._placed(), None
         member = np.full(len(place), -1, dtype=np.int64)
         while np.any(place >= 0):
             place = self._grown(place)
@@ -203,13 +259,53 @@ class _Assigned:
             if np.array_equal(more, place):
                 break
             place = more
-        return member
+        return member, where
+
+    def glimpsed(self, member: IntArray, where: Where | None, frame: IntArray) -> tuple[IntArray, IntArray]:
+        """Return rows of detections too few for a landmark, at places where one stands, and of the members seen there.
+
+        Args:
+            member: (K,) as of `members`.
+            where: as of `members`.
+            frame: (M,) of all detections of the recording.
+        """
+        stood, loose, local = self._stood, self._found.loose, self._local.place
+        there = np.flatnonzero((stood.p >= EXISTS) & ~np.isin(stood.landmark, member))
+        held = np.flatnonzero(member >= 0)
+        if where is None or len(held) < BESIDE or not (len(loose.row) and len(there)):
+            return loose.row[:0], there[:0]
+        motion = rigid(local[held], where.position_m[held])
+        bent = where.position_m - group_of(motion).transform(motion, local)
+        _, near = KDTree(local[held]).query(loose.position_m, k=BESIDE)
+        at = group_of(motion).transform(motion, loose.position_m) + bent[held[near]].mean(axis=1)
+        # of a landmark of the session, or of one of the map
+        place_m = np.vstack([where.position_m, stood.position_m[there]])
+        covariance_m2 = np.concatenate([where.covariance_m2, stood.covariance_m2[there]])
+        kind = np.append(self._found.of_kind[:, 0], stood.class_id[there])
+        p = np.append(np.ones(len(local)), stood.p[there])
+        some, k = in_reach(place_m, at, self._glimpse_m)
+        kept = alike(loose.class_id[some, None], kind[k, None])
+        some, k = some[kept], k[kept]
+        off, variance = at[some] - place_m[k], loose.wide_m[some] ** 2 + where.drift_m**2
+        spread = covariance_m2[k] + variance[:, None, None] * np.eye(self._dim)
+        score = np.log(p[k]) + _log_density(off, spread) - math.log(self._density)
+        score[_squared(off, spread) > GATE[self._dim]] = -np.inf
+        p_own = self._slam.association.p_own
+        found = most_probable(loose.row[some], k, score, frame, len(place_m), p_own)
+        rows = np.flatnonzero(found >= len(local))
+        place = found[rows] - len(local)
+        # had it stood there it would have been seen about as often as what stands beside it, or be a landmark
+        count, at = np.bincount(place, minlength=len(there)), stood.position_m[there]
+        _, beside = KDTree(where.position_m[held]).query(at, distance_upper_bound=self._beside_m)
+        usual = self._slam.association.least_seen * np.append(self._found.sightings[held], 0)[beside]
+        few = ((count < self._slam.fewest_sightings) & (count >= usual))[place]
+        return rows[few], stood.landmark[there[place[few]]]
 
     def _where(self, some: IntArray, place: IntArray) -> Where:
         """Return some landmarks in the map, given those among them at places (K,) of the map."""
         held = np.flatnonzero(place[some] >= 0)
         at = self._stood.row[place[some[held]]]
-        known = of_places(self._living.covariance_m2, at)
+        known = of_places(self._living.covariance_m2, at, self._dim)
         return held_at(self._local.part(some), held, self._living.places.position_m[at], known, self._overlay)
 
     def _grown(self, place: IntArray) -> IntArray:
@@ -239,14 +335,14 @@ class _Assigned:
         some = some[np.argsort(-stands[some], kind="stable")[:MOST_PAIRS]]
         k, m = k[some], m[some]
         off = where.position_m[k] - stood.position_m[m]
-        rows = se2.xy_rows(k)
-        covariance = where.joint_m2[np.ix_(rows, rows)] + of_places(self._living.covariance_m2, stood.row[m])
-        at = se2.xy_rows(np.arange(len(m)))
-        covariance[at, at] += where.drift_m**2
-        own = _log_density(off, blocks(covariance)) if len(m) else np.zeros(0)
+        rows = se2.xy_rows(k, self._dim)
+        known = of_places(self._living.covariance_m2, stood.row[m], self._dim)
+        covariance = drifted(where.joint_m2[np.ix_(rows, rows)] + known, where.drift_m)
+        own = _log_density(off, blocks(covariance, self._dim)) if len(m) else np.zeros(0)
         against = own - stands[some]
         conflict = (k[:, None] == k) | (stood.landmark[m][:, None] == stood.landmark[m])
-        found = consensus(Candidates(off, covariance, against, conflict), gate=GATE, loose=GATE)
+        gate = GATE[self._dim]
+        found = consensus(Candidates(off, covariance, against, conflict), gate=gate, loose=gate)
         p_merge = self._slam.association.p_merge
         sure = found.pairs[found.margin >= math.log(p_merge / (1.0 - p_merge))]
         return group[k[sure]], m[sure]
@@ -255,11 +351,10 @@ class _Assigned:
         """Return (K,) rows of the places that landmarks of one stretch certainly match, -1 for the others."""
         stands, every = np.flatnonzero(self._stood.p >= EXISTS), np.arange(len(self._local.place))
         place, named = np.full(len(every), -1, dtype=np.int64), self._named[:MOST_HELD]
-        best = self._overlaid(named, stands[self._alike[named][:, stands].any(axis=0)], None, self._alike, fewest=2)
+        of_named = stands[self._alike[named][:, stands].any(axis=0)]
+        best = self._overlaid(named, of_named, self._index(of_named), self._alike, fewest=self._dim)
         if not best and len(stands) >= self._settings.fewest:
-            index = None
-            if len(stands) > ALL_TRIED:
-                index = PlaceIndex(*self._about(stands), settings=self._slam)
+            index = self._index(stands)
             for some in _windows(every):
                 best = max(best, self._overlaid(some, stands, index, self._alike), key=len)
             best = best if len(best) >= self._settings.fewest else []
@@ -270,7 +365,7 @@ class _Assigned:
 
     def _regained(self, where: Where, member: IntArray, place: IntArray) -> IntArray:
         """Return `place` with landmarks beyond their gates after a distorted stretch, by their constellation."""
-        stood, together, found = self._stood, self._found.assignment.together, place.copy()
+        stood, together, found = self._stood, self._found.together, place.copy()
         stands, left = np.flatnonzero(stood.p >= EXISTS), np.flatnonzero(member < 0)
         held = np.flatnonzero(member >= 0)
         of = member[held][:, None] == stood.landmark
@@ -278,7 +373,7 @@ class _Assigned:
         for some in _windows(left):
             off = np.linalg.norm(where.position_m[some][:, None] - stood.position_m[stands], axis=2)
             near = stands[off.min(axis=0, initial=np.inf) < self._settings.bent_m]
-            pairs = self._overlaid(some, near, None, self._alike & ~apart)
+            pairs = self._overlaid(some, near, self._index(near), self._alike & ~apart)
             if len(pairs) < self._settings.fewest:
                 continue
             mine, theirs = np.array(pairs).T
@@ -289,7 +384,13 @@ class _Assigned:
     def _about(self, stands: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return places with their covariances, including the deviation from session to session."""
         drift_m = max(self._overlay.drifts_m)
-        return self._stood.position_m[stands], self._stood.covariance_m2[stands] + drift_m**2 * np.eye(2)
+        return self._stood.position_m[stands], self._stood.covariance_m2[stands] + drift_m**2 * np.eye(self._dim)
+
+    def _index(self, stands: IntArray) -> PlaceIndex | None:
+        """Return an index of some places where not every pair is tried: of many, and in space."""
+        if len(stands) <= ALL_TRIED and self._dim < SPACE.point_dim:
+            return None
+        return PlaceIndex(*self._about(stands), settings=self._slam)
 
     def _overlaid(
         self, some: IntArray, stands: IntArray, index: PlaceIndex | None, allowed: BoolArray, *, fewest: int = 0
@@ -299,18 +400,17 @@ class _Assigned:
         if len(some) < fewest or len(stands) < fewest:
             return []
         (at, spread), local, motions = self._about(stands), self._local.part(some), None
-        area_m2 = float(np.prod(np.ptp(at, axis=0) + 10.0))
+        area_m2 = float(np.prod(np.sort(np.ptp(at, axis=0))[-2:] + 10.0))
         if index is not None:
             motions = list(index.motions(local.place, local.beside_m))
             if not motions:
                 return []
-            near = index.around(
-                se2.transform(np.array(motions)[:, None], local.place).reshape(-1, 2), 2.0 * rules.near_m
-            )
+            laid = group_of(motions[0]).transform(np.array(motions)[:, None], local.place)
+            near = index.around(laid.reshape(-1, self._dim), 2.0 * rules.near_m)
             at, spread, stands = at[near], spread[near], stands[near]
         pairs = agreed_pairs(
             local,
-            LocalMap(at, block_diag(*spread)),
+            LocalMap(at, block_diag(*spread), None if local.rotation is None else self._stood.rotation[stands]),
             allowed[np.ix_(some, stands)],
             density=self._density,
             probability=self._slam.association.p_merge,
@@ -324,11 +424,12 @@ class _Assigned:
         """Pairs (Q,) of landmarks, the first of `where`, and places that may be one: rows of both, and the log odds of
         standing there, and of having been moved from there a little, over being new.
         """
-        stood, nudge_m2 = self._stood, self._overlay.nudge_m**2 * np.eye(2)
+        stood, nudge_m2 = self._stood, self._overlay.nudge_m**2 * np.eye(self._dim)
         off = where.position_m[: len(some), None] - stood.position_m[None]
         away = np.linalg.norm(off, axis=2)
         k, m = np.nonzero(self._alike[some] & free & (away < self._settings.farthest_m))
-        step, spread = off[k, m], where.covariance_m2[k] + stood.covariance_m2[m] + where.drift_m**2 * np.eye(2)
+        step, drift_m2 = off[k, m], where.drift_m**2 * np.eye(self._dim)
+        spread = where.covariance_m2[k] + stood.covariance_m2[m] + drift_m2
         stands = np.log(stood.p[m]) + _log_density(step, spread)
         moved = np.log(stood.p_away[m] * self._overlay.share_nudged) + _log_density(step, spread + nudge_m2)
         # beside what was found it would have been found
@@ -336,7 +437,12 @@ class _Assigned:
             away.min(axis=0, initial=np.inf) < self._beside_m
         )
         stands, moved = (odds - math.log(self._density) - missed[m] for odds in (stands, moved))
-        stands[_squared(step, spread) > GATE] = -np.inf
+        stands[_squared(step, spread) > GATE[self._dim]] = -np.inf
+        if self._local.rotation is not None:
+            rules = self._slam.association.space
+            angle = se3.angle_between(se3.turn(where.rotation[k]), se3.turn(stood.rotation[m]))
+            turned = angle > rules.turn_sigmas * rules.turn_floor_rad
+            stands, moved = (odds + np.log(self._overlay.share_turned) * turned for odds in (stands, moved))
         return k, m, stands, moved
 
     def _assigned(self, where: Where, place: IntArray) -> IntArray:
@@ -356,7 +462,7 @@ class _Assigned:
 
     def _with_parts(self, member: IntArray, table: FloatArray) -> IntArray:
         """Return the same with further copies of assigned landmarks: those never seen together with them."""
-        together, found = self._found.assignment.together, member.copy()
+        together, found = self._found.together, member.copy()
         for k in np.flatnonzero((member < 0) & (table.max(axis=1, initial=-np.inf) > 0.0)).tolist():
             one = int(np.argmax(table[k]))
             if not together[[k]][:, np.flatnonzero(found == one)].sum():
@@ -374,4 +480,5 @@ def _squared(step: FloatArray, spread: FloatArray) -> FloatArray:
 
 
 def _log_density(step: FloatArray, spread: FloatArray) -> FloatArray:
-    return np.asarray(-0.5 * _squared(step, spread) - 0.5 * np.linalg.slogdet(spread)[1] - math.log(2.0 * math.pi))
+    log_det = np.linalg.slogdet(2.0 * math.pi * spread)[1]
+    return np.asarray(-0.5 * (_squared(step, spread) + log_det))

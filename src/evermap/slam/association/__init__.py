@@ -7,7 +7,7 @@ from evermap.types import AnyRecording, Landmarks, SpatialRecording
 
 
 def with_identities(recording: AnyRecording, settings: SlamConfig, prior_map: Landmarks | None = None) -> AnyRecording:
-    """Return the recording with landmark ids by geometry, if `slam.unknown_ids` is set.
+    """Return the recording with landmark ids by geometry, if `slam.unknown_ids` is set; in space without a map.
 
     Errors are those of `identify.identified` in the plane, and of `in_space.identified_in_space`.
     """
@@ -19,6 +19,6 @@ def with_identities(recording: AnyRecording, settings: SlamConfig, prior_map: La
 
     keep_ids = settings.unknown_ids == "empty"
     if isinstance(recording, SpatialRecording):
-        return identified_in_space(recording, settings, prior_map, keep_ids=keep_ids)
+        return identified_in_space(recording, settings, keep_ids=keep_ids)
     believed = beliefs(recording.sensor, settings)
     return identified(recording, *believed, prior_map=prior_map, keep_ids=keep_ids, settings=settings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -11,10 +12,26 @@ from evermap.config import SlamConfig
 from evermap.slam.association.features import Likeness, Traits
 from evermap.slam.problem import Estimate, Problem
 from evermap.slam.streaming import USUAL, sighted_at
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+from evermap.types import UNKNOWN, AnyRecordingT, BoolArray, FloatArray, IntArray
 
 NOBODY = -1
 """Landmark row of an unassigned detection."""
+
+
+class LooseDetections(NamedTuple):
+    """Detections of no landmark: (U,) rows.
+
+    Attributes:
+        row: of the recording's detections.
+        position_m: (U, D) in the frame of the first pose.
+        wide_m: standard deviation of each.
+        class_id: `UNKNOWN` for none.
+    """
+
+    row: IntArray
+    position_m: FloatArray
+    wide_m: FloatArray
+    class_id: IntArray
 
 
 def alike(one: IntArray, other: IntArray) -> BoolArray:
@@ -54,6 +71,20 @@ def names_of(name: IntArray, landmark_row: IntArray, n_landmarks: int) -> IntArr
             found[row] = one
             used.add(one)
     return found
+
+
+def with_ids(recording: AnyRecordingT, landmark_row: IntArray, name: IntArray, landmark_id: IntArray) -> AnyRecordingT:
+    """Return a recording with ids (L,) of landmarks for detections without a name.
+
+    Args:
+        recording: as it was associated.
+        landmark_row: (M,) the landmark of each detection, `NOBODY` for none.
+        name: (M,) given id of each, `UNKNOWN` for none.
+        landmark_id: (L,) ids of the landmarks.
+    """
+    found = np.append(landmark_id, UNKNOWN)[landmark_row]
+    detections = replace(recording.detections, landmark_id=np.where(name == UNKNOWN, found, name))
+    return replace(recording, detections=detections)
 
 
 def seen_together(
@@ -187,6 +218,12 @@ class Assignment:
         """Return (M, 2) positions of the detections, as seen from their poses."""
         pose = self.estimate.pose[self.measured.pose_row]
         return sighted_at(pose, self.measured.reading, self.estimate.states, self.measured.mount)
+
+    @property
+    def wide_m(self) -> FloatArray:
+        """(M,) standard deviation of the position of each detection, the larger of along and across."""
+        sigma = self.measured.sigma_given
+        return np.asarray(np.hypot(sigma[:, 0], self.measured.reading[:, 0] * sigma[:, 1]))
 
     def problem(self) -> Problem:
         """Return the least-squares problem of the assigned detections."""

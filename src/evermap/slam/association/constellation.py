@@ -1,9 +1,9 @@
 """Alignment of a local map with a larger one by the constellation of their landmarks.
 
 After a long blind stretch, or in a given map, the rotation of the local map may be too large for a linear gate. Two of
-its landmarks with a matching distance determine a motion; around each such motion the difference of the maps is linear,
-and joint compatibility counts the landmarks that agree. Motions are compared by evidence, so that a chance agreement of
-two landmarks does not beat the correct one of five.
+its landmarks with a matching distance determine a motion in the plane, a triangle one in space (`place_index`); around
+each such motion the difference of the maps is linear, and joint compatibility counts the landmarks that agree. Motions
+are compared by evidence, so that a chance agreement of two landmarks does not beat the correct one of five.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from evermap.config import AssociationConfig, ConstellationConfig, SlamConfig
-from evermap.geometry import se2
+from evermap.geometry import se2, se3
+from evermap.geometry.group import group_of
 from evermap.geometry.rigid import rigid
 from evermap.slam.association.assignment import Assignment, alike, same_name
 from evermap.slam.association.jcbb import Pairings, most_pairings
@@ -34,27 +35,37 @@ MOST_LAID = 120
 
 @dataclass(frozen=True, slots=True)
 class LocalMap:
-    """Landmarks with their uncertainty: place (n, 2), covariance (2 n, 2 n)."""
+    """Landmarks with their uncertainty.
+
+    Attributes:
+        place: (n, D), in the plane or in space.
+        covariance: (D n, D n).
+        rotation: (n, 4) orientations in space, nan for landmarks without; None if none has one.
+    """
 
     place: FloatArray
     covariance: FloatArray
+    rotation: FloatArray | None = None
+
+    @property
+    def dim(self) -> int:
+        """Coordinates of a place: 2, or 3 in space."""
+        return int(self.place.shape[1])
 
     def part(self, rows: IntArray) -> LocalMap:
         """Return some of the landmarks, in the order of the rows."""
-        at = se2.xy_rows(rows)
-        return LocalMap(self.place[rows], self.covariance[np.ix_(at, at)])
+        at = se2.xy_rows(rows, self.dim)
+        rotation = None if self.rotation is None else self.rotation[rows]
+        return LocalMap(self.place[rows], self.covariance[np.ix_(at, at)], rotation)
 
     @property
     def beside_m(self) -> float:
         """Standard deviation of a landmark relative to its nearest neighbour [m], the median."""
-        n = len(self.place)
+        n, dim = self.place.shape
         near: IntArray = np.asarray(KDTree(self.place).query(self.place, k=2)[1])[:, 1]
-        by = np.zeros((2 * n, 2 * n))
-        for k in range(n):
-            by[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = np.eye(2)
-            by[2 * k : 2 * k + 2, 2 * near[k] : 2 * near[k] + 2] = -np.eye(2)
-        spread = np.diag(by @ self.covariance @ by.T).reshape(n, 2).sum(axis=1)
-        return math.sqrt(0.5 * max(float(np.median(spread)), 0.0))
+        by = np.kron(np.eye(n) - np.eye(n)[near], np.eye(dim))
+        spread = np.diag(by @ self.covariance @ by.T).reshape(n, dim).sum(axis=1)
+        return math.sqrt(max(float(np.median(spread)), 0.0) / dim)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +73,7 @@ class Alignment:
     """A motion and the pairs that it explains.
 
     Attributes:
-        motion: (3,) from the frame of the source to that of the target.
+        motion: (3,), in space (7,), from the frame of the source to that of the target.
         pairs: (source, target) of landmarks that agree.
         log_evidence: of the pairs over no pairs [nats].
     """
@@ -87,8 +98,8 @@ def overlays(
         source: the local map, its best known landmarks first.
         target: the map.
         allowed: (n, m) pairs that may be the same.
-        density: expected landmarks per square metre, if they are not the same.
-        motions: candidates; None tries all pairs.
+        density: expected landmarks per square metre, in space per cubic metre, if they are not the same.
+        motions: candidates; None tries all pairs, in the plane.
         settings: of the estimator.
     """
     found: dict[tuple[tuple[int, int], ...], Alignment] = {}
@@ -119,9 +130,9 @@ def agreed_pairs(
         source: the local map, its best known landmarks first.
         target: the map.
         allowed: (n, m) pairs that may be the same.
-        density: expected landmarks per square metre, if they are not the same.
+        density: expected landmarks per square metre, in space per cubic metre, if they are not the same.
         probability: least probability of a pair, against all alignments that differ in this pair only.
-        motions: candidates; None tries all pairs.
+        motions: candidates; None tries all pairs, in the plane.
         margins_nats: evidence that an alignment needs over no alignment, and over its best rival; None for the default
             (`slam.association.constellation.certain_nats`).
         settings: of the estimator.
@@ -136,7 +147,7 @@ def agreed_pairs(
     rivals = [other for other in found[1:] if not set(other.pairs) & set(best.pairs)]
     if rivals and best.log_evidence - rivals[0].log_evidence < lead_nats:
         return []
-    pairings = _pairings(best.motion, source, target, allowed, density, settings.association.constellation)
+    pairings = _pairings(best.motion, source, target, allowed, density, settings.association)
     sure = _certain(best, pairings, density, math.log(probability / (1.0 - probability)))
     return sure if len(sure) > 1 else []
 
@@ -168,7 +179,7 @@ def _evidence(pairings: Pairings, rows: list[int], density: float) -> float:
     """Evidence of some pairs (rows) over no pairs [nats]."""
     if not rows:
         return 0.0
-    columns = np.array([[2 * k, 2 * k + 1] for k in rows]).ravel()
+    columns = se2.xy_rows(np.array(rows), pairings.innovation.shape[1])
     covariance, innovation = pairings.covariance[np.ix_(columns, columns)], pairings.innovation[rows].ravel()
     log_det = np.linalg.slogdet(2.0 * np.pi * covariance)[1]
     distance = innovation @ np.linalg.solve(covariance, innovation)
@@ -217,7 +228,7 @@ def _weighed(
     settings: AssociationConfig,
 ) -> Alignment:
     """The largest jointly compatible set of pairs around a motion, and its evidence."""
-    pairings = _pairings(motion, source, target, allowed, density, settings.constellation)
+    pairings = _pairings(motion, source, target, allowed, density, settings)
     found = most_pairings(pairings, confidence=settings.gate_confidence)
     rows = found.pairing[found.pairing >= 0]
     if len(rows) == 0:
@@ -232,31 +243,29 @@ def _pairings(
     target: LocalMap,
     allowed: BoolArray,
     density: float,
-    rules: ConstellationConfig,
+    settings: AssociationConfig,
 ) -> Pairings:
     """Pairs near each other under the motion, with the covariance of their differences around it."""
-    place = se2.transform(motion, source.place)
+    rules, group = settings.constellation, group_of(motion)
+    place, dim = group.transform(motion, source.place), source.dim
     gap = place[:, None] - target.place[None]
-    s, t = np.nonzero(allowed & (np.linalg.norm(gap, axis=2) < rules.near_m))
-    turn, n = se2.rotation(motion[2]), len(s)
-    blocks = source.covariance.reshape(len(place), 2, len(place), 2)
+    near = allowed & (np.linalg.norm(gap, axis=2) < rules.near_m)
+    if source.rotation is not None and target.rotation is not None:
+        turned = se3.compose(motion, se3.turn(source.rotation))
+        angle = se3.angle_between(turned[:, None], se3.turn(target.rotation))
+        near &= ~(angle > settings.space.turn_sigmas * settings.space.turn_floor_rad)
+    s, t = np.nonzero(near)
+    turn, n = group.rotation_of(motion), len(s)
+    blocks = source.covariance.reshape(len(place), dim, len(place), dim)
     of_source = np.einsum("ij,kjml,nl->kimn", turn, blocks, turn)
-    covariance = _blocks(target.covariance, t) + of_source[s][:, :, s]
-    lever = (place - place.mean(axis=0))[s]
-    by_motion = np.zeros((n, 2, 3))
-    by_motion[:, :, :2], by_motion[:, 0, 2], by_motion[:, 1, 2] = np.eye(2), -lever[:, 1], lever[:, 0]
-    free = np.array([rules.free_m, rules.free_m, rules.free_rad])
-    around = (by_motion * free**2).reshape(2 * n, 3) @ by_motion.reshape(2 * n, 3).T
+    of_target = target.covariance.reshape(len(target.place), dim, len(target.place), dim)[t][:, :, t]
+    by_motion = group.rigid_directions((place - place.mean(axis=0))[s])
+    free = np.repeat([rules.free_m, rules.free_rad], [dim, group.dim - dim])
     return Pairings(
-        s.astype(np.int64), t.astype(np.int64), gap[s, t], covariance.reshape(2 * n, 2 * n) + around,
+        s.astype(np.int64), t.astype(np.int64), gap[s, t],
+        (of_target + of_source[s][:, :, s]).reshape(dim * n, dim * n) + (by_motion * free**2) @ by_motion.T,
         np.full(n, np.log(density)), len(source.place),
     )  # fmt: skip
-
-
-def _blocks(covariance: FloatArray, rows: IntArray) -> FloatArray:
-    """(n, 2, n, 2) blocks of some places, of a covariance (2 P, 2 P)."""
-    count = len(covariance) // 2
-    return covariance.reshape(count, 2, count, 2)[rows][:, :, rows]
 
 
 def propose_constellation(

@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 from operator import itemgetter
 
 import numpy as np
+from scipy import sparse
 from scipy.linalg import block_diag
 
 from evermap.config import SlamConfig
-from evermap.slam.association.assignment import NOBODY, Assignment, alike
+from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetections, alike, with_ids
 from evermap.slam.association.associator import Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
 from evermap.slam.association.features import Traits, learned
@@ -53,16 +54,43 @@ class Associated:
         landmark_row: (M,) landmark of every detection of the recording, by first detection; `NOBODY` if it is of no
             landmark with enough sightings.
         name: (M,) given identity of every detection, `UNKNOWN` if there is none or it was ignored.
-        assignment: of the used detections.
+        used: rows of the recording's detections that are used.
+        assignment: of these.
         noise: of its solution.
         prior: of the calibration states.
     """
 
     landmark_row: IntArray
     name: IntArray
+    used: IntArray
     assignment: Assignment
     noise: Noise
     prior: CalibrationPrior
+
+    @property
+    def names(self) -> IntArray:
+        """(L,) name of each landmark, `UNKNOWN` for none; no two have the same."""
+        return self.assignment.name
+
+    @property
+    def of_kind(self) -> IntArray:
+        """(L, 2) class and name of each landmark, `UNKNOWN` for none."""
+        return self.assignment.of_kind
+
+    @property
+    def sightings(self) -> IntArray:
+        """(L,) number of detections of each landmark."""
+        return self.assignment.sightings
+
+    @property
+    def together(self) -> sparse.csr_array:
+        """(L, L) number of frames that show both of two landmarks."""
+        return self.assignment.together
+
+    @property
+    def density_of_unmet(self) -> float:
+        """Density of unmapped landmarks [1/m^2] in the area of the session."""
+        return density_of_unmet(self.in_metres.place, self.assignment.settings)
 
     @functools.cached_property
     def in_metres(self) -> LocalMap:
@@ -76,11 +104,18 @@ class Associated:
         covariance: FloatArray = assignment.with_shared_errors(marginals.shared)[:-N_STATES, :-N_STATES] * scale**2
         return LocalMap(place, covariance + log_sigma**2 * np.outer(place.ravel(), place.ravel()))
 
+    @property
+    def loose(self) -> LooseDetections:
+        """Detections of no landmark, without a name."""
+        assignment = self.assignment
+        some = np.flatnonzero((assignment.landmark_row == NOBODY) & (self.name[self.used] == UNKNOWN))
+        scale = self.prior.split_scale(assignment.estimate.states, np.eye(N_STATES))[2]
+        at = assignment.points()[some] * scale
+        return LooseDetections(self.used[some], at, assignment.wide_m[some], assignment.kind[some, 0])
+
     def named(self, recording: Recording, landmark_id: IntArray) -> Recording:
         """Return the recording with ids (L,) of its landmarks for detections without one; `UNKNOWN` if unassigned."""
-        found = np.append(landmark_id, UNKNOWN)[self.landmark_row]
-        given = np.where(self.name == UNKNOWN, found, self.name)
-        return replace(recording, detections=replace(recording.detections, landmark_id=given))
+        return with_ids(recording, self.landmark_row, self.name, landmark_id)
 
 
 def associated(
@@ -133,7 +168,7 @@ def associated(
         assignment, cautious = _with_traits(assignment, cautious, given.features[prepared.used], found)
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
-    return Associated(row, name, assignment, cautious.noise, prior)
+    return Associated(row, name, prepared.used, assignment, cautious.noise, prior)
 
 
 def _with_traits(

@@ -14,12 +14,24 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
+from scipy.linalg import block_diag
 
 from evermap.config import AssociationConfig, SlamConfig
-from evermap.errors import ConfigError, DataError
+from evermap.errors import DataError
 from evermap.geometry import se2, se3
-from evermap.slam.association.assignment import NOBODY, alike, labels_of, names_of, same_name, seen_together
+from evermap.slam.association.assignment import (
+    NOBODY,
+    LooseDetections,
+    alike,
+    labels_of,
+    names_of,
+    same_name,
+    seen_together,
+    with_ids,
+)
 from evermap.slam.association.associator import LAST_ROUNDS, MERGE_ROUNDS, effective_number
+from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.identify import numbered
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.association.merging import Differences, Solution, in_reach, propose_merges
@@ -29,7 +41,7 @@ from evermap.slam.space.intake import SpatialIntake, prepare_space, without_rang
 from evermap.slam.space.linearise import POINT, POSE
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Landmarks, SpatialRecording
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
 
 SLIPS = 3
 """Number of powers of `slam.association.slip` that are tried as the factor on the odometry noise: bounds the work."""
@@ -45,16 +57,15 @@ OF_DETECTIONS = (
 
 
 def identified_in_space(
-    recording: SpatialRecording, settings: SlamConfig, prior_map: Landmarks | None = None, *, keep_ids: bool = False
+    recording: SpatialRecording, settings: SlamConfig, *, keep_ids: bool = False
 ) -> SpatialRecording:
-    """Return the recording with landmark ids by geometry.
+    """Return the recording with landmark ids by geometry; those of a map are found by `maps.sessions.nameless`.
 
     Boxes (of a detector of movable objects) and detections without a range get none.
 
     Args:
         recording: as read, with odometry.
         settings: of the estimator.
-        prior_map: must be None: association with a map is not supported in space.
         keep_ids: detections with an id keep it, those without may be of the same landmarks; else ids are ignored.
 
     Returns:
@@ -62,12 +73,17 @@ def identified_in_space(
         `UNKNOWN` if a detection is of no landmark with enough sightings.
 
     Raises:
-        ConfigError: a map is given.
         DataError: no odometry, or too few frames.
     """
-    if prior_map is not None:
-        problem = "landmarks without identity in space cannot be found in a fixed map"
-        raise ConfigError(problem, field="slam.unknown_ids", hint="omit the map, or --unknown-ids")
+    found = associated_in_space(recording, settings, keep_ids=keep_ids)
+    named = found.named(recording, numbered(found.names, found.name))
+    return named if keep_ids else replace(named, landmark_names={})
+
+
+def associated_in_space(
+    recording: SpatialRecording, settings: SlamConfig, *, keep_ids: bool = False
+) -> AssociatedInSpace:
+    """Associate the detections of a recording in space by geometry, as `identified_in_space`; errors are the same."""
     if recording.odometry is None or len(recording.odometry) < 2:
         problem = f"{recording.name}: landmarks without identity need odometry"
         raise DataError(problem, hint="record poses or velocities of the robot, or identities")
@@ -76,14 +92,55 @@ def identified_in_space(
     # symmetries are those of classes, so each class is one landmark until landmarks are known
     by_class = np.where(asked, given.class_id - UNKNOWN, UNKNOWN)
     intake = prepare_space(replace(recording, detections=replace(given, landmark_id=by_class)), settings.space)
-    found = given.landmark_id.copy() if keep_ids else np.full(len(given), UNKNOWN)
-    kind = np.column_stack([given.class_id, found])[intake.used]
-    row = SpatialAssociator(intake, kind, settings).finish()
-    of = names_of(kind[:, 1], row, int(row.max(initial=-1)) + 1)
-    met = np.append(numbered(of, found), UNKNOWN)[row]
-    found[intake.used] = np.where(kind[:, 1] == UNKNOWN, met, kind[:, 1])
-    names = recording.landmark_names if keep_ids else {}
-    return replace(recording, detections=replace(given, landmark_id=found), landmark_names=names)
+    name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
+    kind = np.column_stack([given.class_id, name])[intake.used]
+    row = np.full(len(given), NOBODY)
+    row[intake.used], local, together, loose = SpatialAssociator(intake, kind, settings).finish()
+    of_kind = labels_of(kind, row[intake.used], len(local.place))
+    loose = loose._replace(row=intake.used[loose.row])
+    return AssociatedInSpace(row, name, of_kind, local, together, loose, settings)
+
+
+@dataclass(frozen=True, slots=True)
+class AssociatedInSpace:
+    """A recording in space whose detections were associated by geometry: what `identify.Associated` is in the plane.
+
+    Attributes:
+        landmark_row: (M,) landmark of every detection of the recording, by first detection; `NOBODY` for none.
+        name: (M,) given identity of every detection, `UNKNOWN` if there is none or it was ignored.
+        of_kind: (L, 2) class and name of each landmark, `UNKNOWN` for none.
+        in_metres: the landmarks in the frame of the first pose.
+        together: (L, L) number of views that show both of two landmarks.
+        loose: detections of no landmark, without a name.
+        settings: of the estimator.
+    """
+
+    landmark_row: IntArray
+    name: IntArray
+    of_kind: IntArray
+    in_metres: LocalMap
+    together: sparse.csr_array
+    loose: LooseDetections
+    settings: SlamConfig
+
+    @property
+    def sightings(self) -> IntArray:
+        """(L,) number of detections of each landmark."""
+        return np.bincount(self.landmark_row[self.landmark_row >= 0], minlength=len(self.of_kind))
+
+    @property
+    def names(self) -> IntArray:
+        """(L,) name of each landmark, `UNKNOWN` for none; no two have the same."""
+        return names_of(self.name, self.landmark_row, len(self.in_metres.place))
+
+    @property
+    def density_of_unmet(self) -> float:
+        """Density of unmapped landmarks [1/m^3] in the volume of the session."""
+        return self.settings.association.least_landmarks / _volume_m3(self.in_metres.place, self.settings)
+
+    def named(self, recording: SpatialRecording, landmark_id: IntArray) -> SpatialRecording:
+        """Return the recording with ids (L,) of its landmarks for detections without one; `UNKNOWN` if unassigned."""
+        return with_ids(recording, self.landmark_row, self.name, landmark_id)
 
 
 class _Nearby:
@@ -190,8 +247,10 @@ class SpatialAssociator:
         self._of = np.zeros((0, 2), dtype=np.int64)  # class and name of each landmark
         self._density = _density(np.zeros((0, 3)), np.zeros(0, dtype=np.int64), settings)
 
-    def finish(self) -> IntArray:
-        """Return (M,) the landmark of every detection, numbered by first detection; `NOBODY` for none."""
+    def finish(self) -> tuple[IntArray, LocalMap, sparse.csr_array, LooseDetections]:
+        """Return (M,) the landmark of every detection, numbered by first detection, `NOBODY` for none; the landmarks;
+        (L, L) the number of views that show both of two; and the detections of none, rows of those of the recording.
+        """
         fewest = self._settings.fewest_sightings
         self._follow()
         row = _without(self._row, np.zeros(len(self._of), dtype=np.bool_))
@@ -202,7 +261,26 @@ class SpatialAssociator:
             if np.array_equal(again, solved.row):
                 break
             solved = self._merged(self._learned(again, solved.estimate.pose))
-        return _without(solved.row, np.bincount(solved.row[solved.row >= 0]) < fewest)
+        kept = np.flatnonzero(np.bincount(solved.row[solved.row >= 0]) >= fewest)
+        row = np.where(np.isin(solved.row, kept), np.searchsorted(kept, solved.row), NOBODY)
+        views = int(self._view.max(initial=-1)) + 1
+        together, _ = seen_together(self._view, row, views, len(kept), 0)
+        some = np.flatnonzero((row == NOBODY) & (self._kind[:, -1] == UNKNOWN))
+        at = se3.transform(solved.estimate.pose[self._problem.pose_row[some]], self._at[some])
+        loose = LooseDetections(some, at, self._wide_m()[some], self._kind[some, 0])
+        return row, self._local(solved, kept), together, loose
+
+    def _local(self, solved: _Solved, rows: IntArray) -> LocalMap:
+        """Return some landmarks, with the errors that all sightings of one have in common."""
+        place, turned = solved.estimate.place[rows], solved.smoother.problem.oriented[rows]
+        if not len(rows):
+            return LocalMap(place[:, :3], np.zeros((0, 0)))
+        joint = solved.smoother.factorised(solved.now).joint(len(solved.smoother.problem.stamp_s) + rows)
+        width = np.where(turned, 6, 3)
+        own = block_diag(*np.where(turned[:, None, None], se3.rotation_of(place), np.eye(3)))
+        at = ((np.cumsum(width) - width)[:, None] + np.arange(3)).ravel()
+        covariance = own @ joint[np.ix_(at, at)] @ own.T + np.diag(np.repeat(self._shared_m2(solved.row)[rows], 3))
+        return LocalMap(place[:, :3], covariance, np.where(turned[:, None], place[:, 3:], np.nan))
 
     def _follow(self) -> None:
         """Pair the detections of every view with the landmarks of the last seconds."""
@@ -379,19 +457,25 @@ class SpatialAssociator:
         spread, turned = solved.smoother.spread(solved.now), solved.smoother.problem.oriented
         at = spread.own_first[n : n + count, None, None] + np.arange(3)
         own = spread.own[at + np.where(turned, 6, 3)[:, None, None] * np.arange(3)[:, None]]
-        wide = self._wide_m()[used]
-        order, sightings = np.lexsort((wide, row)), np.bincount(row, minlength=count)
-        middle = wide[order[np.cumsum(sightings) - sightings + sightings // 2]]
-        last_s = np.zeros(count)
+        sightings, last_s = np.bincount(row, minlength=count), np.zeros(count)
         np.maximum.at(last_s, row, self._problem.stamp_s[self._problem.pose_row[used]])
         like = np.array([alike(each, of).mean() for each in of])
-        shared = rules.shared_m**2 + (rules.shared_share * middle) ** 2
-        differences = _Differing(solved, shared, np.log(self._density * like), of, rules)
+        differences = _Differing(solved, self._shared_m2(solved.row), np.log(self._density * like), of, rules)
         n_views = int(self._view.max()) + 1
         return Solution(
             solved.estimate.place[:, :3], own, differences, sightings, last_s,
             *seen_together(self._view[used], row, n_views, count, rules.around_frames), of, rules,
         )  # fmt: skip
+
+    def _shared_m2(self, row: IntArray) -> FloatArray:
+        """(L,) variance [m^2] of the error that all sightings of a landmark have in common; landmarks (M,) of
+        detections.
+        """
+        used = np.flatnonzero(row >= 0)
+        wide, count = self._wide_m()[used], np.bincount(row[used])
+        order = np.lexsort((wide, row[used]))
+        middle = wide[order[np.cumsum(count) - count + count // 2]]
+        return np.asarray(self._rules.shared_m**2 + (self._rules.shared_share * middle) ** 2)
 
     def _covariance(self, rows: IntArray | slice) -> FloatArray:
         """(K, 3, 3) covariances of positions in the frame of the robot, at the current noise levels."""
@@ -552,9 +636,13 @@ def _driven(problem: SpatialProblem) -> FloatArray:
 
 def _density(place: FloatArray, sightings: IntArray, settings: SlamConfig) -> float:
     """Density of landmarks [1/m^3]; see `effective_number`. Those on a wall span no volume, hence a least extent."""
+    return effective_number(sightings, settings) / _volume_m3(place, settings)
+
+
+def _volume_m3(place: FloatArray, settings: SlamConfig) -> float:
     rules = settings.association.space
     volume = float(np.prod(np.maximum(np.ptp(place, axis=0), rules.least_extent_m))) if len(place) else 0.0
-    return effective_number(sightings, settings) / max(volume, rules.least_volume_m3)
+    return max(volume, rules.least_volume_m3)
 
 
 def _without(row: IntArray, gone: BoolArray) -> IntArray:

@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 
 from evermap.config import ConstellationConfig, SlamConfig
 from evermap.geometry import se2
+from evermap.geometry.group import SPACE, group_of
 from evermap.geometry.rigid import rigid
 from evermap.slam.association.constellation import MAX_MOTIONS, LocalMap, agreed_pairs
 from evermap.slam.streaming import USUAL
@@ -41,7 +42,8 @@ TRIES = 3
 class PlaceIndex:
     """Places (P, 2) of a map with covariances (P, 2, 2) each; uses about 1 kB per place.
 
-    Up to `most_matches` of triangles are used, those of the rarest first.
+    Up to `most_matches` of triangles are used, those of the rarest first. Of places (P, 3) in space it gives `motions`
+    and those `around` a point.
     """
 
     def __init__(
@@ -90,25 +92,32 @@ class PlaceIndex:
         return []
 
     def motions(self, place: FloatArray, sigma_m: float) -> FloatArray:
-        """Return (K, 3) motions that align places (n, 2), of error `sigma_m`, with the map; the best of each part."""
+        """Return (K, 3) motions that align places (n, 2), of error `sigma_m`, with the map; the best of each part.
+
+        In space they are (K, 7), those of different orientation are others, and fewer than three landmarks give none.
+        """
         corners = _triangles(place, KDTree(place), min(NEIGHBOURS + 2, len(place) - 1), self._rules)
         sides, order = _sides(place[corners])
         corners = np.take_along_axis(corners, order, axis=1)
         within = self._rules.side_sigmas * math.hypot(sigma_m, self._sigma_m) + self._rules.side_slack_m
         mine, theirs = self._alike(corners, sides, within)
         motion = rigid(place[mine], self._position[theirs])
+        group = group_of(motion)
         best = np.zeros(0, dtype=np.int64)
         count, error, near_m = np.zeros(len(motion)), np.zeros(len(motion)), self._rules.near_m
         for begin in range(0, len(motion), 4096):
             part = slice(begin, begin + 4096)
-            gap = self._tree.query(se2.transform(motion[part, None], place), distance_upper_bound=near_m)[0]
+            gap = self._tree.query(group.transform(motion[part, None], place), distance_upper_bound=near_m)[0]
             count[part] = np.sum(np.isfinite(gap), axis=1)
             error[part] = np.sum(np.minimum(gap, near_m), axis=1)
-        middle = se2.transform(motion, place.mean(axis=0))
-        left = np.lexsort((error, -count))
+        middle, left = group.transform(motion, place.mean(axis=0)), np.lexsort((error, -count))
         while len(left) and len(best) < MAX_MOTIONS:
             best = np.append(best, left[0])
-            left = left[np.hypot(*(middle[left] - middle[left[0]]).T) > self._rules.same_place_m]
+            other = np.linalg.norm(middle[left] - middle[left[0]], axis=1) > self._rules.same_place_m
+            if group is SPACE:
+                turn = group.log(group.between(motion[left[0]], motion[left]))[:, 3:]
+                other |= np.linalg.norm(turn, axis=1) > self._settings.association.space.same_turn_rad
+            left = left[other]
         return motion[best]
 
     def _first(self, source: LocalMap, rows: IntArray, density: float, probability: float) -> list[tuple[int, int]]:
@@ -189,7 +198,9 @@ _TURNS = np.array(list(itertools.permutations(range(3))))
 
 
 def _triangles(place: FloatArray, tree: KDTree, neighbours: int, rules: ConstellationConfig) -> IntArray:
-    """(T, 3) corners of different triangles of each place with two of its nearest; not too large, small or flat."""
+    """(T, 3) corners of different triangles of places (n, D), each with two of its nearest; not too large, small or
+    flat.
+    """
     n = len(place)
     if n < 3:
         return np.zeros((0, 3), dtype=np.int64)
@@ -201,7 +212,8 @@ def _triangles(place: FloatArray, tree: KDTree, neighbours: int, rules: Constell
     corners = corners[np.unique(key, return_index=True)[1]]
     at = place[corners]
     a, b = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
-    area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    squared = (a * a).sum(axis=1) * (b * b).sum(axis=1) - (a * b).sum(axis=1) ** 2
+    area = 0.5 * np.sqrt(np.maximum(squared, 0.0))
     length = np.linalg.norm(at - np.roll(at, 1, axis=1), axis=2)
     longest = length.max(axis=1)
     good = (longest < rules.longest_side_m) & (length.min(axis=1) > rules.least_span_m)
@@ -211,7 +223,7 @@ def _triangles(place: FloatArray, tree: KDTree, neighbours: int, rules: Constell
 
 
 def _sides(at: FloatArray) -> tuple[FloatArray, IntArray]:
-    """(T, 3) lengths of the sides of triangles (T, 3, 2), longest first, and (T, 3) the corners opposite to them."""
+    """(T, 3) lengths of the sides of triangles (T, 3, D), longest first, and (T, 3) the corners opposite to them."""
     length = np.linalg.norm(np.roll(at, -1, axis=1) - np.roll(at, -2, axis=1), axis=2)
     order = np.argsort(-length, axis=1, kind="stable")
     return np.take_along_axis(length, order, axis=1), order

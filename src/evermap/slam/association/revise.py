@@ -47,7 +47,7 @@ def reassigned(assignment: Assignment, explained: FloatArray, *, density: float)
     spread[used] = np.clip(np.trace(explained, axis1=1, axis2=2) / 2.0, 0.0, 1.0)
     spread = np.where(np.isfinite(spread), spread, np.nanmedian(spread) if used.any() else 1.0)
     at = assignment.points()
-    wide = np.hypot(sigma[:, 0], problem.reading[:, 0] * sigma[:, 1]) * np.sqrt(1.0 + spread)
+    wide = assignment.wide_m * np.sqrt(1.0 + spread)
     gate = gates(1, settings.gate_confidence)[1]
     seen, row = in_reach(estimate.landmark, at, float(np.sqrt(gate) * np.quantile(wide, 0.99)))
     same = may_be_of(assignment.kind[seen], assignment.of_kind[row])
@@ -115,8 +115,7 @@ def with_overlooked(assignment: Assignment) -> Assignment:
     left = np.flatnonzero(assignment.landmark_row == NOBODY)
     if len(left) < fewest:
         return assignment
-    at, sigma = assignment.points()[left], problem.sigma_given[left]
-    wide = np.hypot(sigma[:, 0], problem.reading[left, 0] * sigma[:, 1])
+    at, wide = assignment.points()[left], assignment.wide_m[left]
     row, places = assignment.landmark_row.copy(), [assignment.estimate.landmark]
     for mine in lying_together(at, wide, assignment.kind[left], problem.pose_row[left], fewest):
         row[left[mine]] = assignment.n_landmarks + len(places) - 1
