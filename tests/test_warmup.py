@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from evermap.cli.main import app
 from evermap.io import write_native
+from evermap_studies.building.study import story_of
 from evermap_studies.sim import BuildingConfig, simulate_building
 
 pytestmark = pytest.mark.slow
@@ -75,8 +76,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     building = simulate_building(BuildingConfig(days=2, patrol_s=60.0))
     for name, recording in zip(("one", "two"), building.sessions[:2], strict=True):
         write_native(recording, folder / name)
+    for patrol, name in zip(story_of(0, 2).patrols, ("flight", "again"), strict=True):
+        write_native(patrol.recording, folder / name)
     for command in (
         ("slam", folder / "one", "--map", folder / "first.evermap", "--out", folder / "out"),
+        ("slam", folder / "flight", "--map", folder / "space.evermap", "--unknown-ids", "--out", folder / "space"),
+        ("slam", folder / "flight", "--map", folder / "named.evermap", "--out", folder / "named"),
         ("track", "--init", folder / "detections.csv"),
         ("persist", "--init", folder / "looks.csv"),
     ):
@@ -93,6 +98,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "slam one --map nameless.evermap --unknown-ids",
         "slam two --map first.evermap",
         "slam two --map first.evermap --localize",
+        "slam flight --unknown-ids",
+        "slam flight --map flights.evermap",
+        "slam again --map named.evermap",
+        "slam again --map space.evermap --unknown-ids",
         "track detections.csv --range-m 12",
         "persist looks.csv",
     ],

@@ -12,6 +12,8 @@ from evermap.config import Config
 from evermap.existence.lifetimes import log_death_odds
 from evermap.geometry.se3 import NO_TURN
 from evermap.pipeline import run_session, run_slam
+from evermap.sensing.visibility import NominalField
+from evermap.slam import warmup
 from evermap.survival import GeneralPurpose
 from evermap.types import (
     UNKNOWN,
@@ -53,35 +55,38 @@ def warm_up(
         in_space: what recordings in space need, or sessions of them, and nothing else.
         traffic: what boxes without identity in these need, too.
     """
+    config = Config(slam={"unknown_ids": unknown_ids})
+    if unknown_ids:
+        from evermap.slam.association.consensus import warm_up as of_the_association
+
+        of_the_association()
+    if in_space:
+        warmup.seldom_used()
     if in_space and sessions:
-        first = run_session(_flight(0.0))
-        _done(first.slam, run_session(_flight(1e5), first.living).slam)
+        NominalField(Sensor()).p_detect(np.zeros((1, 3)), np.zeros((1, 2)))  # for what appears in a later session
+        first = run_session(_flight(0.0), config=config)
+        _done(first.slam, run_session(_flight(1e5), first.living, config).slam)
         return
     if in_space:
         if traffic:
             from evermap.tracking.run import warm_up as of_the_tracker
 
             of_the_tracker()
-        _done(run_slam(_flight(0.0), Config(slam={"unknown_ids": unknown_ids})))
+        _done(run_slam(_flight(0.0), config))
         return
     if localize:
         from evermap.slam.localize_recording import warm_up as of_the_localizer
 
         of_the_localizer()
         return
-    from evermap.slam import warmup
-
-    config = Config(slam={"unknown_ids": unknown_ids})
     with shared_with("evermap.cli.warmup"):  # about half of the time here, the other half at the end of this file
         warmup.filtered()
         if search or sessions:
             warmup.searched()
         log_death_odds((GeneralPurpose(1e-8, 1.0),), np.zeros(1, dtype=np.int64), np.zeros(1), np.ones(1))
     if unknown_ids:
-        from evermap.slam.association.consensus import warm_up as of_the_association
         from evermap.slam.association.particles import warm_up as of_the_particles
 
-        of_the_association()
         of_the_particles()
     if sessions:
         first = run_session(_drive(0.0), config=config)

@@ -77,9 +77,13 @@ def smoothed() -> None:
     smoother.worth(estimate, marginals)
     _ = marginals.pose, marginals.consecutive
     smoother.information(estimate, np.array([0, len(pose) - 1]))
+    seldom_used()
+
+
+def seldom_used() -> None:
+    """Compile what only damped steps and only large problems ask for, in the plane and in space."""
     one = np.ones(1, dtype=np.int64)
     alone = System(one, Factors(np.arange(2), 0 * one, one, 0 * one), np.zeros((1, 3)), np.zeros(0, dtype=np.int64))
-    # only steps that are damped ask for the one, and only large problems for the other
     curvature(alone.tree, alone.factors, np.zeros(2))
     eliminate_large(alone.tree, alone.factors, np.ones(2), np.ones(1), Elimination.of(alone.tree), 0)
 
