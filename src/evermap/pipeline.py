@@ -47,10 +47,10 @@ def run_slam(
 
     config = config or Config()
     recording, remarks = check.screened(recording, config, prior_map)
-    if config.slam.unknown_ids and prior_map is not None and isinstance(recording, SpatialRecording):
+    if config.slam.unknown_ids and prior_map is not None:
         recording = nameless.numbered_in(recording, prior_map, config)
     else:
-        recording = association.with_identities(recording, config.slam, prior_map)
+        recording = association.with_identities(recording, config.slam)
     if has_traffic(recording):
         return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
     visit = session.solved(recording, config, prior_map, remarks, realtime=realtime, progress=progress)

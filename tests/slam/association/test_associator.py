@@ -10,7 +10,9 @@ from identity_scores import identity_scores
 from problems import World, make_world
 from recordings import building
 
+from evermap.config import Config
 from evermap.geometry import se2
+from evermap.maps.sessions.nameless import numbered_in
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator, compared, fit_sighting_noise
 from evermap.slam.association.identify import identified
@@ -146,9 +148,7 @@ def test_a_building_without_ids_and_in_its_map() -> None:
     assert scores.completeness > 0.9
     assert recording.true_landmarks is not None
     survey = Landmarks.at(recording.true_landmarks.landmark_id, recording.true_landmarks.position_m, sigma_m=0.02)
-    inside = identified(
-        recording, CalibrationPrior.from_settings(calibrated=True), START, prior_map=survey
-    ).detections.landmark_id
+    inside = numbered_in(recording, survey, Config(slam={"unknown_ids": True})).detections.landmark_id
     met = np.isin(inside, survey.landmark_id)
     assert met.mean() > 0.5
     assert np.mean(inside[met] == recording.detections.landmark_id[met]) > 0.98

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from space.corridors import tagged_corridor
 
-from evermap.config import AssociationConfig, Section, SlamConfig
+from evermap.config import AssociationConfig, Config, Section, SlamConfig
+from evermap.maps.sessions.nameless import numbered_in
 from evermap.slam.association import with_identities
+from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.types import UNKNOWN
 from evermap_studies.sim.park import ParkConfig, simulate_park
@@ -37,8 +40,8 @@ def keys(section: Section, prefix: str) -> Iterator[str]:
 
 
 def test_every_key_is_read_from_the_settings_of_the_caller() -> None:
-    """A park with some identities and a radius, again without these in a map of over 100 trees; tags, and points of a
-    map, in space.
+    """A park with some identities and a radius, again without these in a map of over 100 trees; a part of a map that lies
+    over another one; tags, and points of a map, in space.
     """
     wild = ParkConfig(drive_m=150.0, n_trees=105, n_cars=2, steering_noise_rad=0.05)  # as if wheels slip
     park, rng = simulate_park(wild), np.random.default_rng(0)
@@ -47,9 +50,14 @@ def test_every_key_is_read_from_the_settings_of_the_caller() -> None:
     some = np.where(rng.random(len(seen)) < 0.1, seen.landmark_id, UNKNOWN)
     mixed = replace(seen, landmark_id=some, features=radius[:, None], feature_names=("radius_m",))
     settings: Any = Watched(SlamConfig(unknown_ids="empty"), read)
-    with_identities(replace(park, detections=mixed), settings, park.true_landmarks)
+    with_identities(replace(park, detections=mixed), settings)
     settings = Watched(SlamConfig(unknown_ids=True), read)
-    with_identities(park, settings, park.true_landmarks)
+    config: Any = SimpleNamespace(slam=settings, living=Config().living)
+    assert park.true_landmarks is not None
+    numbered_in(park, park.true_landmarks, config)
+    place = rng.uniform(0.0, 40.0, (40, 2))
+    index = PlaceIndex(place, np.tile(1e-4 * np.eye(2), (40, 1, 1)), settings=settings)
+    assert len(index.pairs(LocalMap(place, 1e-4 * np.eye(80)), density=0.01, probability=0.97)) == len(place)
     with_identities(tagged_corridor(0, n_frames=40).recording, settings)
     point = rng.uniform(0.0, 10.0, (20, 3))
     PlaceIndex(point, np.tile(1e-4 * np.eye(3), (20, 1, 1)), settings=settings).motions(point, 0.01)

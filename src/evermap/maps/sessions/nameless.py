@@ -123,10 +123,16 @@ def named_in(recording: AnyRecordingT, living: LivingMap, config: Config) -> Any
     return replace(named, landmark_names={**recording.landmark_names, **texts})
 
 
-def numbered_in(recording: SpatialRecording, prior_map: Landmarks, config: Config) -> SpatialRecording:
-    """Return a recording in space with landmark ids by geometry: those of a fixed map, and numbers for new landmarks.
+def numbered_in(recording: AnyRecordingT, prior_map: Landmarks, config: Config) -> AnyRecordingT:
+    """Return a recording with landmark ids by geometry: those of a fixed map, and numbers for new landmarks.
 
-    What `slam.association.identify.identified` does in the plane; arguments and errors are of the same kind.
+    Args:
+        recording: as read; ids of its detections count with `slam.unknown_ids = "empty"`.
+        prior_map: landmarks that keep their ids when they are found again, wherever the robot starts.
+        config: settings.
+
+    Raises:
+        DataError: as of `named_in`.
     """
     living = replace(LivingMap.begun(prior_map), clock=recording.clock)
     given = recording if config.slam.unknown_ids == "empty" else without_ids(recording)
@@ -357,6 +363,8 @@ class _Assigned:
             index = self._index(stands)
             for some in _windows(every):
                 best = max(best, self._overlaid(some, stands, index, self._alike), key=len)
+                if len(best) >= WINDOW:  # all of one
+                    break
             best = best if len(best) >= self._settings.fewest else []
         if best:
             mine, theirs = np.array(best).T

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from evermap.config import SlamConfig
-from evermap.types import AnyRecording, Landmarks, SpatialRecording
+from evermap.types import AnyRecording, SpatialRecording
 
 
-def with_identities(recording: AnyRecording, settings: SlamConfig, prior_map: Landmarks | None = None) -> AnyRecording:
-    """Return the recording with landmark ids by geometry, if `slam.unknown_ids` is set; in space without a map.
+def with_identities(recording: AnyRecording, settings: SlamConfig) -> AnyRecording:
+    """Return the recording with landmark ids by geometry, if `slam.unknown_ids` is set.
 
     Errors are those of `identify.identified` in the plane, and of `in_space.identified_in_space`.
     """
@@ -21,4 +21,4 @@ def with_identities(recording: AnyRecording, settings: SlamConfig, prior_map: La
     if isinstance(recording, SpatialRecording):
         return identified_in_space(recording, settings, keep_ids=keep_ids)
     believed = beliefs(recording.sensor, settings)
-    return identified(recording, *believed, prior_map=prior_map, keep_ids=keep_ids, settings=settings)
+    return identified(recording, *believed, keep_ids=keep_ids, settings=settings)

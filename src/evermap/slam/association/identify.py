@@ -13,22 +13,20 @@ from operator import itemgetter
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import block_diag
 
 from evermap.config import SlamConfig
-from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetections, alike, with_ids
+from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetections, with_ids
 from evermap.slam.association.associator import Associator, density_of_unmet
-from evermap.slam.association.constellation import LocalMap, agreed_pairs
+from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.features import Traits, learned
 from evermap.slam.association.particles import drawn
-from evermap.slam.association.place_index import PlaceIndex
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import USUAL, StreamingSlam
-from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Recording
+from evermap.types import UNKNOWN, FloatArray, IntArray, Recording
 
 ALL_TRIED = 100
 """Number of landmarks of a prior map up to which every pair is tried; above, an index of constellations is used."""
@@ -274,35 +272,27 @@ def identified(
     prior: CalibrationPrior,
     noise: Noise,
     *,
-    prior_map: Landmarks | None = None,
     keep_ids: bool = False,
     settings: SlamConfig = USUAL,
 ) -> Recording:
-    """Return the recording with landmark ids by geometry.
+    """Return the recording with landmark ids by geometry; those of a map are found by `maps.sessions.nameless`.
 
     Args:
         recording: as read.
         prior: of the calibration states.
         noise: initial noise levels.
-        prior_map: landmarks that keep their ids when they are found again, wherever the robot starts.
         keep_ids: as of `associated`.
         settings: of the estimator.
 
     Returns:
-        The same detections. Landmarks without an id that are not in the prior map are numbered from 1 by first
-        detection, without the ids in use; `UNKNOWN` if a detection is of no landmark with enough sightings.
+        The same detections. Landmarks without an id are numbered from 1 by first detection, without the ids in use;
+        `UNKNOWN` if a detection is of no landmark with enough sightings.
 
     Raises:
         DataError: too few frames with detections, or too many for the memory.
     """
     found = associated(recording, prior, noise, keep_ids=keep_ids, settings=settings)
-    met, known = found.assignment.name, np.zeros(0, dtype=np.int64)
-    if prior_map is not None:
-        known = prior_map.landmark_id
-        mine, theirs = np.array(_found_in(prior_map, found), dtype=np.int64).reshape(-1, 2).T
-        fresh = (met[mine] == UNKNOWN) & ~np.isin(known[theirs], met)
-        met[mine[fresh]] = known[theirs[fresh]]
-    return found.named(recording, numbered(met, np.append(known, found.name)))
+    return found.named(recording, numbered(found.names, found.name))
 
 
 def numbered(landmark_id: IntArray, taken: IntArray) -> IntArray:
@@ -312,27 +302,3 @@ def numbered(landmark_id: IntArray, taken: IntArray) -> IntArray:
     after = landmark_id.copy()
     after[new] = free[: int(new.sum())]
     return after
-
-
-def _found_in(prior_map: Landmarks, found: Associated) -> list[tuple[int, int]]:
-    """Landmarks of the session with rows of the prior map, by common names if there are two, and by constellation."""
-    settings = found.assignment.settings
-    p_merge = settings.association.p_merge
-    trusted = np.argsort(-found.assignment.sightings, kind="stable")
-    source = found.in_metres.part(trusted)
-    known, density = prior_map.covariance_m2 + MAP_FLOOR_M**2 * np.eye(2), density_of_unmet(source.place, settings)
-    name = found.assignment.name[trusted]
-    named, of = (each[:MOST_NAMED] for each in np.intersect1d(name, prior_map.landmark_id, return_indices=True)[1:])
-    sure = agreed_pairs(
-        source.part(named), LocalMap(prior_map.position_m[of], block_diag(*known[of])), np.eye(len(of), dtype=bool),
-        density=density, probability=p_merge, settings=settings,
-    ) if len(of) > 1 else []  # fmt: skip
-    if sure or len(prior_map) > ALL_TRIED:
-        given = [(int(named[k]), int(of[m])) for k, m in sure]
-        index = PlaceIndex(prior_map.position_m, known, settings=settings)
-        pairs = index.pairs(source, density=density, probability=p_merge, given=given)
-    else:
-        target = LocalMap(prior_map.position_m, block_diag(*known))
-        allowed = alike(name[:, None, None], prior_map.landmark_id[None, :, None])
-        pairs = agreed_pairs(source, target, allowed, density=density, probability=p_merge, settings=settings)
-    return [(int(trusted[k]), m) for k, m in pairs]

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -62,22 +61,15 @@ class PlaceIndex:
         self._corners = np.take_along_axis(self._corners, order, axis=1)
         self._by_sides = KDTree(sides, balanced_tree=False)
 
-    def pairs(
-        self, source: LocalMap, *, density: float, probability: float, given: Sequence[tuple[int, int]] = ()
-    ) -> list[tuple[int, int]]:
+    def pairs(self, source: LocalMap, *, density: float, probability: float) -> list[tuple[int, int]]:
         """Return pairs (row of `source`, row of the map) that are certain; empty if there are none.
 
         Args:
             source: the local map, its best known landmarks first.
             density: expected landmarks per square metre, if they are not the same.
             probability: least probability of a pair, against all alignments that differ in this pair only.
-            given: certain pairs, for example by name, around which the others are searched; empty to search everywhere.
         """
         done = np.zeros(len(source.place), dtype=bool)
-        if given:
-            mine, theirs = np.array(given).T
-            done[mine] = True
-            return [*given, *self._further(source, mine, theirs, done, density, probability)]
         for _ in range(TRIES):
             if len(source.place) - int(done.sum()) < 3 or not len(self._corners):
                 break
