@@ -74,7 +74,7 @@ OF_THE_CODE = frozenset(
     maps.sessions.placing.SMALLEST_P maps.sessions.witnessed.WITNESSED_NATS maps.sessions.witnessed.LEAST_P
     maps.sessions.witnessed.MOST_P runs.persist.changes._SHORTEST_GAP_S sensing.kernels.FAR_OUT
     slam.association.associator.LEAST_LEFT slam.association.associator.SAME_NATS slam.association.consensus.IMPLIED_M2
-    slam.association.consensus.LEAST_M2 slam.association.identify.MAP_FLOOR_M slam.association.in_space.FAR_M
+    slam.association.consensus.LEAST_M2 slam.association.in_space.FAR_M
     slam.association.particles.FEWEST_PARTICLES slam.association.particles.GATE slam.association.splitting.LEAST_M2
     slam.association.splitting.LEAST_SHARE slam.calibration.LEAST_SIGMA slam.changes.explain.HELD_M
     slam.changes.search.NEAR slam.known_places.LEAST_VARIANCE slam.known_places.RETRY_S slam.known_places.SIGMA_M

@@ -48,7 +48,7 @@ def run_slam(
     config = config or Config()
     recording, remarks = check.screened(recording, config, prior_map)
     if config.slam.unknown_ids and prior_map is not None:
-        recording = nameless.numbered_in(recording, prior_map, config)
+        recording = nameless.numbered_in(recording, prior_map, config)  # type: ignore[type-var]
     else:
         recording = association.with_identities(recording, config.slam)
     if has_traffic(recording):

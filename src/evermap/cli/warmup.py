@@ -12,7 +12,6 @@ from evermap.config import Config
 from evermap.existence.lifetimes import log_death_odds
 from evermap.geometry.se3 import NO_TURN
 from evermap.pipeline import run_session, run_slam
-from evermap.sensing.visibility import NominalField
 from evermap.slam import warmup
 from evermap.survival import GeneralPurpose
 from evermap.types import (
@@ -27,11 +26,12 @@ from evermap.types import (
     SpatialOdometry,
     SpatialRecording,
     SpatialSensor,
+    rows_of,
 )
 
 FRAMES = 24
 """Enough for more than one look along a cell of the lines of sight."""
-PLACES = np.array([[2.0, 1.0], [3.0, -1.5], [5.0, 1.5], [4.0, 0.5]])
+PLACES = np.array([[2.0, 1.0], [3.0, -1.5], [5.0, 1.5], [4.0, 0.5], [3.5, 2.5], [6.0, -1.0]])
 """[m], beside a drive of 2.3 m along x."""
 
 
@@ -63,8 +63,7 @@ def warm_up(
     if in_space:
         warmup.seldom_used()
     if in_space and sessions:
-        NominalField(Sensor()).p_detect(np.zeros((1, 3)), np.zeros((1, 2)))  # for what appears in a later session
-        first = run_session(_flight(0.0), config=config)
+        first = run_session(_flight(0.0, len(PLACES) - 1), config=config)  # the last one appears in the second
         _done(first.slam, run_session(_flight(1e5), first.living, config).slam)
         return
     if in_space:
@@ -127,10 +126,11 @@ def _drive(start_s: float) -> Recording:
     )
 
 
-def _flight(start_s: float) -> SpatialRecording:
-    """The same in space, with objects that have an orientation."""
+def _flight(start_s: float, n_places: int = len(PLACES)) -> SpatialRecording:
+    """The same in space, with objects that have an orientation; past some of them."""
     planar = _drive(start_s)
-    seen, count = planar.detections, len(planar.detections)
+    seen = rows_of(planar.detections, planar.detections.landmark_id < n_places)
+    count = len(seen)
     pose = np.zeros((FRAMES, 7))
     pose[:, 0], pose[:, 6] = 0.1 * np.arange(FRAMES), 1.0
     position = np.column_stack([PLACES[seen.landmark_id], np.ones(count)]) - pose[seen.frame, :3]

@@ -40,8 +40,8 @@ def keys(section: Section, prefix: str) -> Iterator[str]:
 
 
 def test_every_key_is_read_from_the_settings_of_the_caller() -> None:
-    """A park with some identities and a radius, again without these in a map of over 100 trees; a part of a map that lies
-    over another one; tags, and points of a map, in space.
+    """A park with some identities and a radius, again without these in a map of over 100 trees; a map that lies over
+    another one; tags, and points of a map, in space.
     """
     wild = ParkConfig(drive_m=150.0, n_trees=105, n_cars=2, steering_noise_rad=0.05)  # as if wheels slip
     park, rng = simulate_park(wild), np.random.default_rng(0)

@@ -30,8 +30,6 @@ from evermap.types import UNKNOWN, FloatArray, IntArray, Recording
 
 ALL_TRIED = 100
 """Number of landmarks of a prior map up to which every pair is tried; above, an index of constellations is used."""
-MOST_NAMED = 100
-"""Maximum number of landmarks with a common name that align a session with a map: bounds the work."""
 RUNS, MOST_ROUNDS, MOST_IN_VAIN = 4, 6, 2
 """Draws per round, maximum number of rounds, and of rounds in a row without gain: bound the work."""
 SETTLED = 120
@@ -40,8 +38,6 @@ LITTLE = 200.0
 """Gain per detection below which the search ends, as a fraction 1/`LITTLE` of the cost of an outlier: a tolerance."""
 MOST_LEARNED = 3
 """Maximum number of rounds of learning traits and associating with them; they converge within these."""
-MAP_FLOOR_M = 1e-3
-"""Standard deviation that is added to a prior map, which may state none: a tolerance."""
 
 
 @dataclass(frozen=True)
