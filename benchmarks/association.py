@@ -56,9 +56,7 @@ from evermap.io import read_recording
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
 from evermap.metrics.trajectory import evaluate_trajectory
-from evermap.slam.association.identify import identified
-from evermap.slam.association.in_space import identified_in_space
-from evermap.slam.intake import beliefs
+from evermap.slam.association import with_identities
 from evermap.types import (
     UNKNOWN,
     AnyRecordingT,
@@ -167,11 +165,7 @@ def score(recording: Recording | SpatialRecording, config: Config | None = None)
     config = config or Config()
     named = em.run_slam(recording, config)
     began = time.process_time()
-    found: Recording | SpatialRecording
-    if isinstance(recording, SpatialRecording):
-        found = identified_in_space(recording, config.slam)
-    else:
-        found = identified(recording, *beliefs(recording.sensor, config.slam), settings=config.slam)
+    found = with_identities(recording, config.slam.model_copy(update={"unknown_ids": True}))
     associated = time.process_time()
     nameless = em.run_slam(found, config)
     ended = time.process_time()
@@ -241,10 +235,7 @@ def partly_named(recording: AnyRecordingT, share: float, of: str, seed: int = 0)
 def mixed_line(recording: Recording | SpatialRecording, share: float, of: str) -> str:
     """Return a row of the table of a recording of which some landmarks, or detections, keep their identities."""
     true, config, some = recording.detections.landmark_id, Config(), partly_named(recording, share, of)
-    if isinstance(some, SpatialRecording):
-        found: Recording | SpatialRecording = identified_in_space(some, config.slam, keep_ids=True)
-    else:
-        found = identified(some, *beliefs(some.sensor, config.slam), keep_ids=True, settings=config.slam)
+    found = with_identities(some, config.slam.model_copy(update={"unknown_ids": "empty"}))
     given = found.detections.landmark_id
     every = [em.run_slam(one, config) for one in (found, some, recording)]
     truth = _truth(recording, every[-1])

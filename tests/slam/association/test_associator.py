@@ -10,21 +10,21 @@ from identity_scores import identity_scores
 from problems import World, make_world
 from recordings import building
 
-from evermap.config import Config
+from evermap.config import Config, SlamConfig
 from evermap.geometry import se2
 from evermap.maps.sessions.nameless import numbered_in
+from evermap.slam.association import with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator, compared, fit_sighting_noise
-from evermap.slam.association.identify import identified
 from evermap.slam.association.merging import propose_merges
 from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.noise import START
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, Landmarks
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
+NAMELESS = SlamConfig(unknown_ids=True)
 KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False)
 
 
@@ -142,13 +142,13 @@ def test_noise_that_grows_with_range_is_found() -> None:
 @pytest.mark.slow
 def test_a_building_without_ids_and_in_its_map() -> None:
     recording = building(2).sessions[0]
-    found = identified(recording, CalibrationPrior.from_settings(calibrated=True), START)
+    found = with_identities(recording, NAMELESS)
     scores = identity_scores(found.detections.landmark_id, recording.detections.landmark_id)
     assert scores.purity > 0.98
     assert scores.completeness > 0.9
     assert recording.true_landmarks is not None
     survey = Landmarks.at(recording.true_landmarks.landmark_id, recording.true_landmarks.position_m, sigma_m=0.02)
-    inside = numbered_in(recording, survey, Config(slam={"unknown_ids": True})).detections.landmark_id
+    inside = numbered_in(recording, survey, Config(slam=NAMELESS)).detections.landmark_id
     met = np.isin(inside, survey.landmark_id)
     assert met.mean() > 0.5
     assert np.mean(inside[met] == recording.detections.landmark_id[met]) > 0.98
@@ -206,7 +206,7 @@ def test_landmarks_of_two_classes_are_two_wherever_they_are() -> None:
 @pytest.mark.slow
 def test_a_park_is_driven_again_and_again() -> None:
     recording = simulate_park(ParkConfig(drive_m=1200.0, n_trees=60), seed=2)
-    found, true = identified(recording, KNOWN_SENSORS, START), recording.detections.landmark_id
+    found, true = with_identities(recording, NAMELESS), recording.detections.landmark_id
     trees = true != UNKNOWN
     scores = identity_scores(found.detections.landmark_id[trees], true[trees])
     assert scores.purity > 0.97

@@ -11,17 +11,17 @@ from problems import make_world
 from recordings import building, first_seconds
 from scipy.stats import multivariate_normal, norm
 
-from evermap.config import Config
+from evermap.config import Config, SlamConfig
+from evermap.slam.association import with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator
 from evermap.slam.association.features import Likeness, Traits, Variances, learned, medians
-from evermap.slam.association.identify import identified
 from evermap.slam.association.particles import drawn as drawn_anew
 from evermap.slam.association.splitting import traits_against_others
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.intake import beliefs
 from evermap.types import UNKNOWN
 
+NAMELESS = SlamConfig(unknown_ids=True)
 READINGS = Config().slam.association.readings
 
 
@@ -196,14 +196,13 @@ def test_an_exchange_of_two_landmarks_is_seen() -> None:
 def test_a_useless_column_changes_nothing_and_a_good_one_no_identity() -> None:
     recording = first_seconds(building(3).sessions[0], 45.0)
     seen, rng = recording.detections, np.random.default_rng(7)
-    beliefs_of = beliefs(recording.sensor, Config().slam)
-    plain = identified(recording, *beliefs_of).detections.landmark_id
+    plain = with_identities(recording, NAMELESS).detections.landmark_id
     noise = rng.normal(size=(len(seen), 2))
     good = 0.1 * rng.normal(size=int(seen.landmark_id.max()) + 1)[seen.landmark_id, None] + 0.02 * noise[:, :1]
     for features, same in ((noise, True), (good, False)):
         names = tuple(f"descriptor_{k}" for k in range(features.shape[1]))
         given = replace(recording, detections=replace(seen, features=features, feature_names=names))
-        found = identified(given, *beliefs_of).detections.landmark_id
+        found = with_identities(given, NAMELESS).detections.landmark_id
         if same:
             np.testing.assert_array_equal(found, plain)
         else:

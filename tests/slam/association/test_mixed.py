@@ -11,14 +11,14 @@ from problems import make_world
 from recordings import building
 
 from evermap import run_slam
-from evermap.config import Config
+from evermap.config import Config, SlamConfig
 from evermap.maps.sessions.nameless import numbered_in
 from evermap.metrics.trajectory import evaluate_trajectory
+from evermap.slam.association import with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment, alike, names_of
-from evermap.slam.association.identify import identified, numbered
+from evermap.slam.association.identify import numbered
 from evermap.slam.association.merging import _without_contradictions
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.noise import START
 from evermap.slam.problem import Estimate
 from evermap.types import UNKNOWN, IntArray, Landmarks, Recording
 from evermap_studies.sim.park import ParkConfig, simulate_park
@@ -81,7 +81,7 @@ def test_visits_are_landmarks_of_their_own_but_for_names() -> None:
 def test_half_of_a_building_has_names(share: float) -> None:
     recording = building(2).sessions[0]
     true, some = recording.detections.landmark_id, with_some_named(recording, share)
-    found = identified(some, PRIOR, START, keep_ids=True).detections.landmark_id
+    found = with_identities(some, SlamConfig(unknown_ids="empty")).detections.landmark_id
     scores = identity_scores(found, true)
     assert scores.purity > 0.98
     assert scores.completeness > 0.95
@@ -94,7 +94,7 @@ def test_tags_that_are_not_always_read() -> None:
     true, rng = recording.detections.landmark_id, np.random.default_rng(1)
     read = np.where(rng.random(len(true)) < 0.5, true, UNKNOWN)
     some = replace(recording, detections=replace(recording.detections, landmark_id=read))
-    found = identified(some, PRIOR, START, keep_ids=True).detections.landmark_id
+    found = with_identities(some, SlamConfig(unknown_ids="empty")).detections.landmark_id
     met = (read == UNKNOWN) & (found != UNKNOWN)
     assert np.mean(found[met] == true[met]) > 0.98
     assert met.sum() > 0.95 * np.sum((read == UNKNOWN) & (true != UNKNOWN))
@@ -128,8 +128,8 @@ def test_a_name_helps_a_robot_that_is_lost() -> None:
 
 def test_without_any_name_it_is_as_if_ids_were_ignored() -> None:
     recording = with_some_named(building(2).sessions[0], 0.0)
-    one, other = (identified(recording, PRIOR, START, keep_ids=keep).detections.landmark_id for keep in (True, False))
-    np.testing.assert_array_equal(one, other)
+    one, other = (with_identities(recording, SlamConfig(unknown_ids=each)) for each in (True, "empty"))
+    np.testing.assert_array_equal(one.detections.landmark_id, other.detections.landmark_id)
 
 
 def test_names_say_where_in_a_map_it_is() -> None:

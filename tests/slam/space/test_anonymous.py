@@ -9,23 +9,22 @@ import pytest
 from identity_scores import identity_scores
 
 from evermap import run_session, run_slam
-from evermap.config import Config
+from evermap.config import Config, SlamConfig
 from evermap.errors import DataError
 from evermap.maps.sessions.nameless import numbered_in
-from evermap.slam.association.in_space import identified_in_space
+from evermap.slam.association import with_identities
 from evermap.types import UNKNOWN, ChangeKind, SpatialRecording, rows_of
 
 from .corridors import tagged_corridor
 from .halls import hall, part_of_hall, tilt
 from .rooms import Room
 
-SLAM = Config().slam
 NAMELESS = Config(slam={"unknown_ids": True})
 
 
 def scored(recording: SpatialRecording, *, purity: float, completeness: float) -> SpatialRecording:
     """The recording with ids by geometry, as right as stated, and with as many landmarks as there are."""
-    found = identified_in_space(recording, SLAM)
+    found = with_identities(recording, NAMELESS.slam)
     real = recording.detections.landmark_id != UNKNOWN
     scores = identity_scores(found.detections.landmark_id[real], recording.detections.landmark_id[real])
     assert scores.purity >= purity
@@ -84,7 +83,7 @@ def test_landmarks_of_two_classes_at_one_place_stay_two():
 def test_identities_of_the_recording_are_not_looked_at():
     recording = hall(3, n_points=20, n_frames=150)
     hidden = replace(recording.detections, landmark_id=np.full(len(recording.detections), UNKNOWN))
-    one, other = (identified_in_space(each, SLAM) for each in (recording, replace(recording, detections=hidden)))
+    one, other = (with_identities(each, NAMELESS.slam) for each in (recording, replace(recording, detections=hidden)))
     np.testing.assert_array_equal(one.detections.landmark_id, other.detections.landmark_id)
 
 
@@ -95,7 +94,7 @@ def test_points_of_which_some_have_names(share):
     named = np.isin(true, np.random.default_rng(0).permutation(40)[: int(40 * share)])
     given = np.where(named, 100 + true, UNKNOWN)
     some = replace(recording, detections=replace(recording.detections, landmark_id=given))
-    found = identified_in_space(some, SLAM, keep_ids=True).detections.landmark_id
+    found = with_identities(some, SlamConfig(unknown_ids="empty")).detections.landmark_id
     np.testing.assert_array_equal(found[named], given[named])
     assert not np.isin(found[~named], given[named]).any()
     real = true != UNKNOWN
@@ -110,14 +109,14 @@ def test_tags_that_are_not_always_read():
     true = recording.detections.landmark_id
     read = np.where(np.random.default_rng(0).random(len(true)) < 0.5, true, UNKNOWN)
     some = replace(recording, detections=replace(recording.detections, landmark_id=read))
-    found = identified_in_space(some, SLAM, keep_ids=True).detections.landmark_id
+    found = with_identities(some, SlamConfig(unknown_ids="empty")).detections.landmark_id
     assert np.mean(found == true) > 0.99
 
 
 def test_without_odometry_it_is_refused():
     recording = tagged_corridor(0, n_frames=40, odometry=False).recording
     with pytest.raises(DataError, match="need odometry"):
-        identified_in_space(recording, SLAM)
+        with_identities(recording, NAMELESS.slam)
 
 
 def named_as(recording: SpatialRecording, found: SpatialRecording) -> dict[int, int]:

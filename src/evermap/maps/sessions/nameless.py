@@ -30,16 +30,16 @@ from evermap.maps.sessions.box_search import TESTED_M2
 from evermap.maps.sessions.gaussian import drifted
 from evermap.maps.sessions.placing import SMALLEST_P, one_to_one
 from evermap.maps.sessions.session import admitted
+from evermap.slam.association import associate
 from evermap.slam.association.assignment import alike, with_ids
 from evermap.slam.association.consensus import Candidates, consensus
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
-from evermap.slam.association.identify import ALL_TRIED, Associated, associated, numbered
-from evermap.slam.association.in_space import AssociatedInSpace, associated_in_space
+from evermap.slam.association.identify import ALL_TRIED, Associated, numbered
+from evermap.slam.association.in_space import AssociatedInSpace
 from evermap.slam.association.jcbb import gates
 from evermap.slam.association.merging import in_reach
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.slam.association.revise import most_probable
-from evermap.slam.intake import beliefs
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -48,7 +48,6 @@ from evermap.types import (
     FloatArray,
     IntArray,
     Landmarks,
-    SpatialRecording,
     landmark_id_of,
 )
 
@@ -148,11 +147,7 @@ def _met(
     """The association of a recording, (M,) ids of its detections, given or of glimpsed landmarks of a map, and (L,) ids
     of its landmarks, `UNKNOWN` for new ones.
     """
-    found: Associated | AssociatedInSpace
-    if isinstance(recording, SpatialRecording):
-        found = associated_in_space(recording, config.slam, keep_ids=True)
-    else:
-        found = associated(recording, *beliefs(recording.sensor, config.slam), keep_ids=True, settings=config.slam)
+    found = associate(recording, config.slam, keep_ids=True)
     landmark_id, name = found.names, found.name.copy()
     if len(living.places):
         p_site = aged(living, config.living, float(recording.frames.stamp_s[0])).p_here

@@ -2,23 +2,50 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 from evermap.config import SlamConfig
 from evermap.types import AnyRecording, SpatialRecording
 
+if TYPE_CHECKING:
+    from evermap.slam.association.identify import Associated
+    from evermap.slam.association.in_space import AssociatedInSpace
+
+
+def associate(recording: AnyRecording, settings: SlamConfig, *, keep_ids: bool) -> Associated | AssociatedInSpace:
+    """Associate the detections of a recording by geometry.
+
+    Args:
+        recording: as read.
+        settings: of the estimator.
+        keep_ids: detections with an id keep it, those without may be of the same landmarks; else ids are ignored.
+
+    Raises:
+        DataError: too few frames with detections, or too many for the memory; in space, no odometry.
+    """
+    from evermap.slam.association.identify import associated
+    from evermap.slam.association.in_space import associated_in_space
+    from evermap.slam.intake import beliefs
+
+    if isinstance(recording, SpatialRecording):
+        return associated_in_space(recording, settings, keep_ids=keep_ids)
+    return associated(recording, *beliefs(recording.sensor, settings), keep_ids=keep_ids, settings=settings)
+
 
 def with_identities(recording: AnyRecording, settings: SlamConfig) -> AnyRecording:
-    """Return the recording with landmark ids by geometry, if `slam.unknown_ids` is set.
+    """Return the recording with landmark ids by geometry, if `slam.unknown_ids` is set; errors as of `associate`.
 
-    Errors are those of `identify.identified` in the plane, and of `in_space.identified_in_space`.
+    Landmarks without an id are numbered from 1 by first detection, without the ids in use; `UNKNOWN` if a detection is
+    of no landmark with enough sightings. Those of a map are found by `maps.sessions.nameless`.
     """
     if not settings.unknown_ids:
         return recording
-    from evermap.slam.association.identify import identified
-    from evermap.slam.association.in_space import identified_in_space
-    from evermap.slam.intake import beliefs
+    from evermap.slam.association.assignment import with_ids
+    from evermap.slam.association.identify import numbered
 
     keep_ids = settings.unknown_ids == "empty"
-    if isinstance(recording, SpatialRecording):
-        return identified_in_space(recording, settings, keep_ids=keep_ids)
-    believed = beliefs(recording.sensor, settings)
-    return identified(recording, *believed, keep_ids=keep_ids, settings=settings)
+    found = associate(recording, settings, keep_ids=keep_ids)
+    landmark_id = numbered(found.names, found.name)
+    named = with_ids(recording, found.landmark_row, found.name, landmark_id)  # type: ignore[type-var]
+    return named if keep_ids else replace(named, landmark_names={})

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from evermap.config import SlamConfig
-from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetections, with_ids
+from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetections
 from evermap.slam.association.associator import Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.features import Traits, learned
@@ -106,10 +106,6 @@ class Associated:
         scale = self.prior.split_scale(assignment.estimate.states, np.eye(N_STATES))[2]
         at = assignment.points()[some] * scale
         return LooseDetections(self.used[some], at, assignment.wide_m[some], assignment.kind[some, 0])
-
-    def named(self, recording: Recording, landmark_id: IntArray) -> Recording:
-        """Return the recording with ids (L,) of its landmarks for detections without one; `UNKNOWN` if unassigned."""
-        return with_ids(recording, self.landmark_row, self.name, landmark_id)
 
 
 def associated(
@@ -261,34 +257,6 @@ def _by_names(
     for _ in some.stamp_s:
         slam.step()
     return slam.finish().estimate.pose
-
-
-def identified(
-    recording: Recording,
-    prior: CalibrationPrior,
-    noise: Noise,
-    *,
-    keep_ids: bool = False,
-    settings: SlamConfig = USUAL,
-) -> Recording:
-    """Return the recording with landmark ids by geometry; those of a map are found by `maps.sessions.nameless`.
-
-    Args:
-        recording: as read.
-        prior: of the calibration states.
-        noise: initial noise levels.
-        keep_ids: as of `associated`.
-        settings: of the estimator.
-
-    Returns:
-        The same detections. Landmarks without an id are numbered from 1 by first detection, without the ids in use;
-        `UNKNOWN` if a detection is of no landmark with enough sightings.
-
-    Raises:
-        DataError: too few frames with detections, or too many for the memory.
-    """
-    found = associated(recording, prior, noise, keep_ids=keep_ids, settings=settings)
-    return found.named(recording, numbered(found.names, found.name))
 
 
 def numbered(landmark_id: IntArray, taken: IntArray) -> IntArray:

@@ -28,11 +28,9 @@ from evermap.slam.association.assignment import (
     names_of,
     same_name,
     seen_together,
-    with_ids,
 )
 from evermap.slam.association.associator import LAST_ROUNDS, MERGE_ROUNDS, effective_number
 from evermap.slam.association.constellation import LocalMap
-from evermap.slam.association.identify import numbered
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.association.merging import Differences, Solution, in_reach, propose_merges
 from evermap.slam.association.revise import lying_together, may_be_of, most_probable
@@ -56,34 +54,21 @@ OF_DETECTIONS = (
 """Columns of `SpatialProblem` with one row per detection."""
 
 
-def identified_in_space(
+def associated_in_space(
     recording: SpatialRecording, settings: SlamConfig, *, keep_ids: bool = False
-) -> SpatialRecording:
-    """Return the recording with landmark ids by geometry; those of a map are found by `maps.sessions.nameless`.
+) -> AssociatedInSpace:
+    """Associate the detections of a recording in space by geometry.
 
-    Boxes (of a detector of movable objects) and detections without a range get none.
+    Boxes (of a detector of movable objects) and detections without a range are of no landmark.
 
     Args:
         recording: as read, with odometry.
         settings: of the estimator.
         keep_ids: detections with an id keep it, those without may be of the same landmarks; else ids are ignored.
 
-    Returns:
-        The same detections. Landmarks without an id are numbered from 1 by first detection, without the ids in use;
-        `UNKNOWN` if a detection is of no landmark with enough sightings.
-
     Raises:
         DataError: no odometry, or too few frames.
     """
-    found = associated_in_space(recording, settings, keep_ids=keep_ids)
-    named = found.named(recording, numbered(found.names, found.name))
-    return named if keep_ids else replace(named, landmark_names={})
-
-
-def associated_in_space(
-    recording: SpatialRecording, settings: SlamConfig, *, keep_ids: bool = False
-) -> AssociatedInSpace:
-    """Associate the detections of a recording in space by geometry, as `identified_in_space`; errors are the same."""
     if recording.odometry is None or len(recording.odometry) < 2:
         problem = f"{recording.name}: landmarks without identity need odometry"
         raise DataError(problem, hint="record poses or velocities of the robot, or identities")
@@ -137,10 +122,6 @@ class AssociatedInSpace:
     def density_of_unmet(self) -> float:
         """Density of unmapped landmarks [1/m^3] in the volume of the session."""
         return self.settings.association.least_landmarks / _volume_m3(self.in_metres.place, self.settings)
-
-    def named(self, recording: SpatialRecording, landmark_id: IntArray) -> SpatialRecording:
-        """Return the recording with ids (L,) of its landmarks for detections without one; `UNKNOWN` if unassigned."""
-        return with_ids(recording, self.landmark_row, self.name, landmark_id)
 
 
 class _Nearby:

@@ -37,7 +37,6 @@ class SpatialSolved:
         identity: (P,) rows of `SpatialIntake.landmark_id` that the places are of.
         number: (P,) which of the landmarks with that identity each is, from 1.
         from_map: what of the given map stands; None without a map.
-        map_rows: (K,) rows of the given map behind its comparison.
         online_pose: (N, 7) poses as each frame had them.
         online_spread: (N, 2) roughly how far off these may be [m, rad].
         step_s: (N,) seconds that each frame took.
@@ -47,7 +46,6 @@ class SpatialSolved:
     identity: IntArray
     number: IntArray
     from_map: MapComparison | None
-    map_rows: IntArray
     online_pose: FloatArray
     online_spread: FloatArray
     step_s: FloatArray
@@ -64,15 +62,14 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     Raises:
         NumericalError: no finite optimum.
     """
-    problem, stated, rows = _with_map(intake, prior_map)
+    problem, stated = _with_map(intake, prior_map)
     identity = np.arange(len(intake.landmark_id))
     settings = problem.settings
     goes = (settings.drift_m, settings.drift_rad) if problem.driven else (settings.hand_mps, settings.hand_radps)
     noise = SpatialNoise(*goes, pixel=settings.sigma_px)
     by_corners = (problem.kind == CORNERS) | problem.ray
-    if problem.driven and np.sum(~by_corners) > 0.5 * len(
-        by_corners
-    ):  # pixels err by themselves, detectors of objects by the view
+    # pixels err by themselves, detectors of objects by the view
+    if problem.driven and 2 * np.sum(~by_corners) > len(by_corners):
         drift = drift_of(problem, intake.driven_pose)
         problem = replace(problem, share=np.where(by_corners, 1.0, drift.share))
         if problem.steady:
@@ -108,7 +105,7 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     from_map = None
     if len(stated):
         optimum, from_map = compared(optimum, stated)
-    return SpatialSolved(optimum, identity, number, from_map, rows, stepwise.pose, spread, step_s)
+    return SpatialSolved(optimum, identity, number, from_map, stepwise.pose, spread, step_s)
 
 
 def _with_averaged_scale(optimum: SpatialOptimum) -> SpatialOptimum:
@@ -126,14 +123,14 @@ def _with_averaged_scale(optimum: SpatialOptimum) -> SpatialOptimum:
     return converged(sober, optimum.estimate, optimum.noise, heavy_rounds=0)
 
 
-def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[SpatialProblem, FloatArray, IntArray]:
-    """The problem with the landmarks of a map, their standard deviations (K, 6) as stated, and their rows there."""
+def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[SpatialProblem, FloatArray]:
+    """The problem with the landmarks of a map, and their standard deviations (K, 6) as stated."""
     problem, settings = intake.problem, intake.problem.settings.map
     shared, place, rows = np.intersect1d(
         intake.landmark_id, [] if prior_map is None else prior_map.landmark_id, return_indices=True
     )
     if prior_map is None or not len(shared):
-        return problem, np.zeros((0, 6)), np.zeros(0, dtype=np.int64)
+        return problem, np.zeros((0, 6))
     pose = se3.identity(len(rows))
     pose[:, :3] = prior_map.position_m[rows]
     stated = np.full((len(rows), 6), settings.sigma)
@@ -151,7 +148,7 @@ def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[Spati
     # positions of a map are in its axes, those of tags in their own: all alike
     stated[:, :3] = stated[:, :3].max(axis=1, keepdims=True)
     prior = PlacePrior(place.astype(np.int64), pose, np.maximum(stated, settings.loose_m), np.ones(len(rows)))
-    return replace(problem, prior=prior, start_sigma=FREE), stated, rows.astype(np.int64)
+    return replace(problem, prior=prior, start_sigma=FREE), stated
 
 
 def _likelier(
