@@ -15,6 +15,10 @@ in worlds that are harsher than those that constants were set on (`benchmarks/ha
 
 where detections say what landmarks are like (`COLUMNS` of `benchmarks/harsh.py`),
 
+    python -m benchmarks.association exchanged
+
+the same over the sessions of a map, in which two landmarks of a class change places half-way,
+
     python -m benchmarks.association mixed
 
 where some have identities: a share of the landmarks, or of the detections of each,
@@ -33,6 +37,7 @@ of the site; and found at once if since the last.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import time
@@ -218,6 +223,8 @@ MIXED = (
 """Beginnings of names, shares that keep their identities, and of what."""
 
 
+EXCHANGED = ("none", "radius", "colour", "descriptor of 32", "colour by the light", "useless")
+"""Columns over sessions."""
 WRONG_RATES = (0.0, 0.05, 0.1, 0.2)
 
 
@@ -345,6 +352,48 @@ def lived_through(world: Lived, *, unknown_ids: bool) -> dict[str, float]:
     }
 
 
+def exchanged_line(world: Lived, column: str) -> str:
+    """Return a row of the table of sessions with a column, after half of which two landmarks of a class change places.
+
+    A landmark of the map is what it was in its first session; how many times landmarks were called right and wrong, and
+    what was reported of the two in the session after.
+    """
+    config = load_config(None, [*world.overrides, "slam.unknown_ids=true"])
+    names = np.unique(np.concatenate([recording.detections.landmark_id for recording in world.recordings]))
+    one, other = _two_alike(world.recordings)
+    living, first, called, told = world.begun, dict[int, int](), [0, 0], list[str]()
+    for number, given in enumerate(world.recordings):
+        assert isinstance(given, Recording)
+        true = given.detections.landmark_id.copy()
+        if number >= len(world.recordings) // 2:
+            true[given.detections.landmark_id == one], true[given.detections.landmark_id == other] = other, one
+        recording = replace(given, detections=replace(given.detections, landmark_id=true), truth=None)
+        session = em.run_session(with_columns(recording, column, names=names, session=number + 1), living, config)
+        living, name = session.living, session.recording.detections.landmark_id
+        if len(name) != len(true):  # the cleaning has dropped a frame
+            continue
+        for each in np.unique(name[(name != UNKNOWN) & (true != UNKNOWN)]).tolist():
+            real = int(np.bincount(true[(name == each) & (true != UNKNOWN)]).argmax())
+            called[first.setdefault(each, real) != real] += 1
+        if number == len(world.recordings) // 2:
+            of_both = {each for each, real in first.items() if real in (one, other)}
+            told = [change.kind.value for change in session.changes if of_both & set(change.landmark_ids)]
+    assert living is not None
+    found = int((living.p_exists() >= 0.5).sum())
+    return f"| {world.name} | {column} | {called[0]} / {called[1]} | {', '.join(told) or 'nothing'} | {found} |"
+
+
+def _two_alike(recordings: Sequence[Recording | SpatialRecording]) -> tuple[int, int]:
+    """Two landmarks of one class that are seen more than ten times in every recording."""
+    every = [recording.detections for recording in recordings]
+    often = [np.unique(seen.landmark_id, return_counts=True) for seen in every]
+    common = functools.reduce(np.intersect1d, [name[(count > 10) & (name != UNKNOWN)] for name, count in often])
+    kind = [int(every[0].class_id[every[0].landmark_id == one][0]) for one in common]
+    pairs = [(a, b) for a in range(len(common)) for b in range(a + 1, len(common)) if kind[a] == kind[b]]
+    a, b = next((a, b) for a, b in pairs if b == max(other for first, other in pairs if first == a))
+    return int(common[a]), int(common[b])
+
+
 def _places_told(session: Session, before: LivingMap) -> tuple[FloatArray, FloatArray]:
     """Places in the map that landmarks left, and that they came to, as a session tells."""
     found: tuple[list[FloatArray], list[FloatArray]] = ([], [])
@@ -406,6 +455,11 @@ def main(names: Sequence[str] = ()) -> None:
                 row = lived_through(world, unknown_ids=unknown_ids)
                 cells = [f"{value:.3f}" if value < 10.0 else f"{value:.0f}" for value in row.values()]
                 print(f"| {world.name} | {'without' if unknown_ids else 'with'} | {' | '.join(cells)} |", flush=True)
+        return
+    if names and names[0] == "exchanged":
+        for world in (each for each in worlds() if each.name.startswith(("rooms", "building"))):
+            for name in EXCHANGED:
+                print(exchanged_line(world, name), flush=True)
         return
     if names and names[0] == "columns":
         rooms = (replace(one, name="rooms") for one in simulated_world(1, 0).recordings[:1])

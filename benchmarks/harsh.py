@@ -15,7 +15,18 @@ from typing import Any
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.types import UNKNOWN, Detections, FloatArray, Frames, Landmarks, Odometry, Recording, Sensor, Trajectory
+from evermap.types import (
+    UNKNOWN,
+    Detections,
+    FloatArray,
+    Frames,
+    IntArray,
+    Landmarks,
+    Odometry,
+    Recording,
+    Sensor,
+    Trajectory,
+)
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
 PARKS: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
@@ -129,19 +140,25 @@ growth of a radius with range; light that changes once a minute, the same in all
 LIGHT_S, PAUSE_S = 60.0, 20.0
 
 
-def with_columns(recording: Recording, name: str, seed: int = 0) -> Recording:
-    """Return a recording whose detections have columns of `COLUMNS`, by their own identities."""
+def with_columns(
+    recording: Recording, name: str, seed: int = 0, *, names: IntArray | None = None, session: int = 0
+) -> Recording:
+    """Return a recording whose detections have columns of `COLUMNS`, by their own identities; the same landmarks over
+    the sessions of a world, whose identities are `names`.
+    """
     kind: dict[str, Any] = COLUMNS[name]
     if not kind:
         return recording
     rng, seen = np.random.default_rng([seed, 11]), recording.detections
     stamp_s, count = recording.frames.stamp_s[seen.frame], len(kind["spread"])
-    _, of = np.unique(seen.landmark_id, return_inverse=True)
+    names = np.unique(seen.landmark_id) if names is None else names
+    of = np.searchsorted(names, seen.landmark_id)
     order = np.lexsort((stamp_s, of))
     begins = (np.diff(of[order], prepend=-1) != 0) | (np.diff(stamp_s[order], prepend=-np.inf) > PAUSE_S)
     visit = np.empty(len(order), dtype=np.int64)
     visit[order] = np.cumsum(begins) - 1
-    value = rng.normal(size=(of.max() + 1, count))[of] * kind["spread"]
+    value = rng.normal(size=(len(names), count))[of] * kind["spread"]
+    rng = np.random.default_rng([seed, 11, session]) if session else rng
     value += rng.normal(size=(visit.max() + 1, count))[visit] * kind["visit"]
     value += rng.normal(size=(len(of), count)) * kind["reading"]
     value += kind.get("by_range", 0.0) * seen.range_m[:, None]

@@ -13,6 +13,7 @@ All arrays are sorted by their id. Ids are never used twice, so that revisions o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -183,6 +184,45 @@ class Boxes(_Rows):
 
 
 @dataclass(frozen=True, slots=True)
+class MemberTraits(_Rows):
+    """What landmarks are like, such as their radius or colour: (T,) rows, sorted by `landmark_id` and `column_id`.
+
+    Attributes:
+        landmark_id: which landmark.
+        column_id: `landmark_id_of` the name of the column.
+        value: mean over sessions of the median of a session's readings.
+        sessions: number of these.
+    """
+
+    landmark_id: IntArray
+    column_id: IntArray
+    value: FloatArray
+    sessions: IntArray
+
+    def of(self, landmark_id: IntArray, columns: Sequence[str]) -> tuple[FloatArray, IntArray]:
+        """Return (K, C) values of landmarks, nan where there is none, and the numbers of sessions."""
+        found = [self[self.column_id == landmark_id_of(name)] for name in columns]
+        rows = [_rows_among(each.landmark_id, landmark_id) for each in found]
+        value, sessions = np.full((len(landmark_id), len(columns)), np.nan), np.zeros((len(landmark_id), len(columns)))
+        for c, (each, row) in enumerate(zip(found, rows, strict=True)):
+            value[:, c], sessions[:, c] = np.append(each.value, np.nan)[row], np.append(each.sessions, 0)[row]
+        return value, sessions.astype(np.int64)
+
+    def met(self, landmark_id: IntArray, columns: Sequence[str], value: FloatArray) -> MemberTraits:
+        """Return the table after a session, by the medians (K, C) of its readings, nan for none."""
+        before, sessions = self.of(landmark_id, columns)
+        seen, column_id = np.isfinite(value), np.array([landmark_id_of(name) for name in columns], dtype=np.int64)
+        after = np.where(sessions > 0, before, 0.0) + (value - np.where(sessions > 0, before, 0.0)) / (sessions + 1)
+        k, c = np.nonzero(seen)
+        new = MemberTraits(landmark_id[k], column_id[c], after[k, c], sessions[k, c] + 1)
+        replaced = np.zeros(len(self), dtype=np.bool_)
+        for column, of_column in zip(column_id, seen.T, strict=True):
+            replaced |= (self.column_id == column) & np.isin(self.landmark_id, landmark_id[of_column])
+        every = MemberTraits.joined(self[~replaced], new)
+        return every[np.lexsort((every.column_id, every.landmark_id))]
+
+
+@dataclass(frozen=True, slots=True)
 class Metres(_Rows):
     """Scales of the named robots of a map: (R,) rows.
 
@@ -207,7 +247,7 @@ class LivingMap(Shown):
         stamp_s: until when observations went in: beliefs are those of this instant, but for `dated` ones. -inf before
             the first session.
         session_start_s: begin of the newest session; one that begins earlier is late.
-        members, sites, places, stays, dated, boxes: see there.
+        members, sites, places, stays, dated, boxes, traits: see there.
         covariance_m2: (2 P, 2 P) joint covariance of all places, x and y interleaved, as if the map's size were known;
             or (P, 2, 2) blocks, while the places are independent; in chunks where there are many; with 3 for 2 in
             space.
@@ -232,6 +272,7 @@ class LivingMap(Shown):
     stays: Stays = field(default_factory=Stays.empty)
     dated: Dated = field(default_factory=Dated.empty)
     boxes: Boxes = field(default_factory=Boxes.empty)
+    traits: MemberTraits = field(default_factory=MemberTraits.empty)
     covariance_m2: JointCovariance = field(default_factory=lambda: np.zeros((0, 0)))
     log_size_variance: float = 0.0
     log_size_information: float = np.inf
@@ -493,6 +534,7 @@ class LivingMap(Shown):
             sites=self.sites[np.isin(self.sites.site_id, places.site_id)],
             dated=self.dated[np.isin(self.dated.site_id, places.site_id)],
             boxes=self.boxes[np.isin(self.boxes.landmark_id, members.landmark_id)],
+            traits=self.traits[np.isin(self.traits.landmark_id, members.landmark_id)],
             places=places,
             stays=self.stays[np.isin(self.stays.clique_id, members.clique_id)],
             covariance_m2=taken(self.covariance_m2, kept, self.dim),

@@ -489,7 +489,8 @@ def _members_at(living: LivingMap, site: int) -> tuple[int, ...]:
 
 
 def without_strays(living: LivingMap) -> LivingMap:
-    """Return a map without sizes and names of boxes that it has forgotten."""
+    """Return a map without sizes, traits and names of landmarks that it has forgotten."""
+    living = replace(living, traits=living.traits[np.isin(living.traits.landmark_id, living.members.landmark_id)])
     boxes = living.boxes
     stays = np.isin(boxes.landmark_id, living.members.landmark_id)
     if stays.all():

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.spatial import KDTree
 
-from evermap.config import Config, OverlayConfig
+from evermap.config import Config, OverlayConfig, SlamConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.geometry.group import SPACE, group_of
@@ -31,9 +31,10 @@ from evermap.maps.sessions.gaussian import drifted
 from evermap.maps.sessions.placing import SMALLEST_P, one_to_one
 from evermap.maps.sessions.session import admitted
 from evermap.slam.association import associate
-from evermap.slam.association.assignment import alike, with_ids
+from evermap.slam.association.assignment import alike, landmarks_of_visits, visits_of, with_ids
 from evermap.slam.association.consensus import Candidates, consensus
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
+from evermap.slam.association.features import Likeness, Traits, learned, medians
 from evermap.slam.association.identify import ALL_TRIED, Associated, numbered
 from evermap.slam.association.in_space import AssociatedInSpace
 from evermap.slam.association.jcbb import gates
@@ -59,6 +60,10 @@ HELD_NATS = 100.0
 """Log odds of a certain match."""
 BESIDE = 3
 """Landmarks next to a detection that tell how far the session is bent there."""
+FEWEST_COMPARED = 5
+"""Certain pairs that tell by how much columns differ between sessions: fewer have no median worth the name."""
+CHI2_MEDIAN = 0.45493642311957283
+"""Median of a squared standard normal number."""
 GATE = {dim: float(gates(1, 0.9999, dim)[1]) for dim in (2, 3)}
 """Squared distance beyond which a landmark is not at a place, by the coordinates of one."""
 
@@ -151,7 +156,8 @@ def _met(
     landmark_id, name = found.names, found.name.copy()
     if len(living.places):
         p_site = aged(living, config.living, float(recording.frames.stamp_s[0])).p_here
-        assigned = _Assigned(found, living, _Stood.of(living, p_site), config)
+        traits = _Traits.of(found, recording, living, config.slam)
+        assigned = _Assigned(found, living, _Stood.of(living, p_site), traits, config)
         member, where = assigned.members()
         known = (member >= 0) & (landmark_id == UNKNOWN)
         landmark_id[known] = living.members.landmark_id[member[known]]
@@ -234,11 +240,73 @@ def _drifted(covariance: FloatArray, error: FloatArray, dim: int, config: Overla
     return found
 
 
+class _Traits(NamedTuple):
+    """What the landmarks of a session (K,) and of a map (L,) are like.
+
+    Attributes:
+        traits: of the session's detections.
+        mine, theirs: of its landmarks, and of the map's members.
+    """
+
+    traits: Traits
+    mine: Likeness
+    theirs: Likeness
+
+    @classmethod
+    def of(
+        cls, found: Associated | AssociatedInSpace, recording: AnyRecording, living: LivingMap, settings: SlamConfig
+    ) -> Self | None:
+        """Return what the columns of a recording say; None if that is nothing, or the map does not know them."""
+        seen, row = recording.detections, found.landmark_row
+        if seen.features is None or not len(living.traits):
+            return None
+        visit = visits_of(recording.frames.stamp_s[seen.frame], row, settings.association.forget_s)
+        landmark = landmarks_of_visits(visit, row)
+        traits = learned(seen.features, visit, landmark, settings=settings)
+        if traits is None:
+            return None
+        mine = traits.of_landmarks(traits.of_visits(visit, len(landmark)), landmark, len(found.sightings))
+        columns = [seen.feature_names[c] for c in traits.column]
+        value, sessions = living.traits.of(living.members.landmark_id, columns)
+        error = traits.errors[traits.most_readings] / np.maximum(sessions, 1)
+        readings = (traits.most_readings * sessions.max(axis=1, initial=0)).astype(np.float64)
+        return cls(traits, mine, Likeness(value - traits.mean, error, readings))
+
+    def nats(self, k: IntArray, member: IntArray) -> FloatArray:
+        """Return (Q,) the evidence that landmarks (Q,) of the session are members (Q,) of the map [nats]."""
+        return self.traits.same(self.mine.part(k), self.theirs.part(member))
+
+    def compared(self, k: IntArray, member: IntArray) -> Self:
+        """Return the same for columns that may be off by a common offset, and err by more than within the session, by
+        pairs (Q,) that are certain: the light may be another one.
+        """
+        if len(k) < FEWEST_COMPARED:
+            return self
+        off = self.mine.value[k] - self.theirs.value[member]
+        known = np.isfinite(off)
+        stated = self.mine.variance[k] + self.theirs.variance[member]
+        shift = medians(off, np.zeros(len(k), dtype=np.int64), 1)[0][0]
+        shift = np.where(known.sum(axis=0) >= FEWEST_COMPARED, shift, 0.0)
+        squared = np.where(known, (off - shift) ** 2 / stated, np.nan)
+        wider = np.maximum(medians(squared, np.zeros(len(k), dtype=np.int64), 1)[0][0] / CHI2_MEDIAN, 1.0)
+        wider = np.where(np.isfinite(wider), wider, 1.0)
+        mine, theirs = (each._replace(variance=wider * each.variance) for each in (self.mine, self.theirs))
+        return self._replace(mine=mine._replace(value=mine.value - shift), theirs=theirs)
+
+
 class _Assigned:
     """Landmarks of a session (K,), to be assigned to those of a map."""
 
-    def __init__(self, found: Associated | AssociatedInSpace, living: LivingMap, stood: _Stood, config: Config) -> None:
+    def __init__(
+        self,
+        found: Associated | AssociatedInSpace,
+        living: LivingMap,
+        stood: _Stood,
+        traits: _Traits | None,
+        config: Config,
+    ) -> None:
         self._found, self._living, self._stood, self._overlay = found, living, stood, config.living.overlay
+        self._traits = traits
         self._settings, self._slam = config.living.nameless, config.slam
         self._local, self._beside_m = found.in_metres, config.living.looks.beside_m
         name, known = found.names, living.members.landmark_id[stood.landmark]
@@ -250,10 +318,15 @@ class _Assigned:
 
     def members(self) -> tuple[IntArray, Where | None]:
         """Return (K,) rows of the map's members, -1 for new ones; and where all lie, None if nothing matches."""
-        place, where = self._placed(), None
+        place, where = self._placed(self._alike & self._not_unlike()), None
+        if self._traits is not None and not np.any(place >= 0):  # all may be unlike, in another light
+            self._compare(self._placed(self._alike))
+            place = self._placed(self._alike & self._not_unlike())
         member = np.full(len(place), -1, dtype=np.int64)
         while np.any(place >= 0):
+            self._compare(place)
             place = self._grown(place)
+            self._compare(place)
             where = self._where(np.arange(len(place)), place)
             member = self._assigned(where, place)
             more = self._regained(where, member, place)
@@ -348,8 +421,16 @@ class _Assigned:
         sure = found.pairs[found.margin >= math.log(p_merge / (1.0 - p_merge))]
         return group[k[sure]], m[sure]
 
-    def _placed(self) -> IntArray:
-        """Return (K,) rows of the places that landmarks of one stretch certainly match, -1 for the others."""
+    def _compare(self, place: IntArray) -> None:
+        """Learn from certain matches how columns differ between the session and the map."""
+        if self._traits is not None:
+            held = np.flatnonzero(place >= 0)
+            self._traits = self._traits.compared(held, self._stood.landmark[place[held]])
+
+    def _placed(self, allowed: BoolArray) -> IntArray:
+        """Return (K,) rows of the places that landmarks of one stretch certainly match, -1 for the others; of the
+        `allowed` (K, P) pairs.
+        """
         stands, every = np.flatnonzero(self._stood.p >= EXISTS), np.arange(len(self._local.place))
         place, named = np.full(len(every), -1, dtype=np.int64), self._named[:MOST_HELD]
         of_named = stands[self._alike[named][:, stands].any(axis=0)]
@@ -357,7 +438,7 @@ class _Assigned:
         if not best and len(stands) >= self._settings.fewest:
             index = self._index(stands)
             for some in _windows(every):
-                best = max(best, self._overlaid(some, stands, index, self._alike), key=len)
+                best = max(best, self._overlaid(some, stands, index, allowed), key=len)
                 if len(best) >= WINDOW:  # all of one
                     break
             best = best if len(best) >= self._settings.fewest else []
@@ -365,6 +446,15 @@ class _Assigned:
             mine, theirs = np.array(best).T
             place[mine] = theirs
         return place
+
+    def _not_unlike(self) -> BoolArray:
+        """(K, P) landmarks and places of which what these are like does not say that they are two."""
+        if self._traits is None:
+            return np.ones_like(self._alike)
+        stood, least = self._stood, -self._slam.association.readings.misread_nats
+        every = np.arange(len(self._living.members))
+        nats = [self._traits.nats(np.full_like(every, k), every) for k in range(len(self._local.place))]
+        return np.asarray(np.array(nats).reshape(-1, len(every))[:, stood.landmark] >= least)
 
     def _regained(self, where: Where, member: IntArray, place: IntArray) -> IntArray:
         """Return `place` with landmarks beyond their gates after a distorted stretch, by their constellation."""
@@ -446,6 +536,9 @@ class _Assigned:
             angle = se3.angle_between(se3.turn(where.rotation[k]), se3.turn(stood.rotation[m]))
             turned = angle > rules.turn_sigmas * rules.turn_floor_rad
             stands, moved = (odds + np.log(self._overlay.share_turned) * turned for odds in (stands, moved))
+        if self._traits is not None:
+            like = self._traits.nats(some[k], stood.landmark[m])
+            stands, moved = stands + like, moved + like
         return k, m, stands, moved
 
     def _assigned(self, where: Where, place: IntArray) -> IntArray:
@@ -461,6 +554,23 @@ class _Assigned:
         table = np.full(table.shape, -np.inf)
         np.maximum.at(table, (k, stood.landmark[m]), moved)
         table[member >= 0], table[:, member[member >= 0]] = -np.inf, -np.inf
+        member = np.where(member >= 0, member, one_to_one(table))
+        return member if self._traits is None else self._recognised(member)
+
+    def _recognised(self, member: IntArray) -> IntArray:
+        """Return (K,) `member` with landmarks that were moved far, or exchanged, recognised by what they are like."""
+        assert self._traits is not None
+        left, count = np.flatnonzero(member < 0), len(self._living.members)
+        away = np.setdiff1d(np.arange(count), member)
+        if not len(left) or not len(away):
+            return member
+        p_away, may_be = np.zeros(count), np.zeros((len(member), count), dtype=np.bool_)
+        p_away[self._stood.landmark] = self._stood.p_away
+        np.logical_or.at(may_be.T, self._stood.landmark, self._alike.T)
+        k, m = (each.ravel() for each in np.meshgrid(left, away, indexing="ij"))
+        odds = self._traits.nats(k, m) + np.log(p_away[m]) - math.log(count)
+        table = np.full((len(member), count), -np.inf)
+        table[k, m] = np.where(may_be[k, m], odds, -np.inf)
         return np.where(member >= 0, member, one_to_one(table))
 
     def _with_parts(self, member: IntArray, table: FloatArray) -> IntArray:

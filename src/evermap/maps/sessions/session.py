@@ -22,6 +22,7 @@ from evermap.maps.sessions.spatial import SpatialVisit
 from evermap.maps.sessions.witnessed import arrived, departed
 from evermap.maps.vicinity import in_chunks
 from evermap.show import Shown
+from evermap.slam.association.features import medians
 from evermap.slam.estimate import solve
 from evermap.slam.space.intake import prepare_space
 from evermap.slam.space.solve import solve_space
@@ -341,7 +342,18 @@ def brought_in(
     known = judged(session.living, where, visit, config)
     told_now = told(judged(session.living, where, visit, config, known), where, visit)
     after = told_now.living if session.vicinity is None else session.vicinity.put_back(told_now.living)
-    return replace(told_now, living=decide.without_strays(in_chunks(after, config)))
+    return replace(told_now, living=decide.without_strays(in_chunks(with_traits(after, visit.used), config)))
+
+
+def with_traits(living: LivingMap, recording: AnyRecording) -> LivingMap:
+    """Return a map with what a session's detections say of what its landmarks are like."""
+    seen = recording.detections
+    if seen.features is None:
+        return living
+    names, row = np.unique(seen.landmark_id, return_inverse=True)
+    value, _ = medians(seen.features, row, len(names))
+    known = np.isin(names, living.members.landmark_id)
+    return replace(living, traits=living.traits.met(names[known], seen.feature_names, value[known]))
 
 
 def solved(

@@ -53,7 +53,8 @@ MEMBERS = "members."
 _LIFE = ("lives.life", "lives.prior")
 _NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s", "places.rotation",
           "places.rotation_covariance", "boxes.landmark_id", "boxes.size_m", "metres.robot_id",
-          "metres.log_metre", "metres.log_variance", "metres.information")  # fmt: skip
+          "metres.log_metre", "metres.log_variance", "metres.information", "traits.landmark_id",
+          "traits.column_id", "traits.value", "traits.sessions")  # fmt: skip
 """Written only if present, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
@@ -306,6 +307,7 @@ _EQUALLY_LONG = {
     "stays": tuple(item.name for item in fields(Stays)),
     "dated": ("site_id", "stamp_s"),
     "boxes": ("landmark_id", "size_m"),
+    "traits": ("landmark_id", "column_id", "value", "sessions"),
     "metres": ("robot_id", "log_metre", "log_variance", "information"),
     "lives": ("class_id", "chunk", "life"),
     "sightlines": ("site_id", "landmark_id", "cell", "hits", "looks"),
@@ -314,7 +316,7 @@ _EQUALLY_LONG = {
 _LEAST = {
     "members.class_id": UNKNOWN, "stays.class_id": UNKNOWN, "lives.class_id": UNKNOWN, "lives.prior_class_id": UNKNOWN,
     "members.clique_id": 0, "sites.clique_id": 0, "stays.clique_id": 0, "sites.site_id": 0, "stays.site_id": 0,
-    "places.n_hits": 0, "places.n_misses": 0,
+    "places.n_hits": 0, "places.n_misses": 0, "traits.sessions": 1,
 }  # fmt: skip
 """Smallest numbers of columns."""
 _NEXT_FREE = {
@@ -325,7 +327,7 @@ _NEXT_FREE = {
 _FINITE = (
     "places.position_m", "stays.position_m", "log_size_variance", "dated.stamp_s", "lives.chunk_m",
     "sightlines.cell_m", "sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown",
-    "boxes.size_m", "views.cell_m", "views.stamp_s", "views.frames", "stays.first_s", "stays.last_s",
+    "boxes.size_m", "traits.value", "views.cell_m", "views.stamp_s", "views.frames", "stays.first_s", "stays.last_s",
     "sites.since_s", "sites.seen_s", "metres.log_metre", "metres.log_variance",
 )  # fmt: skip
 _NUMBERS = ("stays.elsewhere_s", "stays.gone_s", "lives.looks_s", "stamp_s", "session_start_s")
@@ -382,6 +384,7 @@ def _flaws_of_ids(living: LivingMap) -> Iterator[str]:
         ("places.site_id", living.sites.site_id),
         ("places.landmark_id", living.members.landmark_id),
         ("boxes.landmark_id", living.members.landmark_id),
+        ("traits.landmark_id", living.members.landmark_id),
     ):
         if not np.isin(attrgetter(column)(living), known).all():
             yield f"'{column}' names one that is not there"

@@ -87,6 +87,21 @@ def with_ids(recording: AnyRecordingT, landmark_row: IntArray, name: IntArray, l
     return replace(recording, detections=detections)
 
 
+def visits_of(stamp_s: FloatArray, landmark_row: IntArray, pause_s: float) -> IntArray:
+    """Return (M,) visits of detections with stamps and landmarks (M,); see `Assignment.visits`."""
+    found, order = np.full_like(landmark_row, NOBODY), np.lexsort((stamp_s, landmark_row))
+    order = order[landmark_row[order] >= 0]
+    again = (np.diff(landmark_row[order]) == 0) & (np.diff(stamp_s[order]) <= pause_s)
+    found[order] = np.cumsum(np.append(0, ~again)[: len(order)])
+    return found
+
+
+def landmarks_of_visits(visit: IntArray, landmark_row: IntArray) -> IntArray:
+    """Return (V,) the landmark of each visit."""
+    first = np.flatnonzero(visit >= 0)
+    return landmark_row[first[np.unique(visit[first], return_index=True)[1]]]
+
+
 def seen_together(
     frame: IntArray, landmark_row: IntArray, n_frames: int, n_landmarks: int, around_frames: int
 ) -> tuple[sparse.csr_array, sparse.csr_array]:
@@ -268,19 +283,12 @@ class Assignment:
         Args:
             pause_s: time without a detection that ends a visit.
         """
-        stamp_s, found = self.measured.stamp_s[self.measured.pose_row], np.full_like(self.landmark_row, NOBODY)
-        order = np.lexsort((stamp_s, self.landmark_row))
-        order = order[self.landmark_row[order] >= 0]
-        again = (np.diff(self.landmark_row[order]) == 0) & (np.diff(stamp_s[order]) <= pause_s)
-        found[order] = np.cumsum(np.append(0, ~again)[: len(order)])
-        return found
+        return visits_of(self.measured.stamp_s[self.measured.pose_row], self.landmark_row, pause_s)
 
     def of_visits(self) -> tuple[IntArray, IntArray]:
         """Return `visits` with the gap of the settings, and (V,) the landmark of each."""
         visit = self.visits(self.settings.association.forget_s)
-        first = np.flatnonzero(visit >= 0)
-        _, at = np.unique(visit[first], return_index=True)
-        return visit, self.landmark_row[first[at]]
+        return visit, landmarks_of_visits(visit, self.landmark_row)
 
     def like(self) -> Likeness | None:
         """Return the traits of each landmark (L,); None if they give no evidence."""

@@ -10,7 +10,7 @@ evidence is not used.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -100,11 +100,15 @@ def _each_same(one: Any, other: Any, spread: Any) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """Readings (M, C) of detections, centred, in the columns that are used; their variances; and settings."""
+    """Readings (M, C) of detections, centred, in the columns that are used; their variances; settings; which columns
+    these are, and (C,) the means.
+    """
 
     value: FloatArray
     spread: Variances
     settings: SlamConfig = USUAL
+    column: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    mean: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def none(cls, count: int, settings: SlamConfig = USUAL) -> Traits:
@@ -244,7 +248,7 @@ def learned(
     if alone * nats[used].sum() < rules.least_nats:
         return None
     spread = Variances(reading[used], error[used], between[used], alone, rules.misread_nats)
-    return Traits(np.ascontiguousarray(value[:, used]), spread, settings)
+    return Traits(np.ascontiguousarray(value[:, used]), spread, settings, used, mean[used])
 
 
 def _within(
