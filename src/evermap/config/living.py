@@ -79,6 +79,8 @@ class NamelessConfig(Section):
     farthest_m: Positive = key(2.0, "how far a landmark that is the same may be off [m]")
     bent_m: Positive = key(2.0, "the same behind a stretch that is bent [m]")
     p_found: Share = key(0.9, "probability that a landmark next to a detected one is detected, too")
+    share_exchanged: Share = key(0.01, "share of landmarks that are where another one of their class was")
+    fewest_compared: Count = key(5, "certain matches that tell by how much columns differ between sessions")
 
 
 class BoxesConfig(Section):

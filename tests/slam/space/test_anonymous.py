@@ -169,3 +169,26 @@ def test_another_hall_is_refused():
     session = run_session(other, begun.living, NAMELESS)
     assert not session.found
     assert len(session.living.places) == len(begun.living.places)
+
+
+def test_points_that_were_exchanged_are_recognised_by_what_they_are_like():
+    whole = hall(1, n_points=60, n_frames=600, drift=0.05)
+    own, random = np.random.default_rng(5).normal(size=(61, 8)), np.random.default_rng(6)
+
+    def like(recording: SpatialRecording, true: np.ndarray) -> SpatialRecording:
+        value = own[true] + 0.2 * random.normal(size=(len(true), 8))
+        names = tuple(f"descriptor_{k}" for k in range(8))
+        return replace(recording, detections=replace(recording.detections, features=value, feature_names=names))
+
+    first, second = part_of_hall(whole, 0, 300), part_of_hall(whole, 300, 600, tilt(1), later_s=86_400.0)
+    begun = run_session(like(first, first.detections.landmark_id), None, NAMELESS)
+    name = named_as(first, begun.recording)
+    a, b = (int(one) for one in np.argsort(-np.bincount(second.detections.landmark_id + 1)[1:], kind="stable")[:2])
+    true = second.detections.landmark_id.copy()
+    true[second.detections.landmark_id == a], true[second.detections.landmark_id == b] = b, a
+    session = run_session(like(second, true), begun.living, NAMELESS)
+    given = {real: one for one, real in name.items()}
+    both = {given[a], given[b]}
+    assert {i for change in session.changes for i in change.landmark_ids} == both
+    assert {change.kind for change in session.changes} <= {ChangeKind.MOVED, ChangeKind.SWAPPED}
+    assert [change.kind for change in run_session(second, begun.living, NAMELESS).changes] == []

@@ -60,8 +60,6 @@ HELD_NATS = 100.0
 """Log odds of a certain match."""
 BESIDE = 3
 """Landmarks next to a detection that tell how far the session is bent there."""
-FEWEST_COMPARED = 5
-"""Certain pairs that tell by how much columns differ between sessions: fewer have no median worth the name."""
 CHI2_MEDIAN = 0.45493642311957283
 """Median of a squared standard normal number."""
 GATE = {dim: float(gates(1, 0.9999, dim)[1]) for dim in (2, 3)}
@@ -276,17 +274,17 @@ class _Traits(NamedTuple):
         """Return (Q,) the evidence that landmarks (Q,) of the session are members (Q,) of the map [nats]."""
         return self.traits.same(self.mine.part(k), self.theirs.part(member))
 
-    def compared(self, k: IntArray, member: IntArray) -> Self:
+    def compared(self, k: IntArray, member: IntArray, fewest: int) -> Self:
         """Return the same for columns that may be off by a common offset, and err by more than within the session, by
-        pairs (Q,) that are certain: the light may be another one.
+        pairs (Q,) that are certain, if there are enough: the light may be another one.
         """
-        if len(k) < FEWEST_COMPARED:
+        if len(k) < fewest:
             return self
         off = self.mine.value[k] - self.theirs.value[member]
         known = np.isfinite(off)
         stated = self.mine.variance[k] + self.theirs.variance[member]
         shift = medians(off, np.zeros(len(k), dtype=np.int64), 1)[0][0]
-        shift = np.where(known.sum(axis=0) >= FEWEST_COMPARED, shift, 0.0)
+        shift = np.where(known.sum(axis=0) >= fewest, shift, 0.0)
         squared = np.where(known, (off - shift) ** 2 / stated, np.nan)
         wider = np.maximum(medians(squared, np.zeros(len(k), dtype=np.int64), 1)[0][0] / CHI2_MEDIAN, 1.0)
         wider = np.where(np.isfinite(wider), wider, 1.0)
@@ -404,7 +402,8 @@ class _Assigned:
         """Return landmarks of a group, the first of `where`, and the places that they certainly match."""
         stood = self._stood
         free = ~np.isin(stood.landmark, stood.landmark[place[place >= 0]])
-        k, m, stands, _ = self._odds(group, where, free)
+        k, m, stands, _, like = self._odds(group, where, free)
+        stands = np.where(like >= -self._slam.association.readings.misread_nats, stands + like, -np.inf)
         some = np.flatnonzero(np.isfinite(stands))
         some = some[np.argsort(-stands[some], kind="stable")[:MOST_PAIRS]]
         k, m = k[some], m[some]
@@ -425,7 +424,8 @@ class _Assigned:
         """Learn from certain matches how columns differ between the session and the map."""
         if self._traits is not None:
             held = np.flatnonzero(place >= 0)
-            self._traits = self._traits.compared(held, self._stood.landmark[place[held]])
+            member = self._stood.landmark[place[held]]
+            self._traits = self._traits.compared(held, member, self._settings.fewest_compared)
 
     def _placed(self, allowed: BoolArray) -> IntArray:
         """Return (K,) rows of the places that landmarks of one stretch certainly match, -1 for the others; of the
@@ -451,10 +451,8 @@ class _Assigned:
         """(K, P) landmarks and places of which what these are like does not say that they are two."""
         if self._traits is None:
             return np.ones_like(self._alike)
-        stood, least = self._stood, -self._slam.association.readings.misread_nats
-        every = np.arange(len(self._living.members))
-        nats = [self._traits.nats(np.full_like(every, k), every) for k in range(len(self._local.place))]
-        return np.asarray(np.array(nats).reshape(-1, len(every))[:, stood.landmark] >= least)
+        nats = self._every_like(np.arange(len(self._local.place)))[:, self._stood.landmark]
+        return np.asarray(nats >= -self._slam.association.readings.misread_nats)
 
     def _regained(self, where: Where, member: IntArray, place: IntArray) -> IntArray:
         """Return `place` with landmarks beyond their gates after a distorted stretch, by their constellation."""
@@ -513,9 +511,11 @@ class _Assigned:
         )
         return [(int(some[k]), int(stands[m])) for k, m in pairs]
 
-    def _odds(self, some: IntArray, where: Where, free: BoolArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-        """Pairs (Q,) of landmarks, the first of `where`, and places that may be one: rows of both, and the log odds of
-        standing there, and of having been moved from there a little, over being new.
+    def _odds(
+        self, some: IntArray, where: Where, free: BoolArray
+    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
+        """Pairs (Q,) of landmarks, the first of `where`, and places that may be one: rows of both; the log odds of
+        standing there, and of having been moved from there a little, over being new; and the evidence of columns.
         """
         stood, nudge_m2 = self._stood, self._overlay.nudge_m**2 * np.eye(self._dim)
         off = where.position_m[: len(some), None] - stood.position_m[None]
@@ -536,42 +536,48 @@ class _Assigned:
             angle = se3.angle_between(se3.turn(where.rotation[k]), se3.turn(stood.rotation[m]))
             turned = angle > rules.turn_sigmas * rules.turn_floor_rad
             stands, moved = (odds + np.log(self._overlay.share_turned) * turned for odds in (stands, moved))
-        if self._traits is not None:
-            like = self._traits.nats(some[k], stood.landmark[m])
-            stands, moved = stands + like, moved + like
-        return k, m, stands, moved
+        like = np.zeros(len(k)) if self._traits is None else self._traits.nats(some[k], stood.landmark[m])
+        return k, m, stands, moved, like
 
     def _assigned(self, where: Where, place: IntArray) -> IntArray:
         """Return (K,) rows of the members that landmarks match, including uncertain ones; -1 for new ones."""
         stood, every = self._stood, np.arange(len(place))
-        k, m, stands, moved = self._odds(every, where, np.ones(len(stood.p), dtype=np.bool_))
-        table = np.full((len(place), len(self._living.members)), -np.inf)
-        np.maximum.at(table, (k, stood.landmark[m]), stands)
-        held = np.flatnonzero(place >= 0)
+        k, m, stands, moved, like = self._odds(every, where, np.ones(len(stood.p), dtype=np.bool_))
+        table, held = np.full((len(place), len(self._living.members)), -np.inf), np.flatnonzero(place >= 0)
+        np.maximum.at(table, (k, stood.landmark[m]), stands + like)
+        if self._traits is not None:  # it may stand where another one of its class stood
+            at_any = np.full(len(place), -np.inf)
+            np.maximum.at(at_any, k, stands)
+            left = np.setdiff1d(np.flatnonzero(np.isfinite(at_any)), held)
+            another = at_any[left, None] + np.log(self._settings.share_exchanged) + self._every_like(left)
+            table[left] = np.maximum(table[left], another)
         table[held], table[held, stood.landmark[place[held]]] = -np.inf, HELD_NATS
         member = self._with_parts(one_to_one(table), table)
         # what is left may have been moved a little
         table = np.full(table.shape, -np.inf)
-        np.maximum.at(table, (k, stood.landmark[m]), moved)
+        np.maximum.at(table, (k, stood.landmark[m]), moved + like)
         table[member >= 0], table[:, member[member >= 0]] = -np.inf, -np.inf
         member = np.where(member >= 0, member, one_to_one(table))
         return member if self._traits is None else self._recognised(member)
 
     def _recognised(self, member: IntArray) -> IntArray:
-        """Return (K,) `member` with landmarks that were moved far, or exchanged, recognised by what they are like."""
-        assert self._traits is not None
+        """Return (K,) `member` with landmarks that were moved far recognised by what they are like."""
         left, count = np.flatnonzero(member < 0), len(self._living.members)
-        away = np.setdiff1d(np.arange(count), member)
-        if not len(left) or not len(away):
-            return member
-        p_away, may_be = np.zeros(count), np.zeros((len(member), count), dtype=np.bool_)
+        p_away, table = np.zeros(count), np.full((len(member), count), -np.inf)
         p_away[self._stood.landmark] = self._stood.p_away
-        np.logical_or.at(may_be.T, self._stood.landmark, self._alike.T)
-        k, m = (each.ravel() for each in np.meshgrid(left, away, indexing="ij"))
-        odds = self._traits.nats(k, m) + np.log(p_away[m]) - math.log(count)
-        table = np.full((len(member), count), -np.inf)
-        table[k, m] = np.where(may_be[k, m], odds, -np.inf)
+        table[left] = self._every_like(left) + np.log(np.maximum(p_away, SMALLEST_P)) - math.log(count)
+        table[:, member[member >= 0]] = -np.inf
         return np.where(member >= 0, member, one_to_one(table))
+
+    def _every_like(self, some: IntArray) -> FloatArray:
+        """(S, L) evidence that landmarks are members by what they are like; minus infinity if labels differ."""
+        assert self._traits is not None
+        every = np.arange(len(self._living.members))
+        found = np.full((len(some), len(every)), -np.inf)
+        for row, k in enumerate(some.tolist()):
+            may_be = np.unique(self._stood.landmark[self._alike[k]])
+            found[row, may_be] = self._traits.nats(np.full_like(may_be, k), may_be)
+        return found
 
     def _with_parts(self, member: IntArray, table: FloatArray) -> IntArray:
         """Return the same with further copies of assigned landmarks: those never seen together with them."""
