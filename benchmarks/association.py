@@ -457,7 +457,7 @@ def main(names: Sequence[str] = ()) -> None:
                 print(f"| {world.name} | {'without' if unknown_ids else 'with'} | {' | '.join(cells)} |", flush=True)
         return
     if names and names[0] == "exchanged":
-        for world in (each for each in worlds() if each.name.startswith(("rooms", "building"))):
+        for world in (each for each in worlds() if each.name.startswith(tuple(names[1:]) or ("rooms", "building"))):
             for name in EXCHANGED:
                 print(exchanged_line(world, name), flush=True)
         return

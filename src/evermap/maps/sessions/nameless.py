@@ -545,13 +545,9 @@ class _Assigned:
         k, m, stands, moved, like = self._odds(every, where, np.ones(len(stood.p), dtype=np.bool_))
         table, held = np.full((len(place), len(self._living.members)), -np.inf), np.flatnonzero(place >= 0)
         np.maximum.at(table, (k, stood.landmark[m]), stands + like)
-        if self._traits is not None:  # it may stand where another one of its class stood
-            at_any = np.full(len(place), -np.inf)
-            np.maximum.at(at_any, k, stands)
-            left = np.setdiff1d(np.flatnonzero(np.isfinite(at_any)), held)
-            another = at_any[left, None] + np.log(self._settings.share_exchanged) + self._every_like(left)
-            table[left] = np.maximum(table[left], another)
         table[held], table[held, stood.landmark[place[held]]] = -np.inf, HELD_NATS
+        if self._traits is not None:
+            table = self._with_exchanged(table, held, (k, stood.landmark[m], stands))
         member = self._with_parts(one_to_one(table), table)
         # what is left may have been moved a little
         table = np.full(table.shape, -np.inf)
@@ -559,6 +555,32 @@ class _Assigned:
         table[member >= 0], table[:, member[member >= 0]] = -np.inf, -np.inf
         member = np.where(member >= 0, member, one_to_one(table))
         return member if self._traits is None else self._recognised(member)
+
+    def _with_exchanged(
+        self, table: FloatArray, held: IntArray, at_place: tuple[IntArray, IntArray, FloatArray]
+    ) -> FloatArray:
+        """Return log odds (K, L) of being members, also where another one of their class was.
+
+        Two that were exchanged share the choice of the other one. A landmark that is where another one was, while none
+        is where it was, has that choice for itself.
+
+        Args:
+            table: without that.
+            held: rows that are certain.
+            at_place: (Q,) rows, members and log odds of being at a place of these, whatever they are like.
+        """
+        k, member, stands = at_place
+        odds, home = np.full(len(table), -np.inf), np.full(len(table), -1, dtype=np.int64)
+        order = np.argsort(stands, kind="stable")  # the last one counts
+        odds[k[order]], home[k[order]] = stands[order], member[order]
+        left = np.setdiff1d(np.flatnonzero(np.isfinite(odds)), held)
+        another = np.full(table.shape, -np.inf)
+        another[left] = odds[left, None] + np.log(self._settings.share_exchanged) + self._every_like(left)
+        found = one_to_one(np.maximum(table, another))
+        other = left[(found[left] >= 0) & (another[left, found[left]] > table[left, found[left]])]
+        alone = other[~np.isin(found[other], home[other])]
+        another[alone] -= math.log(table.shape[1])
+        return np.asarray(np.maximum(table, another))
 
     def _recognised(self, member: IntArray) -> IntArray:
         """Return (K,) `member` with landmarks that were moved far recognised by what they are like."""
