@@ -192,3 +192,14 @@ def test_points_that_were_exchanged_are_recognised_by_what_they_are_like():
     assert {i for change in session.changes for i in change.landmark_ids} == both
     assert {change.kind for change in session.changes} <= {ChangeKind.MOVED, ChangeKind.SWAPPED}
     assert [change.kind for change in run_session(second, begun.living, NAMELESS).changes] == []
+
+
+def test_objects_that_look_the_same_however_they_are_turned_keep_their_names_over_sessions():
+    room = Room.of(1)
+    walks = [room.walk(10 + day, day=day) for day in range(2)]
+    begun = run_session(walks[0], None, NAMELESS)
+    session = run_session(walks[1], begun.living, NAMELESS)
+    assert session.found
+    assert session.changes == ()
+    assert named_as(walks[0], begun.recording) == named_as(walks[1], session.recording)
+    assert len(session.living.members) == len(room.place)

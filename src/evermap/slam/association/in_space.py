@@ -253,15 +253,17 @@ class SpatialAssociator:
 
     def _local(self, solved: _Solved, rows: IntArray) -> LocalMap:
         """Return some landmarks, with the errors that all sightings of one have in common."""
-        place, turned = solved.estimate.place[rows], solved.smoother.problem.oriented[rows]
+        problem = solved.smoother.problem
+        place, turned = solved.estimate.place[rows], problem.oriented[rows]
         if not len(rows):
             return LocalMap(place[:, :3], np.zeros((0, 0)))
-        joint = solved.smoother.factorised(solved.now).joint(len(solved.smoother.problem.stamp_s) + rows)
+        joint = solved.smoother.factorised(solved.now).joint(len(problem.stamp_s) + rows)
         width = np.where(turned, 6, 3)
         own = block_diag(*np.where(turned[:, None, None], se3.rotation_of(place), np.eye(3)))
         at = ((np.cumsum(width) - width)[:, None] + np.arange(3)).ravel()
         covariance = own @ joint[np.ix_(at, at)] @ own.T + np.diag(np.repeat(self._shared_m2(solved.row)[rows], 3))
-        return LocalMap(place[:, :3], covariance, np.where(turned[:, None], place[:, 3:], np.nan))
+        told = turned & (problem.symmetries.of[rows] == 0)  # what looks the same in several has none
+        return LocalMap(place[:, :3], covariance, np.where(told[:, None], place[:, 3:], np.nan))
 
     def _follow(self) -> None:
         """Pair the detections of every view with the landmarks of the last seconds."""
