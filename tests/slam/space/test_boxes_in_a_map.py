@@ -191,6 +191,16 @@ def test_what_stands_is_known_once_and_what_changed_is_told(days: Days) -> None:
     assert right >= 0.9 * told
 
 
+def test_boxes_are_as_they_are_where_ids_are_ignored(days: Days) -> None:
+    """They have none anyway; nothing else is there to be associated."""
+    made, sessions = days[1, False]
+    first = recordings(made, 1)[0]
+    for given in (True, "empty"):
+        session = run_session(first, None, Config(slam={"unknown_ids": given}))
+        np.testing.assert_array_equal(session.living.places.position_m, sessions[0].living.places.position_m)
+        assert session.living.landmark_texts == sessions[0].living.landmark_texts
+
+
 def test_what_comes_and_leaves_in_view_is_told_with_its_instant(days: Days) -> None:
     for (_, back), (made, sessions) in days.items():
         if back:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy import sparse
@@ -74,10 +74,12 @@ def associated_in_space(
         raise DataError(problem, hint="record poses or velocities of the robot, or identities")
     given = recording.detections
     asked = ~np.isfinite(given.size_m).all(axis=1) & ~without_range(recording)
+    name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
+    if not asked.any():
+        return AssociatedInSpace.of_none(name, settings)
     # symmetries are those of classes, so each class is one landmark until landmarks are known
     by_class = np.where(asked, given.class_id - UNKNOWN, UNKNOWN)
     intake = prepare_space(replace(recording, detections=replace(given, landmark_id=by_class)), settings.space)
-    name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
     kind = np.column_stack([given.class_id, name])[intake.used]
     row = np.full(len(given), NOBODY)
     row[intake.used], local, together, loose = SpatialAssociator(intake, kind, settings).finish()
@@ -107,6 +109,14 @@ class AssociatedInSpace:
     together: sparse.csr_array
     loose: LooseDetections
     settings: SlamConfig
+
+    @classmethod
+    def of_none(cls, name: IntArray, settings: SlamConfig) -> Self:
+        """Return the association of a recording without landmarks, such as one of boxes alone."""
+        none, place = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        local, loose = LocalMap(place, np.zeros((0, 0))), LooseDetections(none, place, np.zeros(0), none)
+        nobody, of_kind = np.full(len(name), NOBODY), np.zeros((0, 2), dtype=np.int64)
+        return cls(nobody, name, of_kind, local, sparse.csr_array((0, 0)), loose, settings)
 
     @property
     def sightings(self) -> IntArray:
