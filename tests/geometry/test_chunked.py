@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import block_diag
 
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import ChunkedCovariance, Update, blocks, of_places, taken
@@ -184,3 +185,16 @@ def test_it_stays_a_covariance_whatever_is_learned(seed: int, dim: int) -> None:
         position = after_m
         some = rng.permutation(len(position))[:40]
         assert np.linalg.eigvalsh(chunked.of(some)).min() > -1e-8
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_independent_points_are_cut_as_their_dense_covariance_is(dim: int) -> None:
+    rng = np.random.default_rng(dim)
+    position, root = rng.uniform(0.0, 100.0, (700, dim)), rng.normal(size=(700, dim, dim))
+    each = root @ root.transpose(0, 2, 1)
+    dense = ChunkedCovariance.of_dense(position, block_diag(*each))
+    found = ChunkedCovariance.of_independent(position, each)
+    np.testing.assert_array_equal(found.chunk, dense.chunk)
+    np.testing.assert_array_equal(found.each_m2, each)
+    for mine, theirs in zip(found.parts, dense.parts, strict=True):
+        np.testing.assert_array_equal(mine.values, theirs.values)

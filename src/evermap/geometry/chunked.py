@@ -132,6 +132,19 @@ class ChunkedCovariance:
         dim = position_m.shape[1]
         return cls.of_points(position_m, lambda a, b: covariance_m2[np.ix_(se2.xy_rows(a, dim), se2.xy_rows(b, dim))])
 
+    @classmethod
+    def of_independent(cls, position_m: FloatArray, each_m2: FloatArray) -> Self:
+        """Cut points (P, 2) with a covariance (P, 2, 2) each into chunks."""
+
+        def joint(a: IntArray, b: IntArray) -> FloatArray:
+            dim = position_m.shape[1]
+            found = np.zeros((len(a), dim, len(b), dim))
+            i, j = np.nonzero(a[:, None] == b)
+            found[i, :, j] = each_m2[a[i]]
+            return found.reshape(dim * len(a), dim * len(b))
+
+        return cls.of_points(position_m, joint)
+
     def flaw(self, count: int, dim: int = 2) -> str:
         """Return a description of an inconsistency, also with the number of points; '' if it is consistent."""
         n = len(self.parent)

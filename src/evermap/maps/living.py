@@ -18,9 +18,11 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from scipy.linalg import block_diag
 
+from evermap.config import LivingConfig
 from evermap.errors import InputError
-from evermap.geometry.chunked import JointCovariance, blocks, taken
+from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, taken
 from evermap.maps.lives import Lives
 from evermap.maps.shelves import Sight
 from evermap.sensing.sightlines import SightLines, Views, pair_rows
@@ -30,6 +32,7 @@ from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landm
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+USUAL = LivingConfig()
 EXISTS = 0.5
 """What exists with at least this probability is in the map."""
 
@@ -293,27 +296,28 @@ class LivingMap(Shown):
         return cls(places=Places.empty(3), stays=Stays.empty(3), clock=clock)
 
     @classmethod
-    def begun(cls, landmarks: Landmarks) -> Self:
+    def begun(cls, landmarks: Landmarks, whole_places: int = USUAL.whole_places) -> Self:
         """Return a map of surveyed landmarks, each a separate body, before its first session.
 
-        They are taken to have been seen when that begins.
+        They are taken to have been seen when that begins. The covariance of more than `whole_places` is in chunks.
         """
         order = np.argsort(landmarks.landmark_id, kind="stable")
         names, count = landmarks.landmark_id[order], len(order)
         number, none = np.arange(count), np.zeros(count, dtype=np.int64)
         off, then = np.zeros(count, dtype=np.bool_), np.zeros(count)
         p_here = np.clip(landmarks.p_exists[order], 0.0, SURVEYED)
-        position = landmarks.position_m[order]
+        position, own = landmarks.position_m[order], landmarks.covariance_m2[order]
         dim = position.shape[1]
         turns = [part[order] for part in (landmarks.rotation, landmarks.rotation_covariance) if part is not None]
-        covariance = np.zeros((count, dim, count, dim))
-        covariance[number, :, number] = landmarks.covariance_m2[order]
+        covariance: JointCovariance = ChunkedCovariance.of_independent(position, own)
+        if count <= whole_places:
+            covariance = block_diag(*own) if count else np.zeros((0, 0))
         return cls(
             members=Members(names, landmarks.class_id[order], number, off, off),
             sites=Sites(number, number, p_here, p_here, then, then),
             places=Places(number, names, position, none, none, *turns),
             stays=Stays.empty(dim),
-            covariance_m2=covariance.reshape(dim * count, dim * count),
+            covariance_m2=covariance,
             class_names=landmarks.class_names,
             landmark_texts=tuple(sorted(landmarks.names.values())),
             clock=landmarks.clock,

@@ -11,9 +11,10 @@ from identity_scores import identity_scores
 from evermap import run_session, run_slam
 from evermap.config import Config, SlamConfig
 from evermap.errors import DataError
+from evermap.maps.living import LivingMap
 from evermap.maps.sessions.nameless import numbered_in
 from evermap.slam.association import with_identities
-from evermap.types import UNKNOWN, ChangeKind, SpatialRecording, rows_of
+from evermap.types import UNKNOWN, ChangeKind, Landmarks, SpatialRecording, rows_of
 
 from .corridors import tagged_corridor
 from .halls import hall, part_of_hall, tilt
@@ -203,3 +204,18 @@ def test_objects_that_look_the_same_however_they_are_turned_keep_their_names_ove
     assert session.changes == ()
     assert named_as(walks[0], begun.recording) == named_as(walks[1], session.recording)
     assert len(session.living.members) == len(room.place)
+
+
+@pytest.mark.slow
+def test_points_are_found_in_a_large_survey():
+    """A thousand others lie beside the hall, so that the map is in chunks."""
+    whole = hall(1, n_points=60, n_frames=600, drift=0.05)
+    drive = part_of_hall(whole, 300, 600, tilt(1))
+    assert whole.true_landmarks is not None
+    beside = np.random.default_rng(0).uniform([30.0, 0.0, 0.0], [110.0, 80.0, 3.0], (1000, 3))
+    place = np.vstack([whole.true_landmarks.position_m, beside])
+    survey = replace(Landmarks.in_space(np.arange(1060), place), covariance_m2=np.tile(1e-4 * np.eye(3), (1060, 1, 1)))
+    begun = replace(LivingMap.begun(survey), clock=drive.clock)
+    session = run_session(drive, begun, NAMELESS)
+    assert session.found
+    assert all(name == real for name, real in named_as(drive, session.recording).items())

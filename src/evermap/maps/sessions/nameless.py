@@ -136,7 +136,7 @@ def numbered_in(recording: AnyRecordingT, prior_map: Landmarks, config: Config) 
     Raises:
         DataError: as of `named_in`.
     """
-    living = replace(LivingMap.begun(prior_map), clock=recording.clock)
+    living = replace(LivingMap.begun(prior_map, config.living.whole_places), clock=recording.clock)
     given = recording if config.slam.unknown_ids == "empty" else without_ids(recording)
     of_map, living = admitted(given, living.from_now_on(float(recording.frames.stamp_s[0])))
     found, name, landmark_id = _met(of_map, living, config)
