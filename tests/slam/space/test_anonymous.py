@@ -219,3 +219,24 @@ def test_points_are_found_in_a_large_survey():
     session = run_session(drive, begun, NAMELESS)
     assert session.found
     assert all(name == real for name, real in named_as(drive, session.recording).items())
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5])
+def test_points_of_which_some_have_names_keep_them_over_sessions(share):
+    whole, gone = hall(1, n_points=60, n_frames=600, drift=0.05), [3, 20, 41]
+    named = np.random.default_rng(0).permutation(60)[: int(60 * share)]
+    days = part_of_hall(whole, 0, 300), part_of_hall(whole, 300, 600, tilt(1), without=gone, later_s=86_400.0)
+    living, called = None, []
+    for day in days:
+        true = day.detections.landmark_id
+        given = np.where(np.isin(true, named), true, UNKNOWN)
+        some = replace(day, detections=replace(day.detections, landmark_id=given))
+        session = run_session(some, living, Config(slam={"unknown_ids": "empty"}))
+        assert session.found
+        found = session.recording.detections.landmark_id
+        np.testing.assert_array_equal(found[given != UNKNOWN], given[given != UNKNOWN])
+        living, called = session.living, [*called, named_as(day, session.recording)]
+    both = called[0].keys() & called[1].keys()
+    assert len(both) > 40
+    assert all(called[0][one] == called[1][one] for one in both)
+    assert {called[0][one] for change in session.changes for one in change.landmark_ids} <= set(gone)
