@@ -204,25 +204,28 @@ class MemberTraits(_Rows):
 
     def of(self, landmark_id: IntArray, columns: Sequence[str]) -> tuple[FloatArray, IntArray]:
         """Return (K, C) values of landmarks, nan where there is none, and the numbers of sessions."""
-        found = [self[self.column_id == landmark_id_of(name)] for name in columns]
-        rows = [_rows_among(each.landmark_id, landmark_id) for each in found]
-        value, sessions = np.full((len(landmark_id), len(columns)), np.nan), np.zeros((len(landmark_id), len(columns)))
-        for c, (each, row) in enumerate(zip(found, rows, strict=True)):
-            value[:, c], sessions[:, c] = np.append(each.value, np.nan)[row], np.append(each.sessions, 0)[row]
-        return value, sessions.astype(np.int64)
+        wanted = np.array([landmark_id_of(name) for name in columns], dtype=np.int64)
+        names, kinds = np.unique(self.landmark_id), np.unique(self.column_id)
+        code = np.searchsorted(names, self.landmark_id) * len(kinds) + np.searchsorted(kinds, self.column_id)
+        name, kind = np.searchsorted(names, landmark_id), np.searchsorted(kinds, wanted)
+        known = np.isin(landmark_id, names)[:, None] & np.isin(wanted, kinds)
+        asked = np.where(known, name[:, None] * len(kinds) + kind, -1)
+        row = np.searchsorted(code, asked)
+        found = known & (np.append(code, -1)[row] == asked)
+        row = np.where(found, row, len(self))
+        return np.append(self.value, np.nan)[row], np.append(self.sessions, 0)[row]
 
     def met(self, landmark_id: IntArray, columns: Sequence[str], value: FloatArray) -> MemberTraits:
         """Return the table after a session, by the medians (K, C) of its readings, nan for none."""
         before, sessions = self.of(landmark_id, columns)
-        seen, column_id = np.isfinite(value), np.array([landmark_id_of(name) for name in columns], dtype=np.int64)
-        after = np.where(sessions > 0, before, 0.0) + (value - np.where(sessions > 0, before, 0.0)) / (sessions + 1)
-        k, c = np.nonzero(seen)
-        new = MemberTraits(landmark_id[k], column_id[c], after[k, c], sessions[k, c] + 1)
-        replaced = np.zeros(len(self), dtype=np.bool_)
-        for column, of_column in zip(column_id, seen.T, strict=True):
-            replaced |= (self.column_id == column) & np.isin(self.landmark_id, landmark_id[of_column])
-        every = MemberTraits.joined(self[~replaced], new)
-        return every[np.lexsort((every.column_id, every.landmark_id))]
+        before = np.where(sessions > 0, before, 0.0)
+        after, column_id = before + (value - before) / (sessions + 1), [landmark_id_of(name) for name in columns]
+        k, c = np.nonzero(np.isfinite(value))
+        new = MemberTraits(landmark_id[k], np.array(column_id, dtype=np.int64)[c], after[k, c], sessions[k, c] + 1)
+        every = self.joined(new)
+        every = every[np.lexsort((every.column_id, every.landmark_id))]  # of two the newer one is behind
+        last = (np.diff(every.landmark_id) != 0) | (np.diff(every.column_id) != 0)
+        return every[np.append(last, True)[: len(every)]]
 
 
 @dataclass(frozen=True, slots=True)
