@@ -99,6 +99,7 @@ def test_interrupt_says_what_was_kept_and_130(
         (["convert", "only-one"], "OUT"),
         (["reproduce", "rosen1999"], "rosen2016"),
         (["slam"], "INPUT"),
+        (["slam", "--init", "--3d"], "--init DIR --3d"),
         (["slam", "--set", "slam.sed=1", "x"], "slam.seed"),
         (["slam", "--config", "no-such.toml", "x"], "no-such.toml"),
         (["slam", "no/such/recording"], "no/such/recording"),

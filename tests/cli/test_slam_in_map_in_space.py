@@ -137,3 +137,17 @@ def test_a_new_map_may_begin_with_a_survey(in_space: bool, tmp_path: Path) -> No
     assert [row["kind"] for row in told["revisions"]] == ["edit", "session"]
     assert told["revisions"][0]["note"].endswith("surveyed landmarks")
     assert "has landmarks already" in refused(*given, "--out", tmp_path / "second")
+
+
+def test_sessions_in_space_without_identities(tmp_path: Path) -> None:
+    """A fixed map keeps its ids, though the frame of the recording says nothing of them."""
+    folder, file = tmp_path / "flight", tmp_path / "map.evermap"
+    assert run("slam", "--init", folder, "--3d").exit_code == 0
+    assert run("slam", folder, "--unknown-ids", "--map", file, "--out", tmp_path / "one", *QUICK).exit_code == 0
+    with open_store(file) as store:
+        first = store.load()
+    prior = "--prior-map", tmp_path / "one" / "map.parquet"
+    assert run("slam", folder, "--unknown-ids", *prior, "--out", tmp_path / "two", *QUICK).exit_code == 0
+    found = read_landmarks(tmp_path / "two" / "map.parquet")
+    np.testing.assert_array_equal(np.sort(found.landmark_id), first.members.landmark_id)
+    assert all(first.label(one).startswith("landmark-") for one in found.landmark_id.tolist())

@@ -464,6 +464,8 @@ def _write_what_is_to_edit(folder: Path | None, bag: Path | None, *, in_space: b
             raise ConfigError("is for a template", field="3d", hint="--init DIR --3d")
         _write_bag_settings(bag)
         return
+    if folder.name.startswith("-"):
+        raise ConfigError(f"needs a folder, not {folder.name}", field="init", hint="--init DIR --3d")
     write_template(folder, in_space=in_space)
     say(f"wrote a template to {folder}; fill it with your recording, then: evermap slam {folder}")
 

@@ -472,25 +472,41 @@ class _Assigned:
                 found[mine] = theirs
         return found
 
-    def _about(self, stands: IntArray) -> tuple[FloatArray, FloatArray]:
+    def _about(self, stands: IntArray, drift_m: float) -> tuple[FloatArray, FloatArray]:
         """Return places with their covariances, including the deviation from session to session."""
-        drift_m = max(self._overlay.drifts_m)
         return self._stood.position_m[stands], self._stood.covariance_m2[stands] + drift_m**2 * np.eye(self._dim)
 
     def _index(self, stands: IntArray) -> PlaceIndex | None:
         """Return an index of some places where not every pair is tried: of many, and in space."""
         if len(stands) <= ALL_TRIED and self._dim < SPACE.point_dim:
             return None
-        return PlaceIndex(*self._about(stands), settings=self._slam)
+        return PlaceIndex(*self._about(stands, max(self._overlay.drifts_m)), settings=self._slam)
 
     def _overlaid(
         self, some: IntArray, stands: IntArray, index: PlaceIndex | None, allowed: BoolArray, *, fewest: int = 0
     ) -> list[tuple[int, int]]:
-        """Return some landmarks of the session with places that they certainly match, among some (S,) of all."""
+        """Return some landmarks of the session with places that they certainly match, among some (S,) of all.
+
+        What is ambiguous if places may deviate much between sessions may not be if they deviate little.
+        """
+        drifts_m = sorted({max(self._overlay.drifts_m), min(self._overlay.drifts_m)}, reverse=True)
+        tried = (self._overlaid_at(some, stands, index, allowed, drift_m, fewest) for drift_m in drifts_m)
+        return next(filter(None, tried), [])
+
+    def _overlaid_at(
+        self,
+        some: IntArray,
+        stands: IntArray,
+        index: PlaceIndex | None,
+        allowed: BoolArray,
+        drift_m: float,
+        fewest: int,
+    ) -> list[tuple[int, int]]:
+        """Return the same at one deviation of places between sessions."""
         fewest, rules = fewest or self._settings.fewest, self._slam.association.constellation
         if len(some) < fewest or len(stands) < fewest:
             return []
-        (at, spread), local, motions = self._about(stands), self._local.part(some), None
+        (at, spread), local, motions = self._about(stands, drift_m), self._local.part(some), None
         area_m2 = float(np.prod(np.sort(np.ptp(at, axis=0))[-2:] + 10.0))
         if index is not None:
             motions = list(index.motions(local.place, local.beside_m))
