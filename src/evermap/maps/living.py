@@ -312,9 +312,9 @@ class LivingMap(Shown):
         position, own = landmarks.position_m[order], landmarks.covariance_m2[order]
         dim = position.shape[1]
         turns = [part[order] for part in (landmarks.rotation, landmarks.rotation_covariance) if part is not None]
-        covariance: JointCovariance = ChunkedCovariance.of_independent(position, own)
-        if count <= whole_places:
-            covariance = block_diag(*own) if count else np.zeros((0, 0))
+        covariance: JointCovariance = np.zeros((0, 0))
+        if count:
+            covariance = ChunkedCovariance.of_independent(position, own) if count > whole_places else block_diag(*own)
         return cls(
             members=Members(names, landmarks.class_id[order], number, off, off),
             sites=Sites(number, number, p_here, p_here, then, then),

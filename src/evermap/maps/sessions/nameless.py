@@ -34,7 +34,7 @@ from evermap.slam.association import associate
 from evermap.slam.association.assignment import alike, landmarks_of_visits, visits_of, with_ids
 from evermap.slam.association.consensus import Candidates, consensus
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
-from evermap.slam.association.features import Likeness, Traits, learned, medians
+from evermap.slam.association.features import Likeness, Traits, column_medians, learned
 from evermap.slam.association.identify import ALL_TRIED, Associated, numbered
 from evermap.slam.association.in_space import AssociatedInSpace
 from evermap.slam.association.jcbb import gates
@@ -283,10 +283,9 @@ class _Traits(NamedTuple):
         off = self.mine.value[k] - self.theirs.value[member]
         known = np.isfinite(off)
         stated = self.mine.variance[k] + self.theirs.variance[member]
-        shift = medians(off, np.zeros(len(k), dtype=np.int64), 1)[0][0]
-        shift = np.where(known.sum(axis=0) >= fewest, shift, 0.0)
+        shift = np.where(known.sum(axis=0) >= fewest, column_medians(off), 0.0)
         squared = np.where(known, (off - shift) ** 2 / stated, np.nan)
-        wider = np.maximum(medians(squared, np.zeros(len(k), dtype=np.int64), 1)[0][0] / CHI2_MEDIAN, 1.0)
+        wider = np.maximum(column_medians(squared) / CHI2_MEDIAN, 1.0)
         wider = np.where(np.isfinite(wider), wider, 1.0)
         mine, theirs = (each._replace(variance=wider * each.variance) for each in (self.mine, self.theirs))
         return self._replace(mine=mine._replace(value=mine.value - shift), theirs=theirs)

@@ -228,7 +228,7 @@ def learned(
     rules = settings.association.readings
     middle, read = medians(value, visit, len(landmark))
     with np.errstate(all="ignore"):
-        mean = _median(middle)
+        mean = column_medians(middle)
         value, middle = value - mean, middle - mean
         reading, least = _within(value, visit, middle, read, settings)
         every = _clipped(middle, np.ones_like(middle), settings)
@@ -259,7 +259,7 @@ def _within(
     of = visit[seen]
     left = 1.0 - 1.0 / np.maximum(read[of], 1.5)
     off = np.where(read[of] > 1, value[seen] - middle[of], np.nan)
-    reading = (1.4826 * _median(np.abs(off) / np.sqrt(left))) ** 2
+    reading = (1.4826 * column_medians(np.abs(off) / np.sqrt(left))) ** 2
     reading = np.where(reading > 0.0, reading, _clipped(off, left, settings))  # the median is 0 if values are rounded
     order = np.lexsort((seen, of))  # detections are in the order of time
     size = np.bincount(of, minlength=len(middle))
@@ -278,8 +278,8 @@ def _within(
     return reading, np.where(np.isfinite(more), np.maximum(more, 0.0), 0.0)
 
 
-def _median(value: FloatArray) -> FloatArray:
-    """Medians (D,) of columns (N, D), nan without readings."""
+def column_medians(value: FloatArray) -> FloatArray:
+    """Return (D,) medians of columns (N, D), nan without readings."""
     return np.asarray(medians(value, np.zeros(len(value), dtype=np.int64), 1)[0][0])
 
 
