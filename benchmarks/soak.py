@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from evermap.config import Config
 from evermap.errors import DataError, EvermapError, NumericalError
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
@@ -35,6 +36,10 @@ SESSION_S = 180.0
 SESSIONS_A_DAY = 48
 NEAR_M = 0.25
 """A landmark is where the map has it, up to this."""
+ROUGHLY_M = 0.5
+"""The same where only existence is scored."""
+SURE = 1e-3
+"""Beliefs are scored as if they were at least so far from 0 and 1."""
 FIXED = "fixture"
 """Class of what never moves in the simulated building."""
 UNKNOWABLE = ("elsewhere_s", "gone_s", "first_seen_s", "last_seen_s", "sigma_range_m", "sigma_bearing_rad", "p_next")
@@ -51,6 +56,7 @@ class Soak:
             was set is no error of a pose); nan where the session was refused or set aside.
         set_aside: numbers of the sessions that were not entered.
         precision, recall: of the landmarks that the map believes in, against what stands in the building.
+        log_loss: of the existence of the landmarks of the map, each where the map has it; nan before it is aligned.
         memory_mb: resident memory of the process after the session.
         map_kb: size of all arrays of the map.
         n_landmarks, n_places: of the map.
@@ -65,6 +71,7 @@ class Soak:
     set_aside: list[int] = field(default_factory=list)
     precision: list[float] = field(default_factory=list)
     recall: list[float] = field(default_factory=list)
+    log_loss: list[float] = field(default_factory=list)
     memory_mb: list[float] = field(default_factory=list)
     map_kb: list[float] = field(default_factory=list)
     n_landmarks: list[int] = field(default_factory=list)
@@ -127,7 +134,7 @@ def soak(recordings: tuple[Recording, ...], faults: FaultConfig = FAULTLESS, *, 
     return entered(faulty, recordings)
 
 
-def entered(told: Iterable[Recording], recordings: tuple[Recording, ...]) -> Soak:
+def entered(told: Iterable[Recording], recordings: tuple[Recording, ...], config: Config | None = None) -> Soak:
     """Session after session into one map, as they are `told`, scored by the recordings as they truly were.
 
     Sessions that are refused with an `EvermapError` leave the map as it is; anything else that is raised goes through.
@@ -137,7 +144,7 @@ def entered(told: Iterable[Recording], recordings: tuple[Recording, ...]) -> Soa
         found.driven_s += float(np.ptp(recording.odometry.stamp_s))
         session: Session | None = None
         try:
-            session = run_session(given, living)
+            session = run_session(given, living, config)
             living = session.living
         except (DataError, NumericalError) as refusal:
             found.refused.append(f"session {row}: {refusal}")
@@ -204,23 +211,27 @@ def _enter(
     found: Soak, session: Session | None, living: LivingMap, recording: Recording, pose_truth_map: FloatArray | None
 ) -> None:
     """The numbers of a session."""
-    rmse, off, right, claims, there = np.nan, np.nan, 0, 0, 1
+    rmse, off, log_loss, right, claims, there = np.nan, np.nan, np.nan, 0, 0, 1
     if session is not None and not session.found:
         found.set_aside.append(len(found.rmse_m))
     if pose_truth_map is not None:
         if session is not None:
             rmse = _rmse(session, recording, pose_truth_map)
             off = _off(session, recording, pose_truth_map) if session.found else np.nan
-        claimed, truth = living.landmarks(p_least=0.5), recording.true_landmarks
+        known, truth = living.landmarks(p_least=0.0), recording.true_landmarks
         assert truth is not None
-        row = np.clip(np.searchsorted(truth.landmark_id, claimed.landmark_id), 0, len(truth) - 1)
-        away = np.linalg.norm(se2.transform(pose_truth_map, claimed.position_m) - truth.position_m[row], axis=1)
-        right = int(np.sum((truth.landmark_id[row] == claimed.landmark_id) & (away < NEAR_M)))
-        claims, there = len(claimed), len(truth)
+        row = np.clip(np.searchsorted(truth.landmark_id, known.landmark_id), 0, len(truth) - 1)
+        away = np.linalg.norm(se2.transform(pose_truth_map, known.position_m) - truth.position_m[row], axis=1)
+        same = truth.landmark_id[row] == known.landmark_id
+        stands = same & (away < NEAR_M)
+        claimed, p = known.p_exists >= 0.5, np.clip(known.p_exists, SURE, 1.0 - SURE)
+        right, claims, there = int(np.sum(claimed & stands)), int(np.sum(claimed)), len(truth)
+        log_loss = -float(np.mean(np.log(np.where(same & (away < ROUGHLY_M), p, 1.0 - p))))
     found.rmse_m.append(rmse)
     found.off_m.append(off)
     found.precision.append(right / max(claims, 1))
     found.recall.append(right / there)
+    found.log_loss.append(log_loss)
     found.step_p99_ms.append(1e3 * float(np.quantile(session.slam.step_s, 0.99)) if session is not None else np.nan)
     found.map_kb.append(sum(column.nbytes for _, column in _arrays(living, "living")) / 1e3)
     found.n_landmarks.append(len(living.members))

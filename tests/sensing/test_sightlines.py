@@ -19,6 +19,7 @@ from evermap.sensing.sightlines import (
     Views,
     nominal_lines,
     offsets,
+    session_rate,
 )
 from evermap.sensing.visibility import NominalField
 from evermap.types import BoolArray, FloatArray, IntArray, Recording
@@ -281,6 +282,47 @@ def test_how_often_places_are_hidden_is_a_beta_mean_of_what_was_counted(seed: in
     # looks keep it
     after = looked_along(table, 3, 5)
     np.testing.assert_array_equal(after.p_hidden, table.p_hidden)
+
+
+@pytest.mark.parametrize("rate", [0.15, 0.5, 1.0, 1.5])
+def test_the_rate_of_a_session_is_found(rate: float) -> None:
+    """To 5 %, whatever the lines' own rates are."""
+    rng = np.random.default_rng(4)
+    p_detect = rng.uniform(0.2, 0.6, 40_000)
+    hit = rng.random(40_000) < rate * p_detect
+    assert session_rate(hit, p_detect, np.ones(40_000)) == pytest.approx(rate, rel=0.05)
+
+
+@given(seed=seeds, n=st.integers(0, 40))
+def test_the_rate_of_a_session_is_the_mean_over_spike_and_slab(seed: int, n: int) -> None:
+    """By quadrature over the log of the factor, each look by itself."""
+    rng = np.random.default_rng(seed)
+    p_detect, hit = (rng.integers(0, 100, n) + 0.5) / 100.0, rng.random(n) < 0.3
+    weight = rng.random(n)
+
+    def likelihood(factor: FloatArray) -> FloatArray:
+        p = np.minimum(factor[:, None] * p_detect, RULES.highest_rate)
+        return np.asarray(np.prod(np.where(hit, p, 1.0 - p) ** weight, axis=1))
+
+    log = np.arange(-4.0, 1.5001, 0.01)
+    prior = np.exp(-0.5 * (log / RULES.rate_sigma) ** 2)
+    slab = likelihood(np.exp(log)) * prior / prior.sum()
+    spike = float(likelihood(np.ones(1))[0])
+    expected = (spike + np.exp(log) @ slab) / (spike + slab.sum()) if n else 1.0
+    assert session_rate(hit, p_detect, weight) == pytest.approx(expected, rel=1e-9)
+    assert session_rate(hit, p_detect, weight, SightConfig(rate_sigma=0.0)) == 1.0
+
+
+def test_a_session_that_detects_little_teaches_the_same_rate_of_a_line() -> None:
+    """A third of the detections over a third of the looks; and it is predicted with a third of the rate."""
+    rng = np.random.default_rng(1)
+    row, cell = np.zeros(900, dtype=np.int64), np.full(900, cells_of(np.array([[1.0, 0.0]]))[0])
+    usual = SightLines.empty().learned(ONE, row, cell, rng.random(900) < 0.9, np.ones(900))
+    poor = SightLines.empty().learned(ONE, row, cell, rng.random(900) < 0.3, np.ones(900), 1.0 / 3.0)
+    one = np.zeros(1, dtype=np.int64), cell[:1], np.array([0.9])
+    rates = [lines.lines(ONE, *one)[0].p_detect[0] for lines in (usual, poor)]
+    assert rates == pytest.approx([0.9, 0.9], abs=0.06)
+    assert usual.lines(ONE, *one)[0].at(1.0 / 3.0, 0.98).p_detect[0] == pytest.approx(rates[0] / 3.0)
 
 
 def test_how_often_places_are_hidden_fades() -> None:

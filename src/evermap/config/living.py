@@ -211,6 +211,10 @@ class SightConfig(Section):
     p_blocked_detect: Share = key(0.03, "detection rate along blocked lines")
     least_rate: Share = key(0.002, "minimum detection rate of any kind of line")
     highest_rate: Share = key(0.98, "maximum detection rate of any kind of line")
+    rate_sigma: NotNegative = key(
+        1.0, "standard deviation of the log of the factor by which a sensor detects more or less often; 0: never"
+    )
+    rate_looks: Positive = key(5.0, "maximum looks at one place in a session from which this is learned")
     neighbour: Probability = key(0.35, "weight of looks from the eight cells around, in looks along the line")
     clear: Share = key(0.9, "probability above which a line is known to be clear")
     blocked: Share = key(0.25, "probability below which a line is known to be blocked")

@@ -28,6 +28,8 @@ KNOWN = 1e9
 """Looks that are worth certainty."""
 HEADINGS = 24
 """Headings that views distinguish."""
+_FACTORS = np.exp(np.linspace(-4.0, 1.5, 551))
+"""Rates of a session that are compared."""
 _REACH = 1 << 12
 _SPAN = 1 << 24
 _AROUND = tuple((dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1))
@@ -52,6 +54,12 @@ class Lines(NamedTuple):
     def p_detect(self) -> FloatArray:
         """(N,) mean detection probability."""
         return self.p_free * self.hits / (self.hits + self.misses) + (1.0 - self.p_free) * self.p_blocked
+
+    def at(self, rate: float, highest: float) -> Lines:
+        """Return lines along which a session detects `rate` times as often, with a probability of `highest` at most."""
+        worth = self.hits + self.misses
+        hits = np.minimum(rate * self.hits, highest * worth) if rate != 1.0 else self.hits
+        return self._replace(hits=hits, misses=worth - hits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +163,7 @@ class SightLines:
         cell: IntArray,
         hit: BoolArray,
         weight: FloatArray,
+        rate: float = 1.0,
     ) -> SightLines:
         """Return the table after looks at landmarks of known P(exists), without lines to removed places.
 
@@ -164,6 +173,7 @@ class SightLines:
             cell: (N,) cell of the sensor.
             hit: (N,) whether it was detected.
             weight: (N,) probability that it was there.
+            rate: of the session, see `session_rate`: with half the detections, a look is worth half.
         """
         mine = self._rows(places)
         kept = mine >= 0
@@ -171,7 +181,7 @@ class SightLines:
         every, row = np.unique(key, return_inverse=True)
         n_old, n = int(kept.sum()), len(every)
         old, new = row.ravel()[:n_old], row.ravel()[n_old:]
-        looks = np.bincount(old, self.looks[kept], n) + np.bincount(new, weight, n)
+        looks = np.bincount(old, self.looks[kept], n) + np.bincount(new, rate * weight, n)
         hits = np.bincount(old, self.hits[kept], n) + np.bincount(new, weight * hit, n)
         used = looks > 1e-3
         every, looks, hits = every[used], looks[used], hits[used]
@@ -282,16 +292,43 @@ class Views:
         """(V, 3) middles of the cells, and of the headings."""
         return np.column_stack([(self.cell + 0.5) * self.cell_m, (self.heading + 0.5) * (2.0 * np.pi / HEADINGS)])
 
-    def seen_from(self, pose_map_sensor: FloatArray, stamp_s: float) -> Views:
-        """Return the table after a session that ended at `stamp_s`, with sensor poses (F, 3)."""
+    def seen_from(self, pose_map_sensor: FloatArray, stamp_s: float, rate: float = 1.0) -> Views:
+        """Return the table after a session that ended at `stamp_s`, with sensor poses (F, 3).
+
+        A frame of a session with half the `rate` of detections is worth half.
+        """
         cell = np.floor(pose_map_sensor[:, :2] / self.cell_m).astype(np.int64)
         turn = np.floor(np.mod(pose_map_sensor[:, 2], 2.0 * np.pi) * (HEADINGS / (2.0 * np.pi))).astype(np.int64)
         own, counts = np.unique(np.column_stack([cell, turn % HEADINGS]), axis=0, return_counts=True)
-        frames = np.append(counts.astype(np.float64), self.frames)
+        frames = np.append(min(rate, 1.0) * counts, self.frames)
         both = np.concatenate([own, np.column_stack([self.cell, self.heading])])
         every, first = np.unique(both, axis=0, return_index=True)  # the first of equal rows: those of this session
         stamps = np.append(np.full(len(own), stamp_s), self.stamp_s)[first]
         return Views(every[:, :2], every[:, 2], stamps, frames[first], self.cell_m)
+
+
+def session_rate(hit: BoolArray, p_detect: FloatArray, weight: FloatArray, rules: SightConfig = USUAL) -> float:
+    """Return how often a session detects, over what lines of sight lead to expect.
+
+    Sensors differ between robots, and lenses get dirty. The posterior mean of a factor common to all lines on a grid;
+    a priori it is 1 or, as probably, log-normal.
+
+    Args:
+        hit: (N,) detections of what was there for certain.
+        p_detect: (N,) how probable they were, by what earlier sessions saw along the same lines.
+        weight: (N,) of each look, as consecutive ones are not independent.
+        rules: `rate_sigma`; 0 gives a factor of 1.
+    """
+    if rules.rate_sigma == 0.0 or not len(hit):
+        return 1.0
+    percent = np.minimum((100.0 * p_detect).astype(np.int64), 99)
+    hits, misses = (np.bincount(percent[some], weight[some], 100) for some in (hit, ~hit))
+    factor = np.append(1.0, _FACTORS)
+    p = np.minimum(factor[:, None] * (np.arange(100) + 0.5) / 100.0, rules.highest_rate)
+    slab = np.exp(-0.5 * (np.log(_FACTORS) / rules.rate_sigma) ** 2)
+    log_p = np.log(p) @ hits + np.log1p(-p) @ misses + np.log(np.append(1.0, slab / slab.sum()))
+    likely = np.exp(log_p - log_p.max())
+    return float(factor @ likely / likely.sum())
 
 
 def _p_clear(hits: FloatArray, looks: FloatArray, prior: float, free: FloatArray, rules: SightConfig) -> FloatArray:

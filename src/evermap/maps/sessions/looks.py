@@ -20,11 +20,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.config import LivingConfig, LooksConfig
+from evermap.config import LivingConfig, LooksConfig, SightConfig
 from evermap.existence.sites import SiteLooks
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap, class_of, clique_rows, site_middles
-from evermap.sensing.sightlines import HEADINGS, Lines, SightLines, Views, nominal_lines, offsets
+from evermap.maps.sessions.extend import first_and_last
+from evermap.sensing.sightlines import HEADINGS, Lines, SightLines, Views, nominal_lines, offsets, session_rate
 from evermap.sensing.visibility import LooksAt, NominalField, looks_at
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
@@ -84,6 +85,7 @@ class PlaceLooks:
             does not take what stands behind a wall for gone.
         sight: (C,) what is known of the lines to each clique, as a row of `SightConfig.p_hidden`.
         unwitnessed: (2,) cliques that stood there, but were hidden, or shown, along lines that were unknown before.
+        rate: how often the session detects, over what lines of sight lead to expect.
     """
 
     rows: SiteLooks
@@ -94,6 +96,7 @@ class PlaceLooks:
     settled: BoolArray
     sight: IntArray
     unwitnessed: FloatArray
+    rate: float = 1.0
 
 
 def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: LivingConfig) -> PlaceLooks:
@@ -127,11 +130,12 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
         sight = np.zeros(len(cliques), dtype=np.int64)
         return PlaceLooks(rows, place, cell, nominal_lines(p_nominal, rules), everything, settled, sight, np.zeros(2))
     names = places.site_id, places.landmark_id
+    before, p_before, seen_before = living.sightlines.lines(names, line[:, 0], line[:, 1], p_nominal)
+    rate = _rate(rows, before.p_detect, seen_before & (p_before >= rules.clear), len(living.sites), rules)
     now = living.sightlines.learned(
-        names, place[settled], cell[settled], rows.hit[settled], np.ones(int(settled.sum()))
+        names, place[settled], cell[settled], rows.hit[settled], np.ones(int(settled.sum())), rate
     )
     lines, p_clear, seen = now.lines(names, line[:, 0], line[:, 1], p_nominal)
-    _, p_before, seen_before = living.sightlines.lines(names, line[:, 0], line[:, 1], p_nominal)
     line_is_clear, was_clear = (p_clear >= rules.clear) & seen, (p_before >= rules.clear) & seen_before
     clear = line_is_clear[key]
     beside, behind = (some[order] for some in witnessed(
@@ -149,8 +153,26 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
         lambda some: (eye[frame[some], :2], floor_m[place[some]]),
         settings,
     )
-    lines = lines._replace(p_free=1.0 - p_hidden[clique_of_place[line[:, 0]]])
-    return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed)
+    lines = lines.at(rate, rules.highest_rate)._replace(p_free=1.0 - p_hidden[clique_of_place[line[:, 0]]])
+    return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed, rate)
+
+
+def _rate(rows: SiteLooks, p_detect: FloatArray, known: BoolArray, n_sites: int, rules: SightConfig) -> float:
+    """Return the rate of a session, by what was missed between the first and the last time that a site was seen.
+
+    Args:
+        rows: looks of the session.
+        p_detect: (K,) detection probability along each line before the session.
+        known: (K,) lines that are known to be clear.
+        n_sites: of the map.
+        rules: how far sessions differ.
+    """
+    first, last = first_and_last(rows.site[rows.hit], rows.stamp_s[rows.hit], n_sites)
+    there = (rows.stamp_s > first[rows.site]) & (rows.stamp_s < last[rows.site]) & known[rows.key]
+    site = rows.site[there]
+    count = np.bincount(site, minlength=n_sites)
+    weight = np.minimum(1.0, rules.rate_looks / np.maximum(count, 1))[site]
+    return session_rate(rows.hit[there], p_detect[rows.key[there]], weight, rules)
 
 
 def _different(place: IntArray, cell: IntArray, nominal: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:

@@ -308,8 +308,9 @@ def learned(
         names = entry.living.places.site_id, entry.living.places.landmark_id
         p_there = entry.living.sites.p_here[seen.rows.site]
         weight = np.where(seen.settled, 1.0, p_there)
-        lines = after.sightlines.learned(names, seen.place, seen.cell, seen.rows.hit, weight)
-        after = replace(after, sightlines=lines, views=after.views.seen_from(eye, after.stamp_s))
+        lines = after.sightlines.learned(names, seen.place, seen.cell, seen.rows.hit, weight, seen.rate)
+        views = after.views.seen_from(eye, after.stamp_s, seen.rate)
+        after = replace(after, sightlines=lines, views=views)
     if not config.learn_lifetimes:
         return after, None
     classes = ClassLives.of(after.stays, after.lives, after.stamp_s, config.lifetimes)
