@@ -463,7 +463,8 @@ def main(names: Sequence[str] = ()) -> None:
         return
     if names and names[0] == "columns":
         rooms = (replace(one, name="rooms") for one in simulated_world(1, 0).recordings[:1])
-        for recording in itertools.chain(rooms, (simulate_copied_aisles(0),), recordings(parks=1)):
+        planar = itertools.chain(rooms, (simulate_copied_aisles(0),), recordings(parks=1))
+        for recording in itertools.chain(planar, recordings_in_space()):
             for name in COLUMNS if not names[1:] or recording.name.startswith(tuple(names[1:])) else ():
                 row = score(with_columns(recording, name))
                 print(_line(replace(row, name=f"{row.name}, {name}")), flush=True)

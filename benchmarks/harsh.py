@@ -17,6 +17,7 @@ import numpy as np
 from evermap.geometry import se2
 from evermap.types import (
     UNKNOWN,
+    AnyRecordingT,
     Detections,
     FloatArray,
     Frames,
@@ -141,8 +142,8 @@ LIGHT_S, PAUSE_S = 60.0, 20.0
 
 
 def with_columns(
-    recording: Recording, name: str, seed: int = 0, *, names: IntArray | None = None, session: int = 0
-) -> Recording:
+    recording: AnyRecordingT, name: str, seed: int = 0, *, names: IntArray | None = None, session: int = 0
+) -> AnyRecordingT:
     """Return a recording whose detections have columns of `COLUMNS`, by their own identities; the same landmarks over
     the sessions of a world, whose identities are `names`.
     """
@@ -161,7 +162,8 @@ def with_columns(
     rng = np.random.default_rng([seed, 11, session]) if session else rng
     value += rng.normal(size=(visit.max() + 1, count))[visit] * kind["visit"]
     value += rng.normal(size=(len(of), count)) * kind["reading"]
-    value += kind.get("by_range", 0.0) * seen.range_m[:, None]
+    range_m = seen.range_m if isinstance(seen, Detections) else np.linalg.norm(seen.position_sensor_m, axis=1)
+    value += kind.get("by_range", 0.0) * range_m[:, None]
     minute = ((stamp_s - stamp_s[0]) // LIGHT_S).astype(np.int64)
     value += kind.get("light", 0.0) * rng.normal(size=minute.max() + 1)[minute, None]
     wrong = rng.random(len(of)) < kind.get("misread", 0.0)

@@ -29,6 +29,7 @@ def hall(
     sigma_m: float = 0.03,
     p_false: float = 0.02,
     classes: bool = False,
+    beside_m: float = 0.0,
 ) -> SpatialRecording:
     """Make two and a half rounds through a hall; of what is ahead within `RANGE_M` eight of ten are detected.
 
@@ -41,9 +42,12 @@ def hall(
         sigma_m: noise of each coordinate.
         p_false: share of detections that are of nothing; they have the identity -1.
         classes: whether detections come with one of two classes.
+        beside_m: how far above those of the first half the landmarks of the second half are; 0: anywhere.
     """
     random = np.random.default_rng(seed)
     place = random.uniform(0.0, 1.0, (n_points, 3)) * SIZE_M
+    if beside_m:
+        place[n_points // 2 :] = place[: n_points // 2] + (0.0, 0.0, beside_m)
     kind = random.integers(0, 2, n_points)
     stamp_s = step_s * np.arange(n_frames)
     angle = 5.0 * np.pi * np.arange(n_frames) / n_frames

@@ -88,6 +88,26 @@ def test_identities_of_the_recording_are_not_looked_at():
     np.testing.assert_array_equal(one.detections.landmark_id, other.detections.landmark_id)
 
 
+def test_two_at_one_place_are_told_apart_by_a_column():
+    """Places alone exchange them; a colour that says nothing changes no identity."""
+    recording = hall(1, n_points=40, n_frames=250, sigma_m=0.05, beside_m=0.06)
+    seen, random = recording.detections, np.random.default_rng(0)
+    real = seen.landmark_id != UNKNOWN
+
+    def found(**columns):
+        given = replace(recording, detections=replace(seen, **columns))
+        return with_identities(given, NAMELESS.slam).detections.landmark_id
+
+    alone = found()
+    assert identity_scores(alone[real], seen.landmark_id[real]).purity < 0.7
+    radius = random.uniform(0.0, 1.0, 40)[seen.landmark_id] + random.normal(0.0, 0.02, len(seen))
+    told = identity_scores(found(features=radius[:, None], feature_names=("radius_m",))[real], seen.landmark_id[real])
+    assert told.purity > 0.85
+    assert told.completeness > 0.8
+    useless = random.normal(size=(len(seen), 1))
+    np.testing.assert_array_equal(found(features=useless, feature_names=("colour",)), alone)
+
+
 @pytest.mark.parametrize("share", [0.2, 0.5])
 def test_points_of_which_some_have_names(share):
     recording = hall(1, n_points=40, n_frames=400, drift=0.1)

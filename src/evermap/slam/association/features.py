@@ -29,6 +29,8 @@ SETTLED = 0.5
 """Tolerance of a variance, as the change of its logarithm, for the association to be repeated."""
 MOST_COMPARED = 1_000_000
 """Number of differences of visits that are used: bounds the work."""
+MOST_LEARNED = 3
+"""Maximum number of rounds of learning traits and associating with them; they converge within these."""
 ROUNDS = 12
 """Rounds of reweighting; they converge within a few."""
 
@@ -177,12 +179,14 @@ class Traits:
 
     def same(self, one: Likeness, other: Likeness) -> FloatArray:
         """Return (K,) the evidence that groups are pairwise of one landmark [nats]."""
-        return _each_same(one, other, self.spread)
+        return _each_same(one, other, self.spread) if one.value.shape[1] else np.zeros(len(one.value))
 
     def evidence(self, visit: IntArray, landmark: IntArray) -> float:
         """Sum the evidence of all readings for this assignment of visits, over each to its own landmark [nats]; visit
         (M,) of detections, numbered by landmark and time, landmark (V,) of visits.
         """
+        if not self.value.shape[1]:
+            return 0.0
         visits = self.of_visits(visit, len(landmark))
         first = np.searchsorted(landmark, landmark)  # visit to the same landmark
         rank, found = np.arange(len(landmark)) - first, 0.0

@@ -18,7 +18,7 @@ from evermap.config import SlamConfig
 from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetections
 from evermap.slam.association.associator import Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap
-from evermap.slam.association.features import Traits, learned
+from evermap.slam.association.features import MOST_LEARNED, Traits, learned
 from evermap.slam.association.particles import drawn
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
@@ -36,8 +36,6 @@ SETTLED = 120
 """Maximum number of landmarks of all draws that are solved per round, or one draw: as long as the draws take."""
 LITTLE = 200.0
 """Gain per detection below which the search ends, as a fraction 1/`LITTLE` of the cost of an outlier: a tolerance."""
-MOST_LEARNED = 3
-"""Maximum number of rounds of learning traits and associating with them; they converge within these."""
 
 
 @dataclass(frozen=True)

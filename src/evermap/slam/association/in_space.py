@@ -9,6 +9,7 @@ covariances (`merging`), and each detection is compared with the whole map once 
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
@@ -25,12 +26,15 @@ from evermap.slam.association.assignment import (
     LooseDetections,
     alike,
     labels_of,
+    landmarks_of_visits,
     names_of,
     same_name,
     seen_together,
+    visits_of,
 )
 from evermap.slam.association.associator import LAST_ROUNDS, MERGE_ROUNDS, effective_number
 from evermap.slam.association.constellation import LocalMap
+from evermap.slam.association.features import MOST_LEARNED, Likeness, Traits, learned
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.association.merging import Differences, Solution, in_reach, propose_merges
 from evermap.slam.association.revise import lying_together, may_be_of, most_probable
@@ -81,8 +85,12 @@ def associated_in_space(
     by_class = np.where(asked, given.class_id - UNKNOWN, UNKNOWN)
     intake = prepare_space(replace(recording, detections=replace(given, landmark_id=by_class)), settings.space)
     kind = np.column_stack([given.class_id, name])[intake.used]
+    associator = SpatialAssociator(intake, kind, settings)
+    solved = associator.finish()
+    if given.features is not None:
+        solved = _with_traits(associator, solved, given.features[intake.used])
     row = np.full(len(given), NOBODY)
-    row[intake.used], local, together, loose = SpatialAssociator(intake, kind, settings).finish()
+    row[intake.used], local, together, loose = associator.concluded(solved)
     of_kind = labels_of(kind, row[intake.used], len(local.place))
     loose = loose._replace(row=intake.used[loose.row])
     return AssociatedInSpace(row, name, of_kind, local, together, loose, settings)
@@ -205,12 +213,13 @@ class _Match(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """Landmarks (M,) of detections at the optimum, and the linearisation there."""
+    """Landmarks (M,) of detections at the optimum, the linearisation there, and its cost [nats]."""
 
     row: IntArray
     estimate: SpatialEstimate
     smoother: SpatialSmoother
     now: SpatialLinear
+    cost: float
 
 
 class SpatialAssociator:
@@ -221,11 +230,16 @@ class SpatialAssociator:
         kind: (M, 2) class and name of every detection that it uses, `UNKNOWN` for none: different ones exclude each
             other.
         settings: of the estimator.
+        traits: readings of the landmarks themselves; None if they give no evidence.
     """
 
-    def __init__(self, intake: SpatialIntake, kind: IntArray, settings: SlamConfig) -> None:
+    def __init__(
+        self, intake: SpatialIntake, kind: IntArray, settings: SlamConfig, traits: Traits | None = None
+    ) -> None:
         problem = self._problem = _thinned(intake)
-        self._kind, self._settings, self._rules = kind, settings, settings.association
+        self._traits = Traits.none(len(problem.pose_row), settings) if traits is None else traits
+        self._like = self._traits.nothing(0)
+        self._kind, self.settings, self._rules = kind, settings, settings.association
         caution, space = self._rules.odometry_caution, problem.settings
         self._noise = SpatialNoise(caution * space.drift_m, caution * space.drift_rad, pixel=space.sigma_px)
         mount = problem.mount[problem.sensor]
@@ -238,21 +252,56 @@ class SpatialAssociator:
         self._of = np.zeros((0, 2), dtype=np.int64)  # class and name of each landmark
         self._density = _density(np.zeros((0, 3)), np.zeros(0, dtype=np.int64), settings)
 
-    def finish(self) -> tuple[IntArray, LocalMap, sparse.csr_array, LooseDetections]:
-        """Return (M,) the landmark of every detection, numbered by first detection, `NOBODY` for none; the landmarks;
-        (L, L) the number of views that show both of two; and the detections of none, rows of those of the recording.
+    def having(self, traits: Traits) -> SpatialAssociator:
+        """Return an associator of the same detections that also uses traits."""
+        other = copy.copy(self)
+        other._traits, other._like = traits, traits.nothing(0)
+        other._row, other._of = np.full_like(self._row, NOBODY), self._of[:0]
+        return other
+
+    def of_visits(self, solved: _Solved) -> tuple[IntArray, IntArray]:
+        """Return (M,) the visit of every detection, and (V,) the landmark of each; see `Assignment.of_visits`."""
+        visit = visits_of(self._problem.stamp_s[self._problem.pose_row], solved.row, self._rules.forget_s)
+        return visit, landmarks_of_visits(visit, solved.row)
+
+    def against(self, solved: _Solved, traits: Traits | None) -> float:
+        """Return the negative log likelihood [nats] of all detections, and of their traits, up to a constant.
+
+        An unassigned detection is of one of the landmarks that there are elsewhere, as in `_reassigned`.
         """
-        fewest = self._settings.fewest_sightings
-        self._follow()
-        row = _without(self._row, np.zeros(len(self._of), dtype=np.bool_))
-        solved = self._merged(self._learned(row, _driven(self._problem)))
+        density = self._density
+        again = self._solved(solved.row, solved.estimate.pose)
+        self._density = density
+        spread = self._covariance(solved.row == NOBODY)
+        nobody = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(density)
+        numbers = np.where(again.smoother.problem.oriented, 6, 3)
+        cost = again.now.cost + np.maximum(nobody, 0.0).sum()
+        cost += 0.5 * self._rules.landmark_nats * numbers.sum()  # stated for two numbers
+        return float(cost - (0.0 if traits is None else traits.evidence(*self.of_visits(solved))))
+
+    def finish(self, known: _Solved | None = None) -> _Solved:
+        """Return the landmarks of all detections, from `known` ones on; those seen seldom are among them."""
+        fewest = self.settings.fewest_sightings
+        if known is None:
+            self._follow()
+            row = _without(self._row, np.zeros(len(self._of), dtype=np.bool_))
+            known = self._learned(row, _driven(self._problem))
+        else:
+            known = self._solved(known.row, known.estimate.pose)
+        solved = self._merged(known)
         for _ in range(LAST_ROUNDS):
             again = self._with_overlooked(self._reassigned(solved), solved.estimate.pose)
             again = _without(again, np.bincount(again[again >= 0]) < fewest)
             if np.array_equal(again, solved.row):
                 break
             solved = self._merged(self._learned(again, solved.estimate.pose))
-        kept = np.flatnonzero(np.bincount(solved.row[solved.row >= 0]) >= fewest)
+        return solved
+
+    def concluded(self, solved: _Solved) -> tuple[IntArray, LocalMap, sparse.csr_array, LooseDetections]:
+        """Return (M,) the landmark of every detection, numbered by first detection, `NOBODY` for none; the landmarks;
+        (L, L) the number of views that show both of two; and the detections of none, rows of those of the recording.
+        """
+        kept = np.flatnonzero(np.bincount(solved.row[solved.row >= 0]) >= self.settings.fewest_sightings)
         row = np.where(np.isin(solved.row, kept), np.searchsorted(kept, solved.row), NOBODY)
         views = int(self._view.max(initial=-1)) + 1
         together, _ = seen_together(self._view, row, views, len(kept), 0)
@@ -325,6 +374,7 @@ class SpatialAssociator:
         followed = log_det <= least + 3.0 * math.log(rules.followed**2)
         new = np.log(np.where(followed, rules.unmet_share, 1.0) * self._density)
         new -= rules.name_nats * same_name(self._kind[view[source]], self._of[near.row[target]])
+        new -= self._traits.same(self._traits.singly(view[source]), self._like.part(near.row[target]))
         pairs = Pairings(
             source, target, innovation, joint.reshape(3 * len(source), 3 * len(source)), new, len(view), None, least
         )
@@ -362,8 +412,10 @@ class SpatialAssociator:
         new = view[match.p_new >= self._rules.p_new]
         self._row[new] = len(self._of) + np.arange(len(new))
         self._of = np.vstack([self._of, self._kind[new]])
-        near.meet(self._row[new])
+        like = Likeness(*map(np.concatenate, zip(self._like, self._traits.nothing(len(new)), strict=True)))
         seen = np.append(known, new)
+        self._like = self._traits.followed(like, self._row[seen], seen)
+        near.meet(self._row[new])
         at = np.append(match.target, len(near.row) - len(new) + np.arange(len(new)))
         near.update(at, self._at[seen], self._covariance(seen))
         sigma = np.where(self._turned[seen], self._problem.sigma_rad[seen], 0.0)
@@ -403,8 +455,15 @@ class SpatialAssociator:
             smoother = SpatialSmoother(problem, pose)
             estimate, _ = smoother.optimum(estimate, self._noise, heavy=True)
             estimate, now = smoother.optimum(estimate, self._noise, heavy=False)
-        self._density = _density(estimate.place[:, :3], np.bincount(problem.place), self._settings)
-        return _Solved(row, estimate, smoother, now)
+        self._density = _density(estimate.place[:, :3], np.bincount(problem.place), self.settings)
+        solved = _Solved(row, estimate, smoother, now, now.cost)
+        return replace(solved, cost=now.cost - self._traits.evidence(*self.of_visits(solved)))
+
+    def _like_of(self, solved: _Solved) -> Likeness:
+        """Return the traits of each landmark."""
+        visit, landmark = self.of_visits(solved)
+        visits = self._traits.of_visits(visit, len(landmark))
+        return self._traits.of_landmarks(visits, landmark, len(solved.estimate.place))
 
     def _merged(self, solved: _Solved) -> _Solved:
         """Merge duplicates while there are any."""
@@ -435,7 +494,7 @@ class SpatialAssociator:
             numbers = np.where(solved.smoother.problem.oriented[[u for u, _ in pairs]], 6, 3)
             rise = np.minimum(rules.rise_nats + rules.rise_per_sighting * lesser, rules.most_rise_nats)
             rise = 0.5 * numbers * rise  # stated for two numbers
-            if trial.now.cost - solved.now.cost <= rise.sum():
+            if trial.cost - solved.cost <= rise.sum():
                 return trial
             if len(pairs) == 1:
                 refused.update(pairs)
@@ -453,7 +512,9 @@ class SpatialAssociator:
         sightings, last_s = np.bincount(row, minlength=count), np.zeros(count)
         np.maximum.at(last_s, row, self._problem.stamp_s[self._problem.pose_row[used]])
         like = np.array([alike(each, of).mean() for each in of])
-        differences = _Differing(solved, self._shared_m2(solved.row), np.log(self._density * like), of, rules)
+        log_density = np.log(self._density * like)
+        traits = self._traits, self._like_of(solved)
+        differences = _Differing(solved, self._shared_m2(solved.row), log_density, of, traits, rules)
         n_views = int(self._view.max()) + 1
         return Solution(
             solved.estimate.place[:, :3], own, differences, sightings, last_s,
@@ -470,7 +531,7 @@ class SpatialAssociator:
         middle = wide[order[np.cumsum(count) - count + count // 2]]
         return np.asarray(self._rules.shared_m**2 + (self._rules.shared_share * middle) ** 2)
 
-    def _covariance(self, rows: IntArray | slice) -> FloatArray:
+    def _covariance(self, rows: IntArray | BoolArray | slice) -> FloatArray:
         """(K, 3, 3) covariances of positions in the frame of the robot, at the current noise levels."""
         root = self._root[rows] * np.array([self._noise.across, self._noise.across, self._noise.along])
         return np.asarray(root @ np.swapaxes(root, 1, 2))
@@ -500,12 +561,13 @@ class SpatialAssociator:
         score = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(self._density)
         tail = math.log(tail_share) - 3.0 * math.log(tail_by) - 0.5 * squared / tail_by**2
         score += np.logaddexp(math.log(1.0 - tail_share) - 0.5 * squared, tail)
+        score += self._traits.same(self._traits.singly(seen), self._like_of(solved).part(row))
         inside = (squared < tail_by**2 * gate) & (score > 0.0)
         return most_probable(seen[inside], row[inside], score[inside], self._view, len(place), rules.p_own)
 
     def _with_overlooked(self, row: IntArray, pose: FloatArray) -> IntArray:
         """(M,) landmarks, with a new one per cluster of unassigned detections from enough views."""
-        fewest = self._settings.fewest_sightings
+        fewest = self.settings.fewest_sightings
         left = np.flatnonzero(row == NOBODY)
         at = se3.transform(pose[self._problem.pose_row[left]], self._at[left])
         found = lying_together(at, self._wide_m()[left], self._kind[left], self._view[left], fewest)
@@ -523,16 +585,24 @@ class _Differing:
         shared: (L,) variance [m^2] of the shared errors of sightings.
         log_density: (L,) of landmarks with compatible labels [1/m^3].
         kind: (L, 2) class and name of each.
+        traits: of detections, and of the landmarks.
         settings: of the association.
     """
 
     def __init__(
-        self, solved: _Solved, shared: FloatArray, log_density: FloatArray, kind: IntArray, settings: AssociationConfig
+        self,
+        solved: _Solved,
+        shared: FloatArray,
+        log_density: FloatArray,
+        kind: IntArray,
+        traits: tuple[Traits, Likeness],
+        settings: AssociationConfig,
     ) -> None:
         problem, self._kind, self._rules = solved.smoother.problem, kind, settings
         self._place, self._turned = solved.estimate.place, problem.oriented
         self._symmetries, self._first = problem.symmetries, len(problem.stamp_s)
         self._shared, self._log_density = shared, log_density
+        self._traits, self._like = traits
         self._factorised = solved.smoother.factorised(solved.now)
 
     def __call__(self, younger: IntArray, older: IntArray) -> Differences:
@@ -593,6 +663,34 @@ class _Differing:
         like /= (2.0 * math.pi) ** 1.5 * alike_rad**3
         found = like.sum(axis=1)[row] - like[row, younger] - like[row, older]
         return np.asarray(np.log(0.5 / (8.0 * math.pi**2) + 0.5 * np.maximum(found, 0.0) / max(count, 1)))
+
+
+def _with_traits(plain: SpatialAssociator, first: _Solved, features: FloatArray) -> _Solved:
+    """Return the landmarks of all detections that explain these and their traits (M, D) best.
+
+    As in the plane (`identify`): variances are learned from the association without traits, first from readings within
+    visits, then from revisits.
+    """
+
+    def explained(solved: _Solved) -> tuple[float, Traits | None]:
+        own = learned(features, *plain.of_visits(solved), settings=plain.settings)
+        return plain.against(solved, own), own
+
+    traits = learned(features, *plain.of_visits(first), revisits=False, settings=plain.settings)
+    best, (cost, known) = first, explained(first)
+    for _ in range(MOST_LEARNED):
+        if traits is None:
+            break
+        right = traits.evidence(*plain.of_visits(best)) > 0.0  # else most of it is wrong
+        trial = plain.having(traits).finish(best if right else None)
+        against, own = explained(trial)
+        better = against < cost
+        if better:
+            best, cost, known = trial, against, own
+        if known is None or known.close_to(traits):
+            break
+        traits = known
+    return best
 
 
 def _one_way(
