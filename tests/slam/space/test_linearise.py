@@ -58,9 +58,10 @@ def a_sighting(
     return seen, pose, place, mount
 
 
-def residuals(seen, pose, place, mount, velocity) -> tuple[np.ndarray, np.ndarray]:
+def residuals(seen, pose, place, mount, velocity, delay=0.0) -> tuple[np.ndarray, np.ndarray]:
     values, weight, residual = np.zeros(seen.first[-1]), np.zeros(1), np.zeros((1, 8))
-    linearise_sightings(pose, place, mount, velocity, LEVEL, seen, False, values, weight, residual)
+    back, speed = -delay * velocity[None], velocity[None]
+    linearise_sightings(pose, place, mount, back, speed, LEVEL, seen, False, values, weight, residual)
     rows = int(ROWS[seen.kind[0]])
     return residual[0, :rows], values.reshape(rows, -1)
 
@@ -71,15 +72,18 @@ KINDS = [
 ]  # fmt: skip
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.4])
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("kind", "oriented", "alike"), KINDS)
-def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, alike, seed):
+def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, alike, seed, delay):
     symmetry = Symmetry.generated(alike or ())
     seen, pose, place, mount = a_sighting(kind, oriented, seed, symmetry)
     place = se3.compose(place, np.append(np.zeros(3), symmetry.turns[-1])) if oriented else place
     velocity = np.random.default_rng(seed).normal(0.0, 1.0, (1, 6))
-    at, block = residuals(seen, pose, place, mount, velocity)
+    at, block = residuals(seen, pose, place, mount, velocity, delay)
     assert block[:, -1] == pytest.approx(-at, abs=1e-9)
+    earlier = se3.retract(pose, -delay * velocity)
+    assert residuals(seen, earlier, place, mount, velocity)[0] == pytest.approx(at, abs=1e-9)
     dim = 6 if oriented else 3
     columns = []
     for which, size in (("pose", 6), ("place", dim), ("mount", 6), ("late", 1)):
@@ -88,14 +92,14 @@ def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, alike, 
             for sign in (1.0, -1.0):
                 by = np.zeros((1, 6))
                 by[0, k] = sign * STEP
-                moved = {"pose": pose, "place": place.copy(), "mount": mount}
+                moved = {"pose": pose, "place": place.copy(), "mount": mount, "delay": delay}
                 if which == "late":
-                    moved["pose"] = se3.retract(pose, sign * STEP * velocity)
+                    moved["delay"] += sign * STEP
                 elif which == "place" and not oriented:
                     moved["place"][:, :3] += by[:, :3]
                 else:
                     moved[which] = se3.retract(moved[which], by)
-                ends.append(residuals(seen, moved["pose"], moved["place"], moved["mount"], velocity)[0])
+                ends.append(residuals(seen, **moved, velocity=velocity)[0])
             columns.append((ends[0] - ends[1]) / (2.0 * STEP))
     assert block[:, :-1] == pytest.approx(np.column_stack(columns), abs=2e-4 * max(1.0, np.abs(block).max()))
 

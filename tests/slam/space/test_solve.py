@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from corridors import World, as_directions, tagged_corridor
 from scipy.spatial.transform import Rotation
 
 from evermap import Config, run_slam
@@ -14,11 +13,15 @@ from evermap.config import SpaceConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.metrics.summary import compare_with_truth
+from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.space.estimate import converged
 from evermap.slam.space.intake import prepare_space
 from evermap.slam.space.repair import repaired
 from evermap.slam.space.solve import solve_space
-from evermap.types import Landmarks, SlamResult, SpatialSensor, rows_of
+from evermap.types import Frames, Landmarks, SlamResult, SpatialSensor, rows_of
+
+from .corridors import World, as_directions, tagged_corridor
+from .halls import hall
 
 
 def errors(result: SlamResult, world: World) -> tuple[float, float]:
@@ -299,3 +302,18 @@ def test_directions_without_odometry_are_left_out():
     recording = as_directions(tagged_corridor(0, odometry=False), 0)
     with pytest.raises(DataError, match="seen in 0 frames"):
         run_slam(recording)
+
+
+@pytest.mark.parametrize("late_s", [0.15, -0.3])
+def test_stamps_that_are_late_are_found(late_s):
+    """From the changes of speed of a drive around a hall, with points; and the path is that of the right stamps."""
+    recording = hall(1, n_points=40, n_frames=300, drift=0.003)
+    late = replace(recording, frames=Frames(recording.frames.stamp_s + late_s))
+    config = Config(slam={"space": {"delay_sigma_s": 0.5}})
+    found = run_slam(late, config)
+    delay = next(each for each in found.parameters if each.name.endswith("delay_s"))
+    assert delay.value == pytest.approx(late_s, abs=0.03)
+    off = [evaluate_trajectory(run_slam(each, how).trajectory, recording.truth).rmse_m
+           for each, how in ((late, config), (late, Config()), (recording, Config()))]  # fmt: skip
+    assert off[0] < 0.9 * off[1]
+    assert off[0] < 1.5 * off[2]

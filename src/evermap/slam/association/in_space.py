@@ -713,7 +713,7 @@ def _thinned(intake: SpatialIntake) -> SpatialProblem:
     stamp_s = problem.stamp_s[kept]
     return replace(
         problem, stamp_s=stamp_s - stamp_s[0], increment=se3.between(pose[:-1], pose[1:]), lasted_s=np.diff(stamp_s),
-        pose_row=np.searchsorted(kept, problem.pose_row),
+        pose_row=np.searchsorted(kept, problem.pose_row), path=None,
     )  # fmt: skip
 
 

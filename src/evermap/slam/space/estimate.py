@@ -122,7 +122,7 @@ def _traces(smoother: SpatialSmoother, of_factors: FloatArray, first: IntArray) 
 def as_seen(problem: SpatialProblem, estimate: SpatialEstimate, measured: FloatArray) -> FloatArray:
     """Return (M, 7) where each detection puts its place in the world."""
     mount = estimate.mount(problem)[problem.sensor]
-    return se3.compose(se3.compose(estimate.pose[problem.pose_row], mount), measured)
+    return se3.compose(se3.compose(estimate.seen_from(problem)[0], mount), measured)
 
 
 def oriented(problem: SpatialProblem, estimate: SpatialEstimate, weight: FloatArray) -> FloatArray:

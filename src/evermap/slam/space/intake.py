@@ -14,7 +14,7 @@ from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries
 from evermap.slam.space.linearise import CORNERS, POINT, POSE
-from evermap.slam.space.problem import USUAL, SpatialProblem
+from evermap.slam.space.problem import USUAL, OdometryPath, SpatialProblem
 from evermap.types import ANY_RANGE_M2, UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording, rows_of
 
 HARDLY = 1.0
@@ -99,6 +99,7 @@ def prepare_space(
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
         mount_sigma=np.tile(_mount_sigma(settings), (len(recording.sensors), 1)),
         scale_sigma=settings.scale_sigma if driven and by_corners else 0.0,
+        path=_path(recording, stamps[pose_frame[0]]),
         settings=settings,
     )
     return SpatialIntake(
@@ -347,6 +348,13 @@ def _roots(covariance: FloatArray, at: FloatArray) -> FloatArray:
 def _mount_sigma(settings: SpaceConfig) -> FloatArray:
     """(7,) of a mount's twist, and of the delay."""
     return np.array([settings.mount_sigma_m] * 3 + [settings.mount_sigma_rad] * 3 + [settings.delay_sigma_s])
+
+
+def _path(recording: SpatialRecording, start_s: float) -> OdometryPath | None:
+    odometry = recording.odometry
+    if odometry is None or len(odometry) < 2:
+        return None
+    return OdometryPath(odometry.stamp_s - start_s, odometry.pose_world_robot)
 
 
 def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -16,6 +16,7 @@ from evermap.slam.kernels3d import (
     point_residual,
     pose_residual,
     position_residual,
+    retract,
 )
 from evermap.types import FloatArray, IntArray
 
@@ -149,7 +150,7 @@ def linearise_odometry(
 
 @kernel
 def linearise_sightings(
-    pose: FloatArray, place: FloatArray, mount: FloatArray, velocity: FloatArray, level: FloatArray,
+    pose: FloatArray, place: FloatArray, mount: FloatArray, back: FloatArray, speed: FloatArray, level: FloatArray,
     seen: SpatialSightings, heavy: bool, values: FloatArray, weight: FloatArray, residual: FloatArray,
 ) -> float:  # fmt: skip
     """Linearise the detections.
@@ -158,7 +159,8 @@ def linearise_sightings(
         pose: (N, 7) poses.
         place: (P, 7) places; of points the orientation is not looked at.
         mount: (S, 7) poses of the sensors on the robot.
-        velocity: (N, 6) twist of the robot a second, by which late stamps count.
+        back: (S, N, 6) twist from each pose to that at which a detection was made, before its stamp.
+        speed: (S, N, 6) twist of the robot a second there.
         level: (6,) noise levels.
         seen: the detections.
         heavy: tails that never let go, while the estimate may be far off.
@@ -170,16 +172,22 @@ def linearise_sightings(
         Negative log likelihood, up to a constant.
     """
     e, jx, jl, jm = np.zeros(8), np.zeros((8, 6)), np.zeros((8, 6)), np.zeros((8, 6))
-    cost = 0.0
+    cost, here, moved, still = 0.0, np.zeros(7), np.zeros(7), np.zeros(7)
+    still[6] = 1.0
     for m in range(len(seen.kind)):
         kind, i, p, s = seen.kind[m], seen.pose_row[m], seen.place[m], seen.sensor[m]
         dim = 6 if seen.oriented[m] else 3
+        here[:] = pose[i]
+        late = np.any(back[s, i] != 0.0)
+        if late:
+            retract(pose[i], back[s, i], here)
+            retract(still, back[s, i], moved)
         if kind == CORNERS:
             rows = 8
-            _corners(pose[i], place[p], mount[s], seen, m, level[PIXEL], e, jx, jl, jm)
+            _corners(here, place[p], mount[s], seen, m, level[PIXEL], e, jx, jl, jm)
         else:
             rows = 6 if kind == POSE else 3
-            _position_or_pose(pose[i], place[p], mount[s], seen, m, level, e, jx, jl, jm)
+            _position_or_pose(here, place[p], mount[s], seen, m, level, e, jx, jl, jm)
         squared = 0.0
         for a in range(rows):
             squared += e[a] * e[a]
@@ -188,17 +196,32 @@ def linearise_sightings(
         cost += seen.share[m] * loss
         scale, at = math.sqrt(weight[m] * seen.share[m]), seen.first[m]
         for a in range(rows):
-            late = 0.0
+            by_delay = 0.0
+            for b in range(6):
+                by_delay -= jx[a, b] * speed[s, i, b]
+                values[at + 6 + dim + b] = scale * jm[a, b]
+            if late:
+                _before_moving(jx[a], moved)
             for b in range(6):
                 values[at + b] = scale * jx[a, b]
-                late += jx[a, b] * velocity[i, b]
-                values[at + 6 + dim + b] = scale * jm[a, b]
             for b in range(dim):
                 values[at + 6 + b] = scale * jl[a, b]
-            values[at + 12 + dim] = scale * late
+            values[at + 12 + dim] = scale * by_delay
             values[at + 13 + dim] = -scale * e[a]
             at += 14 + dim
     return cost
+
+
+@kernel
+def _before_moving(row: FloatArray, moved: FloatArray) -> None:
+    """Turn derivatives (6,) by a twist after a motion (7,) into those by a twist before it, in place."""
+    r, (x, y, z), (u, v, w) = matrix_of(moved), (row[0], row[1], row[2]), (row[3], row[4], row[5])
+    for b in range(3):
+        row[b] = x * r[3 * b] + y * r[3 * b + 1] + z * r[3 * b + 2]
+        row[3 + b] = u * r[3 * b] + v * r[3 * b + 1] + w * r[3 * b + 2]
+    row[3] -= row[1] * moved[2] - row[2] * moved[1]
+    row[4] -= row[2] * moved[0] - row[0] * moved[2]
+    row[5] -= row[0] * moved[1] - row[1] * moved[0]
 
 
 @kernel

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,6 +75,13 @@ class PlacePrior:
         return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 7)), np.ones((0, 6)), np.ones(0))
 
 
+class OdometryPath(NamedTuple):
+    """Poses (K, 7) of the odometry at stamps (K,)."""
+
+    stamp_s: FloatArray
+    pose: FloatArray
+
+
 @dataclass(frozen=True, slots=True)
 class SpatialProblem:
     """All measurements and priors.
@@ -101,6 +109,7 @@ class SpatialProblem:
         scale_sigma: standard deviation of the logarithm of the odometry's scale; 0 where it is exact.
         prior: on places.
         start_sigma: (6,) how firmly the first pose is held where it is.
+        path: the odometry, in the time of the poses, from which delays are estimated; None without.
         settings: what is believed of sensors and of a map.
     """
 
@@ -130,16 +139,27 @@ class SpatialProblem:
     steady: bool = False
     scale_sigma: float = 0.0
     start_sigma: FloatArray = field(default_factory=lambda: np.full(6, 1e-4))
+    path: OdometryPath | None = None
     settings: SpaceConfig = USUAL
 
-    @property
-    def velocity(self) -> FloatArray:
-        """Return (N, 6) twist a second by the odometry; zeros without."""
-        twist = se3.log(self.increment) / np.maximum(np.diff(self.stamp_s), 1e-6)[:, None]
-        if not self.driven or not len(twist):
-            return np.zeros((len(self.stamp_s), 6))
-        ends = np.vstack([twist[:1], twist, twist[-1:]])
-        return np.asarray(0.5 * (ends[:-1] + ends[1:]))
+    def earlier(self, delay: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return (S, N, 6) twists by the odometry from each pose to where the robot was a `delay` (S,) before, and
+        (S, N, 6) those a second there.
+
+        Zeros of sensors whose stamps are exact, and without odometry.
+        """
+        back, speed = np.zeros((2, len(delay), len(self.stamp_s), 6))
+        if self.path is None:
+            return back, speed
+        step_s = float(np.median(np.diff(self.path.stamp_s)))
+        for row in np.flatnonzero(self.mount_sigma[:, 6] > 0.0):
+            stamp_s = np.array([0.0, -step_s, 0.0, step_s])[:, None] + self.stamp_s
+            stamp_s[1:] -= delay[row]
+            stamp_s = np.clip(stamp_s, *self.path.stamp_s[[0, -1]])
+            now, before, then, after = (se3.interpolate(*self.path, each) for each in stamp_s)
+            back[row] = se3.local(now, then)
+            speed[row] = se3.local(before, after) / np.maximum(stamp_s[3] - stamp_s[1], 1e-6)[:, None]
+        return back, speed
 
     @property
     def either(self) -> FloatArray:
@@ -214,3 +234,14 @@ class SpatialEstimate:
     def mount(self, problem: SpatialProblem) -> FloatArray:
         """Return (S, 7) the sensors' poses on the robot."""
         return se3.retract(problem.mount, self.state[:, :6])
+
+    @property
+    def delay(self) -> FloatArray:
+        """(S,) seconds by which the sensors' stamps are late."""
+        return np.ascontiguousarray(self.state[:, 6])
+
+    def seen_from(self, problem: SpatialProblem) -> tuple[FloatArray, FloatArray]:
+        """Return (M, 7) the robot's pose when each detection was made, and (M, 6) the twist there from its stamp's."""
+        back = problem.earlier(self.delay)[0][problem.sensor, problem.pose_row]
+        pose = self.pose[problem.pose_row]
+        return se3.retract(pose, back) if back.any() else pose, back

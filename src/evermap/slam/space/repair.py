@@ -155,13 +155,14 @@ def _better_poses(problem: SpatialProblem, estimate: SpatialEstimate, noise: Spa
     cost = _cost_of_frames(problem, estimate, noise)
     best, pose = cost.copy(), estimate.pose.copy()
     mount = estimate.mount(problem)[problem.sensor]
+    seen_from, back = estimate.seen_from(problem)
     oriented_place = problem.oriented[problem.place]
     rank = np.arange(len(problem.place)) - np.searchsorted(problem.pose_row, problem.pose_row)
     symmetries, place = problem.symmetries[problem.place], estimate.place[problem.place]
     for measured in problem.explanations:
         seen = se3.compose(mount, measured)
-        turned = symmetries.twisted(place, se3.compose(estimate.pose[problem.pose_row], seen))
-        suggested = se3.compose(turned, se3.inverse(seen))
+        turned = symmetries.twisted(place, se3.compose(seen_from, seen))
+        suggested = se3.retract(se3.compose(turned, se3.inverse(seen)), -back)
         for k in range(int(rank.max(initial=-1)) + 1):
             some = np.flatnonzero((rank == k) & oriented_place)
             rows = problem.pose_row[some]
@@ -188,8 +189,8 @@ def _cost_of_frames(problem: SpatialProblem, estimate: SpatialEstimate, noise: S
     values, weight = np.empty(int(seen.first[-1])), np.empty(len(seen.kind))
     residual = np.zeros((len(seen.kind), 8))
     linearise_sightings(
-        estimate.pose, estimate.place, estimate.mount(problem), problem.velocity, noise.levels, seen, False, values,
-        weight, residual,
+        estimate.pose, estimate.place, estimate.mount(problem), *problem.earlier(estimate.delay), noise.levels, seen,
+        False, values, weight, residual,
     )  # fmt: skip
     squared = (residual**2).sum(axis=1)
     d = 0.5 * squared - seen.log_odds[seen.kind]

@@ -32,7 +32,7 @@ from evermap.types import (
     landmark_id_of,
 )
 
-MOUNT = "correction of the sensor's stated mount, or delay of its stamps"
+MOUNT = "correction of the sensor's stated mount, in the sensor's axes, or seconds by which its stamps are late"
 SCALE = "true distances over those of the odometry, by the sizes of tags"
 _LEVELS = {
     TRANSLATION: ("sigma_odometry_m", "m/sqrt(s)", "noise of the odometry's translation"),

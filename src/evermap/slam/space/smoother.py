@@ -58,7 +58,6 @@ class SpatialSmoother:
     def __init__(self, problem: SpatialProblem, around: FloatArray) -> None:
         self.problem = problem
         self._seen = problem.sightings
-        self._velocity = problem.velocity
         self._states = _information(np.append(problem.mount_sigma, problem.scale_sigma))
         self._start = np.array(around[0])
         self.system = self._structured(around)
@@ -115,8 +114,8 @@ class SpatialSmoother:
         )  # fmt: skip
         end = odometry + int(self._seen.first[-1])
         cost += linearise_sightings(
-            estimate.pose, estimate.place, estimate.mount(problem), self._velocity, noise.levels, self._seen, heavy,
-            values[odometry:end], weight, residual,
+            estimate.pose, estimate.place, estimate.mount(problem), *problem.earlier(estimate.delay), noise.levels,
+            self._seen, heavy, values[odometry:end], weight, residual,
         )  # fmt: skip
         held = se3.local(self._start, estimate.pose[0])
         root = 1.0 / problem.start_sigma
