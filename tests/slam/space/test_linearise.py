@@ -24,7 +24,7 @@ STEP = 1e-6
 
 
 def a_sighting(
-    kind: int, oriented: bool, seed: int, alike: Symmetry | None = None
+    kind: int, oriented: bool, seed: int, alike: Symmetry | None = None, *, ray: bool = False
 ) -> tuple[SpatialSightings, np.ndarray, np.ndarray, np.ndarray]:
     random = np.random.default_rng(seed)
     pose = se3.exp(random.normal(0.0, 0.5, (1, 6)))
@@ -54,6 +54,7 @@ def a_sighting(
         axis=np.array([-1, alike.axis]),
         first_turn=np.array([0, 1, 1 + len(alike.turns)]),
         turns=np.vstack([Symmetry().turns, alike.turns]),
+        ray=np.array([ray]),
     )
     return seen, pose, place, mount
 
@@ -67,7 +68,7 @@ def residuals(seen, pose, place, mount, velocity, delay=0.0) -> tuple[np.ndarray
 
 
 KINDS = [
-    (POINT, False, None), (POINT, True, None), (POSE, True, None), (CORNERS, True, None),
+    (POINT, False, None), (POINT, True, None), (POSE, True, None), (CORNERS, True, None), (POINT, False, "ray"),
     (POSE, True, ("90:z", "90:x")), (POSE, True, ("axis:y",)), (POSE, True, ("axis:z", "180:x")),
 ]  # fmt: skip
 
@@ -76,8 +77,9 @@ KINDS = [
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("kind", "oriented", "alike"), KINDS)
 def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, alike, seed, delay):
-    symmetry = Symmetry.generated(alike or ())
-    seen, pose, place, mount = a_sighting(kind, oriented, seed, symmetry)
+    ray = alike == "ray"
+    symmetry = Symmetry.generated(() if ray else alike or ())
+    seen, pose, place, mount = a_sighting(kind, oriented, seed, symmetry, ray=ray)
     place = se3.compose(place, np.append(np.zeros(3), symmetry.turns[-1])) if oriented else place
     velocity = np.random.default_rng(seed).normal(0.0, 1.0, (1, 6))
     at, block = residuals(seen, pose, place, mount, velocity, delay)

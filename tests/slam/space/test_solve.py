@@ -298,6 +298,24 @@ def test_points_of_which_only_the_direction_is_seen_are_triangulated_along_the_o
     assert 0.8 < np.nanmean(result.innovations.nis / result.innovations.dof) < 1.2
 
 
+@pytest.mark.parametrize("drift", [0.003, 0.02])
+def test_directions_shrink_no_world(drift):
+    """Rounds in a hall: nothing but the odometry tells the size, and the path is better than by that alone."""
+    recording = hall(1, n_points=40, n_frames=400, drift=drift)
+    seen = recording.detections
+    ray = seen.position_sensor_m / np.linalg.norm(seen.position_sensor_m, axis=1, keepdims=True)
+    along = ray[:, :, None] * ray[:, None, :]
+    covariance = 0.01**2 * (np.eye(3) - along) + 1e9 * along
+    directions = replace(seen, position_sensor_m=ray, covariance_sensor_m2=covariance)
+    told = replace(recording, detections=rows_of(directions, seen.landmark_id >= 0))
+    result = run_slam(told)
+    found = compare_with_truth(told, result, rate_hz=2.5)
+    robot, alone = (float(np.sqrt(np.mean(of.position_error_m**2))) for of in (found.poses, found.dead_reckoning))
+    assert robot < 0.75 * alone
+    at, true = (each.pose_world_robot[:, :3] for each in (result.trajectory, recording.truth))
+    assert np.ptp(at, axis=0)[:2].sum() == pytest.approx(np.ptp(true, axis=0)[:2].sum(), rel=0.1)
+
+
 def test_directions_without_odometry_are_left_out():
     recording = as_directions(tagged_corridor(0, odometry=False), 0)
     with pytest.raises(DataError, match="seen in 0 frames"):

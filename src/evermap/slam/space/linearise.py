@@ -18,7 +18,7 @@ from evermap.slam.kernels3d import (
     position_residual,
     retract,
 )
-from evermap.types import FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
 POINT, POSE, CORNERS = 0, 1, 2
 """What a detection gives: a position, a position and an orientation, or the corners of a tag in an image."""
@@ -59,6 +59,7 @@ class SpatialSightings(NamedTuple):
         axis: (K,) axes about which any turn does, of these; -1 without.
         first_turn: (K + 1,) rows of `turns` of each.
         turns: (T, 4) quaternions.
+        ray: (M,) detections of a direction alone.
     """
 
     pose_row: IntArray
@@ -79,6 +80,7 @@ class SpatialSightings(NamedTuple):
     axis: IntArray
     first_turn: IntArray
     turns: FloatArray
+    ray: BoolArray
 
 
 @kernel
@@ -243,6 +245,8 @@ def _position_or_pose(
         pose_residual(pose, place, mount, seen.measured[m], e, jx, jl, jm)
     else:
         point_residual(pose, place, mount, seen.measured[m], e, jx, jl, jm)
+    if seen.ray[m]:
+        _by_range(seen.measured[m], e, jx, jl, jm)
     _whitened(seen.root[m], level, e.reshape(8, 1))
     for part in (jx, jl, jm):
         _whitened(seen.root[m], level, part)
@@ -254,6 +258,25 @@ def _position_or_pose(
                 jx[a, b] *= factor
                 jl[a, b] *= factor
                 jm[a, b] *= factor
+
+
+@kernel
+def _by_range(measured: FloatArray, e: FloatArray, jx: FloatArray, jl: FloatArray, jm: FloatArray) -> None:
+    """Scale the residual of a position by its measured over its predicted range, in place.
+
+    The range of a direction is a triangulated one, from which its noise in metres was made. By that alone, everything
+    would fit better the nearer it is.
+    """
+    x, y, z = measured[0] - e[0], measured[1] - e[1], measured[2] - e[2]
+    r = max(math.sqrt(x * x + y * y + z * z), BEHIND)
+    factor = math.sqrt(measured[0] ** 2 + measured[1] ** 2 + measured[2] ** 2) / r
+    for part in (jx, jl, jm):
+        for b in range(6):
+            longer = (x * part[0, b] + y * part[1, b] + z * part[2, b]) / (r * r)
+            for a in range(3):
+                part[a, b] = factor * (part[a, b] + e[a] * longer)
+    for a in range(3):
+        e[a] *= factor
 
 
 @kernel

@@ -207,6 +207,7 @@ class SpatialProblem:
             np.array(self.settings.outlier_log_odds),
             self.symmetries.of[self.place], np.array([kind.axis for kind in kinds]),
             np.append(0, np.cumsum([len(kind.turns) for kind in kinds])), np.vstack([kind.turns for kind in kinds]),
+            self.ray,
         )  # fmt: skip
 
     def as_points(self) -> SpatialProblem:
