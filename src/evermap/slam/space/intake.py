@@ -34,6 +34,7 @@ class SpatialIntake:
         driven_pose: (N, 7) poses by the odometry, from the identity; all identity without.
         warnings: what was left out, counted.
         names: texts behind landmark ids.
+        boxes: (P,) landmarks that are boxes at rest.
     """
 
     problem: SpatialProblem
@@ -44,6 +45,7 @@ class SpatialIntake:
     driven_pose: FloatArray
     warnings: tuple[str, ...]
     names: Mapping[int, str] = field(default_factory=dict)
+    boxes: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
 
 def prepare_space(
@@ -104,7 +106,7 @@ def prepare_space(
     )
     return SpatialIntake(
         problem, float(stamps[pose_frame[0]]), pose_frame, used, landmark_id, driven_pose, tuple(warnings),
-        recording.landmark_names,
+        recording.landmark_names, np.bincount(place, np.isfinite(detections.size_m[used]).all(axis=1)) > 0.0,
     )  # fmt: skip
 
 

@@ -219,7 +219,9 @@ def rejoined(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProble
     return replace(problem, place=place), replace(estimate, place=at)
 
 
-def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, SpatialEstimate, IntArray] | None:
+def split(
+    optimum: SpatialOptimum, identity: IntArray, whole: BoolArray
+) -> tuple[SpatialProblem, SpatialEstimate, IntArray] | None:
     """Return the problem with places of their own for landmarks that carry the identity of others; None without any.
 
     Of a landmark that was never seen where a map has it the first of them is its own: it was moved there.
@@ -227,6 +229,7 @@ def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, 
     Args:
         optimum: with outliers.
         identity: (P,) rows of landmarks that the places are of; grows by that of each new place.
+        whole: (L,) landmarks that are one each, as boxes that were followed: outliers are errors.
     """
     problem, estimate = optimum.smoother.problem, optimum.estimate
     settings = problem.settings.repair
@@ -234,7 +237,7 @@ def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, 
     located = np.zeros(len(estimate.pose), dtype=np.bool_)
     located[problem.pose_row[~outlier]] = True
     located |= problem.driven
-    asked = outlier & located[problem.pose_row]
+    asked = outlier & located[problem.pose_row] & ~whole[identity[problem.place]]
     at = as_seen(problem, estimate, problem.measured)
     place, places, copied = problem.place.copy(), list[FloatArray](), list[int]()
     at_places, prior = estimate.place.copy(), problem.prior

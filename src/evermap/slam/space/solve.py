@@ -94,7 +94,7 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
         optimum = unjumped(optimum)
         problem = optimum.smoother.problem
     for _ in range(SPLITS):
-        found = split(optimum, identity)
+        found = split(optimum, identity, intake.boxes)
         if found is None:
             break
         problem, estimate, identity = found
