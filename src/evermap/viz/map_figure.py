@@ -15,7 +15,18 @@ from evermap.geometry.group import Group, group_of
 from evermap.metrics.summary import Evaluation
 from evermap.types import AnyRecording, BoolArray, ChangeKind, FloatArray, Landmarks, MapChange, SlamResult
 from evermap.viz.change_words import near_alternatives, probability, what
-from evermap.viz.panels import View, corners_of, draw_shapes, height_over_width, lay_out, moved_map, seen, with_breaks
+from evermap.viz.panels import (
+    View,
+    box_sizes,
+    corners_of,
+    draw_shapes,
+    footprints,
+    height_over_width,
+    lay_out,
+    moved_map,
+    seen,
+    with_breaks,
+)
 from evermap.viz.style import (
     ALERT,
     ESTIMATE,
@@ -52,6 +63,7 @@ class _Scene:
         mapped: (S,) which of the surveyed landmarks the map has.
         landmarks, gone: the map.
         changed: what changed.
+        followed: class and (K, D) positions of what moved, a stretch each.
     """
 
     path_m: FloatArray
@@ -62,25 +74,34 @@ class _Scene:
     landmarks: Landmarks
     gone: Landmarks
     changed: Sequence[Move]
+    followed: Sequence[tuple[str, FloatArray]] = ()
+
+    @property
+    def street(self) -> bool:
+        """Whether most landmarks are boxes: drawn by their outlines, from above alone."""
+        return 2 * int(np.count_nonzero(_boxes(self.landmarks))) > len(self.landmarks)
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
         """Return the corners of the required content; odometry and a larger survey may exceed it."""
         moved = [part for move in self.changed for part in (move.before_m, move.after_m)]
         survey = None if self.survey_m is None else self.survey_m[self.mapped]
         true = [part for part in (self.truth_m, survey) if part is not None]
-        return corners_of([self.path_m, self.landmarks.position_m, self.gone.position_m, *moved, *true])
+        ways = [way for _, way in self.followed]
+        return corners_of([self.path_m, self.landmarks.position_m, self.gone.position_m, *moved, *true, *ways])
 
 
 def draw_map(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) -> NamedFigure:
     """Draw path and map from above, in space from the side too: in the frame of the truth where there is one, else in
-    the map's own; what changed, with arrows.
+    the map's own; what changed, with arrows, and the ways of what moved.
     """
     scene = _scene(recording, result, evaluation)
     low, high = scene.corners()
+    low, high = (low[:2], high[:2]) if scene.street else (low, high)
     changed, names = scene.changed, class_names_of(scene.landmarks)
     lines = 1 + (len(changed) if len(changed) <= _MOST_LINES else 1) + (len(set(names)) + 6) // 4
     highest = 7.2 if len(low) == 2 else 8.2
-    height_in = float(np.clip(6.6 * height_over_width(high - low), 2.6, highest)) + 0.65 + 0.18 * lines
+    lowest = 1.6 if scene.street else 2.6
+    height_in = float(np.clip(6.6 * height_over_width(high - low), lowest, highest)) + 0.65 + 0.18 * lines
     figure = new_figure(7.2, height_in)
     panels = lay_out(figure, low, high)
     (moved, *_) = [_draw_panel(axes, view, scene, low, high) for axes, view in panels]
@@ -118,6 +139,10 @@ def _scene(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) 
         landmarks=moved_map(result.landmarks, pose_truth_map),
         gone=moved_map(result.gone, pose_truth_map),
         changed=moves(result, pose_truth_map),
+        followed=[
+            (result.followed.table.class_names[kind], group.transform(pose_truth_map, way[:, :size]))
+            for kind, way in ([] if result.followed is None else moving_paths(result.followed))
+        ],
     )
 
 
@@ -126,7 +151,7 @@ def _draw_panel(axes: Axes, view: View, scene: _Scene, low: FloatArray, high: Fl
     faint = 0.5 if scene.changed else 1.0  # paths step back behind what changed
     if len(scene.odometry_m):
         drifted = _thin(scene.odometry_m)
-        leaves = bool(np.any((drifted < low) | (drifted > high)))
+        leaves = bool(np.any((drifted[:, : len(low)] < low) | (drifted[:, : len(low)] > high)))
         label = "odometry alone" + (" (leaves the figure)" if leaves else "")
         axes.plot(*drifted[:, view].T, color=ODOMETRY, lw=0.8, alpha=0.65 * faint, label=label, zorder=1)
     if scene.truth_m is not None:
@@ -176,11 +201,15 @@ def _draw_landmarks(axes: Axes, view: View, scene: _Scene, reach_m: float) -> No
     for name in sorted(set(names)):
         look, mine = looks[name], [k for k, other in enumerate(names) if other == name]
         label = legend_name(name) or ("mapped landmark" if set(names) == {""} else "class unknown")
-        axes.plot(*landmarks.position_m[mine].T, look.marker, color=look.colour, ms=4.5, mec=PAPER, mew=0.4,
-                  label=label, zorder=6)  # fmt: skip
+        at = np.where(scene.street, np.nan, landmarks.position_m[mine])
+        axes.plot(*at.T, look.marker, color=look.colour, ms=4.5, mec=PAPER, mew=0.4, label=label, zorder=6)
+    _draw_ways(axes, view, scene, 0.02 * reach_m)
     if len(landmarks) == 0:
         return
     colours = np.array([looks[name].colour for name in names])
+    if scene.street:
+        _draw_footprints(axes, scene.landmarks, colours)
+        return
     factor = magnification(scene.landmarks.covariance_m2, reach_m)
     draw_shapes(axes, scene.landmarks, view, colours, reach_m, _thin(scene.path_m))
     label = draw_ellipses(axes, landmarks.position_m, landmarks.covariance_m2, colours, factor)
@@ -188,6 +217,51 @@ def _draw_landmarks(axes: Axes, view: View, scene: _Scene, reach_m: float) -> No
     if len(landmarks) <= LABELS_UP_TO:
         ids = landmarks.landmark_id.tolist()
         label_points(axes, landmarks.position_m, [landmarks.names.get(name, str(name)) for name in ids])
+
+
+def _draw_ways(axes: Axes, view: View, scene: _Scene, least_m: float) -> None:
+    """Draw the ways of what moved at least so far, in the colour of its class, to where it was seen last."""
+    looks = class_looks(tuple(sorted({*scene.landmarks.class_names, *(name for name, _ in scene.followed)})))
+    far = [(name, way) for name, way in scene.followed if np.linalg.norm(np.ptp(way, axis=0)) > least_m]
+    for k, (name, way) in enumerate(far):
+        label = "seen moving, and where last" if k == 0 else None
+        axes.plot(*way[:, view].T, color=looks[name].colour, lw=0.9, alpha=0.8, ls=(0, (3, 1)), label=label, zorder=4)
+        axes.plot(*way[-1, view], looks[name].marker, mfc=PAPER, mec=looks[name].colour, ms=3.5, mew=0.9, zorder=5)
+
+
+def _draw_footprints(axes: Axes, landmarks: Landmarks, colours: Any) -> None:
+    """Draw boxes from above, the fuller the more probable it is that they are still there."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_rgba
+    from matplotlib.lines import Line2D
+
+    rows = _boxes(landmarks)
+    corners = list(footprints(landmarks, rows))
+    faces = [to_rgba(colour, 0.75 * p) for colour, p in zip(colours[rows], landmarks.p_exists[rows], strict=True)]
+    axes.add_collection(PolyCollection(corners, facecolors=faces, edgecolors=colours[rows], linewidths=0.6, zorder=5.5))
+    axes.add_line(Line2D([], [], ls="", marker="s", mfc="none", mec=MUTED, ms=6, label="box, filled by P(exists)"))
+
+
+def _boxes(landmarks: Landmarks) -> BoolArray:
+    """(L,) landmarks with a size and an orientation."""
+    if landmarks.rotation is None:
+        return np.zeros(len(landmarks), dtype=np.bool_)
+    sized = np.column_stack([landmarks.rotation, box_sizes(landmarks)])
+    return np.asarray(np.isfinite(sized).all(axis=1))
+
+
+def moving_paths(result: Any) -> list[tuple[int, FloatArray]]:
+    """Return class and (K, 3) positions of each stretch in which an object of a `TrackResult` was seen moving."""
+    tracks = result.objects()
+    frame = np.searchsorted(result.table.stamp_s, tracks.stamp_s)
+    rows = np.flatnonzero(~tracks.static)
+    ends = np.flatnonzero((np.diff(tracks.track_id[rows]) != 0) | (np.diff(frame[rows]) != 1)) + 1
+    ids, class_of_track = np.unique(tracks.track_id), result.class_of_track()
+    return [
+        (int(class_of_track[np.searchsorted(ids, tracks.track_id[part[0]])]), tracks.position_m[part])
+        for part in np.split(rows, ends)
+        if len(part) > 1
+    ]
 
 
 def draw_gone(axes: Axes, gone: Landmarks) -> None:

@@ -161,6 +161,12 @@ def box_edges(landmarks: Landmarks, rows: BoolArray) -> FloatArray:
     return corners[:, _EDGES]
 
 
+def footprints(landmarks: Landmarks, rows: BoolArray) -> FloatArray:
+    """Return the corners (K, 4, 2) of the boxes in some rows from above, in order."""
+    around = _CORNERS[[0, 2, 6, 4]] * box_sizes(landmarks)[rows][:, None]
+    return se3.transform(landmark_poses(landmarks)[rows][:, None], around)[..., :2]
+
+
 def landmark_poses(landmarks: Landmarks) -> FloatArray:
     """Return poses (L, 7) of landmarks in space, nan where there is no orientation."""
     rotation = np.full((len(landmarks), 4), np.nan) if landmarks.rotation is None else landmarks.rotation

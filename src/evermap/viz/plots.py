@@ -26,7 +26,7 @@ from evermap.types import (
 )
 from evermap.viz.lifetime_figures import plot_lifetimes, plot_survival
 from evermap.viz.living_map_figures import MapView, plot_living_map
-from evermap.viz.map_figure import draw_map
+from evermap.viz.map_figure import draw_map, moving_paths
 from evermap.viz.panels import corners_of, height_over_width, lay_out
 from evermap.viz.style import (
     ALERT,
@@ -116,27 +116,13 @@ def plot_track_run(result: Any) -> Figure:
     table = result.table
     return plot_objects(
         table.class_names,
-        _paths(result),
+        [(kind, way[:, :2]) for kind, way in moving_paths(result)],
         result.spells,
         start_s=float(table.stamp_s[0]),
         end_s=float(table.stamp_s[-1]),
         sensor_m=None if table.sensor_m is None else table.sensor_m[:, :2],
         clock=guess_clock(table.stamp_s),
     )
-
-
-def _paths(result: Any) -> list[tuple[int, FloatArray]]:
-    """Class and (K, 2) positions of each stretch in which an object was followed and did not rest."""
-    tracks = result.objects()
-    frame = np.searchsorted(result.table.stamp_s, tracks.stamp_s)
-    rows = np.flatnonzero(~tracks.static)
-    ends = np.flatnonzero((np.diff(tracks.track_id[rows]) != 0) | (np.diff(frame[rows]) != 1)) + 1
-    ids, class_of_track = np.unique(tracks.track_id), result.class_of_track()
-    return [
-        (int(class_of_track[np.searchsorted(ids, tracks.track_id[part[0]])]), tracks.position_m[part, :2])
-        for part in np.split(rows, ends)
-        if len(part) > 1
-    ]
 
 
 def plot_trajectory(trajectory: Trajectory) -> Figure:
