@@ -61,6 +61,7 @@ HERE, THERE, FAR = (1.0, 2.0), (4.0, 2.0), (9.0, 9.0)
         pytest.param([[told(VANISHED, 5)], []], a_map({5: HERE}), a_map({}, (5,)), VANISHED, id="one change as it was"),
         pytest.param([[told(VANISHED, 5)], [told(RETURNED, 5, by=(0.0, 0.0))]], a_map({5: HERE}), a_map({5: HERE}),
                      None, id="left and came back"),
+        pytest.param([[told(VANISHED, 5)], []], a_map({5: HERE}), a_map({5: HERE}), None, id="had never left"),
         pytest.param([[told(VANISHED, 5)], [told(RETURNED, 5, by=(3.0, 0.0))]], a_map({5: HERE}), a_map({5: THERE}),
                      MOVED, id="left and came back elsewhere"),
         pytest.param([[told(MOVED, 5, by=(1.0, 0.0))], [told(MOVED, 5, by=(2.0, 0.0))]], a_map({5: HERE}),

@@ -142,7 +142,7 @@ def net(
     known, stood, stands = set(a.members.landmark_id.tolist()), _standing(a), _standing(b)
     groups: dict[tuple[tuple[int, ...], bool, bool, bool], list[int]] = {}
     for name, numbers in sorted(steps.items(), key=lambda item: (item[1], item[0])):
-        ends = (True, True) if forth else (name in stood, name in stands)
+        ends = (True, not (told[numbers[-1]].goes and name in stands)) if forth else (name in stood, name in stands)
         groups.setdefault((tuple(numbers), name in known, *ends), []).append(name)
     found: list[MapChange] = []
     for (row, was_known, before, after), names in groups.items():
@@ -150,6 +150,8 @@ def net(
         only = path[0].change
         if forth and not was_known and only.kind is not ChangeKind.APPEARED:
             continue  # the map grew by it
+        if forth and not after:
+            continue  # it had never left, as a later session saw
         if forth and len(path) == 1 and len(names) == len(only.landmark_ids):
             found.append(only)
             continue

@@ -79,7 +79,7 @@ def decided(
     after = replace(
         after,
         stays=session.stays(),
-        sites=replace(after.sites, p_kept=session.p_kept),
+        sites=replace(after.sites, p_kept=session.p_kept, since_s=session.since_s),
         sightlines=after.sightlines.after_session(hidden, shown),
     )
     return after, with_swaps(session.found, before, after, settings)
@@ -95,7 +95,7 @@ class _Session:
         least: (C,) evidence against it that it takes to tell that it vanished; least_evidence: that it was missed.
         hits, misses: (S,) by site; was_hit: (C,) whether it was seen at any of its sites.
         newest: row of the last stay by clique.
-        last_s, gone_s, p_gone: (K,) of the stays; p_kept: (S,) of the sites.
+        last_s, gone_s, p_gone: (K,) of the stays; p_kept, since_s: (S,) of the sites.
         settings: of decisions.
         hidden, shown: (3,) expected numbers of cliques that were there and not seen, and seen, by `PlaceLooks.sight`.
         begun: clique, site, not there before, first and last sighting of new stays; when they ended, and how probably.
@@ -122,6 +122,7 @@ class _Session:
     gone_s: FloatArray
     p_gone: FloatArray
     p_kept: FloatArray
+    since_s: FloatArray
     hidden: FloatArray
     shown: FloatArray
     begun: list[tuple[int, int, float, float, float, float, float]]
@@ -175,6 +176,7 @@ class _Session:
             gone_s=stays.gone_s.copy(),
             p_gone=stays.p_gone.copy(),
             p_kept=sites.p_kept.copy(),
+            since_s=sites.since_s.copy(),
             hidden=np.zeros(3),
             shown=np.zeros(3),
             begun=[],
@@ -222,6 +224,8 @@ class _Session:
         self.hidden[self._sight(row)] += share * self.p_gone[newest] if same else 0.0
         if same and share >= 1.0 - EXISTS:  # it had never left
             self.last_s[newest], self.gone_s[newest], self.p_gone[newest] = seen_s, np.inf, 0.0
+            at = _row(self.before, int(sites.site_id[site]))
+            self.since_s[site] = self.before.sites.since_s[at] if at >= 0 else self.since_s[site]
             return
         kind, elsewhere_s, probability = self._since_when(site, newest, same, share)
         if newest >= 0:
