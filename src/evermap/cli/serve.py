@@ -19,7 +19,16 @@ from urllib.parse import urlsplit
 
 import typer
 
-from evermap.cli.options import AsJson, ConfigFile, Settings, argument, configured, option
+from evermap.cli.options import (
+    DEFAULT_STORE,
+    STORE_VARIABLE,
+    AsJson,
+    ConfigFile,
+    Settings,
+    argument,
+    configured,
+    option,
+)
 from evermap.cli.terminal import print_json, print_table, say, warm_up, warn
 from evermap.errors import ConfigError, EvermapError, MissingExtraError, printable
 from evermap.interrupts import kept
@@ -38,10 +47,9 @@ app = typer.Typer(
 Store = Annotated[
     str,
     option(
-        "--store", "Folder of the maps, or postgresql://user@host/database.", metavar="WHERE", envvar="EVERMAP_STORE"
+        "--store", "Folder of the maps, or postgresql://user@host/database.", metavar="WHERE", envvar=STORE_VARIABLE
     ),
 ]
-_DEFAULT = "evermap-maps"
 _PATIENCE_S = 600.0
 """Waiting time of a session that indicates too few workers."""
 _MOST_UPLOADS = 10
@@ -52,7 +60,7 @@ _ASK_S = 5.0
 @app.callback()
 def serve(
     ctx: typer.Context,
-    store: Store = _DEFAULT,
+    store: Store = DEFAULT_STORE,
     host: Annotated[str, option("Address to listen on; 0.0.0.0 for all.")] = "127.0.0.1",
     port: Annotated[int, option("Port to listen on.", min=0, max=65535)] = 8080,
     workers: Annotated[int, option("Worker processes that enter sessions, see evermap work.", min=0, max=64)] = 1,
@@ -79,7 +87,7 @@ def serve(
         return
     tls = _tls(certificate, key)
     if public_url is not None and urlsplit(public_url).scheme not in ("http", "https"):
-        raise ConfigError("is not an address", field="public-url", hint="https://maps.example.com")
+        raise ConfigError("is not an address", field="--public-url", hint="https://maps.example.com")
     database = _database(store)
     uvicorn = _uvicorn()
     from evermap.server.app import Server, create_app, prepare
@@ -113,10 +121,10 @@ def _tls(certificate: Path | None, key: Path | None) -> dict[str, str]:
     if certificate is None and key is None:
         return {}
     if certificate is None or key is None:
-        raise ConfigError("TLS needs both", field="tls-cert", hint="--tls-cert FILE --tls-key FILE")
+        raise ConfigError("TLS needs both", field="--tls-cert", hint="--tls-cert FILE --tls-key FILE")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     hint = "files in PEM format, the key without a password"
-    for path, option_name in ((certificate, "tls-cert"), (key, "tls-key")):
+    for path, option_name in ((certificate, "--tls-cert"), (key, "--tls-key")):
         if not path.is_file():
             raise ConfigError("no such file", path=path, field=option_name, hint=hint)
         try:
@@ -145,7 +153,7 @@ def _listener(host: str, port: int) -> socket.socket:
         else:
             problem = f"cannot listen on port {port} of {printable(host, 60)}: {error.strerror}"
             hint = "an address of this machine, and a port from 1024 on"
-        raise ConfigError(problem, field="port", hint=hint) from None
+        raise ConfigError(problem, field="--port", hint=hint) from None
 
 
 def _print_first_token(database: Database) -> None:
@@ -176,7 +184,7 @@ def token(
     name: Annotated[str | None, argument("Name of the robot or person.", metavar="NAME", default=False)] = None,
     role: Annotated[str, option("Its permissions.", metavar="read|upload|approve|admin")] = "upload",
     revoke: Annotated[bool, option("--revoke", "Revoke the token of this name.")] = False,
-    store: Store = _DEFAULT,
+    store: Store = DEFAULT_STORE,
     as_json: AsJson = False,
 ) -> None:
     """Make a token and print it, once; without a name, list them.
@@ -221,7 +229,7 @@ def token(
 
 @app.command("doctor")
 def doctor(
-    store: Store = _DEFAULT,
+    store: Store = DEFAULT_STORE,
     url: Annotated[
         str, option("Address at which robots reach the server; '' to skip this check.", metavar="URL")
     ] = "http://127.0.0.1:8080",
@@ -309,7 +317,7 @@ def _of_address(url: str) -> tuple[str, bool, str]:
 
 
 def work(
-    store: Store = _DEFAULT,
+    store: Store = DEFAULT_STORE,
     config: ConfigFile = None,
     settings: Settings = None,
     drain: Annotated[bool, option("--drain", "Exit as soon as no session waits.")] = False,
@@ -328,9 +336,9 @@ def work(
       evermap work --store maps --drain
       evermap work --store postgresql://evermap@db/fleet --set living.search=gate
     """
+    kept(os.curdir, "a session in work returns to the queue")
     with suppress(OSError):
         os.nice(10)  # who asks the server goes first, also while this one loads its code
-    kept(os.curdir, "a session in work returns to the queue")
     chosen = configured(config, settings)
     database = _database(store)
     from evermap.server.sites import SiteStores

@@ -549,6 +549,7 @@ def approve(request: Request, site: Site, chosen: Chosen, server: Answering, who
     with server.sites.store(site) as store:
         if not 1 <= chosen.revision <= store.head():
             raise HTTPException(422, "there is no such revision")
+        server.sites.living(store, chosen.revision)  # refuses one whose content is pruned
     request.state.said = f"revision {chosen.revision}: {chosen.note}"
     server.database.approve(site, chosen.revision, who)
     return {"site": site, "approved": server.database.approved(site)}
