@@ -151,7 +151,7 @@ class Gate:
             await self._app(scope, receive, send)
             return
         request = Request(scope)
-        limits, left = _server(request).limits, 0
+        limits = _server(request).limits
         most = left = limits.n_bytes if request.url.path.endswith("/sessions") else limits.body_bytes
         refusal = await self._refusal(request, most)
 
