@@ -57,6 +57,8 @@ _UNPACKED_AT_ONCE = 2
 """Uploads that are unpacked at the same time."""
 _LEAST_COMPRESSED = 1000
 """Answers of fewer bytes are sent as they are."""
+_EFFORT = 4
+"""Of compression, 1 to 9: a tenth more bytes than at 9, in a sixth of the time."""
 _WARM = 16
 """Maps that are loaded before the first request."""
 _HEADERS = {
@@ -128,7 +130,7 @@ def create_app(server: Server) -> FastAPI:
     app = FastAPI(**about, default_response_class=PlainJSON)
     app.state.server = server
     app.include_router(router)
-    app.add_middleware(GZipMiddleware, minimum_size=_LEAST_COMPRESSED)
+    app.add_middleware(GZipMiddleware, minimum_size=_LEAST_COMPRESSED, compresslevel=_EFFORT)
     app.add_middleware(Gate)
     app.exception_handler(EvermapError)(_mistake)
     app.exception_handler(RequestValidationError)(_unread)
