@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import gzip
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,9 @@ import pytest
 from evermap.errors import InputError
 from evermap.io import columns as module
 from evermap.io.columns import Columns, csv_bytes, named, read_columns
+from evermap.io.landmarks import read_landmarks, write_map_csv
+from evermap.io.table import csv_text, parse_table
+from evermap.types import landmark_id_of
 from evermap.valid import Quantity
 
 VALUE = Quantity("value", -1e3, 1e3)
@@ -189,3 +194,41 @@ print("pandas" in sys.modules)
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "False"
+
+
+FORMULAS = ["=cmd|calc", "=1+2", "+3 kg", "@a", "-a", "'=x", "''-x", '=1,"2"', "=#", "-5 m"]
+HARMLESS = ["plain", "-5", "+1e3", "'quoted'", "a=b", "'"]
+
+
+@pytest.mark.parametrize("comment", ["", "\n# slow\n"])
+def test_no_text_is_a_formula_and_all_are_read_back(tmp_path: Path, comment: str) -> None:
+    """By both writers and all three readers; a file of another program keeps its quotes."""
+    names = [*FORMULAS, *HARMLESS]
+    texts = [csv_text({"name": names}), csv_bytes({"name": named(names, np.arange(len(names)))}).decode()]
+    for text in texts:
+        cells = [row[0] for row in csv.reader(text.splitlines())][1:]
+        assert cells == [*(f"'{name}" for name in FORMULAS), *HARMLESS]
+        path = tmp_path / "names.csv"
+        path.write_text(text + comment)
+        assert parse_table(path.read_bytes(), path, []).labels("name") == names
+        found, index = read_columns(path, []).labels("name")
+        assert [found[number] for number in index] == names
+
+
+def test_a_map_is_exported_without_formulas(tmp_path: Path) -> None:
+    names = {landmark_id_of(name): name for name in FORMULAS}
+    table = "landmark_id,x_m,y_m,class_id\n" + "".join(f"n{k},{k},0,c{k}\n" for k in range(len(FORMULAS)))
+    (tmp_path / "plain.csv").write_text(table)
+    plain = read_landmarks(tmp_path / "plain.csv")
+    hostile = replace(
+        plain,
+        landmark_id=np.array([*names], dtype=np.int64),
+        names=names,
+        class_names=tuple(FORMULAS[int(label[1:])] for label in plain.class_names),
+    )
+    write_map_csv(hostile, tmp_path / "map.csv")
+    for row in csv.reader((tmp_path / "map.csv").read_text().splitlines()):
+        assert not any(cell.startswith(("=", "+", "@")) for cell in row)
+    back = read_landmarks(tmp_path / "map.csv")
+    assert {back.names[number] for number in back.landmark_id.tolist()} == {*FORMULAS}
+    assert sorted(back.class_names) == sorted(FORMULAS)

@@ -16,6 +16,7 @@ import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,9 @@ from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sqlalchemy import text
+from typer.testing import CliRunner
 
+from evermap.cli.main import app as command
 from evermap.config import Config
 from evermap.errors import ConfigError, InputError
 from evermap.io import write_native
@@ -42,7 +45,7 @@ from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store, verify_store
 from evermap.runs.sessions import enter_session
 from evermap.server import uploads
-from evermap.server.app import Server, create_app
+from evermap.server.app import Gate, Server, _lines, create_app
 from evermap.server.database import MOST_TRIES, Database, JobState, Role
 from evermap.server.sites import SiteStores
 from evermap.server.uploads import UploadLimits, checked_digest, recording_of
@@ -478,6 +481,7 @@ def test_hostile_zips_are_refused(fleet: Fleet, zips: list[bytes], kind: str) ->
 def test_what_is_too_large_or_has_no_site_is_refused(fleet: Fleet, zips: list[bytes]) -> None:
     fleet.server.limits = UploadLimits(n_bytes=1000)
     assert fleet.upload(zips[0]).status_code == 413
+    fleet.server.limits = UploadLimits()
     for site in ("..", "%2e%2e%2fx", "a b", "x" * 49, "a;b", "%00", "server.db", 'a"b'):
         assert fleet.upload(zips[0], site=site).status_code in (404, 405, 422), site
         assert fleet("GET", f"/maps/{site}/revisions").status_code in (404, 405), site
@@ -735,15 +739,11 @@ def test_new_revisions_are_events(fleet: Fleet, zips: list[bytes], monkeypatch: 
     monkeypatch.setattr("evermap.server.app._ALIVE_S", 1e9)  # else it asks now and then
     fleet.upload(zips[0])
     fleet.worker().step()
-    served = uvicorn.Server(uvicorn.Config(create_app(fleet.server), port=0, log_level="warning"))
-    thread = threading.Thread(target=served.run)
-    thread.start()
-    while not served.started:
-        time.sleep(0.01)
-    port = served.servers[0].sockets[0].getsockname()[1]
     headers = {"Authorization": f"Bearer {fleet.tokens['read']}"}
-    address = f"http://127.0.0.1:{port}/maps/ward/events?since=0"
-    with httpx.stream("GET", address, headers=headers, timeout=30.0) as answer:
+    with (
+        served(fleet) as url,
+        httpx.stream("GET", f"{url}/maps/ward/events?since=0", headers=headers, timeout=30.0) as answer,
+    ):
         assert answer.headers["Content-Type"].startswith("text/event-stream")
         lines = answer.iter_lines()
         assert next(line for line in lines if line.startswith("id:")) == "id: 1"
@@ -763,9 +763,22 @@ def test_new_revisions_are_events(fleet: Fleet, zips: list[bytes], monkeypatch: 
         ):
             fleet(method, path, json=what)
             assert next(line for line in lines if line == "event: beside")
-    served.should_exit = True
-    thread.join()
     wait_until(lambda: not fleet.server.database.announcements.arrive)
+
+
+@contextmanager
+def served(fleet: Fleet) -> Iterator[str]:
+    """Yield the address at which a thread serves the application."""
+    server = uvicorn.Server(uvicorn.Config(create_app(fleet.server), port=0, log_level="warning"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    try:
+        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        thread.join()
 
 
 def wait_until(holds: Callable[[], bool]) -> None:
@@ -793,7 +806,8 @@ def test_the_page_is_served_without_text_that_becomes_html(fleet: Fleet) -> None
     for asked in set(re.findall(r'\$\("([a-z]+)"\)', served["page.js"].text)):
         assert f'id="{asked}"' in served[""].text
     assert "<script>" not in served[""].text
-    assert fleet.client.get("/app.py").status_code == 404
+    assert fleet.client.get("/app.py").status_code == 401
+    assert fleet("GET", "/app.py").status_code == 404
 
 
 def test_tables_of_another_version_are_one_line(tmp_path: Path) -> None:
@@ -864,3 +878,225 @@ def test_no_question_is_a_defect(fleet: Fleet, zips: list[bytes]) -> None:
         if not path.endswith("/events")
     ]
     fuzzed(fleet, asked)
+
+
+SQLITE_ONLY = pytest.mark.parametrize("where", ["sqlite"], indirect=True)
+
+
+@pytest.fixture
+def reading(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Sizes of the parts of bodies that the server has read."""
+    parts: list[int] = []
+    usual = Gate.__call__
+
+    async def counted(self: Gate, scope: Any, receive: Any, send: Any) -> None:
+        async def heard() -> Any:
+            message = await receive()
+            parts.append(len(message.get("body", b"")))
+            return message
+
+        await usual(self, scope, heard, send)
+
+    monkeypatch.setattr(Gate, "__call__", counted)
+    return parts
+
+
+@SQLITE_ONLY
+def test_no_body_is_read_without_a_token_nor_a_long_one_with_it(
+    reading: list[int], fleet: Fleet, zips: list[bytes]
+) -> None:
+    fleet.server.limits = UploadLimits(n_bytes=400_000, body_bytes=20_000)
+
+    def pieces(size: int) -> Iterator[bytes]:  # without a Content-Length
+        yield b"["
+        for _ in range(size // 1000):
+            yield b" " * 1000
+
+    def sent(path: str, role: str | None, content: Any, method: str = "POST") -> tuple[int, int]:
+        reading.clear()
+        headers = {} if role is None else {"Authorization": f"Bearer {fleet.tokens[role]}"}
+        answer = httpx.request(method, f"{url}{path}", headers=headers, content=content)
+        assert "detail" in answer.json()
+        return answer.status_code, sum(reading)
+
+    with served(fleet) as url:
+        for path, method in (("/maps/ward/pin", "POST"), ("/maps/ward/sessions", "POST"), ("/robots/x/maps", "PUT")):
+            assert sent(path, None, pieces(100_000), method) == (401, 0)
+            assert sent(path, None, b"{broken", method) == (401, 0)
+        assert sent("/maps/ward/pin", "admin", b" " * 100_000) == (413, 0)
+        for path, most in (("/maps/ward/pin", 20_000), ("/maps/ward/sessions", 400_000)):
+            status, n_bytes = sent(path, "admin", pieces(2_000_000))
+            assert (status, n_bytes < most + 300_000) == (413, True), n_bytes
+        assert sent("/maps/ward/sessions", "read", b" " * 1000) == (403, 0)
+        assert sent("/maps/ward/pin", "admin", b"{broken")[0] == 422
+    assert fleet.upload(zips[0]).status_code == 202
+
+
+@SQLITE_ONLY
+def test_strangers_are_limited_by_address_and_fill_no_audit(fleet: Fleet) -> None:
+    fleet.server.rate_hz = 0.0
+    answers = [fleet.client.post("/maps/ward/pin", headers={"Authorization": "Bearer no"}) for _ in range(210)]
+    told = [answer.status_code for answer in answers]
+    assert (told[:200], told[200:]) == ([401] * 200, [429] * 10)
+    assert fleet("GET", "/jobs", "read").status_code == 200
+    assert fleet("GET", "/audit").json() == []
+    for k in range(11_000):
+        fleet.server.admits("address", str(k))
+    assert len(fleet.server._budget) == 10_000
+
+
+@SQLITE_ONLY
+def test_what_robots_report_is_in_the_audit_when_it_changes(fleet: Fleet) -> None:
+    for version in (1, 1, 2, 2):
+        assert fleet("PUT", "/robots/upload/maps", "upload", json=[held(version)]).status_code == 200
+    assert fleet("PUT", "/robots/robot-8/maps", "upload", json=[]).status_code == 403
+    notes = fleet("GET", "/audit").json()
+    assert [(note["who"], note["status"]) for note in notes] == [("upload", 403), ("upload", 200), ("upload", 200)]
+    assert notes[1]["what"].startswith("PUT /robots/upload/maps")
+
+
+def test_tables_that_no_recording_has_are_not_unpacked(zips: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+    usual = zipfile.ZipFile.open
+
+    def opened(self: zipfile.ZipFile, name: Any, *how: Any, **more: Any) -> Any:
+        read.append(name.filename)
+        return usual(self, name, *how, **more)
+
+    more = renamed(zips[0], lambda files: {**files, "day0/foreign.csv": bytes(3_000_000), "day0/x.toml": b"a"})
+    monkeypatch.setattr(zipfile.ZipFile, "open", opened)
+    assert checked_digest(more, UploadLimits()) == checked_digest(zips[0], UploadLimits())
+    assert read
+    assert not any("foreign" in name or "x.toml" in name for name in read)
+
+
+def test_a_session_is_unpacked_in_pieces(zips: list[bytes]) -> None:
+    import tracemalloc
+
+    large = renamed(zips[0], lambda files: {**files, "day0/frames.csv": bytes(200_000_000)})
+    tracemalloc.start()
+    checked_digest(large, UploadLimits())
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 20_000_000
+
+
+@SQLITE_ONLY
+def test_few_uploads_are_unpacked_at_once(fleet: Fleet, zips: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    now, most, lock = 0, 0, threading.Lock()
+
+    def slowly(data: bytes, limits: UploadLimits) -> str:
+        nonlocal now, most
+        with lock:
+            now += 1
+            most = max(most, now)
+        time.sleep(0.2)
+        with lock:
+            now -= 1
+        return checked_digest(data, limits)
+
+    monkeypatch.setattr("evermap.server.app.checked_digest", slowly)
+    threads = [threading.Thread(target=fleet.upload, args=(zips[0], f"site-{k}")) for k in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == 2
+    assert len(fleet("GET", "/jobs").json()) == 6
+
+
+@SQLITE_ONLY
+def test_revisions_are_short_paged_and_compressed(fleet: Fleet, zips: list[bytes]) -> None:
+    fleet.upload(zips[0])
+    fleet.worker().step()
+    for _ in range(3):
+        fleet("POST", "/maps/ward/pin", json={"landmarks": ["1"]})
+        fleet("POST", "/maps/ward/unpin", json={"landmarks": ["1"]})
+
+    def listed(query: str) -> list[int]:
+        return [item["revision"] for item in fleet("GET", f"/maps/ward/revisions?{query}").json()]
+
+    assert listed("") == [1, 2, 3, 4, 5, 6, 7]
+    assert listed("since=2&most=3") == [3, 4, 5]
+    assert listed("since=7") == []
+    assert fleet("GET", "/maps/ward/revisions?most=0").status_code == 422
+    short, whole = (fleet("GET", f"/maps/ward/revisions{query}").json() for query in ("", "?config=true"))
+    assert "[living]" in whole[0]["config"]
+    assert [{key: value for key, value in item.items() if key != "config"} for item in whole] == short
+    assert all("config" not in item for _, item in _lines_of(fleet))
+    path = "/maps/ward/revisions?config=true"
+    headers = {"Authorization": f"Bearer {fleet.tokens['read']}"}
+    packed = fleet.client.get(path, headers=headers)
+    plain = fleet.client.get(path, headers={**headers, "Accept-Encoding": "identity"})
+    assert packed.headers["Content-Encoding"] == "gzip"
+    assert "Content-Encoding" not in plain.headers
+    assert int(packed.headers["Content-Length"]) < len(plain.content) / 2
+    assert (packed.content, packed.headers["ETag"]) == (plain.content, plain.headers["ETag"])
+    again = fleet.client.get(path, headers={**headers, "If-None-Match": packed.headers["ETag"]})
+    assert (again.status_code, again.content) == (304, b"")
+
+
+def _lines_of(fleet: Fleet) -> list[tuple[int, Any]]:
+    with fleet.server.sites.store("ward") as store:
+        return [(number, json.loads(line)) for number, line in _lines(store, 0)]
+
+
+@SQLITE_ONLY
+def test_links_have_the_address_that_robots_know(fleet: Fleet, zips: list[bytes]) -> None:
+    fleet.upload(zips[0])
+    fleet.worker().step()
+    fleet("POST", "/maps/ward/approve", json={"revision": 1})
+
+    def link() -> str:
+        told = fleet("GET", "/maps/ward/actions").json()["actions"][0]["actionParameters"]
+        return next(one["value"] for one in told if one["key"] == "mapDownloadLink")
+
+    assert link() == "http://testserver/maps/ward/file?revision=1"
+    for url in ("https://maps.example.com/fleet", "https://maps.example.com/fleet/"):
+        fleet.server.public_url = url
+        assert link() == "https://maps.example.com/fleet/maps/ward/file?revision=1"
+
+
+@SQLITE_ONLY
+def test_a_revoked_token_is_told_no_more_events(
+    fleet: Fleet, zips: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("evermap.server.app._CHECKED_S", 0.5)
+    fleet.upload(zips[0])
+    fleet.worker().step()
+    with served(fleet) as url:
+        headers = {"Authorization": f"Bearer {fleet.tokens['read']}"}
+        with httpx.stream("GET", f"{url}/maps/ward/events?since=0", headers=headers, timeout=30.0) as answer:
+            assert "Content-Encoding" not in answer.headers
+            lines = answer.iter_lines()
+            assert next(line for line in lines if line.startswith("id:")) == "id: 1"
+            fleet.server.database.revoke_token("read")
+            assert not any(line.startswith("id:") for line in lines)  # it ends
+
+
+def test_pruning_keeps_the_approved_revision(fleet: Fleet, zips: list[bytes]) -> None:
+    fleet.upload(zips[0])
+    fleet.worker().step()
+    for _ in range(3):
+        fleet("POST", "/maps/ward/pin", json={"landmarks": ["1"]})
+        fleet("POST", "/maps/ward/unpin", json={"landmarks": ["1"]})
+    with fleet.server.sites.store("other", create=True):
+        pass
+    fleet("POST", "/maps/ward/approve", json={"revision": 2})
+
+    def pruned(*arguments: str) -> Any:
+        done = CliRunner().invoke(command, ["map", "gc", "--keep", "2", "--json", *arguments])
+        assert done.exit_code == 0, done.stderr
+        return json.loads(done.stdout)
+
+    planned = pruned(fleet.server.sites.address("ward"), "--dry-run")
+    assert (planned["pruned"], planned["kept"], planned["approved"]) == ([1, 3, 4, 5], [2, 6, 7], 2)
+    assert [item["pruned"] for item in pruned("--store", fleet.where)["maps"]] == [[], [1, 3, 4, 5]]
+    fresh = SiteStores(fleet.where)
+    fleet.server.sites = fresh
+    for path in ("actions", "file?approved=true", "landmarks?revision=2"):
+        assert fleet("GET", f"/maps/ward/{path}").status_code == 200, path
+    refused = fleet("POST", "/maps/ward/approve", json={"revision": 3})
+    assert (refused.status_code, "is pruned" in refused.json()["detail"]) == (422, True)
+    fleet("POST", "/maps/ward/approve", json={"revision": 7})
+    assert pruned(fleet.server.sites.address("ward"))["kept"] == [6, 7]

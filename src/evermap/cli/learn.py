@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from evermap.cli.options import (
+    DEFAULT_STORE,
+    STORE_VARIABLE,
     AsJson,
     Cluster,
     ConfigFile,
@@ -51,7 +54,11 @@ Maps = Annotated[
 ]
 Store = Annotated[
     str | None,
-    option("All maps of a server: folder, or postgresql://user@host/database.", metavar="WHERE", default="none"),
+    option(
+        "All maps of a server: folder, or postgresql://user@host/database.",
+        metavar="WHERE",
+        default=f"without MAP: ${STORE_VARIABLE}, else {DEFAULT_STORE}",
+    ),
 ]
 
 
@@ -101,6 +108,8 @@ def sites_of(maps: list[str], store: str | None, cluster: str | None = None) -> 
         if name in found:
             raise ConfigError(f"two maps are named '{name}'", field="MAP", hint="rename one of the files")
         found[name] = where
+    if not maps and store is None:
+        store = os.environ.get(STORE_VARIABLE, DEFAULT_STORE)
     for name, where in [] if store is None else _stored(store):
         if name in found:
             raise ConfigError(

@@ -86,7 +86,8 @@ def verify(file: MapFile, as_json: AsJson = False) -> None:
 
 
 def gc(
-    file: MapFile,
+    maps: Maps = None,
+    store: Store = None,
     keep: Annotated[int, option("Newest revisions to keep complete.", min=1, metavar="N")] = 10,
     dry_run: Annotated[bool, option("--dry-run", "Only list what would be deleted.")] = False,
     as_json: AsJson = False,
@@ -94,26 +95,39 @@ def gc(
     """Prune old revisions: delete their content, and shrink the file.
 
     The log, the evidence, the recordings and what operators said stay; but a pruned revision cannot be shown, compared,
-    exported or reverted to, and no session can be entered before it any more.
+    exported or reverted to, and no session can be entered before it any more. Of the maps of a server, the approved
+    revisions stay.
 
     \b
-    Example:
+    Examples:
       evermap map gc site.evermap --keep 20
+      evermap map gc --store maps --keep 20
     """
-    from evermap.maps.store import open_store
+    from evermap.maps.store import is_address, open_store
     from evermap.maps.store.history import ranges
+    from evermap.server.database import approved_of
 
-    with open_store(file) as store:
-        found = store.prune(keep, dry_run=dry_run)
+    if not maps and store is None:  # nothing is deleted by default
+        raise ConfigError("nothing to prune", field="MAP", hint="files of maps, or --store WHERE")
+    told = []
+    for where in sites_of(maps or [], store).values():
+        with open_store(where) as opened:
+            at = opened.where
+            approved = approved_of(where if is_address(where) else at)
+            found = opened.prune(keep, also=[] if approved is None else [approved], dry_run=dry_run)
+        item = {"map": at, "pruned": [*found.revisions], "kept": [*found.kept], "approved": approved}
+        told.append({**item, "dry_run": dry_run, "parts": found.n_chunks, "bytes": found.n_bytes})
+        if as_json:
+            continue
+        of = f"{at}: " if store is not None or len(maps or []) > 1 else ""
+        if found.revisions:
+            done = "would be pruned" if dry_run else "pruned"
+            what = f"{found.n_chunks} parts, {found.n_bytes / 1e3:,.0f} kB"
+            say(f"{of}{done}: the content of {ranges(found.revisions)} ({what}); {ranges(found.kept)} kept")
+        else:
+            say(f"{of}nothing to prune: {len(found.kept)} revisions have content")
     if as_json:
-        told = {"pruned": list(found.revisions), "kept": list(found.kept), "dry_run": dry_run}
-        print_json({"map": file, **told, "parts": found.n_chunks, "bytes": found.n_bytes})
-    elif found.revisions:
-        done = "would be pruned" if dry_run else "pruned"
-        what = f"{found.n_chunks} parts, {found.n_bytes / 1e3:,.0f} kB"
-        say(f"{done}: the content of {ranges(found.revisions)} ({what}); {ranges(found.kept)} kept")
-    else:
-        say(f"nothing to prune: {len(found.kept)} revisions have content")
+        print_json(told[0] if store is None and len(told) == 1 else {"maps": told})
 
 
 def reenter(

@@ -34,6 +34,9 @@ def argument(help_text: str, *, default: bool | str = True, **how: Any) -> Any:
     return typer.Argument(help=help_text, show_default=default, **how)
 
 
+DEFAULT_STORE, STORE_VARIABLE = "evermap-maps", "EVERMAP_STORE"
+"""Store of a server where none is named, and the environment variable that names another."""
+
 ConfigFile = Annotated[
     Path | None, option("--config", "TOML file; see slam --show-config.", metavar="FILE", default=False)
 ]

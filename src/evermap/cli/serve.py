@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
+import errno
+import getpass
+import itertools
 import json
 import os
 import shutil
 import signal
-import subprocess
+import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
 
 import typer
 
-from evermap.cli.options import AsJson, ConfigFile, Settings, argument, configured, option
-from evermap.cli.terminal import print_json, print_table, say, warm_up
+from evermap.cli.options import (
+    DEFAULT_STORE,
+    STORE_VARIABLE,
+    AsJson,
+    ConfigFile,
+    Settings,
+    argument,
+    configured,
+    option,
+)
+from evermap.cli.terminal import print_json, print_table, say, warm_up, warn
 from evermap.errors import ConfigError, EvermapError, MissingExtraError, printable
+from evermap.interrupts import kept
 
 if TYPE_CHECKING:
     from evermap.server.database import Database, Job
@@ -34,10 +47,9 @@ app = typer.Typer(
 Store = Annotated[
     str,
     option(
-        "--store", "Folder of the maps, or postgresql://user@host/database.", metavar="WHERE", envvar="EVERMAP_STORE"
+        "--store", "Folder of the maps, or postgresql://user@host/database.", metavar="WHERE", envvar=STORE_VARIABLE
     ),
 ]
-_DEFAULT = "evermap-maps"
 _PATIENCE_S = 600.0
 """Waiting time of a session that indicates too few workers."""
 _MOST_UPLOADS = 10
@@ -48,7 +60,7 @@ _ASK_S = 5.0
 @app.callback()
 def serve(
     ctx: typer.Context,
-    store: Store = _DEFAULT,
+    store: Store = DEFAULT_STORE,
     host: Annotated[str, option("Address to listen on; 0.0.0.0 for all.")] = "127.0.0.1",
     port: Annotated[int, option("Port to listen on.", min=0, max=65535)] = 8080,
     workers: Annotated[int, option("Worker processes that enter sessions, see evermap work.", min=0, max=64)] = 1,
@@ -56,10 +68,14 @@ def serve(
         Path | None, option("--tls-cert", "TLS certificate chain.", metavar="FILE", default="no TLS")
     ] = None,
     key: Annotated[Path | None, option("--tls-key", "Key of the certificate.", metavar="FILE", default=False)] = None,
+    public_url: Annotated[
+        str | None,
+        option("Address at which robots reach the server, used in links.", metavar="URL", default="of each request"),
+    ] = None,
 ) -> None:
     """Serve the maps of a fleet: sessions are uploaded, queued, and entered by workers.
 
-    Without any token, that of an administrator is created and printed.
+    Without an administrator's token, one is created and printed.
 
     \b
     Examples:
@@ -69,35 +85,98 @@ def serve(
     """
     if ctx.invoked_subcommand is not None:
         return
-    if (certificate is None) != (key is None):
-        raise ConfigError("TLS needs both", field="tls-cert", hint="--tls-cert FILE --tls-key FILE")
-    for path in (certificate, key):
-        if path is not None and not path.is_file():
-            raise ConfigError("no such file", path=path, field="tls-cert", hint="files in PEM format")
+    tls = _tls(certificate, key)
+    if public_url is not None and urlsplit(public_url).scheme not in ("http", "https"):
+        raise ConfigError("is not an address", field="--public-url", hint="https://maps.example.com")
     database = _database(store)
     uvicorn = _uvicorn()
     from evermap.server.app import Server, create_app, prepare
-    from evermap.server.database import Role
     from evermap.server.sites import SiteStores
+    from evermap.server.worker import Crew
 
-    if not database.tokens():
-        typer.echo(database.add_token("admin", Role.ADMIN))
-        say("this administrator token is shown once; more tokens: evermap serve token NAME --role ROLE")
-    server = Server(database, SiteStores(store))
+    listener = _listener(host, port)
+    _print_first_token(database)
+    crew = Crew([sys.executable, "-m", "evermap", "work", "--store", store, "--under", str(os.getpid())], workers, warn)
+    server = Server(database, SiteStores(store), public_url=public_url, workers=crew.alive)
+    how = {"log_level": "warning", "server_header": False, "timeout_graceful_shutdown": 5}
+    served = uvicorn.Server(uvicorn.Config(create_app(server), **how, **tls))
+    for number in (signal.SIGINT, signal.SIGTERM):  # its own until it runs: no signal is lost before
+        signal.signal(number, served.handle_exit)
     prepare(server)
-    scheme = "http" if certificate is None else "https"
-    say(f"serving {scheme}://{host}:{port}; Ctrl-C ends it")
-    tls = {} if certificate is None else {"ssl_certfile": str(certificate), "ssl_keyfile": str(key)}
-    with _working(store, workers):
-        uvicorn.run(
-            create_app(server),
-            host=host,
-            port=port,
-            log_level="warning",
-            server_header=False,
-            timeout_graceful_shutdown=5,
-            **tls,
-        )
+    scheme, at = "https" if tls else "http", f"[{host}]" if ":" in host else host
+    say(f"serving {scheme}://{at}:{listener.getsockname()[1]}; Ctrl-C ends it")
+    with crew:
+        served.run(sockets=[listener])
+    say("the server has stopped")
+
+
+def _tls(certificate: Path | None, key: Path | None) -> dict[str, str]:
+    """Return the options of uvicorn for TLS; none without a certificate.
+
+    Raises:
+        ConfigError: one of the files is missing or cannot be used.
+    """
+    import ssl
+
+    if certificate is None and key is None:
+        return {}
+    if certificate is None or key is None:
+        raise ConfigError("TLS needs both", field="--tls-cert", hint="--tls-cert FILE --tls-key FILE")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    hint = "files in PEM format, the key without a password"
+    for path, option_name in ((certificate, "--tls-cert"), (key, "--tls-key")):
+        if not path.is_file():
+            raise ConfigError("no such file", path=path, field=option_name, hint=hint)
+        try:
+            if path is certificate:
+                context.load_verify_locations(path)
+            else:
+                context.load_cert_chain(certificate, key, password="")  # nosec  # B106: rather than to ask for one
+        except OSError as error:
+            problem = f"cannot be used: {printable(str(error.strerror or error), 100)}"
+            raise ConfigError(problem, path=path, field=option_name, hint=hint) from None
+    return {"ssl_certfile": str(certificate), "ssl_keyfile": str(key)}
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    """Return a socket that listens.
+
+    Raises:
+        ConfigError: the port is in use, or the address is not of this machine.
+    """
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            problem, hint = f"port {port} of {host} is in use", f"--port {port + 1}, or end what listens there"
+        else:
+            problem = f"cannot listen on port {port} of {printable(host, 60)}: {error.strerror}"
+            hint = "an address of this machine, and a port from 1024 on"
+        raise ConfigError(problem, field="--port", hint=hint) from None
+
+
+def _print_first_token(database: Database) -> None:
+    """Make and print the token of an administrator where there is none."""
+    from evermap.server.database import Role
+
+    known = database.tokens()
+    if any(row["role"] == Role.ADMIN.name.lower() for row in known):
+        return
+    taken = {row["name"] for row in known}
+    name = next(name for k in itertools.count(1) if (name := "admin" if k == 1 else f"admin-{k}") not in taken)
+    typer.echo(database.add_token(name, Role.ADMIN))
+    database.note(_operator(), f"first token {name}, role admin", 200)
+    say("this administrator token is shown once; more tokens: evermap serve token NAME --role ROLE")
+
+
+def _operator() -> str:
+    """Return who is at this machine, for the audit."""
+    try:
+        name = getpass.getuser()
+    except (OSError, KeyError):  # a user without a name, as in a container
+        name = str(os.getuid())
+    return f"{name}@{socket.gethostname()}"
 
 
 @app.command("token")
@@ -105,7 +184,7 @@ def token(
     name: Annotated[str | None, argument("Name of the robot or person.", metavar="NAME", default=False)] = None,
     role: Annotated[str, option("Its permissions.", metavar="read|upload|approve|admin")] = "upload",
     revoke: Annotated[bool, option("--revoke", "Revoke the token of this name.")] = False,
-    store: Store = _DEFAULT,
+    store: Store = DEFAULT_STORE,
     as_json: AsJson = False,
 ) -> None:
     """Make a token and print it, once; without a name, list them.
@@ -133,12 +212,14 @@ def token(
         if not database.revoke_token(name):
             known = [row["name"] for row in database.tokens()]
             raise ConfigError(f"no token '{name}'", field="name", hint=suggestion(name, known))
+        database.note(_operator(), f"token {name} revoked", 200)
         say(f"the token of {name} is revoked")
         return
     roles = {item.name.lower(): item for item in Role}
     if role not in roles:
         raise ConfigError(f"unknown role '{role}'", field="role", hint=suggestion(role, roles))
     text = database.add_token(name, roles[role])
+    database.note(_operator(), f"token {name}, role {role}", 200)
     if as_json:
         print_json({"name": name, "role": role, "token": text})
         return
@@ -148,7 +229,7 @@ def token(
 
 @app.command("doctor")
 def doctor(
-    store: Store = _DEFAULT,
+    store: Store = DEFAULT_STORE,
     url: Annotated[
         str, option("Address at which robots reach the server; '' to skip this check.", metavar="URL")
     ] = "http://127.0.0.1:8080",
@@ -177,12 +258,12 @@ def _of_database(store: str) -> Iterator[tuple[str, bool, str]]:
     """Yield the checks of a server's store: name, result, and a line."""
     from evermap.maps.store import is_address
     from evermap.server.database import VERSION, Role
-    from evermap.server.sites import SiteStores
+    from evermap.server.sites import SiteStores, store_place
     from evermap.server.uploads import UploadLimits
     from evermap.server.worker import LEASE_S
 
     try:
-        if not is_address(store) and not Path(store, "server.db").is_file():
+        if not is_address(store_place(store)) and not Path(store, "server.db").is_file():
             raise ConfigError("contains no server yet", field="store", hint=f"evermap serve --store {store}")
         database = _database(store)
     except EvermapError as error:
@@ -225,16 +306,18 @@ def _of_address(url: str) -> tuple[str, bool, str]:
     local = host in ("localhost", "127.0.0.1", "::1")
     try:
         with urlopen(f"{url.rstrip('/')}/healthz", timeout=_ASK_S) as answer:  # nosec  # B310: http or https, see above
-            told = json.load(answer)["evermap"]
+            said = json.load(answer)
+            told, workers = said["evermap"], said.get("workers", 0)
     except (OSError, ValueError, KeyError, TypeError) as error:
         return "address", False, f"no server answers at {url}: {printable(str(error), 100)}"
     if scheme != "https" and not local:
         return "address", False, f"{url} does not use TLS, so tokens can be read in transit: --tls-cert, or a proxy"
-    return "address", True, f"evermap {told} answers at {url}{'' if not local else ', seen from this machine'}"
+    seen = ", seen from this machine" if local else ""
+    return "address", True, f"evermap {told} answers at {url}{seen}, with {workers} workers of its own"
 
 
 def work(
-    store: Store = _DEFAULT,
+    store: Store = DEFAULT_STORE,
     config: ConfigFile = None,
     settings: Settings = None,
     drain: Annotated[bool, option("--drain", "Exit as soon as no session waits.")] = False,
@@ -242,6 +325,7 @@ def work(
         float, option("Time after which another worker takes over a session [s].", min=1.0, max=3600.0)
     ] = 60.0,
     as_json: Annotated[bool, option("--json", "Print the result of each, one JSON object per line.")] = False,
+    under: Annotated[int | None, option("End with this parent process.", hidden=True, default=False)] = None,
 ) -> None:
     """Enter the sessions that were uploaded to a server.
 
@@ -252,12 +336,16 @@ def work(
       evermap work --store maps --drain
       evermap work --store postgresql://evermap@db/fleet --set living.search=gate
     """
+    kept(os.curdir, "a session in work returns to the queue")
     with suppress(OSError):
         os.nice(10)  # who asks the server goes first, also while this one loads its code
     chosen = configured(config, settings)
     database = _database(store)
     from evermap.server.sites import SiteStores
-    from evermap.server.worker import Worker
+    from evermap.server.worker import Worker, end_without
+
+    if under is not None:
+        end_without(under)
 
     def told(job: Job, outcome: JobOutcome) -> None:
         became = outcome.state.value if outcome.revision is None else f"revision {outcome.revision}"
@@ -293,17 +381,3 @@ def _uvicorn() -> Any:
         problem = f"a server needs the package {error.name}, which is not installed"
         raise MissingExtraError(problem, hint="pip install 'evermap[server]'") from None
     return uvicorn
-
-
-@contextmanager
-def _working(store: str, count: int) -> Iterator[None]:
-    """Run worker processes, and end them with this one; their sessions return to the queue."""
-    command = [sys.executable, "-m", "evermap", "work", "--store", store]
-    processes = [subprocess.Popen(command, stdin=subprocess.DEVNULL) for _ in range(count)]  # nosec  # B603: ourselves
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.send_signal(signal.SIGTERM)
-        for process in processes:
-            process.wait()

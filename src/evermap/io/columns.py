@@ -7,7 +7,7 @@ line and cell at fault; both take the same files and give the same values.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,18 @@ import numpy as np
 from evermap.errors import InputError
 from evermap.interrupts import raises
 from evermap.io.files import unpacked
-from evermap.io.table import Table, arrow_cells, dates_as_text, numbers_of, parse_csv, read_parquet
+from evermap.io.table import (
+    FORMULA,
+    GUARDED,
+    Table,
+    arrow_cells,
+    dates_as_text,
+    guarded,
+    numbers_of,
+    parse_csv,
+    read_parquet,
+    unguarded,
+)
 from evermap.io.text import quote, reason
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
 from evermap.valid import Quantity
@@ -280,10 +291,20 @@ def needs_quotes(cells: Any) -> bool:
 
 
 def _cells(column: Any) -> Any:
-    """A column for a CSV file, nan as null."""
+    """A column for a CSV file, nan as null, and without text that a spreadsheet would execute."""
     if not isinstance(column, np.ndarray):
-        return column
+        return _mapped(column, FORMULA, guarded) if _is_text(column.type) else column
     return arrow_cells(column, ~np.isnan(column) if column.dtype.kind == "f" else None)
+
+
+def _mapped(cells: Any, pattern: str, change: Callable[[str], str]) -> Any:
+    """Return an array of text with a change of each different one, if any matches the pattern."""
+    import pyarrow.compute as pc
+
+    if not pc.any(pc.match_substring_regex(cells, pattern)).as_py():
+        return cells
+    code, words = _coded(cells)
+    return arrow_cells([*map(change, words), ""], np.arange(len(words) + 1) < len(words)).take(arrow_cells(code))
 
 
 def _without(text: Any, known: BoolArray) -> Any:
@@ -332,6 +353,8 @@ def _fast_csv(data: bytes, path: Path) -> Columns | None:
     if table.num_rows != rows or header.header_line is None:
         return None
     cells = {name: _plain(column) for name, column in zip(names, table.columns, strict=True)}
+    if b"'" in data:
+        cells = {name: _mapped(column, GUARDED, unguarded) for name, column in cells.items()}
     return Columns(path, cells, header.header_line + 1 + np.arange(rows), header.header_line)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
@@ -17,6 +18,9 @@ from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, landm
 from evermap.valid import STAMP_S, Quantity
 
 ENDINGS = (".csv", ".csv.gz", ".parquet")
+FORMULA = r"^'*[=+@\t\r-]"
+"""Begin of a cell that a spreadsheet would execute, or that looks as if it had been guarded against that."""
+GUARDED = r"^'+[=+@\t\r-]"
 _LARGEST_ID = 2**53
 """Whole numbers beyond this lose digits as float64, in which Parquet tables made by others often hold ids."""
 
@@ -205,7 +209,9 @@ def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
     if rows and content[-1][0] == len(lines) and len(rows) == len(content) - 1 and _broken(rows[-1][-1], rows[:-1]):
         warnings.append(f"{path.name}: 1 unfinished last line ({len(lines)}) left out")
         rows.pop()
-    columns = zip(*rows, strict=True) if rows else [()] * len(names)
+    columns: Iterable[Sequence[str]] = zip(*rows, strict=True) if rows else [()] * len(names)
+    if b"'" in data:
+        columns = [[unguarded(cell) for cell in column] for column in columns]
     line_numbers = np.array([number for number, _ in content[1 : len(rows) + 1]], dtype=np.int64)
     return Table(path, dict(zip(names, columns, strict=True)), line_numbers, content[0][0])
 
@@ -307,10 +313,20 @@ def csv_text(columns: dict[str, Any], comment: str = "") -> str:
 
 def _csv_cells(column: Any) -> list[str]:
     if isinstance(column, list):
-        return [_quoted(cell) for cell in column]
+        return [_quoted(guarded(cell)) for cell in column]
     if column.dtype.kind == "i":
         return ["" if value == UNKNOWN else str(value) for value in column.tolist()]
     return ["" if isnan(value) else repr(value) for value in column.tolist()]
+
+
+def guarded(cell: str) -> str:
+    """Return a text as a cell of a CSV file: a quote precedes what a spreadsheet would read as a formula."""
+    return f"'{cell}" if re.match(FORMULA, cell) and not _is_number(cell) else cell
+
+
+def unguarded(cell: str) -> str:
+    """Return the text of a cell that `guarded` made."""
+    return cell[1:] if re.match(GUARDED, cell) else cell
 
 
 def _quoted(cell: str) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from evermap.io.landmarks import labels_of
+from evermap.io.table import guarded
 from evermap.types import ChangeKind, Landmarks, MapChange, SlamResult
 from evermap.viz.map_figure import places_of
 
@@ -22,8 +23,6 @@ COLUMNS = (
     "change", "kind", "place", "name", "class", "x_m", "y_m", "z_m", "from_s", "to_s", "first_seen_s", "last_seen_s",
     "probability", "p_exists", "hits", "misses",
 )  # fmt: skip
-_FORMULAS = ("=", "+", "-", "@", "\t", "\r")
-"""First characters of cells that a spreadsheet reads as formulas."""
 _PLACES = {ChangeKind.APPEARED: (AFTER,), ChangeKind.RETURNED: (AFTER,), ChangeKind.VANISHED: (BEFORE,)}
 """Places of a change by its kind; both if it is not listed."""
 
@@ -93,4 +92,4 @@ def _cell(value: Any) -> Any:
     """Return the cell of a value: empty if unknown, and without text that a spreadsheet would execute."""
     if isinstance(value, float):
         return repr(value) if math.isfinite(value) else ""
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULAS) else value
+    return guarded(value) if isinstance(value, str) else value

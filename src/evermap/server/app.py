@@ -10,7 +10,7 @@ import asyncio
 import json
 import math
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib import resources
@@ -21,14 +21,17 @@ import numpy as np
 from fastapi import APIRouter, Body, Depends, FastAPI, Header, HTTPException, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
+from fastapi.middleware.gzip import GZipMiddleware
 from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
 from pydantic import BaseModel, Field
+from starlette.datastructures import MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from evermap import __version__
 from evermap.errors import EvermapError, InputError, printable
 from evermap.maps.diff import diff as between
 from evermap.maps.living import LivingMap
-from evermap.maps.store import DamagedMapError, Provenance, StaleRevisionError, StoreUnavailableError
+from evermap.maps.store import DamagedMapError, Provenance, Revision, StaleRevisionError, StoreUnavailableError
 from evermap.maps.store.postgres import PREFIX, SITE
 from evermap.maps.store.sql import SqlStore
 from evermap.maps.why import why as of_landmark
@@ -44,12 +47,29 @@ _EVERY_S = 1.0
 """Between two looks for new revisions, where none are announced."""
 _ALIVE_S = 15.0
 """Interval between two keep-alive lines."""
+_CHECKED_S = 5.0
+"""Longest use of a token by a follower before it is looked up again."""
 _RATE_HZ, _BURST = 50.0, 200.0
-"""Rate and burst of requests per token."""
+"""Rate and burst of requests per token, and per address of requests without a valid one."""
+_MOST_COUNTED = 10_000
+"""Tokens and addresses whose requests are counted; the one that has asked least recently is forgotten."""
+_UNPACKED_AT_ONCE = 2
+"""Uploads that are unpacked at the same time."""
+_LEAST_COMPRESSED = 1000
+"""Answers of fewer bytes are sent as they are."""
+_EFFORT = 4
+"""Of compression, 1 to 9: a tenth more bytes than at 9, in a sixth of the time."""
 _WARM = 16
 """Maps that are loaded before the first request."""
-_POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; frame-ancestors 'none'"
+_HEADERS = {
+    "Content-Security-Policy":
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-cache",
+}  # fmt: skip
 _PAGE = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
+_OPEN = {"/healthz", "/openapi.json", *(f"/{name}" for name in _PAGE)}
+"""Paths that need no token."""
 
 
 @dataclass(slots=True)
@@ -61,20 +81,27 @@ class Server:
         sites: the maps.
         limits: of uploads.
         rate_hz: requests of one token over time.
+        public_url: address at which robots reach the server; None for that of each request.
+        workers: counts the living worker processes that this server has started.
     """
 
     database: Database
     sites: SiteStores
     limits: UploadLimits = field(default_factory=UploadLimits)
     rate_hz: float = _RATE_HZ
-    _budget: dict[str, tuple[float, float]] = field(default_factory=dict)
+    public_url: str | None = None
+    workers: Callable[[], int] = lambda: 0
+    unpacking: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(_UNPACKED_AT_ONCE))
+    _budget: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
 
-    def admits(self, who: str) -> bool:
-        """Count a request; returns whether it is within the rate (a token bucket)."""
+    def admits(self, kind: str, who: str) -> bool:
+        """Count a request of a token or an address; returns whether it is within the rate (a token bucket)."""
         now = time.monotonic()
-        left, since = self._budget.get(who, (_BURST, now))
+        left, since = self._budget.pop((kind, who), (_BURST, now))
         left = min(_BURST, left + (now - since) * self.rate_hz)
-        self._budget[who] = (max(left - 1.0, 0.0), now)
+        self._budget[kind, who] = (max(left - 1.0, 0.0), now)
+        if len(self._budget) > _MOST_COUNTED:
+            self._budget.pop(next(iter(self._budget)))
         return left >= 1.0
 
 
@@ -103,7 +130,8 @@ def create_app(server: Server) -> FastAPI:
     app = FastAPI(**about, default_response_class=PlainJSON)
     app.state.server = server
     app.include_router(router)
-    app.middleware("http")(_guard)
+    app.add_middleware(GZipMiddleware, minimum_size=_LEAST_COMPRESSED, compresslevel=_EFFORT)
+    app.add_middleware(Gate)
     app.exception_handler(EvermapError)(_mistake)
     app.exception_handler(RequestValidationError)(_unread)
     for away in AWAY:
@@ -111,18 +139,83 @@ def create_app(server: Server) -> FastAPI:
     return app
 
 
-async def _guard(request: Request, answer: Callable[[Request], Awaitable[Response]]) -> Response:
-    """Log changes to the audit, and send the security headers of pages."""
-    response = await answer(request)
-    response.headers["Content-Security-Policy"] = _POLICY
-    response.headers["X-Content-Type-Options"] = "nosniff"
-    response.headers["Cache-Control"] = "no-cache"
-    if request.method == "POST":
-        who = getattr(request.state, "who", "-")
-        what = f"{request.method} {request.url.path} {getattr(request.state, 'said', '')}"
+class Gate:
+    """Middleware that looks at the token before anything reads the body, bounds the body, sends the security headers
+    of pages, and notes changes in the audit.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or let the application do it."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope)
+        limits = _server(request).limits
+        most = left = limits.n_bytes if request.url.path.endswith("/sessions") else limits.body_bytes
+        refusal = await self._refusal(request, most)
+
+        async def bounded() -> Message:
+            nonlocal left
+            message = await receive()
+            left -= len(message.get("body", b""))
+            if left < 0:
+                raise HTTPException(413, f"more than {most} bytes")
+            return message
+
+        async def finished(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(_HEADERS)
+                await self._note(request, message["status"])
+            await send(message)
+
+        await (self._app if refusal is None else refusal)(scope, bounded, finished)
+
+    async def _refusal(self, request: Request, most: int) -> Response | None:
+        """Return what is answered without a look at the body; None for what the application answers."""
+        length = request.headers.get("content-length", "")
+        try:
+            if request.url.path not in _OPEN:
+                await run_in_threadpool(_identify, request)
+            if length.isdecimal() and int(length[:20]) > most:
+                raise HTTPException(413, f"more than {most} bytes")
+        except HTTPException as error:
+            return PlainJSON({"detail": error.detail}, error.status_code, error.headers)
+        except AWAY as error:
+            return await _outage(request, error)
+        return None
+
+    async def _note(self, request: Request, status: int) -> None:
+        """Note a change that somebody with a token has asked for."""
+        state = request.state
+        if request.method not in ("POST", "PUT") or not hasattr(state, "who") or getattr(state, "unchanged", False):
+            return
+        what = f"{request.method} {request.url.path} {getattr(state, 'said', '')}"
         with suppress(*AWAY):  # the answer reports it
-            await run_in_threadpool(_server(request).database.note, who, what, response.status_code)
-    return response
+            await run_in_threadpool(_server(request).database.note, state.who, what, status)
+
+
+def _identify(request: Request) -> None:
+    """Keep the name and the role of a request's token.
+
+    Raises:
+        HTTPException: there is none, or too many requests came with it, or without one from its address.
+    """
+    server, known = _server(request), _holder(request)
+    address = "" if request.client is None else request.client.host
+    if not (server.admits("address", address) if known is None else server.admits("token", known[0])):
+        raise HTTPException(429, "too many requests", {"Retry-After": "1"})
+    if known is None:
+        raise HTTPException(401, "a token is needed", {"WWW-Authenticate": "Bearer"})
+    request.state.who, request.state.role = known
+
+
+def _holder(request: Request) -> tuple[str, Role] | None:
+    """Return the name and the role of a request's token; None if it has no valid one."""
+    scheme, _, text = request.headers.get("authorization", "").partition(" ")
+    return _server(request).database.who(text.strip()) if scheme.lower() == "bearer" else None
 
 
 async def _mistake(request: Request, error: Exception) -> Response:
@@ -174,19 +267,11 @@ def _server(request: Request) -> Server:
 def _may(role: Role) -> Any:
     """A dependency: the token's name, if it has this role."""
 
-    def check(request: Request, authorization: Annotated[str, Header()] = "") -> str:
-        server = _server(request)
-        scheme, _, text = authorization.partition(" ")
-        known = server.database.who(text.strip()) if scheme.lower() == "bearer" else None
-        if known is None:
-            raise HTTPException(401, "a token is needed", {"WWW-Authenticate": "Bearer"})
-        name, has = known
-        request.state.who, request.state.role = name, has
-        if not server.admits(name):
-            raise HTTPException(429, "too many requests", {"Retry-After": "1"})
+    async def check(request: Request, authorization: Annotated[str, Header()] = "") -> str:  # noqa: ARG001 (described)
+        who, has = request.state.who, request.state.role
         if has < role:
             raise HTTPException(403, f"this needs the role {role.name.lower()}, the token has {has.name.lower()}")
-        return name
+        return str(who)
 
     return Depends(check)
 
@@ -267,7 +352,7 @@ def show_token(request: Request, who: Reader) -> dict[str, str]:
 @router.get("/healthz")
 def health(server: Answering) -> dict[str, Any]:
     """Report that the server and its database answer; needs no token."""
-    return {"evermap": __version__, "waiting": server.database.depth()}
+    return {"evermap": __version__, "waiting": server.database.depth(), "workers": server.workers()}
 
 
 @router.get("/", include_in_schema=False)
@@ -304,13 +389,9 @@ def list_maps(
 async def upload(request: Request, response: Response, site: Site, server: Answering, who: Uploader) -> dict[str, Any]:
     """Queue a session: the body is a zip of a native folder or of a bag, or a bag. Sent twice, it is entered once."""
     server.sites.address(site)
-    most, body = server.limits.n_bytes, bytearray()
-    async for part in request.stream():
-        body += part
-        if len(body) > most:
-            raise HTTPException(413, f"more than {most} bytes")
-    data = bytes(body)
-    digest = await run_in_threadpool(checked_digest, data, server.limits)
+    data = await request.body()
+    async with server.unpacking:
+        digest = await run_in_threadpool(checked_digest, data, server.limits)
     job, fresh = await run_in_threadpool(server.database.enqueue, site, digest, data, who)
     response.status_code = 202 if fresh else 200
     return asdict(job)
@@ -356,9 +437,22 @@ def _job(server: Server, number: int) -> Job:
 
 
 @router.get("/maps/{site}/revisions")
-def list_revisions(request: Request, site: Site, _: Reader) -> Response:
-    """List the revisions, the oldest first."""
-    return _told(request, site, lambda store: [map_dicts.revision_dict(item) for item in store.log()])
+def list_revisions(
+    request: Request, site: Site, _: Reader, since: AtRevision = 0,
+    most: Annotated[int | None, Query(ge=1, le=2**31 - 1)] = None, config: bool = False,
+) -> Response:  # fmt: skip
+    """List the first `most` revisions after `since`, the oldest first; with `config` also the settings of each."""
+
+    def listed(store: SqlStore) -> list[dict[str, Any]]:
+        return [_revision(item, config=config) for item in store.log() if item.number > (since or 0)][:most]
+
+    return _told(request, site, listed)
+
+
+def _revision(item: Revision, *, config: bool = False) -> dict[str, Any]:
+    """A line of the history, without the whole configuration unless it is asked for."""
+    told = map_dicts.revision_dict(item)
+    return {key: value for key, value in told.items() if config or key != "config"}
 
 
 @router.get("/maps/{site}/diff")
@@ -457,6 +551,7 @@ def approve(request: Request, site: Site, chosen: Chosen, server: Answering, who
     with server.sites.store(site) as store:
         if not 1 <= chosen.revision <= store.head():
             raise HTTPException(422, "there is no such revision")
+        server.sites.living(store, chosen.revision)  # refuses one whose content is pruned
     request.state.said = f"revision {chosen.revision}: {chosen.note}"
     server.database.approve(site, chosen.revision, who)
     return {"site": site, "approved": server.database.approved(site)}
@@ -474,7 +569,7 @@ def actions(request: Request, site: Site, server: Answering, _: Reader, robot: R
     which = {"mapId": site, "mapVersion": str(number)}
     wanted = []
     if not held:
-        link = f"{request.base_url}maps/{site}/file?revision={number}"
+        link = f"{server.public_url or request.base_url}".rstrip("/") + f"/maps/{site}/file?revision={number}"
         file = {"mapDownloadLink": link, "mapHash": server.sites.file(site, number).sha256}
         wanted.append(_instant("downloadMap", {**which, **file}))
     if "ENABLED" not in held:
@@ -505,7 +600,7 @@ def hold(
     if len(set(enabled)) < len(enabled):
         raise HTTPException(422, "two versions of one map are enabled")
     held = [one.model_dump(by_alias=True) for one in maps]
-    server.database.hold(robot, held)
+    request.state.unchanged = not server.database.hold(robot, held)
     return {"robot": robot, "maps": held}
 
 
@@ -560,7 +655,8 @@ async def events(
 
 async def _news(request: Request, server: Server, site: str, told: int) -> AsyncIterator[str]:
     """Ask for news whenever some are announced, and where nothing arrives, every second."""
-    alive, beat = time.monotonic(), await run_in_threadpool(_beat, server, site)
+    alive = checked = time.monotonic()
+    beat = await run_in_threadpool(_beat, server, site)
     yield ": following\n\n"
     news, loop, asked = asyncio.Event(), asyncio.get_running_loop(), -math.inf
 
@@ -572,6 +668,10 @@ async def _news(request: Request, server: Server, site: str, told: int) -> Async
     announced = server.database.announcements
     with announced.followed(hear):
         while not await request.is_disconnected():
+            if news.is_set() or time.monotonic() - checked > _CHECKED_S:
+                checked = time.monotonic()
+                if not await run_in_threadpool(_still_valid, request):
+                    return
             if news.is_set() or not announced.arrive or time.monotonic() - asked > _ALIVE_S:
                 news.clear()
                 asked = time.monotonic()
@@ -586,6 +686,14 @@ async def _news(request: Request, server: Server, site: str, told: int) -> Async
                 yield ": alive\n\n"
             with suppress(TimeoutError):
                 await asyncio.wait_for(news.wait(), _EVERY_S)
+
+
+def _still_valid(request: Request) -> bool:
+    """Return whether a follower's token is not revoked, as far as the database answers."""
+    try:
+        return _holder(request) is not None
+    except AWAY:
+        return True
 
 
 def _head(server: Server, site: str) -> int:
@@ -611,4 +719,4 @@ def _since(server: Server, site: str, told: int) -> list[tuple[int, str]]:
 
 
 def _lines(store: SqlStore, told: int) -> list[tuple[int, str]]:
-    return [(item.number, json.dumps(map_dicts.revision_dict(item))) for item in store.log() if item.number > told]
+    return [(item.number, json.dumps(_revision(item))) for item in store.log() if item.number > told]

@@ -47,10 +47,11 @@ from sqlalchemy.schema import CreateIndex, CreateSchema
 
 from evermap.errors import ConfigError, InputError, printable
 from evermap.maps.store import is_address
-from evermap.maps.store.postgres import PREFIX, Announcements
+from evermap.maps.store.postgres import PREFIX, Announcements, split_address
 from evermap.maps.store.postgres import engine_of as postgres_engine
 from evermap.maps.store.sql import announce, now_utc
 from evermap.maps.store.sqlite import engine_of as sqlite_engine
+from evermap.server.sites import store_place
 
 VERSION = 1
 """Schema version of the tables; there is no older one to migrate."""
@@ -191,6 +192,7 @@ class Database:
     """
 
     def __init__(self, where: str | Path) -> None:
+        where = store_place(where)
         if is_address(where):
             self._engine = postgres_engine(str(where), SCHEMA)
         else:
@@ -363,20 +365,22 @@ class Database:
             row = connection.execute(question.order_by(_approval.c.id.desc()).limit(1)).mappings().one_or_none()
         return None if row is None else dict(row)
 
-    def hold(self, robot: str, maps: list[dict[str, str]]) -> None:
-        """Store the maps that a robot reports, in place of its earlier report."""
+    def hold(self, robot: str, maps: list[dict[str, str]]) -> bool:
+        """Store the maps that a robot reports, in place of its earlier report; returns whether they are others."""
         values = {"maps": json.dumps(maps), "at": now_utc()}
         news = case((_robot.c.maps == values["maps"], 0), else_=1)
         for _ in range(2):  # again where it says so the first time, and twice at once
             try:
                 with self._writer.begin() as connection:
+                    before = connection.execute(select(_robot.c.maps).where(_robot.c.name == robot)).scalar()
                     changed = update(_robot).where(_robot.c.name == robot).values(**values, told=_robot.c.told + news)
                     if not connection.execute(changed).rowcount:
                         connection.execute(insert(_robot).values(name=robot, **values, told=1))
                     announce(connection, "")
-                return
+                return before != values["maps"]
             except IntegrityError:
                 continue
+        return True
 
     def robots(self) -> list[dict[str, Any]]:
         """Return the robots that said which maps they hold, and when."""
@@ -437,6 +441,30 @@ class Database:
     def close(self) -> None:
         """Let go of all connections."""
         self._engine.dispose()
+
+
+def approved_of(where: str | Path) -> int | None:
+    """Return the approved revision of a map in the store of a server; None if there is none, or no server.
+
+    Args:
+        where: its file, or its address with the name of the site.
+    """
+    if is_address(where):
+        url, site = split_address(str(where))
+        home = url.render_as_string(hide_password=False)
+        with postgres_engine(home, "public").connect() as connection:
+            served = inspect(connection).has_schema(SCHEMA)
+    else:
+        home, site = str(Path(where).parent), Path(where).stem
+        served = Path(home, "server.db").is_file()
+    if not served:
+        return None
+    database = Database(home)
+    try:
+        chosen = database.approved(site)
+    finally:
+        database.close()
+    return None if chosen is None else int(chosen["revision"])
 
 
 def _mine(job: int, worker: str) -> Any:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from evermap.errors import ConfigError, InputError
+from evermap.errors import ConfigError, InputError, printable
 from evermap.maps.living import LivingMap
 from evermap.maps.store import is_address, open_store
 from evermap.maps.store.postgres import SITE, address_of, has_site, sites_in
@@ -25,6 +25,21 @@ _MOST_OPEN = 200
 _MOST_FILES, _MOST_MAPS, _MOST_ANSWERS = 8, 16, 500
 _LONGEST_ANSWER = 500_000
 """Maximum bytes of a cached answer."""
+
+
+def store_place(where: str | Path) -> str | Path:
+    """Return the folder or the address of a server's store.
+
+    Raises:
+        ConfigError: an address of something else.
+    """
+    scheme, mark, rest = str(where).partition("://")
+    if not mark:
+        return where
+    if scheme not in ("postgres", "postgresql"):
+        hint = "a folder, or postgresql://user@host/database"
+        raise ConfigError(f"no store for '{printable(scheme, 40)}://'", field="store", hint=hint)
+    return f"postgresql://{rest}"
 
 
 class NoSuchSiteError(InputError):
@@ -54,7 +69,7 @@ class SiteStores:
     """
 
     def __init__(self, where: str | Path) -> None:
-        self._where = where
+        self._where = store_place(where)
         self._open: dict[str, list[SqlStore]] = {}
         self._files: dict[tuple[str, str], MapFile] = {}
         self._maps: dict[tuple[str, str], LivingMap] = {}

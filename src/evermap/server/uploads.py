@@ -10,22 +10,30 @@ import hashlib
 import io
 import json
 import re
+import shutil
 import stat
 import subprocess
 import sys
 import tempfile
 import zipfile
 import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import IO, Any
 
 from evermap.errors import EvermapError, InputError
+from evermap.io.native import TABLES
+from evermap.io.rig_toml import CAMERA_FILE, SENSOR_FILE
 from evermap.types import AnyRecording
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. ()+-]{0,119}")
 """Allowed parts of paths: nothing hidden, no '..', no drive, no control character."""
 _READ = (".csv", ".parquet", ".toml")
+_NATIVE = {*(f"{name}{ending}" for name in TABLES for ending in (".csv", ".parquet")), SENSOR_FILE, CAMERA_FILE}
+"""Files that a native folder is read from; others are neither unpacked nor part of a session's digest."""
 _BAGS = {".mcap": b"\x89MCAP0\r\n", ".bag": b"#ROSBAG V", ".db3": b"SQLite format 3\0"}
 """File endings of bags, and their first bytes."""
 _BAG_READ = (*_BAGS, "metadata.yaml", ".toml")
@@ -41,6 +49,8 @@ run()
 """
 _ENCRYPTED = 0x1
 _VALUE_BYTES = 8
+_PIECE = 1 << 20
+"""Bytes that are unpacked at a time."""
 _ROTTEN = (
     zipfile.BadZipFile,
     zlib.error,
@@ -61,11 +71,13 @@ class UploadLimits:
         n_bytes: as it is sent.
         unpacked_bytes: of all files together.
         n_files: in the zip.
+        body_bytes: of a request that is no upload.
     """
 
     n_bytes: int = 256_000_000
     unpacked_bytes: int = 1_000_000_000
     n_files: int = 100
+    body_bytes: int = 1_000_000
 
 
 def checked_digest(data: bytes, limits: UploadLimits) -> str:
@@ -74,35 +86,40 @@ def checked_digest(data: bytes, limits: UploadLimits) -> str:
     Raises:
         InputError: it is neither a zip of a native folder or of a bag, nor a bag, or may harm who reads it.
     """
-    parts = _parts(data, limits)
     digest = hashlib.sha256()
-    for name in sorted(parts):
-        digest.update(f"{name}\n".encode() + parts[name])
+    with _opened(data, limits) as files:
+        for name, (told, file) in sorted(files.items()):
+            with file() as content:
+                _check(content, told, limits)
+            digest.update(f"{name}\n".encode())
+            with file() as content:
+                while piece := content.read(_PIECE):
+                    digest.update(piece)
     return digest.hexdigest()
 
 
-def _parts(data: bytes, limits: UploadLimits) -> dict[str, bytes]:
-    """The files that a recording is read from, by name; a bag that is one file is always called the same."""
+_Files = dict[str, tuple[str, Callable[[], IO[bytes]]]]
+"""Files that a recording is read from, by name: what the upload calls each, and what opens it."""
+
+
+@contextmanager
+def _opened(data: bytes, limits: UploadLimits) -> Iterator[_Files]:
+    """Yield the files that a recording is read from; a bag that is one file always has the same name."""
     for ending, start in _BAGS.items():
         if data.startswith(start):
-            return {f"session{ending}": data}
+            yield {f"session{ending}": (f"session{ending}", partial(io.BytesIO, data))}
+            return
     if data.count(b"PK\x01\x02") > 2 * limits.n_files:  # before millions of entries are listed
         raise InputError(f"contains more than {limits.n_files} files")
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             wanted = _members(archive.infolist(), limits)
-            parts = {name: _content(archive, info, limits) for name, info in wanted.items()}
+            yield {name: (info.filename, partial(archive.open, info)) for name, info in wanted.items()}
     except InputError:
         raise
     except _ROTTEN as error:
         hint = "zip -r session.zip FOLDER, or a bag: .mcap, .bag, .db3"
         raise InputError(f"is not a readable zip: {str(error)[:120]}", hint=hint) from None
-    bags = [name for name in parts if name.endswith((*_BAGS,))]
-    if not bags or "metadata.yaml" in parts:
-        return parts
-    if len(bags) > 1:
-        raise InputError(f"contains {len(bags)} bags", hint="one, or the folder with its metadata.yaml")
-    return {f"session{Path(name).suffix}": content for name, content in parts.items()}
 
 
 def _members(infos: list[zipfile.ZipInfo], limits: UploadLimits) -> dict[str, zipfile.ZipInfo]:
@@ -129,34 +146,38 @@ def _members(infos: list[zipfile.ZipInfo], limits: UploadLimits) -> dict[str, zi
                 raise InputError("contains two files of that name", field=info.filename[:80])
             found[parts[-1]] = info
     if {"detections.csv", "detections.parquet"} & found.keys():
-        return {name: info for name, info in found.items() if name.endswith(_READ)}
-    if not any(name.endswith((*_BAGS,)) for name in found):
+        return {name: info for name, info in found.items() if name in _NATIVE}
+    bags = [name for name in found if name.endswith((*_BAGS,))]
+    if not bags:
         raise InputError("contains no detections and no bag", hint="a zip of a folder as docs/formats.md describes it")
     found = {name: info for name, info in found.items() if name.endswith(_BAG_READ)}
     if sum(name.endswith(".toml") for name in found) > 1:
         raise InputError("contains two settings files", hint="one that states the topics of the bag")
-    return found
+    if "metadata.yaml" in found:
+        return found
+    if len(bags) > 1:
+        raise InputError(f"contains {len(bags)} bags", hint="one, or the folder with its metadata.yaml")
+    return {f"session{Path(name).suffix}": info for name, info in found.items()}
 
 
-def _content(archive: zipfile.ZipFile, info: zipfile.ZipInfo, limits: UploadLimits) -> bytes:
-    content = archive.read(info)
-    if content[:2] == b"\x1f\x8b":
-        raise InputError("is compressed twice", field=info.filename[:80], hint="plain CSV or Parquet in the zip")
-    start = _BAGS.get(Path(info.filename).suffix, b"")
-    if not content.startswith(start):
-        raise InputError("is not a bag", field=info.filename[:80], hint="record it again, or leave it out")
-    if info.filename.endswith(".parquet"):
-        _check_parquet(content, info.filename, limits)
-    return content
+def _check(content: IO[bytes], name: str, limits: UploadLimits) -> None:
+    """Refuse a file that is compressed, no bag in spite of its name, or a table that expands beyond the limits."""
+    start = content.read(max(map(len, _BAGS.values())))
+    if start[:2] == b"\x1f\x8b":
+        raise InputError("is compressed twice", field=name[:80], hint="plain CSV or Parquet in the zip")
+    if not start.startswith(_BAGS.get(Path(name).suffix, b"")):
+        raise InputError("is not a bag", field=name[:80], hint="record it again, or leave it out")
+    if name.endswith(".parquet"):
+        _check_parquet(content, name, limits)
 
 
-def _check_parquet(content: bytes, name: str, limits: UploadLimits) -> None:
+def _check_parquet(content: IO[bytes], name: str, limits: UploadLimits) -> None:
     """Refuse a table that expands beyond the limits."""
     import pyarrow as pa
     from pyarrow import parquet
 
     try:
-        about = parquet.ParquetFile(io.BytesIO(content)).metadata
+        about = parquet.ParquetFile(content).metadata
         packed = sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups))
     except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(f"is not a Parquet file: {str(error)[:120]}", field=name[:80]) from None
@@ -175,10 +196,12 @@ def recording_of(data: bytes, digest: str) -> AnyRecording:
     remarks: tuple[str, ...] = ()
     with tempfile.TemporaryDirectory(prefix="evermap-upload-") as folder:
         path = Path(folder) / f"session-{digest[:12]}"
-        parts = _parts(data, UploadLimits())
         try:
-            if any(name.endswith((*_BAGS,)) for name in parts):
-                remarks = _convert(parts, path)
+            with _opened(data, UploadLimits()) as files:
+                is_bag = any(name.endswith((*_BAGS,)) for name in files)
+                bag = _unpacked(files, path) if is_bag else {}
+            if is_bag:
+                remarks = _convert(bag, path)
             else:
                 path = path.with_suffix(".zip")
                 path.write_bytes(data)
@@ -190,20 +213,27 @@ def recording_of(data: bytes, digest: str) -> AnyRecording:
     return replace(recording, source=f"upload:{digest}", warnings=(*remarks, *recording.warnings))
 
 
-def _convert(parts: dict[str, bytes], out: Path) -> tuple[str, ...]:
-    """Write a bag as a native folder, in a process that cannot take more than its share; returns remarks on it.
-
-    Raises:
-        InputError: it cannot be read, or not with so much memory and time.
-    """
+def _unpacked(parts: _Files, out: Path) -> dict[str, Path]:
+    """Write the files of a bag into a folder beside `out`; returns them by name."""
     bag = out.with_name("bag") / out.name
     bag.mkdir(parents=True)
     whole = "metadata.yaml" in parts
     files = {name: bag / (name if whole else f"{out.name}{Path(name).suffix}") for name in parts}
     for name, path in files.items():
-        path.write_bytes(parts[name])
+        with parts[name][1]() as content, path.open("wb") as file:
+            shutil.copyfileobj(content, file, _PIECE)
+    return files
+
+
+def _convert(files: dict[str, Path], out: Path) -> tuple[str, ...]:
+    """Write a bag as a native folder, in a process that cannot take more than its share; returns remarks on it.
+
+    Raises:
+        InputError: it cannot be read, or not with so much memory and time.
+    """
+    bag = next(iter(files.values())).parent
     settings = [str(path) for path in files.values() if path.suffix == ".toml"]
-    bag = bag if whole else next(path for path in files.values() if path.suffix in _BAGS)
+    bag = bag if "metadata.yaml" in files else next(path for path in files.values() if path.suffix in _BAGS)
     command = [sys.executable, "-c", _CONVERT, "convert", str(bag), str(out), "--format", "parquet", "--json"]
     command += [f"--topics={name}" for name in settings]
     how: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 2 * _BAG_CPU_S}

@@ -1,15 +1,18 @@
-"""Workers that enter waiting sessions by the same code as `evermap slam --map`."""
+"""Workers that enter waiting sessions by the same code as `evermap slam --map`, and the processes they run in."""
 
 from __future__ import annotations
 
 import os
 import secrets
+import signal
 import socket
+import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Self
 
 from evermap.config import Config
 from evermap.errors import EvermapError
@@ -22,6 +25,10 @@ from evermap.server.uploads import recording_of
 LEASE_S = 60.0
 _PAUSE_S = 0.5
 _OUTAGE_S = 2.0
+_LONGEST_PAUSE_S = 60.0
+"""Before a process is replaced that ends again and again within this time."""
+_GRACE_S = 10.0
+"""For a process to end before it is killed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,3 +141,75 @@ class Worker:
         finally:
             done.set()
             thread.join()
+
+
+class Crew:
+    """Worker processes, each of which is replaced when it ends, as long as a `with` block runs.
+
+    Args:
+        command: starts one.
+        count: how many.
+        told: called with a line when one has ended.
+    """
+
+    def __init__(self, command: Sequence[str], count: int, told: Callable[[str], None] = lambda _: None) -> None:
+        self._command, self._told = command, told
+        self._processes: dict[int, subprocess.Popen[bytes]] = {}
+        self._over, self._lock = threading.Event(), threading.Lock()
+        self._threads = [threading.Thread(target=self._replace, args=(place,), daemon=True) for place in range(count)]
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:  # no thread starts another from now on
+            self._over.set()
+            processes = list(self._processes.values())
+        for process in processes:
+            process.terminate()
+        end = time.monotonic() + _GRACE_S
+        for process in processes:
+            try:
+                process.wait(max(end - time.monotonic(), 0.0))
+            except subprocess.TimeoutExpired:
+                process.kill()
+        for thread in self._threads:
+            thread.join()
+
+    def alive(self) -> int:
+        """Return the number of processes that run."""
+        with self._lock:
+            return sum(process.poll() is None for process in self._processes.values())
+
+    def _replace(self, place: int) -> None:
+        """Start a process, and again whenever it has ended; the later the more often it ended soon."""
+        pause_s = _PAUSE_S
+        while True:
+            with self._lock:
+                if self._over.is_set():
+                    return
+                # in a session of its own: Ctrl-C is for the server, which ends its workers
+                process = subprocess.Popen(  # nosec  # B603: ourselves
+                    self._command, stdin=subprocess.DEVNULL, start_new_session=True
+                )
+                self._processes[place] = process
+            start = time.monotonic()
+            code = process.wait()
+            lasted_s = time.monotonic() - start
+            pause_s = _PAUSE_S if lasted_s > _LONGEST_PAUSE_S else min(2.0 * pause_s, _LONGEST_PAUSE_S)
+            if not self._over.is_set():
+                self._told(f"a worker ended with code {code}; another starts in {pause_s:.0f} s")
+            self._over.wait(pause_s)
+
+
+def end_without(parent: int) -> None:
+    """End this process, by SIGTERM, as soon as its parent is another than it was."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_PAUSE_S)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -210,7 +210,7 @@ class MapStore(Protocol):
         """
         ...
 
-    def prune(self, keep: int = 10, *, dry_run: bool = False) -> Pruning:
+    def prune(self, keep: int = 10, *, also: Collection[int] = (), dry_run: bool = False) -> Pruning:
         """Delete the content that only old revisions hold; all or nothing of it, and nothing from a damaged map.
 
         Their lines in the log, changes, evidence, attachments, landmarks' ids and operators' words stay, as do all
@@ -218,6 +218,7 @@ class MapStore(Protocol):
 
         Args:
             keep: newest revisions that stay whole, and as many of `lineage()`, which late sessions start from.
+            also: other revisions that stay whole, as those that robots use.
             dry_run: return what would be deleted, and delete nothing.
 
         Raises:

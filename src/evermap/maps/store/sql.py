@@ -288,13 +288,14 @@ class SqlStore(Shown):
         origin = replace(origin, kind=RevisionKind.REVERT, note=origin.note or f"back to revision {revision}")
         return self.commit(restored, origin, parent=head, restores=revision, lost=lost)
 
-    def prune(self, keep: int = 10, *, dry_run: bool = False) -> Pruning:
+    def prune(self, keep: int = 10, *, also: Collection[int] = (), dry_run: bool = False) -> Pruning:
         """Delete the content that only old revisions hold."""
         if keep < 1:
             raise ConfigError(f"{keep} is less than 1", field="keep", hint="1 keeps the newest revision only")
         with self._reading() if dry_run else self._writing() as connection:
             records, pruned = self._chain(connection)[0], self._pruned(connection)
-            kept = {*sorted(records)[-keep:], *self._lineage(connection, None)[-keep:]} - pruned.keys()
+            newest = {*sorted(records)[-keep:], *self._lineage(connection, None)[-keep:]}
+            kept = (newest | (records.keys() & {*also})) - pruned.keys()
             old = records.keys() - pruned.keys() - kept
             for number in kept:  # as long as one of them is damaged, an old one may be needed
                 self._unpacked(connection, records[number])
