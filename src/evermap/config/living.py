@@ -212,7 +212,7 @@ class SightConfig(Section):
     least_rate: Share = key(0.002, "minimum detection rate of any kind of line")
     highest_rate: Share = key(0.98, "maximum detection rate of any kind of line")
     rate_sigma: NotNegative = key(
-        1.0, "standard deviation of the log of the factor by which a sensor detects more or less often; 0: never"
+        1.0, "standard deviation of the log of the factor by which a sensor may detect less than others; 0: never"
     )
     rate_looks: Positive = key(5.0, "maximum looks at one place in a session from which this is learned")
     neighbour: Probability = key(0.35, "weight of looks from the eight cells around, in looks along the line")

@@ -28,7 +28,7 @@ KNOWN = 1e9
 """Looks that are worth certainty."""
 HEADINGS = 24
 """Headings that views distinguish."""
-_FACTORS = np.exp(np.linspace(-4.0, 1.5, 551))
+_FACTORS = np.exp(np.linspace(-4.0, 0.0, 401))
 """Rates of a session that are compared."""
 _REACH = 1 << 12
 _SPAN = 1 << 24
@@ -300,7 +300,7 @@ class Views:
         cell = np.floor(pose_map_sensor[:, :2] / self.cell_m).astype(np.int64)
         turn = np.floor(np.mod(pose_map_sensor[:, 2], 2.0 * np.pi) * (HEADINGS / (2.0 * np.pi))).astype(np.int64)
         own, counts = np.unique(np.column_stack([cell, turn % HEADINGS]), axis=0, return_counts=True)
-        frames = np.append(min(rate, 1.0) * counts, self.frames)
+        frames = np.append(rate * counts, self.frames)
         both = np.concatenate([own, np.column_stack([self.cell, self.heading])])
         every, first = np.unique(both, axis=0, return_index=True)  # the first of equal rows: those of this session
         stamps = np.append(np.full(len(own), stamp_s), self.stamp_s)[first]
@@ -311,7 +311,8 @@ def session_rate(hit: BoolArray, p_detect: FloatArray, weight: FloatArray, rules
     """Return how often a session detects, over what lines of sight lead to expect.
 
     Sensors differ between robots, and lenses get dirty. The posterior mean of a factor common to all lines on a grid;
-    a priori it is 1 or, as probably, log-normal.
+    a priori it is 1 or, as probably, smaller: half of a log-normal distribution. It is not larger, so that a miss never
+    says more than the lines of the map tell.
 
     Args:
         hit: (N,) detections of what was there for certain.
