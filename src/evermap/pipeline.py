@@ -121,15 +121,17 @@ def run_session(
     from evermap.slam import check
 
     config = config or Config()
-    living = session.opened(living, recording)
+    living, whole = session.opened(living, recording), recording
     if not isinstance(recording, SpatialRecording):
-        return bring_in(solve_alone(recording, living, config, progress=progress), living, config)
+        entered = bring_in(solve_alone(recording, living, config, progress=progress), living, config)
+        return session.begun_with(entered, whole)
     recording = nameless.without_ids(recording) if config.slam.unknown_ids is True else recording
     recording, remarks = check.screened(recording, config)
     recording, living = session.admitted(recording, living)
     if config.slam.unknown_ids:
         recording, living = session.admitted(nameless.named_in(recording, living, config), living)
-    return session.brought_in(boxes.localised(recording, living, config, remarks, progress), living, config.living)
+    entered = session.brought_in(boxes.localised(recording, living, config, remarks, progress), living, config.living)
+    return session.begun_with(entered, whole)
 
 
 @single_threaded()

@@ -234,7 +234,7 @@ def test_a_session_of_another_place_is_refused(copy: Path, building: BuildingSim
     result = slam(tmp_path / "elsewhere", copy, tmp_path / "run")
     assert result.exit_code == 2
     problem = result.stderr.splitlines()[-1]
-    assert "could not be localised in this map, which is unchanged: too few of the detected landmarks" in problem
+    assert "was set aside, the map is unchanged: too few of the detected landmarks" in problem
     assert "begin another map" in problem
     assert digest(copy) == before
     assert json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))["accepted"] is False

@@ -297,7 +297,7 @@ def test_a_session_that_is_of_another_place_is_set_aside(tmp_path: Path, two_ses
         for _ in fed(live, strange):
             pass
         assert live.save() is None
-        assert "cannot localise in the map" in live.step().warnings[0]
+        assert "set aside" in live.step().warnings[0]
     (aside,) = path.with_name("site.evermap.live").glob("aside-*")
     assert len(em.read_recording(aside).frames) == len(recording.frames)
     with open_store(path) as store:

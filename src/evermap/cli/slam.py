@@ -578,9 +578,7 @@ def _commit(entered: Entered, store: MapStore, map_file: str | Path, config: Con
     """Make a session the newest revision of a map."""
     if not entered.session.found:
         problem, hint = entered.session.set_aside
-        raise ConfigError(
-            f"the session could not be localised in this map, which is unchanged: {problem}", path=map_file, hint=hint
-        )
+        raise ConfigError(f"the session was set aside, the map is unchanged: {problem}", path=map_file, hint=hint)
     with held():
         revision = entered.commit(store, config, command=command_line(), wall_s=elapsed_s)
         kept(map_file, f"the session is revision {revision} of {map_file}")

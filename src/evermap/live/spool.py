@@ -168,7 +168,7 @@ def _entered(map_file: Path, recording: Recording, config: Config, path: Path) -
             with open_store(map_file, create=True) as store:
                 entered = enter_session(store, recording, config)
                 if not entered.session.found:
-                    problem = f"cannot localise in the map: {entered.session.set_aside[0]}"
+                    problem = f"set aside: {entered.session.set_aside[0]}"
                     break
                 number = entered.commit(store, config, command="evermap live")
                 return Brought(recording.name, number, entered=entered)

@@ -412,12 +412,9 @@ def _motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]:
     return found
 
 
-def unrelated(recording: Recording, settings: CheckConfig) -> bool:
-    """Return whether landmarks move by the odometry of a recording, and no single mistake explains it."""
-    pairs = pairs_of(recording, settings)
-    if pairs is None or pairs.still or np.median(off(pairs.residual(HONEST))) <= settings.off:
-        return False
-    return any(finding.code == "landmarks-move" for finding in _motion(recording, settings))
+def unusable(recording: Recording, settings: CheckConfig) -> Finding | None:
+    """Return why static landmarks seem to move by the odometry of a recording; None if they do not."""
+    return next(iter(_motion(recording, settings)), None)
 
 
 def valid(recording: Recording, sensor: SensorConfig, prior_map: Landmarks | None = None) -> Recording:

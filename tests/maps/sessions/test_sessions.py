@@ -14,7 +14,7 @@ from evermap.geometry.rigid import rigid
 from evermap.maps.lives import Lives
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import predicted
-from evermap.maps.sessions.session import Session
+from evermap.maps.sessions.session import Session, begun_with
 from evermap.pipeline import run_session
 from evermap.types import ChangeKind, Clock, FloatArray, Recording
 from evermap_studies.sim import BuildingSimulation, looked_at
@@ -284,7 +284,7 @@ def test_a_session_elsewhere_leaves_the_map_as_it_was(still: tuple[BuildingSimul
     assert_same_bytes(session.living, sessions[0].living)
     assert session.changes == ()
     assert len(session.evidence) == 0
-    assert any("cannot localise" in warning for warning in session.slam.warnings)
+    assert any("set aside" in warning for warning in session.slam.warnings)
     assert session.slam.landmarks.frame == "first_pose"
 
 
@@ -304,6 +304,33 @@ def test_a_session_whose_odometry_is_of_another_drive_is_not_believed(
     assert not session.found
     assert "contradict the map or each other" in session.set_aside[0]
     assert_same_bytes(session.living, sessions[0].living)
+
+
+def test_a_session_with_a_wrong_sign_begins_no_map_and_enters_none(
+    still: tuple[BuildingSimulation, list[Session]],
+) -> None:
+    """Mirrored, its landmarks agree with each other."""
+    world, sessions = still
+    other = world.sessions[1]
+    mirrored = replace(other, detections=replace(other.detections, bearing_rad=-other.detections.bearing_rad))
+    for living in (None, sessions[0].living):
+        session = run_session(mirrored, living, settings())
+        assert not session.found
+        assert "wrong sign" in session.set_aside[0]
+        assert len(session.living.places) == (0 if living is None else len(living.places))
+
+
+def test_a_session_is_as_old_as_its_recording_whatever_is_left_out(
+    still: tuple[BuildingSimulation, list[Session]],
+) -> None:
+    """So a recording that begins between that and the first frame that is used comes after it."""
+    world, sessions = still
+    began_s = sessions[0].living.session_start_s
+    assert began_s == world.sessions[0].frames.stamp_s[0]
+    for earlier_s, expected_s in ((10.0, began_s - 10.0), (-10.0, began_s)):
+        frames = replace(world.sessions[0].frames, stamp_s=world.sessions[0].frames.stamp_s - earlier_s)
+        after = begun_with(sessions[0], replace(world.sessions[0], frames=frames))
+        assert after.living.session_start_s == expected_s
 
 
 @pytest.mark.parametrize("seed", [5, 6, 7, 8])

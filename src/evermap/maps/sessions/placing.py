@@ -30,9 +30,12 @@ NOT_FOUND = (
     "too few of the detected landmarks have the relative positions of the map",
     "begin another map with it, or first enter a session that overlaps both",
 )
+ANYWAY = (
+    "`evermap check` names problems; `--set living.search=gate` enters it anyway, by the alignment with most agreement"
+)
 CONTRADICTED = (
     "most sightings contradict the map or each other; the session is distorted, or from another place",
-    "`evermap check` names problems; `--set living.search=gate` enters it anyway, by the alignment with most agreement",
+    ANYWAY,
 )
 """Why a session cannot be localised in a map, and what to try."""
 SMALLEST_P = 1e-6

@@ -27,6 +27,7 @@ from evermap.maps.sessions.gaussian import (
 )
 from evermap.maps.sessions.looks import Sighting, Watch
 from evermap.maps.sessions.placing import (
+    ANYWAY,
     CONTRADICTED,
     NOT_FOUND,
     Held,
@@ -43,7 +44,7 @@ from evermap.maps.sessions.placing import (
 from evermap.maps.sessions.witnessed import Witnessed
 from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.slam import result as of_slam
-from evermap.slam.check import unrelated
+from evermap.slam.check import unusable
 from evermap.slam.cleaning import some_frames
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.streaming import Outcome, silent_links
@@ -180,7 +181,10 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
     """
     settings, lost = config.living, Localised.lost(PlanarVisit(alone), living, CONTRADICTED)
     joint = settings.search == "joint"
-    if joint and cut and len(living.places) and unrelated(alone.recording, config.slam.check):
+    wrong = unusable(alone.recording, config.slam.check) if joint and cut else None
+    if wrong is not None and not wrong.usable:
+        return Localised.lost(PlanarVisit(alone), living, (wrong.message, ANYWAY))
+    if wrong is not None and len(living.places):
         return lost
     large = len(living.places) > settings.whole_places
     vicinity, where = near_session(living, alone, settings) if large else (None, None)

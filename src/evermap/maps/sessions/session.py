@@ -158,6 +158,16 @@ def check_in_order(recording: AnyRecording, living: LivingMap) -> None:
         )
 
 
+def begun_with(session: Session, recording: AnyRecording) -> Session:
+    """Return a session of a map that began with its recording, whatever of that was left out: sessions are in the order
+    of their recordings (`check_in_order`).
+    """
+    if not session.found:
+        return session
+    start_s = float(np.fmin(recording.frames.stamp_s[0], session.living.session_start_s))
+    return replace(session, living=replace(session.living, session_start_s=start_s))
+
+
 @dataclass(frozen=True, slots=True)
 class Judged:
     """What a session says of a map.
@@ -338,7 +348,7 @@ def brought_in(
     visit, where = session.visit, session.where
     if session.reason:
         slam = existing(visit, visit.concluded(), config)
-        slam = replace(slam, warnings=(*slam.warnings, f"cannot localise in the map: {session.reason[0]}"))
+        slam = replace(slam, warnings=(*slam.warnings, f"set aside: {session.reason[0]}"))
         return Session(whole, False, visit.used, slam, (), Evidence.empty(), session.reason)
     known = judged(session.living, where, visit, config)
     told_now = told(judged(session.living, where, visit, config, known), where, visit)
