@@ -165,3 +165,10 @@ def test_a_landmark_whose_first_sighting_was_misread_is_where_all_others_say(see
     truth = recording.true_landmarks.position_m[found.landmark_id]
     off_m = np.linalg.norm(se2.transform(rigid(found.position_m, truth), found.position_m) - truth, axis=1)
     assert off_m.max() < 0.5
+
+
+def test_ranges_in_millimetres_are_told_and_go_through():
+    recording = judged(1).recording
+    seen = recording.detections
+    result = run_slam(replace(recording, detections=replace(seen, range_m=1000.0 * seen.range_m)))
+    assert any("millimetres" in warning for warning in result.warnings)

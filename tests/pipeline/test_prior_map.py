@@ -11,6 +11,9 @@ from recordings import some_rows
 
 from evermap.config import load_config
 from evermap.geometry import se2
+from evermap.io import read_planar
+from evermap.io.landmarks import read_prior_map
+from evermap.io.template import write_template
 from evermap.pipeline import run_slam
 from evermap.types import FloatArray, Landmarks
 
@@ -60,3 +63,16 @@ def test_a_map_of_another_place_is_not_entered():
     result = run_slam(recording, prior_map=Landmarks.at([7000, 8000, 9000], [[0.0, 0.0], [5.0, 0.0], [0.0, 5.0]]))
     assert result.trajectory.frame == "first_pose"
     assert any("prior map" in warning for warning in result.warnings)
+
+
+def test_a_small_map_is_enough_without_identities(tmp_path):
+    """Six landmarks, one of them moved: the others have their identities."""
+    folder = write_template(tmp_path / "template")
+    recording, survey = read_planar(folder), read_prior_map(folder / "survey.csv")
+    result = run_slam(recording, load_config(None, ["slam.unknown_ids=true"]), prior_map=survey)
+    assert not any("cannot localise" in warning for warning in result.warnings)
+    named = run_slam(recording, prior_map=survey)
+    both, mine, theirs = np.intersect1d(result.landmarks.landmark_id, named.landmarks.landmark_id, return_indices=True)
+    assert len(both) >= 5
+    off = result.landmarks.position_m[mine] - named.landmarks.position_m[theirs]
+    assert np.linalg.norm(off, axis=1).max() < 0.05

@@ -214,7 +214,7 @@ class ConstellationConfig(Section):
     free_m: Positive = key(5.0, "standard deviation of the offset around a candidate motion [m]")
     free_rad: Positive = key(2.0, "standard deviation of its rotation [rad]")
     certain_nats: NotNegative = key(7.0, "evidence of an alignment over no alignment, and over its best rival [nats]")
-    lead_nats: NotNegative = key(20.0, "the same over its best rival, if a whole map was searched [nats]")
+    lead_nats: NotNegative = key(20.0, "the same over its best rival, if a large map was searched [nats]")
     stiff_m: Positive = key(0.2, "landmarks known this well relative to each other are one rigid part of a map [m]")
     longest_side_m: Positive = key(25.0, "longest side of an indexed triangle [m]")
     side_sigmas: Positive = key(3.4, "standard deviations by which the sides of matching triangles may differ ...")

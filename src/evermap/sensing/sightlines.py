@@ -90,6 +90,11 @@ class SightLines:
         return len(self.cell)
 
     @property
+    def reach_m(self) -> float:
+        """Return how far from a place lines of sight are told apart on each axis."""
+        return (_REACH // 2 - 1) * self.cell_m
+
+    @property
     def p_hidden(self) -> FloatArray:
         """(3,) probability that a place is hidden for a whole session, by the state of the lines to it."""
         at_first, worth = np.array(self.rules.p_hidden), self.rules.hidden_looks

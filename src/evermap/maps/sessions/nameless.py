@@ -507,6 +507,7 @@ class _Assigned:
             return []
         (at, spread), local, motions = self._about(stands, drift_m), self._local.part(some), None
         area_m2 = float(np.prod(np.sort(np.ptp(at, axis=0))[-2:] + 10.0))
+        by_chance = math.log(max(len(some), 2) ** 2 * max(len(stands), 2) ** 2)  # pairs of both, each a motion
         if index is not None:
             motions = list(index.motions(local.place, local.beside_m))
             if not motions:
@@ -521,7 +522,10 @@ class _Assigned:
             density=self._density,
             probability=self._slam.association.p_merge,
             motions=motions,
-            margins_nats=(rules.certain_nats + max(math.log(area_m2 / TESTED_M2), 0.0), rules.lead_nats),
+            margins_nats=(
+                rules.certain_nats + max(math.log(area_m2 / TESTED_M2), 0.0),
+                min(rules.certain_nats + by_chance, rules.lead_nats),
+            ),
             settings=self._slam,
         )
         return [(int(some[k]), int(stands[m])) for k, m in pairs]
