@@ -85,7 +85,7 @@ from evermap_studies.sim.park import simulate_park
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 PARKS = 3
 DATASETS = (1, 2, 3, 6)
-"""Those with true poses."""
+"""The first two have no true poses: position errors are those against the run with identities."""
 ROBOTS = (1, 2, 3, 4, 5)
 BUILDINGS, DRIVES = 3, 3
 """In space."""

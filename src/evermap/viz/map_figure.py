@@ -17,7 +17,7 @@ from evermap.types import AnyRecording, BoolArray, ChangeKind, FloatArray, Landm
 from evermap.viz.change_words import near_alternatives, probability, what
 from evermap.viz.panels import (
     View,
-    box_sizes,
+    boxes,
     corners_of,
     draw_shapes,
     footprints,
@@ -79,7 +79,7 @@ class _Scene:
     @property
     def street(self) -> bool:
         """Whether most landmarks are boxes: drawn by their outlines, from above alone."""
-        return 2 * int(np.count_nonzero(_boxes(self.landmarks))) > len(self.landmarks)
+        return 2 * int(np.count_nonzero(boxes(self.landmarks))) > len(self.landmarks)
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
         """Return the corners of the required content; odometry and a larger survey may exceed it."""
@@ -235,19 +235,11 @@ def _draw_footprints(axes: Axes, landmarks: Landmarks, colours: Any) -> None:
     from matplotlib.colors import to_rgba
     from matplotlib.lines import Line2D
 
-    rows = _boxes(landmarks)
+    rows = boxes(landmarks)
     corners = list(footprints(landmarks, rows))
     faces = [to_rgba(colour, 0.75 * p) for colour, p in zip(colours[rows], landmarks.p_exists[rows], strict=True)]
     axes.add_collection(PolyCollection(corners, facecolors=faces, edgecolors=colours[rows], linewidths=0.6, zorder=5.5))
     axes.add_line(Line2D([], [], ls="", marker="s", mfc="none", mec=MUTED, ms=6, label="box, filled by P(exists)"))
-
-
-def _boxes(landmarks: Landmarks) -> BoolArray:
-    """(L,) landmarks with a size and an orientation."""
-    if landmarks.rotation is None:
-        return np.zeros(len(landmarks), dtype=np.bool_)
-    sized = np.column_stack([landmarks.rotation, box_sizes(landmarks)])
-    return np.asarray(np.isfinite(sized).all(axis=1))
 
 
 def moving_paths(result: Any) -> list[tuple[int, FloatArray]]:

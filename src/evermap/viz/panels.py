@@ -137,7 +137,7 @@ def draw_shapes(
     if landmarks.rotation is None:
         return
     oriented = np.isfinite(landmarks.rotation).all(axis=1)
-    sized = np.asarray(np.isfinite(np.column_stack([landmarks.rotation, box_sizes(landmarks)])).all(axis=1))
+    sized = boxes(landmarks)
     lines = [*box_edges(landmarks, sized)[..., view].reshape(-1, 2, 2)]
     looks = [colour for colour, box in zip(colours, sized, strict=True) if box for _ in _EDGES]
     for row in np.flatnonzero(oriented & ~sized):
@@ -148,6 +148,13 @@ def draw_shapes(
         lines.append(np.stack([start, start + _NORMAL * reach_m * normal])[:, view])
         looks.append(colours[row])
     axes.add_collection(LineCollection(lines, colors=looks, linewidths=1.1, zorder=5.5))
+
+
+def boxes(landmarks: Landmarks) -> BoolArray:
+    """Return (L,) which landmarks have a size and an orientation."""
+    if landmarks.rotation is None:
+        return np.zeros(len(landmarks), dtype=np.bool_)
+    return np.asarray(np.isfinite(np.column_stack([landmarks.rotation, box_sizes(landmarks)])).all(axis=1))
 
 
 def box_sizes(landmarks: Landmarks) -> FloatArray:
