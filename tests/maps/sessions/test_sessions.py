@@ -16,7 +16,8 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import predicted
 from evermap.maps.sessions.session import Session, begun_with
 from evermap.pipeline import run_session
-from evermap.types import ChangeKind, Clock, FloatArray, Recording
+from evermap.slam.cleaning import some_frames
+from evermap.types import UNKNOWN, ChangeKind, Clock, FloatArray, Recording, rows_of
 from evermap_studies.sim import BuildingSimulation, looked_at
 from evermap_studies.sim.world import positions_at
 
@@ -318,6 +319,34 @@ def test_a_session_with_a_wrong_sign_begins_no_map_and_enters_none(
         assert not session.found
         assert "wrong sign" in session.set_aside[0]
         assert len(session.living.places) == (0 if living is None else len(living.places))
+
+
+def test_a_drive_in_pieces_that_nothing_ties_begins_a_map_with_the_largest(
+    still: tuple[BuildingSimulation, list[Session]],
+) -> None:
+    """Though that is less than half of it: the others do not contradict it."""
+    world, _ = still
+    whole = world.sessions[0]
+    first_s, last_s = whole.frames.stamp_s[[0, -1]]
+    piece = np.minimum((whole.frames.stamp_s - first_s) * 3.0 / (last_s - first_s), 2.999).astype(int)
+    of = piece[whole.detections.frame]
+    times = np.array([np.bincount(of[whole.detections.landmark_id == name], minlength=3) for name in range(200)])
+    own = (whole.detections.landmark_id >= 0) & (times.argmax(axis=1)[whole.detections.landmark_id] == of)
+    edges_s = first_s + (last_s - first_s) * np.array([1.0, 2.0]) / 3.0
+    silent = (np.abs(whole.odometry.stamp_s[:, None] - edges_s) < 3.0).any(axis=1)
+    blind = (np.abs(whole.frames.stamp_s[:, None] - edges_s) < 3.0).any(axis=1)
+    frames, detections = some_frames(whole.frames, whole.detections, ~blind)
+    own = own[~blind[whole.detections.frame]]
+    detections = replace(detections, landmark_id=np.where(own, detections.landmark_id, UNKNOWN))
+    session = run_session(
+        replace(whole, odometry=rows_of(whole.odometry, ~silent), frames=frames, detections=detections),
+        None,
+        settings(),
+    )
+    assert session.found, session.set_aside
+    assert any("nothing connects them" in warning for warning in session.recording.warnings)
+    pieces = times.argmax(axis=1)[session.living.members.landmark_id]
+    assert len(np.unique(pieces)) == 1
 
 
 def test_a_session_is_as_old_as_its_recording_whatever_is_left_out(

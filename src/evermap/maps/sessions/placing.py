@@ -37,6 +37,7 @@ CONTRADICTED = (
     "most sightings contradict the map or each other; the session is distorted, or from another place",
     ANYWAY,
 )
+DISTORTED = "most sightings contradict each other; the session is distorted", ANYWAY
 """Why a session cannot be localised in a map, and what to try."""
 SMALLEST_P = 1e-6
 BENT_ROUNDS = 5

@@ -29,6 +29,7 @@ from evermap.maps.sessions.looks import Sighting, Watch
 from evermap.maps.sessions.placing import (
     ANYWAY,
     CONTRADICTED,
+    DISTORTED,
     NOT_FOUND,
     Held,
     Laid,
@@ -179,12 +180,13 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
         config: settings.
         cut: solve without doubtful frames (`doubtful`), if there are any.
     """
-    settings, lost = config.living, Localised.lost(PlanarVisit(alone), living, CONTRADICTED)
+    settings, known = config.living, len(living.places) > 0
+    lost = Localised.lost(PlanarVisit(alone), living, CONTRADICTED if known else DISTORTED)
     joint = settings.search == "joint"
     wrong = unusable(alone.recording, config.slam.check) if joint and cut else None
     if wrong is not None and not wrong.usable:
         return Localised.lost(PlanarVisit(alone), living, (wrong.message, ANYWAY))
-    if wrong is not None and len(living.places):
+    if wrong is not None and known:
         return lost
     large = len(living.places) > settings.whole_places
     vicinity, where = near_session(living, alone, settings) if large else (None, None)
@@ -198,7 +200,7 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
         part, where, visit = refit(part, p_site, where, alone, settings, robust=config.slam.robust, part=in_part)
     if joint:
         if cut:
-            some = without(visit, doubtful(visit, where, settings))
+            some = without(visit, *doubtful(visit, where, settings))
             if some is None:
                 return lost
             if some is not visit.recording:
@@ -335,8 +337,8 @@ def fits(visit: Solved, alone: Solved, config: LivingConfig) -> bool:
     return bool(visit.outcome.inlier.mean() >= config.fit.least_fit * alone.outcome.inlier.mean())
 
 
-def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> BoolArray:
-    """Return (F,) doubtful frames of a session, which are not entered.
+def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> tuple[BoolArray, BoolArray]:
+    """Return (F,) frames of a session that nothing ties to the rest, and (F,) that contradict it: neither are entered.
 
     Where the odometry was silent, a session falls into parts, if what was seen does not tie them. Those that show none
     of the map, or in a map that begins, all but the largest, may be anywhere. And where most sightings of a stretch
@@ -370,21 +372,31 @@ def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> BoolArr
     window = min(settings.bent_windows * settings.window, n_seen)
     fits = np.convolve(outcome.inlier, np.ones(window) / window, "valid")
     first = np.clip(np.searchsorted(row, np.arange(n_poses)) - window // 2, 0, len(fits) - 1)
-    wrong = ~tied[part] | (fits[first] < settings.inlier)
     frames = np.arange(len(visit.recording.frames))
     at = np.searchsorted(visit.prepared.pose_frame, frames)
     before, after = np.clip(at - 1, 0, n_poses - 1), np.minimum(at, n_poses - 1)
     seen = visit.prepared.pose_frame[after] == frames
-    return np.asarray(np.where(seen, wrong[after], wrong[before] | wrong[after]))
+
+    def of_frames(wrong: BoolArray) -> BoolArray:
+        return np.asarray(np.where(seen, wrong[after], wrong[before] | wrong[after]))
+
+    return of_frames(~tied[part]), of_frames(fits[first] < settings.inlier)
 
 
-def without(visit: Solved, doubt: BoolArray) -> Recording | None:
-    """Return the recording of a session without doubtful frames (F,); None where that is most of it."""
-    recording = visit.recording
+def without(visit: Solved, untied: BoolArray, wrong: BoolArray) -> Recording | None:
+    """Return the recording of a session without doubtful frames; None where most of what is tied contradicts the rest.
+
+    Args:
+        visit: the session.
+        untied: (F,) frames that nothing ties to the rest, see `doubtful`.
+        wrong: (F,) frames that contradict it.
+    """
+    recording, doubt = visit.recording, untied | wrong
     if not doubt.any():
         return recording
     frames, detections = some_frames(recording.frames, recording.detections, ~doubt)
-    if 2 * len(detections) < len(recording.detections) or len(np.unique(detections.frame)) < 2:
+    n_tied = np.count_nonzero(~untied[recording.detections.frame])
+    if 2 * len(detections) < n_tied or len(np.unique(detections.frame)) < 2:
         return None
     start_s = recording.frames.stamp_s[0]
     spans = np.flatnonzero(np.diff(np.concatenate([[False], doubt, [False]])))
