@@ -15,9 +15,16 @@ from evermap.geometry import se2
 from evermap.maps.sessions.nameless import numbered_in
 from evermap.slam.association import with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment
-from evermap.slam.association.associator import Associator, compared, fit_sighting_noise
+from evermap.slam.association.associator import Associator, compared, correlated, fit_sighting_noise
 from evermap.slam.association.merging import propose_merges
-from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
+from evermap.slam.association.revise import (
+    HIDDEN,
+    LOOK_BINS,
+    likely_real,
+    reassigned,
+    unseen_nats,
+    with_overlooked,
+)
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
@@ -153,6 +160,92 @@ def test_a_building_without_ids_and_in_its_map() -> None:
     assert met.mean() > 0.5
     assert np.mean(inside[met] == recording.detections.landmark_id[met]) > 0.98
     assert np.all(inside[~met & (inside != UNKNOWN)] > 0)
+
+
+def after_a_silence(seed: int, late: int = 50) -> World:
+    """Among 16 landmarks; later, after a gap of the odometry, only two are in view, the second one seldom seen."""
+    made = make_world(seed, n_poses=80, n_landmarks=16, prior=KNOWN_SENSORS, p_seen=0.9)
+    problem, rng = made.problem, np.random.default_rng(seed)
+    seldom = rng.random(len(problem.pose_row)) < 0.2
+    kept = (problem.pose_row < late) | (problem.landmark_row == 0) | ((problem.landmark_row == 1) & seldom)
+    drive = problem.drive
+    gap = (drive.stamp_s > problem.stamp_s[late - 1]) & (drive.stamp_s < problem.stamp_s[late])
+    columns = {name: getattr(problem, name)[kept] for name in ("pose_row", "landmark_row", "reading", "sigma_given")}
+    drive = replace(drive, unknown=np.where(gap, 10.0, drive.unknown))
+    return replace(made, problem=replace(problem, drive=drive, **columns))
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_a_loose_part_is_aligned_where_it_explains_most_though_not_certainly(seed: int) -> None:
+    """In seed 4 the two fit to other pairs, too; left as a ghost, the second one would explain none of its hits."""
+    made = after_a_silence(seed)
+    found, true = associated(made), made.problem.landmark_row
+    assert found.n_landmarks == 16
+    late = made.problem.pose_row >= 50
+    for name in (0, 1):
+        assert len(np.unique(found.landmark_row[true == name])) == 1, f"landmark {name} in several parts"
+    assert (found.landmark_row[late] != NOBODY).all()
+
+
+def test_what_is_new_after_a_silence_is_not_taken_for_what_is_known() -> None:
+    """Two landmarks at a distance at which others stand, too: fewer landmarks alone are no reason to merge them."""
+    made = after_a_silence(4)
+    problem, late = made.problem, made.problem.pose_row >= 50
+    reading = problem.reading.copy()
+    reading[late & (problem.landmark_row == 1), 0] *= 0.4
+    reading[late & (problem.landmark_row == 0), 0] *= 0.4
+    found = associated(replace(made, problem=replace(problem, reading=reading)))
+    old = set(found.landmark_row[~late])
+    assert old.isdisjoint(set(found.landmark_row[late]) - {NOBODY})
+
+
+def test_a_map_that_is_there_twice_was_not_seen_where_it_should_have_been() -> None:
+    made = make_world(3, n_poses=200, n_landmarks=8, prior=KNOWN_SENSORS)
+    true, pose = made.problem.landmark_row, made.problem.pose_row
+    once = settled(made, true)
+    twice = replace(
+        once,
+        landmark_row=true + 8 * (pose >= 100),
+        estimate=replace(once.estimate, landmark=np.tile(once.estimate.landmark, (2, 1))),
+    )
+    assert likely_real(twice).all()
+    assert unseen_nats(twice) > unseen_nats(once) + 50.0
+
+
+def test_hits_and_misses_are_as_likely_as_counted_by_hand() -> None:
+    made = make_world(1, n_poses=150, n_landmarks=8, prior=KNOWN_SENSORS, p_seen=0.1)
+    found = settled(made, made.problem.landmark_row)
+    reach, bearing = found.measured.reading.T
+    edges = np.quantile(reach, np.linspace(0.0, 1.0, LOOK_BINS + 1))
+    local = np.stack([se2.transform(se2.inverse(pose), found.estimate.landmark) for pose in found.estimate.pose])
+    away, turned = np.hypot(*local.T).T, np.arctan2(local[..., 1], local[..., 0])
+    view = (away <= edges[-1]) & (turned >= bearing.min()) & (turned <= bearing.max())
+    which = np.clip(np.searchsorted(edges, away) - 1, 0, LOOK_BINS - 1)
+    hits = np.bincount(np.clip(np.searchsorted(edges, reach) - 1, 0, LOOK_BINS - 1), minlength=LOOK_BINS)
+    rate = np.array([hits[b] / max(np.sum(view & (which == b)), 1) for b in range(LOOK_BINS)])
+    window = ((found.measured.stamp_s - found.measured.stamp_s[0]) // 20.0).astype(int)
+    likelihood = np.zeros(len(HIDDEN))
+    for k in range(8):
+        for w in range(window[-1] + 1):
+            rows = window == w
+            p = 1.0 - np.exp(-np.sum(rate[which[rows, k]] * view[rows, k]))
+            seen = np.any(found.landmark_row[rows[found.measured.pose_row]] == k)
+            likelihood += np.log((1.0 - HIDDEN) * p if seen else 1.0 - (1.0 - HIDDEN) * p)
+    assert unseen_nats(found) == pytest.approx(-likelihood.max(), rel=1e-6)
+
+
+def test_residuals_that_hang_together_count_as_fewer() -> None:
+    made = make_world(2, n_poses=200, n_landmarks=8, prior=KNOWN_SENSORS, p_seen=0.95)
+    found = settled(made, made.problem.landmark_row)
+    found = replace(
+        found, measured=replace(found.measured, sigma_given=np.tile([0.05, 0.02], (len(found.landmark_row), 1)))
+    )
+    alone = correlated(found)
+    assert alone < 2.0
+    visit, rng = found.visits(20.0), np.random.default_rng(0)
+    common = rng.normal(0.0, 0.05, visit.max() + 1)[visit]
+    reading = found.measured.reading + np.column_stack([common, np.zeros(len(common))])
+    assert correlated(replace(found, measured=replace(found.measured, reading=reading))) > 2.0 * alone
 
 
 def settled(made: World, row: np.ndarray) -> Assignment:

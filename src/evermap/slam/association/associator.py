@@ -17,12 +17,12 @@ import numpy as np
 from evermap.config import AssociationConfig, SlamConfig
 from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment, alike, same_name
-from evermap.slam.association.constellation import MOST_LAID, propose_constellation
+from evermap.slam.association.constellation import MOST_LAID, LoosePart, overlays, propose_constellation
 from evermap.slam.association.features import Likeness, Traits
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.association.merging import Differences, Solution, propose_merges
 from evermap.slam.association.relaying import displaced_stretches, laid
-from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
+from evermap.slam.association.revise import likely_real, reassigned, unseen_nats, with_overlooked
 from evermap.slam.association.splitting import weighed_visits
 from evermap.slam.filter_kernels import BY_PLACE, GATED, WIDTH, spread_of_frame
 from evermap.slam.linearise import detection_residuals
@@ -43,6 +43,8 @@ MOST_COMPARED = 96
 """Number of nearest landmarks that a frame is compared with: bounds the work."""
 MERGE_ROUNDS = 8
 """Maximum number of rounds of merging per solution: each makes the map stiffer."""
+ATTACHED = 6
+"""Maximum number of alignments of a loose part with the rest that are tried at the end: bounds the work."""
 REALIGNED, STRETCHES = 8, 2
 """Maximum number of realigned stretches, and of those that are tried each time, the longest first: bound the work."""
 BEFORE = (8.0, 2.0, 0.0)
@@ -122,6 +124,8 @@ class Associator:
         self._sigma = rules.noise_caution * SightingNoise.constant(noise.detection).of_detections(problem)
         self._filter = LocalFilter(problem.mount, problem.prior, most=MOST_COMPARED)
         self._done, self._doubted = 0, 0
+        self.worth = 1.0
+        """Detections whose residuals count as one; learned by the first `finish`."""
         self._next_batch = FIRST_BATCH
         self._density_m2 = landmark_density(np.zeros((0, 2)), np.zeros(0, dtype=np.int64), settings)
 
@@ -210,6 +214,7 @@ class Associator:
         """
         refused: set[tuple[int, int]] = set()
         total = math.inf
+        first = begun is None
         if begun is None:
             begun = self._assignment()
         else:
@@ -228,9 +233,9 @@ class Associator:
             same = changed <= SAME_SHARE and solved.assignment.n_landmarks == before.n_landmarks == count
             if hopeless or same:
                 break
-        assignment = solved.assignment
-        assignment = assignment.without(_seldom(assignment))
-        return assignment.without(~likely_real(assignment) & (assignment.n_named == 0))
+        if first:
+            self.worth = correlated(solved.assignment)
+        return without_ghosts(self._attached(solved).assignment)
 
     @property
     def doubtful(self) -> float:
@@ -255,9 +260,10 @@ class Associator:
         return noise.odometry
 
     def against(self, assignment: Assignment) -> float:
-        """Return the negative log likelihood [nats] of all detections under an assignment, up to a constant.
+        """Return the negative log likelihood [nats] of all detections and misses under an assignment, up to a constant.
 
-        An unassigned detection is as likely as an outlier. Comparable between assignments of one recording.
+        An unassigned detection is as likely as an outlier. Residuals are correlated: `worth` of them count as one.
+        Comparable between assignments of one recording.
 
         Args:
             assignment: as `finish` returns it, of this associator or another one of the same recording.
@@ -272,7 +278,8 @@ class Associator:
         nobody = np.count_nonzero(assignment.landmark_row == NOBODY)
         fit = solved.cost + float(np.log(assignment.measured.sigma_given).sum())
         landmarks = float(_twice(assignment).sum()) + self._rules.landmark_nats * assignment.n_landmarks
-        return fit + self.noise.outlier_log_odds * nobody + landmarks
+        explained = fit + self.noise.outlier_log_odds * nobody
+        return explained / self.worth + landmarks + unseen_nats(assignment)
 
     def _match(self, detections: IntArray) -> _Frame:
         """Weigh the detections of the frame against the landmarks so far."""
@@ -408,9 +415,9 @@ class Associator:
                 compared(now, solved.marginals, density), probability=p_merge,
                 among=among, known=known, last=recent is None, refused=refused,
             )  # fmt: skip
-            if not pairs and within is None and now.n_landmarks <= MOST_LAID:
-                honest = now.with_shared_errors(solved.marginals.shared)[: 2 * now.n_landmarks, : 2 * now.n_landmarks]
-                pairs = propose_constellation(now, honest, density=density, probability=p_merge, refused=refused)
+            part = self._loose(solved, refused) if not pairs and within is None else None
+            if part is not None:
+                pairs = propose_constellation(part, density=density, probability=p_merge, settings=settings)
             if not pairs:
                 break
             merged = self._merged(solved, pairs, refused)
@@ -418,6 +425,39 @@ class Associator:
                 refused.clear()
                 solved = merged
         return solved
+
+    def _loose(self, solved: _Solved, refused: set[tuple[int, int]]) -> LoosePart | None:
+        """The loose part of a map that is small enough to be aligned with the rest by all its pairs."""
+        now = solved.assignment
+        if now.n_landmarks > MOST_LAID:
+            return None
+        honest = now.with_shared_errors(solved.marginals.shared)[: 2 * now.n_landmarks, : 2 * now.n_landmarks]
+        return LoosePart.of(now, honest, refused)
+
+    def _attached(self, solved: _Solved) -> _Solved:
+        """Align a loose part with the rest in the best of its ways, if that explains detections of removed ghosts.
+
+        No way is certain. But copies of landmarks, removed as ghosts, leave detections that this alignment explains;
+        fewer landmarks alone are no reason.
+        """
+        part = self._loose(solved, set())
+        if part is None or not len(part.root):
+            return solved
+        rules, best = self._rules, solved
+        every = overlays(part.source, part.target, part.allowed, density=self._density_m2, settings=self._settings)
+        least = self._total(self._real(solved)) - rules.constellation.certain_nats
+        for overlay in every[:ATTACHED]:
+            trial = self._all_merged(self._solved(solved.assignment.merged(part.rows(overlay.pairs))))
+            fewer = max(0, solved.assignment.n_landmarks - trial.assignment.n_landmarks)
+            against = self._total(self._real(trial)) + rules.landmark_nats * fewer
+            if against < least:
+                best, least = trial, against
+        return best
+
+    def _real(self, solved: _Solved) -> _Solved:
+        """The same without ghosts, at its optimum."""
+        real = without_ghosts(solved.assignment)
+        return solved if real.n_landmarks == solved.assignment.n_landmarks else self._solved(real)
 
     def _contradictions_split(
         self, solved: _Solved, refused: set[tuple[int, int]], recent: int | None = None
@@ -555,6 +595,24 @@ def by_name(one: IntArray, other: IntArray, readings: IntArray, settings: Associ
         settings: of the association.
     """
     return np.asarray(settings.name_nats * np.minimum(readings, settings.most_names) * same_name(one, other))
+
+
+def correlated(assignment: Assignment) -> float:
+    """Return the variance of sums of residuals over visits, relative to that of independent ones; at least 1."""
+    seen = assignment.landmark_row >= 0
+    sigma = assignment.measured.sigma_given[seen]
+    residual = np.clip(detection_residuals(assignment.problem(), assignment.estimate) / sigma, -3.0, 3.0)
+    visit = assignment.visits(assignment.settings.association.forget_s)[seen]
+    if not len(visit):
+        return 1.0
+    together = np.column_stack([np.bincount(visit, of) for of in residual.T])
+    return max(1.0, float((together**2).sum() / max((residual**2).sum(), 1e-300)))
+
+
+def without_ghosts(assignment: Assignment) -> Assignment:
+    """Return the assignment without landmarks that have too few sightings, or fewer than a real one would have."""
+    assignment = assignment.without(_seldom(assignment))
+    return assignment.without(~likely_real(assignment) & (assignment.n_named == 0))
 
 
 def _seldom(assignment: Assignment) -> BoolArray:

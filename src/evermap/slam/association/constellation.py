@@ -9,8 +9,9 @@ are compared by evidence, so that a chance agreement of two landmarks does not b
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -268,38 +269,61 @@ def _pairings(
     )  # fmt: skip
 
 
+class LoosePart(NamedTuple):
+    """The landmarks of a map that are not stiffly connected with the oldest, beside those that are.
+
+    Attributes:
+        loose: (n,) their rows, those with most sightings first.
+        root: (m,) rows of the others.
+        source, target: both, with their covariances.
+        allowed: (n, m) pairs that may be the same.
+    """
+
+    loose: IntArray
+    root: IntArray
+    source: LocalMap
+    target: LocalMap
+    allowed: BoolArray
+
+    @classmethod
+    def of(
+        cls, assignment: Assignment, joint: FloatArray, refused: Collection[tuple[int, int]] = ()
+    ) -> LoosePart | None:
+        """Return the loose part of a map with covariance `joint`; None if it has no two landmarks."""
+        rules = assignment.settings.association
+        place, sightings = assignment.estimate.landmark, assignment.sightings
+        apart = assignment.together.toarray() > 0.0
+        root, loose = stiff_and_loose(sightings, joint, rules)
+        if len(loose) < 2:
+            return None
+        loose = loose[np.argsort(-sightings[loose], kind="stable")]
+        allowed = ~apart[np.ix_(loose, root)]
+        gap = place[loose][:, None] - place[root][None]
+        spread = _spreads(joint, loose, root)
+        near = np.einsum("ijk,ijk->ij", gap, np.linalg.solve(spread, gap[..., None])[..., 0]) < rules.loose_gate
+        one, other = assignment.of_kind[loose][:, None], assignment.of_kind[root][None]
+        allowed &= (near | same_name(one, other)) & alike(one, other)
+        like, traits = assignment.like(), assignment.traits
+        if traits is not None and like is not None:
+            k, m = np.nonzero(allowed)
+            allowed[k, m] = traits.same(like.part(loose[k]), like.part(root[m])) >= -rules.readings.misread_nats
+        for k, m in np.argwhere(allowed):
+            allowed[k, m] = _ordered(loose[k], root[m]) not in refused
+        return cls(loose, root, _local(place, joint, loose), _local(place, joint, root), allowed)
+
+    def rows(self, pairs: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Return pairs (younger, older) of the map, from those of `source` and `target`."""
+        return [_ordered(self.loose[k], self.root[m]) for k, m in pairs]
+
+
 def propose_constellation(
-    assignment: Assignment,
-    joint: FloatArray,
-    *,
-    density: float,
-    probability: float,
-    refused: set[tuple[int, int]],
+    part: LoosePart, *, density: float, probability: float, settings: SlamConfig
 ) -> list[tuple[int, int]]:
     """Return pairs (younger, older) of a loose part of the map that has one alignment with the rest."""
-    settings = assignment.settings
-    rules = settings.association
-    place, sightings = assignment.estimate.landmark, assignment.sightings
-    apart = assignment.together.toarray() > 0.0
-    root, loose = stiff_and_loose(sightings, joint, rules)
-    if len(loose) < 2:
-        return []
-    loose = loose[np.argsort(-sightings[loose], kind="stable")]
-    allowed = ~apart[np.ix_(loose, root)]
-    gap = place[loose][:, None] - place[root][None]
-    spread = _spreads(joint, loose, root)
-    near = np.einsum("ijk,ijk->ij", gap, np.linalg.solve(spread, gap[..., None])[..., 0]) < rules.loose_gate
-    one, other = assignment.of_kind[loose][:, None], assignment.of_kind[root][None]
-    allowed &= (near | same_name(one, other)) & alike(one, other)
-    like = assignment.like()
-    if assignment.traits is not None and like is not None:
-        k, m = np.nonzero(allowed)
-        allowed[k, m] = assignment.traits.same(like.part(loose[k]), like.part(root[m])) >= -rules.readings.misread_nats
-    for k, m in np.argwhere(allowed):
-        allowed[k, m] = _ordered(loose[k], root[m]) not in refused
-    source, target = _local(place, joint, loose), _local(place, joint, root)
-    pairs = agreed_pairs(source, target, allowed, density=density, probability=probability, settings=settings)
-    return [_ordered(loose[k], root[m]) for k, m in pairs]
+    pairs = agreed_pairs(
+        part.source, part.target, part.allowed, density=density, probability=probability, settings=settings
+    )
+    return part.rows(pairs)
 
 
 def stiff_and_loose(sightings: IntArray, joint: FloatArray, settings: AssociationConfig) -> tuple[IntArray, IntArray]:

@@ -217,7 +217,10 @@ def searched(associator: Associator, assignment: Assignment, again: Callable[[Fl
         again: returns the result of another associator under (5,) noise levels of the odometry.
     """
     outlier_nats, factors = assignment.settings.outlier_log_odds, assignment.settings.association.particles.wider
-    cost, little = associator.against(assignment), outlier_nats / LITTLE * len(assignment.landmark_row)
+    cost, little = (
+        associator.against(assignment),
+        outlier_nats / LITTLE * len(assignment.landmark_row) / associator.worth,
+    )
     odometry = at_first = associator.learned_odometry(assignment)
     in_vain, asked = 0, False
     for k, seeds in enumerate(np.arange(MOST_ROUNDS * RUNS).reshape(-1, RUNS).tolist()):

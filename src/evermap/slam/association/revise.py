@@ -9,7 +9,7 @@ enough frames, are overlooked landmarks.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -26,6 +26,8 @@ LOOK_BINS = 12
 """Number of bins of range, with equal numbers of detections, in which the usual rate of sightings is estimated."""
 ROUNDS = 20
 """Maximum number of rounds of rates and landmarks; they converge within a few."""
+HIDDEN = np.geomspace(0.01, 0.8, 12)
+"""Grid of the probability of a landmark in view to be hidden for a while; the least one is that of a hit out of view."""
 
 
 def reassigned(assignment: Assignment, explained: FloatArray, *, density: float) -> Assignment:
@@ -179,9 +181,45 @@ def likely_real(assignment: Assignment) -> BoolArray:
     below `slam.association.least_seen` (posterior with a flat prior; the usual rate is that of the landmarks only).
     """
     real, least = np.ones(assignment.n_landmarks, dtype=bool), assignment.settings.association.least_seen
+    if not (assignment.landmark_row >= 0).any():
+        return real
+    return _looked_at(assignment, least).real
+
+
+def unseen_nats(assignment: Assignment) -> float:
+    """Return the negative log likelihood [nats] of hits and misses, given where all landmarks are.
+
+    Misses in a row are correlated, so what counts is whether a landmark was seen at all in each interval of
+    `slam.association.forget_s`: its sightings are Poisson, with those expected from range and view as the mean, unless
+    it is hidden. How often that is follows by likelihood. If the map is there twice, each copy is missed half of the
+    time.
+    """
     used = assignment.landmark_row >= 0
     if not used.any():
-        return real
+        return 0.0
+    rules, measured, estimate = assignment.settings.association, assignment.measured, assignment.estimate
+    look = _looked_at(assignment, rules.least_seen)
+    when = ((measured.stamp_s - measured.stamp_s[0]) // rules.forget_s).astype(np.int64)
+    expected = _expected(estimate.pose, estimate.landmark, look.edges, look.view, look.rate, when)
+    seen = np.zeros(expected.shape, dtype=np.bool_)
+    seen[assignment.landmark_row[used], when[measured.pose_row[used]]] = True
+    p_seen = -np.expm1(-expected)
+    hit, miss = np.maximum(p_seen[seen], HIDDEN[0]), p_seen[~seen]
+    return -max(float(np.log(p * hit).sum() + np.log1p(-p * miss).sum()) for p in 1.0 - HIDDEN)
+
+
+class _Visible(NamedTuple):
+    """Landmarks that are real (L,), sightings per look by range (B,) with edges (B + 1,), and bearings in view (2,)."""
+
+    real: BoolArray
+    rate: FloatArray
+    edges: FloatArray
+    view: FloatArray
+
+
+def _looked_at(assignment: Assignment, least: float) -> _Visible:
+    """Which landmarks are seen often enough in view, and how often these are."""
+    real, used = np.ones(assignment.n_landmarks, dtype=bool), assignment.landmark_row >= 0
     measured, estimate = assignment.measured, assignment.estimate
     reach, bearing = measured.reading[used].T
     edges = np.quantile(reach, np.linspace(0.0, 1.0, LOOK_BINS + 1))
@@ -195,7 +233,19 @@ def likely_real(assignment: Assignment) -> BoolArray:
         before, real = real, gammainc(hits.sum(axis=1) + 1.0, least * (looks @ rate)) <= 0.5
         if np.array_equal(before, real):
             break
-    return real
+    return _Visible(real, rate, edges, view)
+
+
+@kernel
+def _range_bin(pose: FloatArray, place: FloatArray, edges: FloatArray, view: FloatArray) -> int:
+    """The range bin of a place from a pose; -1 if it is not in view."""
+    x, y = place[0] - pose[0], place[1] - pose[1]
+    away = np.hypot(x, y)
+    turned = np.arctan2(y, x) - pose[2]
+    turned -= 2.0 * np.pi * np.round(turned / (2.0 * np.pi))
+    if away <= edges[-1] and view[0] <= turned <= view[1]:
+        return int(max(np.searchsorted(edges, away) - 1, 0))
+    return -1
 
 
 @kernel
@@ -204,10 +254,21 @@ def _looks(pose: FloatArray, place: FloatArray, edges: FloatArray, view: FloatAr
     looks = np.zeros((len(place), len(edges) - 1))
     for k in range(len(place)):
         for n in range(len(pose)):
-            x, y = place[k, 0] - pose[n, 0], place[k, 1] - pose[n, 1]
-            away = np.hypot(x, y)
-            turned = np.arctan2(y, x) - pose[n, 2]
-            turned -= 2.0 * np.pi * np.round(turned / (2.0 * np.pi))
-            if away <= edges[-1] and view[0] <= turned <= view[1]:
-                looks[k, max(np.searchsorted(edges, away) - 1, 0)] += 1.0
+            which = _range_bin(pose[n], place[k], edges, view)
+            if which >= 0:
+                looks[k, which] += 1.0
     return looks
+
+
+@kernel
+def _expected(
+    pose: FloatArray, place: FloatArray, edges: FloatArray, view: FloatArray, rate: FloatArray, when: IntArray
+) -> FloatArray:
+    """(L, W) expected sightings of places, in the window `when` (N,) of each pose."""
+    expected = np.zeros((len(place), when[-1] + 1))
+    for k in range(len(place)):
+        for n in range(len(pose)):
+            which = _range_bin(pose[n], place[k], edges, view)
+            if which >= 0:
+                expected[k, when[n]] += rate[which]
+    return expected
