@@ -43,10 +43,9 @@ MOST_COMPARED = 96
 """Number of nearest landmarks that a frame is compared with: bounds the work."""
 MERGE_ROUNDS = 8
 """Maximum number of rounds of merging per solution: each makes the map stiffer."""
-ATTACHED = 6
-"""Maximum number of alignments of a loose part with the rest that are tried at the end: bounds the work."""
 REALIGNED, STRETCHES = 8, 2
-"""Maximum number of realigned stretches, and of those that are tried each time, the longest first: bound the work."""
+"""Maximum number of realigned stretches, also of ways to align a loose part, and of those that are tried each time, the
+longest first: bound the work."""
 BEFORE = (8.0, 2.0, 0.0)
 """Grid of the time before a stretch in which revisits may be wrong, relative to its length; tried in this order."""
 SPLIT_ROUNDS = 5
@@ -446,7 +445,7 @@ class Associator:
         rules, best = self._rules, solved
         every = overlays(part.source, part.target, part.allowed, density=self._density_m2, settings=self._settings)
         least = self._total(self._real(solved)) - rules.constellation.certain_nats
-        for overlay in every[:ATTACHED]:
+        for overlay in every[:REALIGNED]:
             trial = self._all_merged(self._solved(solved.assignment.merged(part.rows(overlay.pairs))))
             fewer = max(0, solved.assignment.n_landmarks - trial.assignment.n_landmarks)
             against = self._total(self._real(trial)) + rules.landmark_nats * fewer

@@ -27,7 +27,7 @@ LOOK_BINS = 12
 ROUNDS = 20
 """Maximum number of rounds of rates and landmarks; they converge within a few."""
 HIDDEN = np.geomspace(0.01, 0.8, 12)
-"""Grid of the probability of a landmark in view to be hidden for a while; the least one is that of a hit out of view."""
+"""Grid of the probability of a landmark in view to be hidden for a while; the least is that of a hit out of view."""
 
 
 def reassigned(assignment: Assignment, explained: FloatArray, *, density: float) -> Assignment:
