@@ -187,7 +187,7 @@ def test_tokens_are_in_the_audit(tmp_path: Path) -> None:
 def test_a_store_of_another_scheme_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, store: str) -> None:
     monkeypatch.chdir(tmp_path)
     for verb in (("serve",), ("serve", "token", "x"), ("work", "--drain"), ("learn",), ("map", "gc")):
-        assert_refused(run(*verb, "--store", store), f"no store for '{store.partition(':')[0]}://'")
+        assert_refused(run(*verb, "--store", store), f"field '--store': no store for '{store.partition(':')[0]}://'")
     result = run("serve", "doctor", "--url", "", "--store", store)
     assert (result.exit_code, "no store for" in result.stdout) == (1, True)
     assert list(tmp_path.iterdir()) == []

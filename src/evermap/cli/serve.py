@@ -25,6 +25,7 @@ from evermap.cli.options import (
     AsJson,
     ConfigFile,
     Settings,
+    VerbGroup,
     argument,
     configured,
     option,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="serve",
+    cls=VerbGroup,
     help="Serve the maps of a fleet.",
     rich_markup_mode=None,
     invoke_without_command=True,
