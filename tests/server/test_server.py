@@ -39,8 +39,9 @@ from typer.testing import CliRunner
 from evermap.cli.main import app as command
 from evermap.config import Config
 from evermap.errors import ConfigError, InputError
-from evermap.io import write_native
+from evermap.io import read_native, write_native
 from evermap.io.bag import bag_settings, read_bag
+from evermap.io.native_write import write_session
 from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store, verify_store
 from evermap.runs.sessions import enter_session
@@ -50,6 +51,7 @@ from evermap.server.database import MOST_TRIES, Database, JobState, Role
 from evermap.server.sites import SiteStores
 from evermap.server.uploads import UploadLimits, checked_digest, recording_of
 from evermap.server.worker import Worker
+from evermap.slam.cleaning import clean
 from evermap.types import SpatialRecording
 from evermap_studies.sim import BuildingConfig, simulate_building
 
@@ -674,6 +676,27 @@ def test_a_worker_killed_after_the_commit_enters_nothing_twice(fleet: Fleet, zip
     assert fleet("GET", "/maps").json()[0]["head"] == 1
     fleet.server.database.finish(number, "killed", JobState.REJECTED, "too late")
     assert fleet("GET", f"/jobs/{number}").json()["state"] == "entered"
+
+
+@pytest.mark.parametrize("where", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("condensed_first", [False, True])
+def test_a_drive_that_is_sent_condensed_and_whole_counts_once(
+    fleet: Fleet, zips: list[bytes], folders: list[Path], tmp_path: Path, condensed_first: bool
+) -> None:
+    condensed = write_session(clean(read_native(folders[0])), tmp_path / "condensed.zip").read_bytes()
+    other = write_session(clean(read_native(folders[1])), tmp_path / "other.zip").read_bytes()
+    both = [condensed, zips[0]] if condensed_first else [zips[0], condensed]
+    first, second, third = (fleet.upload(data).json()["id"] for data in (*both, other))
+    worker = fleet.worker()
+    while worker.step():
+        pass
+    assert fleet("GET", "/maps").json()[0]["head"] == 2
+    told = [fleet("GET", f"/jobs/{number}").json() for number in (first, second, third)]
+    assert [(job["state"], job["revision"]) for job in told] == [("entered", 1), ("repeat", 1), ("entered", 2)]
+    assert "its drive is in the map already, as revision 1" in told[1]["reason"]
+    again = fleet.upload(both[1])
+    assert (again.status_code, again.json()["state"]) == (200, "repeat")
+    assert fleet("GET", f"/jobs/{second}/payload").status_code == 404
 
 
 def test_a_session_that_kills_its_workers_is_refused_in_the_end(fleet: Fleet, zips: list[bytes]) -> None:

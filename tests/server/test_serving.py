@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -214,3 +216,12 @@ def test_the_store_of_the_environment_is_that_of_every_verb(tmp_path: Path, monk
     assert list(sites_of(["evermap-maps/a.evermap"], None)) == ["a"]
     assert list(sites_of([], "evermap-maps")) == ["a"]
     assert_refused(run("map", "gc"), "nothing to prune")
+
+
+def test_all_versions_of_a_server_are_pinned() -> None:
+    """`examples/compose.yaml` and the README install by the lock file."""
+    root = Path(__file__).resolve().parents[2]
+    extras = tomllib.loads((root / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    locked = {line.partition("==")[0] for line in (root / "requirements.lock").read_text().splitlines()}
+    missing = {re.split(r"[\[>=]", name)[0] for name in (*extras["server"], *extras["ros"])} - locked
+    assert not missing
