@@ -105,6 +105,7 @@ class Entered(Shown):
             StaleRevisionError: another commit came in between.
         """
         from evermap.config import Config, to_toml
+        from evermap.maps.store.measured import TRAJECTORY, pack_trajectory
 
         config, recording = config or Config(), self.session.recording
         stamps = recording.frames.stamp_s
@@ -126,7 +127,7 @@ class Entered(Shown):
             self.changes,
             self.session.evidence,
             parent=self.parent,
-            attachments=self.attachments,
+            attachments={**self.attachments, TRAJECTORY: pack_trajectory(self.session.slam.trajectory)},
         )
 
 
@@ -176,7 +177,7 @@ def enter_session(
     head = store.head()
     newest = store.load(head)
     data = pack_recording(recording)
-    kept = {item.revision: item for item in store.attachments() if item.name == RECORDING}
+    kept = _recordings(store, head)
     _refuse_twice(store, kept, data, recording)
     stamps = recording.frames.stamp_s
     start_s = float(stamps[0]) if len(stamps) else np.inf
@@ -185,7 +186,7 @@ def enter_session(
     if not start_s < newest.session_start_s:
         session = run_session(recording, said, config, progress=progress)
         return Entered(session, newest, session.living, session.changes, (), head, {RECORDING: data})
-    late = _enter_late(store, recording, said, config, _history(store, kept), data, progress)
+    late = _enter_late(store, recording, said, config, _history(store, head), data, progress)
     return replace(late, parent=head)  # whatever came in since `head` was read makes the commit stale
 
 
@@ -410,9 +411,18 @@ def _equal(one: tuple[FloatArray, ...], other: tuple[FloatArray, ...]) -> bool:
     return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
 
 
-def _history(store: MapStore, kept: dict[int, Attachment]) -> list[_Step]:
-    """Sessions and edits of the newest map, in the order in which they were committed."""
-    lineage = set(store.lineage())
+def _recordings(store: MapStore, head: int) -> dict[int, Attachment]:
+    """Stored recordings of a revision and those before it."""
+    from evermap.maps.store.measured import RECORDING
+
+    return {item.revision: item for item in store.attachments(store.lineage(head)) if item.name == RECORDING}
+
+
+def _history(store: MapStore, head: int) -> list[_Step]:
+    """Sessions and edits of the map at a revision, in the order in which they were committed; what comes in meanwhile
+    is no part of it.
+    """
+    kept, lineage = _recordings(store, head), set(store.lineage(head))
     steps: list[_Step] = []
     start_s = -np.inf
     for revision in store.log():
@@ -525,12 +535,11 @@ def reenter(where: str, work: Path, config: Config | None = None, *, adopt: bool
 
 
 def _reentered(store: SqlStore, work: Path, config: Config | None) -> Reentered:
-    from evermap.maps.store.measured import RECORDING
     from evermap.maps.store.sql import SqlStore
     from evermap.maps.store.sqlite import snapshot
 
     head = store.head()
-    steps = _history(store, {item.revision: item for item in store.attachments() if item.name == RECORDING})
+    steps = _history(store, head)
     sessions = [step for step in steps if step.recording is not None]
     if not sessions:
         return Reentered(0, 0, head, head, adopted=False)
@@ -569,7 +578,7 @@ def _entered_again(
 ) -> LivingMap:
     """Commit a session or an edit to the copy of a map; returns the map after it."""
     from evermap.config import to_toml
-    from evermap.maps.store.measured import RECORDING
+    from evermap.maps.store.measured import RECORDING, TRAJECTORY, pack_trajectory
 
     said = step.revision.provenance
     if step.recording is None:
@@ -581,7 +590,7 @@ def _entered_again(
     if config is not None:
         said = replace(said, config=to_toml(config), seed=config.slam.seed)
     said = replace(said, wall_s=time.perf_counter() - start)
-    attached = {RECORDING: step.recording}
+    attached = {RECORDING: step.recording, TRAJECTORY: pack_trajectory(session.slam.trajectory)}
     parent = fresh.head()
     fresh.commit(session.living, said, session.changes, session.evidence, parent=parent, attachments=attached)
     return session.living
@@ -609,7 +618,7 @@ def _said(living: LivingMap) -> dict[str, Life]:
 def _taken_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequence[_Step], config: Config | None) -> int:
     """Copy what an earlier attempt has entered alike, from its first step on; returns the number of steps."""
     from evermap.config import to_toml
-    from evermap.maps.store.measured import RECORDING
+    from evermap.maps.store.measured import RECORDING, TRAJECTORY
     from evermap.maps.store.sql import SqlStore
 
     if earlier is None or not _written_by(earlier):
@@ -620,20 +629,26 @@ def _taken_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequenc
         same = old.named(log[start].restores)[1] == fresh.named(base)[1]
         if not same or _said(old.load()) != _said(fresh.load(fresh.head() - 1)):
             return 0
-        digests = {item.revision: item.digest for item in old.attachments()}
+        kept: dict[str, dict[int, Attachment]] = {RECORDING: {}, TRAJECTORY: {}}
+        for item in old.attachments():
+            kept[item.name][item.revision] = item
         for count, step in enumerate(steps):
             number = start + count + 1
             wanted = replace(step.revision.provenance, wall_s=np.nan)
             if step.recording is not None and config is not None:
                 wanted = replace(wanted, config=to_toml(config), seed=config.slam.seed)
             digest = None if step.recording is None else step.recording.digest
-            if number not in log or log[number].evermap_version != __version__ or digests.get(number) != digest:
+            if number not in log or log[number].evermap_version != __version__:
+                return count
+            if getattr(kept[RECORDING].get(number), "digest", None) != digest:
                 return count
             said = log[number].provenance
             if repr(replace(said, wall_s=np.nan)) != repr(wanted):  # nan is not equal to itself
                 return count
             seen = old.evidence(revisions=[number])
-            attached = {} if step.recording is None else {RECORDING: step.recording}
+            attached: dict[str, bytes | Attachment] = {} if step.recording is None else {RECORDING: step.recording}
+            if number in kept[TRAJECTORY]:
+                attached[TRAJECTORY] = old.attached(kept[TRAJECTORY][number])
             parent = fresh.head()
             fresh.commit(old.load(number), said, old.changes(number), seen, parent=parent, attachments=attached)
     return len(steps)
