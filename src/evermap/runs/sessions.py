@@ -28,7 +28,7 @@ from evermap.maps.store import (
     open_store,
 )
 from evermap.show import Shown
-from evermap.types import Detections, Progress, Recording
+from evermap.types import Progress
 
 if TYPE_CHECKING:
     from evermap.config import Config
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.session import Session
     from evermap.maps.store.sql import SqlStore
-    from evermap.types import AnyRecording, FloatArray, IntArray, Landmarks, MapChange
+    from evermap.types import AnyRecording, IntArray, Landmarks, MapChange
 
 
 class TwiceError(InputError):
@@ -351,16 +351,17 @@ def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, rec
     Raises:
         TwiceError: it is.
     """
+    from evermap.maps.sessions.session import drive_of, same_drive
     from evermap.maps.store.measured import unpack_recording
 
     for number, item in kept.items():
         if item.n_bytes == len(data) and store.attached(item) == data:
             raise _twice(store, number, f"{recording.name}: is in the map already, as revision {number}", is_copy=False)
     alike = _of_the_same_time(store, kept, recording)
-    mine = _drive(recording) if alike else ()
+    mine = drive_of(recording) if alike else ()
     for number in alike:
         other = unpack_recording(store.attached(kept[number]))
-        if type(other) is type(recording) and _equal(mine, _drive(other)):
+        if type(other) is type(recording) and same_drive(mine, drive_of(other)):
             same = f"'{printable(other.name, 80)}' has the same frames and readings"
             problem = f"{recording.name}: its drive is in the map already, as revision {number}: {same}"
             raise _twice(store, number, problem, is_copy=True)
@@ -374,6 +375,8 @@ def _twice(store: MapStore, number: int, problem: str, *, is_copy: bool) -> Twic
 
 def _of_the_same_time(store: MapStore, kept: Mapping[int, Attachment], recording: AnyRecording) -> list[int]:
     """Revisions of sessions that begin and end with a recording; others cannot be of its drive."""
+    from evermap.maps.sessions.session import repaired
+
     stamp_s = recording.frames.stamp_s
     if not len(stamp_s):
         return []
@@ -382,33 +385,11 @@ def _of_the_same_time(store: MapStore, kept: Mapping[int, Attachment], recording
     near = [number for number in kept if spans[number][0] <= last_s and spans[number][1] >= first_s]
     if not near:
         return []
-    repaired_s = _repaired(recording).frames.stamp_s
-    ends = {(first_s, last_s), *((float(one[0]), float(one[-1])) for one in (repaired_s,) if len(one))}
+    repaired_s = repaired(recording).frames.stamp_s
+    ends = {(first_s, last_s)}
+    if len(repaired_s):
+        ends.add((float(repaired_s[0]), float(repaired_s[-1])))
     return [number for number in near if spans[number] in ends]
-
-
-def _repaired(recording: AnyRecording) -> AnyRecording:
-    from evermap.slam.cleaning import clean
-
-    return clean(recording) if isinstance(recording, Recording) else recording
-
-
-def _drive(recording: AnyRecording) -> tuple[FloatArray, ...]:
-    """Return what all copies of a drive have in common: (F,) stamps of frames, and (M, K) sorted readings, each with
-    the stamp of its frame, repaired and in single precision, as in a session that was condensed.
-    """
-    recording = _repaired(recording)
-    seen, stamp_s = recording.detections, recording.frames.stamp_s
-    if isinstance(seen, Detections):
-        read = np.column_stack([seen.range_m, seen.bearing_rad])
-    else:
-        read = np.column_stack([seen.position_sensor_m, seen.corner_px.reshape(len(seen), -1)])
-    rows = np.column_stack([stamp_s[seen.frame], read.astype(np.float32)])
-    return stamp_s, rows[np.lexsort(rows.T[::-1])]
-
-
-def _equal(one: tuple[FloatArray, ...], other: tuple[FloatArray, ...]) -> bool:
-    return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
 
 
 def _recordings(store: MapStore, head: int) -> dict[int, Attachment]:
