@@ -58,10 +58,12 @@ def workers_of(store: Path) -> list[int]:
     found = []
     for entry in Path("/proc").iterdir():
         try:
-            words = (entry / "cmdline").read_bytes().decode().split("\0") if entry.name.isdecimal() else []
+            words = (entry / "cmdline").read_bytes().split(b"\0") if entry.name.isdecimal() else []
+            told = (entry / "environ").read_bytes().split(b"\0") if b"work" in words else []
         except OSError:
             continue
-        if "work" in words and str(store) in words:
+        if f"EVERMAP_STORE={store}".encode() in told:
+            assert str(store).encode() not in words, "a command line would show a password"
             found.append(int(entry.name))
     return [number for number in found if runs(number)]
 
@@ -175,6 +177,11 @@ def test_a_token_of_an_administrator_is_printed_while_there_is_none(tmp_path: Pa
     assert database.who(first) == ("admin-2", Role.ADMIN)
     assert len(database.tokens()) == 2
     assert database.audit()[0]["what"] == "first token admin-2, role admin"
+
+
+@pytest.mark.parametrize("name", ["", " ", "x" * 101, "a\nb", "\x1b[2J"])
+def test_names_of_tokens_are_short_and_printable(tmp_path: Path, name: str) -> None:
+    assert_refused(run("serve", "token", name, "--store", tmp_path), "up to 100 printable characters")
 
 
 def test_tokens_are_in_the_audit(tmp_path: Path) -> None:

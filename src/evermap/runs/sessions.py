@@ -571,7 +571,8 @@ def _entered_again(
     if config is not None:
         said = replace(said, config=to_toml(config), seed=config.slam.seed)
     said = replace(said, wall_s=time.perf_counter() - start)
-    attached = {RECORDING: step.recording, TRAJECTORY: pack_trajectory(session.slam.trajectory)}
+    attached: dict[str, bytes | Attachment] = {RECORDING: step.recording}
+    attached[TRAJECTORY] = pack_trajectory(session.slam.trajectory)
     parent = fresh.head()
     fresh.commit(session.living, said, session.changes, session.evidence, parent=parent, attachments=attached)
     return session.living
