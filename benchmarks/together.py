@@ -111,6 +111,12 @@ class World:
         return replace(recording, detections=replace(found, range_m=range_m, bearing_rad=bearing_rad))
 
 
+def _whole_truth(recording: Recording) -> bool:
+    """Return whether the true path is known during nearly all of a recording."""
+    truth, frame_s = recording.truth, recording.frames.stamp_s
+    return truth is not None and np.ptp(truth.stamp_s) > 0.9 * np.ptp(frame_s)
+
+
 def _unwrapped(pose: FloatArray) -> FloatArray:
     return np.column_stack([pose[:, :2], np.unwrap(pose[:, 2])])
 
@@ -221,6 +227,8 @@ def main() -> None:
         print(CHANGES_HEAD)
         for path in given.recordings:
             recordings = {number: read_planar(path, robot=number) for number in list_robots(path)}
+            if not all(_whole_truth(one) for one in recordings.values()):
+                parser.error(f"--changes needs the true paths of all robots, as in data set 6; not in {path}")
             print(changes_as_markdown(path, changing(recordings, given.changes)), flush=True)
         return
     print(HEAD)

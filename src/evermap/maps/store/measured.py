@@ -37,7 +37,7 @@ from evermap.types import (
 
 RECORDING, TRAJECTORY = "recording", "trajectory"
 """Names of the attachments."""
-_MOST_POSES = 500
+_MOST_POSES = 200
 """Of a stored trajectory, which is for pictures."""
 _TABLES: dict[str, Any] = {"odometry": Odometry, "frames": Frames, "detections": Detections, "sensor": Sensor}
 _IN_SPACE: dict[str, Any] = {"odometry": SpatialOdometry, "frames": Frames, "detections": SpatialDetections}
@@ -105,7 +105,7 @@ def unpack_recording(data: bytes) -> AnyRecording:
 
 
 def pack_trajectory(trajectory: Trajectory) -> bytes:
-    """Return up to 500 poses of a trajectory, evenly chosen and with the last one, seen from above."""
+    """Return up to 200 poses of a trajectory, evenly chosen and with the last one, seen from above."""
     rows = np.unique(np.linspace(0.0, max(len(trajectory) - 1, 0), _MOST_POSES).astype(np.int64))[: len(trajectory)]
     pose = trajectory.pose_world_robot[rows]
     if pose.shape[1] == 7:  # where its x axis points
