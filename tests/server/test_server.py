@@ -8,9 +8,11 @@ import re
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("fastapi", reason="a server needs evermap[server]")
@@ -22,7 +24,9 @@ from typer.testing import CliRunner
 
 from evermap.cli.main import app as command
 from evermap.errors import ConfigError, InputError
-from evermap.maps.store import open_store, verify_store
+from evermap.io import read_native
+from evermap.maps.store import Provenance, open_store, verify_store
+from evermap.runs.sessions import enter_session
 from evermap.server.app import _lines
 from evermap.server.database import Database, Role
 from evermap.server.sites import SiteStores
@@ -125,6 +129,34 @@ def test_a_session_is_uploaded_entered_and_asked_about(fleet: Fleet, zips: list[
     assert fleet.client.get("/maps/ward/file", headers=unchanged).status_code == 200
     fresh = SiteStores(fleet.where).file("ward", 1)  # another process makes the same file
     assert (fresh.sha256, f'"{fresh.tag}"') == (file.headers["X-Checksum-Sha256"], file.headers["ETag"])
+
+
+@SQLITE_ONLY
+def test_robots_are_where_their_newest_sessions_ended(fleet: Fleet, folders: list[Path]) -> None:
+    parts = [replace(read_native(folders[k]), robot=f"robot-{k % 2}") for k in range(3)]
+    with fleet.server.sites.store("ward", create=True) as store:
+        entered = [enter_session(store, part) for part in parts[:1]]
+        entered[0].commit(store)
+        for part in parts[1:]:
+            entered.append(enter_session(store, part))
+            entered[-1].commit(store)
+        store.commit(store.load(), Provenance(robot="old", stamp_from_s=1.0, stamp_to_s=2.0), parent=store.head())
+    told = fleet("GET", "/maps/ward/poses").json()["robots"]
+    assert [(one["robot"], one["revision"]) for one in told] == [("old", 4), ("robot-0", 3), ("robot-1", 2)]
+    assert (told[0]["x_m"], told[0]["stamp_s"], told[0]["path_m"]) == (None, None, [])  # an older evermap kept none
+    path = entered[2].session.slam.trajectory
+    last = [told[1][name] for name in ("stamp_s", "x_m", "y_m", "heading_rad")]
+    np.testing.assert_allclose(last, [path.stamp_s[-1], *path.pose_world_robot[-1]], rtol=1e-6, atol=1e-6)
+    assert 2 < len(told[1]["path_m"]) <= 200
+    earlier = fleet("GET", "/maps/ward/poses?revision=1").json()["robots"]
+    assert [(one["robot"], one["revision"]) for one in earlier] == [("robot-0", 1)]
+    middle_s = float(path.stamp_s[len(path) // 2])
+    (then,) = (
+        one for one in fleet("GET", f"/maps/ward/poses?at_s={middle_s}").json()["robots"] if one["revision"] == 3
+    )
+    assert 0.0 <= middle_s - then["stamp_s"] < 1.0
+    assert fleet("GET", "/maps/ward/poses?at_s=nan").status_code == 422
+    assert fleet("GET", "/maps/ward/poses?revision=9").status_code == 404
 
 
 def test_the_doctor_tells_what_is_wrong(fleet: Fleet, zips: list[bytes]) -> None:
