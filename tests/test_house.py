@@ -22,7 +22,7 @@ def tree_of(name: str) -> ast.Module:
 
 
 MOST_MODULES = 296
-MOST_LINES = 78_922
+MOST_LINES = 79_112
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8
