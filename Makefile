@@ -119,7 +119,7 @@ lock: $(DEVELOPMENT)
 	$(PIP_INSTALL) pip-tools
 	$(VENV)/bin/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir $(VENV)/wheels .
 	$(COMPILE) --extra rerun --extra ros --extra live --extra server --extra cluster --extra dev --build-deps-for editable --output-file requirements-dev.lock pyproject.toml studies/pyproject.toml
-	$(COMPILE) --extra rerun --extra ros --extra live --build-deps-for editable --constraint requirements-dev.lock --output-file requirements.lock pyproject.toml studies/pyproject.toml
+	$(COMPILE) --extra rerun --extra ros --extra live --extra server --build-deps-for editable --constraint requirements-dev.lock --output-file requirements.lock pyproject.toml studies/pyproject.toml
 	$(VENV)/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"], sep="\n")' \
 	  | $(COMPILE) --constraint requirements-dev.lock --output-file requirements-docs.lock -
 

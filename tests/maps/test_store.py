@@ -84,6 +84,17 @@ def test_every_revision_reads_back_bit_by_bit(store: MapStore, dim: int) -> None
     assert_same(store.load(), maps[-1])
 
 
+def test_what_was_checked_long_ago_is_forgotten(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("evermap.maps.store.sql._MOST_CHECKED", 100)
+    assert isinstance(store, SqlStore)
+    maps = [random_map(seed, cliques=3) for seed in range(12)]
+    for number, living in enumerate(maps):
+        store.commit(living, SESSION, parent=number)
+        assert len(store._checked) <= 100
+    for number, living in enumerate(maps):
+        assert_same(store.load(number + 1), living)
+
+
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(data=st.data())
 def test_any_numbers_read_back_bit_by_bit(data: st.DataObject, store: MapStore) -> None:

@@ -86,7 +86,7 @@ def test_other_settings_give_the_map_that_they_give_from_the_beginning(tmp_path:
         assert_same(store.load(), otherwise)
         assert store.lineage() == (5, 6, 7, 8, 9)
         assert len(store.evidence()) > 0
-        assert len(store.attachments()) == 4
+        assert sorted(item.name for item in store.attachments()) == ["recording"] * 4 + ["trajectory"] * 4
         store.revert(4)
         assert_same(store.load(), before)
     assert verify_store(path).sound

@@ -11,13 +11,14 @@ import fcntl
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import threading
 import time
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -31,6 +32,7 @@ import uvicorn
 
 from evermap.config import Config
 from evermap.io import write_native
+from evermap.runs.sessions import enter_session
 from evermap.server.app import Server, create_app
 from evermap.server.database import Database, Role
 from evermap.server.sites import SiteStores
@@ -259,12 +261,14 @@ def test_an_operator_approves_by_keyboard_and_sees_it_live(site: Site, browser: 
         "Revision 4",
         "Revision 3",
     ]
-    assert (browser.text("#number"), browser.text("#other")) == ("4", "2")
+    assert re.search("revision 4, the newest$", browser.text("#when"))
+    assert browser.text("#other").endswith("revision 2")
     difference = site("GET", "/maps/ward/diff?a=2&b=4").json()
-    assert browser.value("document.querySelectorAll('#changes li').length") == len(difference["changes"])
+    assert browser.value("document.querySelectorAll('#changes button').length") == len(difference["changes"])
+    assert f"seen for the first time, {len(difference['grown'])}: " in browser.text("#changes li:last-child")
     browser.tab_to("#candidates li:nth-child(2) button")
     browser.press("Enter")
-    browser.wait("document.getElementById('number').textContent === '3'")
+    browser.wait("document.getElementById('when').textContent.endsWith('revision 3')")
     browser.tab_to("#approve-note")
     browser("Input.insertText", text="looked at it")
     browser.press("Enter")
@@ -296,14 +300,14 @@ def test_an_operator_deletes_with_the_evidence_before_them(site: Site, browser: 
     browser.press("Enter")
     browser.wait("document.getElementById('deletes').textContent.startsWith('Undelete')")
     assert HOSTILE in site("GET", "/maps/ward/revisions").json()[-1]["note"]
-    browser.wait("document.getElementById('number').textContent === '5'")
+    browser.wait("document.getElementById('when').textContent.endsWith('revision 5, the newest')")
     browser.wait(f"document.getElementById('about').textContent.includes({json.dumps(HOSTILE)})")
     assert browser.value("document.title") == "evermap"
     assert browser.value("document.querySelectorAll('main img').length") == 0
     browser.value("document.getElementById('deletes').click()")
     browser.wait("document.getElementById('deletes').textContent.startsWith('Delete')")
     browser.value("document.querySelector('#candidates li:last-child button').click()")
-    browser.wait("document.getElementById('number').textContent === '3'")
+    browser.wait("document.getElementById('when').textContent.endsWith('revision 3')")
     browser.value("document.getElementById('reverts').click()")
     browser.wait("document.getElementById('said').textContent === 'revision 7 restores revision 3'")
 
@@ -317,11 +321,11 @@ def test_what_an_operator_chooses_is_kept_while_the_page_reads_the_newest(site: 
         " window.refreshed = refresh(true);"
         " document.querySelector('#candidates li:last-child button').click(); })()"
     )
-    assert browser.text("#number") == "3"
+    assert browser.text("#when").endswith("revision 3")
     browser.value("release()")
     browser.value("refreshed.then(() => 0)")
-    assert browser.text("#number") == "3"
-    browser.wait("document.getElementById('revision').value === '3'")
+    assert browser.text("#when").endswith("revision 3")
+    browser.wait("document.getElementById('time').value === '3'")
 
 
 def test_who_only_reads_has_no_buttons_that_change(site: Site, browser: Browser) -> None:
@@ -374,6 +378,62 @@ def test_the_map_is_moved_and_asked_by_finger_and_by_key(site: Site, browser: Br
     before = browser.value(left)
     browser.press("ArrowRight")
     browser.wait(f"{left} > {before}")
+
+
+def test_robots_are_on_the_map_where_they_were_last_and_where_they_are_next(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["read"])
+    told = site("GET", "/maps/ward/poses").json()["robots"]
+    assert [(one["robot"], one["revision"]) for one in told] == [("robot-7", 3), ("robot-8", 4)]
+    names = "[...document.querySelectorAll('#map .label')].map((one) => one.textContent)"
+    assert browser.value(names)[:2] == ["robot-7", "robot-8"]
+    assert re.fullmatch(r"\d+ c?m", browser.value(names)[2])  # the scale
+    drawn = (
+        "[...document.querySelectorAll('#map .robot')].map((one) => one.getBBox())"
+        ".map((box) => [box.x + box.width / 2, box.y + box.height / 2])"
+    )
+    for (x, y), one in zip(browser.value(drawn), told, strict=True):
+        assert (x, -y) == pytest.approx((one["x_m"], one["y_m"]), abs=0.3)
+    assert f"{told[1]['x_m']:.1f}, {told[1]['y_m']:.1f} m at " in browser.text("#robots")
+    pixels = browser.value(
+        "(() => { const bar = document.querySelector('#map .scale'); return bar.getBoundingClientRect().width; })()"
+    )
+    metre = browser.value("metre()")
+    label = browser.value(names)[2].split()
+    assert pixels * metre == pytest.approx(float(label[0]) / (100.0 if label[1] == "cm" else 1.0), rel=0.1)
+    browser.value("point('time', 2), show()")
+    browser.wait("document.getElementById('when').textContent.endsWith('revision 2')")
+    earlier = site("GET", "/maps/ward/poses?revision=2").json()["robots"]
+    browser.wait(f"document.getElementById('robots').textContent.includes('{earlier[1]['x_m']:.1f}, ')")
+    assert browser.value(drawn)[1][0] == pytest.approx(earlier[1]["x_m"], abs=0.3)
+    browser.value("point('time', 4), show()")
+    browser.wait("document.getElementById('when').textContent.includes('revision 4')")
+    # another session arrives
+    recording = simulate_building(BuildingConfig(days=5, patrol_s=60.0), 3).sessions[4]
+    with site.server.sites.store("ward") as store:
+        enter_session(store, replace(recording, robot="robot-9")).commit(store)
+    browser.wait("[...document.querySelectorAll('#map .label')].some((one) => one.textContent === 'robot-9')")
+
+
+def test_what_is_late_or_reverted_is_told_in_the_order_of_the_world(site: Site, browser: Browser) -> None:
+    sessions = simulate_building(BuildingConfig(days=4, patrol_s=60.0), 3).sessions
+    with site.server.sites.store("late", create=True) as store:
+        for number in (0, 2, 1):
+            enter_session(store, replace(sessions[number], robot="robot-7")).commit(store)
+        store.revert(1)
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["approve"])
+    browser.value("document.getElementById('site').value = 'late', choose()")
+    browser.wait("document.getElementById('when').textContent.endsWith('revision 4, the newest')")
+    assert browser.value("order.map((one) => one.revision)") == [1, 4, 2, 3]
+    assert browser.value("document.getElementById('time').value") == "2"
+    assert browser.text("#other").endswith("revision 3")
+    assert browser.text("#changes li") == "revision 4 goes back to revision 1"
+    told = browser.value("[...document.querySelectorAll('#candidates li')].map((one) => one.textContent)")
+    assert told[0].endswith(": goes back to revision 1")
+    assert all("seen for the first time" in line or "moved" in line for line in told[1:])
+    browser.value("compare(3, 2)")
+    browser.wait("document.getElementById('about').textContent.includes('which came late')")
 
 
 def test_lifetimes_are_told_by_class_and_by_place(site: Site, browser: Browser) -> None:

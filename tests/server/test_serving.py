@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -56,10 +58,12 @@ def workers_of(store: Path) -> list[int]:
     found = []
     for entry in Path("/proc").iterdir():
         try:
-            words = (entry / "cmdline").read_bytes().decode().split("\0") if entry.name.isdecimal() else []
+            words = (entry / "cmdline").read_bytes().split(b"\0") if entry.name.isdecimal() else []
+            told = (entry / "environ").read_bytes().split(b"\0") if b"work" in words else []
         except OSError:
             continue
-        if "work" in words and str(store) in words:
+        if f"EVERMAP_STORE={store}".encode() in told:
+            assert str(store).encode() not in words, "a command line would show a password"
             found.append(int(entry.name))
     return [number for number in found if runs(number)]
 
@@ -175,6 +179,11 @@ def test_a_token_of_an_administrator_is_printed_while_there_is_none(tmp_path: Pa
     assert database.audit()[0]["what"] == "first token admin-2, role admin"
 
 
+@pytest.mark.parametrize("name", ["", " ", "x" * 101, "a\nb", "\x1b[2J"])
+def test_names_of_tokens_are_short_and_printable(tmp_path: Path, name: str) -> None:
+    assert_refused(run("serve", "token", name, "--store", tmp_path), "up to 100 printable characters")
+
+
 def test_tokens_are_in_the_audit(tmp_path: Path) -> None:
     run("serve", "token", "robot-7", "--store", tmp_path)
     run("serve", "token", "robot-7", "--revoke", "--store", tmp_path)
@@ -187,7 +196,7 @@ def test_tokens_are_in_the_audit(tmp_path: Path) -> None:
 def test_a_store_of_another_scheme_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, store: str) -> None:
     monkeypatch.chdir(tmp_path)
     for verb in (("serve",), ("serve", "token", "x"), ("work", "--drain"), ("learn",), ("map", "gc")):
-        assert_refused(run(*verb, "--store", store), f"no store for '{store.partition(':')[0]}://'")
+        assert_refused(run(*verb, "--store", store), f"field '--store': no store for '{store.partition(':')[0]}://'")
     result = run("serve", "doctor", "--url", "", "--store", store)
     assert (result.exit_code, "no store for" in result.stdout) == (1, True)
     assert list(tmp_path.iterdir()) == []
@@ -214,3 +223,12 @@ def test_the_store_of_the_environment_is_that_of_every_verb(tmp_path: Path, monk
     assert list(sites_of(["evermap-maps/a.evermap"], None)) == ["a"]
     assert list(sites_of([], "evermap-maps")) == ["a"]
     assert_refused(run("map", "gc"), "nothing to prune")
+
+
+def test_all_versions_of_a_server_are_pinned() -> None:
+    """`examples/compose.yaml` and the README install by the lock file."""
+    root = Path(__file__).resolve().parents[2]
+    extras = tomllib.loads((root / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    locked = {line.partition("==")[0] for line in (root / "requirements.lock").read_text().splitlines()}
+    missing = {re.split(r"[\[>=]", name)[0] for name in (*extras["server"], *extras["ros"])} - locked
+    assert not missing

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from evermap.cli.terminal import remark_as
 from evermap.errors import ConfigError, EvermapError
@@ -151,11 +152,26 @@ class Verb(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
         remark_as.set(lambda text: with_options(text, ctx))
-        try:
+        with _speaking_of_options(ctx):
             return super().invoke(ctx)
-        except EvermapError as error:
-            speak_of_options(error, ctx)
-            raise
+
+
+class VerbGroup(TyperGroup):
+    """A group that is a command itself, whose errors name options as those of a `Verb` do."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the group, or one of its commands."""
+        with _speaking_of_options(ctx):
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _speaking_of_options(ctx: Any) -> Iterator[None]:
+    try:
+        yield
+    except EvermapError as error:
+        speak_of_options(error, ctx)
+        raise
 
 
 def speak_of_options(error: EvermapError, ctx: Any) -> None:

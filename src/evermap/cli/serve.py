@@ -25,6 +25,7 @@ from evermap.cli.options import (
     AsJson,
     ConfigFile,
     Settings,
+    VerbGroup,
     argument,
     configured,
     option,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="serve",
+    cls=VerbGroup,
     help="Serve the maps of a fleet.",
     rich_markup_mode=None,
     invoke_without_command=True,
@@ -96,7 +98,8 @@ def serve(
 
     listener = _listener(host, port)
     _print_first_token(database)
-    crew = Crew([sys.executable, "-m", "evermap", "work", "--store", store, "--under", str(os.getpid())], workers, warn)
+    os.environ[STORE_VARIABLE] = store  # of the workers: command lines, which all users see, show no password
+    crew = Crew([sys.executable, "-m", "evermap", "work", "--under", str(os.getpid())], workers, warn)
     server = Server(database, SiteStores(store), public_url=public_url, workers=crew.alive)
     how = {"log_level": "warning", "server_header": False, "timeout_graceful_shutdown": 5}
     served = uvicorn.Server(uvicorn.Config(create_app(server), **how, **tls))
@@ -206,8 +209,8 @@ def token(
         else:
             print_table("tokens", [[*row.values()] for row in rows], ("name", "role", "made (UTC)"))
         return
-    if not name.strip() or len(name) > 100:
-        raise ConfigError("a token needs a name of up to 100 characters", field="name", hint="robot-7")
+    if not name.strip() or len(name) > 100 or not name.isprintable():
+        raise ConfigError("a token needs a name of up to 100 printable characters", field="name", hint="robot-7")
     if revoke:
         if not database.revoke_token(name):
             known = [row["name"] for row in database.tokens()]

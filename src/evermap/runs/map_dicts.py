@@ -12,7 +12,7 @@ from evermap.types import UNKNOWN, FloatArray, json_number
 if TYPE_CHECKING:
     from evermap.maps.diff import Difference
     from evermap.maps.living import LivingMap
-    from evermap.maps.store import Revision
+    from evermap.maps.store import MapStore, Revision
     from evermap.maps.why import Answer
 
 AXES = ("x_m", "y_m", "z_m")
@@ -87,6 +87,44 @@ def _rotation(living: LivingMap, place: int) -> list[float] | None:
     """Quaternion of a place in space; None of a point, and where `place` is -1."""
     rotation: list[float] = living.places.rotation[place].tolist() if place >= 0 else [math.nan]
     return None if math.isnan(rotation[0]) else rotation
+
+
+def pose_dicts(store: MapStore, revision: int | None = None, at_s: float = math.inf) -> list[dict[str, Any]]:
+    """Return where each robot was in its newest session, with the path that it had driven in it.
+
+    Args:
+        store: the map.
+        revision: whose sessions; None for the newest.
+        at_s: leave out what is later.
+
+    Raises:
+        DamagedMapError: a path is not what was written.
+    """
+    from evermap.maps.store import DamagedMapError, RevisionKind
+    from evermap.maps.store.content import DamagedError
+    from evermap.maps.store.measured import TRAJECTORY, unpack_trajectory
+
+    line = store.lineage(revision)
+    kept = {item.revision: item for item in store.attachments(line) if item.name == TRAJECTORY}
+    newest: dict[str, tuple[float, int]] = {}
+    for item in store.log():
+        said = item.provenance
+        if item.number in line and said.kind is RevisionKind.SESSION and said.stamp_from_s <= at_s:
+            newest[said.robot] = max(newest.get(said.robot, (-math.inf, 0)), (said.stamp_from_s, item.number))
+    found = []
+    for robot, (_, number) in sorted(newest.items()):
+        told: dict[str, Any] = dict.fromkeys(("stamp_s", "x_m", "y_m", "heading_rad")) | {"path_m": []}
+        if number in kept:  # an older evermap kept none
+            try:
+                stamp_s, pose = unpack_trajectory(store.attached(kept[number]))
+            except DamagedError as error:
+                raise DamagedMapError(f"revision {number}: {error}", path=store.where) from None
+            pose, stamp_s = pose[stamp_s <= at_s], stamp_s[stamp_s <= at_s]
+            for row in range(len(pose))[-1:]:
+                told |= dict(zip(told, [stamp_s[row].item(), *pose[row].tolist()], strict=False))
+            told["path_m"] = pose[:, :2].round(3).tolist()
+        found.append({"robot": robot, "revision": number, **told})
+    return found
 
 
 def prior_dicts(living: LivingMap) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evermap import __version__
-from evermap.errors import DataError, EvermapError, InputError
+from evermap.errors import DataError, EvermapError, InputError, printable
 from evermap.maps.store import (
     Attachment,
     MapStore,
@@ -45,9 +45,11 @@ class TwiceError(InputError):
 
     Attributes:
         revision: that it is.
+        is_copy: whether that revision was made from another copy of the drive.
     """
 
     revision: int = 0
+    is_copy: bool = False
 
 
 class UnbridgedError(DataError):
@@ -103,6 +105,7 @@ class Entered(Shown):
             StaleRevisionError: another commit came in between.
         """
         from evermap.config import Config, to_toml
+        from evermap.maps.store.measured import TRAJECTORY, pack_trajectory
 
         config, recording = config or Config(), self.session.recording
         stamps = recording.frames.stamp_s
@@ -124,7 +127,7 @@ class Entered(Shown):
             self.changes,
             self.session.evidence,
             parent=self.parent,
-            attachments=self.attachments,
+            attachments={**self.attachments, TRAJECTORY: pack_trajectory(self.session.slam.trajectory)},
         )
 
 
@@ -174,7 +177,7 @@ def enter_session(
     head = store.head()
     newest = store.load(head)
     data = pack_recording(recording)
-    kept = {item.revision: item for item in store.attachments() if item.name == RECORDING}
+    kept = _recordings(store, head)
     _refuse_twice(store, kept, data, recording)
     stamps = recording.frames.stamp_s
     start_s = float(stamps[0]) if len(stamps) else np.inf
@@ -183,7 +186,7 @@ def enter_session(
     if not start_s < newest.session_start_s:
         session = run_session(recording, said, config, progress=progress)
         return Entered(session, newest, session.living, session.changes, (), head, {RECORDING: data})
-    late = _enter_late(store, recording, said, config, _history(store, kept), data, progress)
+    late = _enter_late(store, recording, said, config, _history(store, head), data, progress)
     return replace(late, parent=head)  # whatever came in since `head` was read makes the commit stale
 
 
@@ -343,20 +346,64 @@ def at_time(store: MapStore, stamp_s: float) -> LivingMap:
 
 
 def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, recording: AnyRecording) -> None:
+    """Refuse a recording that is in the map, or another copy of its drive: condensed, converted, or packed otherwise.
+
+    Raises:
+        TwiceError: it is.
+    """
+    from evermap.maps.sessions.session import drive_of, same_drive
+    from evermap.maps.store.measured import unpack_recording
+
     for number, item in kept.items():
         if item.n_bytes == len(data) and store.attached(item) == data:
-            twice = TwiceError(
-                f"{recording.name}: is in the map already, as revision {number}",
-                path=store.where,
-                hint="a session counts once; the map is unchanged",
-            )
-            twice.revision = number
-            raise twice
+            raise _twice(store, number, f"{recording.name}: is in the map already, as revision {number}", is_copy=False)
+    alike = _of_the_same_time(store, kept, recording)
+    mine = drive_of(recording) if alike else ()
+    for number in alike:
+        other = unpack_recording(store.attached(kept[number]))
+        if type(other) is type(recording) and same_drive(mine, drive_of(other)):
+            same = f"'{printable(other.name, 80)}' has the same frames and readings"
+            problem = f"{recording.name}: its drive is in the map already, as revision {number}: {same}"
+            raise _twice(store, number, problem, is_copy=True)
 
 
-def _history(store: MapStore, kept: dict[int, Attachment]) -> list[_Step]:
-    """Sessions and edits of the newest map, in the order in which they were committed."""
-    lineage = set(store.lineage())
+def _twice(store: MapStore, number: int, problem: str, *, is_copy: bool) -> TwiceError:
+    twice = TwiceError(problem, path=store.where, hint="a session counts once; the map is unchanged")
+    twice.revision, twice.is_copy = number, is_copy
+    return twice
+
+
+def _of_the_same_time(store: MapStore, kept: Mapping[int, Attachment], recording: AnyRecording) -> list[int]:
+    """Revisions of sessions that begin and end with a recording; others cannot be of its drive."""
+    from evermap.maps.sessions.session import repaired
+
+    stamp_s = recording.frames.stamp_s
+    if not len(stamp_s):
+        return []
+    first_s, last_s = float(np.nanmin(stamp_s)), float(np.nanmax(stamp_s))
+    spans = {item.number: (item.provenance.stamp_from_s, item.provenance.stamp_to_s) for item in store.log()}
+    near = [number for number in kept if spans[number][0] <= last_s and spans[number][1] >= first_s]
+    if not near:
+        return []
+    repaired_s = repaired(recording).frames.stamp_s
+    ends = {(first_s, last_s)}
+    if len(repaired_s):
+        ends.add((float(repaired_s[0]), float(repaired_s[-1])))
+    return [number for number in near if spans[number] in ends]
+
+
+def _recordings(store: MapStore, head: int) -> dict[int, Attachment]:
+    """Stored recordings of a revision and those before it."""
+    from evermap.maps.store.measured import RECORDING
+
+    return {item.revision: item for item in store.attachments(store.lineage(head)) if item.name == RECORDING}
+
+
+def _history(store: MapStore, head: int) -> list[_Step]:
+    """Sessions and edits of the map at a revision, in the order in which they were committed; what comes in meanwhile
+    is no part of it.
+    """
+    kept, lineage = _recordings(store, head), set(store.lineage(head))
     steps: list[_Step] = []
     start_s = -np.inf
     for revision in store.log():
@@ -469,12 +516,11 @@ def reenter(where: str, work: Path, config: Config | None = None, *, adopt: bool
 
 
 def _reentered(store: SqlStore, work: Path, config: Config | None) -> Reentered:
-    from evermap.maps.store.measured import RECORDING
     from evermap.maps.store.sql import SqlStore
     from evermap.maps.store.sqlite import snapshot
 
     head = store.head()
-    steps = _history(store, {item.revision: item for item in store.attachments() if item.name == RECORDING})
+    steps = _history(store, head)
     sessions = [step for step in steps if step.recording is not None]
     if not sessions:
         return Reentered(0, 0, head, head, adopted=False)
@@ -513,7 +559,7 @@ def _entered_again(
 ) -> LivingMap:
     """Commit a session or an edit to the copy of a map; returns the map after it."""
     from evermap.config import to_toml
-    from evermap.maps.store.measured import RECORDING
+    from evermap.maps.store.measured import RECORDING, TRAJECTORY, pack_trajectory
 
     said = step.revision.provenance
     if step.recording is None:
@@ -525,7 +571,8 @@ def _entered_again(
     if config is not None:
         said = replace(said, config=to_toml(config), seed=config.slam.seed)
     said = replace(said, wall_s=time.perf_counter() - start)
-    attached = {RECORDING: step.recording}
+    attached: dict[str, bytes | Attachment] = {RECORDING: step.recording}
+    attached[TRAJECTORY] = pack_trajectory(session.slam.trajectory)
     parent = fresh.head()
     fresh.commit(session.living, said, session.changes, session.evidence, parent=parent, attachments=attached)
     return session.living
@@ -553,7 +600,7 @@ def _said(living: LivingMap) -> dict[str, Life]:
 def _taken_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequence[_Step], config: Config | None) -> int:
     """Copy what an earlier attempt has entered alike, from its first step on; returns the number of steps."""
     from evermap.config import to_toml
-    from evermap.maps.store.measured import RECORDING
+    from evermap.maps.store.measured import RECORDING, TRAJECTORY
     from evermap.maps.store.sql import SqlStore
 
     if earlier is None or not _written_by(earlier):
@@ -564,20 +611,26 @@ def _taken_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequenc
         same = old.named(log[start].restores)[1] == fresh.named(base)[1]
         if not same or _said(old.load()) != _said(fresh.load(fresh.head() - 1)):
             return 0
-        digests = {item.revision: item.digest for item in old.attachments()}
+        kept: dict[str, dict[int, Attachment]] = {RECORDING: {}, TRAJECTORY: {}}
+        for item in old.attachments():
+            kept[item.name][item.revision] = item
         for count, step in enumerate(steps):
             number = start + count + 1
             wanted = replace(step.revision.provenance, wall_s=np.nan)
             if step.recording is not None and config is not None:
                 wanted = replace(wanted, config=to_toml(config), seed=config.slam.seed)
             digest = None if step.recording is None else step.recording.digest
-            if number not in log or log[number].evermap_version != __version__ or digests.get(number) != digest:
+            if number not in log or log[number].evermap_version != __version__:
+                return count
+            if getattr(kept[RECORDING].get(number), "digest", None) != digest:
                 return count
             said = log[number].provenance
             if repr(replace(said, wall_s=np.nan)) != repr(wanted):  # nan is not equal to itself
                 return count
             seen = old.evidence(revisions=[number])
-            attached = {} if step.recording is None else {RECORDING: step.recording}
+            attached: dict[str, bytes | Attachment] = {} if step.recording is None else {RECORDING: step.recording}
+            if number in kept[TRAJECTORY]:
+                attached[TRAJECTORY] = old.attached(kept[TRAJECTORY][number])
             parent = fresh.head()
             fresh.commit(old.load(number), said, old.changes(number), seen, parent=parent, attachments=attached)
     return len(steps)

@@ -514,6 +514,15 @@ def why(request: Request, site: Site, landmark: str, _: Reader, revision: AtRevi
     return _told(request, site, lambda store: map_dicts.answer_dict(of_landmark(store, landmark, revision)))
 
 
+@router.get("/maps/{site}/poses")
+def poses(
+    request: Request, site: Site, _: Reader, revision: AtRevision = None, at_s: Number = None,
+) -> Response:  # fmt: skip
+    """Return where each robot was in its newest session up to `at_s`, and its path in it."""
+    until_s = math.inf if at_s is None else at_s
+    return _told(request, site, lambda store: {"robots": map_dicts.pose_dicts(store, revision, until_s)})
+
+
 @router.get("/maps/{site}/lifetimes")
 def lifetimes(request: Request, site: Site, _: Reader, revision: AtRevision = None) -> Response:
     """Return the lifetimes by class and place."""

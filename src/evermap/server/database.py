@@ -143,6 +143,8 @@ class JobState(StrEnum):
     QUEUED = "queued"
     WORKING = "working"
     ENTERED = "entered"
+    REPEAT = "repeat"
+    """Another copy of a drive that is entered."""
     ASIDE = "aside"
     REJECTED = "rejected"
 
@@ -320,7 +322,7 @@ class Database:
             site = connection.execute(mine.returning(_job.c.site)).scalar()
             if site is not None:
                 announce(connection, PREFIX + site)
-            if site is not None and state is JobState.ENTERED:  # the map keeps the recording
+            if site is not None and state in (JobState.ENTERED, JobState.REPEAT):  # the map keeps the recording
                 connection.execute(delete(_payload).where(_payload.c.job == job))
 
     def retry(self, job: int) -> bool:

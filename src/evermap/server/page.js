@@ -5,8 +5,10 @@ const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
 let token = sessionStorage.getItem("evermap-token") || "";
 let site = "", revisions = [], follows = null, asked = 0, compares = false; // with another than the one before
+let order = [], clock = "unix"; // revisions by the time of the world that they show, and the clock of that
 let operator = false, approved = 0, chosen = null, picks = 0; // how often a revision was chosen
-let placed = [], told = [], whole = null, view = null, tile = null; // what is drawn, and which part of it
+let placed = [], told = [], fleet = [], held = []; // landmarks, changes, robots on the map, and what robots report
+let whole = null, view = null, tile = null; // which part is drawn
 
 async function get(path, how = {}) {
   const headers = { Authorization: `Bearer ${token}`, "Content-Type": "application/json" };
@@ -55,6 +57,47 @@ function table(id, heads, rows) {
 
 const minute = (stamp) => stamp.slice(0, 16).replace("T", " ");
 
+// A time of the map's clock.
+function moment(s) {
+  if (s === null || !Number.isFinite(s)) return "before all sessions";
+  if (clock === "recording") return `${s.toFixed(1)} s`;
+  const date = new Date(1000 * s);
+  return Number.isNaN(date.getTime()) ? `${s} s` : minute(date.toISOString());
+}
+
+// Revisions by the time that they show: that of the newest session in each. One that came late shows no earlier time.
+function sorted(log) {
+  const at = new Map([[0, -Infinity]]);
+  for (const one of log) {
+    const shows = at.get(one.restores ?? one.parent) ?? -Infinity;
+    at.set(one.revision, Math.max(shows, one.stamp_to_s ?? -Infinity));
+  }
+  const all = log.map((one) => ({ ...one, shows: at.get(one.revision), late: one.stamp_to_s !== null && one.stamp_to_s < at.get(one.revision) }));
+  return all.sort((a, b) => (a.shows === b.shows ? a.revision - b.revision : a.shows - b.shows));
+}
+
+const at = (id) => order[Number($(id).value) - 1]; // undefined of the empty map
+const place = (revision) => order.findIndex((one) => one.revision === revision) + 1;
+const number = () => at("time")?.revision ?? 0;
+const head = () => revisions.at(-1)?.revision ?? 0;
+
+function point(id, revision) { $(id).value = String(place(revision)); }
+
+// What a slider is at, beside it and for who hears it.
+function tellTime(id, text) { $(id === "time" ? "when" : "other").textContent = text; $(id).setAttribute("aria-valuetext", text); }
+
+const called = (one) => `${moment(one.shows)}, revision ${one.revision}${one.revision === head() ? ", the newest" : ""}`;
+
+// What a revision did, in words.
+function deed(one) {
+  const note = one.note === `back to revision ${one.restores}` ? "" : one.note; // unless somebody gave another
+  if (one.restores !== null) return `goes back to ${one.restores ? `revision ${one.restores}` : "the empty map"}${note ? `: ${note}` : ""}`;
+  if (one.kind === "edit") return one.note || "edited by an operator";
+  const counts = Object.entries(one.changes).filter(([, count]) => count).map(([kind, count]) => `${count} ${kind}`);
+  if (one.grown) counts.push(`${one.grown} seen for the first time`);
+  return counts.join(", ") || "nothing has changed";
+}
+
 function duration(s) {
   if (s === null) return "unknown";
   const [size, unit] = [[31557600, "years"], [86400, "days"], [3600, "h"], [60, "min"], [1, "s"]].find(([one]) => s >= one) || [1, "s"];
@@ -86,8 +129,13 @@ function draw(landmarks, changes) {
     [left, right] = [Math.min(left, one.x_m), Math.max(right, one.x_m)];
     [low, high] = [Math.min(low, -one.y_m), Math.max(high, -one.y_m)];
   }
+  for (const one of fleet.filter((robot) => robot.x_m !== null)) {
+    if (!placed.length) [left, right, low, high] = [one.x_m - 1, one.x_m + 1, -one.y_m - 1, -one.y_m + 1];
+    [left, right] = [Math.min(left, one.x_m), Math.max(right, one.x_m)];
+    [low, high] = [Math.min(low, -one.y_m), Math.max(high, -one.y_m)];
+  }
   const edge = Math.max(right - left, high - low, 1) / 20;
-  whole = { x: left - edge, y: low - edge, w: right - left + 2 * edge, h: high - low + 2 * edge };
+  whole = { x: left - edge, y: low - edge, w: right - left + 2 * edge, h: high - low + 3 * edge }; // a scale fits below
   if (!$("map").classList.contains("near")) view = { ...whole };
   paint();
 }
@@ -95,7 +143,7 @@ function draw(landmarks, changes) {
 const metre = () => Math.max(view.w / ($("map").clientWidth || 800), view.h / ($("map").clientHeight || 500)); // a pixel's
 
 function paint() {
-  const size = 5 * metre(), at = new Map(placed.map((one) => [one.landmark, one])), nodes = [];
+  const size = 5 * metre(), of = new Map(placed.map((one) => [one.landmark, one])), nodes = [];
   const kinds = new Map(told.flatMap((change) => change.landmarks.map((id) => [id, change.kind])));
   if (tile) nodes.push(shape("rect", { ...tile, "stroke-width": size / 3 }, "tile"));
   for (const one of placed) {
@@ -120,15 +168,49 @@ function paint() {
     nodes.push(node);
   }
   for (const change of told.filter((one) => one.kind === "moved" && one.displacement_m.every((x) => x !== null))) {
-    for (const one of change.landmarks.map((id) => at.get(id)).filter(Boolean)) {
+    for (const one of change.landmarks.map((id) => of.get(id)).filter(Boolean)) {
       const [dx, dy] = change.displacement_m, [x, y] = [one.x_m, -one.y_m], turn = Math.atan2(-dy, dx);
       const tip = (angle) => `${x - 2 * size * Math.cos(turn + angle)} ${y - 2 * size * Math.sin(turn + angle)}`;
       const d = `M${x - dx} ${y + dy}L${x} ${y}M${tip(0.5)}L${x} ${y}L${tip(-0.5)}`;
       nodes.push(shape("path", { d, "stroke-width": size / 2 }, "moved"));
     }
   }
+  nodes.push(...robots(size), ...scale(size));
   $("map").setAttribute("viewBox", `${view.x} ${view.y} ${view.w} ${view.h}`);
   $("map").replaceChildren(...nodes);
+}
+
+function label(x, y, size, words) {
+  return Object.assign(shape("text", { x, y, "font-size": 2.6 * size, "stroke-width": 0.6 * size }, "label"), { textContent: words });
+}
+
+// Robots where their newest sessions ended, pointing ahead, with their paths; names of those at one place are listed.
+function robots(size) {
+  const nodes = [], names = [], seen = [];
+  for (const one of fleet.filter((robot) => robot.x_m !== null)) {
+    const [x, y] = [one.x_m, -one.y_m], corner = (angle, r) => `${x + r * size * Math.cos(one.heading_rad + angle)} ${y - r * size * Math.sin(one.heading_rad + angle)}`;
+    const path = shape("path", { d: `M${one.path_m.map(([u, v]) => `${u} ${-v}`).join("L")}`, "stroke-width": size / 3 }, "path");
+    const mark = shape("path", { d: `M${corner(0, 2.6)}L${corner(2.5, 2.2)}L${corner(Math.PI, 0.9)}L${corner(-2.5, 2.2)}Z`, "stroke-width": size / 3 }, "robot");
+    const title = document.createElementNS(SVG, "title");
+    title.textContent = `${one.robot || "a robot"}, ${moment(one.stamp_s)}, revision ${one.revision}`;
+    mark.append(title);
+    const beside = seen.filter(([u, v]) => Math.hypot(u - x, v - y) < 6 * size).length;
+    seen.push([x, y]);
+    nodes.unshift(path);
+    nodes.push(mark);
+    const left = x > view.x + 0.7 * view.w, name = label(x + (left ? -3.2 : 3.2) * size, y + (1 + 3 * beside) * size, size, one.robot || "a robot");
+    if (left) name.setAttribute("text-anchor", "end");
+    names.push(name);
+  }
+  return [...nodes, ...names];
+}
+
+// A bar of 1, 2 or 5 times a power of ten metres.
+function scale(size) {
+  const about = 24 * size, power = 10 ** Math.floor(Math.log10(about)), long = power * [5, 2, 1].find((one) => one * power <= about);
+  const [x, y] = [view.x + 2 * size, view.y + view.h - 2 * size];
+  const bar = shape("path", { d: `M${x} ${y - size}v${size}h${long}v${-size}`, "stroke-width": size / 3 }, "scale");
+  return [bar, label(x + long + size, y, size, long < 1 ? `${Math.round(100 * long)} cm` : `${long} m`)];
 }
 
 // Show a part `scale` times as wide, with what is at [x, y] of the map at `to` afterwards.
@@ -196,7 +278,7 @@ function handle() {
 // P(exists) from look to look, as many as there were, not by time: a dot where it was seen, a cross where it was missed.
 function history(answer) {
   const { hits, p_exists: belief } = answer.looks, [wide, tall] = [100, 30], nodes = [];
-  const svg = shape("svg", { viewBox: `-6 -2 ${wide + 8} ${tall + 9}`, role: "img", "aria-label": answer.headline }, "history");
+  const svg = shape("svg", { viewBox: `-6 -2 ${wide + 8} ${tall + 11}`, role: "img", "aria-label": answer.headline }, "history");
   const across = (k) => (wide * (k + 0.5)) / Math.max(hits.length, 1), xs = hits.map((_, k) => across(k));
   const ys = belief.map((p) => (p === null ? tall : tall * (1 - p)));
   const text = (x, y, words) => Object.assign(shape("text", { x, y }, "tick"), { textContent: words });
@@ -218,14 +300,14 @@ function history(answer) {
     const d = `M${x - 0.8} ${y - 0.8}l1.6 1.6m0 -1.6l-1.6 1.6`;
     nodes.push(seen ? shape("circle", { cx: x, cy: y, r: 0.8 }, "there") : shape("path", { d }, "vanished thin"));
   });
-  nodes.push(text(0, tall + 6, `P(exists) in ${hits.length} looks, by revision: ● seen, ✕ missed`));
+  nodes.push(text(0, tall + 7.5, `P(exists) in ${hits.length} looks, by revision: ● seen, ✕ missed`));
   svg.append(...nodes);
   return svg;
 }
 
 async function why(label) {
   try {
-    chosen = await json(of(`landmarks/${encodeURIComponent(label)}/why?revision=${$("revision").value}`));
+    chosen = await json(of(`landmarks/${encodeURIComponent(label)}/why?revision=${number()}`));
     const words = [chosen.headline, ...chosen.reasons].map((line) => element("p", line));
     $("why").replaceChildren(words[0], history(chosen), ...words.slice(1));
     $("word").hidden = !operator;
@@ -247,55 +329,71 @@ async function tell(action) {
 async function goTo(label) { await why(label); $("why-head").focus(); }
 
 async function show() {
-  const number = Number($("revision").value), mine = ++asked;
-  $("before").max = String(number - 1);
-  if (!compares) $("before").value = String(number - 1);
-  const before = Number($("before").value);
-  $("number").textContent = String(number);
-  $("other").textContent = before ? String(before) : "an empty map";
-  candidates();
-  const item = revisions.find((one) => one.revision === number);
+  const item = at("time"), mine = ++asked;
   if (!item) return;
-  const [found, difference] = await Promise.all([json(of(`landmarks?revision=${number}`)), json(of(`diff?a=${before}&b=${number}`))]);
+  if (!compares) point("before", item.parent);
+  const before = at("before")?.revision ?? 0, shown = item.revision;
+  tellTime("time", called(item));
+  tellTime("before", before ? called(at("before")) : "an empty map");
+  candidates();
+  let found, difference, here;
+  try {
+    [found, difference, here] = await Promise.all(
+      [`landmarks?revision=${shown}`, `diff?a=${before}&b=${shown}`, `poses?revision=${shown}`].map((path) => json(of(path))));
+  } catch (error) {
+    if (mine === asked) { [fleet, placed, told] = [[], [], []]; $("about").textContent = error.message; list("changes", []); draw([], []); }
+    return;
+  }
   if (mine !== asked) return; // the slider is elsewhere by now
+  [fleet, clock] = [here.robots, found.clock];
+  tellTime("time", called(item));
+  tellTime("before", before ? called(at("before")) : "an empty map");
   const labels = new Map(found.landmarks.map((one) => [one.landmark, one.label]));
-  $("about").textContent = `${minute(item.created_at)} UTC: ${item.note || item.recording}; ${item.existing} of ${item.landmarks} landmarks exist`;
+  const from = item.robot ? ` of ${item.robot}` : "", late = item.late ? `, of ${moment(item.stamp_to_s)}, which came late` : "";
+  const origin = item.kind === "session" ? `${item.recording || "a session"}${from}${late}` : deed(item);
+  $("about").textContent = `Entered ${minute(item.created_at)} UTC: ${origin}; ${item.existing} of ${item.landmarks} landmarks exist`;
   $("names").replaceChildren(...found.landmarks.map((one) => new Option(one.label)));
   draw(found.landmarks, difference.changes);
+  tableOfRobots();
   const line = (id, text) => [`${text} `, button("Why", () => goTo(labels.get(id) ?? String(id)), `Why: ${text}`)];
   const said = difference.edits.map((one) => line(one.landmark, `${labels.get(one.landmark) ?? one.landmark} ${one.what} by an operator`));
   const changed = difference.changes.map((one) => line(one.landmarks[0], what(one, labels)));
-  list("changes", changed.length + said.length ? [...changed, ...said] : ["nothing"]);
+  const fresh = difference.grown.map((id) => labels.get(id) ?? String(id)), more = fresh.length > 12 ? ` and ${fresh.length - 12} more` : "";
+  const grown = fresh.length ? [`seen for the first time, ${fresh.length}: ${fresh.slice(0, 12).join(", ")}${more}`] : [];
+  const back = item.restores !== null ? [`revision ${shown} ${deed(item)}`] : [];
+  const all = [...back, ...changed, ...said, ...grown];
+  list("changes", all.length ? all : ["nothing"]);
 }
 
 // Revisions that are newer than the approved one; of the one that the slider is at, what has changed since that is shown.
 function candidates() {
-  const number = Number($("revision").value), newer = revisions.filter((one) => one.revision > approved);
+  const shown = number(), newer = revisions.filter((one) => one.revision > approved);
   const lines = newer.slice(-100).reverse().map((one) => {
-    const counts = Object.entries(one.changes).filter(([, count]) => count).map(([kind, count]) => `${count} ${kind}`);
-    const from = one.robot ? `from ${one.robot}` : one.note || one.kind;
     const choose = button(`Revision ${one.revision}`, () => compare(one.revision, approved));
-    choose.setAttribute("aria-pressed", String(one.revision === number));
-    return [choose, ` ${minute(one.created_at)} ${from}: ${counts.join(", ") || "no change"}`];
+    choose.setAttribute("aria-pressed", String(one.revision === shown));
+    const time = one.stamp_to_s === null ? minute(one.created_at) : moment(one.stamp_to_s);
+    return [choose, ` ${time}${one.robot ? ` from ${one.robot}` : ""}: ${deed(one)}`];
   });
   const focused = [...$("candidates").querySelectorAll("button")].indexOf(document.activeElement);
   list("candidates", lines);
   if (focused >= 0) $("candidates").querySelectorAll("button")[focused]?.focus();
-  $("approves").textContent = number === approved ? `Revision ${number} is approved` : `Approve revision ${number} for the robots`;
-  $("approves").disabled = number === approved;
-  $("reverts").textContent = `Revert to revision ${number}`;
-  $("reverts").disabled = number === revisions.at(-1)?.revision;
+  $("approves").textContent = shown === approved ? `Revision ${shown} is approved` : `Approve revision ${shown} for the robots`;
+  $("approves").disabled = shown === approved;
+  $("reverts").textContent = `Revert to revision ${shown}`;
+  $("reverts").disabled = shown === head();
 }
 
-function compare(number, before) {
+function compare(revision, before) {
   picks += 1;
-  [compares, $("revision").value, $("before").max, $("before").value] = [before !== number - 1, String(number), String(number - 1), String(before)];
-  show().catch((error) => say(error.message));
+  point("time", revision);
+  point("before", before);
+  compares = before !== at("time").parent;
+  show();
 }
 
 // Learned lifetimes; of a place, a button shows where that is.
 function stays(lifetimes) {
-  const place = ({ chunk, chunk_m: size }) => {
+  const where = ({ chunk, chunk_m: size }) => {
     if (!chunk) return "everywhere";
     const [x, y] = [chunk[0] * size, chunk[1] * size];
     const mark = () => {
@@ -307,15 +405,17 @@ function stays(lifetimes) {
     return button(text, mark, `Show on the map: ${text}`);
   };
   table("lives", ["Class", "Where (x, y)", "Half are gone after", "Stays seen, ended"], lifetimes.map((one) =>
-    [one.class || "all", place(one), duration(one.half_gone_s), `${one.stays}, ${one.stays_that_ended}`]));
+    [one.class || "all", where(one), duration(one.half_gone_s), `${one.stays}, ${one.stays_that_ended}`]));
 }
 
 async function refresh(newest) {
   const before = picks, [log, learned] = await Promise.all([json(of("revisions")), json(of("lifetimes"))]);
+  const shown = number(), other = at("before")?.revision ?? 0;
   revisions = log;
-  const head = revisions.length ? revisions[revisions.length - 1].revision : 0;
-  $("revision").max = String(head);
-  if (newest && picks === before) $("revision").value = String(head); // not if one was chosen meanwhile
+  order = sorted(log);
+  $("time").max = $("before").max = String(order.length);
+  point("time", newest && picks === before ? head() : shown); // not the newest if one was chosen meanwhile
+  point("before", other);
   stays(learned.lifetimes);
   await show();
 }
@@ -329,15 +429,25 @@ async function beside() {
   $("approved").textContent = `${approved ? `Revision ${approved} is approved (${who})` : "No revision is approved"}; ${newer > 0 ? `${newer} newer` : "none is newer"}.`;
   candidates();
   list("jobs", jobs.length ? jobs.map((job) => `${job.id} of ${job.robot}: ${job.state}${job.reason ? `, ${job.reason}` : ""}`) : ["none yet"]);
-  const rows = robots.map((one) => {
-    const held = one.maps.filter((item) => item.mapId === site);
-    const used = held.find((item) => item.mapStatus === "ENABLED")?.mapVersion ?? "";
-    return { ...one, used, held: held.map((item) => item.mapVersion).filter((version) => version !== used) };
-  }).filter((one) => one.used || one.held.length).sort((a, b) => Number(b.used) - Number(a.used));
+  held = robots;
+  tableOfRobots();
+}
+
+// Robots by the revision that they use, as they report, and where their newest sessions ended.
+function tableOfRobots() {
+  const rows = held.map((one) => {
+    const mine = one.maps.filter((item) => item.mapId === site);
+    const used = mine.find((item) => item.mapStatus === "ENABLED")?.mapVersion ?? "";
+    return { ...one, used, also: mine.map((item) => item.mapVersion).filter((version) => version !== used) };
+  }).filter((one) => one.used || one.also.length).sort((a, b) => Number(b.used) - Number(a.used));
   const right = rows.filter((one) => one.used === String(approved)).length;
   $("holders").textContent = !rows.length ? "No robot has reported that it holds this map." : approved ? `${right} of ${rows.length} use revision ${approved}, which is approved.` : "";
-  table("robots", ["Robot", "Uses", "Also holds", "Reported (UTC)"], rows.map((one) =>
-    [one.robot, one.used ? `${one.used} ${one.used === String(approved) ? "✓ approved" : "△ another"}` : "none", one.held.join(", ") || "–", minute(one.at)]));
+  const seen = new Map(fleet.map((one) => [one.robot, one])), silent = fleet.filter((one) => !rows.some((row) => row.robot === one.robot));
+  const last = (one) => (!one ? "–" : `${one.x_m === null ? "unknown" : `${one.x_m.toFixed(1)}, ${one.y_m.toFixed(1)} m at ${moment(one.stamp_s)}`} (revision ${one.revision})`);
+  const uses = (one) => (one.used ? `${one.used} ${one.used === String(approved) ? "✓ approved" : "△ another"}` : "none");
+  table("robots", ["Robot", "Uses", "Also holds", "Reported (UTC)", "Last place (x, y)"], [
+    ...rows.map((one) => [one.robot, uses(one), one.also.join(", ") || "–", minute(one.at), last(seen.get(one.robot))]),
+    ...silent.map((one) => [one.robot || "without a name", "–", "–", "–", last(one)])]);
 }
 
 // Server-Sent Events by fetch, which can send the token.
@@ -347,13 +457,13 @@ async function follow() {
   while (!signal.aborted) {
     try {
       const reader = (await get(of("events"), { signal })).body.pipeThrough(new TextDecoderStream()).getReader();
-      await Promise.all([refresh($("revision").value === $("revision").max), beside()]); // what was missed meanwhile
+      await Promise.all([refresh(number() === head()), beside()]); // what was missed meanwhile
       say("live");
       let text = "";
       for (let part = await reader.read(); !part.done; part = await reader.read()) {
         text += part.value;
         const end = text.lastIndexOf("\n\n") + 2, lines = text.slice(0, end);
-        if (lines.includes("event: revision")) await refresh($("revision").value === $("revision").max);
+        if (lines.includes("event: revision")) await refresh(number() === head());
         if (lines.includes("event: ")) await beside();
         if (end > 1) text = text.slice(end);
       }
@@ -364,14 +474,13 @@ async function follow() {
 }
 
 async function choose() {
-  [site, tile, chosen, compares] = [$("site").value, null, null, false];
+  [site, tile, chosen, compares, order, revisions, fleet] = [$("site").value, null, null, false, [], [], []];
   $("map").classList.remove("near");
   $("why").textContent = "Choose a landmark.";
   $("word").hidden = true;
   await beside();
   await refresh(true);
-  const head = revisions.at(-1)?.revision ?? 0;
-  if (approved && approved < head) compare(head, approved); // what waits for approval
+  if (approved && approved < head()) compare(head(), approved); // what waits for approval
   follow();
 }
 
@@ -390,7 +499,6 @@ async function start() {
   } catch (error) { $("enter").hidden = false; say(error.message); }
 }
 
-const number = () => Number($("revision").value);
 $("enter").addEventListener("submit", (event) => { event.preventDefault(); token = $("token").value; start(); });
 $("find").addEventListener("submit", (event) => { event.preventDefault(); goTo($("name").value); });
 $("approve").addEventListener("submit", async (event) => {
@@ -406,12 +514,12 @@ $("pins").addEventListener("click", () => tell(chosen.pinned ? "unpin" : "pin"))
 $("deletes").addEventListener("click", () => tell(chosen.deleted ? "undelete" : "delete"));
 $("site").addEventListener("change", choose);
 $("before").addEventListener("input", () => {
-  compares = $("before").value !== $("before").max;
-  show().catch((error) => say(error.message));
+  compares = (at("before")?.revision ?? 0) !== at("time")?.parent;
+  show();
 });
-$("revision").addEventListener("input", () => {
+$("time").addEventListener("input", () => {
   picks += 1;
-  show().catch((error) => say(error.message));
+  show();
 });
 handle();
 if (token) start();

@@ -36,7 +36,8 @@ class JobOutcome:
     """Result of a session.
 
     Attributes:
-        state: entered, rejected, set aside where it does not fit the map, or queued where the store did not answer.
+        state: entered, a repeat of one that is, rejected, set aside where it does not fit the map, or queued where the
+            store did not answer.
         reason: why, or a remark.
         revision: that it is, or that it was tried with.
     """
@@ -112,7 +113,8 @@ class Worker:
                 except StaleRevisionError:  # another process committed meanwhile: again, from the newest
                     continue
         except TwiceError as error:  # a worker died between the commit and saying so, or it came another way
-            return JobOutcome(JobState.ENTERED, error.problem, error.revision)
+            state = JobState.REPEAT if error.is_copy else JobState.ENTERED
+            return JobOutcome(state, error.problem, error.revision)
         except UnbridgedError as error:
             return JobOutcome(JobState.ASIDE, error.problem, head)
         except StoreUnavailableError as error:

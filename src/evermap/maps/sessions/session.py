@@ -23,12 +23,14 @@ from evermap.maps.sessions.witnessed import arrived, departed
 from evermap.maps.vicinity import in_chunks
 from evermap.show import Shown
 from evermap.slam.association.features import medians
+from evermap.slam.cleaning import clean
 from evermap.slam.estimate import solve
 from evermap.slam.space.intake import prepare_space
 from evermap.slam.space.solve import solve_space
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
+    Detections,
     FloatArray,
     IntArray,
     Landmarks,
@@ -156,6 +158,30 @@ def check_in_order(recording: AnyRecording, living: LivingMap) -> None:
             field="stamp_s",
             hint="evermap.enter_session(store, recording), or evermap slam --map FILE, enter it at its time",
         )
+
+
+def repaired(recording: AnyRecording) -> AnyRecording:
+    """Return a recording as it is condensed: one of the plane repaired, one of space as it is."""
+    return clean(recording) if isinstance(recording, Recording) else recording
+
+
+def drive_of(recording: AnyRecording) -> tuple[FloatArray, FloatArray]:
+    """Return what all copies of a drive have in common: (F,) stamps of frames, and (M, K) sorted readings, each with
+    the stamp of its frame, repaired and in single precision, as in a session that was condensed.
+    """
+    recording = repaired(recording)
+    seen, stamp_s = recording.detections, recording.frames.stamp_s
+    if isinstance(seen, Detections):
+        read = np.column_stack([seen.range_m, seen.bearing_rad])
+    else:
+        read = np.column_stack([seen.position_sensor_m, seen.corner_px.reshape(len(seen), -1)])
+    rows = np.column_stack([stamp_s[seen.frame], read.astype(np.float32)])
+    return stamp_s, rows[np.lexsort(rows.T[::-1])]
+
+
+def same_drive(one: tuple[FloatArray, ...], other: tuple[FloatArray, ...]) -> bool:
+    """Return whether two results of `drive_of` are equal."""
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
 
 
 def begun_with(session: Session, recording: AnyRecording) -> Session:

@@ -1,4 +1,4 @@
-"""Stored recordings of sessions, for replays, and the evidence of every clique, as bytes.
+"""Stored recordings of sessions, for replays, where their robots drove, and the evidence of every clique, as bytes.
 
 Of a recording is kept what the estimate may see: odometry, frames, detections, sensor and objects, bit by bit, and no
 truth. Evidence is one chunk a clique, some ten bytes a look, and an index of them.
@@ -16,11 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.existence.sites import Evidence
+from evermap.geometry import se3
 from evermap.maps.store.content import Chunk, DamagedError, name_of, text_chunk
 from evermap.types import (
     AnyRecording,
     Clock,
     Detections,
+    FloatArray,
     Frames,
     Odometry,
     Recording,
@@ -29,11 +31,14 @@ from evermap.types import (
     SpatialOdometry,
     SpatialRecording,
     SpatialSensor,
+    Trajectory,
     landmark_id_of,
 )
 
-RECORDING = "recording"
-"""Name of the attachment."""
+RECORDING, TRAJECTORY = "recording", "trajectory"
+"""Names of the attachments."""
+_MOST_POSES = 200
+"""Of a stored trajectory, which is for pictures."""
 _TABLES: dict[str, Any] = {"odometry": Odometry, "frames": Frames, "detections": Detections, "sensor": Sensor}
 _IN_SPACE: dict[str, Any] = {"odometry": SpatialOdometry, "frames": Frames, "detections": SpatialDetections}
 _LATER = ("features", "feature_names")
@@ -97,6 +102,34 @@ def unpack_recording(data: bytes) -> AnyRecording:
         return SpatialRecording(**about, **tables, sensors=tuple(sensors), symmetries=symmetries)
     except (KeyError, ValueError, TypeError, OSError, zipfile.BadZipFile) as error:
         raise DamagedError(f"a recording that was kept cannot be read: {error}") from None
+
+
+def pack_trajectory(trajectory: Trajectory) -> bytes:
+    """Return up to 200 poses of a trajectory, evenly chosen and with the last one, seen from above."""
+    rows = np.unique(np.linspace(0.0, max(len(trajectory) - 1, 0), _MOST_POSES).astype(np.int64))[: len(trajectory)]
+    pose = trajectory.pose_world_robot[rows]
+    if pose.shape[1] == 7:  # where its x axis points
+        ahead = se3.transform(pose, [1.0, 0.0, 0.0]) - pose[:, :3]
+        pose = np.column_stack([pose[:, :2], np.arctan2(ahead[:, 1], ahead[:, 0])])
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, stamp_s=trajectory.stamp_s[rows], pose=pose.astype(np.float32))
+    return buffer.getvalue()
+
+
+def unpack_trajectory(data: bytes) -> tuple[FloatArray, FloatArray]:
+    """Return the stamps (N,) and poses (N, 3) that `pack_trajectory` wrote: x, y [m] and heading [rad].
+
+    Raises:
+        DamagedError: anything else.
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            stamp_s, pose = archive["stamp_s"].astype(np.float64), archive["pose"].astype(np.float64)
+        if pose.shape != (len(stamp_s), 3) or not np.isfinite(pose).all():
+            raise ValueError("another shape")
+    except (KeyError, ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise DamagedError(f"a trajectory that was kept cannot be read: {error}") from None
+    return stamp_s, pose
 
 
 def _table(table: str, kind: Any, arrays: dict[str, Any], values: dict[str, Any]) -> Any:

@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
 CHANNEL = "evermap"
 """On which commits are announced."""
+_MOST_CHECKED = 2_000
+"""Names of checked chunks that are remembered, a few times those of one map."""
 _AT_ONCE = 500
 """Names in one question to the database."""
 _LONGEST = 900_000_000
@@ -246,7 +248,7 @@ class SqlStore(Shown):
             self._fetched(connection, {key for key, _ in attached.values()} - chunks.keys())  # those that are shared
             connection.execute(insert(schema.revision).values(number=number, record=record.name))
             self._move_anchor(connection, number, record.name)
-        self._checked |= chunks.keys()
+        self._remember(chunks.keys())
         return number
 
     def revert(self, revision: int, provenance: Provenance | None = None) -> int:
@@ -604,8 +606,14 @@ class SqlStore(Shown):
             return found
 
         living = content.unpack(record.content, fetch, lazily=True)
-        self._checked |= read
+        self._remember(read)
         return living
+
+    def _remember(self, names: Collection[bytes]) -> None:
+        """Note chunks as checked; those of older revisions are forgotten, so that a long history takes no memory."""
+        if len(self._checked) + len(names) > _MOST_CHECKED:
+            self._checked = set()
+        self._checked.update(names)
 
     def _clique_of(self, connection: Connection, record: Record, landmark_id: int) -> int | None:
         """The clique that a landmark belonged to in a revision."""
