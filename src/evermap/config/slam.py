@@ -307,7 +307,7 @@ class AssociationConfig(Section):
     contradiction: Share = key(0.95, "confidence from which a visit contradicts all others")
     fewest_displaced: Count = key(4, "landmarks from which a stretch is displaced as a whole")
     least_seen: Share = key(1.0 / 3.0, "sightings below this share of the usual number are of no landmark")
-    doubtful_share: Probability = key(0.015, "share of ambiguous detections from which particles are drawn")
+    doubtful_share: Probability = key(0.008, "share of ambiguous detections from which particles are drawn")
     constellation: ConstellationConfig = part(ConstellationConfig, "aligned maps")
     readings: ReadingsConfig = part(ReadingsConfig, "columns of detections")
     particles: ParticlesConfig = part(ParticlesConfig, "drawn histories")
