@@ -249,7 +249,7 @@ class Misses(_Columns):
 
 
 class SensorKind(StrEnum):
-    """Kind of range-bearing sensor, which sets the priors of its errors."""
+    """Kind of sensor, which sets the priors of its errors."""
 
     LASER = "laser"
     CAMERA = "camera"
@@ -612,6 +612,10 @@ class SpatialSensor(Shown):
         sigma_m, sigma_rad, sigma_px: nominal noise of positions, orientations and corners, where noise is estimated a
             starting value; None = unknown.
         p_detect: probability of detecting a landmark in view; p_false: probability of a false detection a frame.
+        kind: what it is; None = unknown.
+        sigma_scale: standard deviation of the scale of its ranges, as a share; sigma_angle_rad: of its orientation in
+            the mount, about each axis; sigma_position_m: of its position there, along each. None: as usual.
+        sigma_odometer_scale: standard deviation of the scale of the odometry; the same for all sensors.
     """
 
     name: str = "sensor"
@@ -627,6 +631,11 @@ class SpatialSensor(Shown):
     sigma_px: float | None = None
     p_detect: float = 0.9
     p_false: float = 0.01
+    kind: SensorKind | None = None
+    sigma_scale: float | None = None
+    sigma_angle_rad: float | None = None
+    sigma_position_m: float | None = None
+    sigma_odometer_scale: float | None = None
 
     def _facts(self) -> dict[str, Any]:
         return {"name": self.name, "camera": self.intrinsics is not None, "mount": self.mount_robot_sensor}

@@ -29,6 +29,20 @@ from evermap.types import (
     Trajectory,
 )
 
+WITHOUT_IDS = "`unknown_ids` associates detections without a landmark_id by geometry"
+"""What to try where nothing has an identity."""
+
+NOT_IN_SPACE = {
+    "sigma_offset_m": "no offset of ranges is estimated there: subtract it from the ranges",
+    "sigma_askew_rad": "the robot may move in any direction there: sigma_angle_rad is that of the sensor's mount",
+    "bearing_min_rad": "the field of view is that of the detections",
+    "bearing_max_rad": "the field of view is that of the detections",
+    "sigma_range_m": "[noise] sigma_m in sensor.toml",
+    "sigma_bearing_rad": "[noise] sigma_m or sigma_px in sensor.toml",
+    "mount_robot_sensor": "[mount] in sensor.toml or camera.toml",
+}
+"""Keys of a sensor in the plane that mean nothing in space, and what to try instead."""
+
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
@@ -243,6 +257,11 @@ def _check_spatial_sensor(sensor: SpatialSensor) -> None:
     if not sensor.range_min_m < sensor.range_max_m:
         problem = f"{where}: {sensor.range_min_m} is not below range_max_m = {sensor.range_max_m}"
         raise InputError(problem, field="sensors.range_min_m")
+    for name in ("sigma_scale", "sigma_angle_rad", "sigma_position_m", "sigma_odometer_scale"):
+        sigma = getattr(sensor, name)
+        if sigma is not None and not 0.0 <= sigma < inf:
+            problem = f"{where}: {sigma} is not a standard deviation"
+            raise InputError(problem, field=f"sensors.{name}", hint="None where unknown")
     for name in ("sigma_m", "sigma_rad", "sigma_px"):
         sigma = getattr(sensor, name)
         if sigma is not None and not 0.0 < sigma < inf:

@@ -46,6 +46,12 @@ Settings = Annotated[
 ShowConfig = Annotated[bool, option("--show-config", "Print the configuration in force as commented TOML and exit.")]
 AsJson = Annotated[bool, option("--json", "Print the summary as JSON.")]
 Force = Annotated[bool, option("--force", "Write into --out even if it holds other files; these are kept.")]
+UnknownIds = Annotated[
+    bool, option("--unknown-ids", "Ignore the landmark ids of the detections; associate by geometry.")
+]
+EmptyIds = Annotated[
+    bool, option("--empty-ids", "Associate detections with an empty landmark id by geometry; others keep theirs.")
+]
 Robot = Annotated[int | None, option("Robot of a recording that has several.", default=False)]
 Topics = Annotated[
     Path | None, option("Settings file of the topics, as slam --init-bag writes it.", metavar="FILE", default=False)
@@ -104,6 +110,13 @@ def configured(
         typer.echo(to_toml(config), nl=False)
         raise typer.Exit
     return config
+
+
+def associated(unknown_ids: bool, empty_ids: bool) -> bool | str | None:
+    """Return `slam.unknown_ids` as the two flags have it."""
+    if unknown_ids and empty_ids:
+        raise ConfigError("ignores the ids that --empty-ids keeps", field="unknown-ids", hint="one of the two")
+    return True if unknown_ids else "empty" if empty_ids else None
 
 
 def priors_by_class(texts: Sequence[str] | None) -> tuple[str | None, dict[str, str] | None]:

@@ -14,12 +14,15 @@ import typer
 from evermap.cli.options import (
     AsJson,
     ConfigFile,
+    EmptyIds,
     Force,
     Robot,
     Settings,
     ShowConfig,
     Topics,
+    UnknownIds,
     argument,
+    associated,
     configured,
     default_out,
     option,
@@ -77,12 +80,6 @@ HowMoved = Annotated[
         metavar="joint|nohyp|max-mixture|nn|em|mcts|viterbi",
         default="joint",
     ),
-]
-UnknownIds = Annotated[
-    bool, option("--unknown-ids", "Ignore the landmark ids of the detections; associate by geometry.")
-]
-EmptyIds = Annotated[
-    bool, option("--empty-ids", "Associate detections with an empty landmark id by geometry; others keep theirs.")
 ]
 PriorMap = Annotated[
     str | None, option("Start from this landmark map, or from the recording's surveyed one.", metavar="FILE|truth")
@@ -200,7 +197,7 @@ def slam(
     if init is not None or init_bag is not None or in_space:
         _write_what_is_to_edit(init, init_bag, in_space=in_space)
         return
-    given = {"sensor_model": sensor_model, "method": method, "unknown_ids": _associated(unknown_ids, empty_ids)}
+    given = {"sensor_model": sensor_model, "method": method, "unknown_ids": associated(unknown_ids, empty_ids)}
     chosen = configured(config, settings, given, within="slam", show=show_config)
     paths = _recordings(input, one=offline_session is not None)
     if together:
@@ -503,13 +500,6 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) ->
         class_names=survey.class_names,
         frame="prior_map",
     )
-
-
-def _associated(unknown_ids: bool, empty_ids: bool) -> bool | str | None:
-    """`slam.unknown_ids` as the two flags have it."""
-    if unknown_ids and empty_ids:
-        raise ConfigError("ignores the ids that --empty-ids keeps", field="unknown-ids", hint="one of the two")
-    return True if unknown_ids else "empty" if empty_ids else None
 
 
 class MapOptions(NamedTuple):

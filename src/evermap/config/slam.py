@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -10,7 +11,8 @@ from pydantic import ValidationInfo, field_validator
 
 from evermap.config.section import Count, NotNegative, Positive, Probability, Section, Share, key, part
 from evermap.errors import ConfigError
-from evermap.types import FloatArray, Sensor, SensorKind
+from evermap.types import FloatArray, Sensor, SensorKind, SpatialSensor
+from evermap.valid import NOT_IN_SPACE
 
 SIGMAS = {
     "range_bias_m": 0.1,
@@ -32,6 +34,14 @@ KINDS: dict[SensorKind, OfSensor] = {
     SensorKind.TAG: (0.05, 0.02, 0.05, 0.1, 0.05),
     SensorKind.STEREO: (0.05, 0.02, 0.05, 0.1, 0.03),
     SensorKind.UWB: (0.3, 0.005, 0.02, 0.02, 0.05),
+}
+InSpace = tuple[Positive, Positive, NotNegative, NotNegative]
+KINDS_IN_SPACE: dict[SensorKind, InSpace] = {
+    SensorKind.LASER: (0.001, 0.02, 0.001, 0.003),
+    SensorKind.CAMERA: (0.02, 0.02, 0.1, 0.005),
+    SensorKind.TAG: (0.005, 0.005, 0.02, 0.005),
+    SensorKind.STEREO: (0.01, 0.01, 0.03, 0.003),
+    SensorKind.UWB: (0.003, 0.1, 0.002, 0.05),
 }
 
 
@@ -378,6 +388,10 @@ class SpaceConfig(Section):
         gt=0.5,
         lt=2.0,
     )
+    kinds: dict[SensorKind, InSpace] = key(
+        KINDS_IN_SPACE,
+        "of a stated kind of sensor: standard deviation of the scale of its ranges, a share, and the next three keys",
+    )
     sigma_m: Positive = key(0.005, "noise of unstated positions at no range [m] ...")
     sigma_along: NotNegative = key(0.02, "... along the ray, as a share of the range ...")
     sigma_across: NotNegative = key(0.01, "... and across")
@@ -415,6 +429,11 @@ class SpaceConfig(Section):
     map: MapInSpaceConfig = part(MapInSpaceConfig, "a map that is given")
     repair: RepairConfig = part(RepairConfig, "other explanations")
     traffic: TrafficConfig = part(TrafficConfig, "boxes without identity")
+
+    @field_validator("kinds")
+    @classmethod
+    def _all_kinds(cls, given: dict[SensorKind, InSpace]) -> dict[SensorKind, InSpace]:
+        return KINDS_IN_SPACE | given
 
 
 class NoiseConfig(Section):
@@ -512,6 +531,23 @@ class SensorConfig(Section):
             if getattr(merged, low) >= getattr(merged, high):
                 problem = f"{getattr(merged, low):g} is not below {high} = {getattr(merged, high):g}"
                 raise ConfigError(problem, field=f"sensor.{low}")
+        return merged
+
+    def applied_in_space(self, sensors: Sequence[SpatialSensor]) -> tuple[SpatialSensor, ...]:
+        """Return the sensors of a recording in space with the fields that are set here, each the same.
+
+        Raises:
+            ConfigError: a field that means nothing in space, or nothing can be in range.
+        """
+        given = self.model_dump(exclude_none=True)
+        for name, hint in NOT_IN_SPACE.items():
+            if name in given:
+                raise ConfigError("is not used for a recording in space", field=f"sensor.{name}", hint=hint)
+        merged = tuple(replace(sensor, **given) for sensor in sensors)
+        for one in merged:
+            if one.range_min_m >= one.range_max_m:
+                problem = f"{one.range_min_m:g} is not below range_max_m = {one.range_max_m:g}"
+                raise ConfigError(problem, field="sensor.range_min_m")
         return merged
 
 

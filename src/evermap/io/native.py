@@ -20,6 +20,7 @@ from evermap.io.sensor_toml import Settings, parse_sensor_toml
 from evermap.io.table import ENDINGS, Table, parse_table
 from evermap.io.tagslam import is_tagslam
 from evermap.types import (
+    UNKNOWN,
     Clock,
     Detections,
     FloatArray,
@@ -288,7 +289,7 @@ def frames_and_detections(
     """
     given = table.one_form(POLAR, _CARTESIAN)
     optional = ("class_id", *_POLAR_SIGMAS, *_ROUND_SIGMAS, *feature_columns(table))
-    table.expect(("stamp_s", "landmark_id", *given), optional)
+    table.expect(("stamp_s", *given), ("landmark_id", *optional))
     if frame_table is not None:
         frame_table.expect(("stamp_s",))
     frames, frame = frames_of(
@@ -298,7 +299,11 @@ def frames_and_detections(
     sigma_range_m, sigma_bearing_rad = _sigmas(table, range_m)
     detections = Detections(
         frame=frame,
-        landmark_id=table.ids("landmark_id", optional=True, names=names),
+        landmark_id=(
+            table.ids("landmark_id", optional=True, names=names)
+            if "landmark_id" in table
+            else np.full(len(table), UNKNOWN, dtype=np.int64)
+        ),
         range_m=range_m,
         bearing_rad=bearing_rad,
         class_id=class_ids(table, class_names),
