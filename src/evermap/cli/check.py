@@ -47,10 +47,14 @@ def check(
       evermap check monday.mcap
     """
     given = {"slam.unknown_ids": associated(unknown_ids, empty_ids)}
-    chosen = configured(config, settings, given, within="slam.check", show=show_config)
+    chosen = configured(config, settings, given, within="slam.check", also=["sensor"], show=show_config)
+    from evermap.config import SlamConfig, refuse_unread
     from evermap.io import read_recording
     from evermap.slam.check import check_recording
 
+    reads = ("check", "cleaning", "space", "unknown_ids")
+    unread = [f"slam.{name}" for name in SlamConfig.model_fields if name not in reads]
+    refuse_unread(settings or [], {"by this command": unread}, within="slam.check")
     found = check_recording(read_recording(input, robot=robot), chosen)
     if as_json:
         print_json(found.as_dict())

@@ -89,6 +89,7 @@ def configured(
     values: Mapping[str, Any] | None = None,
     *,
     within: str = "",
+    also: Sequence[str] = (),
     show: bool = False,
 ) -> Config:
     """Return the configuration of `--config`, `--set` and single options; where asked to, print it and exit.
@@ -97,15 +98,19 @@ def configured(
         path: TOML file.
         settings: `section.key=value` each.
         values: what other options say, by key; None where an option was not given.
-        within: section that keys without a dot are of.
+        within: section that keys without a dot are of; others but it and `also` are not read.
+        also: further sections that the command reads.
         show: print the configuration and exit.
 
     Raises:
-        ConfigError: an unknown key or a value out of its bounds.
+        ConfigError: an unknown key, one that the command does not read, or a value out of its bounds.
     """
-    from evermap.config import load_config, to_toml
+    from evermap.config import Config, load_config, refuse_unread, to_toml
 
     config = load_config(path, settings or [], values, within=within)
+    reads = {within.partition(".")[0], *also}
+    others = [name for name in Config.model_fields if name not in reads] if within else []
+    refuse_unread(settings or [], {"by this command": others}, within=within)
     if show:
         typer.echo(to_toml(config), nl=False)
         raise typer.Exit

@@ -198,17 +198,21 @@ def slam(
         _write_what_is_to_edit(init, init_bag, in_space=in_space)
         return
     given = {"sensor_model": sensor_model, "method": method, "unknown_ids": associated(unknown_ids, empty_ids)}
-    chosen = configured(config, settings, given, within="slam", show=show_config)
+    sections = ("living", "sensor", "output", "track")
+    chosen = configured(config, settings, given, within="slam", also=sections, show=show_config)
+    set_here = [*(settings or []), *(f"slam.{name}=" for name, value in given.items() if value is not None)]
     paths = _recordings(input, one=offline_session is not None)
     if together:
         single = {"realtime": realtime or None, "topics": topics, "offline_session": offline_session}
         _check_together(map_file=map_file, prior_map=prior_map, robot=robot, **single)
+        _refuse_unread(set_here, chosen, in_map=False, in_space=False)
         _each_together(paths, out, chosen, {"as_json": as_json, "force": force, "inputs": [*paths, config]})
         return
     _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, shift=shift, prior=prior)
     from evermap.io import parse_shift, shifted
 
-    read = partial(_read, robot=robot, topics=topics, session=offline_session, force=force)
+    check = partial(_refuse_unread, set_here, chosen, in_map=map_file is not None)
+    read = partial(_read, robot=robot, topics=topics, session=offline_session, force=force, check=check)
     shifts = [parse_shift(text) for text in shift or []]
 
     def known(recording: AnyRecording) -> Landmarks | None:
@@ -436,16 +440,53 @@ def _recordings(given: list[Path] | None, *, one: bool) -> list[Path]:
     return given
 
 
-def _read(path: Path, *, robot: int | None, topics: Path | None, session: Path | None, force: bool) -> AnyRecording:
-    """Read a recording, and write it condensed to `session`: repaired first, as before it enters a map."""
+def _refuse_unread(given: Sequence[str], config: Config, *, in_map: bool, in_space: bool, boxes: bool = False) -> None:
+    """Refuse settings that such a recording would silently ignore.
+
+    Raises:
+        ConfigError: names the first one.
+    """
+    from evermap.config import (
+        UNREAD_IN_SPACE,
+        UNREAD_IN_THE_PLANE,
+        UNREAD_WITHOUT_BOXES,
+        UNREAD_WITHOUT_MAP,
+        refuse_unread,
+    )
+
+    unread = {
+        "for a recording in space": UNREAD_IN_SPACE if in_space else (),
+        "for a recording in the plane": () if in_space else UNREAD_IN_THE_PLANE,
+        "for a recording without boxes without identity": () if boxes or not in_space else UNREAD_WITHOUT_BOXES,
+        "without --map": () if in_map else UNREAD_WITHOUT_MAP,
+        "without --unknown-ids": () if in_map or config.slam.unknown_ids else ("slam.association",),
+    }
+    refuse_unread(given, unread, within="slam")
+
+
+def _read(
+    path: Path,
+    *,
+    robot: int | None,
+    topics: Path | None,
+    session: Path | None,
+    force: bool,
+    check: Callable[..., None],
+) -> AnyRecording:
+    """Read a recording, and write it condensed to `session`: repaired first, as before it enters a map.
+
+    `check` refuses settings that such a recording does not read.
+    """
     from evermap.io import read_recording
     from evermap.io.native_write import write_session
     from evermap.slam.cleaning import clean
+    from evermap.slam.space.moving import has_traffic
     from evermap.types import Recording
 
     if session is not None and session.exists() and not force:
         raise ConfigError(f"{session} is there already", field="offline_session", hint="another name, or --force")
     recording = read_recording(path, robot=robot, topics=topics)
+    check(in_space=not isinstance(recording, Recording), boxes=has_traffic(recording))
     if session is not None:
         write_session(clean(recording) if isinstance(recording, Recording) else recording, session)
         say(f"wrote the session for a map to {session} ({session.stat().st_size / 1e3:.0f} kB)")
