@@ -199,7 +199,7 @@ class Detections(_Columns):
         frame: (M,) row of `Frames`.
         landmark_id: (M,) identity given by the front end, or `UNKNOWN`.
         range_m: (M,) distance from the sensor, as reported (uncalibrated).
-        bearing_rad: (M,) counter-clockwise from the sensor's x axis, as reported.
+        bearing_rad: (M,) counter-clockwise from the sensor's x axis, as reported; nan where only the range is known.
         class_id: (M,) row of `Recording.class_names`, or `UNKNOWN`.
         sigma_range_m, sigma_bearing_rad: (M,) standard deviations given for this very detection, nan where none is.
         source_line: (M,) line in the input file, for messages; 0 where there is none.
@@ -548,6 +548,8 @@ class SpatialOdometry(_Columns):
         return {"rows": len(self), **span(self.stamp_s), "clock": self.clock.value}
 
 
+ANY_BEARING_RAD = 100.0
+"""Standard deviation of a bearing that was not measured: its value is a start for the estimator, and worth nothing."""
 ANY_RANGE_M2 = 1e6
 """Variance beyond which the range of a detection is not known."""
 

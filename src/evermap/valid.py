@@ -6,7 +6,7 @@ are far beyond any robot. They catch wrong units (degrees, milliseconds, millime
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, pi
 from pathlib import Path
 from typing import Any
@@ -152,7 +152,7 @@ def validate(recording: Any) -> None:
     for quantity in (FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS):
         quantity.check_array(getattr(odometry, quantity.name), f"odometry.{quantity.name}")
     _check_stamps(frames.stamp_s, "frames.stamp_s")
-    for quantity in (RANGE_M, BEARING_RAD, SIGMA_RANGE_M, SIGMA_BEARING_RAD):
+    for quantity in (RANGE_M, replace(BEARING_RAD, optional=True), SIGMA_RANGE_M, SIGMA_BEARING_RAD):
         quantity.check_array(getattr(detections, quantity.name), f"detections.{quantity.name}")
     _check_frames(detections.frame, len(frames))
     for name in ("landmark_id", "class_id"):

@@ -94,6 +94,8 @@ def content_rows(contents: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
         if low_middle_high := detections.get(f"{kind}_{unit}"):
             low, middle, high = low_middle_high
             rows += [(f"{kind}s", f"{low:.3g} to {high:.3g} {unit}, half of them below {middle:.3g} {unit}")]
+    if detections.get("without_bearing"):
+        rows += [("ranges only", f"{detections['without_bearing']:,} detections without a bearing")]
     aside = "bearings" if "bearing_rad" in detections else "tags"
     beyond = f"{detections['beyond_range_max']:,} ranges, {detections['outside_view']:,} {aside}"
     return [

@@ -46,6 +46,7 @@ from evermap.config.slam import (
     NoiseConfig,
     OdometryConfig,
     OutputConfig,
+    RangesConfig,
     ReadingsConfig,
     SensorConfig,
     SlamConfig,
@@ -60,7 +61,7 @@ UNREAD_IN_THE_PLANE = ("slam.space", "slam.association.space", "track", "living.
 UNREAD_IN_SPACE = (
     "slam.method", "slam.sensor_model", "slam.robust", "slam.outlier_log_odds", "slam.rejected_in_a_row",
     "slam.narrowing", "slam.estimate_noise", "slam.odometry_noise_factor", "slam.calibration", "slam.modes",
-    "slam.changes", "slam.noise", "slam.odometry", "slam.localize", "slam.cleaning", "slam.check",
+    "slam.changes", "slam.noise", "slam.odometry", "slam.ranges", "slam.localize", "slam.cleaning", "slam.check",
     "slam.association.particles", "living.metre",
 )  # fmt: skip
 UNREAD_WITHOUT_BOXES = ("track", "living.boxes", "slam.space.traffic", "slam.space.range_scale")
@@ -256,6 +257,7 @@ __all__ = [
     "OutputConfig",
     "OverlayConfig",
     "PersistConfig",
+    "RangesConfig",
     "ReadingsConfig",
     "Section",
     "SensorConfig",

@@ -96,6 +96,22 @@ class VotesConfig(Section):
     surprising: Positive = key(50.0, "squared normalised residual from which a sighting disputes where its landmark is")
 
 
+class RangesConfig(Section):
+    """Detections without a bearing: where their landmarks are, before the estimator begins."""
+
+    window_s: Positive = key(20.0, "span of ranges that locate a landmark, or the double, and so on [s]")
+    drift_share: NotNegative = key(0.03, "drift of the odometry over it, as a share of the way")
+    fewest: Count = key(6, "ranges that this takes")
+    most_ranges: Count = key(200, "ranges that are used, at most")
+    starts: int = key(16, "directions from which the place is sought", ge=4)
+    steps: Count = key(30, "steps from each")
+    tail: Positive = key(2.0, "standard deviations beyond which a range is probably an outlier")
+    most_sigma_m: Positive = key(1.0, "standard deviation from which a place is not known [m]")
+    apart_m: Positive = key(1.0, "distance from which another place is another one [m] ...")
+    rival_nats: NotNegative = key(6.0, "... and how much worse it must be [nats]")
+    first_m: Positive = key(1.0, "least standard deviation of the place at which the estimator begins [m]")
+
+
 class LocalizeConfig(Section):
     """When the place of a robot in a map is known, and when it is lost; landmarks are found by their identity."""
 
@@ -488,6 +504,7 @@ class SlamConfig(Section):
     odometry: OdometryConfig = part(OdometryConfig, "silences and jitter of the odometry")
     votes: VotesConfig = part(VotesConfig, "identities that were read wrongly")
     association: AssociationConfig = part(AssociationConfig, "landmarks without identities")
+    ranges: RangesConfig = part(RangesConfig, "detections without a bearing")
     localize: LocalizeConfig = part(LocalizeConfig, "where a robot is in a map")
     space: SpaceConfig = part(SpaceConfig, "sensors in space")
     check: CheckConfig = part(CheckConfig, "thresholds of the recording check")

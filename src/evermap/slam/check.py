@@ -235,9 +235,11 @@ def _seen(recording: Recording) -> dict[str, Any]:
     sensor, detections = recording.sensor, recording.detections
     aside = detections.bearing_rad > sensor.bearing_max_rad
     aside |= detections.bearing_rad < sensor.bearing_min_rad
+    known = detections.bearing_rad[np.isfinite(detections.bearing_rad)]
     return {
         "range_m": [float(edge) for edge in np.quantile(detections.range_m, [0.0, 0.5, 1.0])],
-        "bearing_rad": [float(edge) for edge in np.quantile(detections.bearing_rad, [0.0, 0.5, 1.0])],
+        "bearing_rad": [float(edge) for edge in np.quantile(known, [0.0, 0.5, 1.0])] if len(known) else None,
+        "without_bearing": len(detections) - len(known),
         "beyond_range_max": int(np.sum(detections.range_m > sensor.range_max_m)),
         "outside_view": int(np.sum(aside)),
     }
@@ -461,6 +463,7 @@ def screened(
         InputError: no recording, or values that cannot be, in it or in the prior map.
         DataError: nothing can be estimated from it.
     """
+    from evermap.slam.ranges import with_bearings
     from evermap.slam.space.moving import has_traffic
     from evermap.slam.votes import without_contradicted_ids
 
@@ -474,6 +477,9 @@ def screened(
         else:
             recording = valid(recording, config.sensor, prior_map)
         remarks = odd(recording, identities=settings.unknown_ids is not True, settings=settings.check)
+    if not isinstance(recording, SpatialRecording):
+        recording, told = with_bearings(recording, settings)
+        remarks = (*remarks, *told)
     if (
         settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording)
     ):  # the tracker assigns identities

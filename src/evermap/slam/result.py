@@ -16,8 +16,10 @@ from evermap.slam.kernels import NOISE_NAMES
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.streaming import Outcome, StreamingSlam
 from evermap.types import (
+    ANY_BEARING_RAD,
     UNKNOWN,
     Alternative,
+    BoolArray,
     FloatArray,
     Innovations,
     IntArray,
@@ -204,12 +206,15 @@ def innovations(prepared: Prepared, slam: StreamingSlam, outcome: Outcome, recor
     """Return consistency of every detection that was predicted."""
     told = np.flatnonzero(np.isfinite(slam.nis[: len(outcome.inlier)]))
     detection = prepared.used[told]
+    sigma_rad = recording.detections.sigma_bearing_rad[detection]
+    measured: BoolArray = ~(sigma_rad >= ANY_BEARING_RAD)
     return Innovations(
         stamp_s=recording.frames.stamp_s[recording.detections.frame[detection]],
         detection=detection,
         landmark_id=recording.detections.landmark_id[detection],
         nis=slam.nis[told],
         p_inlier=outcome.inlier[told],
+        dof=None if measured.all() else 1 + measured.astype(np.int64),
     )
 
 
