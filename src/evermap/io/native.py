@@ -325,7 +325,8 @@ def _polar_or_range(table: Table) -> tuple[FloatArray, FloatArray]:
     """As `polar`, with nan where a bearing is empty, or there is no such column."""
     if "bearing_rad" not in table:
         return table.numbers(q.RANGE_M), np.full(len(table), np.nan)
-    return table.numbers(q.RANGE_M), wrap_far(table.numbers(replace(q.BEARING_RAD, optional=True)))
+    bearing_rad = table.numbers(replace(q.BEARING_RAD, optional=True))
+    return table.numbers(q.RANGE_M), np.where(np.isnan(bearing_rad), np.nan, wrap_far(bearing_rad))
 
 
 def _polar_of_cartesian(table: Table) -> tuple[FloatArray, FloatArray]:

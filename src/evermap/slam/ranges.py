@@ -112,16 +112,16 @@ def _fixes(ranged: Ranged, noise_m: float, offset_m: float, settings: RangesConf
     stamp_s = ranged.stamp_s
     for block in np.unique((stamp_s - stamp_s[0]) // settings.window_s).tolist():
         middle_s = stamp_s[0] + (block + 0.5) * settings.window_s
-        half_s = 0.5 * settings.window_s
-        while True:
+        half_s, fix = 0.5 * settings.window_s, None
+        while fix is None:
             some = np.flatnonzero(np.abs(stamp_s - middle_s) <= half_s)
+            whole = len(some) == len(stamp_s)
             some = some[np.linspace(0, len(some) - 1, min(len(some), settings.most_ranges)).astype(np.int64)]
             fix = _fix(Ranged(*(column[some] for column in ranged)), noise_m, offset_m, settings)
-            if fix is not None:
-                found.append(fix)
-            if fix is not None or half_s > np.ptp(stamp_s):
-                break
+            if fix is None and whole:  # all together do not tell: nor will they around another moment
+                return found
             half_s *= 2.0
+        found.append(fix)
     return found
 
 

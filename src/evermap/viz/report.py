@@ -282,6 +282,8 @@ def _latency(timing: Mapping[str, Any]) -> str:
 
 def _nis(metrics: Mapping[str, Any]) -> str:
     mean = metrics["nis_mean"]
+    if mean is None:
+        return "No detection was judged an inlier: the readings do not fit the estimate."
     if mean > 2.6:
         verdict = "errors are larger than estimated"
     elif mean < 1.4:
