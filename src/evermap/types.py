@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import lru_cache
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -721,6 +721,9 @@ class ParameterEstimate(Shown):
         fixed: True where it was held: by the configuration, or because it is not needed.
         meaning: half a sentence for the report.
         p_needed: probability that it is another than stated, by which it is estimated; nan where that is not asked.
+        alone: value if it were the only one of two errors that only show together; nan of others.
+        shown_with: name of the other one; '' without.
+        decided_by: keys of `sensor.toml` that divide what both show.
     """
 
     name: str
@@ -732,6 +735,31 @@ class ParameterEstimate(Shown):
     fixed: bool = False
     meaning: str = ""
     p_needed: float = float("nan")
+    alone: float = float("nan")
+    shown_with: str = ""
+    decided_by: tuple[str, ...] = ()
+
+
+def _differs(parameter: ParameterEstimate) -> bool:
+    """Return whether it is probably another than stated."""
+    if np.isnan(parameter.p_needed):
+        return abs(parameter.value - parameter.prior_mean) > 2.0 * parameter.sigma > 0.0
+    return parameter.p_needed >= 0.5
+
+
+class Undecided(NamedTuple):
+    """Two errors of which a recording only shows what they are together."""
+
+    one: ParameterEstimate
+    other: ParameterEstimate
+
+    @property
+    def text(self) -> str:
+        """Return both readings in one line, with what decides between them."""
+        alone = " or ".join(f"{each.name} = {each.alone:.4g}" for each in self)
+        assumed = ", ".join(f"{each.name} = {each.value:.4g}" for each in self)
+        decide = " or ".join(self.one.decided_by)
+        return f"either {alone}, which this recording cannot tell (assumed: {assumed}); state {decide} in sensor.toml"
 
 
 @dataclass(frozen=True, slots=True)
@@ -861,6 +889,13 @@ class SlamResult(Shown):
     alternatives: tuple[Alternative, ...] = ()
     gone: Landmarks = field(default_factory=lambda: Landmarks.at([], np.zeros((0, 2))))
     followed: Any = None
+
+    @property
+    def undecided(self) -> tuple[Undecided, ...]:
+        """Return errors that only show together, where either is probably another than stated."""
+        by_name = {one.name: one for one in self.parameters}
+        pairs = [(one, by_name[one.shown_with]) for one in self.parameters if one.shown_with in by_name]
+        return tuple(Undecided(*pair) for pair in pairs if pair[0].name < pair[1].name and any(map(_differs, pair)))
 
     def _facts(self) -> dict[str, Any]:
         return {

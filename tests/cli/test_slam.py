@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +19,7 @@ from evermap.cli.options import default_out
 from evermap.cli.slam import HowMoved
 from evermap.config import SlamConfig
 from evermap.io import parse_shift, read_landmarks, read_recording, read_tum, write_native, write_template
+from evermap.types import Recording
 
 # pictures have tests of their own, and take most of the time
 QUICK = ["--set", "output.figures=false", "--set", "output.report=false", "--set", "output.rerun=false"]
@@ -386,3 +389,42 @@ def test_contradicted_identities_are_told_once(in_map: bool, tmp_path: Path) -> 
     result = run("slam", folder, "--out", tmp_path / "out", *options, *QUICK)
     assert result.exit_code == 0, result.stderr
     assert result.stderr.count("whose landmark_id contradicts the frames around") == 1
+
+
+def test_errors_that_only_show_together_are_told_with_both_readings(tmp_path: Path) -> None:
+    """On the terminal, in the summary and in the report; a data sheet decides."""
+    recording = read_recording(write_template(tmp_path / "template"))
+    assert isinstance(recording, Recording)
+    turned = replace(recording.detections, bearing_rad=recording.detections.bearing_rad + 0.06)
+    slow = replace(recording.odometry, forward_mps=recording.odometry.forward_mps / 1.06)
+    folder, out = tmp_path / "off", tmp_path / "out"
+    write_native(replace(recording, detections=turned, odometry=slow), folder)
+    result = run("slam", folder, "--out", out, "--set", "output.figures=false")
+    assert result.exit_code == 0, result.stderr
+    told = [line for line in result.stdout.splitlines() if line.startswith("either ")]
+    angle, scale = sorted(told)
+    assert re.match(r"either bearing_bias_rad = 0\.0[567]\d* or odometry_askew_rad = 0\.0[567]", angle)
+    assert "state [sensor] sigma_angle_rad or [odometry] sigma_askew_rad in sensor.toml" in angle
+    assert re.match(r"either odometry_forward_scale = 1\.0[23]\d* or range_slope = 0\.0[23]", scale)
+    assert "state [sensor] sigma_scale or [odometry] sigma_odometer_scale in sensor.toml" in scale
+    summary = json.loads((out / "summary.json").read_text("utf-8"))
+    assert sorted(pair["text"] for pair in summary["undecided"]) == [angle, scale]
+    by_name = {one["name"]: one for one in summary["parameters"]}
+    sensor, robot = by_name["bearing_bias_rad"], by_name["odometry_askew_rad"]
+    assert (sensor["value"], sensor["p_needed"]) == (0.0, None)
+    assert sensor["alone"] == robot["value"] == robot["alone"]
+    assert (sensor["shown_with"], robot["shown_with"]) == ("odometry_askew_rad", "bearing_bias_rad")
+    assert robot["p_needed"] > 0.9
+    page = html.unescape((out / "report.html").read_text("utf-8"))
+    for line in told:
+        assert f"Either{line.removeprefix('either')}" in page
+    assert "rad without odometry_askew_rad" in page
+    (folder / "sensor.toml").write_text(
+        (folder / "sensor.toml").read_text("utf-8") + "[sensor]\nsigma_angle_rad = 0.1\n"
+        "[odometry]\nsigma_askew_rad = 0.0\nsigma_odometer_scale = 0.05\n"
+    )
+    run("slam", folder, "--out", out, *QUICK)
+    summary = json.loads((out / "summary.json").read_text("utf-8"))
+    by_name = {one["name"]: one for one in summary["parameters"]}
+    assert by_name["bearing_bias_rad"]["value"] == pytest.approx(0.06, abs=0.015)
+    assert abs(by_name["odometry_askew_rad"]["value"]) < 1e-4

@@ -380,7 +380,8 @@ def _write(
     files = (out / name for name in ("report.html", "summary.json"))
     rows += [(file.stem, str(file)) for file in files if file.is_file()]
     print_table(recording.name or "run", rows)
-    for finding in [*explanations(result), *grew(info.grown)]:
+    both_readings = [pair.text for pair in result.undecided]
+    for finding in [*both_readings, *explanations(result), *grew(info.grown)]:
         echo(finding)
 
 

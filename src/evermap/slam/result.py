@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from evermap.geometry import se2
 from evermap.slam.bridge import bridged, dead_reckoned
-from evermap.slam.calibration import BEARING, FORWARD, SLOPE, SPECS, CalibrationPrior, from_front
+from evermap.slam.calibration import BEARING, FORWARD, OF_ANGLE, OF_SCALE, SLOPE, SPECS, CalibrationPrior, from_front
 from evermap.slam.check import far_off
 from evermap.slam.estimate import Solved
 from evermap.slam.intake import Prepared
@@ -230,21 +231,26 @@ def described(
 ) -> tuple[ParameterEstimate, ...]:
     """Return calibration states (11,) with their covariance (11, 11), driving askew, and noise levels, as records.
 
-    For errors that are only observable together the meanings give both interpretations. With `undivided`, the scale is
-    of that kind.
+    Of errors that are only observable together each has its value if it were the only one, too. With `undivided`, the
+    scale is of that kind.
     """
-    needs = np.full(len(SPECS), np.nan) if p_needed is None else p_needed
+    needs = np.full(len(SPECS), np.nan) if p_needed is None else p_needed.copy()
+    needed = float(needs[BEARING])
     meanings = {spec.name: spec.meaning for spec in SPECS}
+    pairs: dict[str, dict[str, Any]] = {}
     if undivided:
         scale = states[FORWARD] * (1.0 + states[SLOPE])
         meanings["range_slope"] += f"; {scale - 1.0:.4f} if the odometer were right"
         meanings["odometry_forward_scale"] += f"; {scale:.4f} if ranges were right"
+        pairs |= _shown_together("range_slope", scale - 1.0, "odometry_forward_scale", scale, OF_SCALE)
     if askew[1] > 0.0:
         angle = states[BEARING] + askew[0]
         meanings["bearing_bias_rad"] += f"; {angle:.4f} if the robot drove straight"
         meanings["odometry_askew_rad"] = (
             f"driving direction to the left of the robot's front; {angle:.4f} if the sensor were mounted as stated"
         )
+        pairs |= _shown_together("bearing_bias_rad", angle, "odometry_askew_rad", angle, OF_ANGLE)
+        needs[BEARING] = needed if prior.angle_share > 0.0 else np.nan  # what is needed is the other one
     estimates = [
         ParameterEstimate(
             name=spec.name,
@@ -256,13 +262,25 @@ def described(
             fixed=not prior.free[k],
             meaning=meanings[spec.name],
             p_needed=float(needs[k]),
+            **pairs.get(spec.name, {}),
         )
         for k, spec in enumerate(SPECS)
     ]
     if askew[1] > 0.0:
-        name, needed = "odometry_askew_rad", float(needs[BEARING])
-        estimates.append(ParameterEstimate(name, *askew, 0.0, prior.askew_sigma, "rad", False, meanings[name], needed))
+        name = "odometry_askew_rad"
+        more: dict[str, Any] = {"meaning": meanings[name], "p_needed": needed, **pairs[name]}
+        estimates.append(ParameterEstimate(name, *askew, 0.0, prior.askew_sigma, "rad", **more))
     return (*estimates, *_levels(fit))
+
+
+def _shown_together(
+    one: str, one_alone: float, other: str, other_alone: float, decided_by: tuple[str, ...]
+) -> dict[str, dict[str, Any]]:
+    """Return what `ParameterEstimate` says of two errors that only show together, by their names."""
+    return {
+        one: {"alone": float(one_alone), "shown_with": other, "decided_by": decided_by},
+        other: {"alone": float(other_alone), "shown_with": one, "decided_by": decided_by},
+    }
 
 
 def _levels(fit: NoiseFit) -> list[ParameterEstimate]:

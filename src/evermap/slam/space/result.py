@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from evermap.geometry import se3
+from evermap.slam.calibration import OF_SCALE
 from evermap.slam.space.intake import SpatialIntake, most_of
 from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PIXEL, POSE, ROTATION, ROWS, TRANSLATION
 from evermap.slam.space.problem import SpatialProblem
@@ -264,9 +266,14 @@ def _scales(told: _Told, sigma: float) -> list[ParameterEstimate]:
         return [ParameterEstimate("odometry_scale", scale, scale * sigma, 1.0, odometer, "", meaning=SCALE)]
     of_odometer = float(scale * np.hypot((1.0 - share) * sigma, undivided))
     of_ranges = float(np.hypot(share * sigma, undivided))
-    both = ParameterEstimate("odometry_scale", scale, of_odometer, 1.0, odometer, "", meaning=DIVIDED)
     reads = float(np.exp(problem.ranges_log))
-    return [both, ParameterEstimate("range_scale", reads, reads * of_ranges, 1.0, ranges, "", meaning=DIVIDED)]
+    more: dict[str, Any] = {"meaning": DIVIDED, "alone": scale * reads, "decided_by": OF_SCALE}
+    return [
+        ParameterEstimate("odometry_scale", scale, of_odometer, 1.0, odometer, "", shown_with="range_scale", **more),
+        ParameterEstimate(
+            "range_scale", reads, reads * of_ranges, 1.0, ranges, "", shown_with="odometry_scale", **more
+        ),
+    ]
 
 
 def _innovations(told: _Told, identities: IntArray) -> Innovations:
