@@ -32,17 +32,6 @@ from evermap.types import (
 WITHOUT_IDS = "`unknown_ids` associates detections without a landmark_id by geometry"
 """What to try where nothing has an identity."""
 
-NOT_IN_SPACE = {
-    "sigma_offset_m": "no offset of ranges is estimated there: subtract it from the ranges",
-    "sigma_askew_rad": "the robot may move in any direction there: sigma_angle_rad is that of the sensor's mount",
-    "bearing_min_rad": "the field of view is that of the detections",
-    "bearing_max_rad": "the field of view is that of the detections",
-    "sigma_range_m": "[noise] sigma_m in sensor.toml",
-    "sigma_bearing_rad": "[noise] sigma_m or sigma_px in sensor.toml",
-    "mount_robot_sensor": "[mount] in sensor.toml or camera.toml",
-}
-"""Keys of a sensor in the plane that mean nothing in space, and what to try instead."""
-
 
 @dataclass(frozen=True, slots=True)
 class Quantity:

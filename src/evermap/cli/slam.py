@@ -54,6 +54,9 @@ _ROWS = (
     ("timing", "step_p99_ms", "99 % of the steps within", "{:.1f} ms"),
 )
 
+_SECTIONS = ("living", "sensor", "output", "track")
+"""Sections of the configuration that are read beside `slam`."""
+
 Recorded = Annotated[
     list[Path] | None,
     argument(
@@ -198,8 +201,7 @@ def slam(
         _write_what_is_to_edit(init, init_bag, in_space=in_space)
         return
     given = {"sensor_model": sensor_model, "method": method, "unknown_ids": associated(unknown_ids, empty_ids)}
-    sections = ("living", "sensor", "output", "track")
-    chosen = configured(config, settings, given, within="slam", also=sections, show=show_config)
+    chosen = configured(config, settings, given, within="slam", also=_SECTIONS, show=show_config)
     set_here = [*(settings or []), *(f"slam.{name}=" for name, value in given.items() if value is not None)]
     paths = _recordings(input, one=offline_session is not None)
     if together:
@@ -209,15 +211,11 @@ def slam(
         _each_together(paths, out, chosen, {"as_json": as_json, "force": force, "inputs": [*paths, config]})
         return
     _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, shift=shift, prior=prior)
-    from evermap.io import parse_shift, shifted
+    from evermap.io import parse_shift
 
     check = partial(_refuse_unread, set_here, chosen, in_map=map_file is not None)
     read = partial(_read, robot=robot, topics=topics, session=offline_session, force=force, check=check)
-    shifts = [parse_shift(text) for text in shift or []]
-
-    def known(recording: AnyRecording) -> Landmarks | None:
-        return None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
-
+    known = partial(_known, prior_map, prior_sigma, [parse_shift(text) for text in shift or []])
     options = None if map_file is None else MapOptions(map_file, prior or [], localize, realtime)
     inputs = [*paths, config, topics, None if prior_map == "truth" else prior_map, map_file]
     how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
@@ -520,6 +518,13 @@ def _write_bag_settings(bag: Path) -> None:
     write_atomic(path, text)
     typer.echo(text)
     say(f"wrote this to {path}; correct it where needed, then: evermap slam {bag}")
+
+
+def _known(prior_map: str | None, sigma_m: float, shifts: Sequence[Any], recording: AnyRecording) -> Landmarks | None:
+    """Return the prior map with the shifts of experiments."""
+    from evermap.io import shifted
+
+    return None if prior_map is None else shifted(_prior_landmarks(prior_map, sigma_m, recording), shifts)
 
 
 def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) -> Landmarks:

@@ -11,8 +11,7 @@ from pydantic import ValidationInfo, field_validator
 
 from evermap.config.section import Count, NotNegative, Positive, Probability, Section, Share, key, part
 from evermap.errors import ConfigError
-from evermap.types import FloatArray, Sensor, SensorKind, SpatialSensor
-from evermap.valid import NOT_IN_SPACE
+from evermap.types import NOT_IN_SPACE, FloatArray, Sensor, SensorKind, SpatialSensor
 
 SIGMAS = {
     "range_bias_m": 0.1,

@@ -16,8 +16,8 @@ from evermap.geometry.symmetry import HINT, Symmetry
 from evermap.io.files import FileSet
 from evermap.io.sensor_toml import UNKNOWN_KIND, Settings, TomlReader, recording_section, toml_string, toml_text
 from evermap.io.spatial import AT, QUATERNION
-from evermap.types import FloatArray, IntArray, Sensor, SensorKind, SpatialSensor, landmark_id_of
-from evermap.valid import CAMERA_MODELS, NOT_IN_SPACE
+from evermap.types import NOT_IN_SPACE, FloatArray, IntArray, Sensor, SensorKind, SpatialSensor, landmark_id_of
+from evermap.valid import CAMERA_MODELS
 
 SENSOR_FILE = "sensor.toml"
 CAMERA_FILE = "camera.toml"

@@ -82,12 +82,10 @@ def prepare_space(
     landmark_id, place = np.unique(detections.landmark_id[used], return_inverse=True)
     some = rows_of(where, used)
     symmetries = _symmetries(recording, place, used, some.kind)
-    oriented = np.zeros(len(landmark_id), dtype=np.bool_)
-    oriented[place[some.kind != POINT]] = True
-    driven = recording.odometry is not None
-    by_corners = bool(np.count_nonzero(some.kind == CORNERS) > 0.5 * len(some.kind))
+    oriented = np.bincount(place, some.kind != POINT, minlength=len(landmark_id)) > 0.0
+    driven, by_corners = recording.odometry is not None, 2 * np.count_nonzero(some.kind == CORNERS) > len(some.kind)
     driven_pose, increment = _driven(recording, stamps[pose_frame])
-    scale_sigma, ranges_share = scale_between(recording.sensors, settings, settings.scale_sigma if by_corners else 0.0)
+    scale = scale_between(recording.sensors, settings, settings.scale_sigma if by_corners else 0.0)
     problem = SpatialProblem(
         stamp_s=stamps[pose_frame] - stamps[pose_frame[0]],
         increment=increment,
@@ -111,8 +109,8 @@ def prepare_space(
         symmetries=symmetries,
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
         mount_sigma=_mount_sigma(recording.sensors, settings),
-        scale_sigma=scale_sigma if driven else 0.0,
-        ranges_share=ranges_share,
+        scale_sigma=scale[0] if driven else 0.0,
+        ranges_share=scale[1],
         path=_path(recording, stamps[pose_frame[0]]),
         settings=settings,
     )
