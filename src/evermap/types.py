@@ -736,6 +736,7 @@ class ParameterEstimate(Shown):
         alone: value if it were the only one of two errors that only show together; nan of others.
         shown_with: name of the other one; '' without.
         decided_by: keys of `sensor.toml` that divide what both show.
+        evident: whether the readings say that one of the two is another than stated.
     """
 
     name: str
@@ -750,13 +751,7 @@ class ParameterEstimate(Shown):
     alone: float = float("nan")
     shown_with: str = ""
     decided_by: tuple[str, ...] = ()
-
-
-def _differs(parameter: ParameterEstimate) -> bool:
-    """Return whether it is probably another than stated."""
-    if np.isnan(parameter.p_needed):
-        return abs(parameter.value - parameter.prior_mean) > 2.0 * parameter.sigma > 0.0
-    return parameter.p_needed >= 0.5
+    evident: bool = False
 
 
 class Undecided(NamedTuple):
@@ -904,10 +899,10 @@ class SlamResult(Shown):
 
     @property
     def undecided(self) -> tuple[Undecided, ...]:
-        """Return errors that only show together, where either is probably another than stated."""
+        """Return errors that only show together, where the readings say that one is another than stated."""
         by_name = {one.name: one for one in self.parameters}
         pairs = [(one, by_name[one.shown_with]) for one in self.parameters if one.shown_with in by_name]
-        return tuple(Undecided(*pair) for pair in pairs if pair[0].name < pair[1].name and any(map(_differs, pair)))
+        return tuple(Undecided(*pair) for pair in pairs if pair[0].name < pair[1].name and pair[0].evident)
 
     def _facts(self) -> dict[str, Any]:
         return {

@@ -293,6 +293,9 @@ def run_and_write(
     if isinstance(recording, SpatialRecording):
         from evermap.slam.space.moving import has_traffic
 
+        if realtime:
+            problem = "all frames of a recording in space are solved together"
+            raise ConfigError(problem, field="realtime", hint="leave it out")
         traffic = has_traffic(recording)
         warm_up(lambda: compile_kernels(in_space=True, traffic=traffic, unknown_ids=config.slam.unknown_ids))
     else:

@@ -57,9 +57,11 @@ def with_bearings(recording: Recording, settings: SlamConfig) -> tuple[Recording
     blind = np.isnan(seen.bearing_rad)
     if not blind.any():
         return recording, ()
-    if settings.unknown_ids is True or np.any(blind & (seen.landmark_id == UNKNOWN)):
+    if settings.unknown_ids or np.any(blind & (seen.landmark_id == UNKNOWN)):
         problem = f"{recording.name}: detections without a bearing need a landmark_id"
-        raise DataError(problem, field="bearing_rad", hint="the number of the beacon, without `unknown_ids`")
+        raise DataError(
+            problem, field="bearing_rad", hint="the number of the beacon; leave out what associates by geometry"
+        )
     stamp_s, odometry_s = frames[seen.frame], recording.odometry.stamp_s
     rows = np.flatnonzero(blind & (stamp_s >= odometry_s[0]) & (stamp_s <= odometry_s[-1]))
     eye, way_m = _eyes(recording, stamp_s[rows], settings)

@@ -242,14 +242,16 @@ def described(
         scale = states[FORWARD] * (1.0 + states[SLOPE])
         meanings["range_slope"] += f"; {scale - 1.0:.4f} if the odometer were right"
         meanings["odometry_forward_scale"] += f"; {scale:.4f} if ranges were right"
-        pairs |= _shown_together("range_slope", scale - 1.0, "odometry_forward_scale", scale, OF_SCALE)
+        evident = any(_evident(needs[state], prior.p_needed[state]) for state in (SLOPE, FORWARD))
+        pairs |= _shown_together("range_slope", scale - 1.0, "odometry_forward_scale", scale, OF_SCALE, evident)
     if askew[1] > 0.0:
         angle = states[BEARING] + askew[0]
         meanings["bearing_bias_rad"] += f"; {angle:.4f} if the robot drove straight"
         meanings["odometry_askew_rad"] = (
             f"driving direction to the left of the robot's front; {angle:.4f} if the sensor were mounted as stated"
         )
-        pairs |= _shown_together("bearing_bias_rad", angle, "odometry_askew_rad", angle, OF_ANGLE)
+        evident = _evident(needed, prior.p_needed[BEARING])
+        pairs |= _shown_together("bearing_bias_rad", angle, "odometry_askew_rad", angle, OF_ANGLE, evident)
         needs[BEARING] = needed if prior.angle_share > 0.0 else np.nan  # what is needed is the other one
     estimates = [
         ParameterEstimate(
@@ -274,13 +276,19 @@ def described(
 
 
 def _shown_together(
-    one: str, one_alone: float, other: str, other_alone: float, decided_by: tuple[str, ...]
+    one: str, one_alone: float, other: str, other_alone: float, decided_by: tuple[str, ...], evident: bool
 ) -> dict[str, dict[str, Any]]:
     """Return what `ParameterEstimate` says of two errors that only show together, by their names."""
+    both: dict[str, Any] = {"decided_by": decided_by, "evident": evident}
     return {
-        one: {"alone": float(one_alone), "shown_with": other, "decided_by": decided_by},
-        other: {"alone": float(other_alone), "shown_with": one, "decided_by": decided_by},
+        one: {"alone": float(one_alone), "shown_with": other, **both},
+        other: {"alone": float(other_alone), "shown_with": one, **both},
     }
+
+
+def _evident(p_needed: float, before: float) -> bool:
+    """Return whether readings made it clearly more probable that a state is needed, and it probably is."""
+    return bool(p_needed >= 0.5 and p_needed * (1.0 - before) > 2.0 * before * (1.0 - p_needed))
 
 
 def _levels(fit: NoiseFit) -> list[ParameterEstimate]:

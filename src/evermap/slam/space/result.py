@@ -267,7 +267,10 @@ def _scales(told: _Told, sigma: float) -> list[ParameterEstimate]:
     of_odometer = float(scale * np.hypot((1.0 - share) * sigma, undivided))
     of_ranges = float(np.hypot(share * sigma, undivided))
     reads = float(np.exp(problem.ranges_log))
-    more: dict[str, Any] = {"meaning": DIVIDED, "alone": scale * reads, "decided_by": OF_SCALE}
+    evident = abs(np.log(scale * reads)) > 2.0 * sigma
+    more: dict[str, Any] = {
+        "meaning": DIVIDED, "alone": scale * reads, "decided_by": OF_SCALE, "evident": bool(evident),
+    }  # fmt: skip
     return [
         ParameterEstimate("odometry_scale", scale, of_odometer, 1.0, odometer, "", shown_with="range_scale", **more),
         ParameterEstimate(
