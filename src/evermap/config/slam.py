@@ -215,6 +215,7 @@ class CleaningConfig(Section):
     sharpest: Positive = key(2.0, "change of speed that is never a spike [m/s, rad/s]")
     too_far: float = key(2.0, "factor on the maximum range above which a reading is dropped", ge=1.0)
     far_from_median: float = key(100.0, "the same on the median range, for a sensor without a maximum range", ge=1.0)
+    ranges_only: Share = key(0.2, "share of readings without a bearing above which a sensor measures ranges only")
     moved: Positive = key(0.1, "motion after which identical readings indicate stale data [m, rad]")
     stray_s: Positive = key(
         10.0, "distance from neighbouring stamps, and of frames from odometry, above which they are dropped [s]"

@@ -106,7 +106,10 @@ def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]
         limit = f"{settings.too_far:g} times range_max_m = {sensor.range_max_m:g}"
         problem = f"{n_far} of {len(far)} ranges lie beyond {limit}"
         raise DataError(problem, field="range_m", hint="ranges and range_max_m in metres")
-    real &= ~far & ~(np.abs(detections.bearing_rad) > 2.0 * np.pi)
+    real &= ~far
+    blind = np.isnan(detections.bearing_rad)
+    ranges_only = blind.sum() > settings.ranges_only * len(blind)  # a few without a bearing are damaged
+    real &= (np.abs(detections.bearing_rad) <= 2.0 * np.pi) | (blind & ranges_only)
     real &= (detections.frame >= 0) & (detections.frame < len(recording.frames))
     _remark(remarks, "impossible readings dropped", int(np.sum(~real)))
     if not real.all():
