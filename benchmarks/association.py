@@ -447,8 +447,11 @@ def _truth(recording: Recording | SpatialRecording, named: SlamResult) -> Trajec
     return replace(named.trajectory, frame="truth")
 
 
-def main(names: Sequence[str] = ()) -> None:
-    """Print one line as soon as it is known; names are beginnings of those wanted, after one of the words above."""
+def main(names: Sequence[str] = (), folder: Path = FOLDER) -> None:
+    """Print one line as soon as it is known; names are beginnings of those wanted, after one of the words above.
+
+    Recordings are read from `folder`.
+    """
     if names and names[0] == "sessions":
         for world in worlds():
             for unknown_ids in (False, True) if not names[1:] or world.name.startswith(tuple(names[1:])) else ():
@@ -463,26 +466,26 @@ def main(names: Sequence[str] = ()) -> None:
         return
     if names and names[0] == "columns":
         rooms = (replace(one, name="rooms") for one in simulated_world(1, 0).recordings[:1])
-        planar = itertools.chain(rooms, (simulate_copied_aisles(0),), recordings(parks=1))
-        for recording in itertools.chain(planar, recordings_in_space()):
+        planar = itertools.chain(rooms, (simulate_copied_aisles(0),), recordings(folder, parks=1))
+        for recording in itertools.chain(planar, recordings_in_space(folder)):
             for name in COLUMNS if not names[1:] or recording.name.startswith(tuple(names[1:])) else ():
                 row = score(with_columns(recording, name))
                 print(_line(replace(row, name=f"{row.name}, {name}")), flush=True)
         return
     if names and names[0] == "mixed":
-        for recording in itertools.chain(recordings(), recordings_in_space()):
+        for recording in itertools.chain(recordings(folder), recordings_in_space(folder)):
             for name, share, of in MIXED if not names[1:] or recording.name.startswith(tuple(names[1:])) else ():
                 if recording.name.startswith(name):
                     print(mixed_line(recording, share, of), flush=True)
         return
     if names and names[0] == "wrong":
-        for recording in itertools.chain(recordings(parks=1), recordings_in_space()):
+        for recording in itertools.chain(recordings(folder, parks=1), recordings_in_space(folder)):
             if not names[1:] or recording.name.startswith(tuple(names[1:])):
                 print(wrong_line(recording), flush=True)
         return
-    every: Iterator[Recording | SpatialRecording] = recordings()
+    every: Iterator[Recording | SpatialRecording] = recordings(folder)
     if names and names[0] in ("space", "harsh"):
-        every, names = recordings_in_space() if names[0] == "space" else harsh_worlds(), names[1:]
+        every, names = recordings_in_space(folder) if names[0] == "space" else harsh_worlds(), names[1:]
     for recording in every:
         if not names or recording.name.startswith(tuple(names)):
             print(_line(score(recording)), flush=True)

@@ -12,7 +12,7 @@ in after the first round, on average over the sessions, and so is the log loss o
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -97,15 +97,15 @@ def scores(
     return precision, recall, log_loss, len(apart) / len(told_wrong)
 
 
-def main() -> None:
-    """Run from the command line."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run from the command line, with its arguments if none are given."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--lies", choices=LIES, nargs="+", default=LIES)
     parser.add_argument("--session-s", type=float, default=SESSION_S)
     parser.add_argument("--liars", type=int, choices=(1, 2), default=1, help="robots of five")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of evermap")
-    chosen = parser.parse_args()
+    chosen = parser.parse_args(arguments)
     config = load_config(None, chosen.set)
     print("| what is wrong | seed | precision | recall | log loss of P(exists) | their sessions set aside |")
     print("|---|---:|---:|---:|---:|---:|")

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import gc
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -292,14 +292,19 @@ def resident_mb() -> float:
     return float("nan")
 
 
-if __name__ == "__main__":
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run from the command line, with its arguments if none are given."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hours", type=float, default=24.0, help="of driving")
     parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
+    chosen = parser.parse_args(arguments)
     drives = world(chosen.hours, chosen.seed)
     with_all = soak(drives, FaultConfig(), seed=chosen.seed)
     without = soak(drives)
     print(json.dumps({"faults": with_all.summary(), "none": without.summary()}, indent=2))
     for line in [*with_all.refused, *with_all.defects, *without.defects]:
         print(line)
+
+
+if __name__ == "__main__":
+    main()

@@ -318,6 +318,31 @@ def test_a_second_process_compiles_the_other_half_only_where_something_is_missin
     assert run() == "True False"
 
 
+TELLING = """
+from evermap.cli.terminal import warm_up
+from evermap.compiled import kept
+
+@kept()
+def one(x):
+    return x + 1.0
+
+warm_up(lambda: None)
+warm_up(lambda: one(1.0))
+warm_up(lambda: one(2.0))
+"""
+
+
+def test_compiling_is_told_where_something_is_compiled_and_not_where_loading_takes_long(tmp_path: Path) -> None:
+    (tmp_path / "telling.py").write_text(TELLING)
+
+    def run() -> str:
+        command = [sys.executable, "-c", "import telling"]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stderr
+
+    assert run().count("compiling the kernels") == 1
+    assert run() == ""
+
+
 FAILING = """
 import time
 from pathlib import Path

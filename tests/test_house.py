@@ -21,8 +21,8 @@ def tree_of(name: str) -> ast.Module:
     return ast.parse(MODULES[name].read_text(encoding="utf-8"))
 
 
-MOST_MODULES = 296
-MOST_LINES = 79_270
+MOST_MODULES = 297
+MOST_LINES = 79_995
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8

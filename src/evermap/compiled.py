@@ -87,10 +87,25 @@ def shared_with(module: str) -> Iterator[None]:
         for process in second:
             process.wait()
     finally:
-        _AT_FIRST_MISSING.clear()
+        _forget(start)
         for process in second:
             process.kill()
             process.wait()
+
+
+@contextlib.contextmanager
+def at_first_missing(tell: Callable[[], None]) -> Iterator[None]:
+    """Call `tell` once, when within the block a kernel turns out not to be kept: it is compiled next."""
+    _AT_FIRST_MISSING.append(tell)
+    try:
+        yield
+    finally:
+        _forget(tell)
+
+
+def _forget(called: Callable[[], None]) -> None:
+    if called in _AT_FIRST_MISSING:
+        _AT_FIRST_MISSING.remove(called)
 
 
 _AT_FIRST_MISSING: list[Callable[[], None]] = []

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from evermap.compiled import single_threaded
 from evermap.config import Config
 from evermap.errors import ConfigError, DataError
@@ -180,7 +182,7 @@ def run_localization(
 
     Raises:
         ConfigError: `slam.unknown_ids`: that is not causal.
-        DataError: the map is empty, or the robot's place in it could not be found.
+        DataError: the map is empty, ranges come without bearings, or the robot's place in it could not be found.
     """
     from evermap.maps import vicinity
     from evermap.maps.sessions import believe, session, spatial
@@ -198,6 +200,9 @@ def run_localization(
         p_site = believe.aged(living, config.living, float(recording.frames.stamp_s[0])).p_here
         return run_slam(recording, config, prior_map=spatial.standing(living, p_site), progress=progress)
     recording = check.valid(recording, config.sensor)
+    if np.isnan(recording.detections.bearing_rad).any():
+        problem = "a range without a bearing is located by what is seen later, which is not causal"
+        raise DataError(problem, field="bearing_rad", hint="enter the session, or use the map as `prior_map`")
     remarks = check.odd(recording, settings=config.slam.check)
     recording, living = session.admitted(recording, living)
     named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])

@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import lru_cache
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,7 +199,7 @@ class Detections(_Columns):
         frame: (M,) row of `Frames`.
         landmark_id: (M,) identity given by the front end, or `UNKNOWN`.
         range_m: (M,) distance from the sensor, as reported (uncalibrated).
-        bearing_rad: (M,) counter-clockwise from the sensor's x axis, as reported.
+        bearing_rad: (M,) counter-clockwise from the sensor's x axis, as reported; nan where only the range is known.
         class_id: (M,) row of `Recording.class_names`, or `UNKNOWN`.
         sigma_range_m, sigma_bearing_rad: (M,) standard deviations given for this very detection, nan where none is.
         source_line: (M,) line in the input file, for messages; 0 where there is none.
@@ -249,13 +249,25 @@ class Misses(_Columns):
 
 
 class SensorKind(StrEnum):
-    """Kind of range-bearing sensor, which sets the priors of its errors."""
+    """Kind of sensor, which sets the priors of its errors."""
 
     LASER = "laser"
     CAMERA = "camera"
     TAG = "tag"
     STEREO = "stereo"
     UWB = "uwb"
+
+
+NOT_IN_SPACE = {
+    "sigma_offset_m": "no offset of ranges is estimated there: subtract it from the ranges",
+    "sigma_askew_rad": "the robot may move in any direction there: sigma_angle_rad is that of the sensor's mount",
+    "bearing_min_rad": "the field of view is that of the detections",
+    "bearing_max_rad": "the field of view is that of the detections",
+    "sigma_range_m": "[noise] sigma_m in sensor.toml",
+    "sigma_bearing_rad": "[noise] sigma_m or sigma_px in sensor.toml",
+    "mount_robot_sensor": "[mount] in sensor.toml or camera.toml",
+}
+"""Keys of a sensor in the plane that mean nothing in space, and what to try instead."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -548,6 +560,8 @@ class SpatialOdometry(_Columns):
         return {"rows": len(self), **span(self.stamp_s), "clock": self.clock.value}
 
 
+ANY_BEARING_RAD = 100.0
+"""Standard deviation of a bearing that was not measured: its value is a start for the estimator, and worth nothing."""
 ANY_RANGE_M2 = 1e6
 """Variance beyond which the range of a detection is not known."""
 
@@ -612,6 +626,10 @@ class SpatialSensor(Shown):
         sigma_m, sigma_rad, sigma_px: nominal noise of positions, orientations and corners, where noise is estimated a
             starting value; None = unknown.
         p_detect: probability of detecting a landmark in view; p_false: probability of a false detection a frame.
+        kind: what it is; None = unknown.
+        sigma_scale: standard deviation of the scale of its ranges, as a share; sigma_angle_rad: of its orientation in
+            the mount, about each axis; sigma_position_m: of its position there, along each. None: as usual.
+        sigma_odometer_scale: standard deviation of the scale of the odometry; the same for all sensors.
     """
 
     name: str = "sensor"
@@ -627,6 +645,11 @@ class SpatialSensor(Shown):
     sigma_px: float | None = None
     p_detect: float = 0.9
     p_false: float = 0.01
+    kind: SensorKind | None = None
+    sigma_scale: float | None = None
+    sigma_angle_rad: float | None = None
+    sigma_position_m: float | None = None
+    sigma_odometer_scale: float | None = None
 
     def _facts(self) -> dict[str, Any]:
         return {"name": self.name, "camera": self.intrinsics is not None, "mount": self.mount_robot_sensor}
@@ -710,6 +733,10 @@ class ParameterEstimate(Shown):
         fixed: True where it was held: by the configuration, or because it is not needed.
         meaning: half a sentence for the report.
         p_needed: probability that it is another than stated, by which it is estimated; nan where that is not asked.
+        alone: value if it were the only one of two errors that only show together; nan of others.
+        shown_with: name of the other one; '' without.
+        decided_by: keys of `sensor.toml` that divide what both show.
+        evident: whether the readings say that one of the two is another than stated.
     """
 
     name: str
@@ -721,6 +748,25 @@ class ParameterEstimate(Shown):
     fixed: bool = False
     meaning: str = ""
     p_needed: float = float("nan")
+    alone: float = float("nan")
+    shown_with: str = ""
+    decided_by: tuple[str, ...] = ()
+    evident: bool = False
+
+
+class Undecided(NamedTuple):
+    """Two errors of which a recording only shows what they are together."""
+
+    one: ParameterEstimate
+    other: ParameterEstimate
+
+    @property
+    def text(self) -> str:
+        """Return both readings in one line, with what decides between them."""
+        alone = " or ".join(f"{each.name} = {each.alone:.4g}" for each in self)
+        assumed = ", ".join(f"{each.name} = {each.value:.4g}" for each in self)
+        decide = " or ".join(self.one.decided_by)
+        return f"either {alone}, which this recording cannot tell (assumed: {assumed}); state {decide} in sensor.toml"
 
 
 @dataclass(frozen=True, slots=True)
@@ -850,6 +896,13 @@ class SlamResult(Shown):
     alternatives: tuple[Alternative, ...] = ()
     gone: Landmarks = field(default_factory=lambda: Landmarks.at([], np.zeros((0, 2))))
     followed: Any = None
+
+    @property
+    def undecided(self) -> tuple[Undecided, ...]:
+        """Return errors that only show together, where the readings say that one is another than stated."""
+        by_name = {one.name: one for one in self.parameters}
+        pairs = [(one, by_name[one.shown_with]) for one in self.parameters if one.shown_with in by_name]
+        return tuple(Undecided(*pair) for pair in pairs if pair[0].name < pair[1].name and pair[0].evident)
 
     def _facts(self) -> dict[str, Any]:
         return {

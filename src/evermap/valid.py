@@ -6,7 +6,7 @@ are far beyond any robot. They catch wrong units (degrees, milliseconds, millime
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, pi
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,9 @@ from evermap.types import (
     SpatialSensor,
     Trajectory,
 )
+
+WITHOUT_IDS = "`unknown_ids` associates detections without a landmark_id by geometry"
+"""What to try where nothing has an identity."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +141,7 @@ def validate(recording: Any) -> None:
     for quantity in (FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS):
         quantity.check_array(getattr(odometry, quantity.name), f"odometry.{quantity.name}")
     _check_stamps(frames.stamp_s, "frames.stamp_s")
-    for quantity in (RANGE_M, BEARING_RAD, SIGMA_RANGE_M, SIGMA_BEARING_RAD):
+    for quantity in (RANGE_M, replace(BEARING_RAD, optional=True), SIGMA_RANGE_M, SIGMA_BEARING_RAD):
         quantity.check_array(getattr(detections, quantity.name), f"detections.{quantity.name}")
     _check_frames(detections.frame, len(frames))
     for name in ("landmark_id", "class_id"):
@@ -243,6 +246,11 @@ def _check_spatial_sensor(sensor: SpatialSensor) -> None:
     if not sensor.range_min_m < sensor.range_max_m:
         problem = f"{where}: {sensor.range_min_m} is not below range_max_m = {sensor.range_max_m}"
         raise InputError(problem, field="sensors.range_min_m")
+    for name in ("sigma_scale", "sigma_angle_rad", "sigma_position_m", "sigma_odometer_scale"):
+        sigma = getattr(sensor, name)
+        if sigma is not None and not 0.0 <= sigma < inf:
+            problem = f"{where}: {sigma} is not a standard deviation"
+            raise InputError(problem, field=f"sensors.{name}", hint="None where unknown")
     for name in ("sigma_m", "sigma_rad", "sigma_px"):
         sigma = getattr(sensor, name)
         if sigma is not None and not 0.0 < sigma < inf:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -11,8 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from scipy.spatial import KDTree
+from typer.testing import CliRunner
 
+import evermap_studies.commands
 from evermap.cli.bench import load_benchmarks
 from evermap.errors import InputError
 from evermap.existence import single
@@ -23,6 +28,7 @@ from evermap.tracking import kalman
 from evermap_studies.lifetimes.tracking_scores import score_tracks
 
 SMALL = 150
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -336,3 +342,31 @@ def _read(path: Path) -> dict[str, Any]:
 @pytest.fixture
 def json_of() -> Callable[[Any], Any]:
     return lambda value: json.loads(json.dumps(value, allow_nan=False))
+
+
+@pytest.mark.parametrize(
+    ("study", "given", "wanted"),
+    [
+        ("association", ["sessions", "rooms"], (["sessions", "rooms"], {})),
+        ("association", ["--data", "recordings"], ((), {"folder": Path("recordings")})),
+        ("soak", ["--hours", "1", "--seed", "3"], (["--hours", "1.0", "--seed", "3"], {})),
+        ("liars", [], ([], {})),
+        ("liars", ["--lie", "misreads", "--seed", "4"], (["--lies", "misreads", "--seeds", "4"], {})),
+    ],
+)
+def test_studies_of_the_pages_run_the_benchmarks(
+    study: str, given: list[str], wanted: tuple[Any, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`evermap reproduce` has a command for each; it adds nothing to them."""
+    declared = tomllib.loads((ROOT / "studies" / "pyproject.toml").read_text("utf-8"))
+    points = declared["project"]["entry-points"]["evermap.studies"]
+    assert points[study] == f"evermap_studies.commands:{study}"
+    called: list[tuple[Any, dict[str, Any]]] = []
+    load_benchmarks()
+    benchmark = importlib.import_module(f"benchmarks.{study}")
+    monkeypatch.setattr(benchmark, "main", lambda *args, **more: called.append((*args, more)))
+    commands = typer.Typer()
+    commands.command()(getattr(evermap_studies.commands, study))
+    result = CliRunner().invoke(commands, given)
+    assert result.exit_code == 0, result.output
+    assert called == [wanted]

@@ -137,6 +137,7 @@ def test_printed_configuration_reads_back_as_it_was(tmp_path: Path) -> None:
         ("[slam]\nrobst = true", ["slam.robst", "unknown key", "try: slam.robust"]),
         ("[slam.calibraton]\n", ["slam.calibraton", "try: slam.calibration"]),
         ("robust = true", ["'robust'", "try: slam.robust"]),
+        ("[odometry]\nsigma_askew_rad = 0.1", ["'odometry'", "try: sensor.sigma_askew_rad"]),
         ("[colour]\nx = 1", ["'colour'", "one of slam, living, sensor"]),
         ("[slam]\nseed = -1", ["slam.seed", "greater than or equal to 0", "-1"]),
         ("[slam]\nseed = 1.5", ["slam.seed", "1.5"]),
@@ -160,6 +161,9 @@ def test_mistake_in_a_file_names_file_and_field(tmp_path: Path, content: str, na
     ("override", "named"),
     [
         ("slam.sed=1", "try: slam.seed"),
+        ("odometry.sigma_askew_rad=0.1", "try: sensor.sigma_askew_rad"),
+        ("calibration.fix.range_slope=0", "try: slam.calibration.fix"),
+        ("persist.rest_for_s=1", "try: track.rest_for_s"),
         ("slam.seed", "section.key=value"),
         ("=1", "section.key=value"),
         ("slam..seed=1", "section.key=value"),

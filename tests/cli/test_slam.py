@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +18,8 @@ from evermap.cli.main import app
 from evermap.cli.options import default_out
 from evermap.cli.slam import HowMoved
 from evermap.config import SlamConfig
-from evermap.io import parse_shift, read_landmarks, read_recording, read_tum, write_native
+from evermap.io import parse_shift, read_landmarks, read_recording, read_tum, write_native, write_template
+from evermap.types import Recording
 
 # pictures have tests of their own, and take most of the time
 QUICK = ["--set", "output.figures=false", "--set", "output.report=false", "--set", "output.rerun=false"]
@@ -309,3 +312,119 @@ def test_what_is_for_one_robot_is_refused(template: Path, options: list[str], sa
     result = run("slam", template, "--together", *options)
     assert result.exit_code == 2
     assert said in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("in_space", "options", "words"),
+    [
+        (False, ["--set", "slam.space.delay_sigma_s=1"], ["slam.space.delay_sigma_s", "in the plane"]),
+        (False, ["--set", "track.rest_for_s=1"], ["track.rest_for_s", "in the plane"]),
+        (False, ["--set", "living.search=gate"], ["living.search", "without --map"]),
+        (False, ["--set", "slam.association.p_new=0.3"], ["slam.association.p_new", "without --unknown-ids"]),
+        (False, ["--set", "persist.rows_at_once=3"], ["persist.rows_at_once", "by this command"]),
+        (True, ["--set", "slam.calibration.fix.range_slope=0"], ["slam.calibration.fix.range_slope", "in space"]),
+        (True, ["--set", "robust=false"], ["slam.robust", "in space"]),
+        (True, ["--method", "nn"], ["--method", "in space"]),
+        (True, ["--sensor-model", "plain"], ["--sensor-model", "in space"]),
+        (True, ["--set", "track.rest_for_s=1"], ["track.rest_for_s", "without boxes"]),
+        (True, ["--set", "sensor.sigma_bearing_rad=1"], ["sensor.sigma_bearing_rad", "in space", "sigma_px"]),
+    ],
+)
+def test_a_setting_that_would_change_nothing_is_refused(
+    in_space: bool, options: list[str], words: list[str], tmp_path: Path
+) -> None:
+    folder = write_template(tmp_path / "template", in_space=in_space)
+    result = run("slam", folder, "--out", tmp_path / "out", *options)
+    assert result.exit_code == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert [word for word in words if word not in result.stderr] == []
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("in_space", [False, True])
+def test_a_file_of_settings_may_hold_sections_of_other_recordings(in_space: bool, tmp_path: Path) -> None:
+    folder = write_template(tmp_path / "template", in_space=in_space)
+    settings = tmp_path / "all.toml"
+    settings.write_text("[slam.space]\nsigma_px = 1.0\n[slam.calibration]\np_needed = 0.4\n", encoding="utf-8")
+    result = run("slam", folder, "--out", tmp_path / "out", "--config", settings, *QUICK)
+    assert result.exit_code == 0, result.stderr
+
+
+@pytest.mark.parametrize("in_space", [False, True])
+@pytest.mark.parametrize("column", ["empty", "absent"])
+def test_a_recording_without_identities(column: str, in_space: bool, tmp_path: Path) -> None:
+    """`check` and `slam` tell the option, and with it both accept the recording."""
+    folder = write_template(tmp_path / "template", in_space=in_space)
+    rows = (folder / "detections.csv").read_text("utf-8").splitlines()
+    head = next(row for row in rows if not row.startswith("#")).split(",")
+    at = head.index("landmark_id")
+    texts = []
+    for row in rows:
+        cells = row.split(",")
+        if not row.startswith("#"):
+            cells[at : at + 1] = [] if column == "absent" else [head[at] if cells == head else ""]
+        texts.append(",".join(cells))
+    (folder / "detections.csv").write_text("\n".join(texts), encoding="utf-8")
+    checked, refused = run("check", folder), run("slam", folder, "--out", tmp_path / "out")
+    assert (checked.exit_code, refused.exit_code) == (0, 2)
+    for result in (checked, refused):
+        [line] = result.stderr.strip().splitlines()
+        assert "--unknown-ids associates detections without a landmark_id" in line
+    done = (
+        run("check", folder, "--unknown-ids"),
+        run("slam", folder, "--unknown-ids", "--out", tmp_path / "out", *QUICK),
+    )
+    assert [result.exit_code for result in done] == [0, 0], [result.stderr for result in done]
+    assert "no problems found" in done[0].stderr
+
+
+@pytest.mark.parametrize("in_map", [False, True])
+def test_contradicted_identities_are_told_once(in_map: bool, tmp_path: Path) -> None:
+    recording = read_recording(write_template(tmp_path / "template"))
+    wrong = recording.detections.landmark_id.copy()
+    wrong[::10] = 1 + wrong[::10] % 6
+    given = replace(recording, detections=replace(recording.detections, landmark_id=wrong))
+    folder = write_native(given, tmp_path / "wrong")
+    options = ["--map", tmp_path / "site.evermap"] if in_map else []
+    result = run("slam", folder, "--out", tmp_path / "out", *options, *QUICK)
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr.count("whose landmark_id contradicts the frames around") == 1
+
+
+def test_errors_that_only_show_together_are_told_with_both_readings(tmp_path: Path) -> None:
+    """On the terminal, in the summary and in the report; a data sheet decides."""
+    recording = read_recording(write_template(tmp_path / "template"))
+    assert isinstance(recording, Recording)
+    turned = replace(recording.detections, bearing_rad=recording.detections.bearing_rad + 0.06)
+    slow = replace(recording.odometry, forward_mps=recording.odometry.forward_mps / 1.14)
+    folder, out = tmp_path / "off", tmp_path / "out"
+    write_native(replace(recording, detections=turned, odometry=slow), folder)
+    result = run("slam", folder, "--out", out, "--set", "output.figures=false")
+    assert result.exit_code == 0, result.stderr
+    told = [line for line in result.stdout.splitlines() if line.startswith("either ")]
+    angle, scale = sorted(told)
+    assert re.match(r"either bearing_bias_rad = 0\.0[567]\d* or odometry_askew_rad = 0\.0[567]", angle)
+    assert "state [sensor] sigma_angle_rad or [odometry] sigma_askew_rad in sensor.toml" in angle
+    assert re.match(r"either odometry_forward_scale = 1\.(0[5-9]|1)\d* or range_slope = 0\.(0[5-9]|1)", scale)
+    assert "state [sensor] sigma_scale or [odometry] sigma_odometer_scale in sensor.toml" in scale
+    summary = json.loads((out / "summary.json").read_text("utf-8"))
+    assert sorted(pair["text"] for pair in summary["undecided"]) == [angle, scale]
+    by_name = {one["name"]: one for one in summary["parameters"]}
+    sensor, robot = by_name["bearing_bias_rad"], by_name["odometry_askew_rad"]
+    assert (sensor["value"], sensor["p_needed"]) == (0.0, None)
+    assert sensor["alone"] == robot["value"] == robot["alone"]
+    assert (sensor["shown_with"], robot["shown_with"]) == ("odometry_askew_rad", "bearing_bias_rad")
+    assert robot["p_needed"] > 0.9
+    page = html.unescape((out / "report.html").read_text("utf-8"))
+    for line in told:
+        assert f"Either{line.removeprefix('either')}" in page
+    assert "rad without odometry_askew_rad" in page
+    (folder / "sensor.toml").write_text(
+        (folder / "sensor.toml").read_text("utf-8") + "[sensor]\nsigma_angle_rad = 0.1\n"
+        "[odometry]\nsigma_askew_rad = 0.0\nsigma_odometer_scale = 0.05\n"
+    )
+    run("slam", folder, "--out", out, *QUICK)
+    summary = json.loads((out / "summary.json").read_text("utf-8"))
+    by_name = {one["name"]: one for one in summary["parameters"]}
+    assert by_name["bearing_bias_rad"]["value"] == pytest.approx(0.06, abs=0.015)
+    assert abs(by_name["odometry_askew_rad"]["value"]) < 1e-4

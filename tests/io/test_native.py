@@ -322,8 +322,8 @@ BAD = {
         [f"{ODO}:1", "'foward_mps'", "unknown column", "try: forward_mps"],
     ),
     "missing column": (
-        put(DET, "stamp_s,range_m,bearing_rad\n0.5,1,0\n"),
-        [f"{DET}:1", "'landmark_id'", "missing column"],
+        put(DET, "stamp_s,landmark_id,bearing_rad\n0.5,1,0\n"),
+        [f"{DET}:1", "'range_m'", "missing column"],
     ),
     "strange column": (put("frames.csv", "stamp_s,zzz\n0.5,1\n"), ["frames.csv:1", "'zzz'", "stamp_s"]),
     "column twice": (edit(ODO, "lateral_mps", "forward_mps"), [f"{ODO}:1", "'forward_mps'", "twice"]),

@@ -414,7 +414,7 @@ BAD: dict[str, tuple[Files, str]] = {
     "tag size": ({"camera.toml": CAMERA.replace("9 = 0.4", "9 = -1")}, r"field 'tags\.sizes\.9': -1 is outside"),
     "planar sensor": (
         {"sensor.toml": "[limits]\nbearing_max_rad = 1.0\n"},
-        r"sensor\.toml:2: field 'limits\.bearing_max_rad': unknown key",
+        r"sensor\.toml:2: field 'limits\.bearing_max_rad': is not used in space \(try: the field of view",
     ),
     "symmetry": (
         {"sensor.toml": '[symmetries]\ncan = "axis:z"\nbox = ["180:z", "50:x"]\n'},

@@ -149,3 +149,16 @@ def test_tags_of_the_template_in_space_are_where_the_truth_says(tmp_path: Path) 
     assert np.median((Rotation.from_quat(known.rotation[tag]).inv() * facing).magnitude()) < 0.08
     end = recording.odometry.pose_world_robot[-1] - truth.pose_world_robot[-1]
     assert 0.05 < np.linalg.norm(end[:3]) < 1.0
+
+
+@pytest.mark.parametrize("in_space", [False, True])
+def test_the_commented_kind_and_data_sheet_can_be_uncommented(in_space: bool, tmp_path: Path) -> None:
+    path = write_template(tmp_path / "made", in_space=in_space) / "sensor.toml"
+    text = path.read_text("utf-8")
+    sheet = text[text.index("# [sensor]") :].split("# [symmetries]")[0]
+    path.write_text(text.replace(sheet, sheet.replace("# ", "", 1).replace("\n# ", "\n")), encoding="utf-8")
+    recording = read_recording(path.parent)
+    sensor = recording.sensors[0] if isinstance(recording, SpatialRecording) else recording.sensor
+    assert sensor.kind is not None
+    assert sensor.sigma_odometer_scale == 0.01
+    assert [name for name in ("sigma_scale", "sigma_angle_rad", "sigma_position_m") if not getattr(sensor, name)] == []

@@ -7,8 +7,19 @@ from typing import Annotated, Any
 
 import typer
 
-from evermap.cli.options import AsJson, ConfigFile, Robot, Settings, ShowConfig, argument, configured
-from evermap.cli.terminal import fail, print_json, print_table, say, warn
+from evermap.cli.options import (
+    AsJson,
+    ConfigFile,
+    EmptyIds,
+    Robot,
+    Settings,
+    ShowConfig,
+    UnknownIds,
+    argument,
+    associated,
+    configured,
+)
+from evermap.cli.terminal import fail, print_json, print_table, remark_as, say, warn
 
 EXIT_NOT_USABLE = 2
 
@@ -18,6 +29,8 @@ def check(
     robot: Robot = None,
     config: ConfigFile = None,
     settings: Settings = None,
+    unknown_ids: UnknownIds = False,
+    empty_ids: EmptyIds = False,
     show_config: ShowConfig = False,
     as_json: AsJson = False,
 ) -> None:
@@ -30,12 +43,18 @@ def check(
     Examples:
       evermap check my-recording
       evermap check MRCLAM_Dataset6.zip --robot 1 --json
+      evermap check my-recording --unknown-ids
       evermap check monday.mcap
     """
-    chosen = configured(config, settings, within="slam.check", show=show_config)
+    given = {"slam.unknown_ids": associated(unknown_ids, empty_ids)}
+    chosen = configured(config, settings, given, within="slam.check", also=["sensor"], show=show_config)
+    from evermap.config import SlamConfig, refuse_unread
     from evermap.io import read_recording
     from evermap.slam.check import check_recording
 
+    reads = ("check", "cleaning", "space", "unknown_ids")
+    unread = [f"slam.{name}" for name in SlamConfig.model_fields if name not in reads]
+    refuse_unread(settings or [], {"by this command": unread}, within="slam.check")
     found = check_recording(read_recording(input, robot=robot), chosen)
     if as_json:
         print_json(found.as_dict())
@@ -44,7 +63,7 @@ def check(
     for remark in found.warnings:
         warn(remark)
     for finding in found.findings:
-        (warn if finding.usable else fail)(finding.message)
+        (warn if finding.usable else fail)(remark_as.get()(finding.message))
     if not found.usable:
         raise typer.Exit(EXIT_NOT_USABLE)
     if not found.warnings and not found.findings:
@@ -75,6 +94,8 @@ def content_rows(contents: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
         if low_middle_high := detections.get(f"{kind}_{unit}"):
             low, middle, high = low_middle_high
             rows += [(f"{kind}s", f"{low:.3g} to {high:.3g} {unit}, half of them below {middle:.3g} {unit}")]
+    if detections.get("without_bearing"):
+        rows += [("ranges only", f"{detections['without_bearing']:,} detections without a bearing")]
     aside = "bearings" if "bearing_rad" in detections else "tags"
     beyond = f"{detections['beyond_range_max']:,} ranges, {detections['outside_view']:,} {aside}"
     return [

@@ -75,7 +75,7 @@ def learn(
     as_json: AsJson = False,
 ) -> None:
     """Learn lifetimes over the maps of many sites."""
-    chosen = configured(config, settings, show=show_config)
+    chosen = configured(config, settings, within="living", show=show_config)
     from evermap.runs.company import Company, collect
     from evermap.runs.folder import RunFolder
 

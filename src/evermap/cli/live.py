@@ -85,7 +85,7 @@ def live(
     from evermap.live.wires import Mailbox, wires_of
     from evermap.maps.store import is_address
 
-    chosen = configured(config, settings, within="live")
+    chosen = configured(config, settings, within="live", also=["slam", "living", "sensor", "output"])
     if map_file is not None and is_address(map_file):
         hint = "--map FILE, and send its recordings to the server"
         raise ConfigError("must be a local file: readings are stored next to it", field="map", hint=hint)

@@ -47,6 +47,12 @@ Settings = Annotated[
 ShowConfig = Annotated[bool, option("--show-config", "Print the configuration in force as commented TOML and exit.")]
 AsJson = Annotated[bool, option("--json", "Print the summary as JSON.")]
 Force = Annotated[bool, option("--force", "Write into --out even if it holds other files; these are kept.")]
+UnknownIds = Annotated[
+    bool, option("--unknown-ids", "Ignore the landmark ids of the detections; associate by geometry.")
+]
+EmptyIds = Annotated[
+    bool, option("--empty-ids", "Associate detections with an empty landmark id by geometry; others keep theirs.")
+]
 Robot = Annotated[int | None, option("Robot of a recording that has several.", default=False)]
 Topics = Annotated[
     Path | None, option("Settings file of the topics, as slam --init-bag writes it.", metavar="FILE", default=False)
@@ -84,6 +90,7 @@ def configured(
     values: Mapping[str, Any] | None = None,
     *,
     within: str = "",
+    also: Sequence[str] = (),
     show: bool = False,
 ) -> Config:
     """Return the configuration of `--config`, `--set` and single options; where asked to, print it and exit.
@@ -92,19 +99,30 @@ def configured(
         path: TOML file.
         settings: `section.key=value` each.
         values: what other options say, by key; None where an option was not given.
-        within: section that keys without a dot are of.
+        within: section that keys without a dot are of; others but it and `also` are not read.
+        also: further sections that the command reads.
         show: print the configuration and exit.
 
     Raises:
-        ConfigError: an unknown key or a value out of its bounds.
+        ConfigError: an unknown key, one that the command does not read, or a value out of its bounds.
     """
-    from evermap.config import load_config, to_toml
+    from evermap.config import Config, load_config, refuse_unread, to_toml
 
     config = load_config(path, settings or [], values, within=within)
+    reads = {within.partition(".")[0], *also}
+    others = [name for name in Config.model_fields if name not in reads] if within else []
+    refuse_unread(settings or [], {"by this command": others}, within=within)
     if show:
         typer.echo(to_toml(config), nl=False)
         raise typer.Exit
     return config
+
+
+def associated(unknown_ids: bool, empty_ids: bool) -> bool | str | None:
+    """Return `slam.unknown_ids` as the two flags have it."""
+    if unknown_ids and empty_ids:
+        raise ConfigError("ignores the ids that --empty-ids keeps", field="unknown-ids", hint="one of the two")
+    return True if unknown_ids else "empty" if empty_ids else None
 
 
 def priors_by_class(texts: Sequence[str] | None) -> tuple[str | None, dict[str, str] | None]:

@@ -14,12 +14,15 @@ import typer
 from evermap.cli.options import (
     AsJson,
     ConfigFile,
+    EmptyIds,
     Force,
     Robot,
     Settings,
     ShowConfig,
     Topics,
+    UnknownIds,
     argument,
+    associated,
     configured,
     default_out,
     option,
@@ -51,6 +54,9 @@ _ROWS = (
     ("timing", "step_p99_ms", "99 % of the steps within", "{:.1f} ms"),
 )
 
+_SECTIONS = ("living", "sensor", "output", "track")
+"""Sections of the configuration that are read beside `slam`."""
+
 Recorded = Annotated[
     list[Path] | None,
     argument(
@@ -77,12 +83,6 @@ HowMoved = Annotated[
         metavar="joint|nohyp|max-mixture|nn|em|mcts|viterbi",
         default="joint",
     ),
-]
-UnknownIds = Annotated[
-    bool, option("--unknown-ids", "Ignore the landmark ids of the detections; associate by geometry.")
-]
-EmptyIds = Annotated[
-    bool, option("--empty-ids", "Associate detections with an empty landmark id by geometry; others keep theirs.")
 ]
 PriorMap = Annotated[
     str | None, option("Start from this landmark map, or from the recording's surveyed one.", metavar="FILE|truth")
@@ -200,23 +200,22 @@ def slam(
     if init is not None or init_bag is not None or in_space:
         _write_what_is_to_edit(init, init_bag, in_space=in_space)
         return
-    given = {"sensor_model": sensor_model, "method": method, "unknown_ids": _associated(unknown_ids, empty_ids)}
-    chosen = configured(config, settings, given, within="slam", show=show_config)
+    given = {"sensor_model": sensor_model, "method": method, "unknown_ids": associated(unknown_ids, empty_ids)}
+    chosen = configured(config, settings, given, within="slam", also=_SECTIONS, show=show_config)
+    set_here = [*(settings or []), *(f"slam.{name}=" for name, value in given.items() if value is not None)]
     paths = _recordings(input, one=offline_session is not None)
     if together:
         single = {"realtime": realtime or None, "topics": topics, "offline_session": offline_session}
         _check_together(map_file=map_file, prior_map=prior_map, robot=robot, **single)
+        _refuse_unread(set_here, chosen, in_map=False, in_space=False)
         _each_together(paths, out, chosen, {"as_json": as_json, "force": force, "inputs": [*paths, config]})
         return
     _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, shift=shift, prior=prior)
-    from evermap.io import parse_shift, shifted
+    from evermap.io import parse_shift
 
-    read = partial(_read, robot=robot, topics=topics, session=offline_session, force=force)
-    shifts = [parse_shift(text) for text in shift or []]
-
-    def known(recording: AnyRecording) -> Landmarks | None:
-        return None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
-
+    check = partial(_refuse_unread, set_here, chosen, in_map=map_file is not None)
+    read = partial(_read, robot=robot, topics=topics, session=offline_session, force=force, check=check)
+    known = partial(_known, prior_map, prior_sigma, [parse_shift(text) for text in shift or []])
     options = None if map_file is None else MapOptions(map_file, prior or [], localize, realtime)
     inputs = [*paths, config, topics, None if prior_map == "truth" else prior_map, map_file]
     how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
@@ -294,6 +293,9 @@ def run_and_write(
     if isinstance(recording, SpatialRecording):
         from evermap.slam.space.moving import has_traffic
 
+        if realtime:
+            problem = "all frames of a recording in space are solved together"
+            raise ConfigError(problem, field="realtime", hint="leave it out")
         traffic = has_traffic(recording)
         warm_up(lambda: compile_kernels(in_space=True, traffic=traffic, unknown_ids=config.slam.unknown_ids))
     else:
@@ -379,7 +381,8 @@ def _write(
     files = (out / name for name in ("report.html", "summary.json"))
     rows += [(file.stem, str(file)) for file in files if file.is_file()]
     print_table(recording.name or "run", rows)
-    for finding in [*explanations(result), *grew(info.grown)]:
+    both_readings = [pair.text for pair in result.undecided]
+    for finding in [*both_readings, *explanations(result), *grew(info.grown)]:
         echo(finding)
 
 
@@ -439,16 +442,53 @@ def _recordings(given: list[Path] | None, *, one: bool) -> list[Path]:
     return given
 
 
-def _read(path: Path, *, robot: int | None, topics: Path | None, session: Path | None, force: bool) -> AnyRecording:
-    """Read a recording, and write it condensed to `session`: repaired first, as before it enters a map."""
+def _refuse_unread(given: Sequence[str], config: Config, *, in_map: bool, in_space: bool, boxes: bool = False) -> None:
+    """Refuse settings that such a recording would silently ignore.
+
+    Raises:
+        ConfigError: names the first one.
+    """
+    from evermap.config import (
+        UNREAD_IN_SPACE,
+        UNREAD_IN_THE_PLANE,
+        UNREAD_WITHOUT_BOXES,
+        UNREAD_WITHOUT_MAP,
+        refuse_unread,
+    )
+
+    unread = {
+        "for a recording in space": UNREAD_IN_SPACE if in_space else (),
+        "for a recording in the plane": () if in_space else UNREAD_IN_THE_PLANE,
+        "for a recording without boxes without identity": () if boxes or not in_space else UNREAD_WITHOUT_BOXES,
+        "without --map": () if in_map else UNREAD_WITHOUT_MAP,
+        "without --unknown-ids": () if in_map or config.slam.unknown_ids else ("slam.association",),
+    }
+    refuse_unread(given, unread, within="slam")
+
+
+def _read(
+    path: Path,
+    *,
+    robot: int | None,
+    topics: Path | None,
+    session: Path | None,
+    force: bool,
+    check: Callable[..., None],
+) -> AnyRecording:
+    """Read a recording, and write it condensed to `session`: repaired first, as before it enters a map.
+
+    `check` refuses settings that such a recording does not read.
+    """
     from evermap.io import read_recording
     from evermap.io.native_write import write_session
     from evermap.slam.cleaning import clean
+    from evermap.slam.space.moving import has_traffic
     from evermap.types import Recording
 
     if session is not None and session.exists() and not force:
         raise ConfigError(f"{session} is there already", field="offline_session", hint="another name, or --force")
     recording = read_recording(path, robot=robot, topics=topics)
+    check(in_space=not isinstance(recording, Recording), boxes=has_traffic(recording))
     if session is not None:
         write_session(clean(recording) if isinstance(recording, Recording) else recording, session)
         say(f"wrote the session for a map to {session} ({session.stat().st_size / 1e3:.0f} kB)")
@@ -483,6 +523,13 @@ def _write_bag_settings(bag: Path) -> None:
     say(f"wrote this to {path}; correct it where needed, then: evermap slam {bag}")
 
 
+def _known(prior_map: str | None, sigma_m: float, shifts: Sequence[Any], recording: AnyRecording) -> Landmarks | None:
+    """Return the prior map with the shifts of experiments."""
+    from evermap.io import shifted
+
+    return None if prior_map is None else shifted(_prior_landmarks(prior_map, sigma_m, recording), shifts)
+
+
 def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) -> Landmarks:
     from evermap.io import read_prior_map
     from evermap.types import Landmarks
@@ -503,13 +550,6 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) ->
         class_names=survey.class_names,
         frame="prior_map",
     )
-
-
-def _associated(unknown_ids: bool, empty_ids: bool) -> bool | str | None:
-    """`slam.unknown_ids` as the two flags have it."""
-    if unknown_ids and empty_ids:
-        raise ConfigError("ignores the ids that --empty-ids keeps", field="unknown-ids", hint="one of the two")
-    return True if unknown_ids else "empty" if empty_ids else None
 
 
 class MapOptions(NamedTuple):

@@ -8,7 +8,6 @@ import os
 import re
 import shlex
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".png", ".svg")
 """Of pictures."""
-PATIENCE_S = 4.0
-"""Loading compiled kernels takes about a second, compiling them much longer."""
 
 remark_as: ContextVar[Callable[[str], str]] = ContextVar("remark_as", default=lambda line: line)
 """Translates a remark of the core for the running command: options instead of arguments."""
@@ -97,19 +94,16 @@ def print_table(
 
 
 def warm_up(compile_kernels: Callable[[], None] | None = None) -> None:
-    """Compile the kernels (of the pipeline by default), or load them; prints a line if that takes a while."""
+    """Compile the kernels (of the pipeline by default), or load them; prints a line where one has to be compiled."""
+    from evermap.compiled import at_first_missing
+
     if compile_kernels is None:
         from evermap.slam.warmup import warm_up as of_the_pipeline
 
         compile_kernels = of_the_pipeline
-    note = "compiling the kernels, once on this machine; this takes about half a minute"
-    timer = threading.Timer(PATIENCE_S, say, [note])
-    timer.daemon = True
-    timer.start()
-    try:
+    note = "compiling the kernels, once on this machine; this takes up to a minute"
+    with at_first_missing(lambda: say(note)):
         compile_kernels()
-    finally:
-        timer.cancel()
 
 
 @contextmanager

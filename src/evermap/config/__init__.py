@@ -46,6 +46,7 @@ from evermap.config.slam import (
     NoiseConfig,
     OdometryConfig,
     OutputConfig,
+    RangesConfig,
     ReadingsConfig,
     SensorConfig,
     SlamConfig,
@@ -55,6 +56,17 @@ from evermap.config.slam import (
 )
 from evermap.config.tables import PersistConfig, ShapeConfig, StillConfig, SurvivalConfig, TrackConfig, TrackerConfig
 from evermap.errors import ConfigError
+
+UNREAD_IN_THE_PLANE = ("slam.space", "slam.association.space", "track", "living.boxes")
+UNREAD_IN_SPACE = (
+    "slam.method", "slam.sensor_model", "slam.robust", "slam.outlier_log_odds", "slam.rejected_in_a_row",
+    "slam.narrowing", "slam.estimate_noise", "slam.odometry_noise_factor", "slam.calibration", "slam.modes",
+    "slam.changes", "slam.noise", "slam.odometry", "slam.ranges", "slam.localize", "slam.cleaning", "slam.check",
+    "slam.association.particles", "living.metre",
+)  # fmt: skip
+UNREAD_WITHOUT_BOXES = ("track", "living.boxes", "slam.space.traffic", "slam.space.range_scale")
+UNREAD_WITHOUT_MAP = ("living.search", "living.metre", "living.lifetimes", "living.boxes", "living.prior_stays")
+"""Keys and sections that `evermap slam` does not read for some recordings: setting one is refused."""
 
 
 class Config(Section):
@@ -106,6 +118,24 @@ def with_overrides(config: Config, overrides: Iterable[str]) -> Config:
     return _overridden(config, overrides, {}, "")
 
 
+def refuse_unread(overrides: Iterable[str], unread: Mapping[str, Iterable[str]], *, within: str = "") -> None:
+    """Refuse overrides of what is not read, which would change nothing.
+
+    Args:
+        overrides: as of `load_config`.
+        unread: keys and sections, by why they are not read.
+        within: as of `load_config`.
+
+    Raises:
+        ConfigError: names the first such key.
+    """
+    for override in overrides:
+        key = _dotted(override.partition("=")[0], within)
+        for why, names in unread.items():
+            if any(f"{key}.".startswith(f"{name}.") for name in names):
+                raise ConfigError(f"would change nothing: not read {why}", field=key, hint="leave it out")
+
+
 def to_toml(config: Config) -> str:
     """Return a commented TOML file that `load_config` reads back. Unset fields are commented out."""
     return "\n".join(_table_lines(config, ())).lstrip("\n") + "\n"
@@ -141,15 +171,19 @@ def _overridden(config: Config, overrides: Iterable[str], values: Mapping[str, A
 
 def _set(content: dict[str, Any], key: str, value: Any, within: str) -> None:
     """Write a value into nested dicts by its dotted key; one without a dot is of the section `within`."""
-    if within and "." not in key and key.strip() not in Config.model_fields:
-        key = f"{within}.{key}"
-    names = [name.strip() for name in key.split(".")]
+    names = _dotted(key, within).split(".")
     table: Any = content
     for name in names[:-1]:
         table = table.setdefault(name, {})
         if not isinstance(table, dict):
             raise ConfigError("is a value, not a section", field=".".join(names[:-1]))
     table[names[-1]] = value
+
+
+def _dotted(key: str, within: str) -> str:
+    if within and "." not in key and key.strip() not in Config.model_fields:
+        key = f"{within}.{key}"
+    return ".".join(name.strip() for name in key.split("."))
 
 
 def _toml_value(text: str) -> Any:
@@ -223,6 +257,7 @@ __all__ = [
     "OutputConfig",
     "OverlayConfig",
     "PersistConfig",
+    "RangesConfig",
     "ReadingsConfig",
     "Section",
     "SensorConfig",
@@ -238,6 +273,7 @@ __all__ = [
     "VotesConfig",
     "load_config",
     "parse_config",
+    "refuse_unread",
     "to_toml",
     "with_overrides",
 ]

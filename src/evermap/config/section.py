@@ -72,7 +72,7 @@ def config_error(root: Any, error: ValidationError, path: Path | None = None) ->
     names = [str(name) for name in first["loc"]]
     field = ".".join(names)
     if first["type"] == "extra_forbidden":
-        return ConfigError("unknown key", path=path, field=field, hint=_nearest_key(root, names))
+        return ConfigError("unknown key", path=path, field=field, hint=_nearest_key(root, names, first["input"]))
     told = first["ctx"]["error"] if first["type"] == "value_error" else None
     if isinstance(told, ValueError):
         return ConfigError(str(told), path=path, field=field or None)
@@ -97,13 +97,22 @@ def known_keys(section: type[Section], prefix: tuple[str, ...] = ()) -> Iterator
             yield from known_keys(info.annotation, (*prefix, name))
 
 
-def _nearest_key(root: type[Section], names: list[str]) -> str:
-    """The known key that resembles an unknown one most, or the keys of its section."""
-    known = list(known_keys(root))
-    meant = similar(".".join(names), known, cutoff=0.6)
-    in_other_section = [key for key in known if key.rsplit(".", maxsplit=1)[-1] == names[-1]]
-    if meant or in_other_section:
-        return meant or in_other_section[0]
+def _nearest_key(root: type[Section], names: list[str], value: Any) -> str:
+    """The known key that an unknown one means: of its name in any section, or similar; else the keys of its section.
+
+    Args:
+        root: the section that it was given to.
+        names: of the key and the sections around it.
+        value: that it was given; of a section that is not known, what that holds.
+    """
+    known, inner = list(known_keys(root)), names
+    while isinstance(value, dict) and value:
+        inner, value = [*inner, str(next(iter(value)))], next(iter(value.values()))
+    for wanted in (inner, names):
+        same_name = [key for key in known if key.rpartition(".")[2] == wanted[-1]]
+        meant = similar(".".join(wanted), same_name, cutoff=0.0) or similar(".".join(wanted), known, cutoff=0.6)
+        if meant:
+            return meant
     section = max(
         (key.rpartition(".")[0] for key in known if ".".join(names).startswith(key.rpartition(".")[0])), key=len
     )

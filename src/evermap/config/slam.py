@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -10,7 +11,7 @@ from pydantic import ValidationInfo, field_validator
 
 from evermap.config.section import Count, NotNegative, Positive, Probability, Section, Share, key, part
 from evermap.errors import ConfigError
-from evermap.types import FloatArray, Sensor, SensorKind
+from evermap.types import NOT_IN_SPACE, FloatArray, Sensor, SensorKind, SpatialSensor
 
 SIGMAS = {
     "range_bias_m": 0.1,
@@ -32,6 +33,14 @@ KINDS: dict[SensorKind, OfSensor] = {
     SensorKind.TAG: (0.05, 0.02, 0.05, 0.1, 0.05),
     SensorKind.STEREO: (0.05, 0.02, 0.05, 0.1, 0.03),
     SensorKind.UWB: (0.3, 0.005, 0.02, 0.02, 0.05),
+}
+InSpace = tuple[Positive, Positive, NotNegative, NotNegative]
+KINDS_IN_SPACE: dict[SensorKind, InSpace] = {
+    SensorKind.LASER: (0.001, 0.02, 0.001, 0.003),
+    SensorKind.CAMERA: (0.02, 0.02, 0.1, 0.005),
+    SensorKind.TAG: (0.005, 0.005, 0.02, 0.005),
+    SensorKind.STEREO: (0.01, 0.01, 0.03, 0.003),
+    SensorKind.UWB: (0.003, 0.1, 0.002, 0.05),
 }
 
 
@@ -84,6 +93,22 @@ class VotesConfig(Section):
     times: NotNegative = key(3.0, "... and more than so many times those with its own")
     fewest_doubles: Count = key(3, "frames that have an id at two places, from which on it is on two landmarks")
     surprising: Positive = key(50.0, "squared normalised residual from which a sighting disputes where its landmark is")
+
+
+class RangesConfig(Section):
+    """Detections without a bearing: where their landmarks are, before the estimator begins."""
+
+    window_s: Positive = key(20.0, "span of ranges that locate a landmark, or the double, and so on [s]")
+    drift_share: NotNegative = key(0.03, "drift of the odometry over it, as a share of the way")
+    fewest: Count = key(6, "ranges that this takes")
+    most_ranges: Count = key(200, "ranges that are used, at most")
+    starts: int = key(16, "directions from which the place is sought", ge=4)
+    steps: Count = key(30, "steps from each")
+    tail: Positive = key(2.0, "standard deviations beyond which a range is probably an outlier")
+    most_sigma_m: Positive = key(1.0, "standard deviation from which a place is not known [m]")
+    apart_m: Positive = key(1.0, "distance from which another place is another one [m] ...")
+    rival_nats: NotNegative = key(6.0, "... and how much worse it must be [nats]")
+    first_m: Positive = key(1.0, "least standard deviation of the place at which the estimator begins [m]")
 
 
 class LocalizeConfig(Section):
@@ -190,6 +215,7 @@ class CleaningConfig(Section):
     sharpest: Positive = key(2.0, "change of speed that is never a spike [m/s, rad/s]")
     too_far: float = key(2.0, "factor on the maximum range above which a reading is dropped", ge=1.0)
     far_from_median: float = key(100.0, "the same on the median range, for a sensor without a maximum range", ge=1.0)
+    ranges_only: Share = key(0.2, "share of readings without a bearing above which a sensor measures ranges only")
     moved: Positive = key(0.1, "motion after which identical readings indicate stale data [m, rad]")
     stray_s: Positive = key(
         10.0, "distance from neighbouring stamps, and of frames from odometry, above which they are dropped [s]"
@@ -378,6 +404,10 @@ class SpaceConfig(Section):
         gt=0.5,
         lt=2.0,
     )
+    kinds: dict[SensorKind, InSpace] = key(
+        KINDS_IN_SPACE,
+        "of a stated kind of sensor: standard deviation of the scale of its ranges, a share, and the next three keys",
+    )
     sigma_m: Positive = key(0.005, "noise of unstated positions at no range [m] ...")
     sigma_along: NotNegative = key(0.02, "... along the ray, as a share of the range ...")
     sigma_across: NotNegative = key(0.01, "... and across")
@@ -415,6 +445,11 @@ class SpaceConfig(Section):
     map: MapInSpaceConfig = part(MapInSpaceConfig, "a map that is given")
     repair: RepairConfig = part(RepairConfig, "other explanations")
     traffic: TrafficConfig = part(TrafficConfig, "boxes without identity")
+
+    @field_validator("kinds")
+    @classmethod
+    def _all_kinds(cls, given: dict[SensorKind, InSpace]) -> dict[SensorKind, InSpace]:
+        return KINDS_IN_SPACE | given
 
 
 class NoiseConfig(Section):
@@ -469,6 +504,7 @@ class SlamConfig(Section):
     odometry: OdometryConfig = part(OdometryConfig, "silences and jitter of the odometry")
     votes: VotesConfig = part(VotesConfig, "identities that were read wrongly")
     association: AssociationConfig = part(AssociationConfig, "landmarks without identities")
+    ranges: RangesConfig = part(RangesConfig, "detections without a bearing")
     localize: LocalizeConfig = part(LocalizeConfig, "where a robot is in a map")
     space: SpaceConfig = part(SpaceConfig, "sensors in space")
     check: CheckConfig = part(CheckConfig, "thresholds of the recording check")
@@ -512,6 +548,23 @@ class SensorConfig(Section):
             if getattr(merged, low) >= getattr(merged, high):
                 problem = f"{getattr(merged, low):g} is not below {high} = {getattr(merged, high):g}"
                 raise ConfigError(problem, field=f"sensor.{low}")
+        return merged
+
+    def applied_in_space(self, sensors: Sequence[SpatialSensor]) -> tuple[SpatialSensor, ...]:
+        """Return the sensors of a recording in space with the fields that are set here, each the same.
+
+        Raises:
+            ConfigError: a field that means nothing in space, or nothing can be in range.
+        """
+        given = self.model_dump(exclude_none=True)
+        for name, hint in NOT_IN_SPACE.items():
+            if name in given:
+                raise ConfigError("is not used for a recording in space", field=f"sensor.{name}", hint=hint)
+        merged = tuple(replace(sensor, **given) for sensor in sensors)
+        for one in merged:
+            if one.range_min_m >= one.range_max_m:
+                problem = f"{one.range_min_m:g} is not below range_max_m = {one.range_max_m:g}"
+                raise ConfigError(problem, field="sensor.range_min_m")
         return merged
 
 

@@ -20,6 +20,7 @@ from evermap.io.sensor_toml import Settings, parse_sensor_toml
 from evermap.io.table import ENDINGS, Table, parse_table
 from evermap.io.tagslam import is_tagslam
 from evermap.types import (
+    UNKNOWN,
     Clock,
     Detections,
     FloatArray,
@@ -288,17 +289,22 @@ def frames_and_detections(
     """
     given = table.one_form(POLAR, _CARTESIAN)
     optional = ("class_id", *_POLAR_SIGMAS, *_ROUND_SIGMAS, *feature_columns(table))
-    table.expect(("stamp_s", "landmark_id", *given), optional)
+    required, more = (given, ()) if given is not POLAR else (POLAR[:1], POLAR[1:])
+    table.expect(("stamp_s", *required), ("landmark_id", *more, *optional))
     if frame_table is not None:
         frame_table.expect(("stamp_s",))
     frames, frame = frames_of(
         table, frame_table, complete=settings.frames_complete, clock=settings.clock, warnings=warnings
     )
-    range_m, bearing_rad = polar(table) if given is POLAR else _polar_of_cartesian(table)
+    range_m, bearing_rad = _polar_or_range(table) if given is POLAR else _polar_of_cartesian(table)
     sigma_range_m, sigma_bearing_rad = _sigmas(table, range_m)
     detections = Detections(
         frame=frame,
-        landmark_id=table.ids("landmark_id", optional=True, names=names),
+        landmark_id=(
+            table.ids("landmark_id", optional=True, names=names)
+            if "landmark_id" in table
+            else np.full(len(table), UNKNOWN, dtype=np.int64)
+        ),
         range_m=range_m,
         bearing_rad=bearing_rad,
         class_id=class_ids(table, class_names),
@@ -313,6 +319,14 @@ def frames_and_detections(
 def polar(table: Table) -> tuple[FloatArray, FloatArray]:
     """Return range and bearing, the latter within half a turn. Shapes (R,)."""
     return table.numbers(q.RANGE_M), wrap_far(table.numbers(q.BEARING_RAD))
+
+
+def _polar_or_range(table: Table) -> tuple[FloatArray, FloatArray]:
+    """As `polar`, with nan where a bearing is empty, or there is no such column."""
+    if "bearing_rad" not in table:
+        return table.numbers(q.RANGE_M), np.full(len(table), np.nan)
+    bearing_rad = table.numbers(replace(q.BEARING_RAD, optional=True))
+    return table.numbers(q.RANGE_M), np.where(np.isnan(bearing_rad), np.nan, wrap_far(bearing_rad))
 
 
 def _polar_of_cartesian(table: Table) -> tuple[FloatArray, FloatArray]:

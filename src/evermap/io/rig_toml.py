@@ -14,9 +14,9 @@ from evermap.errors import suggestion
 from evermap.geometry import se3
 from evermap.geometry.symmetry import HINT, Symmetry
 from evermap.io.files import FileSet
-from evermap.io.sensor_toml import Settings, TomlReader, recording_section, toml_string, toml_text
+from evermap.io.sensor_toml import UNKNOWN_KIND, Settings, TomlReader, recording_section, toml_string, toml_text
 from evermap.io.spatial import AT, QUATERNION
-from evermap.types import FloatArray, IntArray, Sensor, SpatialSensor, landmark_id_of
+from evermap.types import NOT_IN_SPACE, FloatArray, IntArray, Sensor, SensorKind, SpatialSensor, landmark_id_of
 from evermap.valid import CAMERA_MODELS
 
 SENSOR_FILE = "sensor.toml"
@@ -26,14 +26,16 @@ _LIMITS: dict[str, dict[str, tuple[float, float]]] = {
     "limits": {"range_min_m": (0.0, 1e6), "range_max_m": (0.0, inf)},
     "noise": {"sigma_m": (1e-9, 1e6), "sigma_rad": (1e-9, 1e3), "sigma_px": (1e-6, 1e4)},
     "detection": {"p_detect": (0.0, 1.0), "p_false": (0.0, 1.0)},
+    "sensor": {"sigma_scale": (0.0, 1.0), "sigma_angle_rad": (0.0, 2 * pi), "sigma_position_m": (0.0, 1e3)},
+    "odometry": {"sigma_odometer_scale": (0.0, 1.0)},
 }
-"""Sections of `sensor.toml`; their keys are valid for a camera, too."""
-_OF_CAMERA = {key: limits for section in _LIMITS.values() for key, limits in section.items()}
+"""Sections of `sensor.toml`; their keys are valid for a camera, too, but for that of the odometry."""
+_OF_CAMERA = {key: limits for name, keys in _LIMITS.items() if name != "odometry" for key, limits in keys.items()}
 _ANGLES = ("roll_rad", "pitch_rad", "yaw_rad")
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 """Names that need no quotation marks in TOML."""
 _MOUNT = (*AT, *QUATERNION, *_ANGLES)
-_CAMERA = ("model", "intrinsics", "distortion", "resolution_px", "baseline_m", "mount", *_OF_CAMERA)
+_CAMERA = ("model", "intrinsics", "distortion", "resolution_px", "baseline_m", "mount", "kind", *_OF_CAMERA)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +78,10 @@ def read_rig(files: FileSet, warnings: list[str]) -> Rig:
         symmetries = _symmetries(reader, settings.class_names)
         values: dict[str, Any] = {}
         for section, keys in _LIMITS.items():
-            content = reader.section(section, tuple(keys))
-            values |= {key: reader.number(section, key, content[key], *keys[key]) for key in content}
+            known = ("kind", *keys) if section == "sensor" else tuple(keys)
+            content = _known(reader, section, reader.document.get(section, {}), known)
+            values |= {key: reader.number(section, key, content[key], *keys[key]) for key in keys if key in content}
+        values["kind"] = reader.choice("sensor", "kind", SensorKind, UNKNOWN_KIND)
         mount = _mount(reader, "mount", reader.section("mount", _MOUNT))
         common = replace(common, mount_robot_sensor=mount, **values)
         _check_range(reader, "limits", common)
@@ -107,12 +111,14 @@ def rig_toml(
             "intrinsics": None if sensor.intrinsics is None else tuple(map(float, sensor.intrinsics)),
             "distortion": tuple(map(float, sensor.distortion)) or None,
             "resolution_px": sensor.resolution_px,
-            **{key: getattr(sensor, key) for key in _OF_CAMERA},
+            **{key: getattr(sensor, key) for key in ("kind", *_OF_CAMERA)},
         }
         pose = map(float, sensor.mount_robot_sensor)
         sections[f"{section}.mount"] = dict(zip((*AT, *QUATERNION), pose, strict=True))
+    odometer = {"sigma_odometer_scale": sensors[0].sigma_odometer_scale}
     alike = {_key(name): texts for name, texts in symmetries.items()}
-    return {SENSOR_FILE: toml_text({"recording": about, "symmetries": alike}), CAMERA_FILE: toml_text(sections)}
+    common = {"recording": about, "odometry": odometer, "symmetries": alike}
+    return {SENSOR_FILE: toml_text(common), CAMERA_FILE: toml_text(sections)}
 
 
 def _key(name: str) -> str:
@@ -138,7 +144,7 @@ def cameras(reader: TomlReader, settings: Settings, common: SpatialSensor, also:
     sensors, baselines = [], []
     for name, content in listed.items():
         section = f"camera.{name}"
-        reader.checked(section, content, (*_CAMERA, *also))
+        _known(reader, section, content, (*_CAMERA, *also))
         values: dict[str, Any] = {
             key: reader.number(section, key, content[key], *limits)
             for key, limits in _OF_CAMERA.items()
@@ -147,6 +153,8 @@ def cameras(reader: TomlReader, settings: Settings, common: SpatialSensor, also:
         if "mount" in content:
             inner = f"{section}.mount"
             values["mount_robot_sensor"] = _mount(reader, inner, reader.checked(inner, content["mount"], _MOUNT))
+        if "kind" in content:
+            values["kind"] = reader.choice(section, "kind", SensorKind, UNKNOWN_KIND, content)
         values |= _lens(reader, section, content)
         sensor = replace(common, name=name, **values)
         _check_range(reader, section, sensor)
@@ -157,6 +165,14 @@ def cameras(reader: TomlReader, settings: Settings, common: SpatialSensor, also:
         )
     size_m, sizes = _tags(reader)
     return Rig(settings, tuple(sensors), tuple(baselines), size_m, sizes)
+
+
+def _known(reader: TomlReader, section: str, content: Any, known: tuple[str, ...]) -> dict[str, Any]:
+    """Return a section without unknown keys; one that is known in the plane only gets its own hint."""
+    for key in content if isinstance(content, dict) else ():
+        if key in NOT_IN_SPACE and key not in known:
+            raise reader.error(section, key, "is not used in space", NOT_IN_SPACE[key])
+    return reader.checked(section, content, known)
 
 
 def _lens(reader: TomlReader, section: str, content: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from evermap.io.text import decode_text, reason
 from evermap.types import Clock, Sensor, SensorKind
 
 FORMAT_VERSION = 1
+UNKNOWN_KIND = "unknown kind of sensor"
 _Choice = TypeVar("_Choice", bound=StrEnum)
 
 # sections and keys with their limits; those of all but the mount are fields of `Sensor`
@@ -104,7 +105,7 @@ def _sensor(values: dict[str, dict[str, float]], reader: TomlReader) -> Sensor:
     mount = values.pop("mount")
     x_m, y_m, theta_rad = (mount.get(key, 0.0) for key in _LIMITS["mount"])
     numbers: dict[str, Any] = {k: v for part in values.values() for k, v in part.items()}
-    kind = reader.choice("sensor", "kind", SensorKind, "unknown kind of sensor")
+    kind = reader.choice("sensor", "kind", SensorKind, UNKNOWN_KIND)
     sensor = Sensor(**numbers, kind=kind, mount_robot_sensor=(x_m, y_m, theta_rad))
     if sensor.range_min_m >= sensor.range_max_m:
         raise reader.error("limits", "range_max_m", "must be greater than range_min_m")
@@ -161,8 +162,10 @@ class TomlReader:
             raise self.error(section, key, f"must be a list of {wanted} numbers")
         return tuple(self.number(section, key, item, -1e9, 1e9) for item in value)
 
-    def choice(self, section: str, key: str, among: type[_Choice], problem: str) -> _Choice | None:
-        value = self.document.get(section, {}).get(key)
+    def choice(
+        self, section: str, key: str, among: type[_Choice], problem: str, content: dict[str, Any] | None = None
+    ) -> _Choice | None:
+        value = (self.document.get(section, {}) if content is None else content).get(key)
         if value is None:
             return None
         if value not in list(among):

@@ -62,6 +62,17 @@ theta_rad = 0.0
 [detection]
 p_detect = 0.9             # probability that a landmark in view is detected
 p_false = 0.001            # probability of a false detection in a frame
+
+# [sensor]                 # kind and data sheet set the priors of its errors; state what you know (docs/calibration.md)
+# kind = "laser"           # "laser", "camera", "tag", "stereo" or "uwb"
+# sigma_scale = 0.0005     # standard deviation of the scale of its ranges
+# sigma_offset_m = 0.02    # of the offset of all ranges
+# sigma_angle_rad = 0.005  # of its mounting angle
+# sigma_position_m = 0.03  # of its position on the robot, along each axis
+
+# [odometry]
+# sigma_odometer_scale = 0.01
+# sigma_askew_rad = 0.002  # of the angle between driving direction and front
 """
 
 _COMMENTS = {
@@ -70,7 +81,8 @@ Required. Velocities of the robot; each row holds until the next stamp. Lines th
 Optional: lateral_mps, to the left. Instead of velocities: stamp_s,dx_m,dy_m,dtheta_rad, the motion since the row
 before, in the robot's frame at that row.""",
     "detections": """\
-Required. Detections. An empty landmark_id means: detected, but not identified.
+Required. Detections. An empty landmark_id means: detected, but not identified. If the sensor identifies nothing (laser
+reflectors, poles), leave the column out and run with --unknown-ids.
 Instead of range_m,bearing_rad: x_m,y_m in the sensor's frame. Optional: class_id (any name), and standard deviations
 of single detections: sigma_range_m,sigma_bearing_rad or sigma_m.""",
     "frames": """\

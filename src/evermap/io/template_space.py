@@ -51,14 +51,23 @@ sigma_px = 0.3             # of pixels; sigma_m of positions and sigma_rad of or
 p_detect = 0.9             # probability that a landmark in view is detected
 p_false = 0.001            # probability of a false detection in a frame
 
+# [sensor]                 # kind and data sheet set the priors of its errors; state what you know (docs/space.md)
+# kind = "tag"             # "laser", "camera", "tag", "stereo" or "uwb"
+# sigma_scale = 0.002      # standard deviation of the scale of its ranges
+# sigma_angle_rad = 0.005  # of its orientation in the mount, about each axis
+# sigma_position_m = 0.01  # of its position on the robot, along each axis
+
+# [odometry]
+# sigma_odometer_scale = 0.01
+
 # [symmetries]             # rotations after which objects look the same, by class_id; x, y, z are the object's own axes
 # can = "axis:z"           # any rotation about z
 # box = ["180:z", "180:x"] # half a turn about z or x; "90:z" a quarter; "any" for a ball
 """,
     "camera.toml": """\
 # The cameras, and the sizes of tags. Required for pixels, or for several sensors. A sensor
-# other than a camera has a section without intrinsics. The keys of [limits], [noise] and [detection] of sensor.toml are
-# valid here, too, for one camera.
+# other than a camera has a section without intrinsics. The keys of [limits], [noise], [detection] and [sensor] of
+# sensor.toml are valid here, too, for one camera.
 
 [camera.front]
 model = "radtan"                                # "pinhole", "radtan" or "equidistant" (fisheye)

@@ -28,6 +28,7 @@ from evermap.types import (
     SlamResult,
     SpatialRecording,
     Trajectory,
+    rows_of,
 )
 
 TOPICS = {
@@ -230,7 +231,7 @@ def _detections(ros: Ros, recording: AnyRecording) -> Iterator[_Stamped]:
         spread = np.zeros((len(seen), 6, 6))
         ids, frames, classes = seen.landmark_id, seen.frame, seen.class_id
     else:
-        flat = recording.detections
+        flat = rows_of(recording.detections, np.isfinite(recording.detections.bearing_rad))  # a position takes both
         ids, frames, classes = flat.landmark_id, flat.frame, flat.class_id
         bearing, zero = flat.bearing_rad, np.zeros(len(flat))
         at = np.stack([flat.range_m * np.cos(bearing), flat.range_m * np.sin(bearing), zero], axis=1)

@@ -142,6 +142,10 @@ def summary_dict(
             for other in result.alternatives
         ],
         "parameters": [_parameter(parameter) for parameter in result.parameters],
+        "undecided": [
+            {"parameters": [one.name for one in pair], "decided_by": list(pair.one.decided_by), "text": pair.text}
+            for pair in result.undecided
+        ],
         "interrupted": bool(result.interrupted),
     }
 
@@ -275,6 +279,6 @@ def _counts(recording: AnyRecording, result: SlamResult) -> dict[str, Any]:
 
 
 def _parameter(parameter: ParameterEstimate) -> dict[str, Any]:
-    names = ("value", "sigma", "prior_mean", "prior_sigma", "p_needed")
+    names = ("value", "sigma", "prior_mean", "prior_sigma", "p_needed", "alone")
     numbers = {name: json_number(getattr(parameter, name)) for name in names}
     return {**asdict(parameter), **numbers, "fixed": bool(parameter.fixed)}

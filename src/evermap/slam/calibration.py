@@ -61,6 +61,9 @@ SPECS: tuple[Spec, ...] = (
 USUAL = CalibrationConfig()
 NAMES = tuple(spec.name for spec in SPECS)
 BIAS, SLOPE, SKEW, CURVATURE, BEARING, AHEAD, ASIDE, DELAY, FORWARD, SLIP = 0, 1, 2, 3, 4, 5, 6, 7, 8, 10
+OF_SCALE = ("[sensor] sigma_scale", "[odometry] sigma_odometer_scale")
+OF_ANGLE = ("[sensor] sigma_angle_rad", "[odometry] sigma_askew_rad")
+"""Keys of `sensor.toml` that divide what two errors only show together."""
 LEAST_SIGMA = 1e-6
 """Standard deviation for a data sheet without errors, to avoid division by zero."""
 

@@ -34,7 +34,7 @@ from evermap.types import (
     SpatialRecording,
     rows_of,
 )
-from evermap.valid import check_landmarks, validate, validate_spatial
+from evermap.valid import WITHOUT_IDS, check_landmarks, validate, validate_spatial
 
 OUTSIDE = 0.05
 """Share of the image size by which undistorted corners of tags may lie outside of the image."""
@@ -75,10 +75,15 @@ class Check(Shown):
     @classmethod
     def of(cls, recording: AnyRecording, settings: SlamConfig) -> Check:
         """Count and compare a valid recording."""
+        from evermap.slam.space.moving import has_traffic
+
         if isinstance(recording, SpatialRecording):
             found = findings_in_space(recording, settings)
         else:
             found = findings(recording, identities=settings.unknown_ids is not True, settings=settings.check)
+        anonymous = (recording.detections.landmark_id == UNKNOWN).all()
+        if anonymous and not (settings.unknown_ids or has_traffic(recording)):
+            found = (*found, Finding("no-identities", f"no detection has a landmark_id: {WITHOUT_IDS}"))
         return cls(recording.name, recording.source, contents(recording), found, recording.warnings)
 
     @property
@@ -114,7 +119,8 @@ def findings(recording: Recording, *, identities: bool = True, settings: CheckCo
 def findings_in_space(recording: SpatialRecording, settings: SlamConfig) -> tuple[Finding, ...]:
     """Return everything that is odd about a valid recording in space, the worst first; its truth is not looked at."""
     found = [*_left_out(recording, settings), *_motion(recording, settings.check), *_limits_in_space(recording)]
-    found += _identities(recording, settings.check)
+    if settings.unknown_ids is not True:
+        found += _identities(recording, settings.check)
     if recording.odometry is not None and all(finding.usable for finding in found):
         found += _jumps(recording.odometry, settings.cleaning)
     return tuple(sorted(found, key=lambda finding: finding.usable))
@@ -229,9 +235,11 @@ def _seen(recording: Recording) -> dict[str, Any]:
     sensor, detections = recording.sensor, recording.detections
     aside = detections.bearing_rad > sensor.bearing_max_rad
     aside |= detections.bearing_rad < sensor.bearing_min_rad
+    known = detections.bearing_rad[np.isfinite(detections.bearing_rad)]
     return {
         "range_m": [float(edge) for edge in np.quantile(detections.range_m, [0.0, 0.5, 1.0])],
-        "bearing_rad": [float(edge) for edge in np.quantile(detections.bearing_rad, [0.0, 0.5, 1.0])],
+        "bearing_rad": [float(edge) for edge in np.quantile(known, [0.0, 0.5, 1.0])] if len(known) else None,
+        "without_bearing": len(detections) - len(known),
         "beyond_range_max": int(np.sum(detections.range_m > sensor.range_max_m)),
         "outside_view": int(np.sum(aside)),
     }
@@ -307,10 +315,12 @@ def _left_out(recording: SpatialRecording, settings: SlamConfig) -> list[Finding
     from evermap.slam.space.intake import prepare_space
     from evermap.slam.space.moving import boxes_of, has_traffic
 
-    some = recording
+    some, unknown = recording, recording.detections.landmark_id == UNKNOWN
     if has_traffic(recording):
         others = np.setdiff1d(np.arange(len(recording.detections)), boxes_of(recording))
         some = replace(recording, detections=rows_of(recording.detections, others))
+    elif settings.unknown_ids or unknown.all():  # any identity will do: what else is wrong with them?
+        some = replace(recording, detections=replace(recording.detections, landmark_id=np.zeros_like(unknown, int)))
     try:
         remarks = prepare_space(some, settings.space, fewest=0 if some is not recording else 2).warnings
     except DataError as error:
@@ -453,23 +463,30 @@ def screened(
         InputError: no recording, or values that cannot be, in it or in the prior map.
         DataError: nothing can be estimated from it.
     """
+    from evermap.slam.ranges import with_bearings
     from evermap.slam.space.moving import has_traffic
     from evermap.slam.votes import without_contradicted_ids
 
     settings, remarks = config.slam, tuple[str, ...]()
-    if not isinstance(recording, SpatialRecording):
+    if isinstance(recording, SpatialRecording):
+        recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
+    else:
         if repair:
             recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
             recording = clean(recording, settings.cleaning)
         else:
             recording = valid(recording, config.sensor, prior_map)
         remarks = odd(recording, identities=settings.unknown_ids is not True, settings=settings.check)
+    if not isinstance(recording, SpatialRecording):
+        recording, told = with_bearings(recording, settings)
+        remarks = (*remarks, *told)
     if (
         settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording)
     ):  # the tracker assigns identities
         return recording, remarks
     voted = without_contradicted_ids(recording, settings)
-    return voted, (*remarks, *voted.warnings[len(recording.warnings) :])
+    remarks = (*remarks, *voted.warnings[len(recording.warnings) :])
+    return replace(voted, warnings=recording.warnings), remarks
 
 
 def check_recording(recording: AnyRecording, config: Config | None = None) -> Check:
@@ -488,6 +505,7 @@ def check_recording(recording: AnyRecording, config: Config | None = None) -> Ch
     config = config or Config()
     if isinstance(recording, SpatialRecording):
         validate_spatial(recording)
+        recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
     else:
         recording = valid(recording, config.sensor)
     return Check.of(recording, config.slam)

@@ -106,7 +106,10 @@ def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]
         limit = f"{settings.too_far:g} times range_max_m = {sensor.range_max_m:g}"
         problem = f"{n_far} of {len(far)} ranges lie beyond {limit}"
         raise DataError(problem, field="range_m", hint="ranges and range_max_m in metres")
-    real &= ~far & (np.abs(detections.bearing_rad) <= 2.0 * np.pi)
+    real &= ~far
+    blind = np.isnan(detections.bearing_rad)
+    ranges_only = blind.sum() > settings.ranges_only * len(blind)  # a few without a bearing are damaged
+    real &= (np.abs(detections.bearing_rad) <= 2.0 * np.pi) | (blind & ranges_only)
     real &= (detections.frame >= 0) & (detections.frame < len(recording.frames))
     _remark(remarks, "impossible readings dropped", int(np.sum(~real)))
     if not real.all():
@@ -142,7 +145,8 @@ def _in_time(
     order = np.argsort(row, kind="stable")
     order = order[np.isfinite(stamps[detections.frame[order]])]
     detections = replace(rows_of(detections, order), frame=row[order])
-    same = np.column_stack([detections.frame, detections.landmark_id, detections.range_m, detections.bearing_rad])
+    bearing_rad = np.nan_to_num(detections.bearing_rad, nan=np.inf)  # nan is not equal to itself
+    same = np.column_stack([detections.frame, detections.landmark_id, detections.range_m, bearing_rad])
     _, first = np.unique(same, axis=0, return_index=True)
     _remark(remarks, "repeated readings of a frame dropped", len(same) - len(first))
     if not sorted_already:
@@ -259,7 +263,7 @@ def _fresh(
     alike = (before >= 0) & (count[detections.frame] == count[before])
     at = np.where(alike, first[before] + np.arange(len(detections)) - first[detections.frame], 0)
     for name in ("landmark_id", "range_m", "bearing_rad"):
-        column = getattr(detections, name)
+        column = np.nan_to_num(getattr(detections, name), nan=np.inf)
         alike &= column == column[at]
     repeated = (count > 0) & (np.bincount(detections.frame, alike, minlength=len(frames)) == count)
     least = np.where(count > 1, 1.0, SINGLE) * settings.moved

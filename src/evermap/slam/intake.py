@@ -16,6 +16,7 @@ from evermap.slam.noise import start_noise
 from evermap.slam.problem import USUAL, Drive, Noise, Problem
 from evermap.slam.streaming import PriorMap
 from evermap.types import UNKNOWN, IntArray, Landmarks, Recording, Sensor
+from evermap.valid import WITHOUT_IDS
 
 FIRST_POSE_INFORMATION = 1e8
 """Standard deviation of the first pose, the origin: 0.1 mm."""
@@ -84,7 +85,9 @@ def prepare(
     if len(pose_frame) < 2:
         raise DataError(
             f"{recording.name}: landmarks of known identity were seen in {len(pose_frame)} frames, at least 2 needed",
-            hint="check landmark ids (without any: slam.unknown_ids), and that detections and odometry share one clock",
+            hint=WITHOUT_IDS
+            if anonymous.all()
+            else "check landmark ids, and that detections and odometry share one clock",
         )
     landmark_id, landmark_row = np.unique(detections.landmark_id[used], return_inverse=True)
     start_s = float(odometry.stamp_s[0])

@@ -237,6 +237,8 @@ def _pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, In
         from evermap.slam.space.intake import positions_of, without_range
 
         known &= ~without_range(recording) & np.isfinite(positions_of(recording)).all(axis=1)
+    else:
+        known &= np.isfinite(recording.detections.bearing_rad)
     if not known.any() or recording.odometry is None or len(recording.odometry) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     odometry_s = recording.odometry.stamp_s

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from evermap.geometry import se2
 from evermap.slam.bridge import bridged, dead_reckoned
-from evermap.slam.calibration import BEARING, FORWARD, SLOPE, SPECS, CalibrationPrior, from_front
+from evermap.slam.calibration import BEARING, FORWARD, OF_ANGLE, OF_SCALE, SLOPE, SPECS, CalibrationPrior, from_front
 from evermap.slam.check import far_off
 from evermap.slam.estimate import Solved
 from evermap.slam.intake import Prepared
@@ -16,8 +17,10 @@ from evermap.slam.kernels import NOISE_NAMES
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.streaming import Outcome, StreamingSlam
 from evermap.types import (
+    ANY_BEARING_RAD,
     UNKNOWN,
     Alternative,
+    BoolArray,
     FloatArray,
     Innovations,
     IntArray,
@@ -204,12 +207,15 @@ def innovations(prepared: Prepared, slam: StreamingSlam, outcome: Outcome, recor
     """Return consistency of every detection that was predicted."""
     told = np.flatnonzero(np.isfinite(slam.nis[: len(outcome.inlier)]))
     detection = prepared.used[told]
+    sigma_rad = recording.detections.sigma_bearing_rad[detection]
+    measured: BoolArray = ~(sigma_rad >= ANY_BEARING_RAD)
     return Innovations(
         stamp_s=recording.frames.stamp_s[recording.detections.frame[detection]],
         detection=detection,
         landmark_id=recording.detections.landmark_id[detection],
         nis=slam.nis[told],
         p_inlier=outcome.inlier[told],
+        dof=None if measured.all() else 1 + measured.astype(np.int64),
     )
 
 
@@ -225,21 +231,28 @@ def described(
 ) -> tuple[ParameterEstimate, ...]:
     """Return calibration states (11,) with their covariance (11, 11), driving askew, and noise levels, as records.
 
-    For errors that are only observable together the meanings give both interpretations. With `undivided`, the scale is
-    of that kind.
+    Of errors that are only observable together each has its value if it were the only one, too. With `undivided`, the
+    scale is of that kind.
     """
-    needs = np.full(len(SPECS), np.nan) if p_needed is None else p_needed
+    needs = np.full(len(SPECS), np.nan) if p_needed is None else p_needed.copy()
+    needed = float(needs[BEARING])
     meanings = {spec.name: spec.meaning for spec in SPECS}
+    pairs: dict[str, dict[str, Any]] = {}
     if undivided:
         scale = states[FORWARD] * (1.0 + states[SLOPE])
         meanings["range_slope"] += f"; {scale - 1.0:.4f} if the odometer were right"
         meanings["odometry_forward_scale"] += f"; {scale:.4f} if ranges were right"
+        evident = any(_evident(needs[state], prior.p_needed[state]) for state in (SLOPE, FORWARD))
+        pairs |= _shown_together("range_slope", scale - 1.0, "odometry_forward_scale", scale, OF_SCALE, evident)
     if askew[1] > 0.0:
         angle = states[BEARING] + askew[0]
         meanings["bearing_bias_rad"] += f"; {angle:.4f} if the robot drove straight"
         meanings["odometry_askew_rad"] = (
             f"driving direction to the left of the robot's front; {angle:.4f} if the sensor were mounted as stated"
         )
+        evident = _evident(needed, prior.p_needed[BEARING])
+        pairs |= _shown_together("bearing_bias_rad", angle, "odometry_askew_rad", angle, OF_ANGLE, evident)
+        needs[BEARING] = needed if prior.angle_share > 0.0 else np.nan  # what is needed is the other one
     estimates = [
         ParameterEstimate(
             name=spec.name,
@@ -251,13 +264,31 @@ def described(
             fixed=not prior.free[k],
             meaning=meanings[spec.name],
             p_needed=float(needs[k]),
+            **pairs.get(spec.name, {}),
         )
         for k, spec in enumerate(SPECS)
     ]
     if askew[1] > 0.0:
-        name, needed = "odometry_askew_rad", float(needs[BEARING])
-        estimates.append(ParameterEstimate(name, *askew, 0.0, prior.askew_sigma, "rad", False, meanings[name], needed))
+        name = "odometry_askew_rad"
+        more: dict[str, Any] = {"meaning": meanings[name], "p_needed": needed, **pairs[name]}
+        estimates.append(ParameterEstimate(name, *askew, 0.0, prior.askew_sigma, "rad", **more))
     return (*estimates, *_levels(fit))
+
+
+def _shown_together(
+    one: str, one_alone: float, other: str, other_alone: float, decided_by: tuple[str, ...], evident: bool
+) -> dict[str, dict[str, Any]]:
+    """Return what `ParameterEstimate` says of two errors that only show together, by their names."""
+    both: dict[str, Any] = {"decided_by": decided_by, "evident": evident}
+    return {
+        one: {"alone": float(one_alone), "shown_with": other, **both},
+        other: {"alone": float(other_alone), "shown_with": one, **both},
+    }
+
+
+def _evident(p_needed: float, before: float) -> bool:
+    """Return whether readings made it clearly more probable that a state is needed, and it probably is."""
+    return bool(p_needed >= 0.5 and p_needed * (1.0 - before) > 2.0 * before * (1.0 - p_needed))
 
 
 def _levels(fit: NoiseFit) -> list[ParameterEstimate]:

@@ -172,7 +172,12 @@ def _calibration(result: SlamResult) -> str:
         title: [parameter for parameter in result.parameters if parameter.name.startswith("sigma_") is noise]
         for title, noise in parts.items()
     }
-    return "".join(f"<h3>{title}</h3>{_parameters(those)}" for title, those in chosen.items() if those)
+    tables = "".join(f"<h3>{title}</h3>{_parameters(those)}" for title, those in chosen.items() if those)
+    return tables + "".join(f"<p>{escape(_sentence(pair.text))}</p>" for pair in result.undecided)
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 def _consistency(summary: Mapping[str, Any]) -> str:
@@ -282,6 +287,8 @@ def _latency(timing: Mapping[str, Any]) -> str:
 
 def _nis(metrics: Mapping[str, Any]) -> str:
     mean = metrics["nis_mean"]
+    if mean is None:
+        return "No detection was judged an inlier: the readings do not fit the estimate."
     if mean > 2.6:
         verdict = "errors are larger than estimated"
     elif mean < 1.4:
@@ -294,11 +301,18 @@ def _nis(metrics: Mapping[str, Any]) -> str:
 _MAX_LANDMARK_ROWS = 500
 
 
+def _alone(parameter: ParameterEstimate) -> str:
+    """The other reading of an error that only shows together with another one."""
+    if not parameter.shown_with or abs(parameter.alone - parameter.value) < 1e-9:
+        return ""
+    return escape(f", or {quantity(parameter.alone, 0.0, parameter.unit)} without {parameter.shown_with}")
+
+
 def _parameters(parameters: Sequence[ParameterEstimate]) -> str:
     rows = [
         (
             f"<code>{escape(p.name)}</code>",
-            escape(quantity(p.value, 0.0 if p.fixed else p.sigma, p.unit)) + _held(p),
+            escape(quantity(p.value, 0.0 if p.fixed else p.sigma, p.unit)) + _held(p) + _alone(p),
             escape(quantity(p.prior_mean, p.prior_sigma, p.unit)) if has_prior(p) else "–",
             _learned(p),
             escape(p.meaning),

@@ -5,6 +5,7 @@ Importing this module loads no study: each command imports its own when it runs.
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -25,9 +26,11 @@ if TYPE_CHECKING:
     """Compute a study into a folder; returns its table, and what writes it as text."""
 
 __all__ = [
+    "association",
     "bateman2020",
     "building",
     "demo",
+    "liars",
     "lifelong",
     "lifetimes",
     "mrclam",
@@ -36,11 +39,13 @@ __all__ = [
     "presence",
     "robots",
     "rosen2016",
+    "soak",
 ]
 
 MRCLAM = Path("../shared/data/mrclam")
 PRESENCE = Path("../shared/data/presence")
 GOLDEN = Path("../shared/golden")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 Out = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<study>")]
 Data = Annotated[Path, typer.Option(help="Folder with the recordings.")]
@@ -49,6 +54,67 @@ Jobs = Annotated[int, typer.Option(min=1, help="Runs at a time; 1 for timings th
 Quick = Annotated[bool, typer.Option("--quick", help="A little of everything, minutes instead of hours.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the table as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Write into --out even if it holds other files; they stay.")]
+
+
+def association(
+    what: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[space|harsh|columns|mixed|wrong|exchanged|sessions] [NAME...]",
+            help="Which part, then beginnings of the names of recordings.",
+            show_default="recordings in the plane",
+        ),
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder with the recordings.", show_default="../shared/data")
+    ] = None,
+) -> None:
+    """Associate landmarks without identities, and compare with the same recordings with identities.
+
+    \b
+    Examples:
+      evermap reproduce association MRCLAM DLR
+      evermap reproduce association sessions
+    """
+    _benchmark("association").main(what or (), **_given(folder=data))
+
+
+def soak(hours: Annotated[float, typer.Option(min=0.05, help="Hours of driving.")] = 24.0, seed: Seed = 0) -> None:
+    """Drive for a day with all faults of sensors, logs and clocks, and without, into one living map each.
+
+    \b
+    Example:
+      evermap reproduce soak --hours 1
+    """
+    _benchmark("soak").main(["--hours", str(hours), "--seed", str(seed)])
+
+
+def liars(
+    lie: Annotated[list[str] | None, typer.Option(help="Only this one; repeatable.", show_default="all")] = None,
+    seed: Annotated[list[int] | None, typer.Option(help="Repeatable.", show_default="0, 1")] = None,
+) -> None:
+    """Falsify the readings of one of five robots that share a living map, and score that map.
+
+    \b
+    Example:
+      evermap reproduce liars --seed 0 --lie "ranges 10 %"
+    """
+    lies = ["--lies", *lie] if lie else []
+    _benchmark("liars").main([*lies, *(["--seeds", *map(str, seed)] if seed else [])])
+
+
+def _benchmark(name: str) -> Any:
+    """Return a module of the folder `benchmarks`, which is not installed: the commands need a clone.
+
+    Raises:
+        InputError: there is none.
+    """
+    from evermap.cli.bench import load_benchmarks
+
+    for variable in THREADS:
+        os.environ.setdefault(variable, "1")
+    load_benchmarks()
+    return importlib.import_module(f"benchmarks.{name}")
 
 
 def mrclam(
@@ -358,7 +424,7 @@ def _run(
     """
     from evermap.runs.folder import check_replaceable
 
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    for name in THREADS:
         os.environ.setdefault(name, "1")  # read when the libraries are loaded, which they are not yet
     target = out or Path("evermap-out") / study
     check_replaceable(target, force=force, inputs=inputs or [])

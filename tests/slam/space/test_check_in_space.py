@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from evermap import check_recording
 from evermap.cli.main import app
+from evermap.config import Config
 from evermap.errors import InputError
 from evermap.io import read_recording, write_native
 from evermap.io.spatial import with_tag_poses
@@ -142,9 +143,17 @@ def test_what_cannot_be_used_is_told() -> None:
     nameless = check_recording(seen(landmark_id=lambda ids: np.where(np.arange(len(ids)) < 7, -1, ids))(room()))
     assert [one.message for one in nameless.findings] == ["7 detections without identity not used"]
     assert nameless.usable
-    without = check_recording(seen(landmark_id=lambda ids: np.full_like(ids, -1))(room()))
-    assert [one.code for one in without.findings] == ["too-little"]
-    assert not without.usable
+    few = check_recording(seen(landmark_id=lambda ids: np.where(np.arange(len(ids)) < 1, ids, -1))(room()))
+    assert [one.code for one in few.findings] == ["too-little"]
+    assert not few.usable
+
+
+def test_a_recording_without_identities_is_usable_by_geometry() -> None:
+    nameless = seen(landmark_id=lambda ids: np.full_like(ids, -1))(room())
+    [finding] = check_recording(nameless).findings
+    assert (finding.code, finding.usable) == ("no-identities", True)
+    assert "`unknown_ids`" in finding.message
+    assert check_recording(nameless, Config(slam={"unknown_ids": True})).findings == ()
 
 
 def test_cameras_and_limits_are_told() -> None:

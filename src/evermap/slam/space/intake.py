@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +15,17 @@ from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries
 from evermap.slam.space.linearise import CORNERS, POINT, POSE
 from evermap.slam.space.problem import USUAL, OdometryPath, SpatialProblem
-from evermap.types import ANY_RANGE_M2, UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording, rows_of
+from evermap.types import (
+    ANY_RANGE_M2,
+    UNKNOWN,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    SpatialRecording,
+    SpatialSensor,
+    rows_of,
+)
+from evermap.valid import WITHOUT_IDS
 
 HARDLY = 1.0
 """Standard deviation with which it counts, as a share of the range: as good as nothing."""
@@ -72,11 +82,10 @@ def prepare_space(
     landmark_id, place = np.unique(detections.landmark_id[used], return_inverse=True)
     some = rows_of(where, used)
     symmetries = _symmetries(recording, place, used, some.kind)
-    oriented = np.zeros(len(landmark_id), dtype=np.bool_)
-    oriented[place[some.kind != POINT]] = True
-    driven = recording.odometry is not None
-    by_corners = np.count_nonzero(some.kind == CORNERS) > 0.5 * len(some.kind)
+    oriented = np.bincount(place, some.kind != POINT, minlength=len(landmark_id)) > 0.0
+    driven, by_corners = recording.odometry is not None, 2 * np.count_nonzero(some.kind == CORNERS) > len(some.kind)
     driven_pose, increment = _driven(recording, stamps[pose_frame])
+    scale = scale_between(recording.sensors, settings, settings.scale_sigma if by_corners else 0.0)
     problem = SpatialProblem(
         stamp_s=stamps[pose_frame] - stamps[pose_frame[0]],
         increment=increment,
@@ -99,8 +108,9 @@ def prepare_space(
         oriented=oriented,
         symmetries=symmetries,
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
-        mount_sigma=np.tile(_mount_sigma(settings), (len(recording.sensors), 1)),
-        scale_sigma=settings.scale_sigma if driven and by_corners else 0.0,
+        mount_sigma=_mount_sigma(recording.sensors, settings),
+        scale_sigma=scale[0] if driven else 0.0,
+        ranges_share=scale[1],
         path=_path(recording, stamps[pose_frame[0]]),
         settings=settings,
     )
@@ -139,6 +149,8 @@ def _symmetries(recording: SpatialRecording, place: IntArray, used: IntArray, ki
 
 def _too_little(recording: SpatialRecording, seen: int, fewest: int) -> DataError:
     hint = "check landmark ids, and that detections and odometry share one clock"
+    if (recording.detections.landmark_id == UNKNOWN).all():
+        hint = WITHOUT_IDS
     if np.isfinite(recording.detections.size_m).any():
         hint = "boxes without identities need `odometry`"
     return DataError(
@@ -321,7 +333,10 @@ def _covariance(recording: SpatialRecording, settings: SpaceConfig) -> FloatArra
     at = given.position_sensor_m
     range_m = np.maximum(np.linalg.norm(at, axis=1), settings.nearest_m)
     ray = at / range_m[:, None]
-    along, across = (settings.sigma_m + share * range_m for share in (settings.sigma_along, settings.sigma_across))
+    usual_noise = (settings.sigma_m, settings.sigma_along, settings.sigma_across)
+    of_kind = [usual_noise if sensor.kind is None else settings.kinds[sensor.kind][1:] for sensor in recording.sensors]
+    near_m, share_along, share_across = np.array(of_kind)[given.sensor].T
+    along, across = (near_m + share * range_m for share in (share_along, share_across))
     outer = ray[:, :, None] * ray[:, None, :]
     usual = (along**2)[:, None, None] * outer + (across**2)[:, None, None] * (np.eye(3) - outer)
     stated = np.array([np.nan if sensor.sigma_m is None else sensor.sigma_m for sensor in recording.sensors])
@@ -347,9 +362,39 @@ def _roots(covariance: FloatArray, at: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.swapaxes(np.linalg.cholesky(information), 1, 2) @ mirror)
 
 
-def _mount_sigma(settings: SpaceConfig) -> FloatArray:
-    """(7,) of a mount's twist, and of the delay."""
-    return np.array([settings.mount_sigma_m] * 3 + [settings.mount_sigma_rad] * 3 + [settings.delay_sigma_s])
+def _mount_sigma(sensors: Sequence[SpatialSensor], settings: SpaceConfig) -> FloatArray:
+    """(S, 7) of the twists of the mounts, by data sheet or as usual, and of the delays."""
+    rows = []
+    for sensor in sensors:
+        at = settings.mount_sigma_m if sensor.sigma_position_m is None else sensor.sigma_position_m
+        turn = settings.mount_sigma_rad if sensor.sigma_angle_rad is None else sensor.sigma_angle_rad
+        rows.append([at] * 3 + [turn] * 3 + [settings.delay_sigma_s])
+    return np.array(rows)
+
+
+def scale_between(sensors: Sequence[SpatialSensor], settings: SpaceConfig, unstated: float) -> tuple[float, float]:
+    """Return the standard deviation of the scale between odometry and ranges, and the ranges' share of its variance.
+
+    Args:
+        sensors: of which the most exact one counts.
+        settings: of kinds of sensors, and of the odometry.
+        unstated: where nothing is stated of any: of the odometry alone.
+    """
+    stated = [sensor for sensor in sensors if sensor.kind is not None or sensor.sigma_scale is not None]
+    odometer = sensors[0].sigma_odometer_scale
+    if not stated and odometer is None:
+        return unstated, 0.0
+    driven = settings.scale_sigma if odometer is None else odometer
+    ranges = min((_scale_sigma(sensor, settings) for sensor in stated), default=0.0)
+    both = float(np.hypot(ranges, driven))
+    return both, ranges**2 / both**2 if both > 0.0 else 0.0
+
+
+def _scale_sigma(sensor: SpatialSensor, settings: SpaceConfig) -> float:
+    """Of the ranges of a sensor of a stated kind, or with a data sheet."""
+    if sensor.sigma_scale is not None or sensor.kind is None:
+        return sensor.sigma_scale or 0.0
+    return settings.kinds[sensor.kind][0]
 
 
 def _path(recording: SpatialRecording, start_s: float) -> OdometryPath | None:

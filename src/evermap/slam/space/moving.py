@@ -19,7 +19,7 @@ from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
 from evermap.slam.space.drift import Gauge, gauge_of
 from evermap.slam.space.estimate import converged
-from evermap.slam.space.intake import SpatialIntake, prepare_space
+from evermap.slam.space.intake import SpatialIntake, prepare_space, scale_between
 from evermap.slam.space.result import concluded_in_space, numbered
 from evermap.slam.space.solve import SpatialSolved, solve_space
 from evermap.tracking.frame import DetectionTable, Poses, heading_of, in_world, with_empty_frames
@@ -127,7 +127,7 @@ class TrafficIntake:
 def take_in_traffic(recording: SpatialRecording, space: SpaceConfig, track: TrackConfig) -> TrafficIntake:
     """Return the static objects of a recording with systematic errors removed; arguments as of `run_in_traffic`."""
     recording, rows = _whole(recording)
-    driven = _driven(recording)
+    driven, space = _driven(recording), _by_sheet(recording, space)
     return _taken(recording, rows, driven, _settled(recording, driven, space, track), space)
 
 
@@ -138,7 +138,8 @@ def _taken(
     identity = _identity(recording, traffic.standing)
     standing_only = _standing_only(recording, driven, traffic, identity)
     intake = prepare_space(standing_only, space, fewest=0)
-    intake = replace(intake, problem=replace(intake.problem, steady=True))
+    # the scale between ranges and odometry was taken off
+    intake = replace(intake, problem=replace(intake.problem, steady=True, scale_sigma=0.0, ranges_share=0.0))
     used = np.flatnonzero(identity != UNKNOWN)
     return TrafficIntake(recording, rows, driven, traffic, _known(recording), used, standing_only, intake)
 
@@ -148,7 +149,19 @@ def rescaled(taken: TrafficIntake, factor: float, space: SpaceConfig) -> Traffic
     gauge = taken.traffic.gauge
     ranges, driven = factor * gauge.range_scale, factor * gauge.odometry_scale
     gauge = gauge._replace(stated=ranges, scale=1.0 / driven - 1.0)
-    return _taken(taken.recording, taken.rows, taken.driven, replace(taken.traffic, gauge=gauge), space)
+    return _taken(
+        taken.recording,
+        taken.rows,
+        taken.driven,
+        replace(taken.traffic, gauge=gauge),
+        _by_sheet(taken.recording, space),
+    )
+
+
+def _by_sheet(recording: SpatialRecording, space: SpaceConfig) -> SpaceConfig:
+    """Return the settings with the prior of the ranges' scale that kind and data sheet of the sensors state."""
+    sigma = max(scale_between(recording.sensors, space, space.traffic.sigma_scale)[0], 1e-6)
+    return space.model_copy(update={"traffic": space.traffic.model_copy(update={"sigma_scale": sigma})})
 
 
 def solve_in_traffic(taken: TrafficIntake, progress: Progress | None = None) -> SpatialSolved:

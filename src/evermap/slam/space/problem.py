@@ -107,6 +107,9 @@ class SpatialProblem:
         mount: (S, 7) nominal poses of the sensors on the robot.
         mount_sigma: (S, 7) standard deviations of its twist and of the delay of the stamps [s]; 0 where exact.
         scale_sigma: standard deviation of the logarithm of the odometry's scale; 0 where it is exact.
+        ranges_share: of what ranges and odometer show together, that is the ranges'; see `in_shared_metre`.
+        ranges_log: logarithm of ranges over true distances, that was taken off the measurements.
+        odometry_log: logarithm of the odometry's scale that was put on its increments.
         prior: on places.
         start_sigma: (6,) how firmly the first pose is held where it is.
         path: the odometry, in the time of the poses, from which delays are estimated; None without.
@@ -138,6 +141,9 @@ class SpatialProblem:
     prior: PlacePrior = field(default_factory=PlacePrior.none)
     steady: bool = False
     scale_sigma: float = 0.0
+    ranges_share: float = 0.0
+    ranges_log: float = 0.0
+    odometry_log: float = 0.0
     start_sigma: FloatArray = field(default_factory=lambda: np.full(6, 1e-4))
     path: OdometryPath | None = None
     settings: SpaceConfig = USUAL
@@ -209,6 +215,30 @@ class SpatialProblem:
             np.append(0, np.cumsum([len(kind.turns) for kind in kinds])), np.vstack([kind.turns for kind in kinds]),
             self.ray,
         )  # fmt: skip
+
+    def in_shared_metre(self, log_scale: float) -> SpatialProblem:
+        """Return the same with ranges and odometry each corrected by its share of the scale between them.
+
+        Args:
+            log_scale: logarithm of distances by the ranges over those by the odometry.
+        """
+        ranges, driven = self.ranges_share * log_scale, (1.0 - self.ranges_share) * log_scale
+        shorter, longer = np.exp([-ranges, driven]).tolist()
+        step = np.array([shorter] * 3 + [1.0] * 4)
+        path = (
+            None if self.path is None else self.path._replace(pose=self.path.pose * np.array([longer] * 3 + [1.0] * 4))
+        )
+        return replace(
+            self,
+            measured=self.measured * step,
+            other=self.other * step,
+            measured_root=self.measured_root / shorter,
+            half_m=self.half_m * shorter,
+            increment=self.increment * np.array([longer] * 3 + [1.0] * 4),
+            path=path,
+            ranges_log=ranges,
+            odometry_log=driven,
+        )
 
     def as_points(self) -> SpatialProblem:
         """Return the same with positions only, which has one optimum, near any start."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from evermap.geometry import se3
+from evermap.slam.calibration import OF_SCALE
 from evermap.slam.space.intake import SpatialIntake, most_of
 from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PIXEL, POSE, ROTATION, ROWS, TRANSLATION
 from evermap.slam.space.problem import SpatialProblem
@@ -34,6 +36,10 @@ from evermap.types import (
 
 MOUNT = "correction of the sensor's stated mount, in the sensor's axes, or seconds by which its stamps are late"
 SCALE = "true distances over those of the odometry, by the sizes of tags"
+DIVIDED = (
+    "true distances over those of the odometry, or ranges over true distances: only their product shows; divided by "
+    "`kind`, sigma_scale and sigma_odometer_scale of sensor.toml"
+)
 _LEVELS = {
     TRANSLATION: ("sigma_odometry_m", "m/sqrt(s)", "noise of the odometry's translation"),
     ROTATION: ("sigma_odometry_rad", "rad/sqrt(s)", "noise of the odometry's rotation"),
@@ -86,7 +92,7 @@ def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solve
         trajectory=Trajectory(
             told.stamp_s[found],
             optimum.estimate.pose[found],
-            optimum.smoother.covariance_of_poses(told.spread)[found],
+            _of_poses(told)[found],
             frame=frame,
             clock=recording.clock,
         ),
@@ -101,6 +107,15 @@ def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solve
         changes=_changes(told, identities, names),
         gone=Landmarks.in_space([], np.zeros((0, 3)), clock=recording.clock),
     )
+
+
+def _of_poses(told: _Told) -> FloatArray:
+    """Return (N, 6, 6) covariances of poses, with what is not known of the metre."""
+    optimum = told.solved.optimum
+    covariance = optimum.smoother.covariance_of_poses(told.spread).copy()
+    away = np.einsum("nji,nj->ni", se3.rotation_of(optimum.estimate.pose), optimum.estimate.pose[:, :3])
+    covariance[:, :3, :3] += _undivided(told) ** 2 * away[:, :, None] * away[:, None, :]
+    return covariance
 
 
 def numbered(name: str | int, number: int) -> str:
@@ -160,6 +175,7 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
             turn = se3.rotation_of(place[k])
             covariance[k] = turn @ own[:3, :3] @ turn.T
             turned[k] = own[3:, 3:]
+        covariance[k] += _undivided(told) ** 2 * np.outer(place[k, :3], place[k, :3])
     first, last = np.full(count, np.nan), np.full(count, np.nan)
     stamp_s = told.stamp_s[problem.pose_row]
     np.fmin.at(first, problem.place[used], stamp_s[used])
@@ -227,10 +243,40 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
                 name, spread = f"{sensor.name}_{part}", float(sigma[row, column])
                 found.append(ParameterEstimate(name, value, spread, 0.0, prior, unit, meaning=MOUNT))
     if problem.scale_sigma > 0.0:
-        scale = float(np.exp(told.solved.optimum.estimate.log_scale))
-        told_sigma, prior = scale * float(of_scale), problem.settings.scale_sigma  # before it was averaged
-        found.append(ParameterEstimate("odometry_scale", scale, told_sigma, 1.0, prior, "", meaning=SCALE))
+        found += _scales(told, float(of_scale))
     return tuple(found)
+
+
+def _undivided(told: _Told) -> float:
+    """Return the standard deviation of all lengths that remains where only ranges and odometer say what a metre is."""
+    problem, before = told.solved.optimum.smoother.problem, told.intake.problem.scale_sigma
+    share = 0.0 if len(problem.prior.place) else problem.ranges_share
+    return float(before * np.sqrt(share * (1.0 - share)))
+
+
+def _scales(told: _Told, sigma: float) -> list[ParameterEstimate]:
+    """Return the scales of odometry and ranges; `sigma` is of the logarithm of what they show together."""
+    optimum = told.solved.optimum
+    problem, share = optimum.smoother.problem, optimum.smoother.problem.ranges_share
+    before = told.intake.problem.scale_sigma  # it was averaged since
+    odometer, ranges = before * np.sqrt(1.0 - share), before * np.sqrt(share)
+    undivided = _undivided(told)
+    scale = float(np.exp(problem.odometry_log + optimum.estimate.log_scale))
+    if share == 0.0:
+        return [ParameterEstimate("odometry_scale", scale, scale * sigma, 1.0, odometer, "", meaning=SCALE)]
+    of_odometer = float(scale * np.hypot((1.0 - share) * sigma, undivided))
+    of_ranges = float(np.hypot(share * sigma, undivided))
+    reads = float(np.exp(problem.ranges_log))
+    evident = abs(np.log(scale * reads)) > 2.0 * sigma
+    more: dict[str, Any] = {
+        "meaning": DIVIDED, "alone": scale * reads, "decided_by": OF_SCALE, "evident": bool(evident),
+    }  # fmt: skip
+    return [
+        ParameterEstimate("odometry_scale", scale, of_odometer, 1.0, odometer, "", shown_with="range_scale", **more),
+        ParameterEstimate(
+            "range_scale", reads, reads * of_ranges, 1.0, ranges, "", shown_with="odometry_scale", **more
+        ),
+    ]
 
 
 def _innovations(told: _Told, identities: IntArray) -> Innovations:

@@ -89,6 +89,8 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     optimum = repaired(converged(problem, estimate, noise))
     if problem.scale_sigma > 0.0:
         optimum = _with_averaged_scale(optimum)
+        if problem.ranges_share > 0.0 and not len(problem.prior.place):
+            optimum = _in_shared_metre(optimum)
         problem = optimum.smoother.problem
     if problem.driven and len(problem.prior.place):
         optimum = unjumped(optimum)
@@ -121,6 +123,15 @@ def _with_averaged_scale(optimum: SpatialOptimum) -> SpatialOptimum:
     information = narrowed(1.0 / (1.0 + np.exp(-log_odds)), before, data, told)
     sober = replace(problem, scale_sigma=float(information**-0.5))
     return converged(sober, optimum.estimate, optimum.noise, heavy_rounds=0)
+
+
+def _in_shared_metre(optimum: SpatialOptimum) -> SpatialOptimum:
+    """Return the optimum with the scale between ranges and odometer divided by what is stated of both."""
+    estimate, whole = optimum.estimate, optimum.smoother.problem
+    problem = whole.in_shared_metre(estimate.log_scale)
+    shorter = np.array([np.exp(-problem.ranges_log)] * 3 + [1.0] * 4)
+    scaled = replace(estimate, pose=estimate.pose * shorter, place=estimate.place * shorter, log_scale=0.0)
+    return converged(problem, scaled, optimum.noise, heavy_rounds=0)
 
 
 def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[SpatialProblem, FloatArray]:
