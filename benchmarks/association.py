@@ -29,7 +29,8 @@ where some identities are wrong, and
 
     python -m benchmarks.association sessions
 
-enters sessions of one world after the other into a map, with identities and without. Since nothing says which of two
+enters sessions of one world after the other into a map: with identities, with those of half of the landmarks, and
+without. Since nothing says which of two
 equal landmarks moved, what is told is scored by places: one that a landmark left, or came to, within `NEAR_M` of the
 truth, one to one; a move is both. It is right if that happened since any earlier session, since a drive may see little
 of the site; and found at once if since the last.
@@ -312,7 +313,7 @@ def warehouse(n_places: int, *, p_gone: float = 0.05) -> Lived:
     return Lived(f"warehouse, {n_places:,} landmarks", [recording], at, (), living_map(config), pose)
 
 
-def lived_through(world: Lived, *, unknown_ids: bool) -> dict[str, float]:
+def lived_through(world: Lived, *, unknown_ids: bool | str) -> dict[str, float]:
     """Enter all sessions; returns how many were found, position error (each aligned) [m], changes by place,
     landmarks in the end and in truth, and CPU seconds."""
     config = load_config(None, [*world.overrides, f"slam.unknown_ids={str(unknown_ids).lower()}"])
@@ -454,10 +455,12 @@ def main(names: Sequence[str] = (), folder: Path = FOLDER) -> None:
     """
     if names and names[0] == "sessions":
         for world in worlds():
-            for unknown_ids in (False, True) if not names[1:] or world.name.startswith(tuple(names[1:])) else ():
-                row = lived_through(world, unknown_ids=unknown_ids)
+            half = replace(world, recordings=[partly_named(one, 0.5, "landmarks") for one in world.recordings])
+            ways = (("with", world, False), ("half", half, "empty"), ("without", world, True))
+            for name, lived, unknown_ids in ways if world.name.startswith(tuple(names[1:]) or "") else ():
+                row = lived_through(lived, unknown_ids=unknown_ids)
                 cells = [f"{value:.3f}" if value < 10.0 else f"{value:.0f}" for value in row.values()]
-                print(f"| {world.name} | {'without' if unknown_ids else 'with'} | {' | '.join(cells)} |", flush=True)
+                print(f"| {world.name} | {name} | {' | '.join(cells)} |", flush=True)
         return
     if names and names[0] == "exchanged":
         for world in (each for each in worlds() if each.name.startswith(tuple(names[1:]) or ("rooms", "building"))):
