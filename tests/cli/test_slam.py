@@ -217,9 +217,16 @@ def test_shortcuts_are_settings() -> None:
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (["--shift", "1:1.0"], "there is no map to shift"),
+        (["--shift", "1:1.0"], "'--shift': there is no prior map"),
         (["--prior-map", "truth", "--shift", "one:1.0"], "'one' is not a landmark id"),
         (["--prior-map", "truth", "--shift", "987654:1.0"], "no landmark 987654 in the prior map"),
+        (["--prior-sigma", "0.3"], "'--prior-sigma': there is no prior map (try: --prior-map truth"),
+        (["--init", "mine"], "'INPUT...': is for a run"),
+        (["--init-bag", "my.bag", "--3d"], "'INPUT...': is for a run"),
+        (["--together", "--prior-sigma", "0.3"], "'--prior-sigma': is for one robot at a time"),
+        (["--together", "--shift", "1:1.0"], "'--shift': is for one robot at a time"),
+        (["--together", "--prior", "never-leaves"], "'--prior': is for one robot at a time"),
+        (["--together", "--localize"], "'--localize': is for one robot at a time"),
         (["--method", "guess"], "field '--method': input should be 'nohyp'"),
     ],
 )

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.options import ConfigFile, Robot, Settings, Topics, configured, option
+from evermap.cli.options import ConfigFile, Robot, Settings, Topics, configured, option, refuse_given
 from evermap.cli.terminal import echo, print_table, say, warm_up, warn
 from evermap.errors import ConfigError
 from evermap.interrupts import kept, watched
@@ -90,6 +90,11 @@ def live(
         hint = "--map FILE, and send its recordings to the server"
         raise ConfigError("must be a local file: readings are stored next to it", field="map", hint=hint)
     connected = zenoh is not None or foxglove is not None
+    if replay is None:
+        refuse_given("is for a replay", "--replay INPUT", robot=robot, realtime=realtime or None)
+    elif map_file is None:
+        told = {"localize": localize or None, "json": as_json or None, "config": config, "set": settings}
+        refuse_given("needs a map", "--map FILE", sensor=sensor, topics=topics, **told)
     if map_file is None and (replay is None or not connected):
         raise ConfigError("a living map is needed", field="map", hint="--map FILE; or --replay INPUT --zenoh ENDPOINT")
     if replay is None and not connected:
@@ -99,7 +104,7 @@ def live(
     if map_file is not None and replay is None and sensor is None:
         raise ConfigError("the sensor is not described", field="sensor", hint="--sensor sensor.toml")
     recording = None if replay is None else _recording(replay, robot)
-    _check_needed(recording, sensor, topics)
+    _check_needed(recording, chosen, sensor, topics)
     mailbox = Mailbox() if replay is None else None
     wires = wires_of(zenoh, foxglove, mailbox)
     try:
@@ -120,10 +125,14 @@ def _recording(path: Path, robot: int | None) -> AnyRecording:
     return read_recording(path, robot=robot)
 
 
-def _check_needed(recording: AnyRecording | None, sensor: Path | None, topics: Path | None) -> None:
-    """Refuse files that would say what a recording in the plane says itself."""
+def _check_needed(recording: AnyRecording | None, config: Config, sensor: Path | None, topics: Path | None) -> None:
+    """Refuse a recording of ranges only, and files that would say what a recording in the plane says itself."""
+    from evermap.slam.cleaning import of_ranges_only
     from evermap.types import Recording
 
+    if isinstance(recording, Recording) and of_ranges_only(recording.detections, config.slam.cleaning):
+        problem = f"'{recording.name}' has ranges without bearings, which are located by what is seen later"
+        raise ConfigError(problem, field="replay", hint="evermap slam --map")
     for name, path in (("sensor", sensor), ("topics", topics)):
         if path is not None and isinstance(recording, Recording):
             problem = f"'{recording.name}' describes its topics and sensors itself"
