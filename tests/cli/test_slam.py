@@ -171,6 +171,7 @@ def test_shift_moves_landmarks_of_the_prior_map(
     template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the estimator is given, and that the words of what it found close the output."""
+    import evermap.cli.warmup  # which keeps the `run_slam` that it finds
     import evermap.pipeline
 
     survey = read_recording(template).true_landmarks
