@@ -174,6 +174,21 @@ def test_a_map_of_the_beacons_locates_the_robot() -> None:
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.06
 
 
+@pytest.mark.parametrize("seed", [2, 4, 5])
+def test_a_beacon_that_moved_is_told_by_a_map_of_the_beacons(seed: int) -> None:
+    recording, before = drive(seed, day=1, moved=True), drive(seed).true_landmarks
+    assert recording.truth is not None
+    assert before is not None
+    survey = Landmarks.at(before.landmark_id, before.position_m, sigma_m=0.02, frame="prior_map")
+    result = run_slam(recording, prior_map=survey)
+    [change] = result.changes
+    assert (change.kind, change.landmark_ids) == (ChangeKind.MOVED, (3,))
+    assert change.displacement_m[:2] == pytest.approx([3.0, -2.0], abs=0.12)
+    rows = np.searchsorted(recording.truth.stamp_s, result.trajectory.stamp_s - 1e-6)
+    off = result.trajectory.pose_world_robot[:, :2] - recording.truth.pose_world_robot[rows, :2]
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.06
+
+
 def test_what_ranges_do_not_locate_is_told_and_left_out() -> None:
     """From a straight line a beacon may be on either side."""
     whole = drive(1)
