@@ -155,7 +155,7 @@ def _part(column: str, name: str, arrays: dict[str, Any], values: dict[str, Any]
     value = values[column]
     if name == "clock":
         return Clock(value)
-    if name == "kind":
+    if name == "kind" and value is not None:
         return SensorKind(value)
     return tuple(value) if isinstance(value, list) else value
 
