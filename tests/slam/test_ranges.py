@@ -202,6 +202,14 @@ def test_what_ranges_do_not_locate_is_told_and_left_out() -> None:
     assert remarks[1] == "landmarks that their ranges do not locate not used: 0, 1, 2, 3, 4, 5, 6, 7"
     with pytest.raises(DataError, match="0 frames"):
         run_slam(recording)
+    some = found.detections.bearing_rad.copy()
+    some[recording.detections.landmark_id != 5] = np.nan  # what has a bearing is used without the ranges
+    given = replace(recording, detections=replace(recording.detections, bearing_rad=some))
+    found, remarks = with_bearings(given, Config().slam)
+    assert (found.detections.landmark_id[recording.detections.landmark_id == 5] == 5).all()
+    some[recording.detections.landmark_id == 5] = np.where(np.arange((~np.isnan(some)).sum()) % 9, 0.1, np.nan)
+    found, remarks = with_bearings(replace(given, detections=replace(given.detections, bearing_rad=some)), Config().slam)
+    assert remarks[1] == "landmarks that their ranges do not locate not used: 0, 1, 2, 3, 4, 6, 7"
 
 
 def test_bearings_that_are_there_are_kept() -> None:

@@ -94,7 +94,8 @@ def spikes(stamp_s: FloatArray, velocity: FloatArray, settings: CleaningConfig) 
 
 def of_ranges_only(detections: Detections, settings: CleaningConfig) -> bool:
     """Return whether the sensor measures no bearings; a few detections without one are damaged."""
-    return bool(np.isnan(detections.bearing_rad).sum() > settings.ranges_only * len(detections))
+    ranged = np.isfinite(detections.range_m)
+    return bool(np.isnan(detections.bearing_rad[ranged]).sum() > settings.ranges_only * ranged.sum())
 
 
 def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]) -> Detections:
