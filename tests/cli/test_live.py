@@ -69,7 +69,7 @@ def test_a_replay_enters_what_slam_enters_and_tells_poses_and_changes(tmp_path: 
         (["--replay", "{0}", "--map", "m.evermap", "--set", "reorder_s=-1"], "live.reorder_s"),
         (["--replay", "{0}"], "--map"),
         (["--replay", "{0}", "--zenoh", "tcp/localhost:7447", "--localize"], "'--localize': needs a map"),
-        (["--replay", "{0}", "--zenoh", "tcp/localhost:7447", "--set", "reorder_s=1"], "'set': needs a map"),
+        (["--replay", "{0}", "--zenoh", "tcp/localhost:7447", "--set", "reorder_s=1"], "'--set': needs a map"),
         (["--map", "m.evermap", "--foxglove", "0", "--robot", "1"], "'--robot': is for a replay"),
         (["--map", "m.evermap", "--foxglove", "0", "--realtime"], "'--realtime': is for a replay"),
         (["--map", "m.evermap"], "no robot (try: --zenoh tcp/localhost:7447"),

@@ -245,7 +245,9 @@ def test_a_kind_of_sensor_is_kept_and_one_of_a_newer_evermap_is_told(
 ) -> None:
     path = begun(tmp_path / "site.evermap", 0)
     sensed = replace(SESSIONS[1], sensor=replace(SESSIONS[1].sensor, kind=SensorKind.LASER))
-    assert unpack_recording(pack_recording(sensed)).sensor.kind is SensorKind.LASER
+    again = unpack_recording(pack_recording(sensed))
+    assert isinstance(again, em.Recording)
+    assert again.sensor.kind is SensorKind.LASER
     with open_store(path) as store:
         enter_session(store, sensed).commit(store)
     monkeypatch.setattr("evermap.maps.store.measured.SensorKind", StrEnum("SensorKind", ["UWB"]))

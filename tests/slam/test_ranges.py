@@ -208,7 +208,9 @@ def test_what_ranges_do_not_locate_is_told_and_left_out() -> None:
     found, remarks = with_bearings(given, Config().slam)
     assert (found.detections.landmark_id[recording.detections.landmark_id == 5] == 5).all()
     some[recording.detections.landmark_id == 5] = np.where(np.arange((~np.isnan(some)).sum()) % 9, 0.1, np.nan)
-    found, remarks = with_bearings(replace(given, detections=replace(given.detections, bearing_rad=some)), Config().slam)
+    found, remarks = with_bearings(
+        replace(given, detections=replace(given.detections, bearing_rad=some)), Config().slam
+    )
     assert remarks[1] == "landmarks that their ranges do not locate not used: 0, 1, 2, 3, 4, 6, 7"
 
 

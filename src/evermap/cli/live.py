@@ -90,19 +90,12 @@ def live(
         hint = "--map FILE, and send its recordings to the server"
         raise ConfigError("must be a local file: readings are stored next to it", field="map", hint=hint)
     connected = zenoh is not None or foxglove is not None
+    told = {"localize": localize or None, "as_json": as_json or None, "config": config, "settings": settings}
     if replay is None:
         refuse_given("is for a replay", "--replay INPUT", robot=robot, realtime=realtime or None)
     elif map_file is None:
-        told = {"localize": localize or None, "json": as_json or None, "config": config, "set": settings}
         refuse_given("needs a map", "--map FILE", sensor=sensor, topics=topics, **told)
-    if map_file is None and (replay is None or not connected):
-        raise ConfigError("a living map is needed", field="map", hint="--map FILE; or --replay INPUT --zenoh ENDPOINT")
-    if replay is None and not connected:
-        raise ConfigError(
-            "no robot", field="zenoh", hint="--zenoh tcp/localhost:7447, --foxglove 8765, or --replay INPUT"
-        )
-    if map_file is not None and replay is None and sensor is None:
-        raise ConfigError("the sensor is not described", field="sensor", hint="--sensor sensor.toml")
+    _check_source(map_file, replay, sensor, connected=connected)
     recording = None if replay is None else _recording(replay, robot)
     _check_needed(recording, chosen, sensor, topics)
     mailbox = Mailbox() if replay is None else None
@@ -117,6 +110,18 @@ def live(
     finally:
         for wire in wires:
             wire.close()
+
+
+def _check_source(map_file: str | None, replay: Path | None, sensor: Path | None, *, connected: bool) -> None:
+    """Refuse a drive without a map, readings, or a sensor."""
+    if map_file is None and (replay is None or not connected):
+        raise ConfigError("a living map is needed", field="map", hint="--map FILE; or --replay INPUT --zenoh ENDPOINT")
+    if replay is None and not connected:
+        raise ConfigError(
+            "no robot", field="zenoh", hint="--zenoh tcp/localhost:7447, --foxglove 8765, or --replay INPUT"
+        )
+    if map_file is not None and replay is None and sensor is None:
+        raise ConfigError("the sensor is not described", field="sensor", hint="--sensor sensor.toml")
 
 
 def _recording(path: Path, robot: int | None) -> AnyRecording:

@@ -200,25 +200,24 @@ def slam(
 ) -> None:
     """Estimate trajectory and landmarks of a recording and write the folder of the run."""
     if init is not None or init_bag is not None or in_space:
-        no_run = {"input": input, "out": out, "prior_map": prior_map, "map": map_file}
-        _write_what_is_to_edit(init, init_bag, in_space=in_space, no_run=no_run)
+        refuse_given("is for a run", "omit it, or --init and --init-bag", input=input, out=out, map_file=map_file)
+        _write_what_is_to_edit(init, init_bag, in_space=in_space)
         return
     given = {"sensor_model": sensor_model, "method": method, "unknown_ids": associated(unknown_ids, empty_ids)}
     chosen = configured(config, settings, given, within="slam", also=_SECTIONS, show=show_config)
+    of_prior_map = {"shift": shift, "prior_sigma": prior_sigma}
     set_here = [*(settings or []), *(f"slam.{name}=" for name, value in given.items() if value is not None)]
     paths = _recordings(input, one=offline_session is not None)
     if together:
-        single = {"realtime": realtime or None, "topics": topics, "offline_session": offline_session}
-        in_a_map = {"prior_sigma": prior_sigma, "shift": shift, "prior": prior, "localize": localize or None}
-        refuse_given("is for one robot at a time", "omit it or --together", map=map_file, prior_map=prior_map)
-        refuse_given("is for one robot at a time", "omit it or --together", robot=robot, **single, **in_a_map)
+        single = {"realtime": realtime or None, "topics": topics, "offline_session": offline_session, "robot": robot}
+        in_a_map = {"map_file": map_file, "prior": prior, "localize": localize or None, "prior_map": prior_map}
+        refuse_given("is for one robot at a time", "omit it or --together", **single, **in_a_map, **of_prior_map)
         _refuse_unread(set_here, chosen, in_map=False, in_space=False)
         _each_together(paths, out, chosen, {"as_json": as_json, "force": force, "inputs": [*paths, config]})
         return
-    of_prior_map = {"shift": shift, "prior_sigma": prior_sigma}
     if prior_map is None:
         refuse_given("there is no prior map", "--prior-map truth, or --prior-map FILE", **of_prior_map)
-    _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, prior=prior)
+    _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, prior=prior, inputs=paths)
     from evermap.io import parse_shift
 
     check = partial(_refuse_unread, set_here, chosen, in_map=map_file is not None)
@@ -228,13 +227,10 @@ def slam(
     inputs = [*paths, config, topics, None if prior_map == "truth" else prior_map, map_file]
     how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
     work = partial(_estimate, read=read, config=chosen, known=known, options=options, realtime=realtime, how=how)
-    if len(paths) == 1:
-        work(paths[0], out)
-    elif map_file is None:
-        hint = "--map FILE, --together for simultaneous recordings, or a single input"
-        raise ConfigError("several recordings need a map", field="input", hint=hint)
-    else:
+    if len(paths) > 1:
         _each(paths, out, work)
+    else:
+        work(paths[0], out)
 
 
 def _each(paths: Sequence[Path], out: Path | None, work: Callable[..., None]) -> None:
@@ -413,12 +409,16 @@ def _check_map_options(
     prior_map: str | None,
     method: str | None,
     prior: list[str] | None,
+    inputs: Sequence[Path],
 ) -> None:
     if prior and (map_file is None or localize):
         raise ConfigError("is for a session of a map", field="prior", hint="--map FILE, without --localize")
     if map_file is None:
         if localize:
             raise ConfigError("needs a map", field="localize", hint="--map FILE")
+        if len(inputs) > 1:
+            hint = "--map FILE, --together for simultaneous recordings, or a single input"
+            raise ConfigError("several recordings need a map", field="input", hint=hint)
         return
     if prior_map is not None and localize:
         raise ConfigError(
@@ -428,8 +428,6 @@ def _check_map_options(
         raise ConfigError(
             "a living map finds changes by itself", field="method", hint="--set living.search=gate, for example"
         )
-
-
 
 
 def _recordings(given: list[Path] | None, *, one: bool) -> list[Path]:
@@ -495,13 +493,10 @@ def _read(
     return recording
 
 
-def _write_what_is_to_edit(
-    folder: Path | None, bag: Path | None, *, in_space: bool, no_run: Mapping[str, object]
-) -> None:
-    """Write a template of a recording, or the settings of a bag; refuse options `no_run`, which are for runs."""
+def _write_what_is_to_edit(folder: Path | None, bag: Path | None, *, in_space: bool) -> None:
+    """Write a template of a recording, or the settings of a bag."""
     from evermap.io import write_template
 
-    refuse_given("is for a run", "omit it, or --init and --init-bag", **no_run)
     if folder is not None:
         refuse_given("is for a bag", "one of --init and --init-bag", init_bag=bag)
     if folder is None:
