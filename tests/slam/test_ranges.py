@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyarrow import parquet
 from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 from typer.testing import CliRunner
@@ -245,6 +246,22 @@ def test_tables_without_bearings(column: str, tmp_path: Path) -> None:
     printed = CliRunner().invoke(app, ["check", str(folder)])
     assert printed.exit_code == 0
     assert f"{len(recording.detections):,} detections without a bearing" in printed.stdout
+
+
+def test_ranges_are_converted_to_parquet_and_back(tmp_path: Path) -> None:
+    write_native(drive(1), tmp_path / "csv")
+    for given, to in (("csv", "parquet"), ("parquet", "csv")):
+        done = CliRunner().invoke(app, ["convert", str(tmp_path / given), str(tmp_path / f"as {to}"), "--format", to])
+        assert done.exit_code == 0, done.stderr
+        (tmp_path / f"as {to}").rename(tmp_path / to if to == "parquet" else tmp_path / "again")
+    for name in ("detections.csv", "odometry.csv", "frames.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "csv" / name).read_bytes()
+    table = parquet.read_table(tmp_path / "parquet" / "detections.parquet")
+    misspelt = ["bearng_rad" if name == "bearing_rad" else name for name in table.column_names]
+    parquet.write_table(table.rename_columns(misspelt), tmp_path / "parquet" / "detections.parquet")
+    refused = CliRunner().invoke(app, ["convert", str(tmp_path / "parquet"), str(tmp_path / "none")])
+    assert refused.exit_code == 2
+    assert "detections.parquet: field 'bearng_rad': unknown column (try: bearing_rad)" in refused.stderr
 
 
 def test_what_ranges_cannot_do_is_told() -> None:
