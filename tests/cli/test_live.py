@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,10 @@ def test_a_replay_enters_what_slam_enters_and_tells_poses_and_changes(tmp_path: 
         (["--replay", "{0}", "--map", "m.evermap", "--set", "live.reorder=1"], "live.reorder_s"),
         (["--replay", "{0}", "--map", "m.evermap", "--set", "reorder_s=-1"], "live.reorder_s"),
         (["--replay", "{0}"], "--map"),
+        (["--replay", "{0}", "--zenoh", "tcp/localhost:7447", "--localize"], "'--localize': needs a map"),
+        (["--replay", "{0}", "--zenoh", "tcp/localhost:7447", "--set", "reorder_s=1"], "'--set': needs a map"),
+        (["--map", "m.evermap", "--foxglove", "0", "--robot", "1"], "'--robot': is for a replay"),
+        (["--map", "m.evermap", "--foxglove", "0", "--realtime"], "'--realtime': is for a replay"),
         (["--map", "m.evermap"], "no robot (try: --zenoh tcp/localhost:7447"),
         (["--zenoh", "tcp/localhost:7447"], "a living map is needed"),
         (["--map", "m.evermap", "--zenoh", "tcp/localhost:7447"], "--sensor sensor.toml"),
@@ -94,6 +99,25 @@ def test_mistakes_are_one_line(
     assert result.stderr.count("\n") == 1
     assert told in result.stderr
     assert not Path("z.json5.live").exists()
+
+
+@pytest.mark.parametrize("others", [["--map", "m.evermap"], ["--zenoh", "tcp/localhost:7447"]])
+def test_ranges_without_bearings_are_refused(
+    others: list[str], sessions: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    recording = read_recording(sessions[0])
+    assert isinstance(recording, em.Recording)
+    unsaid = np.full(len(recording.detections), np.nan)
+    seen = replace(recording.detections, bearing_rad=unsaid, sigma_bearing_rad=unsaid)
+    write_native(replace(recording, detections=seen), tmp_path / "uwb")
+    result = run("live", "--replay", "uwb", *others)
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    assert "'--replay': " in result.stderr
+    assert "has ranges without bearings, which are located by what is seen later" in result.stderr
+    assert "(try: evermap slam --map)" in result.stderr
+    assert not Path("m.evermap").exists()
 
 
 def started(*arguments: str | Path) -> subprocess.Popen[str]:

@@ -171,6 +171,7 @@ def test_shift_moves_landmarks_of_the_prior_map(
     template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the estimator is given, and that the words of what it found close the output."""
+    import evermap.cli.warmup  # which keeps the `run_slam` that it finds
     import evermap.pipeline
 
     survey = read_recording(template).true_landmarks
@@ -217,9 +218,16 @@ def test_shortcuts_are_settings() -> None:
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (["--shift", "1:1.0"], "there is no map to shift"),
+        (["--shift", "1:1.0"], "'--shift': there is no prior map"),
         (["--prior-map", "truth", "--shift", "one:1.0"], "'one' is not a landmark id"),
         (["--prior-map", "truth", "--shift", "987654:1.0"], "no landmark 987654 in the prior map"),
+        (["--prior-sigma", "0.3"], "'--prior-sigma': there is no prior map (try: --prior-map truth"),
+        (["--init", "mine"], "'INPUT...': is for a run"),
+        (["--init-bag", "my.bag", "--3d"], "'INPUT...': is for a run"),
+        (["--together", "--prior-sigma", "0.3"], "'--prior-sigma': is for one robot at a time"),
+        (["--together", "--shift", "1:1.0"], "'--shift': is for one robot at a time"),
+        (["--together", "--prior", "never-leaves"], "'--prior': is for one robot at a time"),
+        (["--together", "--localize"], "'--localize': is for one robot at a time"),
         (["--method", "guess"], "field '--method': input should be 'nohyp'"),
     ],
 )

@@ -363,6 +363,7 @@ def test_more_readings_than_the_map_needs_are_thinned(tmp_path: Path, two_sessio
         (lambda live: live.odometry(1e12, 1.0), "not in milli- or nanoseconds"),
         (lambda live: live.odometry("soon", 1.0), "'soon' is not a number"),
         (lambda live: live.detections(1.0, [1], [float("nan")], [0.0]), "range_m': row 0: nan"),
+        (lambda live: live.detections(1.0, [1], [2.0], [float("nan")]), "bearing_rad': a range without a bearing"),
         (lambda live: live.detections(1.0, [1], [-1.0], [0.0]), "greater than zero"),
         (lambda live: live.detections(1.0, [1, 2], [1.0], [0.0, 0.0]), "1 values for 2 detections"),
         (lambda live: live.detections(1.0, [1.5], [1.0], [0.0]), "1.5 is not an identity"),

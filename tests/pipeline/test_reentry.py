@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import tempfile
+from dataclasses import replace
+from enum import StrEnum
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,11 +17,13 @@ from typer.testing import CliRunner
 import evermap as em
 from evermap.cli.main import app
 from evermap.config import Config, load_config
-from evermap.errors import DataError
+from evermap.errors import DataError, InputError
 from evermap.maps.living import LivingMap
 from evermap.maps.store import Provenance, RevisionKind, open_store, verify_store
+from evermap.maps.store.measured import RECORDING, pack_recording, unpack_recording
 from evermap.maps.store.sql import SqlStore
 from evermap.runs.sessions import UnbridgedError, begin_map, enter_session, reenter
+from evermap.types import SensorKind
 from evermap_studies.sim import BuildingConfig, simulate_building
 
 SESSIONS = simulate_building(BuildingConfig(days=4, patrol_s=35.0), 3).sessions
@@ -213,3 +217,39 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
         assert result.exit_code == 2
         assert result.stderr.count("\n") == 1, result.stderr
     assert path.read_bytes() == data
+
+
+FORMER = Path(__file__).parents[1] / "maps" / "data" / "kept_before_kinds.evermap"
+"""Two drives by the template, entered when recordings had neither data sheets of sensors nor looks of landmarks."""
+
+
+def test_recordings_that_an_older_evermap_kept_are_entered_again(tmp_path: Path) -> None:
+    path = tmp_path / "site.evermap"
+    path.write_bytes(FORMER.read_bytes())
+    with open_store(path) as store:
+        before = store.load()
+        kept = [unpack_recording(store.attached(one)) for one in store.attachments() if one.name == RECORDING]
+    assert len(kept) == 2
+    for recording in kept:
+        assert isinstance(recording, em.Recording)
+        assert (recording.sensor.kind, recording.sensor.sigma_scale) == (None, None)
+        assert recording.detections.feature_names == ()
+    assert (reenter(str(path), tmp_path / "again.evermap", adopt=True).sessions, before.n_cliques_ever) == (2, 6)
+    after = stored(path)
+    np.testing.assert_array_equal(after.landmarks().landmark_id, before.landmarks().landmark_id)
+    np.testing.assert_allclose(after.landmarks().position_m, before.landmarks().position_m, atol=0.01)
+
+
+def test_a_kind_of_sensor_is_kept_and_one_of_a_newer_evermap_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = begun(tmp_path / "site.evermap", 0)
+    sensed = replace(SESSIONS[1], sensor=replace(SESSIONS[1].sensor, kind=SensorKind.LASER))
+    again = unpack_recording(pack_recording(sensed))
+    assert isinstance(again, em.Recording)
+    assert again.sensor.kind is SensorKind.LASER
+    with open_store(path) as store:
+        enter_session(store, sensed).commit(store)
+    monkeypatch.setattr("evermap.maps.store.measured.SensorKind", StrEnum("SensorKind", ["UWB"]))
+    with pytest.raises(InputError, match=r"site\.evermap: revision 2: .*'laser' is not a valid.*a newer one\)"):
+        reenter(str(path), tmp_path / "again.evermap")

@@ -47,7 +47,8 @@ def check_valid(recording: Recording) -> None:
         assert before <= detections.frame[row] < len(frames)
         before = detections.frame[row]
         assert 0.0 < detections.range_m[row] <= 2.0 * recording.sensor.range_max_m
-        assert abs(detections.bearing_rad[row]) <= 2.0 * np.pi
+        bearing_rad = detections.bearing_rad[row]  # nan, where so many have none that the sensor may measure none
+        assert np.isnan(bearing_rad) or abs(bearing_rad) <= 2.0 * np.pi
         assert detections.landmark_id[row] >= -1
         assert -1 <= detections.class_id[row] < len(recording.class_names)
         for sigma in (detections.sigma_range_m[row], detections.sigma_bearing_rad[row]):
@@ -127,6 +128,19 @@ def test_whatever_goes_wrong_a_valid_recording_comes_back(faults: FaultConfig, s
     assert all("\n" not in warning for warning in cleaned.warnings)
     again = clean(cleaned)
     check_valid(again)
+
+
+def test_a_few_readings_without_a_bearing_are_damaged_and_many_are_ranges() -> None:
+    whole = patrol(20.0)
+    for share, left in ((10, 0), (4, len(whole.detections) // 4)):
+        bearing = whole.detections.bearing_rad.copy()
+        bearing[share - 1 :: share] = np.nan
+        cleaned = clean(with_rows(whole, "detections", bearing_rad=bearing))
+        assert np.isnan(cleaned.detections.bearing_rad).sum() == left
+        broken = whole.detections.range_m.copy()
+        broken[np.isnan(bearing)] = np.nan  # what has no range, either, says nothing of what the sensor measures
+        cleaned = clean(with_rows(whole, "detections", bearing_rad=bearing, range_m=broken))
+        assert not np.isnan(cleaned.detections.bearing_rad).any()
 
 
 def test_half_of_a_handful_of_ranges_beyond_reach_is_no_mistake_in_the_unit() -> None:

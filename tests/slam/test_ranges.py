@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyarrow import parquet
 from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 from typer.testing import CliRunner
@@ -174,6 +175,21 @@ def test_a_map_of_the_beacons_locates_the_robot() -> None:
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.06
 
 
+@pytest.mark.parametrize("seed", [2, 4, 5])
+def test_a_beacon_that_moved_is_told_by_a_map_of_the_beacons(seed: int) -> None:
+    recording, before = drive(seed, day=1, moved=True), drive(seed).true_landmarks
+    assert recording.truth is not None
+    assert before is not None
+    survey = Landmarks.at(before.landmark_id, before.position_m, sigma_m=0.02, frame="prior_map")
+    result = run_slam(recording, prior_map=survey)
+    [change] = result.changes
+    assert (change.kind, change.landmark_ids) == (ChangeKind.MOVED, (3,))
+    assert change.displacement_m[:2] == pytest.approx([3.0, -2.0], abs=0.12)
+    rows = np.searchsorted(recording.truth.stamp_s, result.trajectory.stamp_s - 1e-6)
+    off = result.trajectory.pose_world_robot[:, :2] - recording.truth.pose_world_robot[rows, :2]
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.06
+
+
 def test_what_ranges_do_not_locate_is_told_and_left_out() -> None:
     """From a straight line a beacon may be on either side."""
     whole = drive(1)
@@ -187,6 +203,16 @@ def test_what_ranges_do_not_locate_is_told_and_left_out() -> None:
     assert remarks[1] == "landmarks that their ranges do not locate not used: 0, 1, 2, 3, 4, 5, 6, 7"
     with pytest.raises(DataError, match="0 frames"):
         run_slam(recording)
+    some = found.detections.bearing_rad.copy()
+    some[recording.detections.landmark_id != 5] = np.nan  # what has a bearing is used without the ranges
+    given = replace(recording, detections=replace(recording.detections, bearing_rad=some))
+    found, remarks = with_bearings(given, Config().slam)
+    assert (found.detections.landmark_id[recording.detections.landmark_id == 5] == 5).all()
+    some[recording.detections.landmark_id == 5] = np.where(np.arange((~np.isnan(some)).sum()) % 9, 0.1, np.nan)
+    found, remarks = with_bearings(
+        replace(given, detections=replace(given.detections, bearing_rad=some)), Config().slam
+    )
+    assert remarks[1] == "landmarks that their ranges do not locate not used: 0, 1, 2, 3, 4, 6, 7"
 
 
 def test_bearings_that_are_there_are_kept() -> None:
@@ -220,6 +246,22 @@ def test_tables_without_bearings(column: str, tmp_path: Path) -> None:
     printed = CliRunner().invoke(app, ["check", str(folder)])
     assert printed.exit_code == 0
     assert f"{len(recording.detections):,} detections without a bearing" in printed.stdout
+
+
+def test_ranges_are_converted_to_parquet_and_back(tmp_path: Path) -> None:
+    write_native(drive(1), tmp_path / "csv")
+    for given, to in (("csv", "parquet"), ("parquet", "csv")):
+        done = CliRunner().invoke(app, ["convert", str(tmp_path / given), str(tmp_path / f"as {to}"), "--format", to])
+        assert done.exit_code == 0, done.stderr
+        (tmp_path / f"as {to}").rename(tmp_path / to if to == "parquet" else tmp_path / "again")
+    for name in ("detections.csv", "odometry.csv", "frames.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "csv" / name).read_bytes()
+    table = parquet.read_table(tmp_path / "parquet" / "detections.parquet")
+    misspelt = ["bearng_rad" if name == "bearing_rad" else name for name in table.column_names]
+    parquet.write_table(table.rename_columns(misspelt), tmp_path / "parquet" / "detections.parquet")
+    refused = CliRunner().invoke(app, ["convert", str(tmp_path / "parquet"), str(tmp_path / "none")])
+    assert refused.exit_code == 2
+    assert "detections.parquet: field 'bearng_rad': unknown column (try: bearing_rad)" in refused.stderr
 
 
 def test_what_ranges_cannot_do_is_told() -> None:

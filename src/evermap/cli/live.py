@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.options import ConfigFile, Robot, Settings, Topics, configured, option
+from evermap.cli.options import ConfigFile, Robot, Settings, Topics, configured, option, refuse_given
 from evermap.cli.terminal import echo, print_table, say, warm_up, warn
 from evermap.errors import ConfigError
 from evermap.interrupts import kept, watched
@@ -90,16 +90,14 @@ def live(
         hint = "--map FILE, and send its recordings to the server"
         raise ConfigError("must be a local file: readings are stored next to it", field="map", hint=hint)
     connected = zenoh is not None or foxglove is not None
-    if map_file is None and (replay is None or not connected):
-        raise ConfigError("a living map is needed", field="map", hint="--map FILE; or --replay INPUT --zenoh ENDPOINT")
-    if replay is None and not connected:
-        raise ConfigError(
-            "no robot", field="zenoh", hint="--zenoh tcp/localhost:7447, --foxglove 8765, or --replay INPUT"
-        )
-    if map_file is not None and replay is None and sensor is None:
-        raise ConfigError("the sensor is not described", field="sensor", hint="--sensor sensor.toml")
+    told = {"localize": localize or None, "as_json": as_json or None, "config": config, "settings": settings}
+    if replay is None:
+        refuse_given("is for a replay", "--replay INPUT", robot=robot, realtime=realtime or None)
+    elif map_file is None:
+        refuse_given("needs a map", "--map FILE", sensor=sensor, topics=topics, **told)
+    _check_source(map_file, replay, sensor, connected=connected)
     recording = None if replay is None else _recording(replay, robot)
-    _check_needed(recording, sensor, topics)
+    _check_needed(recording, chosen, sensor, topics)
     mailbox = Mailbox() if replay is None else None
     wires = wires_of(zenoh, foxglove, mailbox)
     try:
@@ -114,16 +112,32 @@ def live(
             wire.close()
 
 
+def _check_source(map_file: str | None, replay: Path | None, sensor: Path | None, *, connected: bool) -> None:
+    """Refuse a drive without a map, readings, or a sensor."""
+    if map_file is None and (replay is None or not connected):
+        raise ConfigError("a living map is needed", field="map", hint="--map FILE; or --replay INPUT --zenoh ENDPOINT")
+    if replay is None and not connected:
+        raise ConfigError(
+            "no robot", field="zenoh", hint="--zenoh tcp/localhost:7447, --foxglove 8765, or --replay INPUT"
+        )
+    if map_file is not None and replay is None and sensor is None:
+        raise ConfigError("the sensor is not described", field="sensor", hint="--sensor sensor.toml")
+
+
 def _recording(path: Path, robot: int | None) -> AnyRecording:
     from evermap.io import read_recording
 
     return read_recording(path, robot=robot)
 
 
-def _check_needed(recording: AnyRecording | None, sensor: Path | None, topics: Path | None) -> None:
-    """Refuse files that would say what a recording in the plane says itself."""
+def _check_needed(recording: AnyRecording | None, config: Config, sensor: Path | None, topics: Path | None) -> None:
+    """Refuse a recording of ranges only, and files that would say what a recording in the plane says itself."""
+    from evermap.slam.cleaning import of_ranges_only
     from evermap.types import Recording
 
+    if isinstance(recording, Recording) and of_ranges_only(recording.detections, config.slam.cleaning):
+        problem = f"'{recording.name}' has ranges without bearings, which are located by what is seen later"
+        raise ConfigError(problem, field="replay", hint="evermap slam --map")
     for name, path in (("sensor", sensor), ("topics", topics)):
         if path is not None and isinstance(recording, Recording):
             problem = f"'{recording.name}' describes its topics and sensors itself"

@@ -118,6 +118,13 @@ def configured(
     return config
 
 
+def refuse_given(problem: str, hint: str, **given: object) -> None:
+    """Refuse options that would be ignored: those that are neither None nor empty."""
+    for field, value in given.items():
+        if value is not None and value != []:
+            raise ConfigError(problem, field=field, hint=hint)
+
+
 def associated(unknown_ids: bool, empty_ids: bool) -> bool | str | None:
     """Return `slam.unknown_ids` as the two flags have it."""
     if unknown_ids and empty_ids:

@@ -27,6 +27,7 @@ from evermap.cli.options import (
     default_out,
     option,
     priors_by_class,
+    refuse_given,
 )
 from evermap.cli.terminal import command_line, echo, fail, print_json, print_table, progress_bar, say, warm_up, warn
 from evermap.errors import ConfigError, DataError, EvermapError
@@ -88,7 +89,8 @@ PriorMap = Annotated[
     str | None, option("Start from this landmark map, or from the recording's surveyed one.", metavar="FILE|truth")
 ]
 PriorSigma = Annotated[
-    float, option("Standard deviation of the surveyed map, or of a map without sigmas [m].", min=1e-6)
+    float | None,
+    option("Standard deviation of the surveyed map, or of a map without sigmas [m].", default="0.02", min=1e-6),
 ]
 LivingMapFile = Annotated[
     str | None,
@@ -181,7 +183,7 @@ def slam(
     unknown_ids: UnknownIds = False,
     empty_ids: EmptyIds = False,
     prior_map: PriorMap = None,
-    prior_sigma: PriorSigma = 0.02,
+    prior_sigma: PriorSigma = None,
     map_file: LivingMapFile = None,
     prior: MapPriors = None,
     localize: Localize = False,
@@ -198,35 +200,37 @@ def slam(
 ) -> None:
     """Estimate trajectory and landmarks of a recording and write the folder of the run."""
     if init is not None or init_bag is not None or in_space:
+        refuse_given("is for a run", "omit it, or --init and --init-bag", input=input, out=out, map_file=map_file)
         _write_what_is_to_edit(init, init_bag, in_space=in_space)
         return
     given = {"sensor_model": sensor_model, "method": method, "unknown_ids": associated(unknown_ids, empty_ids)}
     chosen = configured(config, settings, given, within="slam", also=_SECTIONS, show=show_config)
+    of_prior_map = {"shift": shift, "prior_sigma": prior_sigma}
     set_here = [*(settings or []), *(f"slam.{name}=" for name, value in given.items() if value is not None)]
     paths = _recordings(input, one=offline_session is not None)
     if together:
-        single = {"realtime": realtime or None, "topics": topics, "offline_session": offline_session}
-        _check_together(map_file=map_file, prior_map=prior_map, robot=robot, **single)
+        single = {"realtime": realtime or None, "topics": topics, "offline_session": offline_session, "robot": robot}
+        in_a_map = {"map_file": map_file, "prior": prior, "localize": localize or None, "prior_map": prior_map}
+        refuse_given("is for one robot at a time", "omit it or --together", **single, **in_a_map, **of_prior_map)
         _refuse_unread(set_here, chosen, in_map=False, in_space=False)
         _each_together(paths, out, chosen, {"as_json": as_json, "force": force, "inputs": [*paths, config]})
         return
-    _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, shift=shift, prior=prior)
+    if prior_map is None:
+        refuse_given("there is no prior map", "--prior-map truth, or --prior-map FILE", **of_prior_map)
+    _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, prior=prior, inputs=paths)
     from evermap.io import parse_shift
 
     check = partial(_refuse_unread, set_here, chosen, in_map=map_file is not None)
     read = partial(_read, robot=robot, topics=topics, session=offline_session, force=force, check=check)
-    known = partial(_known, prior_map, prior_sigma, [parse_shift(text) for text in shift or []])
+    known = partial(_known, prior_map, prior_sigma or 0.02, [parse_shift(text) for text in shift or []])
     options = None if map_file is None else MapOptions(map_file, prior or [], localize, realtime)
     inputs = [*paths, config, topics, None if prior_map == "truth" else prior_map, map_file]
     how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
     work = partial(_estimate, read=read, config=chosen, known=known, options=options, realtime=realtime, how=how)
-    if len(paths) == 1:
-        work(paths[0], out)
-    elif map_file is None:
-        hint = "--map FILE, --together for simultaneous recordings, or a single input"
-        raise ConfigError("several recordings need a map", field="input", hint=hint)
-    else:
+    if len(paths) > 1:
         _each(paths, out, work)
+    else:
+        work(paths[0], out)
 
 
 def _each(paths: Sequence[Path], out: Path | None, work: Callable[..., None]) -> None:
@@ -404,16 +408,17 @@ def _check_map_options(
     localize: bool,
     prior_map: str | None,
     method: str | None,
-    shift: list[str] | None,
     prior: list[str] | None,
+    inputs: Sequence[Path],
 ) -> None:
-    if shift and prior_map is None:
-        raise ConfigError("there is no map to shift", field="shift", hint="--prior-map truth, or --prior-map FILE")
     if prior and (map_file is None or localize):
         raise ConfigError("is for a session of a map", field="prior", hint="--map FILE, without --localize")
     if map_file is None:
         if localize:
             raise ConfigError("needs a map", field="localize", hint="--map FILE")
+        if len(inputs) > 1:
+            hint = "--map FILE, --together for simultaneous recordings, or a single input"
+            raise ConfigError("several recordings need a map", field="input", hint=hint)
         return
     if prior_map is not None and localize:
         raise ConfigError(
@@ -423,13 +428,6 @@ def _check_map_options(
         raise ConfigError(
             "a living map finds changes by itself", field="method", hint="--set living.search=gate, for example"
         )
-
-
-def _check_together(**given: object) -> None:
-    """Refuse options for a single robot."""
-    for field, value in given.items():
-        if value is not None:
-            raise ConfigError("is for one robot at a time", field=field, hint="omit it or --together")
 
 
 def _recordings(given: list[Path] | None, *, one: bool) -> list[Path]:
@@ -499,8 +497,10 @@ def _write_what_is_to_edit(folder: Path | None, bag: Path | None, *, in_space: b
     """Write a template of a recording, or the settings of a bag."""
     from evermap.io import write_template
 
+    if folder is not None:
+        refuse_given("is for a bag", "one of --init and --init-bag", init_bag=bag)
     if folder is None:
-        if bag is None:
+        if bag is None or in_space:
             raise ConfigError("is for a template", field="3d", hint="--init DIR --3d")
         _write_bag_settings(bag)
         return

@@ -262,6 +262,9 @@ class Inbox:
             if values is None and column > 2:
                 continue
             told = np.asarray(_column([] if values is None else values, len(names), quantity.name), dtype=np.float64)
+            if column == 2 and np.isnan(told).any():
+                problem = "a range without a bearing is located by what is seen later, which is not causal"
+                raise InputError(problem, field=quantity.name, hint="a recording: evermap slam --map")
             quantity.check_array(told, quantity.name)
             rows[:, column] = told
         return rows

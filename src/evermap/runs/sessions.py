@@ -352,7 +352,6 @@ def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, rec
         TwiceError: it is.
     """
     from evermap.maps.sessions.session import drive_of, same_drive
-    from evermap.maps.store.measured import unpack_recording
 
     for number, item in kept.items():
         if item.n_bytes == len(data) and store.attached(item) == data:
@@ -360,11 +359,27 @@ def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, rec
     alike = _of_the_same_time(store, kept, recording)
     mine = drive_of(recording) if alike else ()
     for number in alike:
-        other = unpack_recording(store.attached(kept[number]))
+        other = _kept_recording(store, kept[number], number)
         if type(other) is type(recording) and same_drive(mine, drive_of(other)):
             same = f"'{printable(other.name, 80)}' has the same frames and readings"
             problem = f"{recording.name}: its drive is in the map already, as revision {number}: {same}"
             raise _twice(store, number, problem, is_copy=True)
+
+
+def _kept_recording(store: MapStore, kept: Attachment, number: int) -> AnyRecording:
+    """Return the recording that a revision keeps.
+
+    Raises:
+        InputError: this evermap cannot read it.
+    """
+    from evermap.maps.store.content import DamagedError
+    from evermap.maps.store.measured import unpack_recording
+
+    try:
+        return unpack_recording(store.attached(kept))
+    except DamagedError as error:
+        hint = "the evermap that wrote it, or a newer one"
+        raise InputError(f"revision {number}: {error}", path=store.where, hint=hint) from None
 
 
 def _twice(store: MapStore, number: int, problem: str, *, is_copy: bool) -> TwiceError:
@@ -443,12 +458,12 @@ def _edited_again(store: MapStore, step: _Step, living: LivingMap) -> LivingMap:
 def _session_again(store: MapStore, step: _Step, living: LivingMap, config: Config | None = None) -> Session:
     """A session that a map has had before, with its own settings unless there are others."""
     from evermap.config import parse_config
-    from evermap.maps.store.measured import unpack_recording
     from evermap.pipeline import run_session
 
     assert step.recording is not None
-    recording = replace(unpack_recording(store.attached(step.recording)), robot=step.revision.provenance.robot)
-    problem = f"revision {step.revision.number} cannot be brought in again"
+    number, robot = step.revision.number, step.revision.provenance.robot
+    recording = replace(_kept_recording(store, step.recording, number), robot=robot)
+    problem = f"revision {number} cannot be brought in again"
     try:
         session = run_session(recording, living, config or parse_config(step.revision.provenance.config))
     except DataError as error:

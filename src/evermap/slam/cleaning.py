@@ -92,6 +92,12 @@ def spikes(stamp_s: FloatArray, velocity: FloatArray, settings: CleaningConfig) 
     )
 
 
+def of_ranges_only(detections: Detections, settings: CleaningConfig) -> bool:
+    """Return whether the sensor measures no bearings; a few detections without one are damaged."""
+    ranged = np.isfinite(detections.range_m)
+    return bool(np.isnan(detections.bearing_rad[ranged]).sum() > settings.ranges_only * ranged.sum())
+
+
 def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]) -> Detections:
     """Detections that a sensor can have made, of frames that exist."""
     detections, sensor = recording.detections, recording.sensor
@@ -107,9 +113,8 @@ def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]
         problem = f"{n_far} of {len(far)} ranges lie beyond {limit}"
         raise DataError(problem, field="range_m", hint="ranges and range_max_m in metres")
     real &= ~far
-    blind = np.isnan(detections.bearing_rad)
-    ranges_only = blind.sum() > settings.ranges_only * len(blind)  # a few without a bearing are damaged
-    real &= (np.abs(detections.bearing_rad) <= 2.0 * np.pi) | (blind & ranges_only)
+    blind = np.isnan(detections.bearing_rad) & of_ranges_only(detections, settings)
+    real &= (np.abs(detections.bearing_rad) <= 2.0 * np.pi) | blind
     real &= (detections.frame >= 0) & (detections.frame < len(recording.frames))
     _remark(remarks, "impossible readings dropped", int(np.sum(~real)))
     if not real.all():

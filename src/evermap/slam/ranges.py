@@ -85,7 +85,7 @@ def with_bearings(recording: Recording, settings: SlamConfig) -> tuple[Recording
         drift_m = settings.ranges.drift_share * abs(ranged.way_m[0] - fixes[nearest[0]].way_m)
         first_m = np.hypot(max(fixes[nearest[0]].sigma_m, settings.ranges.first_m), drift_m)
         sigma[rows[mine[0]]] = min(float(first_m / ranged.range_m[0]), ANY_BEARING_RAD)
-    lost = np.unique(seen.landmark_id[landmark_id != seen.landmark_id]).tolist()
+    lost = np.setdiff1d(seen.landmark_id, landmark_id).tolist()  # others have bearings, too
     remarks = [f"{int(blind.sum())} detections without a bearing: only their ranges are used"]
     if lost:
         called = ", ".join(recording.landmark_names.get(name, str(name)) for name in lost)

@@ -27,6 +27,7 @@ from evermap.types import (
     Odometry,
     Recording,
     Sensor,
+    SensorKind,
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
@@ -154,6 +155,8 @@ def _part(column: str, name: str, arrays: dict[str, Any], values: dict[str, Any]
     value = values[column]
     if name == "clock":
         return Clock(value)
+    if name == "kind" and value is not None:
+        return SensorKind(value)
     return tuple(value) if isinstance(value, list) else value
 
 

@@ -117,6 +117,8 @@ class Joint(Method):
                 problem, free, start = self._loosened
                 smoother = Smoother(free, noise, heavy=True, robust=self._robust)
                 estimate = smoother.optimum(start, iterations=10, tolerance=1e-4)
+                # what moved has turned the whole, too: linear evidence of ranges would not turn it back
+                estimate = self._where_most_agree(estimate)
         in_map = self._in_map(problem)
         given = self._given if in_map and self._given is not None else GivenMap.empty(self._count)
         base = self._base(problem)
