@@ -22,6 +22,7 @@ from typer.testing import CliRunner, Result
 pytest.importorskip("fastapi", reason="a server needs evermap[server]")
 
 from evermap.cli.main import app
+from evermap.cli.serve import listening_at
 from evermap.server.database import Database, Role
 from evermap.server.worker import Crew
 
@@ -111,6 +112,13 @@ def test_workers_are_replaced_and_end_with_their_server(tmp_path: Path, number: 
     if number is not signal.SIGKILL:
         assert process.returncode == 0
         assert told.endswith("evermap: the server has stopped\n")
+
+
+def test_small_answers_on_one_connection_wait_for_no_acknowledgement() -> None:
+    with listening_at("127.0.0.1", 0) as listening, socket.create_connection(listening.getsockname()):
+        accepted, _ = listening.accept()
+        with accepted:
+            assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == 1
 
 
 def test_what_dies_at_once_is_started_again_after_growing_pauses(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -96,7 +96,7 @@ def serve(
     from evermap.server.sites import SiteStores
     from evermap.server.worker import Crew
 
-    listener = _listener(host, port)
+    listener = listening_at(host, port)
     _print_first_token(database)
     os.environ[STORE_VARIABLE] = store  # of the workers: command lines, which all users see, show no password
     crew = Crew([sys.executable, "-m", "evermap", "work", "--under", str(os.getpid())], workers, warn)
@@ -141,15 +141,20 @@ def _tls(certificate: Path | None, key: Path | None) -> dict[str, str]:
     return {"ssl_certfile": str(certificate), "ssl_keyfile": str(key)}
 
 
-def _listener(host: str, port: int) -> socket.socket:
-    """Return a socket that listens.
+def listening_at(host: str, port: int) -> socket.socket:
+    """Return a socket that listens, and whose connections send small answers at once.
+
+    asyncio asks for that only of sockets that say that they are TCP, which this one does not: the second answer on a
+    connection would wait 40 ms for the other side to acknowledge the head of it.
 
     Raises:
         ConfigError: the port is in use, or the address is not of this machine.
     """
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        return socket.create_server((host, port), family=family)
+        listener = socket.create_server((host, port), family=family)
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return listener
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             problem, hint = f"port {port} of {host} is in use", f"--port {port + 1}, or end what listens there"
