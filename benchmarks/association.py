@@ -30,10 +30,9 @@ where some identities are wrong, and
     python -m benchmarks.association sessions
 
 enters sessions of one world after the other into a map: with identities, with those of half of the landmarks, and
-without. Since nothing says which of two
-equal landmarks moved, what is told is scored by places: one that a landmark left, or came to, within `NEAR_M` of the
-truth, one to one; a move is both. It is right if that happened since any earlier session, since a drive may see little
-of the site; and found at once if since the last.
+without. Since nothing says which of two equal landmarks moved, what is told is scored by places: one that a landmark
+left, or came to, within `NEAR_M` of the truth, one to one; a move is both. It is right if that happened since any
+earlier session, since a drive may see little of the site; and found at once if since the last.
 """
 
 from __future__ import annotations
@@ -454,10 +453,10 @@ def main(names: Sequence[str] = (), folder: Path = FOLDER) -> None:
     Recordings are read from `folder`.
     """
     if names and names[0] == "sessions":
-        for world in worlds():
+        for world in (each for each in worlds() if each.name.startswith(tuple(names[1:]) or "")):
             half = replace(world, recordings=[partly_named(one, 0.5, "landmarks") for one in world.recordings])
             ways = (("with", world, False), ("half", half, "empty"), ("without", world, True))
-            for name, lived, unknown_ids in ways if world.name.startswith(tuple(names[1:]) or "") else ():
+            for name, lived, unknown_ids in ways:
                 row = lived_through(lived, unknown_ids=unknown_ids)
                 cells = [f"{value:.3f}" if value < 10.0 else f"{value:.0f}" for value in row.values()]
                 print(f"| {world.name} | {name} | {' | '.join(cells)} |", flush=True)

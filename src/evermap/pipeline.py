@@ -188,6 +188,7 @@ def run_localization(
     from evermap.maps.sessions import believe, session, spatial
     from evermap.slam import check, intake
     from evermap.slam.localize_recording import localize
+    from evermap.slam.ranges import RANGE_ONLY
 
     config = config or Config()
     if config.slam.unknown_ids:
@@ -201,8 +202,7 @@ def run_localization(
         return run_slam(recording, config, prior_map=spatial.standing(living, p_site), progress=progress)
     recording = check.valid(recording, config.sensor)
     if np.isnan(recording.detections.bearing_rad).any():
-        problem = "a range without a bearing is located by what is seen later, which is not causal"
-        raise DataError(problem, field="bearing_rad", hint="enter the session, or use the map as `prior_map`")
+        raise DataError(RANGE_ONLY, field="bearing_rad", hint="enter the session, or use the map as `prior_map`")
     remarks = check.odd(recording, settings=config.slam.check)
     recording, living = session.admitted(recording, living)
     named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])

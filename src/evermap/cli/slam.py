@@ -55,6 +55,8 @@ _ROWS = (
     ("timing", "step_p99_ms", "99 % of the steps within", "{:.1f} ms"),
 )
 
+SURVEY_SIGMA_M = 0.02
+"""Standard deviation of the landmarks of a surveyed map, unless it is stated: a default."""
 _SECTIONS = ("living", "sensor", "output", "track")
 """Sections of the configuration that are read beside `slam`."""
 
@@ -90,7 +92,11 @@ PriorMap = Annotated[
 ]
 PriorSigma = Annotated[
     float | None,
-    option("Standard deviation of the surveyed map, or of a map without sigmas [m].", default="0.02", min=1e-6),
+    option(
+        "Standard deviation of the surveyed map, or of a map without sigmas [m].",
+        default=f"{SURVEY_SIGMA_M:g}",
+        min=1e-6,
+    ),
 ]
 LivingMapFile = Annotated[
     str | None,
@@ -222,7 +228,7 @@ def slam(
 
     check = partial(_refuse_unread, set_here, chosen, in_map=map_file is not None)
     read = partial(_read, robot=robot, topics=topics, session=offline_session, force=force, check=check)
-    known = partial(_known, prior_map, prior_sigma or 0.02, [parse_shift(text) for text in shift or []])
+    known = partial(_known, prior_map, prior_sigma or SURVEY_SIGMA_M, [parse_shift(text) for text in shift or []])
     options = None if map_file is None else MapOptions(map_file, prior or [], localize, realtime)
     inputs = [*paths, config, topics, None if prior_map == "truth" else prior_map, map_file]
     how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
@@ -478,8 +484,6 @@ def _read(
     `check` refuses settings that such a recording does not read.
     """
     from evermap.io import read_recording
-    from evermap.io.native_write import write_session
-    from evermap.slam.cleaning import clean
     from evermap.slam.space.moving import has_traffic
     from evermap.types import Recording
 
@@ -488,7 +492,10 @@ def _read(
     recording = read_recording(path, robot=robot, topics=topics)
     check(in_space=not isinstance(recording, Recording), boxes=has_traffic(recording))
     if session is not None:
-        write_session(clean(recording) if isinstance(recording, Recording) else recording, session)
+        from evermap.io.native_write import write_session
+        from evermap.maps.sessions.session import repaired
+
+        write_session(repaired(recording), session)
         say(f"wrote the session for a map to {session} ({session.stat().st_size / 1e3:.0f} kB)")
     return recording
 

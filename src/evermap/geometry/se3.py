@@ -83,6 +83,12 @@ def transform(pose: ArrayLike, point: ArrayLike) -> FloatArray:
     return pose[..., :3] + _turned(pose[..., 3:], np.asarray(point, dtype=np.float64))
 
 
+def scaled(pose: ArrayLike, factor: float) -> FloatArray:
+    """Return poses (..., 7) with all lengths times a factor."""
+    lengths: FloatArray = np.array([factor] * 3 + [1.0] * 4)
+    return np.asarray(np.asarray(pose, dtype=np.float64) * lengths)
+
+
 def rotation_of(pose: ArrayLike) -> FloatArray:
     """Return the rotation matrices (..., 3, 3) of poses (..., 7)."""
     quaternion = np.asarray(pose, dtype=np.float64)[..., None, 3:]

@@ -17,6 +17,7 @@ import numpy as np
 
 from evermap.config import Config
 from evermap.errors import InputError
+from evermap.slam.ranges import RANGE_ONLY
 from evermap.types import (
     UNKNOWN,
     Clock,
@@ -263,8 +264,7 @@ class Inbox:
                 continue
             told = np.asarray(_column([] if values is None else values, len(names), quantity.name), dtype=np.float64)
             if column == 2 and np.isnan(told).any():
-                problem = "a range without a bearing is located by what is seen later, which is not causal"
-                raise InputError(problem, field=quantity.name, hint="a recording: evermap slam --map")
+                raise InputError(RANGE_ONLY, field=quantity.name, hint="a recording: evermap slam --map")
             quantity.check_array(told, quantity.name)
             rows[:, column] = told
         return rows

@@ -351,16 +351,21 @@ def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, rec
     Raises:
         TwiceError: it is.
     """
-    from evermap.maps.sessions.session import drive_of, same_drive
+    from evermap.maps.sessions.session import drive_of, repaired, same_drive
 
     for number, item in kept.items():
         if item.n_bytes == len(data) and store.attached(item) == data:
             raise _twice(store, number, f"{recording.name}: is in the map already, as revision {number}", is_copy=False)
-    alike = _of_the_same_time(store, kept, recording)
-    mine = drive_of(recording) if alike else ()
+    near = _overlapping(store, kept, recording)
+    if not near:
+        return
+    fixed = repaired(recording)
+    ends = {_ends(recording), _ends(fixed)}
+    alike = [number for number, span in near.items() if span in ends]  # others cannot be of its drive
+    mine = drive_of(fixed) if alike else ()
     for number in alike:
         other = _kept_recording(store, kept[number], number)
-        if type(other) is type(recording) and same_drive(mine, drive_of(other)):
+        if type(other) is type(recording) and same_drive(mine, drive_of(repaired(other))):
             same = f"'{printable(other.name, 80)}' has the same frames and readings"
             problem = f"{recording.name}: its drive is in the map already, as revision {number}: {same}"
             raise _twice(store, number, problem, is_copy=True)
@@ -388,23 +393,19 @@ def _twice(store: MapStore, number: int, problem: str, *, is_copy: bool) -> Twic
     return twice
 
 
-def _of_the_same_time(store: MapStore, kept: Mapping[int, Attachment], recording: AnyRecording) -> list[int]:
-    """Revisions of sessions that begin and end with a recording; others cannot be of its drive."""
-    from evermap.maps.sessions.session import repaired
-
-    stamp_s = recording.frames.stamp_s
-    if not len(stamp_s):
-        return []
-    first_s, last_s = float(np.nanmin(stamp_s)), float(np.nanmax(stamp_s))
+def _overlapping(
+    store: MapStore, kept: Mapping[int, Attachment], recording: AnyRecording
+) -> dict[int, tuple[float, float]]:
+    """First and last stamp of the sessions that overlap a recording in time, by revision."""
+    first_s, last_s = _ends(recording)
     spans = {item.number: (item.provenance.stamp_from_s, item.provenance.stamp_to_s) for item in store.log()}
-    near = [number for number in kept if spans[number][0] <= last_s and spans[number][1] >= first_s]
-    if not near:
-        return []
-    repaired_s = repaired(recording).frames.stamp_s
-    ends = {(first_s, last_s)}
-    if len(repaired_s):
-        ends.add((float(repaired_s[0]), float(repaired_s[-1])))
-    return [number for number in near if spans[number] in ends]
+    return {number: spans[number] for number in kept if spans[number][0] <= last_s and spans[number][1] >= first_s}
+
+
+def _ends(recording: AnyRecording) -> tuple[float, float]:
+    """First and last stamp of a recording; nan without any."""
+    stamp_s = recording.frames.stamp_s
+    return (float(np.nanmin(stamp_s)), float(np.nanmax(stamp_s))) if len(stamp_s) else (np.nan, np.nan)
 
 
 def _recordings(store: MapStore, head: int) -> dict[int, Attachment]:

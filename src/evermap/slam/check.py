@@ -477,7 +477,6 @@ def screened(
         else:
             recording = valid(recording, config.sensor, prior_map)
         remarks = odd(recording, identities=settings.unknown_ids is not True, settings=settings.check)
-    if not isinstance(recording, SpatialRecording):
         recording, told = with_bearings(recording, settings)
         remarks = (*remarks, *told)
     if (

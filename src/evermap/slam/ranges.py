@@ -23,6 +23,9 @@ from evermap.slam.noise import START
 from evermap.slam.problem import Drive
 from evermap.types import ANY_BEARING_RAD, UNKNOWN, BoolArray, FloatArray, Recording
 
+RANGE_ONLY = "a range without a bearing is located by what is seen later, which is not causal"
+"""Why a robot cannot use it while it drives."""
+
 
 class Ranged(NamedTuple):
     """Ranges of one landmark in the order of time: where the sensor was (M, 2) by odometry alone, how far it had gone

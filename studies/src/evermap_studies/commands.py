@@ -45,7 +45,6 @@ __all__ = [
 MRCLAM = Path("../shared/data/mrclam")
 PRESENCE = Path("../shared/data/presence")
 GOLDEN = Path("../shared/golden")
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 Out = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<study>")]
 Data = Annotated[Path, typer.Option(help="Folder with the recordings.")]
@@ -111,10 +110,15 @@ def _benchmark(name: str) -> Any:
     """
     from evermap.cli.bench import load_benchmarks
 
-    for variable in THREADS:
-        os.environ.setdefault(variable, "1")
+    _limit_threads()
     load_benchmarks()
     return importlib.import_module(f"benchmarks.{name}")
+
+
+def _limit_threads() -> None:
+    """Limit libraries to one thread: they read it when they are loaded, which they are not yet."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
 
 
 def mrclam(
@@ -424,8 +428,7 @@ def _run(
     """
     from evermap.runs.folder import check_replaceable
 
-    for name in THREADS:
-        os.environ.setdefault(name, "1")  # read when the libraries are loaded, which they are not yet
+    _limit_threads()
     target = out or Path("evermap-out") / study
     check_replaceable(target, force=force, inputs=inputs or [])
     with progress_bar(study, speed=in_seconds) as progress:

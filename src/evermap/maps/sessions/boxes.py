@@ -99,7 +99,7 @@ def visited_in_traffic(
     solved, known = _by_itself(taken, progress, settings), MapBoxes.of(living, p_site, config)
     found = _placed(taken, solved, living, known) if len(living.places) else None
     if found is not None and found[1] != 1.0:
-        taken = rescaled(taken, found[1], config.slam.space)
+        taken = rescaled(taken, found[1])
         solved = _by_itself(taken, None, settings)
         found = _placed(taken, solved, living, known)
     if found is None:

@@ -166,10 +166,9 @@ def repaired(recording: AnyRecording) -> AnyRecording:
 
 
 def drive_of(recording: AnyRecording) -> tuple[FloatArray, FloatArray]:
-    """Return what all copies of a drive have in common: (F,) stamps of frames, and (M, K) sorted readings, each with
-    the stamp of its frame, repaired and in single precision, as in a session that was condensed.
+    """Return what all copies of a drive have in common once they are `repaired`: (F,) stamps of frames, and (M, K)
+    sorted readings, each with the stamp of its frame, in single precision, as in a session that was condensed.
     """
-    recording = repaired(recording)
     seen, stamp_s = recording.detections, recording.frames.stamp_s
     if isinstance(seen, Detections):
         read = np.column_stack([seen.range_m, seen.bearing_rad])

@@ -144,18 +144,13 @@ def _taken(
     return TrafficIntake(recording, rows, driven, traffic, _known(recording), used, standing_only, intake)
 
 
-def rescaled(taken: TrafficIntake, factor: float, space: SpaceConfig) -> TrafficIntake:
+def rescaled(taken: TrafficIntake, factor: float) -> TrafficIntake:
     """Return the same with all lengths scaled to a map: odometry and ranges alike."""
     gauge = taken.traffic.gauge
     ranges, driven = factor * gauge.range_scale, factor * gauge.odometry_scale
     gauge = gauge._replace(stated=ranges, scale=1.0 / driven - 1.0)
-    return _taken(
-        taken.recording,
-        taken.rows,
-        taken.driven,
-        replace(taken.traffic, gauge=gauge),
-        _by_sheet(taken.recording, space),
-    )
+    traffic, space = replace(taken.traffic, gauge=gauge), taken.intake.problem.settings
+    return _taken(taken.recording, taken.rows, taken.driven, traffic, space)
 
 
 def _by_sheet(recording: SpatialRecording, space: SpaceConfig) -> SpaceConfig:

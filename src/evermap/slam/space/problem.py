@@ -224,17 +224,14 @@ class SpatialProblem:
         """
         ranges, driven = self.ranges_share * log_scale, (1.0 - self.ranges_share) * log_scale
         shorter, longer = np.exp([-ranges, driven]).tolist()
-        step = np.array([shorter] * 3 + [1.0] * 4)
-        path = (
-            None if self.path is None else self.path._replace(pose=self.path.pose * np.array([longer] * 3 + [1.0] * 4))
-        )
+        path = None if self.path is None else self.path._replace(pose=se3.scaled(self.path.pose, longer))
         return replace(
             self,
-            measured=self.measured * step,
-            other=self.other * step,
+            measured=se3.scaled(self.measured, shorter),
+            other=se3.scaled(self.other, shorter),
             measured_root=self.measured_root / shorter,
             half_m=self.half_m * shorter,
-            increment=self.increment * np.array([longer] * 3 + [1.0] * 4),
+            increment=se3.scaled(self.increment, longer),
             path=path,
             ranges_log=ranges,
             odometry_log=driven,

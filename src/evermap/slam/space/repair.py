@@ -67,7 +67,7 @@ def bridged(optimum: SpatialOptimum) -> SpatialEstimate | None:
 def _bridged(problem: SpatialProblem, estimate: SpatialEstimate, first: int, end: int) -> SpatialEstimate:
     """The values with some poses by the odometry, from the pose before them to the one after them."""
     pose = estimate.pose.copy()
-    step = problem.increment * np.append(np.full(3, np.exp(estimate.log_scale)), np.ones(4))
+    step = se3.scaled(problem.increment, np.exp(estimate.log_scale))
     if first == 0:
         for k in range(end - 1, -1, -1):
             pose[k] = se3.compose(pose[k + 1], se3.inverse(step[k]))

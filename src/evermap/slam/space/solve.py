@@ -129,8 +129,8 @@ def _in_shared_metre(optimum: SpatialOptimum) -> SpatialOptimum:
     """Return the optimum with the scale between ranges and odometer divided by what is stated of both."""
     estimate, whole = optimum.estimate, optimum.smoother.problem
     problem = whole.in_shared_metre(estimate.log_scale)
-    shorter = np.array([np.exp(-problem.ranges_log)] * 3 + [1.0] * 4)
-    scaled = replace(estimate, pose=estimate.pose * shorter, place=estimate.place * shorter, log_scale=0.0)
+    pose, place = (se3.scaled(of, np.exp(-problem.ranges_log)) for of in (estimate.pose, estimate.place))
+    scaled = replace(estimate, pose=pose, place=place, log_scale=0.0)
     return converged(problem, scaled, optimum.noise, heavy_rounds=0)
 
 
