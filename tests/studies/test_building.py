@@ -77,6 +77,12 @@ def test_nothing_is_seen_through_a_shut_door(world: World) -> None:
             assert count[inside].sum() <= 2  # wrong identities
 
 
+def test_without_changes_all_stays_as_on_the_first_day(world: World) -> None:
+    still = made(3, 6, changes=False)
+    assert np.array_equal(still.thing, np.broadcast_to(world.thing[:1], world.thing.shape), equal_nan=True)
+    assert np.array_equal(still.door_open, world.door_open)
+
+
 @pytest.mark.slow
 def test_a_short_life(tmp_path: Path) -> None:
     content = study.reproduce(tmp_path / "out", Settings(worlds=1, days=2, methods=("evermap",)))

@@ -180,6 +180,28 @@ def test_landmarks_are_called_by_their_names_and_labels_do_not_overlap() -> None
     assert [text.get_text() for text in named.texts] == ["3", "7", "8", "throne"]
 
 
+def test_a_street_shows_boxes_as_large_as_they_are_and_a_mark_for_what_would_be_too_small() -> None:
+    at = np.array([[0.0, 0.0, 0.5], [30.0, 4.0, 0.5], [300.0, 0.0, 0.5]])
+    turned = [0.0, 0.0, np.sin(0.3), np.cos(0.3)]
+    street = Landmarks.in_space(
+        [1, 2, 3], at, rotation=np.array([turned, turned, turned]), class_id=np.array([0, 0, 1]),
+        class_names=("Car", "Pedestrian"),
+        size_m=np.array([[4.0, 2.0, 1.5], [4.0, 2.0, 1.5], [0.6, 0.6, 1.8]]),
+    )  # fmt: skip
+    street = dataclasses.replace(street, p_exists=np.array([1.0, 0.6, 1.0]))
+    figure = plot_living_map(MapView(street, np.zeros(3, dtype=np.bool_)), title="street")
+    (axes,) = figure.axes
+    (drawn,) = [c for c in axes.collections if isinstance(c, PolyCollection)]
+    corners = np.array([path.vertices[:4] for path in drawn.get_paths()])
+    np.testing.assert_allclose(corners.mean(axis=1), at[:, :2], atol=1e-9)
+    np.testing.assert_allclose(sorted(np.linalg.norm(np.diff(corners[0], axis=0), axis=1)), [2.0, 2.0, 4.0])
+    np.testing.assert_allclose(drawn.get_facecolor()[:, 3], 0.75 * street.p_exists)
+    marks = [c.get_offsets() for c in axes.collections if isinstance(c, PathCollection)]
+    np.testing.assert_allclose(np.concatenate(marks), at[2:, :2])
+    assert not any(isinstance(c, EllipseCollection) for c in axes.collections)
+    assert "box, filled by P(exists)" in legend_texts(figure)
+
+
 def test_a_map_without_landmarks_is_refused() -> None:
     with pytest.raises(InputError, match="no landmark"):
         plot_living_map(MapView(Landmarks.at([], np.zeros((0, 2))), np.zeros(0, dtype=bool)), title="site")

@@ -11,7 +11,16 @@ import numpy as np
 from evermap.errors import InputError, printable
 from evermap.types import BoolArray, Clock, FloatArray, IntArray, Landmarks, rows_of
 from evermap.viz.map_figure import GONE, LABELS_UP_TO, class_names_of, draw_ellipses, draw_gone, magnification
-from evermap.viz.panels import View, draw_shapes, height_over_width, lay_out, seen
+from evermap.viz.panels import (
+    View,
+    draw_footprints,
+    draw_shapes,
+    height_over_width,
+    lay_out,
+    mostly_boxes,
+    outlined,
+    seen,
+)
 from evermap.viz.style import (
     ALERT,
     ESTIMATE,
@@ -81,9 +90,11 @@ def plot_living_map(view: MapView, *, title: str) -> Figure:
     for part in (view.seen_from_m, *view.walls_m):
         if len(part):
             low[:2], high[:2] = np.minimum(low[:2], part.min(axis=0)), np.maximum(high[:2], part.max(axis=0))
+    if mostly_boxes(landmarks):
+        low, high = low[:2], high[:2]
     size = np.maximum(high - low, 1.0)
     margin = 0.05 * float(size.max())
-    with drawing(7.2, float(np.clip(6.4 * height_over_width(size), 2.4, 7.5)) + 1.3) as figure:
+    with drawing(7.2, float(np.clip(6.4 * height_over_width(size), 2.4, 7.5)) + 1.5) as figure:
         panels = lay_out(figure, low - margin, high + margin)
         (handles, *_) = [_draw_panel(axes, columns, view, float(size.max())) for axes, columns in panels]
         first = panels[0][0]
@@ -137,7 +148,7 @@ def _draw_landmarks(axes: Axes, columns: View, view: MapView, reach_m: float) ->
     for name in sorted(set(names)):
         look, label = looks[name], legend_name(name) or "class unknown"
         mine = np.array([other == name for other in names])
-        here = np.flatnonzero(mine & there)
+        here = np.flatnonzero(mine & there & ~outlined(view.landmarks, reach_m))
         alpha: Any = _FAINTEST + (1.0 - _FAINTEST) * (landmarks.p_exists[here] - _EXISTS) / (1.0 - _EXISTS)
         x, y = landmarks.position_m[here].T
         if len(here):
@@ -150,10 +161,13 @@ def _draw_landmarks(axes: Axes, columns: View, view: MapView, reach_m: float) ->
     if not there.all():
         hollow = _mark("o", "", mfc="none", mec=MUTED, alpha=0.6, ms=7, mew=1.1)
         handles.append((hollow, _mark("x", GONE, color=ALERT, ms=6, mew=1.1, alpha=0.8)))
-    draw_shapes(axes, rows_of(view.landmarks, there), columns, colours, reach_m)
-    factor = magnification(view.landmarks.covariance_m2[there], reach_m)
-    label = draw_ellipses(axes, landmarks.position_m[there], landmarks.covariance_m2[there], colours, factor)
-    handles.append(_mark("o", label, mfc="none", mec=MUTED, ms=7))
+    if mostly_boxes(view.landmarks):
+        handles.append(draw_footprints(axes, rows_of(view.landmarks, there), colours))
+    else:
+        draw_shapes(axes, rows_of(view.landmarks, there), columns, colours, reach_m)
+        factor = magnification(view.landmarks.covariance_m2[there], reach_m)
+        label = draw_ellipses(axes, landmarks.position_m[there], landmarks.covariance_m2[there], colours, factor)
+        handles.append(_mark("o", label, mfc="none", mec=MUTED, ms=7))
     if view.pinned.any():
         axes.plot(*landmarks.position_m[view.pinned].T, "o", mfc="none", mec=INK, ms=11, mew=1.0, zorder=5)
         handles.append(_mark("o", "pinned", mfc="none", mec=INK, ms=9))

@@ -17,13 +17,14 @@ from evermap.types import AnyRecording, BoolArray, ChangeKind, FloatArray, Landm
 from evermap.viz.change_words import near_alternatives, probability, what
 from evermap.viz.panels import (
     View,
-    boxes,
     corners_of,
+    draw_footprints,
     draw_shapes,
-    footprints,
     height_over_width,
     lay_out,
+    mostly_boxes,
     moved_map,
+    outlined,
     seen,
     with_breaks,
 )
@@ -78,8 +79,8 @@ class _Scene:
 
     @property
     def street(self) -> bool:
-        """Whether most landmarks are boxes: drawn by their outlines, from above alone."""
-        return 2 * int(np.count_nonzero(boxes(self.landmarks))) > len(self.landmarks)
+        """Whether it is drawn from above alone."""
+        return mostly_boxes(self.landmarks)
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
         """Return the corners of the required content; odometry and a larger survey may exceed it."""
@@ -201,14 +202,14 @@ def _draw_landmarks(axes: Axes, view: View, scene: _Scene, reach_m: float) -> No
     for name in sorted(set(names)):
         look, mine = looks[name], [k for k, other in enumerate(names) if other == name]
         label = legend_name(name) or ("mapped landmark" if set(names) == {""} else "class unknown")
-        at = np.where(scene.street, np.nan, landmarks.position_m[mine])
+        at = np.where(outlined(scene.landmarks, reach_m)[mine, None], np.nan, landmarks.position_m[mine])
         axes.plot(*at.T, look.marker, color=look.colour, ms=4.5, mec=PAPER, mew=0.4, label=label, zorder=6)
     _draw_ways(axes, view, scene, 0.02 * reach_m)
     if len(landmarks) == 0:
         return
     colours = np.array([looks[name].colour for name in names])
     if scene.street:
-        _draw_footprints(axes, scene.landmarks, colours)
+        axes.add_line(draw_footprints(axes, scene.landmarks, colours))
         return
     factor = magnification(scene.landmarks.covariance_m2, reach_m)
     draw_shapes(axes, scene.landmarks, view, colours, reach_m, _thin(scene.path_m))
@@ -227,19 +228,6 @@ def _draw_ways(axes: Axes, view: View, scene: _Scene, least_m: float) -> None:
         label = "seen moving, and where last" if k == 0 else None
         axes.plot(*way[:, view].T, color=looks[name].colour, lw=0.9, alpha=0.8, ls=(0, (3, 1)), label=label, zorder=4)
         axes.plot(*way[-1, view], looks[name].marker, mfc=PAPER, mec=looks[name].colour, ms=3.5, mew=0.9, zorder=5)
-
-
-def _draw_footprints(axes: Axes, landmarks: Landmarks, colours: Any) -> None:
-    """Draw boxes from above, the fuller the more probable it is that they are still there."""
-    from matplotlib.collections import PolyCollection
-    from matplotlib.colors import to_rgba
-    from matplotlib.lines import Line2D
-
-    rows = boxes(landmarks)
-    corners = list(footprints(landmarks, rows))
-    faces = [to_rgba(colour, 0.75 * p) for colour, p in zip(colours[rows], landmarks.p_exists[rows], strict=True)]
-    axes.add_collection(PolyCollection(corners, facecolors=faces, edgecolors=colours[rows], linewidths=0.6, zorder=5.5))
-    axes.add_line(Line2D([], [], ls="", marker="s", mfc="none", mec=MUTED, ms=6, label="box, filled by P(exists)"))
 
 
 def moving_paths(result: Any) -> list[tuple[int, FloatArray]]:

@@ -12,11 +12,13 @@ from evermap.geometry import se3
 from evermap.geometry.group import group_of
 from evermap.metrics.trajectory import rotate_covariance
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
+from evermap.viz.style import MUTED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
+    from matplotlib.lines import Line2D
 
 BLIND_S = 5.0
 """Minimum gap that is shown as a gap."""
@@ -25,6 +27,8 @@ View = list[int]
 """The two coordinates of a panel: to the right, and upwards."""
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _EDGES = np.array([[i, i | bit] for bit in (1, 2, 4) for i in range(8) if not i & bit])
+_TINY = 0.004
+"""Length of a box, as a share of the figure, up to which it is drawn as a mark."""
 _NORMAL = 0.04
 """Length of the line along a tag's normal, as a share of the figure."""
 
@@ -157,6 +161,16 @@ def boxes(landmarks: Landmarks) -> BoolArray:
     return np.asarray(np.isfinite(np.column_stack([landmarks.rotation, box_sizes(landmarks)])).all(axis=1))
 
 
+def mostly_boxes(landmarks: Landmarks) -> bool:
+    """Judge whether most landmarks are boxes: a street, drawn by outlines, from above alone."""
+    return 2 * int(np.count_nonzero(boxes(landmarks))) > len(landmarks)
+
+
+def outlined(landmarks: Landmarks, reach_m: float) -> BoolArray:
+    """Return (L,) which landmarks of a street are large enough in the picture to be told by their outlines."""
+    return np.asarray(mostly_boxes(landmarks) & (box_sizes(landmarks)[:, 0] > _TINY * reach_m))
+
+
 def box_sizes(landmarks: Landmarks) -> FloatArray:
     """Return the sizes (L, 3) of boxes, nan of all else."""
     return np.full((len(landmarks), 3), np.nan) if landmarks.size_m is None else landmarks.size_m
@@ -172,6 +186,19 @@ def footprints(landmarks: Landmarks, rows: BoolArray) -> FloatArray:
     """Return the corners (K, 4, 2) of the boxes in some rows from above, in order."""
     around = _CORNERS[[0, 2, 6, 4]] * box_sizes(landmarks)[rows][:, None]
     return se3.transform(landmark_poses(landmarks)[rows][:, None], around)[..., :2]
+
+
+def draw_footprints(axes: Axes, landmarks: Landmarks, colours: Any) -> Line2D:
+    """Draw boxes from above, the fuller the more probable it is that they exist; returns the mark of the legend."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_rgba
+    from matplotlib.lines import Line2D
+
+    rows = boxes(landmarks)
+    corners = list(footprints(landmarks, rows))
+    faces = [to_rgba(colour, 0.75 * p) for colour, p in zip(colours[rows], landmarks.p_exists[rows], strict=True)]
+    axes.add_collection(PolyCollection(corners, facecolors=faces, edgecolors=colours[rows], linewidths=0.6, zorder=5.5))
+    return Line2D([], [], ls="", marker="s", mfc="none", mec=MUTED, ms=6, label="box, filled by P(exists)")
 
 
 def landmark_poses(landmarks: Landmarks) -> FloatArray:

@@ -99,6 +99,8 @@ def write_scene(
     start_s = float(result.trajectory.stamp_s[0]) if len(result.trajectory) else 0.0
     _send_landmarks(stream, landmarks, start_s, recording.clock, scale)
     _send_changes(stream, result, pose_truth_map, recording.clock)
+    if result.followed is not None:
+        _send_moving(stream, result, pose_truth_map, recording.clock)
     _send_rays(stream, recording, result, pose_truth_map, landmarks)
     _send_numbers(stream, recording, result, evaluation)
     stream.flush()
@@ -301,6 +303,37 @@ def _send_changes(stream: Any, result: SlamResult, pose_truth_map: FloatArray, c
         stream.set_time(TIMELINE, **{_kind(clock): move.change.stamp_to_s})
         stream.log(f"world/changes/{number}", arrows)
     stream.reset_time()
+
+
+def _send_moving(stream: Any, result: SlamResult, pose_truth_map: FloatArray, clock: Clock) -> None:
+    """Boxes of what was followed, in the frames in which it moved; what stood from first to last is a landmark."""
+    import rerun as rr
+
+    tracks, p_static = result.followed.tracks, result.followed.p_static
+    stood = np.zeros(len(tracks), dtype=np.bool_) if p_static is None else p_static >= 0.5
+    confirmed = np.isin(tracks.track_id, result.followed.objects().track_id)
+    rows = np.flatnonzero(confirmed & ~tracks.static & ~stood & (tracks.p_exists >= 0.5))
+    rows = rows[np.argsort(tracks.stamp_s[rows], kind="stable")]
+    names = result.followed.table.class_names
+    looks, of = class_looks(names), tracks.class_p[rows].argmax(axis=1)
+    poses, size = se3.identity(len(rows)), np.full((len(rows), 3), 2.0 * RADIUS_M)
+    poses[:, :3] = tracks.position_m[rows]
+    if tracks.box.shape[1]:
+        size = tracks.box[rows, :3]
+        poses[:, 5:] = np.column_stack([np.sin(0.5 * tracks.box[rows, 3]), np.cos(0.5 * tracks.box[rows, 3])])
+    poses = se3.compose(pose_truth_map, poses)
+    stamps = result.followed.table.stamp_s
+    count = np.bincount(np.searchsorted(stamps, tracks.stamp_s[rows]), minlength=len(stamps))
+    columns = rr.Boxes3D.columns(
+        half_sizes=0.5 * size,
+        centers=poses[:, :3],
+        quaternions=poses[:, 3:],
+        colors=np.array([rgb(looks[names[kind]].colour) for kind in of], dtype=np.uint8).reshape(-1, 3),
+        labels=[f"{names[kind]} {one}" for kind, one in zip(of, tracks.track_id[rows].tolist(), strict=True)],
+    )
+    # a row for frames without any, too, or the last ones would stay
+    stream.send_columns("world/moving", [_time(stamps, clock)], columns.partition(lengths=count))
+    stream.log("world/moving", rr.Boxes3D.from_fields(show_labels=False), static=True)
 
 
 def _ellipses(points: Float32Array, covariance: FloatArray) -> Float32Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from evermap.geometry.rigid import rigid
 from evermap.pipeline import run_slam
 from evermap.slam.space.drift import bent, gauge_of
 from evermap.types import ChangeKind, FloatArray, Landmarks, SlamResult
+from evermap.viz.rerun_scene import write_scene
 
 BEND = np.radians(0.03)
 
@@ -37,9 +39,15 @@ def nearest(landmarks: Landmarks, place: FloatArray) -> FloatArray:
     return np.linalg.norm(place[:, None] - landmarks.position_m[None, :, :2], axis=2).min(axis=1)
 
 
-def test_what_stands_is_a_landmark_and_what_moves_is_followed() -> None:
+@pytest.fixture(scope="module")
+def usual() -> tuple[Street, SlamResult]:
+    """A street with odometry that does not err."""
     made = street(1)
-    result = run_slam(made.recording)
+    return made, run_slam(made.recording)
+
+
+def test_what_stands_is_a_landmark_and_what_moves_is_followed(usual: tuple[Street, SlamResult]) -> None:
+    made, result = usual
     assert errors(made, result)[1] < 0.05
     assert len(result.landmarks) == len(made.parked)
     assert nearest(result.landmarks, made.parked[:, :2]).max() < 0.3
@@ -57,6 +65,30 @@ def test_what_stands_is_a_landmark_and_what_moves_is_followed() -> None:
     used = result.innovations
     assert (made.of[used.detection] < len(made.parked)).all()
     assert np.mean(track[used.detection] == used.landmark_id) > 0.95
+
+
+def test_the_scene_shows_what_moves_frame_by_frame(usual: tuple[Street, SlamResult], tmp_path: Path) -> None:
+    reader = pytest.importorskip("rerun.chunk")
+    made, result = usual
+    path = write_scene(made.recording, result, tmp_path / "scene.rrd")
+    parts = [
+        part.to_record_batch() for part in reader.RrdReader(str(path)).stream()
+        if part.entity_path == "/world/moving" and not part.is_static
+    ]  # fmt: skip
+    centres, half = (
+        [np.array(boxes or []).reshape(-1, 3) for part in parts for boxes in part.column(f"Boxes3D:{name}").to_pylist()]
+        for name in ("centers", "half_sizes")
+    )
+    assert len(centres) == len(made.recording.frames)
+    off_m = np.concatenate(
+        [
+            np.nanmin(np.linalg.norm(boxes[:, None, :2] - made.way[None, :, frame, :2], axis=2), axis=1)
+            for frame, boxes in enumerate(centres)
+        ]
+    )
+    assert len(off_m) > 0.6 * np.isfinite(made.way[..., 0]).sum()
+    assert np.mean(off_m < 0.5) > 0.97  # a car that is out of view is predicted for a moment
+    np.testing.assert_allclose(np.median(np.concatenate(half), axis=0), 0.5 * np.array(SIZE_M), rtol=0.05)
 
 
 @pytest.mark.parametrize("seed", [2, 3])

@@ -10,7 +10,7 @@ import numpy as np
 from evermap.geometry import se3
 from evermap.maps.living import LivingMap
 from evermap.viz.style import ALERT, ESTIMATE, MUTED, house_style, new_figure, settle
-from evermap_studies.building.table import of_method, reliability
+from evermap_studies.building.table import UNCHANGED, of_method, reliability
 from evermap_studies.building.world import KINDS
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def draw_map(story: Story, living: LivingMap, run: Mapping[str, Any]) -> Figure:
 
 def draw_existence(content: Mapping[str, Any]) -> Figure:
     """Share of landmarks that stand where the map has them, by the probability that it gives, now and a day ahead."""
-    methods = list(dict.fromkeys(run["method"] for run in content["runs"]))
+    methods = list(dict.fromkeys(run["method"] for run in content["runs"] if run["method"] != UNCHANGED))
     first = {run["seed"] for run in of_method(content, methods[-1])}
     with house_style():
         figure = new_figure(7.2, 3.6)

@@ -2,7 +2,7 @@
 
 Six-day drives and one walk by hand a week. Scored are existence, reported changes, displacements, lifetimes and poses;
 the poses beside those of an oracle that knows the true map of each day, and all of it beside the papers' methods alone,
-which are the same engine with parts switched off.
+which are the same engine with parts switched off, and of evermap where nothing changes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange, Progress, SlamResult, SpatialRecording
 from evermap_studies.building.patrol import DAY_S, Patrol, patrolled
-from evermap_studies.building.table import as_markdown
+from evermap_studies.building.table import UNCHANGED, as_markdown
 from evermap_studies.building.world import FIXED, KINDS, World, made
 from evermap_studies.demo.methods import METHODS
 from evermap_studies.demo.truth import observed
@@ -31,7 +31,7 @@ __all__ = ["QUICK", "Settings", "as_markdown", "reproduce"]
 Row = dict[str, Any]
 SCHEMA_VERSION = "1"
 EXPERIMENT = "building"
-COMPARED = ("evermap", "rosen2016", "bateman2020", "nielsen2024")
+COMPARED = ("evermap", UNCHANGED, "rosen2016", "bateman2020", "nielsen2024")
 BY_HAND = 3
 """Day of the week on which the cameras are carried."""
 AGREE_M = 0.5
@@ -99,7 +99,7 @@ def reproduce(
     with RunFolder(out, force=force) as folder:
         stopwatch, runs, shown = Stopwatch(), [], None
         for number, (seed, method) in enumerate(todo):
-            story = story_of(seed, settings.days)
+            story = story_of(seed, settings.days, changes=method != UNCHANGED)
 
             def tell(day: float, done: int = number) -> None:
                 if progress is not None:
@@ -163,9 +163,9 @@ class Story:
 _FIXED_ROWS = [row for row, kind in enumerate(KINDS) if kind.name in FIXED]
 
 
-def story_of(seed: int, days: int) -> Story:
+def story_of(seed: int, days: int, *, changes: bool = True) -> Story:
     """Make a building and record it."""
-    world = made(seed, days)
+    world = made(seed, days, changes=changes)
     position_m = world.positions()
     place = {
         (name, tuple(at)): (name, day)
@@ -189,7 +189,8 @@ def live(story: Story, method: str, tell: Any = None) -> tuple[Row, LivingMap]:
     from evermap.config import Config, LivingConfig
     from evermap.pipeline import run_session, run_slam
 
-    switches = next(dict(m.switches) for m in METHODS if m.name == method)
+    engine = COMPARED[0] if method == UNCHANGED else method
+    switches = next(dict(m.switches) for m in METHODS if m.name == engine)
     config = Config(living=LivingConfig.model_validate(switches))
     living: LivingMap | None = None
     found: dict[str, list[Any]] = {key: [] for key in ("sessions", "told", "statements", "forecasts")}
@@ -205,7 +206,7 @@ def live(story: Story, method: str, tell: Any = None) -> tuple[Row, LivingMap]:
         }
         if session.found:
             row |= _pose_errors(session.slam, patrol.recording, pose)
-        if method == COMPARED[0]:
+        if engine == COMPARED[0]:
             truth = run_slam(patrol.recording, prior_map=patrol.recording.true_landmarks)
             row |= {
                 f"oracle_{key}": value for key, value in _pose_errors(truth, patrol.recording, se3.identity()).items()

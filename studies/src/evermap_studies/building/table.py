@@ -11,6 +11,8 @@ from evermap_studies.markdown import markdown_table, number
 
 Row = Mapping[str, Any]
 EDGES = np.linspace(0.0, 1.0, 11)
+UNCHANGED = "nothing changes"
+"""Name of a run of evermap in the same building, where all stays as it is on the first day."""
 FLOOR = 1e-4
 """Probabilities are taken to be this far from 0 and 1 at least in the log loss."""
 

@@ -134,8 +134,8 @@ def _about_up(angle_rad: FloatArray) -> Rotation:
     return Rotation.from_rotvec(angle_rad[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
-def made(seed: int, days: int) -> World:
-    """Make a world of `days` sessions, one a day."""
+def made(seed: int, days: int, *, changes: bool = True) -> World:
+    """Make a world of `days` sessions, one a day; without changes it stays as it is on the first."""
     random = np.random.default_rng([seed, 1])
     kind = np.repeat(np.arange(len(KINDS)), [k.count + k.later for k in KINDS])
     stamp_days = np.arange(days) + random.uniform(0.3, 0.7, days)
@@ -144,6 +144,8 @@ def made(seed: int, days: int) -> World:
     for kinds, spots in (((2,), _shelf_spots()), ((3, 4), _floor_spots())):
         rows = np.flatnonzero(np.isin(kind, kinds))
         thing[:, rows] = _lives(kind[rows], spots, stamp_days, random)
+    if not changes:
+        thing[:] = thing[0]
     of, local, facing = [], [], []
     for row, k in enumerate(kind.tolist()):
         for x, y, z, direction in KINDS[k].tags or ((0.0, 0.0, 0.5 * KINDS[k].size_m[2], 0.0),):
