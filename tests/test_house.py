@@ -22,7 +22,7 @@ def tree_of(name: str) -> ast.Module:
 
 
 MOST_MODULES = 297
-MOST_LINES = 80_118
+MOST_LINES = 80_173
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8

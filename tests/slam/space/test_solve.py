@@ -322,6 +322,20 @@ def test_directions_without_odometry_are_left_out():
         run_slam(recording)
 
 
+@pytest.mark.parametrize("late_s", [0.2, -0.2])
+def test_a_delay_is_as_uncertain_as_it_says_where_the_odometry_is_noisy(late_s):
+    off = []
+    for seed in (10, 12, 15):
+        recording = hall(seed, n_points=40, n_frames=300, drift=0.02)
+        late = replace(recording, frames=Frames(recording.frames.stamp_s + late_s))
+        found = run_slam(late, Config(slam={"space": {"delay_sigma_s": 0.3}}))
+        delay = next(each for each in found.parameters if each.name.endswith("delay_s"))
+        assert 0.01 < delay.sigma < 0.04
+        off.append((delay.value - late_s) / delay.sigma)
+    assert np.abs(off).max() < 2.5
+    assert np.abs(np.mean(off)) < 1.5
+
+
 @pytest.mark.parametrize("late_s", [0.15, -0.3])
 def test_stamps_that_are_late_are_found(late_s):
     """From the changes of speed of a drive around a hall, with points; and the path is that of the right stamps."""

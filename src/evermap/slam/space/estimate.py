@@ -167,7 +167,7 @@ def _likeness(angle: FloatArray, sigma: FloatArray) -> FloatArray:
 
 def first_places(problem: SpatialProblem, pose: FloatArray) -> SpatialEstimate:
     """Return places where the middle one of their detections puts them, along given poses (N, 7)."""
-    state = np.zeros((len(problem.mount), 7))
+    state = np.zeros((len(problem.mount), 6))
     place = se3.identity(len(problem.oriented))
     estimate = SpatialEstimate(pose, place, state)
     at = as_seen(problem, estimate, np.where(np.isfinite(problem.measured), problem.measured, se3.identity()))

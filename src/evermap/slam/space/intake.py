@@ -27,6 +27,8 @@ from evermap.types import (
 )
 from evermap.valid import WITHOUT_IDS
 
+MOST_DELAYED, LED_BY_S = 4.0, 0.3
+"""Standard deviations that a delay is at most, and seconds whose motion leads on beyond the ends of the odometry."""
 HARDLY = 1.0
 """Standard deviation with which it counts, as a share of the range: as good as nothing."""
 
@@ -109,9 +111,10 @@ def prepare_space(
         symmetries=symmetries,
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
         mount_sigma=_mount_sigma(recording.sensors, settings),
+        delay_s=np.zeros(len(recording.sensors)),
         scale_sigma=scale[0] if driven else 0.0,
         ranges_share=scale[1],
-        path=_path(recording, stamps[pose_frame[0]]),
+        path=_path(recording, stamps[pose_frame[0]], settings.delay_sigma_s),
         settings=settings,
     )
     return SpatialIntake(
@@ -363,12 +366,12 @@ def _roots(covariance: FloatArray, at: FloatArray) -> FloatArray:
 
 
 def _mount_sigma(sensors: Sequence[SpatialSensor], settings: SpaceConfig) -> FloatArray:
-    """(S, 7) of the twists of the mounts, by data sheet or as usual, and of the delays."""
+    """(S, 6) of the twists of the mounts, by data sheet or as usual."""
     rows = []
     for sensor in sensors:
         at = settings.mount_sigma_m if sensor.sigma_position_m is None else sensor.sigma_position_m
         turn = settings.mount_sigma_rad if sensor.sigma_angle_rad is None else sensor.sigma_angle_rad
-        rows.append([at] * 3 + [turn] * 3 + [settings.delay_sigma_s])
+        rows.append([at] * 3 + [turn] * 3)
     return np.array(rows)
 
 
@@ -397,11 +400,21 @@ def _scale_sigma(sensor: SpatialSensor, settings: SpaceConfig) -> float:
     return settings.kinds[sensor.kind][0]
 
 
-def _path(recording: SpatialRecording, start_s: float) -> OdometryPath | None:
+def _path(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -> OdometryPath | None:
+    """Return the odometry, led on at both ends as it went there, so that delays of all sizes are compared alike."""
     odometry = recording.odometry
     if odometry is None or len(odometry) < 2:
         return None
-    return OdometryPath(odometry.stamp_s - start_s, odometry.pose_world_robot)
+    stamp_s, pose = odometry.stamp_s - start_s, odometry.pose_world_robot
+    further_s = MOST_DELAYED * delay_sigma_s
+    for end, inside_s in ((0, stamp_s[0] + LED_BY_S), (-1, stamp_s[-1] - LED_BY_S)) if further_s > 0.0 else ():
+        near = se3.interpolate(stamp_s, pose, np.clip([inside_s], *stamp_s[[0, -1]]))[0]
+        ahead = further_s / LED_BY_S * se3.local(near, pose[end])
+        beyond = se3.retract(pose[end], ahead)
+        at = 0 if end == 0 else len(pose)
+        pose = np.insert(pose, at, beyond, axis=0)
+        stamp_s = np.insert(stamp_s, at, stamp_s[end] + (further_s if end else -further_s))
+    return OdometryPath(stamp_s, pose)
 
 
 def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -24,8 +24,8 @@ POINT, POSE, CORNERS = 0, 1, 2
 """What a detection gives: a position, a position and an orientation, or the corners of a tag in an image."""
 ROWS = np.array([3, 6, 8])
 """Residuals of each."""
-STATES = 7
-"""Numbers of a sensor's calibration: a twist of its mount, and seconds by which its stamps are late."""
+STATES = 6
+"""Numbers of a sensor's calibration: a twist of its mount."""
 ODOMETRY = 84
 """Numbers of an odometry factor: six rows by two poses, its scale and the right side."""
 TRANSLATION, ROTATION, ACROSS, ALONG, ORIENTATION, PIXEL = range(6)
@@ -152,7 +152,7 @@ def linearise_odometry(
 
 @kernel
 def linearise_sightings(
-    pose: FloatArray, place: FloatArray, mount: FloatArray, back: FloatArray, speed: FloatArray, level: FloatArray,
+    pose: FloatArray, place: FloatArray, mount: FloatArray, back: FloatArray, level: FloatArray,
     seen: SpatialSightings, heavy: bool, values: FloatArray, weight: FloatArray, residual: FloatArray,
 ) -> float:  # fmt: skip
     """Linearise the detections.
@@ -162,7 +162,6 @@ def linearise_sightings(
         place: (P, 7) places; of points the orientation is not looked at.
         mount: (S, 7) poses of the sensors on the robot.
         back: (S, N, 6) twist from each pose to that at which a detection was made, before its stamp.
-        speed: (S, N, 6) twist of the robot a second there.
         level: (6,) noise levels.
         seen: the detections.
         heavy: tails that never let go, while the estimate may be far off.
@@ -198,19 +197,15 @@ def linearise_sightings(
         cost += seen.share[m] * loss
         scale, at = math.sqrt(weight[m] * seen.share[m]), seen.first[m]
         for a in range(rows):
-            by_delay = 0.0
-            for b in range(6):
-                by_delay -= jx[a, b] * speed[s, i, b]
-                values[at + 6 + dim + b] = scale * jm[a, b]
             if late:
                 _before_moving(jx[a], moved)
             for b in range(6):
                 values[at + b] = scale * jx[a, b]
+                values[at + 6 + dim + b] = scale * jm[a, b]
             for b in range(dim):
                 values[at + 6 + b] = scale * jl[a, b]
-            values[at + 12 + dim] = scale * by_delay
-            values[at + 13 + dim] = -scale * e[a]
-            at += 14 + dim
+            values[at + 12 + dim] = -scale * e[a]
+            at += 13 + dim
     return cost
 
 

@@ -105,7 +105,8 @@ class SpatialProblem:
         oriented: (P,) places with an orientation; the others are points.
         symmetries: (P,) turns after which places look the same.
         mount: (S, 7) nominal poses of the sensors on the robot.
-        mount_sigma: (S, 7) standard deviations of its twist and of the delay of the stamps [s]; 0 where exact.
+        mount_sigma: (S, 6) standard deviations of their twists; 0 where exact.
+        delay_s: (S,) by which the stamps of the sensors are late.
         scale_sigma: standard deviation of the logarithm of the odometry's scale; 0 where it is exact.
         ranges_share: of what ranges and odometer show together, that is the ranges'; see `in_shared_metre`.
         ranges_log: logarithm of ranges over true distances, that was taken off the measurements.
@@ -138,6 +139,7 @@ class SpatialProblem:
     symmetries: Symmetries
     mount: FloatArray
     mount_sigma: FloatArray
+    delay_s: FloatArray
     prior: PlacePrior = field(default_factory=PlacePrior.none)
     steady: bool = False
     scale_sigma: float = 0.0
@@ -148,24 +150,16 @@ class SpatialProblem:
     path: OdometryPath | None = None
     settings: SpaceConfig = USUAL
 
-    def earlier(self, delay: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (S, N, 6) twists by the odometry from each pose to where the robot was a `delay` (S,) before, and
-        (S, N, 6) those a second there.
-
-        Zeros of sensors whose stamps are exact, and without odometry.
-        """
-        back, speed = np.zeros((2, len(delay), len(self.stamp_s), 6))
-        if self.path is None:
-            return back, speed
-        step_s = float(np.median(np.diff(self.path.stamp_s)))
-        for row in np.flatnonzero(self.mount_sigma[:, 6] > 0.0):
-            stamp_s = np.array([0.0, -step_s, 0.0, step_s])[:, None] + self.stamp_s
-            stamp_s[1:] -= delay[row]
-            stamp_s = np.clip(stamp_s, *self.path.stamp_s[[0, -1]])
-            now, before, then, after = (se3.interpolate(*self.path, each) for each in stamp_s)
-            back[row] = se3.local(now, then)
-            speed[row] = se3.local(before, after) / np.maximum(stamp_s[3] - stamp_s[1], 1e-6)[:, None]
-        return back, speed
+    def earlier(self) -> FloatArray:
+        """Return (S, N, 6) twists by the odometry from each pose to where the robot was a delay before."""
+        back = np.zeros((len(self.delay_s), len(self.stamp_s), 6))
+        for row in np.flatnonzero(self.delay_s):
+            assert self.path is not None
+            now_s, then_s = (
+                np.clip(self.stamp_s - delay_s, *self.path.stamp_s[[0, -1]]) for delay_s in (0.0, self.delay_s[row])
+            )
+            back[row] = se3.local(se3.interpolate(*self.path, now_s), se3.interpolate(*self.path, then_s))
+        return back
 
     @property
     def either(self) -> FloatArray:
@@ -205,7 +199,7 @@ class SpatialProblem:
         """Return the detections as the kernel reads them."""
         kinds = self.symmetries.kinds
         oriented = self.oriented[self.place].astype(np.int64)
-        width = 14 + np.where(oriented, 6, 3)
+        width = 13 + np.where(oriented, 6, 3)
         first = np.append(0, np.cumsum(ROWS[self.kind] * width))
         return SpatialSightings(
             self.pose_row, self.place, self.sensor, self.kind, oriented, self.measured, self.measured_root,
@@ -250,7 +244,7 @@ class SpatialEstimate:
     Attributes:
         pose: (N, 7) of the robot.
         place: (P, 7) of places; of points the orientation is the identity.
-        state: (S, 7) twist of each sensor's mount, and delay of its stamps [s].
+        state: (S, 6) twist of each sensor's mount.
         log_scale: logarithm of true distances over those of the odometry.
     """
 
@@ -261,15 +255,10 @@ class SpatialEstimate:
 
     def mount(self, problem: SpatialProblem) -> FloatArray:
         """Return (S, 7) the sensors' poses on the robot."""
-        return se3.retract(problem.mount, self.state[:, :6])
-
-    @property
-    def delay(self) -> FloatArray:
-        """(S,) seconds by which the sensors' stamps are late."""
-        return np.ascontiguousarray(self.state[:, 6])
+        return se3.retract(problem.mount, self.state)
 
     def seen_from(self, problem: SpatialProblem) -> tuple[FloatArray, FloatArray]:
         """Return (M, 7) the robot's pose when each detection was made, and (M, 6) the twist there from its stamp's."""
-        back = problem.earlier(self.delay)[0][problem.sensor, problem.pose_row]
+        back = problem.earlier()[problem.sensor, problem.pose_row]
         pose = self.pose[problem.pose_row]
         return se3.retract(pose, back) if back.any() else pose, back

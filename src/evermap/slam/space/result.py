@@ -232,9 +232,8 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
     ]
     border = told.solved.optimum.smoother.factorised(told.solved.optimum.now).border_covariance()
     *of_sensors, of_scale = np.sqrt(np.diag(border))
-    sigma = np.reshape(of_sensors, (-1, 7))
+    sigma = np.reshape(of_sensors, (-1, 6))
     parts = [*((f"mount_{axis}_m", "m") for axis in "xyz"), *((f"mount_r{axis}_rad", "rad") for axis in "xyz")]
-    parts += [("delay_s", "s")]
     for row, sensor in enumerate(told.recording.sensors):
         for column, (part, unit) in enumerate(parts):
             prior = float(problem.mount_sigma[row, column])
@@ -242,6 +241,10 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
                 value = float(told.solved.optimum.estimate.state[row, column])
                 name, spread = f"{sensor.name}_{part}", float(sigma[row, column])
                 found.append(ParameterEstimate(name, value, spread, 0.0, prior, unit, meaning=MOUNT))
+        if np.isfinite(told.solved.delay_sigma_s[row]):
+            value, spread = float(problem.delay_s[row]), float(told.solved.delay_sigma_s[row])
+            prior, name = problem.settings.delay_sigma_s, f"{sensor.name}_delay_s"
+            found.append(ParameterEstimate(name, value, spread, 0.0, prior, "s", meaning=MOUNT))
     if problem.scale_sigma > 0.0:
         found += _scales(told, float(of_scale))
     return tuple(found)

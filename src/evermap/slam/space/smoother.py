@@ -1,7 +1,6 @@
 """Batch smoothing in space: damped Gauss-Newton on the sparse normal equations, and the covariances there.
 
-The border of the elimination tree are the sensors' mounts and delays, which all detections share, and the scale of the
-odometry.
+The border of the elimination tree are the sensors' mounts, which all detections share, and the scale of the odometry.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class SpatialSmoother:
 
     def __init__(self, problem: SpatialProblem, around: FloatArray) -> None:
         self.problem = problem
-        self._seen = problem.sightings
+        self._seen, self._back = problem.sightings, problem.earlier()
         self._states = _information(np.append(problem.mount_sigma, problem.scale_sigma))
         self._start = np.array(around[0])
         self.system = self._structured(around)
@@ -114,7 +113,7 @@ class SpatialSmoother:
         )  # fmt: skip
         end = odometry + int(self._seen.first[-1])
         cost += linearise_sightings(
-            estimate.pose, estimate.place, estimate.mount(problem), *problem.earlier(estimate.delay), noise.levels,
+            estimate.pose, estimate.place, estimate.mount(problem), self._back, noise.levels,
             self._seen, heavy, values[odometry:end], weight, residual,
         )  # fmt: skip
         held = se3.local(self._start, estimate.pose[0])
@@ -169,7 +168,7 @@ class SpatialSmoother:
         for kind, rows_of_kind in enumerate(ROWS.tolist()):
             for dim in (3, 6):
                 some = np.flatnonzero((seen.kind == kind) & (seen.oriented == (dim == 6)))
-                width = 14 + dim
+                width = 13 + dim
                 at = odometry + seen.first[some][:, None] + np.arange(rows_of_kind * width)
                 rows = now.values[at].reshape(len(some), rows_of_kind, width)
                 place = begin[n + seen.place[some]][:, None] + np.arange(dim)

@@ -26,6 +26,8 @@ MOST_TRIED = 200
 GROSS_M = 1.0
 SPLITS = 2
 """Poses tried for a start, the scale of its loss [m], and times that landmarks are split."""
+STRIDE_S, FINE, DELAYS = 0.05, 4.0, 2
+"""Delays are tried so far apart at first, at last by no more than the square root of so many deviations; and rounds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +39,7 @@ class SpatialSolved:
         identity: (P,) rows of `SpatialIntake.landmark_id` that the places are of.
         number: (P,) which of the landmarks with that identity each is, from 1.
         from_map: what of the given map stands; None without a map.
+        delay_sigma_s: (S,) standard deviation of the delay of each sensor's stamps; nan where they are trusted.
         online_pose: (N, 7) poses as each frame had them.
         online_spread: (N, 2) roughly how far off these may be [m, rad].
         step_s: (N,) seconds that each frame took.
@@ -46,6 +49,7 @@ class SpatialSolved:
     identity: IntArray
     number: IntArray
     from_map: MapComparison | None
+    delay_sigma_s: FloatArray
     online_pose: FloatArray
     online_spread: FloatArray
     step_s: FloatArray
@@ -86,7 +90,9 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)
-    optimum = repaired(converged(problem, estimate, noise))
+    optimum, delay_sigma_s = _with_delays(converged(problem, estimate, noise))
+    optimum = repaired(optimum)
+    problem = optimum.smoother.problem
     if problem.scale_sigma > 0.0:
         optimum = _with_averaged_scale(optimum)
         if problem.ranges_share > 0.0 and not len(problem.prior.place):
@@ -107,7 +113,57 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     from_map = None
     if len(stated):
         optimum, from_map = compared(optimum, stated)
-    return SpatialSolved(optimum, identity, number, from_map, stepwise.pose, spread, step_s)
+    return SpatialSolved(optimum, identity, number, from_map, delay_sigma_s, stepwise.pose, spread, step_s)
+
+
+def _with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, FloatArray]:
+    """Return the optimum with the delays of the sensors' stamps, and their (S,) standard deviations."""
+    problem = optimum.smoother.problem
+    sigma_s = np.full(len(problem.mount), np.nan)
+    if problem.path is None or problem.settings.delay_sigma_s == 0.0:
+        return optimum, sigma_s
+    for row in [*range(len(sigma_s))] * DELAYS:
+        delay_s, sigma_s[row] = _delay_of(optimum, row)
+        problem = optimum.smoother.problem
+        late = np.where(np.arange(len(sigma_s)) == row, delay_s, problem.delay_s)
+        optimum = converged(replace(problem, delay_s=late), optimum.estimate, optimum.noise, heavy_rounds=0)
+    return optimum, sigma_s
+
+
+def _delay_of(optimum: SpatialOptimum, row: int) -> tuple[float, float]:
+    """Return the delay of a sensor's stamps and its standard deviation, by the parabola through the best of the delays
+    that were tried.
+
+    These differ by whole steps of the odometry. Half a step off it is interpolated, so less noisy, and fits better.
+    """
+    problem, estimate = optimum.smoother.problem, optimum.estimate
+    assert problem.path is not None
+    step_s, begun_s = float(np.median(np.diff(problem.path.stamp_s))), float(problem.delay_s[row])
+    stride, before, found = max(1, round(STRIDE_S / step_s)), problem.settings.delay_sigma_s, dict[int, float]()
+    eye = se3.retract(estimate.pose, problem.earlier()[row])
+
+    def cost(steps: int) -> float:
+        if steps not in found:
+            delay_s = problem.delay_s.copy()
+            delay_s[row] += steps * step_s
+            tried = replace(problem, delay_s=delay_s)
+            start = replace(estimate, pose=se3.retract(eye, -tried.earlier()[row]))
+            fit = SpatialSmoother(tried, start.pose).optimum(start, optimum.noise, heavy=True)[1].cost
+            found[steps] = fit + 0.5 * (delay_s[row] / before) ** 2
+        return found[steps]
+
+    best = 0
+    while True:
+        below, above = cost(best - stride), cost(best + stride)
+        if min(below, above) < cost(best):
+            best += stride if above < below else -stride
+            continue
+        information = max((below - 2.0 * cost(best) + above) / (stride * step_s) ** 2, before**-2)
+        if stride == 1 or information * (stride * step_s) ** 2 < FINE:
+            break
+        stride = max(1, stride // 2)
+    off_s = 0.5 * (below - above) / (information * stride * step_s)
+    return begun_s + best * step_s + off_s, float(information**-0.5)
 
 
 def _with_averaged_scale(optimum: SpatialOptimum) -> SpatialOptimum:
