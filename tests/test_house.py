@@ -84,7 +84,7 @@ OF_THE_CODE = frozenset(
     slam.space.problem.LEAST_WEIGHT slam.space.problem.NO_JUMP_LOG_ODDS slam.space.solve.GROSS_M
     slam.space.start.SLACK_M slam.space.start.SLACK_RAD slam.space.start.STILL_M slam.space.start.STILL_RAD
     slam.streaming.NEAR slam.streaming.NEAR_NOISE slam.streaming.NEAR_NOISE_GAIN slam.votes.FEWEST_PAIRS
-    slam.votes.LEAST_SHARE tracking.frame._NEAR_S tracking.grid.FAR tracking.rows.LEAST tracking.standing.STRIDE_S
+    slam.votes.LEAST_SHARE tracking.frame._NEAR_S tracking.grid.FAR tracking.life.LEAST tracking.standing.STRIDE_S
     """.split()  # noqa: SIM905
 )
 """Of these names, those that are tolerances, limits of an iteration, first values or the pace of messages."""

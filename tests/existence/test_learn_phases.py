@@ -13,10 +13,9 @@ from scipy.linalg import expm
 
 from evermap.errors import ConfigError, DataError
 from evermap.existence.learn_phases import AUTO, Limits, learn
-from evermap.existence.phase_em_kernels import Expectations, Forgetting, Generator, expect_feature, piece_integral
-from evermap.existence.phase_kernels import PhaseLooks
+from evermap.existence.phase_kernels import Expectations, PhaseChain, expect_feature, piece_integral
 from evermap.existence.phase_type import PhaseType
-from evermap.existence.protocol import Instants, Looks
+from evermap.existence.protocol import Instants, LookColumns, Looks
 from evermap.existence.rhythm import BIN_S, BINS, WEEK_S
 
 LEAVE_HZ, RETURN_HZ = 1 / 300.0, 1 / 120.0
@@ -91,8 +90,8 @@ def test_expectations_are_sums_over_all_paths(bins: int) -> None:
     there, gone, begin = rng.random(4), rng.random(4), rng.dirichlet(np.ones(n))
     integrals, smoothed, last = np.zeros_like(rates), np.empty(n), np.empty(n)
     evidence, bad = expect_feature(
-        Generator(rates, exits, present), 0.0, begin, PhaseLooks(look_s, there, gone), Forgetting(2600.0, np.inf),
-        Expectations(integrals, smoothed, last),
+        PhaseChain(rates, exits, rates, rates[0], present), 0.0, begin, LookColumns(look_s, there, gone),
+        (2600.0, np.inf), Expectations(integrals, smoothed, last),
     )  # fmt: skip
     assert bad == -1
 

@@ -210,8 +210,8 @@ def test_mixtures_keep_their_survival() -> None:
 def test_an_unknown_rate_is_a_mixture_of_a_few() -> None:
     prior = GeneralPurpose(1e-4, 1e-1)
     t = np.logspace(-1, 4.5, 50)
-    mixture = exponential_mixture_of(prior, 16)
-    found = Mixture(mixture.components, mixture.weights).log_survival(t)
+    rates, weights = exponential_mixture_of(prior, 16)
+    found = Mixture.of([Exponential(rate) for rate in rates], weights).log_survival(t)
     np.testing.assert_allclose(np.exp(found), np.exp(prior.log_survival(t)), atol=1e-6)
     with pytest.raises(ConfigError, match="not a mixture of exponentials"):
         exponential_mixture_of(Weibull(10.0, 2.0))

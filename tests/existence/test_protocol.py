@@ -148,7 +148,7 @@ def test_the_evidence_is_the_product_of_the_predictions(name: str, seen: Looks) 
     """Two parts of a sequence are the whole: each look is judged by the belief of those before it."""
     model, total = MODELS[name], 0.0
     columns = (seen.stamp_s, seen.detected, seen.p_miss, seen.p_false)
-    there, gone = seen.likelihoods()
+    _, there, gone = seen.columns()
     for k in range(len(seen.stamp_s)):
         past = Looks(np.array([0, k]), *(column[:k] for column in columns))
         if k == 0 and name == "one stay":

@@ -37,12 +37,6 @@ def test_the_kernels_count_as_this_module_does() -> None:
     assert _week_bin(stamp[0], 1) == 0
 
 
-def test_the_factor_at_an_instant() -> None:
-    rhythm = Rhythm(np.linspace(-1.0, 1.0, BINS))
-    assert rhythm.at(4 * 86400.0) == pytest.approx(np.exp(-1.0))
-    np.testing.assert_allclose(rhythm.at(4 * 86400.0 + BIN_S * np.arange(BINS)), np.exp(rhythm.log_factor))
-
-
 def test_it_is_kept_as_plain_numbers() -> None:
     rhythm = Rhythm(np.sin(np.arange(BINS)))
     np.testing.assert_allclose(Rhythm.from_dict(rhythm.to_dict()).log_factor, rhythm.log_factor, atol=5e-6)

@@ -14,10 +14,10 @@ import pytest
 
 from evermap.errors import ConfigError, DataError, InputError, NumericalError
 from evermap.existence.lifetimes import edges
-from evermap.existence.protocol import Instants, Looks, PresenceModel
+from evermap.existence.protocol import Instants, LookColumns, Looks, PresenceModel
 from evermap.existence.rhythm import BINS, DayShares, Rhythm, bin_of_week
 from evermap.existence.run_length import RunLength, RunLengthBelief
-from evermap.existence.run_length_smoothing import Lattice, lattice
+from evermap.existence.run_length_smoothing import lattice
 from evermap.survival import Exponential, LifetimePrior, LogNormal, PiecewiseConstantHazard, Uniform, never_leaves
 from evermap.types import FloatArray
 
@@ -48,7 +48,7 @@ class Summed:
 
 
 def summed(
-    model: RunLength, grid: Lattice, begin: Any = BEGIN, period: Any = None, level: FloatArray | None = None
+    model: RunLength, grid: LookColumns, begin: Any = BEGIN, period: Any = None, level: FloatArray | None = None
 ) -> Summed:
     """Go through every pattern of changes."""
     steps = len(grid.stamp_s) - 1
@@ -60,7 +60,7 @@ def summed(
     level = np.ones((2, period.max() + 1)) if level is None else level
 
     def look(k: int) -> FloatArray:
-        return np.asarray(np.where(state == 1, grid.present[k], grid.absent[k]))
+        return np.asarray(np.where(state == 1, grid.there[k], grid.gone[k]))
 
     def presence(mass: FloatArray, where: Any) -> float:
         return float(mass[where == 1].sum() / mass.sum())
@@ -293,7 +293,7 @@ def test_a_long_recording_is_smoothed_as_a_hidden_markov_chain(name: str) -> Non
     factors = [np.ones(n - 1) if one is None else one.at(middle) for one in (model.absence_rhythm, model.stay_rhythm)]
     x = np.stack([0.04 * factors[0] * gap, 0.06 * factors[1] * gap], axis=1)
     stays_so, ends = np.exp(-x), -np.expm1(-x)
-    likelihood = np.stack([grid.absent, grid.present], axis=1)
+    likelihood = np.stack([grid.gone, grid.there], axis=1)
     mass = model.first.weight.sum(axis=(1, 3))[0 if name == "no rhythm" else bin_of_week(grid.stamp_s[0])]
     forward, scale = np.empty((n, 2)), np.empty(n)
     for k in range(n):
@@ -430,8 +430,8 @@ def test_a_forecast_over_midnight_is_the_sum_over_all_kinds_of_days(ahead_s: flo
     asked = nothing.stamp_s[-1:]
     grid = lattice(looks, STEP_S)
     steps = lattice(nothing, STEP_S)
-    whole = Lattice(steps.stamp_s, np.ones(len(steps.stamp_s)), np.ones(len(steps.stamp_s)))
-    for column, values in ((whole.absent, grid.absent), (whole.present, grid.present)):
+    whole = LookColumns(steps.stamp_s, np.ones(len(steps.stamp_s)), np.ones(len(steps.stamp_s)))
+    for column, values in ((whole.gone, grid.gone), (whole.there, grid.there)):
         column[np.searchsorted(whole.stamp_s, grid.stamp_s)] = values
     rows = [(share_of(k), summed(on_days_of(k), whole)) for k in np.ndindex(4, 4)]  # type: ignore[arg-type]
     mass = np.array([share * np.exp(one.log_evidence) for share, one in rows])
@@ -443,11 +443,11 @@ def test_a_forecast_over_midnight_is_the_sum_over_all_kinds_of_days(ahead_s: flo
 
 
 def test_each_day_is_told_by_its_own_looks() -> None:
-    from evermap.existence.run_length_kernels import LookColumns, kinds_of_days
+    from evermap.existence.run_length_kernels import kinds_of_days
 
     looks = looks_at(stamps(1), 1)
     grid, model = lattice(looks, STEP_S), beginning(UNUSUAL)
-    sunday, monday = kinds_of_days(LookColumns(*grid), model.slots, model.law, model.first)
+    sunday, monday = kinds_of_days(grid, model.slots, model.law, model.first)
     mass = np.array(
         [[share_of((j, k)) * np.exp(summed(on_days_of((j, k)), grid).log_evidence) for k in range(4)] for j in range(4)]
     )

@@ -11,7 +11,7 @@ from scipy import stats
 from evermap.existence.learn_sojourns import ranked_fits
 from evermap.existence.lifetimes import edges
 from evermap.existence.rhythm import BINS, HALF_AN_EVENT
-from evermap.existence.sojourns import FAMILIES, WITH_RHYTHM, Sojourns, hazards
+from evermap.existence.sojourns import FAMILIES, WITH_RHYTHM, Sojourns, mean_hazards
 from evermap.survival import Exponential, Gamma, LifetimePrior, LogNormal, Mixture, Weibull
 from evermap.types import FloatArray
 
@@ -47,7 +47,7 @@ def test_mean_hazards_of_bins_give_back_survival() -> None:
     _, edge = edges(1.0)
     edge = edge[edge < 300.0]
     prior = TRUE["gamma"]
-    integrated = np.cumsum(hazards(prior, edge) * np.diff(edge))
+    integrated = np.cumsum(mean_hazards(prior.cumulative_hazard(edge), edge) * np.diff(edge))
     np.testing.assert_allclose(-integrated, prior.log_survival(edge[1:]), rtol=1e-9, atol=1e-15)
 
 
@@ -137,5 +137,6 @@ def test_a_rhythm_is_found_beside_the_hazard_of_age() -> None:
         night = np.abs(np.arange(BINS) % 144 - 78) > 45
         ratio = fitted.rhythm.factor[inside].mean() / fitted.rhythm.factor[night].mean()
         assert ratio == pytest.approx(4.0, rel=0.1)
-        total = (exposure * hazards(fitted.prior, edge)[:, None] * fitted.rhythm.factor).sum()
+        hazard = mean_hazards(fitted.prior.cumulative_hazard(edge), edge)
+        total = (exposure * hazard[:, None] * fitted.rhythm.factor).sum()
         assert total == pytest.approx(events.sum(), rel=0.01)

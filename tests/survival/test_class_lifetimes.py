@@ -17,13 +17,12 @@ from evermap.survival.class_lifetimes import (
     LOGIT_RETURN,
     SHAPE_SPREAD,
     SITE_SPREADS,
+    ClassPosterior,
     Sightings,
     SitesPosterior,
     absence_log_likelihood,
-    absence_posterior,
     finer,
     stay_log_likelihood,
-    stay_posterior,
 )
 
 DAY_S = 86_400.0
@@ -107,7 +106,7 @@ def test_absence_is_as_probable_as_the_integral_over_its_beginning_says() -> Non
 
 def test_without_data_any_duration_is_possible() -> None:
     none = np.zeros((0, len(LOG_MEAN), len(LOG_SHAPE)))
-    curve = stay_posterior(none).curve(-1)
+    curve = ClassPosterior.of(none).curve(-1)
     # an hour to ten years, as the general-purpose prior
     assert 1.0 * DAY_S < curve.quantile(0.5) < 100.0 * DAY_S
     assert 0.2 < np.exp(curve.log_survival(30.0 * DAY_S)) < 0.8
@@ -122,7 +121,7 @@ def test_posterior_of_many_stays_is_that_of_the_exact_likelihood() -> None:
     values = stay_log_likelihood(stays).sum(axis=0, keepdims=True)
     memoryless = np.abs(LOG_SHAPE) < 1e-9
     values = np.where(memoryless, values, values - 1e4 * np.square(LOG_SHAPE))  # as if its shape were known
-    mean, lower, upper = stay_posterior(values).band(0, [3.0 * DAY_S])
+    mean, lower, upper = ClassPosterior.of(values).band(0, [3.0 * DAY_S])
     rate = law.gamma(200.0, scale=1.0 / ends.sum())
     assert mean[0] == pytest.approx(float(np.mean(np.exp(-3.0 * rate.rvs(100_000, random_state=1)))), abs=0.005)
     np.testing.assert_allclose([lower[0], upper[0]], np.exp(-3.0 * rate.ppf([0.975, 0.025])), atol=0.01)
@@ -138,8 +137,8 @@ def test_one_stay_makes_no_wild_curve() -> None:
         last = first + (rng.exponential(2.0, n) if kind < 9 else 40.0)
         stays = seen(list(first - 0.01), list(first), list(last), list(last + 0.01))
         rows.append(stay_log_likelihood(stays).sum(axis=0))
-    posterior = stay_posterior(np.array(rows))
-    alone = stay_posterior(np.array(rows[-1:]))
+    posterior = ClassPosterior.of(np.array(rows))
+    alone = ClassPosterior.of(np.array(rows[-1:]))
     medians = [float(one.curve(row).quantile(0.5)) / DAY_S for one, row in ((posterior, 9), (alone, 0), (posterior, 0))]
     assert medians[2] < medians[0] < medians[1]
 
@@ -148,7 +147,7 @@ def test_who_never_comes_back_is_gone() -> None:
     n = 40
     zero = np.zeros(n)
     values = absence_log_likelihood(zero, zero + DAY_S, zero + 30.0 * DAY_S, zero + np.inf).sum(axis=0, keepdims=True)
-    curve = absence_posterior(values).curve(0)
+    curve = ClassPosterior.of(values, improper=True).curve(0)
     assert curve.p_never_leaves > 0.5
     assert np.exp(curve.log_conditional_survival(DAY_S, 30.0 * DAY_S)) > 0.95
 
@@ -210,7 +209,7 @@ def some_sites(count: int, seed: int = 0) -> np.ndarray:
 
 def test_sites_that_do_not_differ_are_one_and_those_that_differ_in_everything_are_alone() -> None:
     sites = some_sites(5)
-    pool, alike = stay_posterior(sites.sum(axis=0)), SitesPosterior.of(sites, spreads=((0.0,), (0.0,)))
+    pool, alike = ClassPosterior.of(sites.sum(axis=0)), SitesPosterior.of(sites, spreads=((0.0,), (0.0,)))
     np.testing.assert_allclose(alike.site(sites[2]).weight, pool.weight, atol=1e-14)
     np.testing.assert_allclose(alike.site().weight, pool.weight, atol=1e-14)
     apart = SitesPosterior.of(sites, spreads=((np.inf,), (np.inf,)))
@@ -224,8 +223,8 @@ def test_sites_that_do_not_differ_are_one_and_those_that_differ_in_everything_ar
 def test_one_site_with_a_known_spread_of_shapes_has_the_posterior_of_its_map() -> None:
     one = some_sites(1)
     found = SitesPosterior.of(one, spreads=((0.0,), (0.0,))).site(one[0])
-    np.testing.assert_allclose(found.weight, stay_posterior(one[0]).weight, atol=1e-14)
-    np.testing.assert_allclose(found.curve(0).rates, stay_posterior(one[0]).curve(0).rates, rtol=1e-9)
+    np.testing.assert_allclose(found.weight, ClassPosterior.of(one[0]).weight, atol=1e-14)
+    np.testing.assert_allclose(found.curve(0).rates, ClassPosterior.of(one[0]).curve(0).rates, rtol=1e-9)
 
 
 def test_a_site_without_data_changes_nothing_and_is_a_new_one() -> None:

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from evermap.config import TrackerConfig
 from evermap.errors import EvermapError
 from evermap.tracking.frame import p_real_of
+from evermap.tracking.kalman import noise_of_centres, noise_of_shapes
 from evermap.tracking.record import EventKind, Followed
-from evermap.tracking.shape import noise_of_centres, noise_of_shapes
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import TrackState
 from evermap.tracking.views import View

@@ -79,11 +79,7 @@ class LeaveAndReturn(NamedTuple):
 
 
 Rates = ConstantRate | UnknownRate | LeaveAndReturn
-_KINDS: dict[type, str] = {
-    ConstantRate: "exponential",
-    UnknownRate: "general_purpose",
-    LeaveAndReturn: "two_state",
-}
+_KINDS: dict[type, str] = {ConstantRate: "exponential", UnknownRate: "general_purpose", LeaveAndReturn: "two_state"}
 """Names of the formulas and kernels."""
 Parts = tuple[RowState, Rates, RowLooks]
 """All columns of a look."""
@@ -115,7 +111,8 @@ def look(
     if not 0.0 <= horizon_s < np.inf:
         raise InputError(f"{horizon_s} s is not a time after the look", field="horizon_s", hint="a finite number >= 0")
     given: Parts = (before, rates, sight)
-    columns, torch = _by_name(given), sys.modules.get("torch")  # tensors exist only where it is loaded
+    columns = {name: column for part in given for name, column in part._asdict().items()}
+    torch = sys.modules.get("torch")  # tensors exist only where it is loaded
     if torch is not None and isinstance(before.inverse_odds, torch.Tensor):
         if out is not None:
             raise InputError("is for arrays only", field="out", hint="leave it out: torch keeps memory for reuse")
@@ -133,10 +130,6 @@ def look(
     if _apply(getattr(kernels, _KINDS[type(rates)]), given, float(horizon_s), answer, threads):
         _refuse(columns, answer.inverse_odds)
     return answer
-
-
-def _by_name(given: Parts) -> dict[str, Any]:
-    return {name: column for part in given for name, column in part._asdict().items()}
 
 
 def _apply(kernel: Callable[..., bool], given: Parts, horizon_s: float, answer: Looked, threads: bool) -> bool:

@@ -1,7 +1,7 @@
 """Rates of a chain of phases learned from uncertain looks, by expectation and maximisation.
 
 Nothing but the looks is used: no truth, no guess of when a feature came or went. The E-step is exact for looks at any
-times (`phase_em_kernels`); the M-step divides expected changes by expected time, or fits a smooth rhythm of the week to
+times (`phase_kernels`); the M-step divides expected changes by expected time, or fits a smooth rhythm of the week to
 the two (`smooth_rates`).
 Between structures, and between rhythm and none, the Bayesian information criterion decides: log evidence minus half
 the number of parameters times the logarithm of the number of looks.
@@ -17,7 +17,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, DataError
 from evermap.existence.phase_type import PhaseType, Structure, structure_of
-from evermap.existence.protocol import Candidate, Looks
+from evermap.existence.protocol import Candidate, LookColumns, Looks
 from evermap.existence.rhythm import BINS, Rhythm
 from evermap.show import Shown
 from evermap.types import FloatArray
@@ -116,8 +116,8 @@ class LearnedPhases(Shown):
             raise DataError(f"looks at {looks.n_features} features instead of {len(self.stamp_s)}")
         if not len(looks.stamp_s):
             return self
-        seen = np.diff(looks.first) > 0
-        early = np.flatnonzero(seen)[looks.stamp_s[looks.first[:-1][seen]] < self.stamp_s[seen]]
+        first_s, last_s = looks.ends_s(self.stamp_s)
+        early = np.flatnonzero(first_s < self.stamp_s)
         if early.size:
             raise DataError(f"feature {early[0]}: looks before the last one learned from", hint="later looks only")
         at_s = max(self.statistics.at_s, float(looks.stamp_s.max()))
@@ -135,8 +135,8 @@ class LearnedPhases(Shown):
             model=model,
             log_evidence=self.log_evidence + expected.log_evidence,
             statistics=total,
-            belief=np.where(seen[:, None], expected.last, self.belief),
-            stamp_s=np.where(seen, looks.stamp_s[np.maximum(looks.first[1:] - 1, 0)], self.stamp_s),
+            belief=np.where(np.diff(looks.first)[:, None] > 0, expected.last, self.belief),
+            stamp_s=last_s,
         )
 
 
@@ -195,7 +195,7 @@ def learn(
         structure=structure,
         statistics=final.statistics,
         belief=final.last,
-        stamp_s=np.where(np.diff(looks.first) > 0, looks.stamp_s[np.maximum(looks.first[1:] - 1, 0)], end_s),
+        stamp_s=looks.ends_s(end_s)[1],
         half_life_s=data.half_life_s,
         limits=limits,
     )
@@ -223,17 +223,14 @@ class _Data(NamedTuple):
     """Looks as the E-step wants them."""
 
     looks: Looks
-    there: FloatArray
-    gone: FloatArray
+    columns: LookColumns
     begin_s: FloatArray
     end_s: float
     half_life_s: float
 
     @classmethod
     def of(cls, looks: Looks, end_s: float, half_life_s: float) -> _Data:
-        there, gone = looks.likelihoods()
-        begin_s = np.append(looks.stamp_s, end_s)[looks.first[:-1]]
-        return cls(looks, there, gone, begin_s, end_s, half_life_s)
+        return cls(looks, looks.columns(), looks.ends_s(end_s)[0], end_s, half_life_s)
 
 
 class _Expected(NamedTuple):
@@ -256,23 +253,16 @@ class _Fit(NamedTuple):
 
 def _expect(data: _Data, model: PhaseType, start: FloatArray) -> _Expected:
     """Expected changes and times under a model; `start` is (n,) rows, one a feature or one for all."""
-    from evermap.existence import phase_em_kernels as kernels
-    from evermap.existence.phase_kernels import PhaseLooks
+    from evermap.existence.phase_kernels import Expectations, expect_all
 
-    rates = model.rates_by_bin
+    rates = model.chain.rates_hz
     features, n = data.looks.n_features, model.n_phases
     begin = np.array(np.broadcast_to(start, (features, n)), order="C")  # any other would be compiled for once more
     integrals = np.zeros_like(rates)
     smoothed, last = np.empty((features, n)), np.empty((features, n))
-    evidence, bad = kernels.expect_all(
-        kernels.Generator(rates, rates.sum(2), model.present.astype(np.float64)),
-        data.begin_s,
-        begin,
-        data.looks.first,
-        PhaseLooks(data.looks.stamp_s, data.there, data.gone),
-        kernels.Forgetting(float(data.end_s), float(data.half_life_s)),
-        kernels.Expectations(integrals, smoothed, last),
-    )
+    fading = float(data.end_s), float(data.half_life_s)
+    out = Expectations(integrals, smoothed, last)
+    evidence, bad = expect_all(model.chain, data.begin_s, begin, data.looks.first, data.columns, fading, out)
     if bad >= 0:
         raise data.looks.impossible(bad)
     exposure = np.einsum("bii->bi", integrals).copy()
@@ -304,20 +294,17 @@ def _maximise(structure: Structure, statistics: Statistics, rhythm: bool, limits
     return PhaseType(structure.present, rates, None, tuple(rhythms), which), freedom
 
 
-def _log_prior(model: PhaseType, structure: Structure, start: FloatArray, limits: Limits) -> float:
-    """Return the log prior of the log rates and of the start, up to a constant, as in the M-step."""
-    rates = model.rates_hz[structure.changes]
-    return HALF_AN_EVENT * float(np.log(rates).sum() + np.log(start).sum()) - limits.prior_s * float(rates.sum())
-
-
 def _round(
     data: _Data, structure: Structure, model: PhaseType, start: FloatArray, limits: Limits
 ) -> tuple[float, PhaseType, FloatArray]:
     """Objective at a model without rhythm, and the next model and start."""
     expected = _expect(data, model, start)
-    objective = expected.log_evidence + _log_prior(model, structure, start, limits)
+    rates = model.rates_hz[structure.changes]
+    # of the log rates and of the start, up to a constant, as in the M-step
+    log_prior = HALF_AN_EVENT * float(np.log(rates).sum() + np.log(start).sum()) - limits.prior_s * float(rates.sum())
     counts = expected.smoothed.sum(0) + HALF_AN_EVENT
-    return objective, _maximise(structure, expected.statistics, False, limits)[0], counts / counts.sum()
+    following, _ = _maximise(structure, expected.statistics, False, limits)
+    return expected.log_evidence + log_prior, following, counts / counts.sum()
 
 
 def _search(

@@ -16,10 +16,10 @@ import numpy as np
 
 from evermap.errors import ConfigError, DataError
 from evermap.existence.lifetimes import edges
-from evermap.existence.protocol import Candidate, Looks
+from evermap.existence.protocol import Candidate, LookColumns, Looks
 from evermap.existence.rhythm import BIN_S, BINS, DAY_S, UNUSUAL, WEEK_S, DayShares, day_shares, fit, steady_level
 from evermap.existence.run_length import RunLength
-from evermap.existence.run_length_smoothing import Lattice, lattice
+from evermap.existence.run_length_smoothing import lattice
 from evermap.existence.sojourns import FAMILIES, WITH_RHYTHM, Fitted, Sojourns
 from evermap.show import Shown
 from evermap.survival import Exponential
@@ -83,7 +83,7 @@ class Data(Shown):
         last_s: end of the last look.
     """
 
-    lattices: tuple[Lattice, ...]
+    lattices: tuple[LookColumns, ...]
     importance: tuple[FloatArray, ...]
     period: tuple[IntArray, ...]
     n_periods: int
@@ -123,11 +123,11 @@ class Data(Shown):
             (K,) how many days were of each kind; the same looks, with no weight on days on which nothing could change,
             so that what is learned from them is of the others; and the shares of days to come.
         """
-        from evermap.existence.run_length_kernels import LookColumns, kinds_of_days
+        from evermap.existence.run_length_kernels import kinds_of_days
 
         guess = replace(model, unusual=DayShares(UNUSUAL, UNUSUAL, UNUSUAL))
         law, first = guess.law, guess.first
-        likelihood = [kinds_of_days(LookColumns(*piece), guess.slots, law, first) for piece in self.lattices]
+        likelihood = [kinds_of_days(piece, guess.slots, law, first) for piece in self.lattices]
         begun = [piece.stamp_s // DAY_S for piece in self.lattices]
         steps = [(days[:-1] - days[0]).astype(np.int64) for days in begun]
         weights = [

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, Mixture, PiecewiseConstantHazard, never_leaves
+from evermap.survival.logmath import gauss_legendre
 from evermap.types import BoolArray, FloatArray, IntArray
 
 NODES = 12
@@ -110,34 +111,27 @@ def lifetime_of_phases(rates_hz: FloatArray, inside: BoolArray, entered: FloatAr
     return PiecewiseConstantHazard(tuple(edge), tuple(np.maximum(hazards, 0.0)))
 
 
-class ExponentialMixture(NamedTuple):
-    """A mixture of exponentials: the components and their probabilities."""
-
-    components: tuple[Exponential, ...]
-    weights: tuple[float, ...]
-
-
-def exponential_mixture_of(prior: LifetimePrior, n: int = NODES) -> ExponentialMixture:
-    """Return a lifetime prior as a mixture of exponentials, which is what a Markov chain can hold.
+def exponential_mixture_of(prior: LifetimePrior, n: int = NODES) -> tuple[FloatArray, FloatArray]:
+    """Return a lifetime prior as a mixture of K exponentials, which is what a Markov chain can hold.
 
     Exact for exponentials and mixtures of them; the general-purpose prior (unknown rate, Rosen 2016 eqs. 25-29) by
     Gauss-Legendre quadrature with `n` nodes over the logarithm of the rate.
+
+    Returns:
+        (K,) rates in 1/s and (K,) probabilities.
 
     Raises:
         ConfigError: any other prior.
     """
     if isinstance(prior, Exponential):
-        return ExponentialMixture((prior,), (1.0,))
+        return np.array([prior.rate]), np.ones(1)
     if isinstance(prior, GeneralPurpose):
-        nodes, weights = np.polynomial.legendre.leggauss(n)
-        rates = prior.low * np.exp(math.log(prior.high / prior.low) * 0.5 * (nodes + 1.0))
-        return ExponentialMixture(tuple(Exponential(float(r)) for r in rates), tuple((0.5 * weights).tolist()))
+        nodes, weights = gauss_legendre(n)
+        return prior.low * np.exp(math.log(prior.high / prior.low) * nodes), weights
     if isinstance(prior, Mixture):
         parts = [exponential_mixture_of(component, n) for component in prior.components]
-        return ExponentialMixture(
-            tuple(c for part in parts for c in part.components),
-            tuple(w * v for w, part in zip(prior.weights, parts, strict=True) for v in part.weights),
-        )
+        shares = [weight * own for weight, (_, own) in zip(prior.weights, parts, strict=True)]
+        return np.concatenate([rates for rates, _ in parts]), np.concatenate(shares)
     raise ConfigError(
         f"{type(prior).__name__} is not a mixture of exponentials",
         field="prior",
@@ -165,7 +159,13 @@ def log_death_odds(
         with np.errstate(all="ignore"):
             start, stop = start_s[rows], stop_s[rows]
             if isinstance(prior, GeneralPurpose) and prior.high > WIDE * prior.low:
-                odds[rows] = np.log(_unknown_rate(prior, start, stop))
+                from evermap.existence.kernels import general_purpose_gaps  # the general road takes 10 us a gap
+
+                gap_odds = np.empty(len(start))
+                general_purpose_gaps(
+                    prior.low, prior.high, np.ascontiguousarray(start), np.ascontiguousarray(stop), gap_odds
+                )
+                odds[rows] = np.log(gap_odds)
                 continue
             if isinstance(prior, PiecewiseConstantHazard):  # learned by maps, and thus evaluated for millions of gaps
                 odds[rows] = np.log(np.expm1(prior.integrated_hazard(start, stop)))
@@ -175,15 +175,6 @@ def log_death_odds(
             # After certain death the conditional is 0 / 0: nothing outlives it, whatever a prior answers.
             lost = np.isneginf(survival) | np.isnan(survival)
             odds[rows] = np.where(lost, np.inf, death - survival)
-    return odds
-
-
-def _unknown_rate(prior: GeneralPurpose, start_s: FloatArray, stop_s: FloatArray) -> FloatArray:
-    """Odds of dying under the prior of robots that know nothing, compiled: the general road takes 10 us a gap."""
-    from evermap.existence.kernels import general_purpose_gaps
-
-    odds = np.empty(len(start_s))
-    general_purpose_gaps(prior.low, prior.high, np.ascontiguousarray(start_s), np.ascontiguousarray(stop_s), odds)
     return odds
 
 
@@ -209,12 +200,6 @@ class HazardTable(NamedTuple):
     edge_s: FloatArray
     hazard_hz: FloatArray
     cumulative: FloatArray
-
-    @property
-    def width_s(self) -> FloatArray:
-        """(B,) widths of the bins; the last counts as wide as the one before."""
-        widths = np.diff(self.edge_s)
-        return np.append(widths, widths[-1])
 
     def survival(self) -> FloatArray:
         """Return (B,) `S` at the edges."""

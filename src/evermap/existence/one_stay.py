@@ -13,7 +13,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from evermap.errors import InputError, NumericalError
+from evermap.errors import InputError
 from evermap.existence.lifetimes import WIDE, Lifetimes, log_death_odds
 from evermap.existence.protocol import Instants, Looks, Track, as_prior, feature_of, impossible, likelihoods
 from evermap.existence.recursion import LARGEST, LOG_LARGEST, aged, observed, odds_of
@@ -99,7 +99,7 @@ class PersistenceFilter(Shown):
         there, gone = (1.0 - p_miss, p_false) if detected else (p_miss, 1.0 - p_false)
         after, likelihood = observed(predicted, there, gone)
         if likelihood <= 0.0:
-            raise NumericalError(impossible(f"time {stamp_s} s"), hint="P_M and P_F strictly between 0 and 1")
+            raise impossible(f"time {stamp_s} s")
         self._inverse_odds = after
         self._stamp = stamp_s
         self._evidence += log(likelihood)

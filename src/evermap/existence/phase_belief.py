@@ -10,10 +10,8 @@ from typing import Self
 
 import numpy as np
 
-from evermap.existence import protocol as checks
-from evermap.existence.belief import RecurrentBeliefTable
 from evermap.existence.phase_type import PhaseType
-from evermap.existence.protocol import Instants, Looks
+from evermap.existence.protocol import Instants, Looks, RecurrentBeliefTable, check_possible
 from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S, bin_of_week
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -72,7 +70,7 @@ class PhaseBelief(RecurrentBeliefTable):
     def _looked(self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray) -> Self:
         weighed = self._at(index, time) * np.where(self.model.present, there[:, None], gone[:, None])
         likelihood = weighed.sum(1)
-        checks.check_possible(np.where(likelihood > 0.0, likelihood, np.nan), index)
+        check_possible(np.where(likelihood > 0.0, likelihood, np.nan), index)
         phases, stamps, evidence = self.phases.copy(), self.stamp_s.copy(), self.log_evidence.copy()
         phases[index] = weighed / likelihood[:, None]
         stamps[index] = time

@@ -42,27 +42,21 @@ class Structure:
     changes: BoolArray
 
 
-def hyperexponential(stays: int, absences: int, name: str = "") -> Structure:
-    """Return several kinds of stays and of absences; each change is between one of these and one of those."""
-    present = np.arange(absences + stays) >= absences
-    return Structure(name or f"{stays}+{absences}", present, present[:, None] != present[None, :])
-
-
 def structure_of(name: str) -> Structure:
-    """Return the structure of a name: 'two-state', 'three-phase' (away, briefly away, there), or '2+3' for two kinds
-    of stays
-    and three of absences.
+    """Return the structure of a name.
+
+    'two-state', 'three-phase' (away, briefly away, there), or '2+3' for two kinds of stays and three of absences.
 
     Raises:
         ConfigError: another name.
     """
-    if name == "two-state":
-        return hyperexponential(1, 1, name)
-    if name == "three-phase":
-        return hyperexponential(1, 2, name)
-    if parts := re.fullmatch(r"([1-6])\+([1-6])", name):
-        return hyperexponential(int(parts[1]), int(parts[2]))
-    raise ConfigError(f"unknown structure '{name}'", field="phases", hint="auto, two-state, three-phase, or 2+2 to 6+6")
+    parts = re.fullmatch(r"([1-6])\+([1-6])", {"two-state": "1+1", "three-phase": "1+2"}.get(name, name))
+    if not parts:
+        hint = "auto, two-state, three-phase, or 2+2 to 6+6"
+        raise ConfigError(f"unknown structure '{name}'", field="phases", hint=hint)
+    stays, absences = int(parts[1]), int(parts[2])
+    present = np.arange(absences + stays) >= absences
+    return Structure(name, present, present[:, None] != present[None, :])
 
 
 _ENDLESS = 100
@@ -146,11 +140,11 @@ class PhaseType(Shown):
         Raises:
             ConfigError: a prior that is not a mixture of exponentials.
         """
-        away, there = exponential_mixture_of(absence), exponential_mixture_of(stay)
-        k, m = len(away.weights), len(there.weights)
+        (away_hz, away), (there_hz, there) = exponential_mixture_of(absence), exponential_mixture_of(stay)
+        k, m = len(away), len(there)
         rates = np.zeros((k + m, k + m))
-        rates[:k, k:] = np.outer([c.rate for c in away.components], there.weights)
-        rates[k:, :k] = np.outer([c.rate for c in there.components], away.weights)
+        rates[:k, k:] = np.outer(away_hz, there)
+        rates[k:, :k] = np.outer(there_hz, away)
         return cls(np.arange(k + m) >= k, rates)
 
     @property
@@ -185,21 +179,18 @@ class PhaseType(Shown):
 
     def filtered(self, looks: Looks, asked: Instants) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return presence at the instants, (F,) evidence, and (F, n) phases at each feature's last look or instant."""
-        from evermap.existence import phase_kernels
+        from evermap.existence.phase_kernels import track_all
 
-        there, gone = looks.likelihoods()
-        beginning = phase_kernels.Beginning(self._starts, self.start is not None)
-        columns = phase_kernels.PhaseLooks(looks.stamp_s, there, gone)
-        p_present, evidence, last, bad = phase_kernels.track_all(
-            self.chain, beginning, looks.first, columns, asked.first, asked.stamp_s
+        starts = self._long_run if self.start is None else self.start[None]
+        p_present, evidence, last, bad = track_all(
+            self.chain, starts, self.start is not None, looks.first, looks.columns(), asked.first, asked.stamp_s
         )
         for row in bad[bad >= 0][:1]:
             raise looks.impossible(int(row))
         return p_present, evidence, last
 
     def stationary(self, stamp_s: float | None = None) -> FloatArray:
-        """Return (n,) probability of each phase in the long run; at this local time of the week where there is a
-        rhythm.
+        """Return (n,) probability of each phase in the long run, at this local time of the week if there is a rhythm.
 
         Raises:
             ConfigError: what lasts depends on the beginning, or a rhythm without a time.
@@ -243,10 +234,7 @@ class PhaseType(Shown):
 
         rates = self.rates_by_bin
         exits = rates.sum(2)
-        if len(rates) == 1:
-            nothing = np.zeros((1, self.n_phases, self.n_phases))
-            return PhaseChain(rates, exits, nothing, nothing[0], self.present.astype(np.float64))
-        whole = transitions(rates, exits, BIN_S)
+        whole = transitions(rates, exits, BIN_S) if len(rates) > 1 else np.zeros_like(rates)
         week = np.eye(self.n_phases)
         for matrix in whole:
             week = week @ matrix
@@ -259,11 +247,6 @@ class PhaseType(Shown):
             return self.rates_hz[None].copy()
         factors = np.vstack([*(rhythm.factor for rhythm in self.rhythms), np.ones(BINS)])
         return np.ascontiguousarray(np.moveaxis(self.rates_hz[..., None] * factors[self.rhythm_of], 2, 0))
-
-    @cached_property
-    def _starts(self) -> FloatArray:
-        """(1, n) the belief at the first look, or (1008, n) at the begin of each ten minutes."""
-        return self._long_run if self.start is None else self.start[None]
 
     @cached_property
     def _long_run(self) -> FloatArray:
@@ -290,8 +273,7 @@ class PhaseType(Shown):
 
 
 def _stationary(rates: FloatArray) -> FloatArray | None:
-    """Return the (n,) stationary state of constant rates without subtractions (Grassmann, Taksar and Heyman 1985); None
-    if there is none.
+    """Return the (n,) stationary state of constant rates without subtractions (Grassmann, Taksar and Heyman 1985).
 
     None where some phase is never left for those before it, so that the beginning may matter.
     """

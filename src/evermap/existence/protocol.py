@@ -1,12 +1,14 @@
-"""The protocol of presence models, their tables (looks, instants, tracks), and the validation of these.
+"""The protocol of presence models and of beliefs, their tables (looks, instants, tracks), and the validation of these.
 
-Errors name the row and what to try.
+Errors name the row and what to try. A table of beliefs is immutable: `update` returns another one. It knows how its
+rows go on over a gap and what a look says to them; row numbers, times and probabilities are checked here.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -113,11 +115,10 @@ def check_times(time_s: FloatArray, last_s: FloatArray, rows: IntArray | None = 
         )
 
 
-def check_possible(inverse_odds: FloatArray, rows: IntArray | None = None, noun: str = "row") -> None:
+def check_possible(inverse_odds: FloatArray, rows: IntArray | None = None) -> None:
     """Raise `NumericalError` where an update came out as 0 / 0: impossible under both states."""
     if first := _first(np.isnan(inverse_odds), rows):
-        _, row = first
-        raise NumericalError(impossible(f"{noun} {row}"), hint="P_M and P_F strictly between 0 and 1")
+        raise impossible(f"row {first[1]}")
 
 
 def check_looks(
@@ -141,9 +142,10 @@ def likelihoods(detected: FloatArray, p_miss: FloatArray, p_false: FloatArray) -
     return np.where(seen, 1.0 - p_miss, p_miss), np.where(seen, p_false, 1.0 - p_false)
 
 
-def impossible(who: str) -> str:
-    """Return the one sentence for an observation that neither state of the feature can have caused."""
-    return f"{who}: this observation is impossible, whether the feature is there or gone"
+def impossible(who: str, row: int | None = None) -> NumericalError:
+    """Return the error of an observation that neither state of the feature can have caused."""
+    problem = f"{who}: this observation is impossible, whether the feature is there or gone"
+    return NumericalError(problem, hint="P_M and P_F strictly between 0 and 1", row=row)
 
 
 def check_rows(rows: Any, n: int, *, twice: bool = False, field: str = "rows") -> IntArray:
@@ -180,6 +182,14 @@ def rows_at(first: IntArray, features: IntArray) -> tuple[IntArray, IntArray]:
     length = first[features + 1] - first[features]
     begin = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
     return begin, np.arange(begin[-1]) - np.repeat(begin[:-1] - first[features], length)
+
+
+class LookColumns(NamedTuple):
+    """M looks in order of time, and their likelihoods if the feature is there and if it is not."""
+
+    stamp_s: FloatArray
+    there: FloatArray
+    gone: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,6 +231,14 @@ class Looks(Shown):
             raise DataError("no feature has looks at two instants", hint="there is nothing to learn from")
         return float(np.median(gaps[gaps > 0.0]))
 
+    def ends_s(self, otherwise: FloatArray | float) -> FloatArray:
+        """Return (2, F) stamps of the first and the last look at each feature; `otherwise` where there is none."""
+        looked = np.diff(self.first) > 0
+        ends = np.empty((2, self.n_features))
+        ends[:] = otherwise
+        ends[:, looked] = self.stamp_s[self.first[:-1][looked]], self.stamp_s[self.first[1:][looked] - 1]
+        return ends
+
     def of(self, feature: int) -> Looks:
         """Return the looks at one feature alone."""
         return self.at(np.array([feature]))[0]
@@ -235,26 +253,18 @@ class Looks(Shown):
         first = firsts_of(self.feature[rows], self.n_features) if first is None else first
         return Looks(first, self.stamp_s[rows], self.detected[rows], self.p_miss[rows], self.p_false[rows])
 
-    def likelihoods(self) -> tuple[FloatArray, FloatArray]:
-        """Return (M,) likelihood of each look if the feature is there, and if it is not."""
-        return likelihoods(self.detected, self.p_miss, self.p_false)
+    def columns(self) -> LookColumns:
+        """Return the looks as the kernels take them."""
+        return LookColumns(self.stamp_s, *likelihoods(self.detected, self.p_miss, self.p_false))
 
     def impossible(self, row: int) -> NumericalError:
         """Return the error of a look that is impossible, whether the feature is there or not."""
         feature = int(np.searchsorted(self.first, row, side="right")) - 1
-        who = f"feature {feature} at {self.stamp_s[row]} s"
-        return NumericalError(impossible(who), hint="P_M and P_F strictly between 0 and 1", row=row)
+        return impossible(f"feature {feature} at {self.stamp_s[row]} s", row)
 
     @classmethod
     def from_rows(
-        cls,
-        feature: Any,
-        stamp_s: Any,
-        detected: Any,
-        p_miss: Any,
-        p_false: Any,
-        *,
-        n_features: int | None = None,
+        cls, feature: Any, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, *, n_features: int | None = None
     ) -> Looks:
         """Sort rows by feature and time; rows of one feature at one time keep their order.
 
@@ -269,12 +279,20 @@ class Looks(Shown):
         Raises:
             InputError: shapes, an index, a time or a probability that cannot be; the row is named, counted from 0.
         """
-        index, order, first = _grouped(feature, n_features)
+        index = np.asarray(feature)
+        if index.ndim != 1 or (index.size and index.dtype.kind not in "iu"):
+            raise InputError("features are row numbers", field="feature", hint="whole numbers from 0")
+        index = index.astype(np.int64)
+        count = int(index.max(initial=-1)) + 1 if n_features is None else n_features
+        if wrong := _first((index < 0) | (index >= count), index):
+            raise InputError(f"row {wrong[0]}: feature {wrong[1]} of {count} does not exist", field="feature")
         columns = {"stamp_s": stamp_s, "detected": detected, "p_miss": p_miss, "p_false": p_false}
         time, hit, miss, false = (as_rows(values, len(index), name) for name, values in columns.items())
         check_looks(time, hit, miss, false, np.full(len(index), -np.inf))
-        order = order[np.lexsort((time[order], index[order]))]
-        return cls(first, *(np.ascontiguousarray(column[order]) for column in (time, hit, miss, false)))
+        order = np.lexsort((time, index))
+        return cls(
+            firsts_of(index, count), *(np.ascontiguousarray(column[order]) for column in (time, hit, miss, false))
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,14 +389,128 @@ class PresenceModel(PresenceFilter, Protocol):
         ...
 
 
-def _grouped(feature: Any, n_features: int | None) -> tuple[IntArray, IntArray, IntArray]:
-    """Feature indices, rows ordered by them, and where each feature starts."""
-    index = np.asarray(feature)
-    if index.ndim != 1 or (index.size and index.dtype.kind not in "iu"):
-        raise InputError("features are row numbers", field="feature", hint="whole numbers from 0")
-    index = index.astype(np.int64)
-    count = int(index.max(initial=-1)) + 1 if n_features is None else n_features
-    wrong = np.flatnonzero((index < 0) | (index >= count))
-    if wrong.size:
-        raise InputError(f"row {wrong[0]}: feature {index[wrong[0]]} of {count} does not exist", field="feature")
-    return index, np.argsort(index, kind="stable"), firsts_of(index, count)
+class BeliefTable(Shown, ABC):
+    """Presence of N features, one row each, and the time of each row's last look."""
+
+    __slots__ = ()
+    stamp_s: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+    @abstractmethod
+    def _presence(self, index: IntArray, time: FloatArray) -> FloatArray:
+        """Return (K,) probability of presence of some rows at later times."""
+
+    @abstractmethod
+    def _looked(self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray) -> Self:
+        """Return beliefs after a look at each of some rows, of these likelihoods if it is there and if it is not."""
+
+    def predict(self, stamp_s: Any, *, rows: Any = None) -> FloatArray:
+        """Return the probability that each feature is there at `stamp_s`.
+
+        Args:
+            stamp_s: scalar, (N,) or (len(rows),) times, none before the row's last look.
+            rows: row numbers asked about; all where None.
+
+        Raises:
+            InputError: a time that is not finite or lies before the last look.
+        """
+        index = np.arange(len(self)) if rows is None else check_rows(rows, len(self), twice=True)
+        time = as_rows(stamp_s, len(index), "stamp_s")
+        check_times(time, self.stamp_s[index], index)
+        return self._presence(index, time)
+
+    def update(self, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, *, rows: Any = None) -> Self:
+        """Return beliefs after one look at each feature.
+
+        Args:
+            stamp_s: scalar, (N,) or (len(rows),) times of the looks, none before the row's last look.
+            detected: 1 or 0, of the same shape.
+            p_miss: `P(no detection | there)`, of the same shape.
+            p_false: `P(detection | not there)`, of the same shape.
+            rows: the rows looked at, each once; all where None.
+
+        Raises:
+            InputError: a probability outside [0, 1], time running back, or a row that does not exist.
+            DataError: a row twice.
+            NumericalError: a look that is impossible, whether the feature is there or not.
+        """
+        columns = {"stamp_s": stamp_s, "detected": detected, "p_miss": p_miss, "p_false": p_false}
+        index, (time, hit, miss, false) = self._looked_at(rows, columns)
+        check_looks(time, hit, miss, false, self.stamp_s[index], index)
+        return self._looked(index, time, *likelihoods(hit, miss, false))
+
+    def _looked_at(self, rows: Any, columns: dict[str, Any]) -> tuple[IntArray, list[FloatArray]]:
+        """The rows looked at, and their part of each column; the first column is the times."""
+        index = np.arange(len(self)) if rows is None else check_rows(rows, len(self))
+        return index, [as_rows(column, len(index), field) for field, column in columns.items()]
+
+
+class RecurrentBeliefTable(BeliefTable):
+    """Presence of N features that leave and return."""
+
+    __slots__ = ()
+
+    @classmethod
+    @abstractmethod
+    def _first(cls, model: Any, time: FloatArray) -> Self:
+        """Return beliefs before the first look."""
+
+    @classmethod
+    @abstractmethod
+    def _after(cls, model: Any, looks: Looks, ends_s: FloatArray) -> Self:
+        """Return beliefs after all looks; `ends_s` (2, F) are the first and last of each feature."""
+
+    @abstractmethod
+    def _mean_time(self, present: bool) -> FloatArray:
+        """Return (N,) the mean time that the present state lasts, given that it is presence, or absence."""
+
+    @classmethod
+    def first(cls, model: PresenceModel, stamp_s: Any) -> Self:
+        """Return beliefs about features that are heard of for the first time.
+
+        Args:
+            model: how they come and go.
+            stamp_s: (N,) when, on one clock.
+
+        Raises:
+            InputError: a time that is not finite.
+        """
+        time = np.array(stamp_s, dtype=np.float64).reshape(-1)
+        check_times(time, np.full(len(time), -np.inf))
+        return cls._first(model, time)
+
+    @classmethod
+    def after(cls, model: PresenceModel, looks: Looks) -> Self:
+        """Return beliefs after all looks, one row a feature.
+
+        A feature that was never looked at is heard of at the last look of all.
+
+        Args:
+            model: how features come and go.
+            looks: at F features.
+
+        Raises:
+            InputError: no look at all.
+            NumericalError: a look that is impossible, whether the feature is there or not.
+        """
+        if not len(looks.stamp_s):
+            raise InputError("there is no look", field="looks", hint="first(), which needs none")
+        return cls._after(model, looks, looks.ends_s(looks.stamp_s.max()))
+
+    def time_to_leave(self) -> FloatArray:
+        """Return the expected time until each feature leaves, if it is there.
+
+        Returns:
+            (N,) seconds from `stamp_s` on; `inf` if some never leave, NaN if the feature is certainly away.
+        """
+        return self._mean_time(True)
+
+    def time_to_return(self) -> FloatArray:
+        """Return the expected time until each feature returns, if it is away.
+
+        Returns:
+            (N,) seconds from `stamp_s` on; `inf` where some never return, NaN where the feature is certainly there.
+        """
+        return self._mean_time(False)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evermap.compiled import single_threaded
 from evermap.errors import ConfigError
 from evermap.show import Shown
 from evermap.types import FloatArray, IntArray
@@ -51,10 +52,6 @@ class Rhythm(Shown):
     def factor(self) -> FloatArray:
         """(1008,) by what the hazard is multiplied."""
         return np.asarray(np.exp(self.log_factor), dtype=np.float64)
-
-    def at(self, stamp_s: ArrayLike) -> FloatArray:
-        """Return the factor at some instants."""
-        return np.asarray(self.factor[bin_of_week(stamp_s)], dtype=np.float64)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, for JSON."""
@@ -211,13 +208,12 @@ def week_basis() -> Basis:
 
 
 def steady_level(n: int) -> Basis:
-    """Return a level for each of n periods, from one to the next changed as little as the events allow: a random
-    walk.
-    """
+    """Return a level for each of n periods, a random walk whose steps are as small as the events allow."""
     difference = np.diff(np.eye(n), axis=0)
     return Basis(np.eye(n), (difference.T @ difference,) if n > 1 else (), np.zeros((n, n)))
 
 
+@single_threaded()
 def fit(
     events: FloatArray, exposure: FloatArray, age: Basis, week: Basis | None, start: SmoothRates | None = None
 ) -> SmoothRates:
@@ -230,15 +226,6 @@ def fit(
         week: basis of the J times of the week; None where there is no rhythm (then J may be 1).
         start: where to begin: an earlier fit of the same bases.
     """
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1, user_api="blas"):  # for matrices this small, threads only get in each other's way
-        return _fit(events, exposure, age, week, start)
-
-
-def _fit(
-    events: FloatArray, exposure: FloatArray, age: Basis, week: Basis | None, start: SmoothRates | None
-) -> SmoothRates:
     total = exposure.sum()
     if total <= 0.0:
         none = np.zeros(0)

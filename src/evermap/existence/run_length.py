@@ -12,12 +12,17 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from evermap.errors import ConfigError, NumericalError
+from evermap.errors import ConfigError
 from evermap.existence import protocol as checks
-from evermap.existence.belief import RecurrentBeliefTable
 from evermap.existence.lifetimes import HazardTable, Lifetimes, bins_of, edges, proportional, tabulate
-from evermap.existence.protocol import Instants, Looks, Track, impossible
-from evermap.existence.rhythm import BIN_S, BINS, DayShares, Rhythm, on_other_days
+from evermap.existence.protocol import (
+    Instants,
+    LookColumns,
+    Looks,
+    RecurrentBeliefTable,
+    Track,
+)
+from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, DayShares, Rhythm, on_other_days
 from evermap.show import Shown
 from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray, IntArray
@@ -107,10 +112,8 @@ class RunLength(Shown):
         from evermap.existence import run_length_kernels as kernels
 
         asked = instants or Instants.of_looks(looks)
-        there, gone = looks.likelihoods()
-        columns = kernels.LookColumns(looks.stamp_s, gone, there)
         answer, evidence, moved, bad = kernels.track(
-            looks.first, columns, asked.first, asked.stamp_s, self.slots, self.law, self.first
+            looks.first, looks.columns(), asked.first, asked.stamp_s, self.slots, self.law, self.first
         )
         for feature in np.flatnonzero(bad >= 0)[:1]:
             raise looks.impossible(int(looks.first[feature] + bad[feature]))
@@ -164,8 +167,6 @@ class RunLength(Shown):
         count = np.full((1, 2), self.slots - 1)
         if self.law.factor.shape[2] == 1:
             return First(age, weight, count)
-        from evermap.existence.rhythm import MONDAY_S
-
         ages, weights = np.zeros((BINS, 2, self.slots)), np.zeros((BINS, kinds, 2, self.slots))
         counts = np.zeros((BINS, 2), dtype=np.int64)
         week = First(ages, weights, counts)
@@ -212,7 +213,8 @@ def _equilibrium(table: HazardTable, n: int) -> tuple[FloatArray, FloatArray]:
 
     The age of what is met at random has density `S(age)`, of integral `E[T]`; ages beyond the table count as its end.
     """
-    survival, width = table.survival(), table.width_s
+    survival, width = table.survival(), np.diff(table.edge_s)
+    width = np.append(width, width[-1])  # the last bin counts as wide as the one before
     drop = np.append(np.diff(table.cumulative), 0.0)
     mass = survival * width * np.where(drop > 1e-9, -np.expm1(-drop) / np.maximum(drop, 1e-300), 1.0)
     middle = table.edge_s + 0.5 * width
@@ -273,11 +275,10 @@ class RunLengthBelief(RecurrentBeliefTable):
 
     @classmethod
     def _after(cls, model: RunLength, looks: Looks, ends_s: FloatArray) -> Self:
-        from evermap.existence.run_length_kernels import LookColumns, look_rows
+        from evermap.existence.run_length_kernels import look_rows
 
         state = cls._first(model, ends_s[0])
-        there, gone = looks.likelihoods()
-        bad = look_rows(looks.feature, state.rows, LookColumns(looks.stamp_s, gone, there), model.law)
+        bad = look_rows(looks.feature, state.rows, looks.columns(), model.law)
         if bad >= 0:
             raise looks.impossible(bad)
         return state
@@ -290,13 +291,13 @@ class RunLengthBelief(RecurrentBeliefTable):
         return belief
 
     def _looked(self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray) -> Self:
-        from evermap.existence.run_length_kernels import LookColumns, look_rows
+        from evermap.existence.run_length_kernels import look_rows
 
         names = ("start_s", "weight", "count", "stamp_s", "log_evidence", "merged_mass")
         after = replace(self, **{name: getattr(self, name).copy() for name in names})
-        bad = look_rows(index, after.rows, LookColumns(time, gone, there), self.model.law)
+        bad = look_rows(index, after.rows, LookColumns(time, there, gone), self.model.law)
         if bad >= 0:
-            raise NumericalError(impossible(f"row {index[bad]}"), hint="P_M and P_F strictly between 0 and 1")
+            raise checks.impossible(f"row {index[bad]}")
         return after
 
     def _mean_time(self, present: bool) -> FloatArray:

@@ -16,6 +16,7 @@ from numba import prange
 
 from evermap.existence.elementary import exp, expm1, inlined, kernel, parallel_kernel, reordered
 from evermap.existence.lifetimes import SHIFT
+from evermap.existence.protocol import LookColumns
 from evermap.existence.rhythm import BIN_S, BINS, DAY_S, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
@@ -76,14 +77,6 @@ class BeliefRows(NamedTuple):
     now_s: FloatArray
     evidence: FloatArray
     moved: FloatArray
-
-
-class LookColumns(NamedTuple):
-    """M looks: when, and their likelihoods if the feature is absent and if it is present."""
-
-    stamp_s: FloatArray
-    absent: FloatArray
-    present: FloatArray
 
 
 class Workspace(NamedTuple):
@@ -362,7 +355,7 @@ def _track_one(
     looks: LookColumns, asked_s: FloatArray, slots: int, law: Law, prior: First, answer: FloatArray
 ) -> tuple[float, float, int]:
     """Filter all looks at one feature; return log evidence, merged mass, impossible look or -1."""
-    stamp_s, absent, present = looks
+    stamp_s, present, absent = looks
     held, space = nothing_held(slots, law), room(slots)
     evidence, moved = 0.0, 0.0
     m, n = stamp_s.size, asked_s.size
@@ -391,13 +384,7 @@ def _track_one(
 
 @parallel_kernel
 def track(
-    first: IntArray,
-    looks: LookColumns,
-    first_asked: IntArray,
-    asked_s: FloatArray,
-    slots: int,
-    law: Law,
-    prior: First,
+    first: IntArray, looks: LookColumns, first_asked: IntArray, asked_s: FloatArray, slots: int, law: Law, prior: First
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
     """Return `_track_one` for every feature, over all threads.
 
@@ -406,13 +393,13 @@ def track(
         look that is impossible under both states, or -1.
     """
     # arrays of its own, taken out of tuples: a parallel loop takes writes to others for dead
-    stamp_s, absent, present = looks
+    stamp_s, present, absent = looks
     n = len(first) - 1
     p_present, evidence, moved = np.empty(len(asked_s)), np.empty(n), np.empty(n)
     impossible = np.empty(n, dtype=np.int64)
     for f in prange(n):
         a, b, c, d = first[f], first[f + 1], first_asked[f], first_asked[f + 1]
-        own = LookColumns(stamp_s[a:b], absent[a:b], present[a:b])
+        own = LookColumns(stamp_s[a:b], present[a:b], absent[a:b])
         evidence[f], moved[f], impossible[f] = _track_one(own, asked_s[c:d], slots, law, prior, p_present[c:d])
     return p_present, evidence, moved, impossible
 
@@ -421,7 +408,7 @@ def track(
 def look_rows(rows: IntArray, state: BeliefRows, looks: LookColumns, law: Law) -> int:
     """Return one look at each of many features, in place; the first row that is impossible under both states, or -1."""
     everyone, now_s, evidence, moved = state
-    stamp_s, absent, present = looks
+    stamp_s, present, absent = looks
     space = room(everyone.start.shape[2])
     for i in range(len(rows)):
         f = rows[i]
@@ -555,7 +542,7 @@ def remaining_rows(state: BeliefRows, s: int, law: Law, weeks: int, out: FloatAr
 @kernel
 def kinds_of_days(looks: LookColumns, slots: int, law: Law, prior: First) -> FloatArray:
     """Return (D, K) the likelihood of each day's looks on each kind of day, relative to that on a day of any kind."""
-    stamp_s, absent, present = looks
+    stamp_s, present, absent = looks
     held, space = nothing_held(slots, law), room(slots)
     now, day, kinds = stamp_s[0], stamp_s // DAY_S - stamp_s[0] // DAY_S, len(law.share)
     out = np.ones((int(day[-1]) + 1, kinds))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.existence.elementary import exp, expm1, kernel
-from evermap.existence.protocol import Looks
+from evermap.existence.protocol import LookColumns, Looks
 from evermap.existence.run_length_kernels import (
     MOST,
     NO_MERGE,
@@ -32,33 +32,19 @@ from evermap.existence.run_length_kernels import (
 from evermap.types import FloatArray, IntArray
 
 
-class Lattice(NamedTuple):
-    """Instants at most a step apart, the looks among them.
+def lattice(looks: Looks, step_s: float) -> LookColumns:
+    """Return one feature's looks at (T + 1,) different instants, with steps between them as the filter takes them.
 
-    Attributes:
-        stamp_s: (T + 1,) in order, all different.
-        absent: (T + 1,) likelihood of the looks there if the feature is absent; 1 where there was none.
-        present: (T + 1,) the same if it is present.
-    """
-
-    stamp_s: FloatArray
-    absent: FloatArray
-    present: FloatArray
-
-
-def lattice(looks: Looks, step_s: float) -> Lattice:
-    """Return one feature's looks, with whole steps after each and a shorter one before the next, as the filter takes
-    them.
+    After a look whole steps, and a shorter one before the next; likelihoods are 1 where there was no look.
     """
     stamp, first = np.unique(looks.stamp_s, return_index=True)
-    present, absent = (np.multiply.reduceat(values, first) for values in looks.likelihoods())
+    _, *likelihoods = looks.columns()
     steps = np.maximum(np.ceil(np.diff(stamp) / step_s * (1.0 - 1e-12)).astype(np.int64), 1)
     place = np.concatenate([[0], np.cumsum(steps)])
     times = np.repeat(stamp[:-1], steps) + step_s * (np.arange(place[-1]) - np.repeat(place[:-1], steps))
-    whole = [np.ones(place[-1] + 1), np.ones(place[-1] + 1)]
-    for column, values in zip(whole, (absent, present), strict=True):
-        column[place] = values
-    return Lattice(np.append(times, stamp[-1]), whole[0], whole[1])
+    there, gone = np.ones(place[-1] + 1), np.ones(place[-1] + 1)
+    there[place], gone[place] = (np.multiply.reduceat(values, first) for values in likelihoods)
+    return LookColumns(np.append(times, stamp[-1]), there, gone)
 
 
 STRETCH = 4096
@@ -97,20 +83,6 @@ class Calendar(NamedTuple):
     level: FloatArray
 
 
-class KeptSteps(NamedTuple):
-    """What is kept of the steps between two checkpoints.
-
-    Attributes:
-        before: hypotheses before each step.
-        merges: where it merged lists.
-        scales: probability of its look.
-    """
-
-    before: RunHypotheses
-    merges: IntArray
-    scales: FloatArray
-
-
 @kernel
 def _copy(held: RunHypotheses, out: RunHypotheses) -> None:
     """Copy hypotheses number by number, see `phase_kernels.copy_row`."""
@@ -122,19 +94,13 @@ def _copy(held: RunHypotheses, out: RunHypotheses) -> None:
 
 @kernel
 def _forward(
-    steps: tuple[int, int],
-    looks: Lattice,
-    calendar: Calendar,
-    law: Law,
-    held: RunHypotheses,
-    space: Workspace,
-    kept: KeptSteps,
-) -> None:
-    """Take some steps, keeping the belief before each, where it merged, and the probability of its look."""
+    steps: tuple[int, int], looks: LookColumns, calendar: Calendar, law: Law, held: RunHypotheses, space: Workspace,
+    before: RunHypotheses, merges: IntArray, scales: FloatArray,
+) -> None:  # fmt: skip
+    """Take some steps, and keep hypotheses `before` each, where it `merges` lists, and the probability of its look."""
     a, b = steps
-    stamp_s, absent, present = looks
+    stamp_s, present, absent = looks
     _, period, level = calendar
-    before, merges, scales = kept
     for k in range(a, b):
         i = k - a
         _copy(held, RunHypotheses(before.start[i], before.weight[i], before.number[i]))
@@ -146,7 +112,7 @@ def _forward(
 
 @kernel
 def expectations(
-    looks: Lattice,
+    looks: LookColumns,
     calendar: Calendar,
     slots: int,
     law: Law,
@@ -168,7 +134,7 @@ def expectations(
     Returns:
         Log evidence of the looks (-inf if they are impossible), and the presence at the first instant, given all.
     """
-    stamp_s, absent, present = looks
+    stamp_s, present, absent = looks
     importance, period, level = calendar
     steps = stamp_s.size - 1
     stretches = (steps + STRETCH - 1) // STRETCH
@@ -177,7 +143,7 @@ def expectations(
     starts, weights = np.zeros((STRETCH, 2, slots)), np.zeros((STRETCH, 1, 2, slots))
     counts, merges = np.zeros((STRETCH, 2), dtype=np.int64), np.zeros((STRETCH, 2), dtype=np.int64)
     scales = np.zeros(STRETCH)
-    kept = KeptSteps(RunHypotheses(starts, weights, counts), merges, scales)
+    before = RunHypotheses(starts, weights, counts)
     kept_start, kept_weight = np.zeros((stretches + 1, 2, slots)), np.zeros((stretches + 1, 1, 2, slots))
     kept_count = np.zeros((stretches + 1, 2), dtype=np.int64)
 
@@ -186,7 +152,7 @@ def expectations(
     for c in range(stretches):
         _copy(held, RunHypotheses(kept_start[c], kept_weight[c], kept_count[c]))
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
-        _forward((a, b), looks, calendar, law, held, space, kept)
+        _forward((a, b), looks, calendar, law, held, space, before, merges, scales)
         for i in range(b - a):
             evidence += np.log(scales[i])
     if not np.isfinite(evidence):
@@ -207,7 +173,7 @@ def expectations(
     for c in range(stretches - 1, -1, -1):
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
         _copy(RunHypotheses(kept_start[c], kept_weight[c], kept_count[c]), held)
-        _forward((a, b), looks, calendar, law, held, space, kept)
+        _forward((a, b), looks, calendar, law, held, space, before, merges, scales)
         for k in range(b - 1, a - 1, -1):
             i = k - a
             now, then = stamp_s[k], stamp_s[k + 1]

@@ -15,10 +15,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from evermap.errors import ConfigError, NumericalError
+from evermap.errors import ConfigError
 from evermap.existence import protocol as checks
-from evermap.existence.belief import BeliefTable
 from evermap.existence.lifetimes import log_death_odds
+from evermap.existence.protocol import BeliefTable
 from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray, IntArray
 
@@ -101,8 +101,6 @@ class Belief(BeliefTable):
         Raises:
             InputError, NumericalError: as `update`; messages count the stream's rows from 0.
         """
-        from evermap.existence.kernels import Stream, stream
-
         entry = checks.check_rows(feature, len(self), twice=True, field="feature")
         columns = {"stamp_s": stamp_s, "detected": detected, "p_miss": p_miss, "p_false": p_false}
         time, hit, miss, false = (checks.as_rows(column, len(entry), name) for name, column in columns.items())
@@ -112,53 +110,46 @@ class Belief(BeliefTable):
         entry, time = entry[order], time[order]
         same = np.append(False, entry[1:] == entry[:-1])[: len(entry)]
         before = np.where(same, np.append(0.0, time[:-1])[: len(entry)], self.stamp_s[entry])
-        odds = log_death_odds(self.priors, self.prior_of_row[entry], before, time)
-
-        inverse_odds, stamps, evidence = self._copies()
-        posterior, unsorted = np.empty((2, len(entry)))
-        bad = int(stream(Stream(entry, odds, there, gone), inverse_odds, evidence, posterior))
+        after, posterior, bad = self._streamed(entry, before, time, there, gone, logs=False)
         if bad >= 0:
-            who = f"row {int(order[bad])} (feature {entry[bad]} at {time[bad]} s)"
-            raise NumericalError(checks.impossible(who), hint="P_M and P_F strictly between 0 and 1")
-        stamps[entry] = time  # sorted by time, and the last assignment holds
+            raise checks.impossible(f"row {int(order[bad])} (feature {entry[bad]} at {time[bad]} s)")
+        unsorted = np.empty(len(entry))
         unsorted[order] = posterior
-        return self._with(inverse_odds, stamps, evidence), unsorted
-
-    def _gaps(self, index: IntArray, time: FloatArray) -> FloatArray:
-        """Log-odds of dying before `time`."""
-        return log_death_odds(self.priors, self.prior_of_row[index], self.stamp_s[index], time)
+        return after, unsorted
 
     def _presence(self, index: IntArray, time: FloatArray) -> FloatArray:
         from evermap.existence.kernels import predict_rows
 
         predicted = np.empty(len(index))
-        predict_rows(self.inverse_odds[index], self._gaps(index, time), predicted)
+        odds = log_death_odds(self.priors, self.prior_of_row[index], self.stamp_s[index], time)
+        predict_rows(self.inverse_odds[index], odds, predicted)
         return 1.0 / (1.0 + predicted)
 
     def _looked(
         self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray, *, logs: bool = False
     ) -> Self:
         """Return beliefs after looks at some rows, of these likelihoods or their logarithms."""
-        from evermap.existence import kernels
-
-        inverse_odds, stamps, evidence = self._copies()
-        looks = kernels.Stream(index, self._gaps(index, time), there, gone)
-        if logs:
-            bad = kernels.stream_of_logs(looks, inverse_odds, evidence)
-        else:
-            bad = kernels.stream(looks, inverse_odds, evidence, np.empty(len(index)))
+        after, _, bad = self._streamed(index, self.stamp_s[index], time, there, gone, logs=logs)
         if bad >= 0:
-            raise NumericalError(checks.impossible(f"row {index[bad]}"), hint="P_M and P_F strictly between 0 and 1")
-        stamps[index] = time
-        return self._with(inverse_odds, stamps, evidence)
+            raise checks.impossible(f"row {index[bad]}")
+        return after
 
-    def _copies(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _streamed(
+        self, row: IntArray, before_s: FloatArray, time: FloatArray, there: FloatArray, gone: FloatArray, logs: bool
+    ) -> tuple[Self, FloatArray, int]:
+        """Return beliefs after M looks, (M,) probabilities unless `logs`, and the first impossible look or -1."""
+        from evermap.existence.kernels import Stream, stream, stream_of_logs
+
+        inverse_odds, stamps, posterior = self.inverse_odds.copy(), self.stamp_s.copy(), np.empty(len(row))
         evidence = np.zeros(len(self)) if self.log_evidence is None else self.log_evidence.copy()
-        return self.inverse_odds.copy(), self.stamp_s.copy(), evidence
-
-    def _with(self, inverse_odds: FloatArray, stamp_s: FloatArray, evidence: FloatArray) -> Self:
+        looks = Stream(row, log_death_odds(self.priors, self.prior_of_row[row], before_s, time), there, gone)
+        if logs:
+            bad = stream_of_logs(looks, inverse_odds, evidence)
+        else:
+            bad = stream(looks, inverse_odds, evidence, posterior)
+        stamps[row] = time  # in order of time, and the last assignment holds
         kept = None if self.log_evidence is None else evidence
-        return replace(self, inverse_odds=inverse_odds, stamp_s=stamp_s, log_evidence=kept)
+        return replace(self, inverse_odds=inverse_odds, stamp_s=stamps, log_evidence=kept), posterior, int(bad)
 
 
 def init(

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.existence.elementary import inlined, kernel
+from evermap.sensing.sightlines import Lines
 from evermap.types import BoolArray, FloatArray, IntArray
 
 
@@ -29,7 +30,7 @@ class FrameRows(NamedTuple):
         first: (F + 1,) rows of frame f are `first[f]` to `first[f + 1]`, those of a seat next to each other.
         clique: (F,) frames of a clique are next to each other, in order of time.
         stamp_s: (F,) of the frames.
-        slot: (N,) rows of `Slots`: one for each pair of seat and line of sight.
+        slot: (N,) rows of `Lines`: one for each pair of seat and line of sight.
         seat: (N,) number of the seat within its clique.
         hit: (N,) detected.
     """
@@ -40,38 +41,6 @@ class FrameRows(NamedTuple):
     slot: IntArray
     seat: IntArray
     hit: BoolArray
-
-
-class Slots(NamedTuple):
-    """Pairs of seat and line of sight.
-
-    Attributes:
-        p_free: that the line of sight is free.
-        hits: pseudo counts of detections along it if it is, updated in place.
-        misses: of misses.
-    """
-
-    p_free: FloatArray
-    hits: FloatArray
-    misses: FloatArray
-
-
-class SensorNumbers(NamedTuple):
-    """`sites.SiteSensor` as plain numbers.
-
-    Attributes:
-        p_blocked: probability of a detection along a line of sight that is not free.
-        p_false: of a detection of nothing.
-        p_occluded: that the whole clique is occluded.
-        occluded_s: mean duration of that; 0 for an occlusion of its own in every frame.
-        use_misses: False has only hits count.
-    """
-
-    p_blocked: float
-    p_false: float
-    p_occluded: float
-    occluded_s: float
-    use_misses: bool
 
 
 class FrameEvidence(NamedTuple):
@@ -95,7 +64,10 @@ class SiteChain(NamedTuple):
     Attributes:
         seat: (C + 1,) rows of the seats of each clique.
         first_frame: (C + 1,) frames of each clique; at least one.
-        log_route, log_rest, log_leave: as in `sites.Transitions`.
+        log_route: (R, W) log probability that one that leaves a seat goes to another of its clique.
+        log_rest: (F, 2, W) log probabilities to be at the same seat since the frame before, of the old and the new;
+            undefined at the first frame of a clique.
+        log_leave: (F, 2, W) to have left it for another one, that is `log_route`.
     """
 
     seat: IntArray
@@ -106,7 +78,9 @@ class SiteChain(NamedTuple):
 
 
 @kernel
-def frame_evidence(rows: FrameRows, slots: Slots, sensor: SensorNumbers, said: FrameEvidence) -> None:
+def frame_evidence(
+    rows: FrameRows, lines: Lines, sensor: tuple[float, float, float, bool], said: FrameEvidence
+) -> None:
     """Compute the evidence of frames for each seat against 'away', while learning the lines of sight.
 
     All is given that the clique has been at a site all the time. (Of one that comes while it is watched, the looks
@@ -115,10 +89,16 @@ def frame_evidence(rows: FrameRows, slots: Slots, sensor: SensorNumbers, said: F
     exchangeable (Beta-Bernoulli): their probabilities multiply, each given those before. And somebody may stand before
     the whole clique (MATH.md section 3), for a while: a chain in continuous time over the frames. What is seen of it
     then is false, and teaches nothing.
+
+    Args:
+        rows: the looks.
+        lines: of each slot; hits and misses are updated in place.
+        sensor: all but the lines of `sites.SiteSensor`.
+        said: filled in.
     """
     first, clique, stamp_s, slot, seat, hit = rows
-    p_free, hits, misses = slots
-    p_blocked, p_false, p_occluded, occluded_s, use_misses = sensor
+    p_free, hits, misses, p_blocked = lines
+    p_false, p_occluded, occluded_s, use_misses = sensor
     log_ratio, n_hits, n_misses, expected = said
     width = log_ratio.shape[1]
     free, likely = np.empty(width), np.empty(width)  # of each seat: after the last frame, and by its lines alone

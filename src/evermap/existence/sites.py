@@ -27,7 +27,7 @@ from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray, Tabular
 
 if TYPE_CHECKING:
-    from evermap.existence.site_kernels import FrameEvidence
+    from evermap.existence.site_kernels import FrameEvidence, SiteChain
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,71 +120,6 @@ def odds(priors: tuple[LifetimePrior, ...], prior: IntArray, start_s: FloatArray
     certain = np.isinf(log_odds)
     bounded = np.clip(log_odds, -LOG_LARGEST, LOG_LARGEST)
     return np.exp(np.where(certain, log_odds, bounded)).reshape(start_s.shape)
-
-
-class Seats(NamedTuple):
-    """Rows of the seats of all cliques.
-
-    Attributes:
-        priors: the different lifetimes.
-        prior: (R,) which of these each seat has.
-        since_s: (R,) when the old ones came there.
-        came_s: (R,) when the new ones did, on average.
-        route: (R, W) where one that leaves a seat goes.
-        moves: (R,) sum of that.
-    """
-
-    priors: tuple[LifetimePrior, ...]
-    prior: IntArray
-    since_s: FloatArray
-    came_s: FloatArray
-    route: FloatArray
-    moves: FloatArray
-
-
-class Transitions(NamedTuple):
-    """Transitions between frames; undefined at the first frame of a clique.
-
-    Attributes:
-        log_route: (R, W) log probability that one that leaves a seat goes to another of its clique.
-        log_rest: (F, 2, W) log probabilities to be at the same seat since the frame before, of the old and the new.
-        log_leave: (F, 2, W) to have left it for another one, that is `log_route`.
-    """
-
-    log_route: FloatArray
-    log_rest: FloatArray
-    log_leave: FloatArray
-
-
-def transitions(chains: CliqueChains, seats: Seats, frame_clique: IntArray, frame_stamp: FloatArray) -> Transitions:
-    """Return what happens between frames.
-
-    Args:
-        chains: R rows of seats.
-        seats: their lifetimes and routes.
-        frame_clique: (F,) clique of each frame, those of a clique next to each other.
-        frame_stamp: (F,) when, in order of time within a clique.
-    """
-    priors, prior, since_s, came_s, route, moves = seats
-    width = chains.width
-    row = chains.first[frame_clique][:, None] + np.arange(width)
-    frame, seat = np.nonzero(row < chains.first[1:][frame_clique][:, None])
-    row = row[frame, seat]
-    stop = frame_stamp[frame]
-    last = np.maximum(frame - 1, 0)
-    start = np.where(frame_clique[last] == frame_clique[frame], frame_stamp[last], stop)
-    with np.errstate(divide="ignore"):
-        log_moves, log_stays = np.log(moves[row]), np.log1p(-moves[row])
-    shape = len(frame_clique), 2, width
-    log_rest, log_leave = np.full(shape, -np.inf), np.full(shape, -np.inf)
-    for age, began in enumerate((since_s, came_s)):
-        young, aged = np.maximum(start - began[row], 0.0), np.maximum(stop - began[row], 0.0)
-        log_odds = log_death_odds(priors, prior[row], young, aged)
-        leave, rest = -np.logaddexp(0.0, -log_odds), -np.logaddexp(0.0, log_odds)
-        log_rest[frame, age, seat] = np.logaddexp(rest, leave + log_stays)
-        log_leave[frame, age, seat] = np.where(log_moves > -np.inf, leave, -np.inf)
-    with np.errstate(divide="ignore"):
-        return Transitions(np.log(route), log_rest, log_leave)
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,11 +265,7 @@ def _check_sites(
     checks.check_rows(looks.clique, n_cliques, twice=True, field="clique")
     checks.check_rows(looks.site, n_sites, twice=True, field="site")
     checks.check_rows(looks.key, len(lines.hits), twice=True, field="key")
-    for field, values in (
-        ("p_here", p_here),
-        ("p_hop", dynamics.p_hop),
-        ("return_share", dynamics.return_share),
-    ):
+    for field, values in (("p_here", p_here), ("p_hop", dynamics.p_hop), ("return_share", dynamics.return_share)):
         checks.check_probability(np.asarray(values, dtype=np.float64), field)
     for field, summed in (("p_here", p_here), ("return_share", dynamics.return_share)):
         total = np.bincount(clique_of_site, summed, minlength=n_cliques)
@@ -413,13 +344,13 @@ class CliqueFrames:
 
 def _said_by(frames: CliqueFrames, looks: SiteLooks, chains: CliqueChains, sensor: SiteSensor) -> FrameEvidence:
     """Return the evidence of every frame."""
-    from evermap.existence.site_kernels import FrameEvidence, FrameRows, SensorNumbers, Slots, frame_evidence
+    from evermap.existence.site_kernels import FrameEvidence, FrameRows, frame_evidence
 
     lines, p_false, p_occluded, occluded_s, use_misses = sensor
     site, key = looks.site[frames.order], looks.key[frames.order]
     n_lines = max(len(lines.hits), 1)
     pair, slot = np.unique(site * n_lines + key, return_inverse=True)  # lines of sight to each site learn by themselves
-    slots = Slots(*(np.asarray(column, dtype=np.float64)[pair % n_lines] for column in lines[:3]))
+    columns = (np.asarray(column, dtype=np.float64)[pair % n_lines] for column in lines[:3])
     shape = len(frames), chains.width
     n_hits, n_misses = np.zeros((2, *shape), dtype=np.int64)
     said = FrameEvidence(np.zeros(shape), n_hits, n_misses, np.zeros(shape))
@@ -431,10 +362,8 @@ def _said_by(frames: CliqueFrames, looks: SiteLooks, chains: CliqueChains, senso
         chains.row_of_site[site] - chains.first[looks.clique[frames.order]],
         np.asarray(looks.hit, dtype=np.bool_)[frames.order],
     )
-    numbers = SensorNumbers(
-        float(lines.p_blocked), float(p_false), float(p_occluded), float(occluded_s), bool(use_misses)
-    )
-    frame_evidence(rows, slots, numbers, said)
+    numbers = float(p_false), float(p_occluded), float(occluded_s), bool(use_misses)
+    frame_evidence(rows, Lines(*columns, float(lines.p_blocked)), numbers, said)
     return said
 
 
@@ -479,11 +408,11 @@ def follow_sites(
     _check_sensor(sensor)
     chains = CliqueChains.of(clique_of_site, n_cliques)
     frames = CliqueFrames.of(looks, n_cliques, until_s)
-    first = _first_beliefs(chains, frames, dynamics, chains.start(p_here, pinned), start, pinned)
-    chain = kernels.SiteChain(chains.first, frames.first, *first.steps)
+    old = chains.start(p_here, pinned)
+    chain, new, came_s = _predicted(chains, frames, dynamics, old, start, pinned)
     with np.errstate(divide="ignore"):
-        log_here = np.log(np.column_stack([first.old, first.new]))
-    shape = first.steps.log_rest.shape
+        log_here = np.log(np.column_stack([old, new]))
+    shape = chain.log_rest.shape
 
     def filtered(said: FrameEvidence) -> tuple[FloatArray, FloatArray, FloatArray]:
         found = np.empty(shape), np.empty(len(frames)), np.empty(n_cliques)
@@ -500,37 +429,34 @@ def follow_sites(
     share = np.divide(stayed, stayed + returned, out=np.ones(n_sites), where=stayed + returned > 0.0)
     weight = np.empty(len(looks))
     weight[frames.order] = np.exp(smoothed[frames.of_look, :, seat[looks.site[frames.order]]]).sum(axis=1)
-    since_s = share * dynamics.since_s + (1.0 - share) * first.came_s[chains.row_of_site]
-    before = (first.old + first.new)[chains.row_of_site]
-    told = log_evidence, _trace(frames, said, log_after, log_odds)
-    return SiteBeliefs(stayed + returned, stayed, before, since_s, weight, *told)
+    since_s = share * dynamics.since_s + (1.0 - share) * came_s[chains.row_of_site]
+    before = (old + new)[chains.row_of_site]
+    trace = _trace(frames, said, log_after, log_odds)
+    return SiteBeliefs(stayed + returned, stayed, before, since_s, weight, log_evidence, trace)
 
 
-class _FirstBeliefs(NamedTuple):
-    """Beliefs of R seats before the first look, and what happens from look to look.
-
-    Attributes:
-        old, new: (R,) probability to be there since before the gap, and to have come within it.
-        came_s: (R,) when those that came did so, on average.
-        steps: from frame to frame.
-    """
-
-    old: FloatArray
-    new: FloatArray
-    came_s: FloatArray
-    steps: Transitions
-
-
-def _first_beliefs(
+def _predicted(
     chains: CliqueChains,
     frames: CliqueFrames,
     dynamics: SiteDynamics,
     old: FloatArray,
     start: FloatArray,
     pinned: BoolArray,
-) -> _FirstBeliefs:
-    """Predict from the last session to the first look, in steps; then from look to look."""
-    from evermap.existence.site_kernels import renew
+) -> tuple[SiteChain, FloatArray, FloatArray]:
+    """Predict from the last session to the first look, in steps; then from look to look.
+
+    Args:
+        chains: R rows of seats.
+        frames: of the session.
+        dynamics: how sites are left and returned to.
+        old: (R,) probability of each seat at `start`; updated in place to that of being there since before.
+        start: (C,) when that held.
+        pinned: (C,) cliques that are never away.
+
+    Returns:
+        What happens from frame to frame, and (R,) probability to have come within the gap, and when, on average.
+    """
+    from evermap.existence.site_kernels import SiteChain, renew
 
     n_sites = len(dynamics.since_s)
     priors, number = distinct((*dynamics.stay, *dynamics.absence))
@@ -547,9 +473,45 @@ def _first_beliefs(
     since_middle = np.maximum(np.arange(steps + 1) - 0.5, 0.0) * step_s[:, None]
     death_old, death_new = (odds(priors, prior, age_s[:, :-1], age_s[:, 1:]) for age_s in (edges, since_middle))
     renew(chains.first, route, moves, death_old, death_new, old, new, came)
-    came = start[chains.clique] + came * step_s
-    seats = Seats(priors, prior, since, came, route, moves)
-    return _FirstBeliefs(old, new, came, transitions(chains, seats, frames.clique, frames.stamp_s))
+    came_s = start[chains.clique] + came * step_s
+    rest_and_leave = _between_frames(chains, frames, (priors, prior), (since, came_s), moves)
+    with np.errstate(divide="ignore"):
+        return SiteChain(chains.first, frames.first, np.log(route), *rest_and_leave), new, came_s
+
+
+def _between_frames(
+    chains: CliqueChains,
+    frames: CliqueFrames,
+    lifetimes: tuple[tuple[LifetimePrior, ...], IntArray],
+    began_s: tuple[FloatArray, FloatArray],
+    moves: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """`log_rest` and `log_leave` of `SiteChain`.
+
+    Args:
+        chains: R rows of seats.
+        frames: of the session.
+        lifetimes: the different ones, and (R,) which of these each seat has.
+        began_s: (R,) when the old ones came there, and (R,) when the new ones did.
+        moves: (R,) probability that one that leaves a seat goes to another.
+    """
+    priors, prior = lifetimes
+    row = chains.first[frames.clique][:, None] + np.arange(chains.width)
+    frame, seat = np.nonzero(row < chains.first[1:][frames.clique][:, None])
+    row = row[frame, seat]
+    stop = frames.stamp_s[frame]
+    last = np.maximum(frame - 1, 0)
+    start = np.where(frames.clique[last] == frames.clique[frame], frames.stamp_s[last], stop)
+    with np.errstate(divide="ignore"):
+        log_moves, log_stays = np.log(moves[row]), np.log1p(-moves[row])
+    log_rest, log_leave = np.full((2, len(frames), 2, chains.width), -np.inf)
+    for age, began in enumerate(began_s):
+        young, aged = np.maximum(start - began[row], 0.0), np.maximum(stop - began[row], 0.0)
+        log_odds = log_death_odds(priors, prior[row], young, aged)
+        leave, rest = -np.logaddexp(0.0, -log_odds), -np.logaddexp(0.0, log_odds)
+        log_rest[frame, age, seat] = np.logaddexp(rest, leave + log_stays)
+        log_leave[frame, age, seat] = np.where(log_moves > -np.inf, leave, -np.inf)
+    return log_rest, log_leave
 
 
 def _trace(frames: CliqueFrames, said: FrameEvidence, log_after: FloatArray, log_odds: FloatArray) -> Evidence:

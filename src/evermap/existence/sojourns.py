@@ -39,7 +39,6 @@ class Sojourns(Shown):
     """Counts of one state.
 
     Attributes:
-        age_s: (A,) middle of each bin of age; its edges lie between.
         edge_s: (A + 1,) edges of the bins.
         events: (A, W) how many ended.
         exposure_s: (A, W) time spent.
@@ -82,29 +81,22 @@ class Fitted(Shown):
 
     def log_likelihood(self, counts: Sojourns) -> float:
         """Return `sum events log h - exposure h` of the table of counts."""
-        hazard = hazards(self.prior, counts.edge_s)[:, None]
+        hazard = mean_hazards(self.prior.cumulative_hazard(counts.edge_s), counts.edge_s)[:, None]
+        events, exposure_s = counts.events, counts.exposure_s
         if self.rhythm is not None:
             hazard = hazard * self.rhythm.factor[None, :]
         else:
-            counts = Sojourns(
-                counts.edge_s, counts.events.sum(1)[:, None], counts.exposure_s.sum(1)[:, None], counts.open_ended
-            )
-        happened = counts.events > 0.0
-        log_hazard = np.log(np.where(happened, np.maximum(hazard, 1e-300), 1.0))
-        return float((counts.events * log_hazard).sum() - (counts.exposure_s * hazard).sum())
+            events, exposure_s = events.sum(1)[:, None], exposure_s.sum(1)[:, None]
+        log_hazard = np.log(np.where(events > 0.0, np.maximum(hazard, 1e-300), 1.0))
+        return float((events * log_hazard).sum() - (exposure_s * hazard).sum())
 
     def score(self, counts: Sojourns) -> float:
         """Return log likelihood less the price of the parameters (Schwarz 1978)."""
         return self.log_likelihood(counts) - 0.5 * self.freedom * float(np.log(max(counts.n_events, 2.0)))
 
 
-def hazards(prior: LifetimePrior, edge_s: FloatArray) -> FloatArray:
-    """Return (A,) mean hazard of a lifetime in each bin of age."""
-    return _mean_hazards(prior.cumulative_hazard(edge_s), edge_s)
-
-
-def _mean_hazards(cumulative: FloatArray, edge_s: FloatArray) -> FloatArray:
-    """(A,) mean hazard in each bin, of the cumulative hazard at the edges."""
+def mean_hazards(cumulative: FloatArray, edge_s: FloatArray) -> FloatArray:
+    """Return (A,) mean hazard in each bin of age, of the cumulative hazard (A + 1,) at the edges."""
     with np.errstate(invalid="ignore"):
         within = np.where(np.isfinite(cumulative[1:]), np.minimum(np.diff(cumulative), CERTAIN), CERTAIN)
     return np.asarray(within / np.diff(edge_s), dtype=np.float64)
@@ -143,28 +135,6 @@ def smooth(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool = Fals
     return Fitted("smooth", prior, Rhythm(rates.log_week) if rhythm else None, rates.freedom, rates)
 
 
-def weibull(counts: Sojourns, _: Fitted | None = None) -> Fitted:
-    """Return a hazard that is a power of age."""
-    return _two_parameters("weibull", counts, lambda a, b: Weibull(exp(a), exp(b)))
-
-
-def gamma(counts: Sojourns, _: Fitted | None = None) -> Fitted:
-    """Return a sum of exponential phases."""
-    from scipy.special import gammaincc
-
-    def cumulative(a: float, b: float, edge_s: FloatArray) -> FloatArray:
-        """Return what `Gamma` has, but for its far tails, at a fortieth of the time."""
-        with np.errstate(divide="ignore"):
-            return np.asarray(-np.log(gammaincc(exp(b), edge_s / exp(a - b))), dtype=np.float64)
-
-    return _two_parameters("gamma", counts, lambda a, b: Gamma(exp(a - b), exp(b)), cumulative)
-
-
-def lognormal(counts: Sojourns, _: Fitted | None = None) -> Fitted:
-    """Return one typical duration and its spread."""
-    return _two_parameters("lognormal", counts, lambda a, b: LogNormal(a, exp(b)))
-
-
 def peaks(counts: Sojourns, _: Fitted | None = None) -> Fitted:
     """Return some typical durations, each with a small spread, on a wide background; as many as pay for themselves."""
     best = _mixture(counts, 0)
@@ -175,37 +145,20 @@ def peaks(counts: Sojourns, _: Fitted | None = None) -> Fitted:
     return best
 
 
-Family = Callable[[Sojourns, Fitted | None], Fitted]
-"""Counts, and an earlier fit to begin with, to a lifetime."""
-FAMILIES: dict[str, Family] = {
-    "exponential": exponential,
-    "weibull": weibull,
-    "gamma": gamma,
-    "lognormal": lognormal,
-    "peaks": peaks,
-    "smooth": smooth,
-}
-"""Families without a rhythm, by name."""
-WITH_RHYTHM: dict[str, Family] = {
-    "exponential": partial(exponential, rhythm=True),
-    "smooth": partial(smooth, rhythm=True),
-}
-"""Families with a rhythm of the week."""
-
-
 def _two_parameters(
     family: str,
-    counts: Sojourns,
     build: Callable[[float, float], LifetimePrior],
-    cumulative: Callable[[float, float, FloatArray], FloatArray] | None = None,
+    cumulative: Callable[[float, float, FloatArray], FloatArray] | None,
+    counts: Sojourns,
+    _: Fitted | None = None,
 ) -> Fitted:
     """Fit a family with two parameters: the logarithms of a typical duration and of a shape.
 
     Args:
         family: its name.
-        counts: data of the fit.
         build: makes the lifetime of the two.
         cumulative: makes its cumulative hazard at some ages, if there is a quicker way than the lifetime's own.
+        counts: data of the fit.
     """
     from scipy.optimize import minimize
 
@@ -222,7 +175,7 @@ def _two_parameters(
     def loss(parameters: FloatArray) -> float:
         a, b = bounded(parameters)
         at_edges = cumulative(a, b, edge) if cumulative else build(a, b).cumulative_hazard(edge)
-        hazard = np.maximum(_mean_hazards(at_edges, edge), 1e-300)
+        hazard = np.maximum(mean_hazards(at_edges, edge), 1e-300)
         likelihood = (events * np.log(hazard)).sum() - (exposure * hazard).sum()
         return float(0.01 * parameters[1] ** 2 - likelihood)  # a weak pull to shape 1
 
@@ -233,6 +186,14 @@ def _two_parameters(
         loss, triangle[0], method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-3, "initial_simplex": triangle}
     )
     return Fitted(family, build(*bounded(found.x)), None, 2.0)
+
+
+def _gamma_hazard(a: float, b: float, edge_s: FloatArray) -> FloatArray:
+    """Cumulative hazard as of `Gamma`, but for its far tails, at a fortieth of the time."""
+    from scipy.special import gammaincc
+
+    with np.errstate(divide="ignore"):
+        return np.asarray(-np.log(gammaincc(exp(b), edge_s / exp(a - b))), dtype=np.float64)
 
 
 def _mixture(counts: Sojourns, n: int) -> Fitted:
@@ -289,3 +250,21 @@ def _highest(x: FloatArray, ended: FloatArray, n: int) -> FloatArray:
         found[i] = x[int(np.argmax(near @ left))]
         left = left * (1.0 - np.exp(-0.5 * ((x - found[i]) / (3.0 * PEAK_SPREAD)) ** 2))
     return found
+
+
+Family = Callable[[Sojourns, Fitted | None], Fitted]
+"""Counts, and an earlier fit to begin with, to a lifetime."""
+FAMILIES: dict[str, Family] = {
+    "exponential": exponential,
+    "weibull": partial(_two_parameters, "weibull", lambda a, b: Weibull(exp(a), exp(b)), None),
+    "gamma": partial(_two_parameters, "gamma", lambda a, b: Gamma(exp(a - b), exp(b)), _gamma_hazard),
+    "lognormal": partial(_two_parameters, "lognormal", lambda a, b: LogNormal(a, exp(b)), None),
+    "peaks": peaks,
+    "smooth": smooth,
+}
+"""Families without a rhythm, by name."""
+WITH_RHYTHM: dict[str, Family] = {
+    "exponential": partial(exponential, rhythm=True),
+    "smooth": partial(smooth, rhythm=True),
+}
+"""Families with a rhythm of the week."""

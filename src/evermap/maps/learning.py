@@ -34,10 +34,8 @@ from evermap.survival.class_lifetimes import (
     ClassPosterior,
     Sightings,
     absence_log_likelihood,
-    absence_posterior,
     finer,
     stay_log_likelihood,
-    stay_posterior,
 )
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, rows_of
 
@@ -198,7 +196,7 @@ class ClassLives:
         """
         looks_s = before.looks_s if now_s is None else np.append(before.looks_s[before.looks_s < now_s], now_s)
         if not len(stays):
-            nothing = stay_posterior(np.zeros((0, len(LOG_MEAN), len(LOG_SHAPE))))
+            nothing = ClassPosterior.of(np.zeros((0, len(LOG_MEAN), len(LOG_SHAPE))))
             return cls(replace(before, looks_s=looks_s), np.zeros(0, dtype=np.int64), nothing)
         history = History.of(stays, looks_s, settings)
         learned = _learned(history, before, settings)
@@ -279,7 +277,7 @@ def _learned(history: History, before: Lives, settings: LifetimeConfig) -> _Lear
     absences_said = [
         life.n_stays * absence_said(life.absence, settings) if life and life.tells_absence else None for life in said
     ]
-    absence = absence_posterior(of_absences, _stacked(absences_said))
+    absence = ClassPosterior.of(of_absences, _stacked(absences_said), improper=True)
     p_hop = history.shares(history.hopped, ended)
     back_by_hop = p_hop * history.shares(history.there_again, history.hopped_twice)
     here_again = history.shares(history.back_here, history.away & np.isfinite(history.back_s))
@@ -298,7 +296,7 @@ def _learned(history: History, before: Lives, settings: LifetimeConfig) -> _Lear
         log_likelihood[doubted] = p_gone * log_likelihood[doubted] + (1.0 - p_gone) * stay_log_likelihood(going_on)
     of_stays = _by_class(log_likelihood, kind, n_classes)
     stays_said = [life.n_stays * stay_said(life.stay, settings) if life else None for life in said]
-    stay = stay_posterior(of_stays, _stacked(stays_said))
+    stay = ClassPosterior.of(of_stays, _stacked(stays_said))
     p_known = history.shares(history.to_known, history.had_choice)
     counts = (history.counts(mask).astype(np.int64) for mask in (history.recent, history.recent & ended))
     return _Learned(of_stays, of_absences, stay, absence, p_hop, p_known, *counts)
@@ -336,7 +334,7 @@ class ClassEvidence:
 
 
 def stay_said(prior: LifetimePrior, settings: LifetimeConfig = USUAL) -> FloatArray:
-    """Return the (M, A) mean log likelihood of one stay distributed as a user's prior, on the grid of `stay_posterior`.
+    """Return the (M, A) mean log likelihood of one stay distributed as a user's prior, on the grid of `ClassPosterior`.
 
     `n` times this is what `n` stays say whose lengths spread as the prior does (a power prior, Ibrahim and Chen 2000);
     of those beyond `settings.prior_longest_s` only that is known.
@@ -353,7 +351,7 @@ def stay_said(prior: LifetimePrior, settings: LifetimeConfig = USUAL) -> FloatAr
 
 
 def absence_said(prior: LifetimePrior, settings: LifetimeConfig = USUAL) -> FloatArray:
-    """Return the (M, A) same of one absence, where `absence_posterior` lives."""
+    """Return the (M, A) same of one absence, on that of absences."""
     age_s, ended = _spread(prior, settings)
     age_s, ended = age_s[:, None, None], ended[:, None, None]
     share, log_mean = 1.0 / (1.0 + np.exp(-finer(LOGIT_RETURN))), finer(LOG_MEAN)[:, None]

@@ -164,7 +164,11 @@ def by_recorded_identity(landmarks: Landmarks, innovations: Innovations, recordi
     given = innovations.landmark_id[kept_rows]
     if np.array_equal(recorded, given):
         return landmarks
-    table, mine, theirs = _table(given, recorded)
+    known = (given != UNKNOWN) & (recorded != UNKNOWN)
+    mine, row = np.unique(given[known], return_inverse=True)
+    theirs, column = np.unique(recorded[known], return_inverse=True)
+    table = np.zeros((len(mine), len(theirs)))  # detections by landmark and identity
+    np.add.at(table, (row, column), 1.0)
     claims: dict[int, int] = {}
     for k in np.argsort(-table.max(axis=1, initial=0), kind="stable"):
         claims.setdefault(int(theirs[table[k].argmax()]), int(mine[k]))
@@ -173,13 +177,3 @@ def by_recorded_identity(landmarks: Landmarks, innovations: Innovations, recordi
     ids = np.array([names[int(k)] for k in landmarks.landmark_id[rows]], dtype=np.int64)
     order = np.argsort(ids)
     return replace(rows_of(landmarks, rows[order]), landmark_id=ids[order])
-
-
-def _table(landmark_id: IntArray, true_id: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
-    """Count detections (L, I) by landmark and identity; return both lists of ids, too."""
-    given = (landmark_id != UNKNOWN) & (true_id != UNKNOWN)
-    landmarks, row = np.unique(landmark_id[given], return_inverse=True)
-    identities, column = np.unique(true_id[given], return_inverse=True)
-    table = np.zeros((len(landmarks), len(identities)))
-    np.add.at(table, (row, column), 1.0)
-    return table, landmarks, identities

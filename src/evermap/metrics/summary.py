@@ -138,39 +138,21 @@ def metrics_dict(evaluation: Evaluation) -> dict[str, Any]:
 
 def _alignment(evaluation: Evaluation) -> dict[str, Any]:
     """Return how estimates were aligned with the truth, and how much truth was scored."""
-    out: dict[str, Any] = {
+    poses, online, odometry = evaluation.poses, evaluation.online, evaluation.dead_reckoning
+    return {
         "purpose": "evaluation only; nothing of it flows back into the estimate",
         "rate_hz": evaluation.rate_hz,
-        "method": None,
-        "pose_truth_estimate": None,
-        "pose_truth_dead_reckoning": None,
-        "pose_truth_online": None,
-        "scored_stamps": 0,
-        "scored_from_s": None,
-        "scored_to_s": None,
-        "skipped_stamps": 0,
-        "online_scored_stamps": 0,
-        "online_skipped_stamps": 0,
+        "method": poses and poses.alignment,
+        "pose_truth_estimate": poses and _pose(poses.pose_truth_estimate),
+        "pose_truth_dead_reckoning": odometry and _pose(odometry.pose_truth_estimate),
+        "pose_truth_online": online and _pose(online.pose_truth_estimate),
+        "scored_stamps": len(poses.stamp_s) if poses else 0,
+        "scored_from_s": poses and json_number(poses.stamp_s[0]),
+        "scored_to_s": poses and json_number(poses.stamp_s[-1]),
+        "skipped_stamps": poses.skipped if poses else 0,
+        "online_scored_stamps": len(online.stamp_s) if online else 0,
+        "online_skipped_stamps": online.skipped if online else 0,
     }
-    poses, online, odometry = evaluation.poses, evaluation.online, evaluation.dead_reckoning
-    if poses:
-        out |= {
-            "method": poses.alignment,
-            "pose_truth_estimate": _pose(poses.pose_truth_estimate),
-            "scored_stamps": len(poses.stamp_s),
-            "scored_from_s": json_number(poses.stamp_s[0]),
-            "scored_to_s": json_number(poses.stamp_s[-1]),
-            "skipped_stamps": poses.skipped,
-        }
-    if odometry:
-        out["pose_truth_dead_reckoning"] = _pose(odometry.pose_truth_estimate)
-    if online:
-        out |= {
-            "pose_truth_online": _pose(online.pose_truth_estimate),
-            "online_scored_stamps": len(online.stamp_s),
-            "online_skipped_stamps": online.skipped,
-        }
-    return out
 
 
 def _pose(pose: FloatArray) -> dict[str, float | None]:

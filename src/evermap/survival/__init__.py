@@ -2,12 +2,7 @@
 
 from evermap.survival.base import LifetimePrior, Seed
 from evermap.survival.families import Exponential, Gamma, GeneralPurpose, LogNormal, Mixture, Uniform, Weibull
-from evermap.survival.hazards import (
-    PeriodicHazard,
-    PiecewiseConstantHazard,
-    gone_daily,
-)
-from evermap.survival.step import StepLifetime, never_leaves
+from evermap.survival.hazards import PeriodicHazard, PiecewiseConstantHazard, StepLifetime, gone_daily, never_leaves
 from evermap.survival.text import parse_prior
 
 __all__ = [

@@ -8,7 +8,6 @@ number.
 
 from __future__ import annotations
 
-import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -249,15 +248,6 @@ def check_rates(rates: Sequence[float], name: str = "rates") -> None:
                 field=name,
                 hint="a rate of 0 where nothing ever leaves",
             )
-
-
-def check_edges(edges: Sequence[float], name: str = "edges_s") -> None:
-    """Raise a ConfigError unless `edges` start at 0 and increase strictly."""
-    if len(edges) == 0 or edges[0] != 0.0:
-        raise ConfigError("edges must start at 0", field=name)
-    for row, (left, right) in enumerate(itertools.pairwise(edges), start=1):
-        if not (math.isfinite(right) and right > left):
-            raise ConfigError(f"edges must be finite and increase strictly, row {row} is {right!r}", field=name)
 
 
 def _refuse(values: FloatArray, good: BoolArray, name: str, problem: str, hint: str | None = None) -> None:

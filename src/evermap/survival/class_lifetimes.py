@@ -74,6 +74,25 @@ class ClassPosterior(Shown):
     second: FloatArray
     improper: bool
 
+    @classmethod
+    def of(cls, log_likelihood: FloatArray, said: FloatArray | float = 0.0, *, improper: bool = False) -> Self:
+        """Compute it from log likelihoods (C, M, A) on `LOG_MEAN` and `LOG_SHAPE`, or `LOGIT_RETURN` of absences.
+
+        Args:
+            log_likelihood: of what was seen; it is interpolated to a finer grid.
+            said: (C, M', A') log likelihoods on that grid, `finer` of both, of what else is known; none where it is 0.
+            improper: whether they are of absences.
+        """
+        fine = _fine(log_likelihood) + said
+        weight, _ = _classes(fine, improper)
+        weight[:-1] *= np.exp(fine - fine.max(axis=(1, 2), keepdims=True, initial=-np.inf))
+        return cls._normalised(weight, improper)
+
+    @classmethod
+    def _normalised(cls, weight: FloatArray, improper: bool) -> Self:
+        weight = weight / weight.sum(axis=(1, 2), keepdims=True)
+        return cls(weight, np.exp(finer(LOG_MEAN)), _second(improper), improper)
+
     def curve(self, row: int) -> PiecewiseConstantHazard:
         """Return the posterior mean of the survival function of a class; -1 for one without data."""
         survival = _survival_table(self.improper) @ self.weight[row].ravel()
@@ -96,26 +115,6 @@ class ClassPosterior(Shown):
             for level in (tail, 1.0 - tail)
         )
         return survival @ weight, lower, upper
-
-
-def stay_posterior(log_likelihood: FloatArray, said: FloatArray | float = 0.0) -> ClassPosterior:
-    """Compute the posterior of stays from log likelihoods (C, M, A) of C classes on `LOG_MEAN` and `LOG_SHAPE`.
-
-    Args:
-        log_likelihood: of what was seen; it is interpolated to a finer grid.
-        said: (C, M', A') log likelihoods on that grid, `finer` of both, of what else is known; none where it is 0.
-    """
-    return _posterior_of(_fine(log_likelihood) + said, improper=False)
-
-
-def absence_posterior(log_likelihood: FloatArray, said: FloatArray | float = 0.0) -> ClassPosterior:
-    """Compute the posterior of absences from log likelihoods (C, M, A) on `LOG_MEAN` and `LOGIT_RETURN`.
-
-    Args:
-        log_likelihood: of what was seen.
-        said: as of `stay_posterior`.
-    """
-    return _posterior_of(_fine(log_likelihood) + said, improper=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +146,7 @@ class SitesPosterior(Shown):
         improper: bool = False,
         spreads: tuple[tuple[float, ...], tuple[float, ...]] | None = None,
     ) -> Self:
-        """Compute it from log likelihoods (S, C, M, A) of S sites, as `stay_posterior` takes them, 0 without data.
+        """Compute it from log likelihoods (S, C, M, A) of S sites, as of `ClassPosterior`, 0 without data.
 
         Args:
             log_likelihood: of what was seen at each site; of absences where `improper`.
@@ -163,12 +162,12 @@ class SitesPosterior(Shown):
             fine = _fine(site)
             for row, pair in enumerate(pairs):
                 log_weight[row] += _log_evidence(fine, pair)
-        parts = [_classes(of_pair, improper) for of_pair in log_weight]
+        priors, log_evidence = zip(*(_classes(of_pair, improper) for of_pair in log_weight), strict=True)
         said = np.concatenate([log_weight, np.zeros_like(log_weight[:, :1])], axis=1)
         with np.errstate(divide="ignore"):
-            log_weight = said + np.log(np.stack([part.prior for part in parts]))
+            log_weight = said + np.log(np.stack(priors))
         log_weight -= _log_sums(log_weight)
-        log_pair = np.array([part.log_evidence for part in parts])
+        log_pair = np.array(log_evidence)
         log_weight += (log_pair - np.logaddexp.reduce(log_pair))[:, None, None, None]
         return cls(log_weight, each, pairs, improper)
 
@@ -193,7 +192,7 @@ class SitesPosterior(Shown):
         of_site = np.sum(list(of_pairs), axis=0)
         if fine is not None:
             of_site[:-1] *= np.exp(fine - fine.max(axis=(1, 2), keepdims=True, initial=-np.inf))
-        return _normalised(of_site, self.improper)
+        return ClassPosterior._normalised(of_site, self.improper)
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,16 +293,13 @@ def absence_log_likelihood(
     return np.asarray(np.log(seen.mean(axis=1)) - np.log((first[..., None] * share + (1.0 - share)).mean(axis=1)))
 
 
-@dataclass(frozen=True, slots=True)
-class _Classes:
-    """Prior (C + 1, M, A) of each class given the data of all others; log evidence of all, up to a constant."""
+def _classes(fine: FloatArray, improper: bool) -> tuple[FloatArray, float]:
+    """Sum over level and spread of the classes, given log likelihoods (C, M, A) on the finer grid.
 
-    prior: FloatArray
-    log_evidence: float
-
-
-def _classes(fine: FloatArray, improper: bool) -> _Classes:
-    """Sum over level and spread of the classes, given log likelihoods (C, M, A) on the finer grid."""
+    Returns:
+        The prior (C + 1, M, A) of each class given the data of all others; and the log evidence of all, up to a
+        constant.
+    """
     if improper:
         share = _second(improper)
         second = share * (1.0 - share)  # even over probabilities
@@ -320,19 +316,7 @@ def _classes(fine: FloatArray, improper: bool) -> _Classes:
     log_evidence = float(log_hyper.max() + np.log(hyper.sum()) + most.sum())
     hyper /= hyper.sum()
     of_means = np.concatenate([(hyper / evidence) @ common, (hyper @ common)[None]])
-    return _Classes(of_means[:, :, None] * second, log_evidence)
-
-
-def _posterior_of(fine: FloatArray, improper: bool) -> ClassPosterior:
-    """Return the posterior of classes of one site, from log likelihoods (C, M, A) on the finer grid."""
-    weight = _classes(fine, improper).prior
-    weight[:-1] *= np.exp(fine - fine.max(axis=(1, 2), keepdims=True, initial=-np.inf))
-    return _normalised(weight, improper)
-
-
-def _normalised(weight: FloatArray, improper: bool) -> ClassPosterior:
-    weight = weight / weight.sum(axis=(1, 2), keepdims=True)
-    return ClassPosterior(weight, np.exp(finer(LOG_MEAN)), _second(improper), improper)
+    return of_means[:, :, None] * second, log_evidence
 
 
 def _second(improper: bool) -> FloatArray:

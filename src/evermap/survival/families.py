@@ -242,9 +242,7 @@ class Gamma(_OfPositives, SmoothLifetime):
         return np.asarray(1.0 / (x + 1.0 - self.shape + value))
 
     def _log_upper_tail(self, x: FloatArray) -> FloatArray:
-        return np.asarray(
-            self.shape * np.log(x) - x - math.lgamma(self.shape) + np.log(self._continued_fraction(x)),
-        )
+        return np.asarray(self.shape * np.log(x) - x - math.lgamma(self.shape) + np.log(self._continued_fraction(x)))
 
     def _log_lower_series(self, x: FloatArray) -> FloatArray:
         """Return `log P(shape, x)` where it underflows, so `x` is far below `shape` or tiny (DLMF 8.7.1)."""

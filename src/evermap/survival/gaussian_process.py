@@ -22,14 +22,7 @@ from numpy.typing import ArrayLike
 from evermap.errors import DataError, NumericalError
 from evermap.show import Shown
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.hazard_regression import (
-    Exposures,
-    HazardDraws,
-    Posterior,
-    Term,
-    learn,
-    stretches_for,
-)
+from evermap.survival.hazard_regression import Exposures, HazardDraws, Posterior, Term, learn, stretches_for
 from evermap.survival.parametric_fit import fit
 from evermap.types import FloatArray, IntArray
 
@@ -125,9 +118,7 @@ class GpHazard(Shown):
         wanted = {smooth.name for smooth in self._smooth} | ({"class_id"} if len(self.class_ids) else set())
         for name in sorted(wanted ^ row.columns().keys()):
             raise DataError("is needed" if name in wanted else "was not learned from", field=name)
-        group = 0
-        if row.class_id is not None:
-            group = group_of(row.class_id, self.class_ids)[0]
+        group = 0 if row.class_id is None else group_of(row.class_id, self.class_ids)[0]
         columns = np.zeros((len(self.edges_s), len(self.posterior.mean)))
         start, levels = 0, iter(self._smooth)
         for term in self._terms:
@@ -152,9 +143,9 @@ def gp_fit(data: CensoredLifetimes, covariates: Covariates | None = None) -> GpH
             raise DataError(f"has {len(values)} rows for {len(data.left_s)} lifetimes", field=name)
     edges_s = stretches_for(data)
     baseline = weibull_baseline(data, edges_s)
-    class_ids = np.zeros(0, dtype=np.int64) if known.class_id is None else np.unique(known.class_id)
-    group = np.zeros(len(data.left_s), dtype=np.int64)
+    class_ids, group = np.zeros(0, dtype=np.int64), np.zeros(len(data.left_s), dtype=np.int64)
     if known.class_id is not None:
+        class_ids = np.unique(known.class_id)
         group = group_of(known.class_id, class_ids)
     named = curve_terms(edges_s, max(len(class_ids), 1))
     smooth = tuple(_smooth_terms(known))

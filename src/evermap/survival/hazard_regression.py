@@ -126,7 +126,8 @@ class HazardDraws(SurvivalEstimate):
         check_open_share(p, "p")
         check_open_share(confidence)
         target = -np.log1p(-p)
-        reached = np.concatenate([np.zeros((len(self.rates), 1)), self._cumulative()], axis=1)
+        cumulative = np.cumsum(self.rates[:, :-1] * np.diff(self.edges_s), axis=1)
+        reached = np.concatenate([np.zeros((len(self.rates), 1)), cumulative], axis=1)
         stretch = (reached < target).sum(axis=1) - 1
         rows = np.arange(len(self.rates))
         with np.errstate(divide="ignore"):
@@ -147,9 +148,6 @@ class HazardDraws(SurvivalEstimate):
         weight = np.exp(lightest[-1] - cumulative[:, -1])
         last = float(weight @ rates[:, -1] / weight.sum())
         return PiecewiseConstantHazard(tuple(edges_s), (*np.maximum(-np.diff(log_expected) / steps, 0.0), last))
-
-    def _cumulative(self) -> FloatArray:
-        return np.asarray(np.cumsum(self.rates[:, :-1] * np.diff(self.edges_s), axis=1))
 
 
 def overlaps(first_s: FloatArray, last_s: FloatArray, edges_s: FloatArray) -> FloatArray:
@@ -224,27 +222,22 @@ def learn(samples: Exposures, terms: Sequence[Term]) -> Posterior:
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1, user_api="blas"):  # matrices of some hundreds are faster on one thread
-        return _learn(samples, terms)
-
-
-def _learn(samples: Exposures, terms: Sequence[Term]) -> Posterior:
-    model = _Model(samples, terms)
-    scales = np.array([GUESS if term.scale is None else term.scale for term in terms])
-    mean = np.zeros(model.size)
-    for _ in range(_ROUNDS):
-        mean, covariance, log_evidence = model.laplace(mean, scales)
-        updated = scales.copy()
-        for j, (term, columns) in enumerate(zip(terms, model.columns, strict=True)):
-            if term.scale is None:
-                u, precision = mean[columns], model.precisions[j]
-                left = float(np.sum(precision * covariance[columns, columns])) / scales[j] ** 2
-                determined = max(term.size - left, 0.0)
-                updated[j] = np.sqrt((u @ precision @ u + GUESS_COUNTS * GUESS**2) / (determined + GUESS_COUNTS))
-        change = float(np.abs(np.log(updated / scales)).max(initial=0.0))
-        if change < _SETTLED:
-            break
-        scales = updated
-    return Posterior(mean, covariance, scales, log_evidence)
+        model = _Model(samples, terms)
+        scales = np.array([GUESS if term.scale is None else term.scale for term in terms])
+        mean = np.zeros(model.size)
+        for _ in range(_ROUNDS):
+            mean, covariance, log_evidence = model.laplace(mean, scales)
+            updated = scales.copy()
+            for j, (term, columns) in enumerate(zip(terms, model.columns, strict=True)):
+                if term.scale is None:
+                    u, precision = mean[columns], model.precisions[j]
+                    left = float(np.sum(precision * covariance[columns, columns])) / scales[j] ** 2
+                    determined = max(term.size - left, 0.0)
+                    updated[j] = np.sqrt((u @ precision @ u + GUESS_COUNTS * GUESS**2) / (determined + GUESS_COUNTS))
+            if float(np.abs(np.log(updated / scales)).max(initial=0.0)) < _SETTLED:
+                break
+            scales = updated
+        return Posterior(mean, covariance, scales, log_evidence)
 
 
 class _Model:
@@ -326,18 +319,13 @@ class _Model:
         before, within = samples.before * ratio, samples.within * ratio
         total = within.sum(axis=1)
         caught = np.where(samples.bounded, 1.0 / np.expm1(np.clip(total, 1e-100, 700.0)), 0.0)[:, None]
-        slope = weight * (samples.ends - before + caught * within)
+        by_sample = weight * (samples.ends - before + caught * within)
+        by_group = np.stack([by_sample[rows].sum(axis=0) for rows in self.rows])
+        slope = np.einsum("gkd,gk->d", self.curves, by_group) + self.levels.T @ by_sample.sum(axis=1)
         curvature = (weight * caught * (1.0 + caught))[:, 0]
         sure, maybe = weight * before, weight * caught * within
-        return (
-            self._slope(slope),
-            self._second(sure - maybe, within, curvature),
-            self._second(sure, within, curvature),
-        )
-
-    def _slope(self, by_sample: FloatArray) -> FloatArray:
-        by_group = np.stack([by_sample[rows].sum(axis=0) for rows in self.rows])
-        return np.asarray(np.einsum("gkd,gk->d", self.curves, by_group) + self.levels.T @ by_sample.sum(axis=1))
+        information, safe = (self._second(diagonal, within, curvature) for diagonal in (sure - maybe, sure))
+        return np.asarray(slope), information, safe
 
     def _second(self, diagonal: FloatArray, within: FloatArray, curvature: FloatArray) -> FloatArray:
         """Return `sum_i X_i' (diag(diagonal_i) + curvature_i within_i within_i') X_i`."""

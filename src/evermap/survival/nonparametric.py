@@ -32,7 +32,8 @@ from evermap.errors import DataError, NumericalError
 from evermap.show import ShownTable
 from evermap.survival.base import SurvivalEstimate, check_open_share, check_times
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.step import StepLifetime
+from evermap.survival.hazards import StepLifetime
+from evermap.survival.turnbull import Point, best_between, contract, from_samples, names, newton_step, rough_step
 from evermap.types import FloatArray
 
 ROUGH, ROUGH_STEPS = 0.02, 40
@@ -89,16 +90,6 @@ def npmle(data: CensoredLifetimes) -> Npmle:
     Raises:
         NumericalError: there is no maximum, which happens only with truncation, or it was not found.
     """
-    from evermap.survival.turnbull import (
-        Point,
-        best_between,
-        contract,
-        from_samples,
-        names,
-        newton_step,
-        rough_step,
-    )
-
     start, end, terms = from_samples(data)
     last_entry = int(np.flatnonzero(terms.entered)[-1])
     point = best = Point(terms, np.full(start.size, 1.0 / start.size))
@@ -119,28 +110,22 @@ def npmle(data: CensoredLifetimes) -> Npmle:
         best, stale = (point, 0) if point.kkt_violation < best.kkt_violation else (best, stale + 1)
     beyond = float(point.above[last_entry])
     if best.kkt_violation > GOOD_ENOUGH:
-        raise (
-            _no_maximum(data)
-            if not beyond > VANISHING_SLOWLY
-            else NumericalError(
-                f"no maximum of the likelihood found in {steps} steps, {best.kkt_violation:.1g} from optimal"
+        if not beyond > VANISHING_SLOWLY:
+            raise NumericalError(
+                "the likelihood has no maximum: it grows as the mass beyond the latest entries "
+                f"(up to {float(data.entry_s.max()):g} s) goes to 0, because all samples at risk before may be gone "
+                "by then",
+                field="entry_s",
+                hint="leave out the few samples of the earliest entries, or estimate given survival of a later time",
             )
-        )
+        problem = f"no maximum of the likelihood found in {steps} steps, {best.kkt_violation:.1g} from optimal"
+        raise NumericalError(problem)
     # Where the conditions hold with equality and without mass, the last trace of mass vanishes slowly.
     tidy = np.where(best.mass > TRACE, best.mass, 0.0)
     tidied = Point(terms, tidy / tidy.sum())
     best = tidied if tidied.kkt_violation <= max(GOOD, best.kkt_violation) else best
     kept = best.mass > 0.0
     return Npmle(start[kept], end[kept], best.mass[kept], best.loglik, best.kkt_violation, steps)
-
-
-def _no_maximum(data: CensoredLifetimes) -> NumericalError:
-    return NumericalError(
-        "the likelihood has no maximum: it grows as the mass beyond the latest entries "
-        f"(up to {float(data.entry_s.max()):g} s) goes to 0, because all samples at risk before may be gone by then",
-        field="entry_s",
-        hint="leave out the few samples of the earliest entries, or estimate given survival of a later time",
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,7 +24,7 @@ from evermap.errors import ConfigError, DataError, NumericalError
 from evermap.survival.base import LifetimePrior, SurvivalEstimate, check_open_share
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.families import Exponential, Gamma, GeneralPurpose, LogNormal, Mixture, Weibull
-from evermap.survival.step import never_leaves
+from evermap.survival.hazards import never_leaves
 from evermap.types import FloatArray
 
 _IMPOSSIBLE = 1e10

@@ -16,8 +16,7 @@ from evermap.errors import ConfigError, suggestion
 from evermap.survival.base import LifetimePrior
 from evermap.survival.durations import parse_duration_s, parse_hour, parse_number, parse_positive, parse_rate_hz
 from evermap.survival.families import Exponential, Gamma, GeneralPurpose, LogNormal, Mixture, Uniform, Weibull
-from evermap.survival.hazards import PeriodicHazard, PiecewiseConstantHazard, gone_daily
-from evermap.survival.step import StepLifetime, never_leaves
+from evermap.survival.hazards import PeriodicHazard, PiecewiseConstantHazard, StepLifetime, gone_daily, never_leaves
 
 Values = Mapping[str, Any]
 Reader = Callable[[str], Any]
@@ -34,8 +33,7 @@ class Form:
         needed: required keys, with the reader of each.
         optional: keys that may be given.
         bare: key whose value stands alone, without `key=`.
-        steps: whether further keys are times at which a hazard begins.
-        spans: whether further keys are times, spans of time or `never`, with the share that leaves then.
+        series: what further keys give: 'rates' from a time on, 'shares' that leave at a time, in a span or `never`.
     """
 
     example: str
@@ -44,8 +42,7 @@ class Form:
     needed: Mapping[str, Reader] = field(default_factory=dict)
     optional: Mapping[str, Reader] = field(default_factory=dict)
     bare: str | None = None
-    steps: bool = False
-    spans: bool = False
+    series: str = ""
 
     @property
     def keys(self) -> dict[str, Reader]:
@@ -93,8 +90,7 @@ def _parse_form(text: str) -> LifetimePrior:
     if form is None:
         raise ConfigError(f"unknown lifetime '{name}'", hint=suggestion(name.lower(), FORMS))
     values: dict[str, Any] = {}
-    steps: list[tuple[float, float]] = []
-    spans: list[tuple[float, float, float]] = []
+    series: list[tuple[float, ...]] = []
     for entry in filter(None, (item.strip() for item in body.split(","))):
         key, equals, value = (item.strip() for item in entry.partition("="))
         if not equals and form.bare is not None:
@@ -105,24 +101,21 @@ def _parse_form(text: str) -> LifetimePrior:
             raise ConfigError("given twice", field=key)
         if key in form.keys:
             values[key] = _read(form.keys[key], key, value)
-        elif form.steps and key[:1].isdigit():
-            steps.append((_time_s(key), _read(parse_rate_hz, key, value)))
-        elif form.spans and (key[:1].isdigit() or key == "never"):
-            spans.append((*_span_s(key), _read(parse_number, key, value)))
+        elif form.series == "rates" and key[:1].isdigit():
+            series.append((_time_s(key), _read(parse_rate_hz, key, value)))
+        elif form.series == "shares" and (key[:1].isdigit() or key == "never"):
+            series.append((*_span_s(key), _read(parse_number, key, value)))
         else:
             raise ConfigError(
                 f"{name} has no '{key}'", hint=suggestion(key.lower(), form.keys) if form.keys else form.example
             )
     missing = [key for key in form.needed if key not in values]
-    if missing or (form.steps and not steps) or (form.spans and not spans):
-        raise ConfigError(f"needs {missing[0] if missing else 'rates' if form.steps else 'shares'}", hint=form.example)
-    if steps and steps[0][0] > 0.0:
+    if missing or (form.series and not series):
+        raise ConfigError(f"needs {missing[0] if missing else form.series}", hint=form.example)
+    if form.series == "rates" and series[0][0] > 0.0:
         raise ConfigError("the first rate must start at 0", hint=form.example)
-    if steps:
-        values["edges_s"], values["rates"] = zip(*steps, strict=True)
-    if spans:
-        values["starts_s"], values["ends_s"], values["masses"] = zip(*spans, strict=True)
-    return form.build(values)
+    columns = {"rates": ("edges_s", "rates"), "shares": ("starts_s", "ends_s", "masses"), "": ()}[form.series]
+    return form.build(values | dict(zip(columns, zip(*series, strict=True), strict=True)))
 
 
 def _time_s(text: str) -> float:
@@ -239,13 +232,13 @@ FORMS: Mapping[str, Form] = {
         "hazard:0s=1/d,3d=0.01/d",
         "a rate of 1 a day for 3 days, then 0.01 a day",
         lambda v: PiecewiseConstantHazard(v["edges_s"], v["rates"]),
-        steps=True,
+        series="rates",
     ),
     "mass": Form(
         "mass:0s..1h=0.3,2d=0.5,never=0.2",
         "30 % leave within the first hour, 50 % after just 2 days",
         lambda v: StepLifetime(v["starts_s"], v["ends_s"], v["masses"]),
-        spans=True,
+        series="shares",
     ),
     "periodic": Form(
         "periodic:period=1w,0s=0.2/d,5d=0/d,start=2d",
@@ -253,7 +246,7 @@ FORMS: Mapping[str, Form] = {
         lambda v: PeriodicHazard(v["period"], v["edges_s"], v["rates"], start_s=v.get("start", 0.0)),
         needed={"period": parse_duration_s},
         optional={"start": parse_duration_s},
-        steps=True,
+        series="rates",
     ),
 }
 """All forms, by name."""
@@ -301,18 +294,10 @@ def _shares(prior: StepLifetime) -> list[str]:
 CLASSES: Mapping[str, type[Any]] = {
     kind.__name__: kind
     for kind in (
-        Exponential,
-        Gamma,
-        GeneralPurpose,
-        LogNormal,
-        Mixture,
-        PeriodicHazard,
-        PiecewiseConstantHazard,
-        StepLifetime,
-        Uniform,
-        Weibull,
+        Exponential, Gamma, GeneralPurpose, LogNormal, Mixture, PeriodicHazard, PiecewiseConstantHazard, StepLifetime,
+        Uniform, Weibull,
     )
-}
+}  # fmt: skip
 """Models that consist of numbers, by name: all but a hazard that is a function of the user's."""
 
 

@@ -20,8 +20,7 @@ import numpy as np
 
 from evermap.tracking.frame import Frame
 from evermap.tracking.grid import bucket_of, cell_of, fill
-from evermap.tracking.kalman import Symmetric, distance_and_log_det, inlined, kernel, sum_of
-from evermap.tracking.shape import shape_log_ratio
+from evermap.tracking.kalman import Symmetric, distance_and_log_det, inlined, kernel, shape_log_ratio, sum_of
 from evermap.types import FloatArray, IntArray
 
 

@@ -75,6 +75,11 @@ def positions(values: Any) -> FloatArray:
     return array
 
 
+def _check_shape(array: Any, shape: tuple[int, ...], field: str, hint: str | None = None) -> None:
+    if array.shape != shape:
+        raise InputError(f"shape {array.shape} instead of {shape}", field=field, hint=hint)
+
+
 def boxes(values: Any, m: int) -> FloatArray:
     """Return (M, 4) sizes and headings.
 
@@ -82,8 +87,7 @@ def boxes(values: Any, m: int) -> FloatArray:
         InputError: another shape, a size that is not positive, or a heading that is not finite.
     """
     array = np.ascontiguousarray(values, dtype=np.float64) if m else np.empty((0, 4))
-    if array.shape != (m, 4):
-        raise InputError(f"shape {array.shape} instead of ({m}, 4)", field="box", hint="length, width, height, heading")
+    _check_shape(array, (m, 4), "box", hint="length, width, height, heading")
     wrong = np.flatnonzero(~(np.isfinite(array).all(axis=1) & (array[:, :3] > 0.0).all(axis=1)))
     if wrong.size:
         what = f"detection {wrong[0]}: {array[wrong[0]].tolist()} is not a box"
@@ -100,8 +104,7 @@ def probabilities(values: Any, m: int) -> FloatArray:
     if values is None:
         return np.full(m, np.nan)
     array = np.asarray(values, dtype=np.float64)
-    if array.shape != (m,):
-        raise InputError(f"shape {array.shape} instead of ({m},)", field="p_real")
+    _check_shape(array, (m,), "p_real")
     wrong = np.flatnonzero((array < 0.0) | (array > 1.0))
     if wrong.size:
         raise InputError(f"detection {wrong[0]}: {array[wrong[0]]} is not a probability", field="p_real")
@@ -117,8 +120,7 @@ def classes(values: Any, m: int, n_classes: int) -> IntArray:
     if values is None:
         return np.full(m, UNKNOWN)
     array = np.asarray(values)
-    if array.shape != (m,):
-        raise InputError(f"shape {array.shape} instead of ({m},)", field="class_id")
+    _check_shape(array, (m,), "class_id")
     if array.size and array.dtype.kind not in "iu":
         raise InputError("classes are whole numbers", field="class_id")
     ids = array.astype(np.int64)
@@ -141,8 +143,7 @@ def covariances(values: Any, m: int, default: FloatArray) -> FloatArray:
     if values is None or m == 0:
         return default
     array = np.ascontiguousarray(values, dtype=np.float64)
-    if array.shape != (m, 3, 3):
-        raise InputError(f"shape {array.shape} instead of ({m}, 3, 3)", field="covariance_m2")
+    _check_shape(array, (m, 3, 3), "covariance_m2")
     symmetric = np.isclose(array, array.transpose(0, 2, 1), rtol=1e-6, atol=1e-12).all(axis=(1, 2))
     minors = np.stack([array[:, 0, 0], np.linalg.det(array[:, :2, :2]), np.linalg.det(array)])
     wrong = np.flatnonzero(~(symmetric & (minors > 0.0).all(axis=0) & np.isfinite(array).all(axis=(1, 2))))
@@ -164,8 +165,7 @@ def appearances(values: Any, m: int, n_appearance: int) -> FloatArray:
     array = np.asarray(values, dtype=np.float64)
     if array.size == 0 and m == 0:
         return np.zeros((0, n_appearance))
-    if array.shape != (m, n_appearance):
-        raise InputError(f"shape {array.shape} instead of ({m}, {n_appearance})", field="appearance")
+    _check_shape(array, (m, n_appearance), "appearance")
     length = np.linalg.norm(array, axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.ascontiguousarray(np.where((length > 0.0) & np.isfinite(length), array / length, 0.0))

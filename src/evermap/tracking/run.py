@@ -23,7 +23,7 @@ from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import TrackState
 from evermap.tracking.views import View
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+from evermap.types import UNKNOWN, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -165,7 +165,8 @@ def run_track(
         raise DataError(
             "no object was seen often enough to be distinguished from false alarms", path=table.source, hint=hint
         )
-    spells = _long_enough(tracker.static_spells(), config.rest_for_s)
+    spells = tracker.static_spells()  # a slow object passes the test for rest again and again, but does not rest
+    spells = spells[spells.last_s - spells.first_s >= config.rest_for_s]
     lifetimes, spell_of_lifetime = _lifetimes(spells, config.rest_for_s)
     confirmed = np.isin(track_of_detection, tracks.track_id[tracks.state != TrackState.BIRTH])
     return TrackResult(
@@ -273,22 +274,12 @@ def _noise(table: DetectionTable, sigma_m: float) -> FloatArray | None:
     return np.where(np.isnan(table.covariance_m2), sigma_m**2 * np.eye(3), table.covariance_m2)
 
 
-def _long_enough(spells: StaticSpells, rest_for_s: float) -> StaticSpells:
-    """Return spells that last: a slow object passes the test for rest again and again, but does not rest."""
-    return spells[spells.last_s - spells.first_s >= rest_for_s]
-
-
 def _lifetimes(spells: StaticSpells, rest_for_s: float) -> tuple[CensoredLifetimes | None, IntArray]:
-    if not _bounded(spells).any():
+    if not np.isfinite(spells.elsewhere_s).any():  # it is known of none when it can have begun
         return None, np.zeros(0, dtype=np.int64)
     return lifetimes_of_sightings(
         spells.elsewhere_s, spells.first_s, spells.last_s, spells.gone_s, least_stay_s=rest_for_s
     )
-
-
-def _bounded(spells: StaticSpells) -> BoolArray:
-    """(K,) whether it is known when they can have begun."""
-    return np.asarray(np.isfinite(spells.elsewhere_s))
 
 
 def _usual_step_s(table: DetectionTable) -> float:
@@ -303,7 +294,7 @@ def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -
         remarks.append(f"frames are {step_s:.3g} s apart: moving objects are hardly tracked at that rate")
     if config.range_m is None and table.sensor_m is not None and table.score is None:
         remarks.append("without `range_m`, a missed detection is no evidence")
-    unknown = int((~_bounded(spells)).sum())
+    unknown = int((~np.isfinite(spells.elsewhere_s)).sum())
     if unknown:
         what = f"{counted(unknown, 'spell')} whose beginning has no bound"
         remarks.append(f"{what}, since the place was not observed before: in spells.csv, not in lifetimes.csv")

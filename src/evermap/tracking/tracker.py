@@ -73,31 +73,27 @@ class Tracker(Shown):
         scored: bool = False,
         priors: LifetimePrior | Sequence[LifetimePrior] | None = None,
     ) -> None:
-        from evermap.tracking import association, kalman, life, rows, shape
+        from scipy.special import chdtri
+
+        from evermap.tracking import association, kalman, life
 
         if n_classes < 1:
             raise ConfigError(f"{n_classes} classes", field="n_classes", hint="at least 1")
-        self._association, self._kalman, self._life, self._rows = association, kalman, life, rows
-        self._shape = shape
+        self._association, self._kalman, self._life = association, kalman, life
         self.settings = s = settings or TrackerConfig()
         self._n_classes, self._n_appearance = n_classes, n_appearance
         self._boxes, self._scored = boxes, scored
         lifetimes = _as_priors(priors, n_classes, s.leave_rates_hz)
-        self._likelihood = association.Likelihood(
+        self._likelihood: association.Likelihood = _numbers(
+            association.Likelihood,
+            s,
             confusion=s.confusion_matrix(n_classes, confusion),
             class_prior=np.full(n_classes, 1.0 / n_classes),
             log_clutter=float(np.log(s.clutter_per_m3)),
-            gate=_chi_square_3(s.gate_probability),
-            appearance_nats=float(s.appearance_nats),
-            appearance_neutral=float(s.appearance_neutral),
+            gate=float(chdtri(3.0, 1.0 - s.gate_probability)),  # of a chi-square with 3 degrees of freedom
             moved_reach_m=0.0,
             log_moved=-np.inf,
-            least_p_detect=float(s.least_p_detect),
-            displaced=float(s.displaced),
-            misplaced=float(s.shape.misplaced),
             log_p_misplaced=math.log(s.shape.p_misplaced),
-            other_size=float(s.shape.other_size),
-            p_misshapen=float(s.shape.p_misshapen),
         )
         self._likelihood_at_rest = self._likelihood
         if s.moved_reach_m > 0.0:
@@ -105,7 +101,16 @@ class Tracker(Shown):
             self._likelihood_at_rest = self._likelihood._replace(
                 moved_reach_m=float(s.moved_reach_m), log_moved=float(np.log(s.p_moved / volume_m3))
             )
-        self._rules = _rules(s, n_classes, boxes=boxes)
+        self._rules: Rules = _numbers(
+            Rules,
+            s,
+            odds_confirm=(1.0 - s.p_confirm) / s.p_confirm,
+            odds_dead=(1.0 - s.p_dead) / s.p_dead,
+            class_speed_mps=s.class_speeds(n_classes).copy(),  # a read-only array would have all kernels compiled twice
+            inverse_odds_new=(1.0 - s.p_real) / s.p_real,
+            place_m2=float(s.place_sigma_m**2) if boxes else 0.0,
+            log_odds_believed=float(np.log(s.p_believed / (1.0 - s.p_believed))),
+        )
         self._noise = np.eye(3)[None] * s.sigma_position_m**2
         self._tracklets = room_for(ROOM, s.order, n_classes, n_appearance, boxes=boxes, scored=scored)
         self._n = 0
@@ -167,7 +172,7 @@ class Tracker(Shown):
     def followed(self) -> Followed:
         """Return the active tracklets after the last frame."""
         t, n = self._tracklets, self._n
-        p_real = self._rows.p_real(t, n, self._rules) if self._scored else 1.0
+        p_real = self._life.p_real(t, n, self._rules) if self._scored else 1.0
         return Followed(
             stamp_s=self._stamp_s,
             track_id=t.track_id[:n].copy(),
@@ -246,8 +251,8 @@ class Tracker(Shown):
         if self._boxes:
             shape = boxes(box, m)
             faces = self.settings.sigma_face_m + self.settings.sigma_face_share * shape[:, :3]
-            box_noise = self._shape.noise_of_shapes(shape, faces)
-            noise = self._shape.noise_of_centres(shape, faces) if m else noise
+            box_noise = self._kalman.noise_of_shapes(shape, faces)
+            noise = self._kalman.noise_of_centres(shape, faces) if m else noise
         return Frame(
             stamp_s=stamp,
             position=position,
@@ -274,7 +279,7 @@ class Tracker(Shown):
         self._kalman.predict(t.mean, t.covariance, self._n, gap, self.settings.motion_density)
         if self._boxes:
             shape = self.settings.shape
-            self._shape.predict_shapes(t.box, self._n, gap, float(shape.turning), float(shape.resizing))
+            self._kalman.predict_shapes(t.box, self._n, gap, float(shape.turning), float(shape.resizing))
         self._death_odds = float(np.expm1(min(self.settings.vanish_rate_hz * gap, 600.0)))
 
     def _associate(self, frame: Frame, view: View | None, events: list[Event]) -> IntArray:
@@ -284,8 +289,9 @@ class Tracker(Shown):
         track_of_detection = np.full(len(frame.position), UNKNOWN)
         table, spells = self._event_table, self._spell_table
         in_sight = self._life.InSight(p_detect, view is not None, self._death_odds)
-        happened = self._life.Happened(track_of_detection, table, spells)
-        n_events, n_spells, n_gone = self._life.live(t, n, frame, in_sight, self._likelihood, self._rules, happened)
+        n_events, n_spells, n_gone = self._life.live(
+            t, n, frame, in_sight, self._likelihood, self._rules, track_of_detection, table, spells
+        )
         for kind, row in zip(table.kind[:n_events].tolist(), table.row[:n_events].tolist(), strict=True):
             events.append(Event(frame.stamp_s, EventKind(kind), int(t.track_id[row])))
             if kind == EventKind.BORN:
@@ -319,25 +325,10 @@ class Tracker(Shown):
         p_detect = np.full(len(rows), s.p_detect) if view is None else view.probability(place)
         appearance, box = (column[rows].astype(np.float64) for column in (w.stored.appearance, w.stored.box))
         inverse_odds = w.inverse_odds(rows, frame.stamp_s)
+        columns = {name: getattr(frame, name)[free] for name in ("class_id", "appearance", "box", "box_noise", "level")}
         found, detection, log_ratio, moved = self._life.match(
-            self._association.Targets(
-                place,
-                covariance,
-                w.class_p(rows),
-                appearance,
-                box,
-                inverse_odds,
-                p_detect,
-            ),
-            frame._replace(
-                position=position,
-                noise=np.ascontiguousarray(noise),
-                class_id=frame.class_id[free],
-                appearance=frame.appearance[free],
-                box=frame.box[free],
-                box_noise=frame.box_noise[free],
-                level=frame.level[free],
-            ),
+            self._association.Targets(place, covariance, w.class_p(rows), appearance, box, inverse_odds, p_detect),
+            frame._replace(position=position, noise=np.ascontiguousarray(noise), **columns),
             self._likelihood_at_rest,
         )
         if len(found) == 0:
@@ -364,7 +355,7 @@ class Tracker(Shown):
         for name in KEPT:
             getattr(t, name)[into] = getattr(w.stored, name)[rows]
         t.class_p[into] = w.class_p(rows)
-        t.inverse_odds[into] = np.maximum(w.inverse_odds(rows, stamp_s) * gain, self._rows.LEAST)
+        t.inverse_odds[into] = np.maximum(w.inverse_odds(rows, stamp_s) * gain, self._life.LEAST)
         t.rest_mean[into], t.rest_covariance[into] = w.stored.position[rows], covariance
 
     def _begin(self, frame: Frame, track_of_detection: IntArray, events: list[Event]) -> None:
@@ -374,7 +365,7 @@ class Tracker(Shown):
             return
         free = free[np.lexsort(frame.position[free].T)]
         self._reserve(self._n + len(free))
-        n_alive = self._rows.start_all(
+        n_alive = self._life.start_all(
             self._tracklets, self._n, self._next_id, frame, free, self._likelihood.confusion, self._rules,
             track_of_detection,
         )  # fmt: skip
@@ -424,33 +415,10 @@ class Tracker(Shown):
         )
 
 
-def _rules(s: TrackerConfig, n_classes: int, *, boxes: bool) -> Rules:
-    """Numbers of the settings, as kernels take them."""
-    return Rules(
-        odds_confirm=(1.0 - s.p_confirm) / s.p_confirm,
-        odds_dead=(1.0 - s.p_dead) / s.p_dead,
-        warm_up=int(s.warm_up),
-        lost_after=int(s.lost_after),
-        max_missed=int(s.max_missed),
-        class_speed_mps=s.class_speeds(n_classes).copy(),  # a read-only array would have all kernels compiled twice
-        rest_for_s=float(s.rest_for_s),
-        appearance_memory=float(s.appearance_memory),
-        sigma_velocity_mps=float(s.sigma_velocity_mps),
-        sigma_acceleration_mps2=float(s.sigma_acceleration_mps2),
-        inverse_odds_new=(1.0 - s.p_real) / s.p_real,
-        speed_per_length_hz=float(s.speed_per_length_hz),
-        place_m2=float(s.place_sigma_m**2) if boxes else 0.0,
-        score_memory=float(s.score_memory),
-        seen_nats=float(s.seen_nats),
-        missed_nats=float(s.missed_nats),
-        most_counted=int(s.most_counted),
-        fast_sigmas=float(s.fast_sigmas),
-        displaced=float(s.displaced),
-        forward_nats=float(s.shape.forward_nats),
-        most_forward_nats=float(s.shape.most_forward_nats),
-        sure_of_way=float(s.shape.sure_of_way),
-        log_odds_believed=float(np.log(s.p_believed / (1.0 - s.p_believed))),
-    )
+def _numbers(table: Any, s: TrackerConfig, **derived: Any) -> Any:
+    """Return a table of numbers as kernels take them: those derived, and those of the same name in the settings."""
+    named = (name for name in table._fields if name not in derived)
+    return table(**derived, **{name: getattr(s.shape if hasattr(s.shape, name) else s, name) for name in named})
 
 
 def _as_priors(
@@ -462,10 +430,3 @@ def _as_priors(
     if len(several) not in {1, n_classes}:
         raise ConfigError(f"{len(several)} lifetime priors for {n_classes} classes", field="priors")
     return several
-
-
-def _chi_square_3(probability: float) -> float:
-    """Quantile of the chi-square distribution with 3 degrees of freedom."""
-    from scipy.special import chdtri
-
-    return float(chdtri(3.0, 1.0 - probability))

@@ -88,9 +88,9 @@ class Tracklets(NamedTuple):
         mean: (N, D) filtered motion; covariance: (N, D, D).
         class_p: (N, C) posterior over classes.
         appearance: (N, A) unit vectors, zeros where none was given.
-        box: (N, 9) size and heading as `shape` says, (N, 0) of points.
+        box: (N, 9) size and heading as `kalman` says, (N, 0) of points.
         level: (N, 3) mean log odds of its detections to be real, their weight, and what misses since the last one take
-            from them, see `scores`; (N, 0) where detections have no scores.
+            from them, see `life`; (N, 0) where detections have no scores.
         inverse_odds: (N,) `(1 - p) / p` of being a real object that is there.
         n_hits: (N,) detections so far; n_missed: (N,) frames in a row without one.
         first_s: (N,) first detection.

@@ -81,6 +81,10 @@ class WorkingSet:
         priors: lifetimes at rest, one for all classes or one a class.
         n_classes: number of classes.
         n_appearance: length of appearance vectors.
+
+    Attributes:
+        stored: all rows, including free ones; read only.
+        widest_m2: no place has been known less well than this: largest variance of a coordinate.
     """
 
     def __init__(
@@ -99,29 +103,14 @@ class WorkingSet:
         self._chunk_m = chunk_m
         self._priors = priors
         self._n_classes = n_classes
-        self._stored = empty_rows(SMALLEST_ROOM, n_appearance, n_box, n_level)
+        self.stored = empty_rows(SMALLEST_ROOM, n_appearance, n_box, n_level)
         self._head = np.full(SMALLEST_ROOM, chunks.END, dtype=np.int32)
         self._free: list[int] = []
         self._n_used = 0
-        self._widest_m2 = 0.0
+        self.widest_m2 = 0.0
 
     def __len__(self) -> int:
         return self._n_used - len(self._free)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of all that is kept, and of the room to grow."""
-        return sum(a.nbytes for a in self._stored) + self._head.nbytes + 8 * len(self._free)
-
-    @property
-    def widest_m2(self) -> float:
-        """No place has been known less well than this: largest variance of a coordinate."""
-        return self._widest_m2
-
-    @property
-    def stored(self) -> Stored:
-        """All rows, including free ones; read only."""
-        return self._stored
 
     @property
     def rows(self) -> IntArray:
@@ -156,21 +145,21 @@ class WorkingSet:
         rows = np.concatenate([np.array(again, dtype=np.int64), self._n_used + np.arange(n_new)])
         self._n_used += n_new
         for name in Stored._fields[:-1]:
-            getattr(self._stored, name)[rows] = getattr(objects, name)
-        self._chunks.link(rows, self._stored.position, self._chunk_m, self._head, self._stored.following)
-        self._widest_m2 = max(self._widest_m2, float(objects.covariance[:, [0, 3, 5]].max(initial=0.0)))
+            getattr(self.stored, name)[rows] = getattr(objects, name)
+        self._chunks.link(rows, self.stored.position, self._chunk_m, self._head, self.stored.following)
+        self.widest_m2 = max(self.widest_m2, float(objects.covariance[:, [0, 3, 5]].max(initial=0.0)))
         return rows
 
     def remove(self, rows: IntArray) -> None:
         """Forget rows, each once."""
-        self._chunks.unlink(rows, self._stored.position, self._chunk_m, self._head, self._stored.following)
+        self._chunks.unlink(rows, self.stored.position, self._chunk_m, self._head, self.stored.following)
         self._free.extend(rows.tolist())
 
     def near(self, centre_m: FloatArray, reach_m: FloatArray) -> IntArray:
         """Return rows within `reach_m` (K,) of any of the points `centre_m` (K, 3), each once, in order."""
         return np.asarray(
             self._chunks.rows_near(
-                centre_m, reach_m, self._stored.position, self._chunk_m, self._head, self._stored.following
+                centre_m, reach_m, self.stored.position, self._chunk_m, self._head, self.stored.following
             ),
             dtype=np.int64,
         )
@@ -179,7 +168,7 @@ class WorkingSet:
         """Return (K,) inverse odds that objects are there still at `stamp_s`: less what lifetimes took."""
         from evermap.existence.kernels import predict_rows
 
-        s = self._stored
+        s = self.stored
         prior = s.class_id[rows].astype(np.int64) if len(self._priors) > 1 else np.zeros(len(rows), dtype=np.int64)
         since = s.rest_since_s[rows]
         log_odds = log_death_odds(self._priors, prior, s.judged_s[rows] - since, stamp_s - since)
@@ -190,33 +179,33 @@ class WorkingSet:
     def missed(self, rows: IntArray, stamp_s: float, p_detect: FloatArray) -> FloatArray:
         """Return (K,) inverse odds after the places of these objects were looked at, and nothing was seen there."""
         after = np.minimum(self.inverse_odds(rows, stamp_s) / np.maximum(1.0 - p_detect, 1e-12), 1e300)
-        self._stored.inverse_odds[rows] = after
-        self._stored.judged_s[rows] = stamp_s
+        self.stored.inverse_odds[rows] = after
+        self.stored.judged_s[rows] = stamp_s
         return np.asarray(after, dtype=np.float64)
 
     def covariance(self, rows: IntArray) -> FloatArray:
         """Return (K, 3, 3) of places."""
         full = np.empty((len(rows), 3, 3))
-        full[:, UPPER[0], UPPER[1]] = self._stored.covariance[rows]
-        full[:, UPPER[1], UPPER[0]] = self._stored.covariance[rows]
+        full[:, UPPER[0], UPPER[1]] = self.stored.covariance[rows]
+        full[:, UPPER[1], UPPER[0]] = self.stored.covariance[rows]
         return full
 
     def class_p(self, rows: IntArray) -> FloatArray:
         """Return (K, C) posterior over classes, as far as it is kept."""
-        top = self._stored.class_p[rows].astype(np.float64)
+        top = self.stored.class_p[rows].astype(np.float64)
         others = max(self._n_classes - 1, 1)
         out = np.repeat((1.0 - top)[:, None] / others, self._n_classes, axis=1)
-        out[np.arange(len(rows)), self._stored.class_id[rows]] = top
+        out[np.arange(len(rows)), self.stored.class_id[rows]] = top
         return out
 
     def _grow(self, n: int) -> None:
         size = before = len(self._head)
         while size < n:
             size *= 2
-        s = self._stored
+        s = self.stored
         room = empty_rows(size, s.appearance.shape[1], s.box.shape[1], s.level.shape[1])
         for name in Stored._fields[:-1]:
-            getattr(room, name)[:before] = getattr(self._stored, name)
-        self._stored = room
+            getattr(room, name)[:before] = getattr(s, name)
+        self.stored = room
         self._head = np.full(size, self._chunks.END, dtype=np.int32)
         self._chunks.link(self.rows, room.position, self._chunk_m, self._head, room.following)

@@ -17,7 +17,7 @@ from evermap.maps.sessions.extend import Extended
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks
 from evermap.sensing.sightlines import nominal_lines
 from evermap.survival import Exponential, Mixture
-from evermap.survival.step import never_leaves
+from evermap.survival.hazards import never_leaves
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, MapChange, rows_of
 
 from .scenes import assert_consistent, begun, found, next_map

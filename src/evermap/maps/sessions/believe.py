@@ -12,7 +12,7 @@ from evermap.maps.lives import Life
 from evermap.maps.living import LivingMap, Sites, class_of, clique_rows, site_middles
 from evermap.maps.sessions.looks import PlaceLooks
 from evermap.sensing.sightlines import Lines, nominal_lines
-from evermap.survival.step import never_leaves
+from evermap.survival.hazards import never_leaves
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor, rows_of
 
 

@@ -133,7 +133,7 @@ def _when(
 
 def _log_ratio(looks: Looks) -> FloatArray:
     """(M,) log likelihood of each look if there, minus that if not; certainties are cut to 700 nats."""
-    there, gone = looks.likelihoods()
+    _, there, gone = looks.columns()
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.log(there) - np.log(gone)
     return np.where(np.isnan(ratio), 0.0, np.clip(ratio, -_CERTAIN, _CERTAIN))
