@@ -276,7 +276,7 @@ OBJECT_FIELDS = (
     "id", "results/hypothesis/class_id", "results/hypothesis/score", "results/pose/pose", "results/pose/covariance",
     "bbox/center", "bbox/size",
 )  # fmt: skip
-"""What a detection of `vision_msgs` in space says (`Cdr.parts`)."""
+"""What a detection of `vision_msgs` in space says (`cdr.parts_of`)."""
 
 
 def objects_in_space(parts: Parts, look: int) -> SeenColumns:
