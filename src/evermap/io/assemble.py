@@ -29,10 +29,10 @@ from evermap.types import (
 )
 from evermap.valid import STAMP_S, validate, validate_spatial
 
-SAME_STAMP_S: float = 1e-6
+SAME_STAMP_S = 1e-6
 """Stamps closer than this are the same instant when detections are assigned to frames."""
 
-ODOMETRY_GAP_S: float = 10.0
+ODOMETRY_GAP_S = 10.0
 """Longer pauses of the odometry are reported, and frames farther than this from any odometry are dropped."""
 
 
@@ -40,14 +40,15 @@ _Seen = TypeVar("_Seen", Detections, SpatialDetections)
 _Recorded = TypeVar("_Recorded", Recording, SpatialRecording)
 
 
-def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray, field: str = "stamp_s") -> None:
+def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray) -> None:
     """Raise InputError at the first stamp that is smaller than the one before."""
     back = np.flatnonzero(np.diff(stamp_s) < 0)
     if len(back):
         row = int(back[0]) + 1
         step = stamp_s[row - 1] - stamp_s[row]
         hint = "sort the rows by time if only their order is wrong"
-        raise InputError(f"time runs backwards by {step:.6g} s", path=path, line=int(line[row]), field=field, hint=hint)
+        problem = f"time runs backwards by {step:.6g} s"
+        raise InputError(problem, path=path, line=int(line[row]), field="stamp_s", hint=hint)
 
 
 def forward_stamps(table: Table) -> FloatArray:
@@ -116,8 +117,6 @@ def frames_of(
 
 def finish_recording(recording: _Recorded, *, warnings: list[str]) -> _Recorded:
     """Return the recording with frames that have no odometry near them left out and all remarks counted.
-
-    A recording in space may have no odometry at all.
 
     Raises:
         DataError: fewer than two odometry rows, no frame within the odometry's time, or no landmark seen.

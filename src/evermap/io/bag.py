@@ -217,13 +217,9 @@ def _sensor(content: BagContent, topic: str) -> BagSensor:
 
 
 def stated_settings(path: Path, content: BagContent, guessed: BagSettings, *, whole: bool = True) -> BagSettings:
-    """Return the settings in a file; missing ones are guessed.
+    """Return the settings in a file; what is missing is as guessed.
 
-    Args:
-        path: the file.
-        content: of the bag.
-        guessed: its guessed topics.
-        whole: topics that the content lacks are errors; else they may come yet.
+    `whole`: topics that the content lacks are errors; else they may come yet.
 
     Raises:
         InputError: the file is missing or wrong, or names a topic that is not there.
@@ -316,7 +312,7 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
         frames=Frames(looked, complete=messages < sum(map(len, stamps)) or messages < FEWEST_LOOKS, clock=clock),
         detections=detections,
         sensors=sensors,
-        truth=None if truth is None else _reference(truth),
+        truth=None if truth is None else _exactly(truth),
         class_names=labels,
         source=str(path),
         clock=clock,
@@ -445,11 +441,7 @@ def _placed(
     sensors: tuple[SpatialSensor, ...],
     settings: BagSettings,
 ) -> SpatialDetections:
-    """The detections with poses, corners and directions.
-
-    Raises:
-        DataError: the size of a tag, or the calibration of a camera, is not known.
-    """
+    """Return the detections with poses, corners and directions; raises what `detections_of` does."""
     pose, corner, pixel = seen.pose.copy(), seen.corners, seen.pixel
     cornered, aimed = np.isfinite(corner[:, 0, 0]), np.isfinite(pixel[:, 0])
     size = settings.rig.size_of(found.landmark_id)
@@ -480,6 +472,10 @@ def _placed(
     )
 
 
+def _exactly(path: SpatialOdometry) -> Trajectory:
+    return Trajectory(path.stamp_s, path.pose_world_robot, np.zeros((len(path), 6, 6)), "truth", path.clock)
+
+
 def _odometry(
     path: Path, content: BagContent, settings: BagSettings, topic: str, clock: Clock
 ) -> SpatialOdometry | None:
@@ -501,11 +497,6 @@ def _odometry(
     child = content.frames.get(topic, "")
     mount = content.mount(settings.base_frame, child) if child else None
     return of_rig(odometry, se3.identity() if mount is None else mount)
-
-
-def _reference(truth: SpatialOdometry) -> Trajectory:
-    pose = truth.pose_world_robot
-    return Trajectory(truth.stamp_s, pose, np.zeros((len(pose), 6, 6)), frame="truth", clock=truth.clock)
 
 
 BAG = Reader(

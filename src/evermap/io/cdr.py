@@ -146,8 +146,8 @@ class _Layout:
         self.steps[at] = _LIST, 4, len(self.steps)
 
     def _numbers(self, name: str, base: str, count: int) -> None:
-        kind, size = _DTYPES[base]
-        self.steps.append(("uif".index(kind), int(size), count))
+        dtype = np.dtype(_DTYPES[base])
+        self.steps.append(("uif".index(dtype.kind), dtype.itemsize, count))
         self.names += [name] if count == 1 else [f"{name}/{row}" for row in range(count)]
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from evermap.io.files import unpacked
 from evermap.io.table import (
     FORMULA,
     GUARDED,
+    NamedColumns,
     Table,
     arrow_cells,
     dates_as_text,
@@ -37,42 +37,16 @@ _BATCH_ROWS = 1 << 18
 _FLAGS = {"1": 1.0, "0": 0.0, "true": 1.0, "false": 0.0, "1.0": 1.0, "0.0": 0.0, "": np.nan, "nan": np.nan}
 
 
-@dataclass(frozen=True, slots=True)
-class Columns:
-    """A table by columns, as pyarrow holds them: text from CSV, any type from Parquet.
+class Columns(NamedColumns):
+    """Columns as pyarrow arrays: text from CSV, any type from Parquet."""
 
-    Attributes:
-        path: file it came from, for messages.
-        cells: name -> pyarrow array of R cells.
-        line: (R,) line numbers in the file; for Parquet the row, counted from 1.
-        header_line: where the names of the columns stand, None for Parquet.
-    """
-
-    path: Path
-    cells: Mapping[str, Any]
-    line: IntArray
-    header_line: int | None
-
-    def __len__(self) -> int:
-        return len(self.line)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.cells
-
-    def error(self, problem: str, *, row: int | None, field: str | None = None, hint: str | None = None) -> InputError:
-        """Return an error that names file, line and column; `row` None blames the header."""
-        return self._table({}).error(problem, row=row, field=field, hint=hint)
-
-    def expect(self, required: Sequence[str], optional: Sequence[str] = ()) -> None:
-        """Raise InputError unless all of `required` and nothing beside `required` and `optional` is there."""
-        self._table(dict.fromkeys(self.cells, ())).expect(required, optional)
+    __slots__ = ()
 
     def numbers(self, quantity: Quantity) -> FloatArray:
-        """Return a numeric column, checked against its limits. Shape (R,); nan where an optional cell is empty."""
         import pyarrow as pa
         import pyarrow.compute as pc
 
-        cells = self.cells[quantity.name]
+        cells = self.columns[quantity.name]
         if _is_text(cells.type):
             text = pc.utf8_trim_whitespace(cells)
             length, given = numbers_of(pc.binary_length(text), np.int32)
@@ -88,18 +62,11 @@ class Columns:
         quantity.check(values, path=self.path, line=self.line)
         return values
 
-    def filled(self, quantity: Quantity, default: float) -> FloatArray:
-        """Return an optional column (R,), with what an empty cell, or no such column, means."""
-        if quantity.name not in self:
-            return np.full(len(self), float(default))
-        values = self.numbers(quantity)
-        return np.where(np.isnan(values), default, values)
-
     def clock(self, name: str = "stamp_s") -> Clock | None:
         """Return what the stamps of a column count, where they are dates; else None."""
         import pyarrow as pa
 
-        cells = self.cells[name][:1]
+        cells = self.columns[name][:1]
         text = dates_as_text(cells) if pa.types.is_timestamp(cells.type) else cells.to_pylist()
         return self._table({name: text}).clock(name) if _is_text(cells.type) or text != cells.to_pylist() else None
 
@@ -111,7 +78,7 @@ class Columns:
         """
         import pyarrow.compute as pc
 
-        cells = self.cells[name]
+        cells = self.columns[name]
         if not _is_text(cells.type):
             values = self._converted(cells, name)
             wrong = np.flatnonzero(~((values == 0.0) | (values == 1.0) | np.isnan(values)))
@@ -139,7 +106,7 @@ class Columns:
         import pyarrow as pa
         import pyarrow.compute as pc
 
-        cells = self.cells[name]
+        cells = self.columns[name]
         if pa.types.is_floating(cells.type):
             values = self._converted(cells, name)
             wrong = np.flatnonzero(~np.isnan(values) & ~((values == np.floor(values)) & (np.abs(values) < 2.0**63)))
@@ -189,16 +156,17 @@ def read_columns(path: str | Path, warnings: list[str]) -> Columns:
     if data[:4] == b"PAR1":
         table = read_parquet(data, path)
         cells = {name: _plain(column) for name, column in zip(table.column_names, table.columns, strict=True)}
-        return Columns(path, cells, np.arange(1, table.num_rows + 1), None)
+        return Columns(path, cells, np.arange(1, table.num_rows + 1))
     return _fast_csv(data, path) or _careful_csv(data, path, warnings)
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
     import pyarrow as pa
 
-    cells = {name: pa.concat_arrays([part.cells[name] for part in parts]) for name in parts[0].cells} if parts else {}
-    line = np.concatenate([part.line for part in parts]) if parts else np.zeros(0, dtype=np.int64)
-    return Columns(parts[0].path if parts else Path(), cells, line, None)
+    if not parts:
+        return Columns(Path(), {}, np.zeros(0, dtype=np.int64))
+    cells = {name: pa.concat_arrays([part.columns[name] for part in parts]) for name in parts[0].columns}
+    return Columns(parts[0].path, cells, np.concatenate([part.line for part in parts]))
 
 
 def parquet_files(path: Path) -> list[Path]:
@@ -206,12 +174,8 @@ def parquet_files(path: Path) -> list[Path]:
     return sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
 
 
-def parquet_batches(path: Path, columns: Sequence[str] | None = None) -> Iterator[Columns]:
+def parquet_batches(path: Path) -> Iterator[Columns]:
     """Yield a Parquet file, or all in a folder as one table, some rows at a time; rows count through all files.
-
-    Args:
-        path: the file or folder.
-        columns: names of those to read; None for all.
 
     Raises:
         InputError: none is there, one is damaged, or files have different columns.
@@ -227,15 +191,13 @@ def parquet_batches(path: Path, columns: Sequence[str] | None = None) -> Iterato
                 if not source.schema_arrow.equals(schema):
                     hint = f"the columns of {files[0].name}, of the same types"
                     raise InputError("has other columns than the files before it", path=file, hint=hint)
-                wanted = None if columns is None else [name for name in columns if name in schema.names]
-                for batch in source.iter_batches(_BATCH_ROWS, columns=wanted, use_threads=False):
+                for batch in source.iter_batches(_BATCH_ROWS, use_threads=False):
                     cells = dict(zip(batch.schema.names, map(_plain, batch.columns), strict=True))
-                    yield Columns(path, cells, np.arange(start, start + batch.num_rows), None)
+                    yield Columns(path, cells, np.arange(start, start + batch.num_rows))
                     start += batch.num_rows
         except (pa.ArrowException, OSError, ValueError) as error:
-            raise InputError(
-                f"not a readable Parquet file: {reason(error)}", path=file, hint="write it again"
-            ) from error
+            problem = f"not a readable Parquet file: {reason(error)}"
+            raise InputError(problem, path=file, hint="write it again") from error
     if schema is None:
         raise InputError("holds no Parquet file", path=path, hint="a folder of .parquet files, or one file")
 

@@ -251,10 +251,7 @@ def write_new(path: str | Path, content: bytes | str) -> Path:
 
 @contextmanager
 def staged_folder(folder: str | Path) -> Iterator[Path]:
-    """Yield A temporary sibling to fill, which becomes `folder` at the end; nothing is left of it after an error.
-
-    Args:
-        folder: must not exist, or be empty.
+    """Yield a temporary sibling to fill, which becomes `folder` at the end; nothing is left of it after an error.
 
     Raises:
         InputError: the folder holds something, or cannot be written.

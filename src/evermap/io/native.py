@@ -14,7 +14,7 @@ from evermap.geometry import se2
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal, wrap_far
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, landmarks_from_table
-from evermap.io.native_space import in_space, spatial_recording
+from evermap.io.native_space import in_space, spatial_recording, truth_of
 from evermap.io.rig_toml import CAMERA_FILE, SENSOR_FILE, read_rig
 from evermap.io.sensor_toml import Settings, parse_sensor_toml
 from evermap.io.table import ENDINGS, Table, parse_table
@@ -30,7 +30,6 @@ from evermap.types import (
     Recording,
     RobotSightings,
     SpatialRecording,
-    Trajectory,
 )
 
 TABLES = ("odometry", "detections", "frames", "truth", "landmarks", "robot_sightings", "objects")
@@ -101,7 +100,7 @@ def _planar_recording(
         frames=frames,
         detections=detections,
         sensor=settings.sensor,
-        truth=_truth(tables["truth"], clock, warnings),
+        truth=truth_of(tables["truth"], ("x_m", "y_m", "theta_rad"), _poses, clock, warnings),
         true_landmarks=None
         if landmarks is None or not len(landmarks)
         else landmarks_from_table(landmarks, sigma_m=0.0, class_names=class_names, clock=clock, names=names),
@@ -163,11 +162,10 @@ def _odometry(table: Table, clock: Clock, warnings: list[str]) -> Odometry:
     stamp_s = forward_stamps(table)
     if given is _VELOCITIES:
         keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
-        lateral = table.numbers(q.LATERAL_MPS) if "lateral_mps" in table else np.zeros(len(table))
         return Odometry(
             stamp_s=stamp_s[keep],
             forward_mps=table.numbers(q.FORWARD_MPS)[keep],
-            lateral_mps=lateral[keep],
+            lateral_mps=table.filled(q.LATERAL_MPS, 0.0)[keep],
             angular_radps=table.numbers(q.ANGULAR_RADPS)[keep],
             clock=clock,
         )
@@ -195,18 +193,10 @@ def _from_increments(
     return Odometry(stamp_s, velocity[0], velocity[1], velocity[2], clock=clock)
 
 
-def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory | None:
-    if table is None:
-        return None
-    table.expect(("stamp_s", "x_m", "y_m", "theta_rad"))
-    if len(table) == 0:
-        warnings.append(f"{table.path.name}: contains no pose, treated as missing")
-        return None
-    stamp_s = forward_stamps(table)
-    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
+def _poses(table: Table) -> FloatArray:
+    """Return the columns `x_m, y_m, theta_rad`. Shape (R, 3)."""
     heading = wrap_far(table.numbers(q.THETA_RAD))
-    pose = np.stack([table.numbers(q.X_M), table.numbers(q.Y_M), heading], axis=1)[keep]
-    return Trajectory(stamp_s[keep], pose, np.zeros((len(pose), 3, 3)), frame="truth", clock=clock)
+    return np.stack([table.numbers(q.X_M), table.numbers(q.Y_M), heading], axis=1)
 
 
 def _robot_sightings(table: Table | None, clock: Clock) -> RobotSightings | None:
@@ -276,13 +266,8 @@ def frames_and_detections(
 ) -> tuple[Frames, Detections]:
     """Return frames of a native recording and the detections in them.
 
-    Args:
-        table: the detections.
-        frame_table: every instant at which the sensor looked; None takes the distinct stamps of the detections.
-        class_names: all class labels.
-        settings: clock, and whether the frames are complete.
-        warnings: gets a remark on repeated frames.
-        names: gets the texts behind landmark ids that are texts.
+    Without a table of frames they are the distinct stamps of the detections. `warnings` gets a remark on repeated
+    frames, `names` the texts behind landmark ids that are texts.
 
     Raises:
         InputError: a value is malformed, or a detection lies in no frame.
@@ -347,8 +332,4 @@ def _sigmas(table: Table, range_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         # a position known equally well in all directions: to first order sigma along the ray, sigma / range across it
         sigma = table.numbers(replace(q.SIGMA_RANGE_M, name=round_names[0]))
         return sigma, sigma / range_m
-    unknown = np.full(len(table), np.nan)
-    return (
-        table.numbers(q.SIGMA_RANGE_M) if "sigma_range_m" in table else unknown,
-        table.numbers(q.SIGMA_BEARING_RAD) if "sigma_bearing_rad" in table else unknown.copy(),
-    )
+    return table.filled(q.SIGMA_RANGE_M, np.nan), table.filled(q.SIGMA_BEARING_RAD, np.nan)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -25,6 +25,7 @@ from evermap.io.spatial import (
     directions,
     integrated,
     posed_odometry,
+    poses,
     positions,
     quaternions,
     sensor_rows,
@@ -65,11 +66,11 @@ _IN_SPACE = {
     "detections": ("z_m", *QUATERNION, *CORNERS, *POINT),
     "truth": ("z_m", *QUATERNION),
 }
-_PIXEL_LIMIT = 1e6
+_SIGMA_RAD = Quantity("sigma_rad", positive=True, optional=True, hint="radians")
 
 
-def _pixel(name: str) -> Quantity:
-    return Quantity(name, -_PIXEL_LIMIT, _PIXEL_LIMIT, optional=True, hint="pixels")
+def _pixel(name: str, *, optional: bool) -> Quantity:
+    return Quantity(name, -1e6, 1e6, optional=optional, hint="pixels")
 
 
 def in_space(tables: Mapping[str, Table | None], files: FileSet) -> bool:
@@ -89,15 +90,7 @@ def spatial_recording(
     source: str,
     warnings: list[str],
 ) -> SpatialRecording:
-    """Return the recording that native tables hold.
-
-    Args:
-        tables: by name; `detections` is there.
-        rig: the sensors.
-        driven: odometry of a robot that drives in the plane, where that is what there is.
-        title: name of the recording where its settings give none.
-        source: where it was read from.
-        warnings: gets remarks.
+    """Return the recording that native tables hold; `driven` is odometry in the plane, where that is what there is.
 
     Raises:
         InputError: a value is malformed, with its line; or stamps contradict each other.
@@ -124,7 +117,7 @@ def spatial_recording(
         frames=frames,
         detections=detections,
         sensors=rig.sensors,
-        truth=_truth(tables["truth"], settings.clock, warnings),
+        truth=truth_of(tables["truth"], (*AT, *QUATERNION), poses, settings.clock, warnings),
         true_landmarks=surveyed,
         class_names=class_names,
         source=source,
@@ -162,8 +155,7 @@ def _odometry(table: Table | None, clock: Clock, warnings: list[str]) -> Spatial
         return posed_odometry(table, VARIANCES, clock, warnings)
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
-    zero = np.zeros(len(table))
-    twist = np.stack([table.numbers(axis) if axis.name in table else zero for axis in q.TWIST], axis=1)
+    twist = np.stack([table.filled(axis, 0.0) for axis in q.TWIST], axis=1)
     return integrated(stamp_s[keep], twist[keep], clock)
 
 
@@ -174,14 +166,21 @@ def _in_space(odometry: Odometry) -> SpatialOdometry:
     return integrated(odometry.stamp_s, twist, odometry.clock)
 
 
-def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory | None:
+def truth_of(
+    table: Table | None,
+    columns: tuple[str, ...],
+    poses: Callable[[Table], FloatArray],
+    clock: Clock,
+    warnings: list[str],
+) -> Trajectory | None:
+    """Return the truth in a table with certain columns, of which a function makes poses; None without any row."""
     if table is None:
         return None
-    table.expect(("stamp_s", *AT, *QUATERNION))
+    table.expect(("stamp_s", *columns))
     if len(table) == 0:
         warnings.append(f"{table.path.name}: contains no pose, treated as missing")
         return None
-    return true_poses(table, clock, warnings)
+    return true_poses(table, clock, warnings, poses)
 
 
 def _by_sensor(table: Table) -> Table:
@@ -189,7 +188,7 @@ def _by_sensor(table: Table) -> Table:
     if all(name in table for name in _WHERE):
         raise table.error("sensor and camera are both given", row=None, field="camera", hint="keep one of them")
     columns = {"sensor" if name == "camera" else name: cells for name, cells in table.columns.items()}
-    return Table(table.path, columns, table.line, table.header_line)
+    return replace(table, columns=columns)
 
 
 def _detections(
@@ -213,10 +212,8 @@ def _detections(
     }
     if "landmark_id" in table:
         columns["landmark_id"] = table.ids("landmark_id", optional=True, names=names)
-    if "score" in table:
-        columns["score"] = table.numbers(Quantity("score", optional=True))
-    if "sigma_rad" in table:
-        columns["sigma_rad"] = table.numbers(Quantity("sigma_rad", positive=True, optional=True, hint="radians"))
+    for quantity in (Quantity("score", optional=True), _SIGMA_RAD):
+        columns[quantity.name] = table.filled(quantity, np.nan)
     if table.has_any(BOX):
         columns["size_m"] = boxes(table)
     if form is POINT:
@@ -293,7 +290,7 @@ def _placed(table: Table) -> dict[str, FloatArray]:
 def _cornered(table: Table, detections: SpatialDetections, rig: Rig) -> SpatialDetections:
     """The detections with the corners of tags, and the tags' sizes."""
     table.expect(CORNERS, tuple(table.columns))
-    corner = np.stack([table.numbers(_pixel(name)) for name in CORNERS], axis=1)
+    corner = np.stack([table.numbers(_pixel(name, optional=True)) for name in CORNERS], axis=1)
     given = np.isfinite(corner)
     partly = np.flatnonzero(given.any(axis=1) & ~given.all(axis=1))
     if len(partly):
@@ -301,9 +298,8 @@ def _cornered(table: Table, detections: SpatialDetections, rig: Rig) -> SpatialD
     camera = np.array([sensor.intrinsics is not None for sensor in rig.sensors])[detections.sensor]
     _need_camera(table, given[:, 0] & ~camera, CORNERS[0], rig)
     size = rig.size_of(detections.landmark_id)
-    if "tag_size_m" in table:
-        stated = table.numbers(Quantity("tag_size_m", high=1e3, positive=True, optional=True, hint="metres"))
-        size = np.where(np.isnan(stated), size, stated)
+    stated = table.filled(Quantity("tag_size_m", high=1e3, positive=True, optional=True, hint="metres"), np.nan)
+    size = np.where(np.isnan(stated), size, stated)
     sizeless = np.flatnonzero(given[:, 0] & np.isnan(size) & np.isnan(detections.position_sensor_m).any(axis=1))
     if len(sizeless):
         hint = f"a column tag_size_m, or size_m under [tags] of {CAMERA_FILE}"
@@ -323,7 +319,7 @@ def _points(table: Table, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
     camera = np.array([one.intrinsics is not None for one in rig.sensors])[sensor]
     baseline = np.array(rig.baseline_m)[sensor]
     _need_camera(table, ~camera, POINT[0], rig)
-    left = np.stack([table.numbers(replace(_pixel(name), optional=False)) for name in POINT], axis=1)
+    left = np.stack([table.numbers(_pixel(name, optional=False)) for name in POINT], axis=1)
     if RIGHT[0] not in table:
         position, covariance = directions(left, sensor, rig.sensors)
         return {"position_sensor_m": position, "covariance_sensor_m2": covariance}
@@ -332,9 +328,9 @@ def _points(table: Table, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
         hint = f"baseline_m of the left camera in {CAMERA_FILE}"
         raise table.error("the baseline is unknown", row=int(lone[0]), field=RIGHT[0], hint=hint)
     right = left.copy()
-    right[:, 0] = table.numbers(replace(_pixel(RIGHT[0]), optional=False))
-    if RIGHT[1] in table:
-        right[:, 1] = table.numbers(replace(_pixel(RIGHT[1]), optional=False))
+    for axis, name in enumerate(RIGHT):
+        if name in table:
+            right[:, axis] = table.numbers(_pixel(name, optional=False))
     position, covariance = np.full((len(table), 3), np.nan), np.full((len(table), 3, 3), np.nan)
     for number, one in enumerate(rig.sensors):
         rows = np.flatnonzero(sensor == number)

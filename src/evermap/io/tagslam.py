@@ -8,7 +8,6 @@ the rig, in which `camera_poses.yaml` gives the cameras. What the authors mended
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from evermap.io.rosbag import BAG_ENDINGS, MOST_HAMMING, TagSightings, read_tag_
 from evermap.io.spatial import of_rig, posed_odometry, sensor_rows, spatial_detections, true_poses, with_tag_poses
 from evermap.io.table import ENDINGS, Table, parse_table
 from evermap.io.tag_maps import map_of_survey, pose_of
-from evermap.io.text import counted
+from evermap.io.text import counted, is_number
 from evermap.io.yaml import parse_yaml
 from evermap.types import (
     Clock,
@@ -262,13 +261,12 @@ def _sightings(files: FileSet, setup: TagRig, warnings: list[str]) -> TagSightin
     corner = np.stack([table.numbers(Quantity(name, -1e6, 1e6, hint="pixels")) for name in CORNERS], axis=1)
     stamp_s = forward_stamps(table)
     frames = _table(files, "frames", warnings)
-    count = len(table)
     return TagSightings(
         looked_s=stamp_s if frames is None else forward_stamps(frames),
         stamp_s=stamp_s,
         camera=sensor_rows(table, "camera", setup.sensors, CAMERAS),
         tag_id=table.ids("tag_id", optional=False),
-        hamming=table.ids("hamming", optional=False) if "hamming" in table else np.zeros(count, dtype=np.int64),
+        hamming=table.counts("hamming"),
         corner_px=corner.reshape(-1, 4, 2),
         line=np.asarray(table.line, dtype=np.int64),
         complete=frames is not None,
@@ -319,12 +317,8 @@ def _numbers(
     files: FileSet, name: str, content: Any, key: str, inside: str, counts: tuple[int, ...]
 ) -> tuple[float, ...]:
     values = _get(files, name, content, key, inside) or []
-    if not isinstance(values, list) or len(values) not in counts or not all(_is_number(value) for value in values):
+    if not isinstance(values, list) or len(values) not in counts or not all(map(is_number, values)):
         wanted = " or ".join(map(str, counts))
         field = f"{inside}.{key}"
         raise InputError(f"must be a list of {wanted} numbers", path=files.path_of(name), field=field)
     return tuple(map(float, values))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

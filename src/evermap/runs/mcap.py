@@ -266,13 +266,7 @@ def _map(ros: Ros, landmarks: Landmarks, start_s: float) -> Iterator[_Stamped]:
 
 
 def drawn(ros: Ros, landmarks: Landmarks, stamp_s: FloatArray) -> Iterator[tuple[Any, Any]]:
-    """Yield a marker and an entity of a scene for each landmark, as opaque as it probably exists.
-
-    Args:
-        ros: makes the messages.
-        landmarks: (L) what to draw.
-        stamp_s: (L,) from when on.
-    """
+    """Yield a marker and a scene entity for each landmark from `stamp_s` (L,) on, as opaque as it probably exists."""
     from evermap.viz.rerun_scene import rgb
     from evermap.viz.style import LANDMARK
 
@@ -348,14 +342,9 @@ def _changes(ros: Ros, result: SlamResult, start_s: float) -> Iterator[_Stamped]
 
 
 def told(ros: Ros, change: MapChange, stamp_s: float, name: str, there: Mapping[int, FloatArray]) -> tuple[Any, Any]:
-    """Return a change as a line and as an arrow in a scene, which is None if none of its landmarks is known.
+    """Return a change as a line and as a named arrow in a scene from `stamp_s` on, or None without a known landmark.
 
-    Args:
-        ros: makes the messages.
-        change: what changed.
-        stamp_s: from when on it is shown.
-        name: of the arrow.
-        there: (3,) positions of landmarks by their ids, after the change.
+    `there` has positions (3,) of landmarks by their ids, after the change.
     """
     from evermap.viz.rerun_scene import rgb
     from evermap.viz.style import ALERT

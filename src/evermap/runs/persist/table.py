@@ -135,11 +135,6 @@ class LookTable:
         times_s = (self.stamp_s.min(), self.stamp_s.max(), looked_s.min(), looked_s.max())
         return Span(*map(float, times_s))
 
-    @property
-    def now_s(self) -> float:
-        """Time of the latest look."""
-        return self.span.last_look_s
-
     def order(self) -> IntArray:
         """Return (R,) the rows by feature and time."""
         return np.lexsort((self.stamp_s, self.feature))
@@ -293,7 +288,7 @@ def read_truth(path: str | Path, looks: LookTable) -> tuple[Truth, tuple[str, ..
 
 def _explain_missing(table: Columns) -> None:
     """More than 'missing column' about the two columns that tables of looks lack most often."""
-    if set(table.cells) - {*_REQUIRED, *_OPTIONAL}:
+    if set(table.columns) - {*_REQUIRED, *_OPTIONAL}:
         return  # a name that is nearly right is the likelier mistake
     if "feature_id" not in table:
         hint = "add it, with one and the same value if there is only one feature"
@@ -368,12 +363,9 @@ class PartedLooks:
 
     @classmethod
     def split(cls, path: Path, folder: Path, config: PersistConfig) -> PartedLooks:
-        """Read a table twice, some rows at a time: what features there are, then which part each row belongs to.
+        """Read a table twice, some rows at a time: what features there are, then which part in a folder each row is of.
 
-        Args:
-            path: the table.
-            folder: for the parts.
-            config: of it `rows_at_once`, at most, unless one feature has more, `p_miss` and `p_false`.
+        Of the configuration it takes `rows_at_once`, at most, unless one feature has more, `p_miss` and `p_false`.
 
         Raises:
             InputError, ConfigError: as `read_looks`; a table with truth, which is scored in one piece only.
@@ -487,7 +479,7 @@ def _route(path: Path, rank: Mapping[str, int], edges: IntArray, files: Sequence
             part = np.searchsorted(edges, ranks, side="right") - 1
             order = np.argsort(part, kind="stable")
             numbers = {"row": arrow_cells(table.line - 1), "rank": arrow_cells(ranks)}
-            batch = pa.table({**table.cells, **numbers}).take(arrow_cells(order))
+            batch = pa.table({**table.columns, **numbers}).take(arrow_cells(order))
             start = np.searchsorted(part[order], np.arange(len(files) + 1))
             for number in np.unique(part):
                 if number not in writers:
