@@ -25,7 +25,6 @@ from evermap.types import (
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
-    rows_of,
 )
 from evermap.valid import STAMP_S, validate, validate_spatial
 
@@ -165,7 +164,7 @@ def _without_far_frames(
         f"{counted(int(np.sum(~keep)), 'frame')} with {counted(int(np.sum(~seen)), 'detection')} left out: "
         f"more than {ODOMETRY_GAP_S:g} s before or after the odometry"
     )
-    kept = rows_of(detections, seen)
+    kept = detections[seen]
     kept = replace(kept, frame=np.asarray(new_frame[kept.frame], dtype=np.int64))
     return replace(frames, stamp_s=frames.stamp_s[keep]), kept
 

@@ -45,7 +45,6 @@ from evermap.types import (
     SpatialSensor,
     Trajectory,
     landmark_id_of,
-    rows_of,
 )
 from evermap.valid import CAMERA_MODELS, is_covariance
 
@@ -304,7 +303,7 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     finite = np.asarray(np.isfinite(detections.position_sensor_m).all(axis=1))
     if not finite.all():
         warnings.append(f"{counted(int((~finite).sum()), 'detection')} without a finite position left out")
-    detections = rows_of(detections, np.flatnonzero(finite)[np.argsort(detections.frame[finite], kind="stable")])
+    detections = detections[np.flatnonzero(finite)[np.argsort(detections.frame[finite], kind="stable")]]
     truth = _odometry(path, content, settings, settings.truth, clock)
     recording = SpatialRecording(
         name=path.resolve().name.split(".")[0],
@@ -388,10 +387,8 @@ def mounted_sensor(
     if not one.stated_mount:
         mount = content.mount(settings.base_frame, one.frame)
         if mount is None:
-            warnings.append(
-                f"no fixed transform from '{settings.base_frame}' to '{one.frame}': '{name}' is assumed at the robot's "
-                f"centre; state its mount (`--init-bag`)"
-            )
+            where = f"'{name}' is assumed at the robot's centre; state its mount (`--init-bag`)"
+            warnings.append(f"no fixed transform from '{settings.base_frame}' to '{one.frame}': {where}")
         sensor = replace(sensor, mount_robot_sensor=tuple((se3.identity() if mount is None else mount).tolist()))
     if sensor.intrinsics is not None or not one.camera_info:
         return sensor
@@ -405,9 +402,8 @@ def mounted_sensor(
         model = "pinhole"
     if model is None or len(used) > max(CAMERA_MODELS[model]) or not (k[0, 0] > 0.0 and k[1, 1] > 0.0):
         problem = f"{one.camera_info} has an unknown camera model: '{info.distortion_model}'"
-        raise InputError(
-            problem, path=path, hint="plumb_bob or equidistant; rectified = true; or state it (`--init-bag`)"
-        )
+        hint = "plumb_bob or equidistant; rectified = true; or state it (`--init-bag`)"
+        raise InputError(problem, path=path, hint=hint)
     count = next(n for n in CAMERA_MODELS[model] if n >= len(used))
     return replace(
         sensor,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from evermap.geometry import se3
-from evermap.io.rosbag import MOST_HAMMING, Handler, Topic, pose_of, scan, seconds, stamp_of
+from evermap.io.rosbag import MOST_HAMMING, Handler, Topic, corners_of, pose_of, scan, seconds, stamp_of
 from evermap.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -229,10 +229,8 @@ def _tags(message: Any, look: int) -> Iterator[Seen]:
         identity = int(names[0]) if len(names) == 1 else "bundle of " + ", ".join(map(str, names))
         if hasattr(tag, "pose"):
             yield Seen(look, identity, pose=pose_of(_inner(tag.pose)))
-        else:
-            corners = tuple(value for corner in tag.corners for value in (corner.x, corner.y))
-            if int(tag.hamming) <= MOST_HAMMING:
-                yield Seen(look, identity, corners=corners)
+        elif int(tag.hamming) <= MOST_HAMMING:
+            yield Seen(look, identity, corners=corners_of(tag))
 
 
 def _markers(message: Any, look: int) -> Iterator[Seen]:

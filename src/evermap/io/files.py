@@ -75,11 +75,8 @@ class FileSet:
         except OSError as error:
             raise InputError(f"cannot be read: {error.strerror or error}", path=self.path_of(name)) from error
         except (*_ZIP_ERRORS, KeyError) as error:
-            raise InputError(
-                f"damaged inside the zip: {reason(error)}",
-                path=self.path_of(name),
-                hint="download or create the zip again",
-            ) from error
+            problem = f"damaged inside the zip: {reason(error)}"
+            raise InputError(problem, path=self.path_of(name), hint="download or create the zip again") from error
 
 
 def file_sets(path: str | Path) -> list[FileSet]:
@@ -147,9 +144,8 @@ def _zip_sets(path: Path) -> list[FileSet]:
         with zipfile.ZipFile(path) as archive:
             names = [info.filename for info in archive.infolist() if not info.is_dir()]
     except _ZIP_ERRORS as error:
-        raise InputError(
-            f"not a readable zip: {reason(error)}", path=path, hint="download or create the zip again"
-        ) from error
+        problem = f"not a readable zip: {reason(error)}"
+        raise InputError(problem, path=path, hint="download or create the zip again") from error
     folders: dict[str, dict[str, str]] = {}
     for name in names:
         inner = PurePosixPath(name)
@@ -184,9 +180,8 @@ def unpacked(data: bytes, path: Path) -> bytes:
     try:
         return gzip.decompress(data)
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(
-            f"damaged gzip file: {reason(error)}", path=path, hint="download or create it again"
-        ) from error
+        problem = f"damaged gzip file: {reason(error)}"
+        raise InputError(problem, path=path, hint="download or create it again") from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ from evermap.io.spatial import (
 from evermap.io.table import Table, csv_text, parquet_bytes, parse_csv, parse_parquet
 from evermap.io.tag_maps import is_wpilib, map_of_survey, tags_of_fiducials, tags_of_tagslam, tags_of_wpilib
 from evermap.io.text import parse_json
-from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, rows_of
+from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks
 from evermap.valid import FEATURES, P_EXISTS, STAMP_S, X_M, Y_M, Quantity
 
 MAP_SCHEMA_VERSION = 1
@@ -159,7 +159,7 @@ def landmarks_from_table(
         names=names,
         **(_pose_columns(table, sigma_rad) if in_space else {}),
     )
-    return rows_of(landmarks, order)
+    return landmarks[order]
 
 
 def write_map_parquet(landmarks: Landmarks, path: str | Path) -> Path:

@@ -144,9 +144,8 @@ def _read_table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
     if not present:
         return None
     if len(present) > 1:
-        raise InputError(
-            f"exists together with {present[1]}", path=files.path_of(present[0]), hint="remove one of them"
-        )
+        problem = f"exists together with {present[1]}"
+        raise InputError(problem, path=files.path_of(present[0]), hint="remove one of them")
     file = present[0]
     return parse_table(files.read(file), files.path_of(file), warnings)
 
@@ -235,9 +234,8 @@ def _objects(table: Table | None, names: dict[int, str]) -> IntArray:
     if len(twice):
         name = int(pairs[twice[0], 0])
         row = int(np.flatnonzero(landmark_id == name)[-1])
-        raise table.error(
-            f"landmark {names.get(name, name)} is on two objects", row=row, field="object_id", hint="one object each"
-        )
+        problem = f"landmark {names.get(name, name)} is on two objects"
+        raise table.error(problem, row=row, field="object_id", hint="one object each")
     return pairs
 
 

@@ -47,7 +47,6 @@ from evermap.types import (
     SpatialOdometry,
     SpatialRecording,
     Trajectory,
-    rows_of,
 )
 from evermap.valid import Quantity
 
@@ -75,10 +74,8 @@ def _pixel(name: str, *, optional: bool) -> Quantity:
 
 def in_space(tables: Mapping[str, Table | None], files: FileSet) -> bool:
     """Return whether tables are those of a recording in space: their columns decide, and a `camera.toml`."""
-    found = {name: tables[name] for name in _IN_SPACE}
-    return CAMERA_FILE in files or any(
-        table is not None and table.has_any(_IN_SPACE[name]) for name, table in found.items()
-    )
+    columns = ((tables[name], names) for name, names in _IN_SPACE.items())
+    return CAMERA_FILE in files or any(table is not None and table.has_any(names) for table, names in columns)
 
 
 def spatial_recording(
@@ -228,7 +225,7 @@ def _detections(
     if behind.any():
         seen = counted(int(behind.sum()), "detection")
         warnings.append(f"{table.path.name}: {seen} left out: no disparity, or no depth ahead of the camera")
-        detections = rows_of(detections, ~behind)
+        detections = detections[~behind]
     return detections
 
 

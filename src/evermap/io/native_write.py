@@ -32,7 +32,6 @@ from evermap.types import (
     SpatialOdometry,
     SpatialRecording,
     Trajectory,
-    rows_of,
 )
 
 LONGEST_S = 0.5
@@ -104,7 +103,7 @@ def _composed(odometry: Any, frame_s: FloatArray) -> Any:
     kept[1:] |= silent
     rows = np.flatnonzero(kept)
     if isinstance(odometry, SpatialOdometry):
-        return rows_of(odometry, rows)
+        return odometry[rows]
     twist = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
     pose = np.zeros((len(stamp_s), 3))
     step = se2.exp(twist[:-1] * np.diff(stamp_s)[:, None])
@@ -113,7 +112,7 @@ def _composed(odometry: Any, frame_s: FloatArray) -> Any:
     driven = se2.log(se2.between(pose[rows[:-1]], pose[rows[1:]])) / np.diff(stamp_s[rows])[:, None]
     held = np.diff(rows, append=rows[-1] + 1) == 1  # a single row is kept as it is
     twist = np.where(held[:, None], twist[rows], np.vstack([driven, twist[-1]]))
-    return replace(rows_of(odometry, rows), forward_mps=twist[:, 0], lateral_mps=twist[:, 1], angular_radps=twist[:, 2])
+    return replace(odometry[rows], forward_mps=twist[:, 0], lateral_mps=twist[:, 1], angular_radps=twist[:, 2])
 
 
 def _single(columns: dict[str, Any]) -> dict[str, Any]:

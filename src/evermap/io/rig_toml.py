@@ -168,20 +168,18 @@ def _known(reader: TomlReader, section: str, content: Any, known: tuple[str, ...
 def _lens(reader: TomlReader, section: str, content: dict[str, Any]) -> dict[str, Any]:
     """How a camera projects; nothing for a sensor that is no camera."""
     if "intrinsics" not in content:
+        hint = "intrinsics = [fx, fy, cx, cy] in pixels"
         for key in ("model", "distortion", "baseline_m"):
             if key in content:
-                raise reader.error(
-                    section, key, "needs intrinsics, too", hint="intrinsics = [fx, fy, cx, cy] in pixels"
-                )
+                raise reader.error(section, key, "needs intrinsics, too", hint)
         return {}
     intrinsics = reader.numbers(section, "intrinsics", content["intrinsics"], (4,))
     if min(intrinsics[:2]) <= 0.0:
         raise reader.error(section, "intrinsics", "focal lengths must be positive", hint="[fx, fy, cx, cy] in pixels")
     model = content.get("model", "pinhole")
     if model not in CAMERA_MODELS:
-        raise reader.error(
-            section, "model", f"unknown camera model '{model}'", hint="one of " + ", ".join(CAMERA_MODELS)
-        )
+        hint = "one of " + ", ".join(CAMERA_MODELS)
+        raise reader.error(section, "model", f"unknown camera model '{model}'", hint)
     distortion = reader.numbers(section, "distortion", content.get("distortion", []), (0, *CAMERA_MODELS[model]))
     found: dict[str, Any] = {"intrinsics": intrinsics, "distortion": distortion, "distortion_model": model}
     if "resolution_px" in content:

@@ -24,7 +24,6 @@ from evermap.types import (
     SpatialOdometry,
     SpatialSensor,
     Trajectory,
-    rows_of,
 )
 from evermap.valid import QUATERNION as QUANTITIES
 from evermap.valid import X_M, Y_M, Z_M, Quantity, is_covariance
@@ -56,9 +55,8 @@ def quaternions(table: Table, *, optional: bool = False) -> FloatArray:
     wrong = np.flatnonzero(~(np.abs(length - 1.0) <= 1e-2) & ~absent)
     if len(wrong):
         row, hint = int(wrong[0]), "scalar last; all four or none"
-        problem = (
-            "is incomplete" if np.isnan(length[row]) else f"is not a unit quaternion, its length is {length[row]:g}"
-        )
+        odd = f"is not a unit quaternion, its length is {length[row]:g}"
+        problem = "is incomplete" if np.isnan(length[row]) else odd
         raise table.error(problem, row=row, field="qx, qy, qz, qw", hint=hint)
     return unit(given)
 
@@ -189,7 +187,7 @@ def with_tag_poses(
     if broken.any():
         warnings.append(f"{counted(int(broken.sum()), 'tag')} left out: their corners are not those of a square")
     filled = replace(detections, position_sensor_m=position, rotation=rotation)
-    return rows_of(filled, ~sizeless & ~broken) if (sizeless | broken).any() else filled
+    return filled[~sizeless & ~broken] if (sizeless | broken).any() else filled
 
 
 def directions(pixel: FloatArray, sensor: IntArray, sensors: Sequence[SpatialSensor]) -> tuple[FloatArray, FloatArray]:

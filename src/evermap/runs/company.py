@@ -95,9 +95,8 @@ def collect(
         InputError: a map that is missing or damaged.
         MissingExtraError, ConfigError: as `spread_over`.
     """
-    found = spread_over(
-        maps, partial(_evidence, settings=settings), workers=workers, cluster=cluster, progress=progress
-    )
+    evidence = partial(_evidence, settings=settings)
+    found = spread_over(maps, evidence, workers=workers, cluster=cluster, progress=progress)
     for site in found:
         if isinstance(site, EvermapError):
             raise site
@@ -229,7 +228,6 @@ def _on_dask(client: Client, apply: Callable[[str], Any], items: Sequence[str]) 
             yield number, future.result()
         except (KilledWorker, ModuleNotFoundError) as error:
             problem = f"a worker crashed, or has no evermap: {error}"
-            raise ConfigError(
-                problem, path=items[number], hint="more memory; the same evermap on all workers"
-            ) from error
+            hint = "more memory; the same evermap on all workers"
+            raise ConfigError(problem, path=items[number], hint=hint) from error
         future.release()

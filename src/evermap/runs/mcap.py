@@ -28,7 +28,6 @@ from evermap.types import (
     SlamResult,
     SpatialRecording,
     Trajectory,
-    rows_of,
 )
 
 TOPICS = {
@@ -64,9 +63,8 @@ def write_mcap(recording: AnyRecording, result: SlamResult, path: Path) -> None:
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
     except ImportError:
-        raise MissingExtraError(
-            "MCAP needs the package rosbags, which is not installed", hint="pip install 'evermap[ros]'"
-        ) from None
+        problem = "MCAP needs the package rosbags, which is not installed"
+        raise MissingExtraError(problem, hint="pip install 'evermap[ros]'") from None
     ros = Ros(ros2_types())
     with tempfile.TemporaryDirectory() as folder:
         with Writer(Path(folder) / "run", version=8, storage_plugin=StoragePlugin.MCAP) as bag:
@@ -160,8 +158,7 @@ def _motion(ros: Ros, recording: AnyRecording, result: SlamResult) -> Iterator[_
     known = len(alone) == len(poses)
     drift = se3.compose(poses, se3.inverse(alone)) if known else poses
     for row, stamp_s in enumerate(path.stamp_s.tolist()):
-        frames = [("map", "odom", drift[row])]
-        frames.append(("odom", "base_link", alone[row] if known else se3.identity()))
+        frames = [("map", "odom", drift[row]), ("odom", "base_link", alone[row] if known else se3.identity())]
         yield stamp_s, "/tf", ros.transforms(stamp_s, frames)
         if known:
             yield stamp_s, "/odom", ros.odometry(stamp_s, alone[row])
@@ -231,7 +228,7 @@ def _detections(ros: Ros, recording: AnyRecording) -> Iterator[_Stamped]:
         spread = np.zeros((len(seen), 6, 6))
         ids, frames, classes = seen.landmark_id, seen.frame, seen.class_id
     else:
-        flat = rows_of(recording.detections, np.isfinite(recording.detections.bearing_rad))  # a position takes both
+        flat = recording.detections[np.isfinite(recording.detections.bearing_rad)]  # a position takes both
         ids, frames, classes = flat.landmark_id, flat.frame, flat.class_id
         bearing, zero = flat.bearing_rad, np.zeros(len(flat))
         at = np.stack([flat.range_m * np.cos(bearing), flat.range_m * np.sin(bearing), zero], axis=1)

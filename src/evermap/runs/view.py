@@ -27,7 +27,6 @@ from evermap.types import (
     SpatialRecording,
     SpatialSensor,
     Trajectory,
-    rows_of,
 )
 
 WRITTEN = {".rrd": "scene.rrd", ".mcap": "run.mcap"}
@@ -130,7 +129,7 @@ def _innovations(path: Path) -> Innovations:
     from evermap.io.table import parse_parquet
 
     table = parse_parquet(path.read_bytes(), path)
-    columns = {name: table.columns[name] for name in Innovations.__dataclass_fields__ if name in table}
+    columns: dict[str, Any] = {name: table.columns[name] for name in Innovations.__dataclass_fields__ if name in table}
     if "dof" in columns:
         columns["dof"] = np.asarray(columns["dof"], dtype=np.int64)
     return Innovations(**columns)
@@ -153,6 +152,6 @@ def _result(path: Trajectory, online: Trajectory, landmarks: Landmarks, **more: 
         innovations=Innovations(none, none.astype(np.int64), none.astype(np.int64), none, none),
         misses=Misses.empty(),
         step_s=none,
-        dead_reckoning=rows_of(path, np.zeros(0, dtype=np.int64)),
+        dead_reckoning=path[np.zeros(0, dtype=np.int64)],
         **more,
     )

@@ -79,9 +79,8 @@ class LookTable:
         if self.class_of_feature.shape != (self.n_features,):
             problem = f"{len(self.class_of_feature)} classes for {self.n_features} features"
             raise InputError(problem, field="class_of_feature")
-        columns = {
-            name: getattr(self, name) for name in ("feature", "detected", "p_miss", "p_false", "present", "line")
-        }
+        names = ("feature", "detected", "p_miss", "p_false", "present", "line")
+        columns = {name: getattr(self, name) for name in names}
         for name, column in columns.items():
             if column is not None and column.shape != self.stamp_s.shape:
                 problem = f"shape {column.shape} where stamp_s has {self.stamp_s.shape}"
@@ -318,9 +317,8 @@ def _classes(table: Columns, feature: IntArray, names: tuple[str, ...]) -> tuple
     if other.size:
         row = int(other[0])
         first = class_names[of_feature[feature[row]]]
-        problem = (
-            f"feature {quote(names[feature[row]])} is {quote(class_names[of_row[row]])} here and {quote(first)} above"
-        )
+        whose, here = quote(names[feature[row]]), quote(class_names[of_row[row]])
+        problem = f"feature {whose} is {here} here and {quote(first)} above"
         raise table.error(problem, row=row, field="class_id", hint="one class per feature")
     return tuple(class_names), of_feature
 

@@ -66,10 +66,8 @@ def write_persist(
         folder.path("changes.jsonl").write_text(_changes(result, _numbered(result.table.names)), encoding="utf-8")
         if result.learned is not None:
             save_models(result.models, result.learned.per, folder.path("model.json"))
-        timing = {
-            **{f"{name}_s": seconds for name, seconds in result.step_s.items()},
-            "write_s": perf_counter() - start,
-        }
+        timing = {f"{name}_s": seconds for name, seconds in result.step_s.items()}
+        timing["write_s"] = perf_counter() - start
         return _finished(folder, result, clock, info or RunInfo(), timing, progress)
 
 
@@ -218,10 +216,8 @@ def _join_rows(path: Path, scratch: Path, parted: PartedLooks, quoted: bool) -> 
             size = min(_ROWS, parted.rows - start)
             stamp_s, p, feature = np.empty(size), np.empty(size), np.empty(size, dtype=np.int64)
             for number in range(len(parted.files)):
-                row, *columns = (
-                    np.load(scratch / f"{name}-{number}.npy", mmap_mode="r")
-                    for name in ("row", "stamp_s", "p", "feature")
-                )
+                pieces = (scratch / f"{name}-{number}.npy" for name in ("row", "stamp_s", "p", "feature"))
+                row, *columns = (np.load(piece, mmap_mode="r") for piece in pieces)
                 a, b = np.searchsorted(row, (start, start + size))
                 for into, column in zip((stamp_s, p, feature), columns, strict=True):
                     into[row[a:b] - start] = column[a:b]
@@ -231,9 +227,8 @@ def _join_rows(path: Path, scratch: Path, parted: PartedLooks, quoted: bool) -> 
 
 def _shown(parted: PartedLooks, done: Sequence[_Part], totals: Totals, config: PersistConfig) -> IntArray:
     """The features of which figures and report tell."""
-    changed = most_changed(
-        np.concatenate([part.changes for part in done]), parted.looks, max(RASTER_ROWS, config.figures)
-    )
+    changes = np.concatenate([part.changes for part in done])
+    changed = most_changed(changes, parted.looks, max(RASTER_ROWS, config.figures))
     decided_s, stamp_s, feature = np.concatenate([part.latest for part in done], axis=1)
     latest = feature[np.lexsort((feature, stamp_s, decided_s))][-MOST_ROWS:].astype(np.int64)
     return np.unique(np.concatenate([changed, latest, np.flatnonzero(~np.isnan(totals.p_now))[:MOST_ROWS]]))

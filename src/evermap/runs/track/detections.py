@@ -27,10 +27,8 @@ POSITION = tuple(replace(axis, optional=True) for axis in (X_M, Y_M, Z_M))
 SENSOR = tuple(replace(axis, name=f"sensor_{axis.name}", hint="metres, in every row") for axis in (X_M, Y_M, Z_M))
 SIGMA = Quantity("sigma_m", 0.0, 1e6, positive=True, optional=True, hint="metres; empty where unknown")
 SCORE = Quantity("score", -1e9, 1e9, optional=True, hint="the detector's confidence, on any scale")
-SIZE = tuple(
-    Quantity(name, 0.0, 1e4, positive=True, optional=True, hint="metres, in every row with a position")
-    for name in SIDES
-)
+_HINT = "metres, in every row with a position"
+SIZE = tuple(Quantity(name, 0.0, 1e4, positive=True, optional=True, hint=_HINT) for name in SIDES)
 YAW = Quantity("yaw_rad", -1e4, 1e4, optional=True, hint="radians, counter-clockwise from x")
 BOX = (*SIZE, YAW)
 _REQUIRED = (STAMP_S.name, *(quantity.name for quantity in POSITION))
