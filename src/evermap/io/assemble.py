@@ -114,6 +114,14 @@ def frames_of(
     return Frames(looked_s[is_first], complete=complete, clock=clock), np.asarray(frame, dtype=np.int64)
 
 
+def looks_of(looked_s: FloatArray, stamp_s: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the distinct ones of some stamps (K,), ascending, and which of them each detection (M,) has."""
+    looked_s = np.unique(looked_s)
+    looked_s = looked_s[np.diff(looked_s, prepend=-np.inf) > SAME_STAMP_S]
+    frame = np.clip(np.searchsorted(looked_s, stamp_s + SAME_STAMP_S) - 1, 0, None)
+    return looked_s, np.asarray(frame, dtype=np.int64)
+
+
 def finish_recording(recording: _Recorded, *, warnings: list[str]) -> _Recorded:
     """Return the recording with frames that have no odometry near them left out and all remarks counted.
 

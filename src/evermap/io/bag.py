@@ -25,7 +25,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError, suggestion
 from evermap.geometry import se3
-from evermap.io.assemble import SAME_STAMP_S, finish_recording
+from evermap.io.assemble import finish_recording, looks_of
 from evermap.io.bag_messages import POSES, TWISTS, BagContent, SeenColumns, scanned
 from evermap.io.files import Reader
 from evermap.io.rig_toml import Rig, cameras
@@ -288,17 +288,14 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     sensors = tuple(mounted_sensor(path, content, settings, name, warnings) for name in settings.sensors)
     _tell_late(content, settings, warnings)
     stamps = [stamps_of(content, one.topic, settings.clock) for one in settings.sensors.values()]
-    looked = np.unique(np.concatenate(stamps))
-    looked = looked[np.diff(looked, prepend=-np.inf) > SAME_STAMP_S]
-    clock = Clock.UNIX if looked[0] > SINCE_1970_S else Clock.RECORDING
     messages = sum(len({one.look for one in content.seen[sensor.topic]}) for sensor in settings.sensors.values())
     names: dict[int, str] = {}
     rows = [(k, one) for k, sensor in enumerate(settings.sensors.values()) for one in content.seen[sensor.topic]]
     of, seen = np.array([k for k, _ in rows], dtype=np.int64), SeenColumns.of([one for _, one in rows])
     labels = tuple(sorted(set(seen.label) - {""}))
     stamp_s = np.array([stamps[k][one.look] for k, one in rows])
-    frame = np.clip(np.searchsorted(looked, stamp_s + SAME_STAMP_S) - 1, 0, None)
-    frame = np.asarray(frame, dtype=np.int64)
+    looked, frame = looks_of(np.concatenate(stamps), stamp_s)
+    clock = Clock.UNIX if looked[0] > SINCE_1970_S else Clock.RECORDING
     detections = detections_of(path, settings, sensors, (seen, of, frame, labels, names), warnings)
     finite = np.asarray(np.isfinite(detections.position_sensor_m).all(axis=1))
     if not finite.all():

@@ -162,6 +162,11 @@ def landmarks_from_table(
     return landmarks[order]
 
 
+def survey_of(table: Table | None, **how: Any) -> Landmarks | None:
+    """Return exact landmarks as `landmarks_from_table`; None without a table, or of an empty one."""
+    return landmarks_from_table(table, sigma_m=0.0, **how) if table is not None and len(table) else None
+
+
 def write_map_parquet(landmarks: Landmarks, path: str | Path) -> Path:
     """Write a map as Parquet, one row a landmark, columns as in `docs/formats.md`. Returns the path.
 

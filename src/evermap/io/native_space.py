@@ -13,7 +13,7 @@ from evermap.errors import DataError
 from evermap.geometry.camera import unproject
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal
 from evermap.io.files import FileSet
-from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, landmarks_from_table
+from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, survey_of
 from evermap.io.rig_toml import CAMERA_FILE, Rig
 from evermap.io.spatial import (
     AT,
@@ -102,12 +102,9 @@ def spatial_recording(
     table = _by_sensor(table)
     frames, frame = _frames(table, tables["frames"], rig, warnings)
     detections = _detections(table, frame, rig, class_names, names, warnings)
-    surveyed = None
     if landmarks is not None and len(landmarks):
         landmarks.expect(AT, tuple(landmarks.columns))
-        surveyed = landmarks_from_table(
-            landmarks, sigma_m=0.0, class_names=class_names, clock=settings.clock, names=names
-        )
+    surveyed = survey_of(landmarks, class_names=class_names, clock=settings.clock, names=names)
     recording = SpatialRecording(
         name=settings.name or title,
         odometry=_odometry(tables["odometry"], settings.clock, warnings) if driven is None else _in_space(driven),
@@ -205,10 +202,9 @@ def _detections(
     columns: dict[str, Any] = {
         "sensor": _sensor_rows(table, rig),
         "class_id": class_ids(table, class_names),
+        "landmark_id": table.ids("landmark_id", optional=True, names=names),
         "source_line": np.asarray(table.line, dtype=np.int64),
     }
-    if "landmark_id" in table:
-        columns["landmark_id"] = table.ids("landmark_id", optional=True, names=names)
     for quantity in (Quantity("score", optional=True), _SIGMA_RAD):
         columns[quantity.name] = table.filled(quantity, np.nan)
     if table.has_any(BOX):

@@ -111,16 +111,15 @@ class Table(NamedColumns):
         return values
 
     def ids(self, name: str, *, optional: bool, names: dict[int, str] | None = None) -> IntArray:
-        """Return whole numbers from 0; empty or -1 means `UNKNOWN` if `optional`. Shape (R,).
+        """Return whole numbers from 0; empty or -1, or no such column, means `UNKNOWN` if `optional`. Shape (R,).
 
-        Args:
-            name: of the column.
-            optional: whether a cell may be empty.
-            names: takes up the texts of cells that are not numbers, by their id (`landmark_id_of`); None refuses them.
+        `names` takes up the texts of cells that are not numbers, by their id (`landmark_id_of`); None refuses them.
 
         Raises:
             InputError: a fraction, a negative number, or nothing where an id is needed; two texts with one id.
         """
+        if optional and name not in self:
+            return np.full(len(self), UNKNOWN, dtype=np.int64)
         if names is not None and not isinstance(self.columns[name], np.ndarray):
             return self._named_ids(name, optional, names)
         values = self.numbers(Quantity(name, UNKNOWN, _LARGEST_ID, optional=True, hint="whole numbers from 0"))

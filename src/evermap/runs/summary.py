@@ -48,7 +48,6 @@ class RunInfo:
         processing_s: wall time spent on estimating, without waiting for a live recording and without writing the
             outputs; None takes the sum of the steps.
         total_s: wall time of everything so far; None if not measured.
-        peak_memory_mb: of the process; None asks the operating system.
         grown: number of landmarks that a living map grew by; None without a map.
         accepted: whether the session was entered into the map; None without one.
     """
@@ -58,7 +57,6 @@ class RunInfo:
     read_s: float | None = None
     processing_s: float | None = None
     total_s: float | None = None
-    peak_memory_mb: float | None = None
     grown: int | None = None
     accepted: bool | None = None
 
@@ -83,7 +81,7 @@ def summary_head(
     times = {**({} if info.read_s is None else {"read_s": info.read_s}), **timing}
     if "total_s" not in times:
         times["total_s"] = sum(seconds for name, seconds in times.items() if name.endswith("_s") and seconds)
-    times["peak_memory_mb"] = json_number(peak_memory_mb() if info.peak_memory_mb is None else info.peak_memory_mb)
+    times["peak_memory_mb"] = json_number(peak_memory_mb())
     times["written_at"] = datetime.now(UTC).isoformat(timespec="seconds")
     return {
         "schema_version": SUMMARY_SCHEMA_VERSION,
