@@ -22,10 +22,14 @@ from evermap.io.table import (
     NamedColumns,
     Table,
     arrow_cells,
+    arrow_csv,
     dates_as_text,
     guarded,
     numbers_of,
+    pa,
     parse_csv,
+    pc,
+    pq,
     read_parquet,
     unguarded,
 )
@@ -43,9 +47,6 @@ class Columns(NamedColumns):
     __slots__ = ()
 
     def numbers(self, quantity: Quantity) -> FloatArray:
-        import pyarrow as pa
-        import pyarrow.compute as pc
-
         cells = self.columns[quantity.name]
         if _is_text(cells.type):
             text = pc.utf8_trim_whitespace(cells)
@@ -64,8 +65,6 @@ class Columns(NamedColumns):
 
     def clock(self, name: str = "stamp_s") -> Clock | None:
         """Return what the stamps of a column count, where they are dates; else None."""
-        import pyarrow as pa
-
         cells = self.columns[name][:1]
         text = dates_as_text(cells) if pa.types.is_timestamp(cells.type) else cells.to_pylist()
         return self._table({name: text}).clock(name) if _is_text(cells.type) or text != cells.to_pylist() else None
@@ -76,8 +75,6 @@ class Columns(NamedColumns):
         Raises:
             InputError: another word or number.
         """
-        import pyarrow.compute as pc
-
         cells = self.columns[name]
         if not _is_text(cells.type):
             values = self._converted(cells, name)
@@ -103,9 +100,6 @@ class Columns(NamedColumns):
         Raises:
             InputError: numbers that are not whole, or characters that cannot be printed.
         """
-        import pyarrow as pa
-        import pyarrow.compute as pc
-
         cells = self.columns[name]
         if pa.types.is_floating(cells.type):
             values = self._converted(cells, name)
@@ -131,8 +125,6 @@ class Columns(NamedColumns):
 
     def _converted(self, cells: Any, name: str) -> FloatArray:
         """Cells that are not text as float64."""
-        import pyarrow as pa
-
         kind = cells.type
         if pa.types.is_timestamp(kind):
             return self._table({name: dates_as_text(cells)}).numbers(Quantity(name, optional=True, dates=True))
@@ -161,8 +153,6 @@ def read_columns(path: str | Path, warnings: list[str]) -> Columns:
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
-    import pyarrow as pa
-
     if not parts:
         return Columns(Path(), {}, np.zeros(0, dtype=np.int64))
     cells = {name: pa.concat_arrays([part.columns[name] for part in parts]) for name in parts[0].columns}
@@ -180,9 +170,6 @@ def parquet_batches(path: Path) -> Iterator[Columns]:
     Raises:
         InputError: none is there, one is damaged, or files have different columns.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     files, start, schema = parquet_files(path), 1, None
     for file in files:
         try:
@@ -204,9 +191,6 @@ def parquet_batches(path: Path) -> Iterator[Columns]:
 
 def is_parted(path: Path, most: int, but: str = "") -> bool:
     """Return whether a Parquet file, or all in a folder together, have more rows than `most`, and no column `but`."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     try:
         about = [pq.read_metadata(file) for file in parquet_files(path)]
     except (pa.ArrowException, OSError):  # none, or reading it will tell
@@ -231,24 +215,19 @@ def csv_bytes(columns: Mapping[str, Any], *, quoted: bool = False, header: bool 
     Missing numbers (nan) are empty cells. Of a file in pieces, all have `quoted` where one needs it, and the first has
     the `header`.
     """
-    import pyarrow as pa
-    from pyarrow import csv
-
     arrays = {name: _cells(column) for name, column in columns.items()}
     marks = quoted or any(_is_text(cells.type) and needs_quotes(cells) for cells in arrays.values())
-    options = csv.WriteOptions(include_header=False, quoting_style="needed" if marks else "none")
+    options = arrow_csv.WriteOptions(include_header=False, quoting_style="needed" if marks else "none")
     sink = pa.BufferOutputStream()
     if header:
         sink.write((",".join(columns) + "\n").encode())
     if len(next(iter(arrays.values()))):
-        csv.write_csv(pa.table(arrays), sink, options)
+        arrow_csv.write_csv(pa.table(arrays), sink, options)
     return bytes(sink.getvalue())
 
 
 def needs_quotes(cells: Any) -> bool:
     """Return whether a pyarrow array of text has a cell that a CSV file must quote."""
-    import pyarrow.compute as pc
-
     return bool(pc.any(pc.match_substring_regex(cells, r'[",\r\n#]|^\s|\s$')).as_py())
 
 
@@ -261,8 +240,6 @@ def _cells(column: Any) -> Any:
 
 def _mapped(cells: Any, pattern: str, change: Callable[[str], str]) -> Any:
     """Return an array of text with a change of each different one, if any matches the pattern."""
-    import pyarrow.compute as pc
-
     if not pc.any(pc.match_substring_regex(cells, pattern)).as_py():
         return cells
     code, words = _coded(cells)
@@ -271,8 +248,6 @@ def _mapped(cells: Any, pattern: str, change: Callable[[str], str]) -> Any:
 
 def _without(text: Any, known: BoolArray) -> Any:
     """Return an array of text with null for unknown values."""
-    import pyarrow as pa
-
     valid = np.packbits(np.concatenate([np.zeros(text.offset, dtype=np.bool_), known]), bitorder="little")
     return pa.Array.from_buffers(text.type, len(text), [pa.py_buffer(valid), *text.buffers()[1:]], offset=text.offset)
 
@@ -291,9 +266,6 @@ def _content(path: Path) -> bytes:
 
 def _fast_csv(data: bytes, path: Path) -> Columns | None:
     """The table, if it is plain: no comments and empty lines after the header, as many cells as names everywhere."""
-    import pyarrow as pa
-    from pyarrow import csv
-
     head = re.match(rb"(?:\xef\xbb\xbf)?(?:[ \t]*(?:#[^\n]*)?\r?\n)*[^\n]*\n", data)
     if head is None or b"\0" in data or re.search(rb"\n[ \t]*#", data[head.end() - 1 :]):
         return None
@@ -303,10 +275,10 @@ def _fast_csv(data: bytes, path: Path) -> Columns | None:
         pa.enable_signal_handlers(False)  # Arrow's own lose a signal that comes as a table ends, one in ten
     rows = data.count(b"\n", head.end()) + (not data.endswith(b"\n"))
     try:
-        table = csv.read_csv(
+        table = arrow_csv.read_csv(
             pa.BufferReader(pa.py_buffer(data).slice(head.end())),
-            read_options=csv.ReadOptions(column_names=names, use_threads=False),
-            convert_options=csv.ConvertOptions(
+            read_options=arrow_csv.ReadOptions(column_names=names, use_threads=False),
+            convert_options=arrow_csv.ConvertOptions(
                 column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False
             ),
         )
@@ -328,8 +300,6 @@ def _careful_csv(data: bytes, path: Path, warnings: list[str]) -> Columns:
 
 def _plain(column: Any) -> Any:
     """One array in place of chunks and dictionaries."""
-    import pyarrow as pa
-
     if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     if pa.types.is_large_string(column.type) or pa.types.is_string_view(column.type):
@@ -338,14 +308,10 @@ def _plain(column: Any) -> Any:
 
 
 def _is_text(kind: Any) -> bool:
-    import pyarrow as pa
-
     return bool(pa.types.is_string(kind))
 
 
 def _as_float(cells: Any) -> FloatArray:
-    import pyarrow as pa
-
     if pa.types.is_boolean(cells.type):
         cells = cells.cast(pa.int8())
     values, known = numbers_of(cells.cast(pa.float64(), safe=False), np.float64)

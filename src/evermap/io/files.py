@@ -62,21 +62,19 @@ class FileSet:
         Raises:
             InputError: it is missing, unreadable, or damaged inside the zip.
         """
-        return unpacked(self._content(name), self.path_of(name))
-
-    def _content(self, name: str) -> bytes:
+        path = self.path_of(name)
         if name not in self.members:
-            raise InputError("file is missing", path=self.path_of(name))
+            raise InputError("file is missing", path=path)
+        if not self.zipped:
+            return content_of(path)
         try:
-            if not self.zipped:
-                return self.path_of(name).read_bytes()
             with zipfile.ZipFile(self.root) as archive:
-                return archive.read(self.members[name])
+                return unpacked(archive.read(self.members[name]), path)
         except OSError as error:
-            raise InputError(f"cannot be read: {error.strerror or error}", path=self.path_of(name)) from error
+            raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
         except (*_ZIP_ERRORS, KeyError) as error:
             problem = f"damaged inside the zip: {reason(error)}"
-            raise InputError(problem, path=self.path_of(name), hint="download or create the zip again") from error
+            raise InputError(problem, path=path, hint="download or create the zip again") from error
 
 
 def file_sets(path: str | Path) -> list[FileSet]:

@@ -26,7 +26,7 @@ from evermap.io.spatial import (
     quaternions,
     upper_triangle,
 )
-from evermap.io.table import Table, csv_text, parquet_bytes, parse_csv, parse_parquet
+from evermap.io.table import Table, csv_text, pa, parquet_bytes, parse_csv, parse_parquet, pq
 from evermap.io.tag_maps import is_wpilib, map_of_survey, tags_of_fiducials, tags_of_tagslam, tags_of_wpilib
 from evermap.io.text import parse_json
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks
@@ -249,9 +249,6 @@ def checked_about(about: Any, path: Path) -> dict[str, Any]:
 
 def parquet_about(data: bytes, path: Path) -> dict[str, Any]:
     """Return the description that `write_map_parquet` leaves in a file; empty for files made by others."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     metadata = pq.read_schema(pa.BufferReader(data)).metadata or {}
     if b"evermap" not in metadata:
         return {}

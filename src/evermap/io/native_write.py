@@ -127,11 +127,18 @@ def _single(columns: dict[str, Any]) -> dict[str, Any]:
 
 def _contents(recording: Recording | SpatialRecording) -> tuple[dict[str, str], dict[str, dict[str, Any]]]:
     """Texts of its settings files, and columns of its tables."""
-    settings, tables = _settings(recording), native_tables(recording)
+    settings = Settings(
+        name=recording.name,
+        robot=recording.robot,
+        clock=recording.clock,
+        frames_complete=recording.frames.complete,
+        class_names=_class_names(recording),
+        sensor=recording.sensor if isinstance(recording, Recording) else Sensor(),
+    )
     if isinstance(recording, Recording):
-        return {SENSOR_FILE: sensor_toml(settings)}, tables
+        return {SENSOR_FILE: sensor_toml(settings)}, native_tables(recording)
     known = {name: said for name, said in recording.symmetries.items() if name in _class_names(recording)}
-    return rig_toml(recording.sensors, settings, known), tables
+    return rig_toml(recording.sensors, settings, known), native_tables(recording)
 
 
 def native_tables(recording: Recording | SpatialRecording) -> dict[str, dict[str, Any]]:
@@ -224,17 +231,6 @@ def _called(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
     if not names.keys() & set(landmark_id.tolist()):
         return landmark_id
     return ["" if number == UNKNOWN else names.get(number, str(number)) for number in landmark_id.tolist()]
-
-
-def _settings(recording: Recording | SpatialRecording) -> Settings:
-    return Settings(
-        name=recording.name,
-        robot=recording.robot,
-        clock=recording.clock,
-        frames_complete=recording.frames.complete,
-        class_names=_class_names(recording),
-        sensor=recording.sensor if isinstance(recording, Recording) else Sensor(),
-    )
 
 
 def _class_names(recording: Recording | SpatialRecording) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,19 @@ from evermap.errors import InputError, similar, suggestion
 from evermap.io.text import clock_of_date, date_s, decode_text, parse_float, quote, reason
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, landmark_id_of
 from evermap.valid import STAMP_S, Quantity
+
+
+class _Lazy:
+    """A package that is loaded when something of it is first used."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(import_module(self._name), name)
+
+
+pa, pc, pq, arrow_csv = map(_Lazy, ("pyarrow", "pyarrow.compute", "pyarrow.parquet", "pyarrow.csv"))
 
 ENDINGS = (".csv", ".csv.gz", ".parquet")
 FORMULA = r"^'*[=+@\t\r-]"
@@ -262,9 +276,6 @@ def read_parquet(data: bytes, path: Path) -> Any:
     Raises:
         InputError: not Parquet, damaged, or a repeated column name.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     try:
         # without threads: one that still runs while the process ends aborts it
         table = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True).read(use_threads=False)
@@ -279,9 +290,6 @@ def read_parquet(data: bytes, path: Path) -> Any:
 
 def parquet_bytes(columns: Mapping[str, Any], metadata: dict[str, str] | None = None) -> bytes:
     """Return a Parquet file of arrays and lists of text ('' becomes null), with checksums against later damage."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     arrays = [
         arrow_cells(cells, np.array([*map(bool, cells)], dtype=np.bool_) if isinstance(cells, list) else None)
         for cells in columns.values()
@@ -301,8 +309,6 @@ def arrow_cells(cells: Any, known: BoolArray | None = None) -> Any:
         cells: R cells.
         known: (R,) False where a cell is null; None for no null.
     """
-    import pyarrow as pa
-
     valid = None if known is None else pa.py_buffer(np.packbits(known, bitorder="little"))
     if not isinstance(cells, list):
         values = np.ascontiguousarray(cells)
@@ -398,8 +404,6 @@ def _is_number(cell: str) -> bool:
 
 
 def _arrow_column(column: Any, path: Path, name: str) -> list[str] | FloatArray:
-    import pyarrow as pa
-
     kind = column.type
     if pa.types.is_dictionary(kind):
         kind = kind.value_type
@@ -419,7 +423,5 @@ def _arrow_column(column: Any, path: Path, name: str) -> list[str] | FloatArray:
 
 def dates_as_text(column: Any) -> list[str]:
     """Return timestamps of a Parquet column, with or without a zone, as ISO 8601; '' where null."""
-    import pyarrow as pa
-
     dates = column.cast(pa.timestamp("us", tz=column.type.tz), safe=False).to_pylist()
     return ["" if date is None else date.isoformat() for date in dates]

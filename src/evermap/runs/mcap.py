@@ -267,7 +267,9 @@ def drawn(ros: Ros, landmarks: Landmarks, stamp_s: FloatArray) -> Iterator[tuple
     from evermap.viz.rerun_scene import rgb
     from evermap.viz.style import LANDMARK
 
-    pose, size = poses_of(landmarks), _sizes(landmarks)
+    pose = poses_of(landmarks)
+    size = np.full((len(landmarks), 3), np.nan) if landmarks.size_m is None else landmarks.size_m
+    size = np.where(np.isnan(size), POINT_M, np.maximum(size, PLATE_M))
     labels = labels_of(landmarks.class_id, landmarks.class_names)
     none, tint = ros.make("builtin_interfaces/Duration", 0, 0), rgb(LANDMARK)
     nothing = np.zeros(0, dtype=np.uint8)
@@ -300,11 +302,6 @@ def poses_of(landmarks: Landmarks) -> FloatArray:
     at[:, : landmarks.position_m.shape[1]] = landmarks.position_m
     turn = np.full((len(landmarks), 4), np.nan) if landmarks.rotation is None else landmarks.rotation
     return np.hstack([at, np.where(np.isnan(turn), se3.NO_TURN, turn)])
-
-
-def _sizes(landmarks: Landmarks) -> FloatArray:
-    size = np.full((len(landmarks), 3), np.nan) if landmarks.size_m is None else landmarks.size_m
-    return np.where(np.isnan(size), POINT_M, np.maximum(size, PLATE_M))
 
 
 def _entity(

@@ -182,8 +182,7 @@ def enter_session(
     if not start_s < newest.session_start_s:
         session = run_session(recording, said, config, progress=progress)
         return Entered(session, newest, session.living, session.changes, (), head, {RECORDING: data})
-    late = _enter_late(store, recording, said, config, _history(store, head), data, progress)
-    return replace(late, parent=head)  # whatever came in since `head` was read makes the commit stale
+    return _enter_late(store, head, recording, said, config, data, progress)
 
 
 def begin_map(store: MapStore, landmarks: Landmarks, recording: AnyRecording, source: str) -> int:
@@ -242,17 +241,20 @@ def edit_landmarks(
 
 def _enter_late(
     store: MapStore,
+    head: int,
     recording: AnyRecording,
     newest: LivingMap,
     config: Config | None,
-    steps: list[_Step],
     data: bytes,
     progress: Progress | None,
 ) -> Entered:
-    """A session that belongs before some of the steps of the history: these are taken once more, after it."""
+    """A session that belongs before some of the steps of the history: these are taken once more, after it.
+
+    Whatever came in since `head` was read makes the commit stale.
+    """
     from evermap.pipeline import run_session
 
-    head, start_s = store.head(), float(recording.frames.stamp_s[0])
+    steps, start_s = _history(store, head), float(recording.frames.stamp_s[0])
     first = _first_again(steps, start_s)
     parent = steps[first].revision.parent
     try:

@@ -14,7 +14,7 @@ from evermap.config import PersistConfig
 from evermap.errors import ConfigError, InputError
 from evermap.existence.protocol import Looks, feature_of, firsts_of
 from evermap.io.columns import Columns, natural_order, parquet_batches, read_columns
-from evermap.io.table import arrow_cells
+from evermap.io.table import arrow_cells, pa, pq
 from evermap.io.text import counted, quote
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
 from evermap.valid import STAMP_S, Quantity
@@ -390,8 +390,6 @@ class PartedLooks:
 
     def part(self, number: int) -> tuple[LookTable, IntArray]:
         """Return a part, and which row of the whole table each of its rows is, counted from 0."""
-        import pyarrow.parquet as pq
-
         read = pq.read_table(self.files[number], use_threads=False)
         cells = {name: read[name].combine_chunks() for name in read.column_names}
         row, rank = (cells.pop(name).to_numpy() for name in ("row", "rank"))
@@ -466,9 +464,6 @@ def _surveyed(path: Path) -> _Surveyed:
 
 def _route(path: Path, rank: Mapping[str, int], edges: IntArray, files: Sequence[Path]) -> None:
     """Write each row to the file of its feature."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     with ExitStack() as stack:
         writers: dict[int, Any] = {}
         for table in parquet_batches(path):
