@@ -142,7 +142,7 @@ def test_objects_by_columns_are_the_objects_one_by_one(monkeypatch: pytest.Monke
         return one.readings
 
     by_columns = drive()
-    monkeypatch.setattr("evermap.io.cdr.Cdr.parts", lambda *_: None)
+    monkeypatch.setattr(ros, "parts_of", lambda *_: None)
     one_by_one = drive()
     assert len(by_columns) == len(one_by_one) == 29 + 30
     for mine, other in zip(by_columns, one_by_one, strict=True):
@@ -154,7 +154,7 @@ def test_objects_by_columns_are_the_objects_one_by_one(monkeypatch: pytest.Monke
 @pytest.mark.parametrize("columns", [True, False])
 def test_a_look_that_cannot_be_read_leaves_the_next_alone(columns: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not columns:
-        monkeypatch.setattr("evermap.io.cdr.Cdr.parts", lambda *_: None)
+        monkeypatch.setattr(ros, "parts_of", lambda *_: None)
     one, real, bad = robot()[0], ros.detections_of, [False]
 
     def read(*given: Any) -> Any:

@@ -21,7 +21,7 @@ from evermap.runs.summary import RunInfo, summary_dict, timing_dict
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "metrics"))
 
-INFO = RunInfo(command="evermap slam x", seeds={"slam": 0}, processing_s=2.0, total_s=3.0, peak_memory_mb=100.0)
+INFO = RunInfo(command="evermap slam x", seeds={"slam": 0}, processing_s=2.0, total_s=3.0)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_summary_has_its_contract(written, run):
     assert summary["metrics"]["pose_rmse_m"] > 0
     assert summary["timing"]["real_time_factor"] == pytest.approx(np.ptp(run[0].frames.stamp_s) / 2.0)
     assert summary["timing"]["step_p99_ms"] == pytest.approx(1e3 * np.percentile(run[1].step_s, 99))
-    assert summary["timing"]["peak_memory_mb"] == 100.0
+    assert summary["timing"]["peak_memory_mb"] > 0.0
     assert summary["counts"]["robot_sightings"] == 5
     assert summary["counts"]["frames"] == len(run[0].frames)
     assert summary["config"]["slam"]["robust"] is True

@@ -266,8 +266,8 @@ def _table(path: Path) -> Described:
     kind = next((kind for columns, kind in _TABLES.items() if all(name in table for name in columns)), "")
     if not kind and all(name in table for name in ("x_m", "y_m")) and ("landmark_id" in table or "tag_id" in table):
         return _landmarks(path)
-    facts: dict[str, Any] = {"table": kind, "rows": len(table), "columns": list(table.cells), "warnings": remarks}
-    rows = [("holds", kind or "a table"), ("rows", f"{len(table):,}"), ("columns", ", ".join(table.cells))]
+    facts: dict[str, Any] = {"table": kind, "rows": len(table), "columns": list(table.columns), "warnings": remarks}
+    rows = [("holds", kind or "a table"), ("rows", f"{len(table):,}"), ("columns", ", ".join(table.columns))]
     if len(table) and "stamp_s" in table:
         stamp_s = table.numbers(STAMP_S)
         facts |= {"from_s": float(stamp_s.min()), "to_s": float(stamp_s.max())}

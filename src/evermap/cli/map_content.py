@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evermap.cli.terminal import echo, print_table, write_picture
-from evermap.runs.map_dicts import AXES
+from evermap.io.spatial import AT
 from evermap.stamps import between_text, stamp_text
 from evermap.types import Clock, MapChange, or_nan
 
@@ -58,7 +58,7 @@ def landmark_row(content: dict[str, Any], clock: Clock) -> list[str]:
         content["class"] or "-",
         probability_text(content["p_exists"]),
         "-" if ahead is None else probability_text(ahead),
-        f"({', '.join(f'{content[axis]:.2f}' for axis in AXES if axis in content)})" if placed else "-",
+        f"({', '.join(f'{content[axis]:.2f}' for axis in AT if axis in content)})" if placed else "-",
         f"{100 * content['sigma_m']:.1f} cm" if placed else "-",
         stamp_text(or_nan(content["since_s"]), clock),
         stamp_text(or_nan(content["seen_s"]), clock),

@@ -25,14 +25,13 @@ from evermap.types import (
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
-    rows_of,
 )
 from evermap.valid import STAMP_S, validate, validate_spatial
 
-SAME_STAMP_S: float = 1e-6
+SAME_STAMP_S = 1e-6
 """Stamps closer than this are the same instant when detections are assigned to frames."""
 
-ODOMETRY_GAP_S: float = 10.0
+ODOMETRY_GAP_S = 10.0
 """Longer pauses of the odometry are reported, and frames farther than this from any odometry are dropped."""
 
 
@@ -40,14 +39,15 @@ _Seen = TypeVar("_Seen", Detections, SpatialDetections)
 _Recorded = TypeVar("_Recorded", Recording, SpatialRecording)
 
 
-def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray, field: str = "stamp_s") -> None:
+def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray) -> None:
     """Raise InputError at the first stamp that is smaller than the one before."""
     back = np.flatnonzero(np.diff(stamp_s) < 0)
     if len(back):
         row = int(back[0]) + 1
         step = stamp_s[row - 1] - stamp_s[row]
         hint = "sort the rows by time if only their order is wrong"
-        raise InputError(f"time runs backwards by {step:.6g} s", path=path, line=int(line[row]), field=field, hint=hint)
+        problem = f"time runs backwards by {step:.6g} s"
+        raise InputError(problem, path=path, line=int(line[row]), field="stamp_s", hint=hint)
 
 
 def forward_stamps(table: Table) -> FloatArray:
@@ -114,10 +114,16 @@ def frames_of(
     return Frames(looked_s[is_first], complete=complete, clock=clock), np.asarray(frame, dtype=np.int64)
 
 
+def looks_of(looked_s: FloatArray, stamp_s: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the distinct ones of some stamps (K,), ascending, and which of them each detection (M,) has."""
+    looked_s = np.unique(looked_s)
+    looked_s = looked_s[np.diff(looked_s, prepend=-np.inf) > SAME_STAMP_S]
+    frame = np.clip(np.searchsorted(looked_s, stamp_s + SAME_STAMP_S) - 1, 0, None)
+    return looked_s, np.asarray(frame, dtype=np.int64)
+
+
 def finish_recording(recording: _Recorded, *, warnings: list[str]) -> _Recorded:
     """Return the recording with frames that have no odometry near them left out and all remarks counted.
-
-    A recording in space may have no odometry at all.
 
     Raises:
         DataError: fewer than two odometry rows, no frame within the odometry's time, or no landmark seen.
@@ -166,7 +172,7 @@ def _without_far_frames(
         f"{counted(int(np.sum(~keep)), 'frame')} with {counted(int(np.sum(~seen)), 'detection')} left out: "
         f"more than {ODOMETRY_GAP_S:g} s before or after the odometry"
     )
-    kept = rows_of(detections, seen)
+    kept = detections[seen]
     kept = replace(kept, frame=np.asarray(new_frame[kept.frame], dtype=np.int64))
     return replace(frames, stamp_s=frames.stamp_s[keep]), kept
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError, suggestion
 from evermap.geometry import se3
-from evermap.io.assemble import SAME_STAMP_S, finish_recording
+from evermap.io.assemble import finish_recording, looks_of
 from evermap.io.bag_messages import POSES, TWISTS, BagContent, SeenColumns, scanned
 from evermap.io.files import Reader
 from evermap.io.rig_toml import Rig, cameras
@@ -45,7 +45,6 @@ from evermap.types import (
     SpatialSensor,
     Trajectory,
     landmark_id_of,
-    rows_of,
 )
 from evermap.valid import CAMERA_MODELS, is_covariance
 
@@ -217,13 +216,9 @@ def _sensor(content: BagContent, topic: str) -> BagSensor:
 
 
 def stated_settings(path: Path, content: BagContent, guessed: BagSettings, *, whole: bool = True) -> BagSettings:
-    """Return the settings in a file; missing ones are guessed.
+    """Return the settings in a file; what is missing is as guessed.
 
-    Args:
-        path: the file.
-        content: of the bag.
-        guessed: its guessed topics.
-        whole: topics that the content lacks are errors; else they may come yet.
+    `whole`: topics that the content lacks are errors; else they may come yet.
 
     Raises:
         InputError: the file is missing or wrong, or names a topic that is not there.
@@ -293,22 +288,19 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     sensors = tuple(mounted_sensor(path, content, settings, name, warnings) for name in settings.sensors)
     _tell_late(content, settings, warnings)
     stamps = [stamps_of(content, one.topic, settings.clock) for one in settings.sensors.values()]
-    looked = np.unique(np.concatenate(stamps))
-    looked = looked[np.diff(looked, prepend=-np.inf) > SAME_STAMP_S]
-    clock = Clock.UNIX if looked[0] > SINCE_1970_S else Clock.RECORDING
     messages = sum(len({one.look for one in content.seen[sensor.topic]}) for sensor in settings.sensors.values())
     names: dict[int, str] = {}
     rows = [(k, one) for k, sensor in enumerate(settings.sensors.values()) for one in content.seen[sensor.topic]]
     of, seen = np.array([k for k, _ in rows], dtype=np.int64), SeenColumns.of([one for _, one in rows])
     labels = tuple(sorted(set(seen.label) - {""}))
     stamp_s = np.array([stamps[k][one.look] for k, one in rows])
-    frame = np.clip(np.searchsorted(looked, stamp_s + SAME_STAMP_S) - 1, 0, None)
-    frame = np.asarray(frame, dtype=np.int64)
+    looked, frame = looks_of(np.concatenate(stamps), stamp_s)
+    clock = Clock.UNIX if looked[0] > SINCE_1970_S else Clock.RECORDING
     detections = detections_of(path, settings, sensors, (seen, of, frame, labels, names), warnings)
     finite = np.asarray(np.isfinite(detections.position_sensor_m).all(axis=1))
     if not finite.all():
         warnings.append(f"{counted(int((~finite).sum()), 'detection')} without a finite position left out")
-    detections = rows_of(detections, np.flatnonzero(finite)[np.argsort(detections.frame[finite], kind="stable")])
+    detections = detections[np.flatnonzero(finite)[np.argsort(detections.frame[finite], kind="stable")]]
     truth = _odometry(path, content, settings, settings.truth, clock)
     recording = SpatialRecording(
         name=path.resolve().name.split(".")[0],
@@ -316,7 +308,7 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
         frames=Frames(looked, complete=messages < sum(map(len, stamps)) or messages < FEWEST_LOOKS, clock=clock),
         detections=detections,
         sensors=sensors,
-        truth=None if truth is None else _reference(truth),
+        truth=None if truth is None else _exactly(truth),
         class_names=labels,
         source=str(path),
         clock=clock,
@@ -392,10 +384,8 @@ def mounted_sensor(
     if not one.stated_mount:
         mount = content.mount(settings.base_frame, one.frame)
         if mount is None:
-            warnings.append(
-                f"no fixed transform from '{settings.base_frame}' to '{one.frame}': '{name}' is assumed at the robot's "
-                f"centre; state its mount (`--init-bag`)"
-            )
+            where = f"'{name}' is assumed at the robot's centre; state its mount (`--init-bag`)"
+            warnings.append(f"no fixed transform from '{settings.base_frame}' to '{one.frame}': {where}")
         sensor = replace(sensor, mount_robot_sensor=tuple((se3.identity() if mount is None else mount).tolist()))
     if sensor.intrinsics is not None or not one.camera_info:
         return sensor
@@ -409,9 +399,8 @@ def mounted_sensor(
         model = "pinhole"
     if model is None or len(used) > max(CAMERA_MODELS[model]) or not (k[0, 0] > 0.0 and k[1, 1] > 0.0):
         problem = f"{one.camera_info} has an unknown camera model: '{info.distortion_model}'"
-        raise InputError(
-            problem, path=path, hint="plumb_bob or equidistant; rectified = true; or state it (`--init-bag`)"
-        )
+        hint = "plumb_bob or equidistant; rectified = true; or state it (`--init-bag`)"
+        raise InputError(problem, path=path, hint=hint)
     count = next(n for n in CAMERA_MODELS[model] if n >= len(used))
     return replace(
         sensor,
@@ -445,11 +434,7 @@ def _placed(
     sensors: tuple[SpatialSensor, ...],
     settings: BagSettings,
 ) -> SpatialDetections:
-    """The detections with poses, corners and directions.
-
-    Raises:
-        DataError: the size of a tag, or the calibration of a camera, is not known.
-    """
+    """Return the detections with poses, corners and directions; raises what `detections_of` does."""
     pose, corner, pixel = seen.pose.copy(), seen.corners, seen.pixel
     cornered, aimed = np.isfinite(corner[:, 0, 0]), np.isfinite(pixel[:, 0])
     size = settings.rig.size_of(found.landmark_id)
@@ -480,6 +465,10 @@ def _placed(
     )
 
 
+def _exactly(path: SpatialOdometry) -> Trajectory:
+    return Trajectory(path.stamp_s, path.pose_world_robot, np.zeros((len(path), 6, 6)), "truth", path.clock)
+
+
 def _odometry(
     path: Path, content: BagContent, settings: BagSettings, topic: str, clock: Clock
 ) -> SpatialOdometry | None:
@@ -501,11 +490,6 @@ def _odometry(
     child = content.frames.get(topic, "")
     mount = content.mount(settings.base_frame, child) if child else None
     return of_rig(odometry, se3.identity() if mount is None else mount)
-
-
-def _reference(truth: SpatialOdometry) -> Trajectory:
-    pose = truth.pose_world_robot
-    return Trajectory(truth.stamp_s, pose, np.zeros((len(pose), 6, 6)), frame="truth", clock=truth.clock)
 
 
 BAG = Reader(

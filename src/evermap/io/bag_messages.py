@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from evermap.geometry import se3
-from evermap.io.rosbag import MOST_HAMMING, Handler, Topic, pose_of, scan, seconds, stamp_of
+from evermap.io.rosbag import MOST_HAMMING, Handler, Topic, corners_of, pose_of, scan, seconds, stamp_of
 from evermap.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -26,14 +26,14 @@ FRAMES = ("TFMessage", "tfMessage")
 
 
 class Seen(NamedTuple):
-    """One detection; `look` is the number of its message, `covariance` (3, 3) as it says, which may be none."""
+    """One detection; `look` is the number of its message; numbers that it does not say are nan."""
 
     look: int
     identity: int | str | None = None
     label: str = ""
     score: float = float("nan")
     pose: tuple[float, ...] = (np.nan,) * 7
-    covariance: FloatArray | None = None
+    covariance: FloatArray = np.full((3, 3), np.nan)
     corners: tuple[float, ...] = (np.nan,) * 8
     size: tuple[float, ...] = (np.nan,) * 3
     pixel: tuple[float, float] = (np.nan, np.nan)
@@ -67,18 +67,13 @@ class SeenColumns(NamedTuple):
     @classmethod
     def of(cls, rows: Sequence[Seen]) -> SeenColumns:
         """Return the columns of some detections."""
-        unknown = np.full((3, 3), np.nan)
-        return cls(
-            np.array([one.look for one in rows], dtype=np.int64),
-            [one.identity for one in rows],
-            [one.label for one in rows],
-            np.array([one.score for one in rows], dtype=np.float64),
-            np.array([one.pose for one in rows], dtype=np.float64).reshape(-1, 7),
-            np.array([unknown if one.covariance is None else one.covariance for one in rows]).reshape(-1, 3, 3),
-            np.array([one.corners for one in rows], dtype=np.float64).reshape(-1, 4, 2),
-            np.array([one.size for one in rows], dtype=np.float64).reshape(-1, 3),
-            np.array([one.pixel for one in rows], dtype=np.float64).reshape(-1, 2),
-        )
+        columns = {name: [getattr(one, name) for one in rows] for name in Seen._fields}
+        shapes = {"score": (), "pose": (7,), "covariance": (3, 3), "corners": (4, 2), "size": (3,), "pixel": (2,)}
+        numbers: dict[str, Any] = {
+            name: np.array(columns[name], dtype=np.float64).reshape(-1, *shape) for name, shape in shapes.items()
+        }
+        look = np.array(columns["look"], dtype=np.int64)
+        return cls(look, columns["identity"], columns["label"], **numbers)
 
 
 @dataclass(slots=True)
@@ -234,10 +229,8 @@ def _tags(message: Any, look: int) -> Iterator[Seen]:
         identity = int(names[0]) if len(names) == 1 else "bundle of " + ", ".join(map(str, names))
         if hasattr(tag, "pose"):
             yield Seen(look, identity, pose=pose_of(_inner(tag.pose)))
-        else:
-            corners = tuple(value for corner in tag.corners for value in (corner.x, corner.y))
-            if int(tag.hamming) <= MOST_HAMMING:
-                yield Seen(look, identity, corners=corners)
+        elif int(tag.hamming) <= MOST_HAMMING:
+            yield Seen(look, identity, corners=corners_of(tag))
 
 
 def _markers(message: Any, look: int) -> Iterator[Seen]:
@@ -267,7 +260,8 @@ def _objects(message: Any, look: int) -> Iterator[Seen]:
         if not sized and best is not None:
             spread = np.asarray(best.pose.covariance, dtype=np.float64).reshape(6, 6)[:3, :3]
             said = spread[0, 0] + spread[1, 1] + spread[2, 2] > 0.0
-            yield Seen(*known, pose_of(_inner(best.pose)), spread if said else None)
+            pose = pose_of(_inner(best.pose))
+            yield Seen(*known, pose, spread) if said else Seen(*known, pose)
         else:
             yield Seen(*known, pose_of(one.bbox.center), size=size if sized else (np.nan,) * 3)
 
@@ -276,7 +270,7 @@ OBJECT_FIELDS = (
     "id", "results/hypothesis/class_id", "results/hypothesis/score", "results/pose/pose", "results/pose/covariance",
     "bbox/center", "bbox/size",
 )  # fmt: skip
-"""What a detection of `vision_msgs` in space says (`Cdr.parts`)."""
+"""What a detection of `vision_msgs` in space says (`cdr.parts_of`)."""
 
 
 def objects_in_space(parts: Parts, look: int) -> SeenColumns:

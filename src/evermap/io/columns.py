@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +19,17 @@ from evermap.io.files import unpacked
 from evermap.io.table import (
     FORMULA,
     GUARDED,
+    NamedColumns,
     Table,
     arrow_cells,
+    arrow_csv,
     dates_as_text,
     guarded,
     numbers_of,
+    pa,
     parse_csv,
+    pc,
+    pq,
     read_parquet,
     unguarded,
 )
@@ -37,42 +41,13 @@ _BATCH_ROWS = 1 << 18
 _FLAGS = {"1": 1.0, "0": 0.0, "true": 1.0, "false": 0.0, "1.0": 1.0, "0.0": 0.0, "": np.nan, "nan": np.nan}
 
 
-@dataclass(frozen=True, slots=True)
-class Columns:
-    """A table by columns, as pyarrow holds them: text from CSV, any type from Parquet.
+class Columns(NamedColumns):
+    """Columns as pyarrow arrays: text from CSV, any type from Parquet."""
 
-    Attributes:
-        path: file it came from, for messages.
-        cells: name -> pyarrow array of R cells.
-        line: (R,) line numbers in the file; for Parquet the row, counted from 1.
-        header_line: where the names of the columns stand, None for Parquet.
-    """
-
-    path: Path
-    cells: Mapping[str, Any]
-    line: IntArray
-    header_line: int | None
-
-    def __len__(self) -> int:
-        return len(self.line)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.cells
-
-    def error(self, problem: str, *, row: int | None, field: str | None = None, hint: str | None = None) -> InputError:
-        """Return an error that names file, line and column; `row` None blames the header."""
-        return self._table({}).error(problem, row=row, field=field, hint=hint)
-
-    def expect(self, required: Sequence[str], optional: Sequence[str] = ()) -> None:
-        """Raise InputError unless all of `required` and nothing beside `required` and `optional` is there."""
-        self._table(dict.fromkeys(self.cells, ())).expect(required, optional)
+    __slots__ = ()
 
     def numbers(self, quantity: Quantity) -> FloatArray:
-        """Return a numeric column, checked against its limits. Shape (R,); nan where an optional cell is empty."""
-        import pyarrow as pa
-        import pyarrow.compute as pc
-
-        cells = self.cells[quantity.name]
+        cells = self.columns[quantity.name]
         if _is_text(cells.type):
             text = pc.utf8_trim_whitespace(cells)
             length, given = numbers_of(pc.binary_length(text), np.int32)
@@ -88,18 +63,9 @@ class Columns:
         quantity.check(values, path=self.path, line=self.line)
         return values
 
-    def filled(self, quantity: Quantity, default: float) -> FloatArray:
-        """Return an optional column (R,), with what an empty cell, or no such column, means."""
-        if quantity.name not in self:
-            return np.full(len(self), float(default))
-        values = self.numbers(quantity)
-        return np.where(np.isnan(values), default, values)
-
     def clock(self, name: str = "stamp_s") -> Clock | None:
         """Return what the stamps of a column count, where they are dates; else None."""
-        import pyarrow as pa
-
-        cells = self.cells[name][:1]
+        cells = self.columns[name][:1]
         text = dates_as_text(cells) if pa.types.is_timestamp(cells.type) else cells.to_pylist()
         return self._table({name: text}).clock(name) if _is_text(cells.type) or text != cells.to_pylist() else None
 
@@ -109,9 +75,7 @@ class Columns:
         Raises:
             InputError: another word or number.
         """
-        import pyarrow.compute as pc
-
-        cells = self.cells[name]
+        cells = self.columns[name]
         if not _is_text(cells.type):
             values = self._converted(cells, name)
             wrong = np.flatnonzero(~((values == 0.0) | (values == 1.0) | np.isnan(values)))
@@ -136,10 +100,7 @@ class Columns:
         Raises:
             InputError: numbers that are not whole, or characters that cannot be printed.
         """
-        import pyarrow as pa
-        import pyarrow.compute as pc
-
-        cells = self.cells[name]
+        cells = self.columns[name]
         if pa.types.is_floating(cells.type):
             values = self._converted(cells, name)
             wrong = np.flatnonzero(~np.isnan(values) & ~((values == np.floor(values)) & (np.abs(values) < 2.0**63)))
@@ -164,8 +125,6 @@ class Columns:
 
     def _converted(self, cells: Any, name: str) -> FloatArray:
         """Cells that are not text as float64."""
-        import pyarrow as pa
-
         kind = cells.type
         if pa.types.is_timestamp(kind):
             return self._table({name: dates_as_text(cells)}).numbers(Quantity(name, optional=True, dates=True))
@@ -189,16 +148,15 @@ def read_columns(path: str | Path, warnings: list[str]) -> Columns:
     if data[:4] == b"PAR1":
         table = read_parquet(data, path)
         cells = {name: _plain(column) for name, column in zip(table.column_names, table.columns, strict=True)}
-        return Columns(path, cells, np.arange(1, table.num_rows + 1), None)
+        return Columns(path, cells, np.arange(1, table.num_rows + 1))
     return _fast_csv(data, path) or _careful_csv(data, path, warnings)
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
-    import pyarrow as pa
-
-    cells = {name: pa.concat_arrays([part.cells[name] for part in parts]) for name in parts[0].cells} if parts else {}
-    line = np.concatenate([part.line for part in parts]) if parts else np.zeros(0, dtype=np.int64)
-    return Columns(parts[0].path if parts else Path(), cells, line, None)
+    if not parts:
+        return Columns(Path(), {}, np.zeros(0, dtype=np.int64))
+    cells = {name: pa.concat_arrays([part.columns[name] for part in parts]) for name in parts[0].columns}
+    return Columns(parts[0].path, cells, np.concatenate([part.line for part in parts]))
 
 
 def parquet_files(path: Path) -> list[Path]:
@@ -206,19 +164,12 @@ def parquet_files(path: Path) -> list[Path]:
     return sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
 
 
-def parquet_batches(path: Path, columns: Sequence[str] | None = None) -> Iterator[Columns]:
+def parquet_batches(path: Path) -> Iterator[Columns]:
     """Yield a Parquet file, or all in a folder as one table, some rows at a time; rows count through all files.
-
-    Args:
-        path: the file or folder.
-        columns: names of those to read; None for all.
 
     Raises:
         InputError: none is there, one is damaged, or files have different columns.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     files, start, schema = parquet_files(path), 1, None
     for file in files:
         try:
@@ -227,24 +178,19 @@ def parquet_batches(path: Path, columns: Sequence[str] | None = None) -> Iterato
                 if not source.schema_arrow.equals(schema):
                     hint = f"the columns of {files[0].name}, of the same types"
                     raise InputError("has other columns than the files before it", path=file, hint=hint)
-                wanted = None if columns is None else [name for name in columns if name in schema.names]
-                for batch in source.iter_batches(_BATCH_ROWS, columns=wanted, use_threads=False):
+                for batch in source.iter_batches(_BATCH_ROWS, use_threads=False):
                     cells = dict(zip(batch.schema.names, map(_plain, batch.columns), strict=True))
-                    yield Columns(path, cells, np.arange(start, start + batch.num_rows), None)
+                    yield Columns(path, cells, np.arange(start, start + batch.num_rows))
                     start += batch.num_rows
         except (pa.ArrowException, OSError, ValueError) as error:
-            raise InputError(
-                f"not a readable Parquet file: {reason(error)}", path=file, hint="write it again"
-            ) from error
+            problem = f"not a readable Parquet file: {reason(error)}"
+            raise InputError(problem, path=file, hint="write it again") from error
     if schema is None:
         raise InputError("holds no Parquet file", path=path, hint="a folder of .parquet files, or one file")
 
 
 def is_parted(path: Path, most: int, but: str = "") -> bool:
     """Return whether a Parquet file, or all in a folder together, have more rows than `most`, and no column `but`."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     try:
         about = [pq.read_metadata(file) for file in parquet_files(path)]
     except (pa.ArrowException, OSError):  # none, or reading it will tell
@@ -269,24 +215,19 @@ def csv_bytes(columns: Mapping[str, Any], *, quoted: bool = False, header: bool 
     Missing numbers (nan) are empty cells. Of a file in pieces, all have `quoted` where one needs it, and the first has
     the `header`.
     """
-    import pyarrow as pa
-    from pyarrow import csv
-
     arrays = {name: _cells(column) for name, column in columns.items()}
     marks = quoted or any(_is_text(cells.type) and needs_quotes(cells) for cells in arrays.values())
-    options = csv.WriteOptions(include_header=False, quoting_style="needed" if marks else "none")
+    options = arrow_csv.WriteOptions(include_header=False, quoting_style="needed" if marks else "none")
     sink = pa.BufferOutputStream()
     if header:
         sink.write((",".join(columns) + "\n").encode())
     if len(next(iter(arrays.values()))):
-        csv.write_csv(pa.table(arrays), sink, options)
+        arrow_csv.write_csv(pa.table(arrays), sink, options)
     return bytes(sink.getvalue())
 
 
 def needs_quotes(cells: Any) -> bool:
     """Return whether a pyarrow array of text has a cell that a CSV file must quote."""
-    import pyarrow.compute as pc
-
     return bool(pc.any(pc.match_substring_regex(cells, r'[",\r\n#]|^\s|\s$')).as_py())
 
 
@@ -299,8 +240,6 @@ def _cells(column: Any) -> Any:
 
 def _mapped(cells: Any, pattern: str, change: Callable[[str], str]) -> Any:
     """Return an array of text with a change of each different one, if any matches the pattern."""
-    import pyarrow.compute as pc
-
     if not pc.any(pc.match_substring_regex(cells, pattern)).as_py():
         return cells
     code, words = _coded(cells)
@@ -309,8 +248,6 @@ def _mapped(cells: Any, pattern: str, change: Callable[[str], str]) -> Any:
 
 def _without(text: Any, known: BoolArray) -> Any:
     """Return an array of text with null for unknown values."""
-    import pyarrow as pa
-
     valid = np.packbits(np.concatenate([np.zeros(text.offset, dtype=np.bool_), known]), bitorder="little")
     return pa.Array.from_buffers(text.type, len(text), [pa.py_buffer(valid), *text.buffers()[1:]], offset=text.offset)
 
@@ -329,9 +266,6 @@ def _content(path: Path) -> bytes:
 
 def _fast_csv(data: bytes, path: Path) -> Columns | None:
     """The table, if it is plain: no comments and empty lines after the header, as many cells as names everywhere."""
-    import pyarrow as pa
-    from pyarrow import csv
-
     head = re.match(rb"(?:\xef\xbb\xbf)?(?:[ \t]*(?:#[^\n]*)?\r?\n)*[^\n]*\n", data)
     if head is None or b"\0" in data or re.search(rb"\n[ \t]*#", data[head.end() - 1 :]):
         return None
@@ -341,10 +275,10 @@ def _fast_csv(data: bytes, path: Path) -> Columns | None:
         pa.enable_signal_handlers(False)  # Arrow's own lose a signal that comes as a table ends, one in ten
     rows = data.count(b"\n", head.end()) + (not data.endswith(b"\n"))
     try:
-        table = csv.read_csv(
+        table = arrow_csv.read_csv(
             pa.BufferReader(pa.py_buffer(data).slice(head.end())),
-            read_options=csv.ReadOptions(column_names=names, use_threads=False),
-            convert_options=csv.ConvertOptions(
+            read_options=arrow_csv.ReadOptions(column_names=names, use_threads=False),
+            convert_options=arrow_csv.ConvertOptions(
                 column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False
             ),
         )
@@ -366,8 +300,6 @@ def _careful_csv(data: bytes, path: Path, warnings: list[str]) -> Columns:
 
 def _plain(column: Any) -> Any:
     """One array in place of chunks and dictionaries."""
-    import pyarrow as pa
-
     if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     if pa.types.is_large_string(column.type) or pa.types.is_string_view(column.type):
@@ -376,14 +308,10 @@ def _plain(column: Any) -> Any:
 
 
 def _is_text(kind: Any) -> bool:
-    import pyarrow as pa
-
     return bool(pa.types.is_string(kind))
 
 
 def _as_float(cells: Any) -> FloatArray:
-    import pyarrow as pa
-
     if pa.types.is_boolean(cells.type):
         cells = cells.cast(pa.int8())
     values, known = numbers_of(cells.cast(pa.float64(), safe=False), np.float64)

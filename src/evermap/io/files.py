@@ -62,24 +62,19 @@ class FileSet:
         Raises:
             InputError: it is missing, unreadable, or damaged inside the zip.
         """
-        return unpacked(self._content(name), self.path_of(name))
-
-    def _content(self, name: str) -> bytes:
+        path = self.path_of(name)
         if name not in self.members:
-            raise InputError("file is missing", path=self.path_of(name))
+            raise InputError("file is missing", path=path)
+        if not self.zipped:
+            return content_of(path)
         try:
-            if not self.zipped:
-                return self.path_of(name).read_bytes()
             with zipfile.ZipFile(self.root) as archive:
-                return archive.read(self.members[name])
+                return unpacked(archive.read(self.members[name]), path)
         except OSError as error:
-            raise InputError(f"cannot be read: {error.strerror or error}", path=self.path_of(name)) from error
+            raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
         except (*_ZIP_ERRORS, KeyError) as error:
-            raise InputError(
-                f"damaged inside the zip: {reason(error)}",
-                path=self.path_of(name),
-                hint="download or create the zip again",
-            ) from error
+            problem = f"damaged inside the zip: {reason(error)}"
+            raise InputError(problem, path=path, hint="download or create the zip again") from error
 
 
 def file_sets(path: str | Path) -> list[FileSet]:
@@ -147,9 +142,8 @@ def _zip_sets(path: Path) -> list[FileSet]:
         with zipfile.ZipFile(path) as archive:
             names = [info.filename for info in archive.infolist() if not info.is_dir()]
     except _ZIP_ERRORS as error:
-        raise InputError(
-            f"not a readable zip: {reason(error)}", path=path, hint="download or create the zip again"
-        ) from error
+        problem = f"not a readable zip: {reason(error)}"
+        raise InputError(problem, path=path, hint="download or create the zip again") from error
     folders: dict[str, dict[str, str]] = {}
     for name in names:
         inner = PurePosixPath(name)
@@ -184,9 +178,8 @@ def unpacked(data: bytes, path: Path) -> bytes:
     try:
         return gzip.decompress(data)
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(
-            f"damaged gzip file: {reason(error)}", path=path, hint="download or create it again"
-        ) from error
+        problem = f"damaged gzip file: {reason(error)}"
+        raise InputError(problem, path=path, hint="download or create it again") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,10 +244,7 @@ def write_new(path: str | Path, content: bytes | str) -> Path:
 
 @contextmanager
 def staged_folder(folder: str | Path) -> Iterator[Path]:
-    """Yield A temporary sibling to fill, which becomes `folder` at the end; nothing is left of it after an error.
-
-    Args:
-        folder: must not exist, or be empty.
+    """Yield a temporary sibling to fill, which becomes `folder` at the end; nothing is left of it after an error.
 
     Raises:
         InputError: the folder holds something, or cannot be written.

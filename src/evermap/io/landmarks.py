@@ -26,11 +26,11 @@ from evermap.io.spatial import (
     quaternions,
     upper_triangle,
 )
-from evermap.io.table import Table, csv_text, parquet_bytes, parse_csv, parse_parquet
+from evermap.io.table import Table, csv_text, pa, parquet_bytes, parse_csv, parse_parquet, pq
 from evermap.io.tag_maps import is_wpilib, map_of_survey, tags_of_fiducials, tags_of_tagslam, tags_of_wpilib
 from evermap.io.text import parse_json
-from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, rows_of
-from evermap.valid import FEATURES, STAMP_S, X_M, Y_M, Quantity
+from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks
+from evermap.valid import FEATURES, P_EXISTS, STAMP_S, X_M, Y_M, Quantity
 
 MAP_SCHEMA_VERSION = 1
 
@@ -44,18 +44,14 @@ _OPTIONAL = (
     "name",
 )  # fmt: skip
 _MAP_FILES = (
-    "map.parquet",
-    "landmarks.parquet",
-    "landmarks.csv",
-    "landmarks.csv.gz",
-    "map.geojson",
-    "survey.csv",
+    "map.parquet", "landmarks.parquet", "landmarks.csv", "landmarks.csv.gz", "map.geojson", "survey.csv",
     "survey.csv.gz",
-)
+)  # fmt: skip
 
 _SIGMA_M = Quantity("sigma_m", 0.0, 1e6, optional=True, hint="standard deviation in metres, empty where unknown")
 _SIGMA_RAD = Quantity("sigma_rad", 0.0, 1e3, optional=True, hint="standard deviation in radians")
-_P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
+_FIRST_SEEN_S = replace(STAMP_S, name="first_seen_s", optional=True, dates=False)
+_LAST_SEEN_S = replace(_FIRST_SEEN_S, name="last_seen_s")
 _FEATURES = {quantity.name: quantity for quantity in FEATURES}
 _DESCRIPTOR, _NUMBERED = "descriptor_", re.compile(r"descriptor_(0|[1-9]\d{0,4})")
 
@@ -142,31 +138,33 @@ def landmarks_from_table(
     again = repeats(ids)
     if len(again):
         row = int(again[0])
-        raise table.error(
-            f"landmark {names.get(int(ids[row]), ids[row])} is listed twice", row=row, field="landmark_id"
-        )
-    count = len(ids)
+        problem = f"landmark {names.get(int(ids[row]), ids[row])} is listed twice"
+        raise table.error(problem, row=row, field="landmark_id")
     if class_names is None:
         class_names = distinct_labels(table)
-    never = np.full(count, np.nan)
     order = np.argsort(ids)
     landmarks = Landmarks(
         landmark_id=ids,
         position_m=positions(table) if in_space else np.stack([table.numbers(X_M), table.numbers(Y_M)], axis=1),
         covariance_m2=_covariance(table, sigma_m),
         class_id=class_ids(table, class_names),
-        p_exists=table.numbers(_P_EXISTS) if "p_exists" in table else np.ones(count),
-        n_hits=table.ids("n_hits", optional=False) if "n_hits" in table else np.zeros(count, dtype=np.int64),
-        n_misses=table.ids("n_misses", optional=False) if "n_misses" in table else np.zeros(count, dtype=np.int64),
-        first_seen_s=table.numbers(_seen("first_seen_s")) if "first_seen_s" in table else never,
-        last_seen_s=table.numbers(_seen("last_seen_s")) if "last_seen_s" in table else never,
+        p_exists=table.filled(P_EXISTS, 1.0),
+        n_hits=table.counts("n_hits"),
+        n_misses=table.counts("n_misses"),
+        first_seen_s=table.filled(_FIRST_SEEN_S, np.nan),
+        last_seen_s=table.filled(_LAST_SEEN_S, np.nan),
         class_names=class_names,
         frame=frame,
         clock=clock,
         names=names,
         **(_pose_columns(table, sigma_rad) if in_space else {}),
     )
-    return rows_of(landmarks, order)
+    return landmarks[order]
+
+
+def survey_of(table: Table | None, **how: Any) -> Landmarks | None:
+    """Return exact landmarks as `landmarks_from_table`; None without a table, or of an empty one."""
+    return landmarks_from_table(table, sigma_m=0.0, **how) if table is not None and len(table) else None
 
 
 def write_map_parquet(landmarks: Landmarks, path: str | Path) -> Path:
@@ -187,7 +185,8 @@ def write_map_csv(landmarks: Landmarks, path: str | Path) -> Path:
 
 
 def map_columns(landmarks: Landmarks) -> dict[str, Any]:
-    """Return all columns of a map, in the order of `docs/formats.md`; class ids as labels."""
+    """Return all columns of a map, in the order of `docs/formats.md`: class ids as labels, `name` where any has one."""
+    names = [landmarks.names.get(identity, "") for identity in landmarks.landmark_id.tolist()]
     return {
         **survey_columns(landmarks),
         "class_id": labels_of(landmarks.class_id, landmarks.class_names),
@@ -196,14 +195,8 @@ def map_columns(landmarks: Landmarks) -> dict[str, Any]:
         "n_misses": landmarks.n_misses,
         "first_seen_s": landmarks.first_seen_s,
         "last_seen_s": landmarks.last_seen_s,
-        **names_column(landmarks),
+        **({"name": names} if any(names) else {}),
     }
-
-
-def names_column(landmarks: Landmarks) -> dict[str, list[str]]:
-    """Return `name`, the texts that landmarks are called by, '' for those with a number; none if all have numbers."""
-    names = [landmarks.names.get(identity, "") for identity in landmarks.landmark_id.tolist()]
-    return {"name": names} if any(names) else {}
 
 
 def survey_columns(landmarks: Landmarks) -> dict[str, Any]:
@@ -256,9 +249,6 @@ def checked_about(about: Any, path: Path) -> dict[str, Any]:
 
 def parquet_about(data: bytes, path: Path) -> dict[str, Any]:
     """Return the description that `write_map_parquet` leaves in a file; empty for files made by others."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     metadata = pq.read_schema(pa.BufferReader(data)).metadata or {}
     if b"evermap" not in metadata:
         return {}
@@ -333,8 +323,7 @@ def _covariance(table: Table, sigma_m: float) -> FloatArray:
     covariance = covariances(table, names)
     if covariance is not None:
         return covariance
-    sigma = table.numbers(_SIGMA_M) if "sigma_m" in table else np.full(len(table), np.nan)
-    return np.where(np.isnan(sigma), sigma_m, sigma)[:, None, None] ** 2 * np.eye(3 if "z_m" in table else 2)
+    return table.filled(_SIGMA_M, sigma_m)[:, None, None] ** 2 * np.eye(3 if "z_m" in table else 2)
 
 
 def _pose_columns(table: Table, sigma_rad: float) -> dict[str, FloatArray]:
@@ -344,8 +333,7 @@ def _pose_columns(table: Table, sigma_rad: float) -> dict[str, FloatArray]:
         found["rotation"] = quaternions(table, optional=True)
         turn = covariances(table, TURN_COVARIANCE, optional=True)
         if turn is None:
-            sigma = table.numbers(_SIGMA_RAD) if "sigma_rad" in table else np.full(len(table), np.nan)
-            turn = np.where(np.isnan(sigma), sigma_rad, sigma)[:, None, None] ** 2 * np.eye(3)
+            turn = table.filled(_SIGMA_RAD, sigma_rad)[:, None, None] ** 2 * np.eye(3)
         turn[np.isnan(found["rotation"]).any(axis=1)] = np.nan
         found["rotation_covariance"] = turn
     if table.has_any(BOX):
@@ -354,10 +342,6 @@ def _pose_columns(table: Table, sigma_rad: float) -> dict[str, FloatArray]:
         edge = table.numbers(Quantity("tag_size_m", 0.0, 1e3, positive=True, optional=True, hint="metres"))
         found["size_m"] = edge[:, None] * [1.0, 1.0, 0.0]
     return found
-
-
-def _seen(name: str) -> Quantity:
-    return Quantity(name, STAMP_S.low, STAMP_S.high, optional=True, hint=STAMP_S.hint)
 
 
 def _map_file(path: Path) -> Path:
@@ -381,13 +365,11 @@ def write_map_geojson(landmarks: Landmarks, path: str | Path) -> Path:
     covariance is not zero, the polygon of its 2-sigma ellipse in x and y (Mahalanobis distance 2, 86.5 % of the
     probability) with `"kind": "ellipse_2sigma"` and the same `landmark_id`. `read_landmarks` gives back equal arrays.
     """
-    columns = {
-        name: cells if isinstance(cells, list) else cells.tolist() for name, cells in map_columns(landmarks).items()
-    }
+    columns = {name: _json_cells(cells) for name, cells in map_columns(landmarks).items()}
     ellipses = ellipse_polygons(landmarks.position_m[:, :2], landmarks.covariance_m2[:, :2, :2])
     features: list[dict[str, Any]] = []
     for row, identity in enumerate(columns["landmark_id"]):
-        properties = {name: _plain(cells[row]) for name, cells in columns.items()}
+        properties = {name: cells[row] for name, cells in columns.items()}
         point = [properties[name] for name in AT if name in properties]
         features.append(_feature({"kind": "landmark", **properties}, "Point", point))
         if landmarks.covariance_m2[row].any():
@@ -403,15 +385,15 @@ def write_map_geojson(landmarks: Landmarks, path: str | Path) -> Path:
     return write_atomic(path, f'{head}, "features": [\n{body}\n]}}\n')
 
 
-def ellipse_polygons(center_m: FloatArray, covariance_m2: FloatArray, sigmas: float = 2.0) -> FloatArray:
-    """Return the closed counter-clockwise outlines of covariance ellipses. Shapes (L, 2), (L, 2, 2) -> (L, 37, 2)."""
+def ellipse_polygons(center_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
+    """Return the closed counter-clockwise outlines of 2-sigma ellipses. Shapes (L, 2), (L, 2, 2) -> (L, 37, 2)."""
     value, vector = np.linalg.eigh(covariance_m2)
     # eigenvectors may form a left-handed pair; GeoJSON wants outlines counter-clockwise
     vector[..., 1] *= np.sign(np.linalg.det(vector))[..., None]
     angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     circle[-1] = circle[0]
-    half_axes = sigmas * np.sqrt(np.maximum(value, 0.0))
+    half_axes = 2.0 * np.sqrt(np.maximum(value, 0.0))
     outline = np.einsum("lij,lj,kj->lki", vector, half_axes, circle)
     return np.asarray(center_m[:, None, :] + outline)
 
@@ -433,14 +415,14 @@ def parse_geojson(data: bytes, path: Path) -> tuple[Table, dict[str, Any]]:
         hint = 'a top-level member "evermap": {"frame": "prior_map"}'
         raise InputError(problem, path=path, field="evermap", hint=hint)
     about = checked_about(document["evermap"], path)
-    points = [(number, feature) for number, feature in enumerate(document["features"], 1) if _is_landmark(feature)]
+    points = [(number, one) for number, one in enumerate(document["features"], 1) if _is_point(one)]
     rows = [_properties(feature, path, number) for number, feature in points]
     names = list(dict.fromkeys(name for row in rows for name in row)) or ["landmark_id", "x_m", "y_m"]
     columns = {name: _column([row.get(name) for row in rows], name) for name in names}
     return Table(path, columns, np.array([number for number, _ in points], dtype=np.int64)), about
 
 
-def _is_landmark(feature: Any) -> bool:
+def _is_point(feature: Any) -> bool:
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
     return isinstance(geometry, dict) and geometry.get("type") == "Point"
 
@@ -455,7 +437,7 @@ def _properties(feature: dict[str, Any], path: Path, number: int) -> dict[str, A
 
 
 def _column(cells: list[Any], name: str) -> list[str] | FloatArray:
-    if name not in ("class_id", "name") and all(_is_number(c) for c in cells):
+    if name not in ("class_id", "name") and {*map(type, cells)} <= {int, float, type(None)}:
         try:
             return np.array([np.nan if c is None else float(c) for c in cells], dtype=np.float64)
         except OverflowError:
@@ -463,12 +445,9 @@ def _column(cells: list[Any], name: str) -> list[str] | FloatArray:
     return ["" if c is None else str(c) for c in cells]
 
 
-def _is_number(cell: Any) -> bool:
-    return cell is None or (isinstance(cell, int | float) and not isinstance(cell, bool))
-
-
-def _plain(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def _json_cells(cells: Any) -> list[Any]:
+    values = cells if isinstance(cells, list) else cells.tolist()
+    return [None if isinstance(value, float) and not np.isfinite(value) else value for value in values]
 
 
 def _feature(properties: dict[str, Any], kind: str, coordinates: Any) -> dict[str, Any]:

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+from evermap import valid as q
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import check_forward, finish_recording, last_of_equal, repeats, wrap_far
 from evermap.io.files import FileSet, Reader, find_file_set
-from evermap.io.rows import Rows, parse_rows
-from evermap.io.text import counted
+from evermap.io.text import Rows, counted, parse_rows
 from evermap.types import (
     UNKNOWN,
     Clock,
@@ -33,17 +33,6 @@ from evermap.types import (
     Sensor,
     SensorKind,
     Trajectory,
-)
-from evermap.valid import (
-    ANGULAR_RADPS,
-    BEARING_RAD,
-    FORWARD_MPS,
-    RANGE_M,
-    STAMP_S,
-    THETA_RAD,
-    X_M,
-    Y_M,
-    Quantity,
 )
 
 LAST_ROBOT_SUBJECT = 5
@@ -65,9 +54,8 @@ MOST_STRAY = 1e-3
 """Maximum share of rows out of order in a file that is sorted."""
 
 _NAME = re.compile(r"Robot(\d{1,6})_(Odometry|Measurement)\.dat", re.ASCII)
-_SUBJECT = Quantity("subject", 1, 1e6, hint="subjects count from 1")
-_BARCODE = Quantity("barcode", 0, 1e6, hint="barcodes are whole numbers")
-_VARIANCE_HINT = "standard deviation in metres"
+_SUBJECT = q.Quantity("subject", 1, 1e6, hint="subjects count from 1")
+_BARCODE = q.Quantity("barcode", 0, 1e6, hint="barcodes are whole numbers")
 
 
 def read_mrclam(path: str | Path, robot: int | None = None) -> Recording:
@@ -144,7 +132,7 @@ def _choose_robot(files: FileSet, robot: int | None) -> int:
 
 def _read_odometry(files: FileSet, robot: int, warnings: list[str]) -> Odometry:
     name = f"Robot{robot}_Odometry.dat"
-    rows = _parse(files, name, (STAMP_S, FORWARD_MPS, ANGULAR_RADPS), warnings)
+    rows = _parse(files, name, (q.STAMP_S, q.FORWARD_MPS, q.ANGULAR_RADPS), warnings)
     if len(rows) == 0:
         raise DataError("contains no odometry", path=rows.path)
     rows = _forward_in_time(rows, warnings)
@@ -162,7 +150,7 @@ def _read_measurements(
 ) -> tuple[Frames, Detections, RobotSightings | None]:
     name = f"Robot{robot}_Measurement.dat"
     # the file's second column is headed 'Subject #' but holds barcodes
-    rows = _parse(files, name, (STAMP_S, _BARCODE, RANGE_M, BEARING_RAD), warnings)
+    rows = _parse(files, name, (q.STAMP_S, _BARCODE, q.RANGE_M, q.BEARING_RAD), warnings)
     if len(rows) == 0:
         raise DataError("contains no measurement", path=rows.path)
     rows = _sorted(rows, warnings)
@@ -196,8 +184,8 @@ def _subjects(files: FileSet, barcode: IntArray, name: str, warnings: list[str])
     """Subject of every barcode, 0 where `Barcodes.dat` does not list it. Shape (M,)."""
     rows = _parse(files, "Barcodes.dat", (_SUBJECT, _BARCODE), warnings)
     listed_subject, listed_barcode = _whole(rows, 0, "subject"), _whole(rows, 1, "barcode")
-    for listed, field in ((listed_subject, "subject"), (listed_barcode, "barcode")):
-        _refuse_repeats(rows, listed, field)
+    _refuse_repeats(rows, listed_subject, "subject")
+    _refuse_repeats(rows, listed_barcode, "barcode")
     subject_of = dict(zip(listed_barcode.tolist(), listed_subject.tolist(), strict=True))
     subject = np.array([subject_of.get(code, 0) for code in barcode.tolist()], dtype=np.int64)
     unknown = Counter(barcode[subject == 0].tolist())
@@ -212,7 +200,7 @@ def _read_truth(files: FileSet, robot: int, warnings: list[str]) -> Trajectory |
     name = f"Robot{robot}_Groundtruth.dat"
     if name not in files:
         return None
-    rows = _parse(files, name, (STAMP_S, X_M, Y_M, THETA_RAD), warnings)
+    rows = _parse(files, name, (q.STAMP_S, q.X_M, q.Y_M, q.THETA_RAD), warnings)
     if len(rows) == 0:
         warnings.append(f"{name}: contains no pose, treated as missing")
         return None
@@ -226,8 +214,8 @@ def _read_landmarks(files: FileSet, warnings: list[str]) -> Landmarks | None:
     name = "Landmark_Groundtruth.dat"
     if name not in files:
         return None
-    sigmas = tuple(Quantity(f"{axis}_std_m", 0.0, 1e6, hint=_VARIANCE_HINT) for axis in "xy")
-    rows = _parse(files, name, (_SUBJECT, X_M, Y_M, *sigmas), warnings)
+    sigmas = tuple(q.Quantity(f"{axis}_std_m", 0.0, 1e6, hint="standard deviation in metres") for axis in "xy")
+    rows = _parse(files, name, (_SUBJECT, q.X_M, q.Y_M, *sigmas), warnings)
     if len(rows) == 0:
         warnings.append(f"{name}: contains no landmark, treated as missing")
         return None
@@ -237,14 +225,13 @@ def _read_landmarks(files: FileSet, warnings: list[str]) -> Landmarks | None:
     return replace(surveyed, clock=Clock.UNIX)
 
 
-def _parse(files: FileSet, name: str, quantities: tuple[Quantity, ...], warnings: list[str]) -> Rows:
+def _parse(files: FileSet, name: str, quantities: tuple[q.Quantity, ...], warnings: list[str]) -> Rows:
     return parse_rows(files.read(name), files.path_of(name), quantities, warnings)
 
 
 def _forward_in_time(rows: Rows, warnings: list[str]) -> Rows:
     rows = _sorted(rows, warnings)
-    keep = last_of_equal(rows.column(0), path=rows.path, warnings=warnings)
-    return Rows(rows.path, rows.values[keep], rows.line[keep])
+    return rows[last_of_equal(rows.column(0), path=rows.path, warnings=warnings)]
 
 
 def _sorted(rows: Rows, warnings: list[str]) -> Rows:
@@ -262,8 +249,7 @@ def _sorted(rows: Rows, warnings: list[str]) -> Rows:
     row = int(np.argmax(np.diff(stamp_s) < 0.0)) + 1
     where = f"time runs backwards at line {rows.line[row]}"
     warnings.append(f"{rows.path.name}: {counted(stray, 'row')} out of order sorted ({where})")
-    order = np.argsort(stamp_s, kind="stable")
-    return Rows(rows.path, rows.values[order], rows.line[order])
+    return rows[np.argsort(stamp_s, kind="stable")]
 
 
 def _longest_forward(stamp_s: FloatArray) -> int:

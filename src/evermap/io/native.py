@@ -13,14 +13,13 @@ from evermap.errors import DataError, InputError, similar
 from evermap.geometry import se2
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal, wrap_far
 from evermap.io.files import FileSet, Reader, find_file_set
-from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, landmarks_from_table
-from evermap.io.native_space import in_space, spatial_recording
+from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, survey_of
+from evermap.io.native_space import in_space, spatial_recording, truth_of
 from evermap.io.rig_toml import CAMERA_FILE, SENSOR_FILE, read_rig
 from evermap.io.sensor_toml import Settings, parse_sensor_toml
 from evermap.io.table import ENDINGS, Table, parse_table
 from evermap.io.tagslam import is_tagslam
 from evermap.types import (
-    UNKNOWN,
     Clock,
     Detections,
     FloatArray,
@@ -30,7 +29,6 @@ from evermap.types import (
     Recording,
     RobotSightings,
     SpatialRecording,
-    Trajectory,
 )
 
 TABLES = ("odometry", "detections", "frames", "truth", "landmarks", "robot_sightings", "objects")
@@ -65,50 +63,34 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
     warnings: list[str] = []
     _warn_of_similar_names(files, warnings)
     tables = {name: _read_table(files, name, warnings) for name in TABLES}
-    detection_table = _needed("detections", tables, files)
+    seen = _needed("detections", tables, files)
     if in_space(tables, files):
         rig = read_rig(files, warnings)
-        settings = replace(rig.settings, clock=_clock(rig.settings, tables, files))
-        driven, table = None, tables["odometry"]
+        rig = replace(rig, settings=_on_clock(rig.settings, tables, files))
+        planar, table = None, tables["odometry"]
         if table is not None and table.has_any((*_VELOCITIES, *_INCREMENTS)):
-            driven, tables = _odometry(table, settings.clock, warnings), {**tables, "odometry": None}
-        rig = replace(rig, settings=settings)
-        return spatial_recording(tables, rig, driven, title=files.title, source=str(path), warnings=warnings)
-    settings = _read_settings(files, warnings)
-    settings = replace(settings, clock=_clock(settings, tables, files))
-    tables = {**tables, "odometry": _needed("odometry", tables, files), "detections": detection_table}
-    return _planar_recording(tables, settings, title=files.title, source=str(path), warnings=warnings)
-
-
-def _planar_recording(
-    tables: Mapping[str, Table | None], settings: Settings, *, title: str, source: str, warnings: list[str]
-) -> Recording:
-    odometry_table, detection_table, clock = tables["odometry"], tables["detections"], settings.clock
-    assert odometry_table is not None
-    assert detection_table is not None
+            planar, tables = _odometry(table, rig.settings.clock, warnings), {**tables, "odometry": None}
+        return spatial_recording(tables, rig, planar, title=files.title, source=str(path), warnings=warnings)
+    settings = _on_clock(_read_settings(files, warnings), tables, files)
+    clock, driven = settings.clock, _needed("odometry", tables, files)
     names: dict[int, str] = {}
     class_names = settings.class_names
     if class_names is None:
-        class_names = distinct_labels(detection_table, tables["landmarks"])
-    odometry = _odometry(odometry_table, clock, warnings)
-    frames, detections = frames_and_detections(
-        detection_table, tables["frames"], class_names, settings, warnings, names
-    )
-    landmarks = tables["landmarks"]
+        class_names = distinct_labels(seen, tables["landmarks"])
+    odometry = _odometry(driven, clock, warnings)
+    frames, detections = _frames_and_detections(seen, tables["frames"], class_names, settings, warnings, names)
     recording = Recording(
-        name=settings.name or title,
+        name=settings.name or files.title,
         odometry=odometry,
         frames=frames,
         detections=detections,
         sensor=settings.sensor,
-        truth=_truth(tables["truth"], clock, warnings),
-        true_landmarks=None
-        if landmarks is None or not len(landmarks)
-        else landmarks_from_table(landmarks, sigma_m=0.0, class_names=class_names, clock=clock, names=names),
+        truth=truth_of(tables["truth"], ("x_m", "y_m", "theta_rad"), _poses, clock, warnings),
+        true_landmarks=survey_of(tables["landmarks"], class_names=class_names, clock=clock, names=names),
         robot_sightings=_robot_sightings(tables["robot_sightings"], clock),
         objects=_objects(tables["objects"], names),
         class_names=class_names,
-        source=source,
+        source=str(path),
         clock=clock,
         robot=settings.robot,
         landmark_names=names,
@@ -145,9 +127,8 @@ def _read_table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
     if not present:
         return None
     if len(present) > 1:
-        raise InputError(
-            f"exists together with {present[1]}", path=files.path_of(present[0]), hint="remove one of them"
-        )
+        problem = f"exists together with {present[1]}"
+        raise InputError(problem, path=files.path_of(present[0]), hint="remove one of them")
     file = present[0]
     return parse_table(files.read(file), files.path_of(file), warnings)
 
@@ -163,11 +144,10 @@ def _odometry(table: Table, clock: Clock, warnings: list[str]) -> Odometry:
     stamp_s = forward_stamps(table)
     if given is _VELOCITIES:
         keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
-        lateral = table.numbers(q.LATERAL_MPS) if "lateral_mps" in table else np.zeros(len(table))
         return Odometry(
             stamp_s=stamp_s[keep],
             forward_mps=table.numbers(q.FORWARD_MPS)[keep],
-            lateral_mps=lateral[keep],
+            lateral_mps=table.filled(q.LATERAL_MPS, 0.0)[keep],
             angular_radps=table.numbers(q.ANGULAR_RADPS)[keep],
             clock=clock,
         )
@@ -195,30 +175,22 @@ def _from_increments(
     return Odometry(stamp_s, velocity[0], velocity[1], velocity[2], clock=clock)
 
 
-def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory | None:
-    if table is None:
-        return None
-    table.expect(("stamp_s", "x_m", "y_m", "theta_rad"))
-    if len(table) == 0:
-        warnings.append(f"{table.path.name}: contains no pose, treated as missing")
-        return None
-    stamp_s = forward_stamps(table)
-    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
+def _poses(table: Table) -> FloatArray:
+    """Return the columns `x_m, y_m, theta_rad`. Shape (R, 3)."""
     heading = wrap_far(table.numbers(q.THETA_RAD))
-    pose = np.stack([table.numbers(q.X_M), table.numbers(q.Y_M), heading], axis=1)[keep]
-    return Trajectory(stamp_s[keep], pose, np.zeros((len(pose), 3, 3)), frame="truth", clock=clock)
+    return np.stack([table.numbers(q.X_M), table.numbers(q.Y_M), heading], axis=1)
 
 
 def _robot_sightings(table: Table | None, clock: Clock) -> RobotSightings | None:
     if table is None or len(table) == 0:
         return None
-    table.expect(("stamp_s", "robot_id", *POLAR))
-    range_m, bearing_rad = polar(table)
+    table.expect(("stamp_s", "robot_id", *_POLAR))
+    range_m, bearing_rad = table.numbers(q.RANGE_M), wrap_far(table.numbers(q.BEARING_RAD))
     return RobotSightings(forward_stamps(table), table.ids("robot_id", optional=False), range_m, bearing_rad, clock)
 
 
-def _clock(settings: Settings, tables: dict[str, Table | None], files: FileSet) -> Clock:
-    """Return the clock of the recording: that of its dates, else that of `sensor.toml`."""
+def _on_clock(settings: Settings, tables: dict[str, Table | None], files: FileSet) -> Settings:
+    """Return the settings with the clock of the dates in the tables; without any, as they are."""
     said = {table.clock(): table for table in tables.values() if table is not None and table.clock() is not None}
     if len(said) > 1:
         problem = "some tables have dates with a zone, others without"
@@ -229,8 +201,8 @@ def _clock(settings: Settings, tables: dict[str, Table | None], files: FileSet) 
             problem = f'dates on the clock {clock.value}, but {SENSOR_FILE} has clock = "{settings.clock.value}"'
             hint = "dates with a zone are unix, dates without one local_wall"
             raise table.error(problem, row=0, field="stamp_s", hint=hint)
-        return clock
-    return settings.clock
+        return replace(settings, clock=clock)
+    return settings
 
 
 def _objects(table: Table | None, names: dict[int, str]) -> IntArray:
@@ -245,9 +217,8 @@ def _objects(table: Table | None, names: dict[int, str]) -> IntArray:
     if len(twice):
         name = int(pairs[twice[0], 0])
         row = int(np.flatnonzero(landmark_id == name)[-1])
-        raise table.error(
-            f"landmark {names.get(name, name)} is on two objects", row=row, field="object_id", hint="one object each"
-        )
+        problem = f"landmark {names.get(name, name)} is on two objects"
+        raise table.error(problem, row=row, field="object_id", hint="one object each")
     return pairs
 
 
@@ -260,13 +231,13 @@ def _warn_of_similar_names(files: FileSet, warnings: list[str]) -> None:
             warnings.append(f"file {name} is not read; did you mean {meant}?")
 
 
-POLAR = ("range_m", "bearing_rad")
+_POLAR = ("range_m", "bearing_rad")
 _CARTESIAN = ("x_m", "y_m")
 _POLAR_SIGMAS = ("sigma_range_m", "sigma_bearing_rad")
 _ROUND_SIGMAS = ("sigma_m", "sigma")
 
 
-def frames_and_detections(
+def _frames_and_detections(
     table: Table,
     frame_table: Table | None,
     class_names: tuple[str, ...],
@@ -274,37 +245,21 @@ def frames_and_detections(
     warnings: list[str],
     names: dict[int, str],
 ) -> tuple[Frames, Detections]:
-    """Return frames of a native recording and the detections in them.
-
-    Args:
-        table: the detections.
-        frame_table: every instant at which the sensor looked; None takes the distinct stamps of the detections.
-        class_names: all class labels.
-        settings: clock, and whether the frames are complete.
-        warnings: gets a remark on repeated frames.
-        names: gets the texts behind landmark ids that are texts.
-
-    Raises:
-        InputError: a value is malformed, or a detection lies in no frame.
-    """
-    given = table.one_form(POLAR, _CARTESIAN)
+    """Return frames and the detections in them; `names` gets the texts behind landmark ids that are texts."""
+    given = table.one_form(_POLAR, _CARTESIAN)
     optional = ("class_id", *_POLAR_SIGMAS, *_ROUND_SIGMAS, *feature_columns(table))
-    required, more = (given, ()) if given is not POLAR else (POLAR[:1], POLAR[1:])
+    required, more = (given, ()) if given is not _POLAR else (_POLAR[:1], _POLAR[1:])
     table.expect(("stamp_s", *required), ("landmark_id", *more, *optional))
     if frame_table is not None:
         frame_table.expect(("stamp_s",))
     frames, frame = frames_of(
         table, frame_table, complete=settings.frames_complete, clock=settings.clock, warnings=warnings
     )
-    range_m, bearing_rad = _polar_or_range(table) if given is POLAR else _polar_of_cartesian(table)
+    range_m, bearing_rad = _polar(table) if given is _POLAR else _polar_of_cartesian(table)
     sigma_range_m, sigma_bearing_rad = _sigmas(table, range_m)
     detections = Detections(
         frame=frame,
-        landmark_id=(
-            table.ids("landmark_id", optional=True, names=names)
-            if "landmark_id" in table
-            else np.full(len(table), UNKNOWN, dtype=np.int64)
-        ),
+        landmark_id=table.ids("landmark_id", optional=True, names=names),
         range_m=range_m,
         bearing_rad=bearing_rad,
         class_id=class_ids(table, class_names),
@@ -316,16 +271,9 @@ def frames_and_detections(
     return frames, detections
 
 
-def polar(table: Table) -> tuple[FloatArray, FloatArray]:
-    """Return range and bearing, the latter within half a turn. Shapes (R,)."""
-    return table.numbers(q.RANGE_M), wrap_far(table.numbers(q.BEARING_RAD))
-
-
-def _polar_or_range(table: Table) -> tuple[FloatArray, FloatArray]:
-    """As `polar`, with nan where a bearing is empty, or there is no such column."""
-    if "bearing_rad" not in table:
-        return table.numbers(q.RANGE_M), np.full(len(table), np.nan)
-    bearing_rad = table.numbers(replace(q.BEARING_RAD, optional=True))
+def _polar(table: Table) -> tuple[FloatArray, FloatArray]:
+    """Range and bearing within half a turn, nan where a bearing is empty, or there is no such column. Shapes (R,)."""
+    bearing_rad = table.filled(replace(q.BEARING_RAD, optional=True), np.nan)
     return table.numbers(q.RANGE_M), np.where(np.isnan(bearing_rad), np.nan, wrap_far(bearing_rad))
 
 
@@ -347,8 +295,4 @@ def _sigmas(table: Table, range_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         # a position known equally well in all directions: to first order sigma along the ray, sigma / range across it
         sigma = table.numbers(replace(q.SIGMA_RANGE_M, name=round_names[0]))
         return sigma, sigma / range_m
-    unknown = np.full(len(table), np.nan)
-    return (
-        table.numbers(q.SIGMA_RANGE_M) if "sigma_range_m" in table else unknown,
-        table.numbers(q.SIGMA_BEARING_RAD) if "sigma_bearing_rad" in table else unknown.copy(),
-    )
+    return table.filled(q.SIGMA_RANGE_M, np.nan), table.filled(q.SIGMA_BEARING_RAD, np.nan)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from evermap.errors import DataError
 from evermap.geometry.camera import unproject
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal
 from evermap.io.files import FileSet
-from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, landmarks_from_table
+from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, survey_of
 from evermap.io.rig_toml import CAMERA_FILE, Rig
 from evermap.io.spatial import (
     AT,
@@ -25,6 +25,7 @@ from evermap.io.spatial import (
     directions,
     integrated,
     posed_odometry,
+    poses,
     positions,
     quaternions,
     sensor_rows,
@@ -46,7 +47,6 @@ from evermap.types import (
     SpatialOdometry,
     SpatialRecording,
     Trajectory,
-    rows_of,
 )
 from evermap.valid import Quantity
 
@@ -65,19 +65,17 @@ _IN_SPACE = {
     "detections": ("z_m", *QUATERNION, *CORNERS, *POINT),
     "truth": ("z_m", *QUATERNION),
 }
-_PIXEL_LIMIT = 1e6
+_SIGMA_RAD = Quantity("sigma_rad", positive=True, optional=True, hint="radians")
 
 
-def _pixel(name: str) -> Quantity:
-    return Quantity(name, -_PIXEL_LIMIT, _PIXEL_LIMIT, optional=True, hint="pixels")
+def _pixel(name: str, *, optional: bool) -> Quantity:
+    return Quantity(name, -1e6, 1e6, optional=optional, hint="pixels")
 
 
 def in_space(tables: Mapping[str, Table | None], files: FileSet) -> bool:
     """Return whether tables are those of a recording in space: their columns decide, and a `camera.toml`."""
-    found = {name: tables[name] for name in _IN_SPACE}
-    return CAMERA_FILE in files or any(
-        table is not None and table.has_any(_IN_SPACE[name]) for name, table in found.items()
-    )
+    columns = ((tables[name], names) for name, names in _IN_SPACE.items())
+    return CAMERA_FILE in files or any(table is not None and table.has_any(names) for table, names in columns)
 
 
 def spatial_recording(
@@ -89,15 +87,7 @@ def spatial_recording(
     source: str,
     warnings: list[str],
 ) -> SpatialRecording:
-    """Return the recording that native tables hold.
-
-    Args:
-        tables: by name; `detections` is there.
-        rig: the sensors.
-        driven: odometry of a robot that drives in the plane, where that is what there is.
-        title: name of the recording where its settings give none.
-        source: where it was read from.
-        warnings: gets remarks.
+    """Return the recording that native tables hold; `driven` is odometry in the plane, where that is what there is.
 
     Raises:
         InputError: a value is malformed, with its line; or stamps contradict each other.
@@ -112,19 +102,16 @@ def spatial_recording(
     table = _by_sensor(table)
     frames, frame = _frames(table, tables["frames"], rig, warnings)
     detections = _detections(table, frame, rig, class_names, names, warnings)
-    surveyed = None
     if landmarks is not None and len(landmarks):
         landmarks.expect(AT, tuple(landmarks.columns))
-        surveyed = landmarks_from_table(
-            landmarks, sigma_m=0.0, class_names=class_names, clock=settings.clock, names=names
-        )
+    surveyed = survey_of(landmarks, class_names=class_names, clock=settings.clock, names=names)
     recording = SpatialRecording(
         name=settings.name or title,
         odometry=_odometry(tables["odometry"], settings.clock, warnings) if driven is None else _in_space(driven),
         frames=frames,
         detections=detections,
         sensors=rig.sensors,
-        truth=_truth(tables["truth"], settings.clock, warnings),
+        truth=truth_of(tables["truth"], (*AT, *QUATERNION), poses, settings.clock, warnings),
         true_landmarks=surveyed,
         class_names=class_names,
         source=source,
@@ -162,8 +149,7 @@ def _odometry(table: Table | None, clock: Clock, warnings: list[str]) -> Spatial
         return posed_odometry(table, VARIANCES, clock, warnings)
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
-    zero = np.zeros(len(table))
-    twist = np.stack([table.numbers(axis) if axis.name in table else zero for axis in q.TWIST], axis=1)
+    twist = np.stack([table.filled(axis, 0.0) for axis in q.TWIST], axis=1)
     return integrated(stamp_s[keep], twist[keep], clock)
 
 
@@ -174,14 +160,21 @@ def _in_space(odometry: Odometry) -> SpatialOdometry:
     return integrated(odometry.stamp_s, twist, odometry.clock)
 
 
-def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory | None:
+def truth_of(
+    table: Table | None,
+    columns: tuple[str, ...],
+    poses: Callable[[Table], FloatArray],
+    clock: Clock,
+    warnings: list[str],
+) -> Trajectory | None:
+    """Return the truth in a table with certain columns, of which a function makes poses; None without any row."""
     if table is None:
         return None
-    table.expect(("stamp_s", *AT, *QUATERNION))
+    table.expect(("stamp_s", *columns))
     if len(table) == 0:
         warnings.append(f"{table.path.name}: contains no pose, treated as missing")
         return None
-    return true_poses(table, clock, warnings)
+    return true_poses(table, clock, warnings, poses)
 
 
 def _by_sensor(table: Table) -> Table:
@@ -189,7 +182,7 @@ def _by_sensor(table: Table) -> Table:
     if all(name in table for name in _WHERE):
         raise table.error("sensor and camera are both given", row=None, field="camera", hint="keep one of them")
     columns = {"sensor" if name == "camera" else name: cells for name, cells in table.columns.items()}
-    return Table(table.path, columns, table.line, table.header_line)
+    return replace(table, columns=columns)
 
 
 def _detections(
@@ -209,14 +202,11 @@ def _detections(
     columns: dict[str, Any] = {
         "sensor": _sensor_rows(table, rig),
         "class_id": class_ids(table, class_names),
+        "landmark_id": table.ids("landmark_id", optional=True, names=names),
         "source_line": np.asarray(table.line, dtype=np.int64),
     }
-    if "landmark_id" in table:
-        columns["landmark_id"] = table.ids("landmark_id", optional=True, names=names)
-    if "score" in table:
-        columns["score"] = table.numbers(Quantity("score", optional=True))
-    if "sigma_rad" in table:
-        columns["sigma_rad"] = table.numbers(Quantity("sigma_rad", positive=True, optional=True, hint="radians"))
+    for quantity in (Quantity("score", optional=True), _SIGMA_RAD):
+        columns[quantity.name] = table.filled(quantity, np.nan)
     if table.has_any(BOX):
         columns["size_m"] = boxes(table)
     if form is POINT:
@@ -231,7 +221,7 @@ def _detections(
     if behind.any():
         seen = counted(int(behind.sum()), "detection")
         warnings.append(f"{table.path.name}: {seen} left out: no disparity, or no depth ahead of the camera")
-        detections = rows_of(detections, ~behind)
+        detections = detections[~behind]
     return detections
 
 
@@ -293,7 +283,7 @@ def _placed(table: Table) -> dict[str, FloatArray]:
 def _cornered(table: Table, detections: SpatialDetections, rig: Rig) -> SpatialDetections:
     """The detections with the corners of tags, and the tags' sizes."""
     table.expect(CORNERS, tuple(table.columns))
-    corner = np.stack([table.numbers(_pixel(name)) for name in CORNERS], axis=1)
+    corner = np.stack([table.numbers(_pixel(name, optional=True)) for name in CORNERS], axis=1)
     given = np.isfinite(corner)
     partly = np.flatnonzero(given.any(axis=1) & ~given.all(axis=1))
     if len(partly):
@@ -301,9 +291,8 @@ def _cornered(table: Table, detections: SpatialDetections, rig: Rig) -> SpatialD
     camera = np.array([sensor.intrinsics is not None for sensor in rig.sensors])[detections.sensor]
     _need_camera(table, given[:, 0] & ~camera, CORNERS[0], rig)
     size = rig.size_of(detections.landmark_id)
-    if "tag_size_m" in table:
-        stated = table.numbers(Quantity("tag_size_m", high=1e3, positive=True, optional=True, hint="metres"))
-        size = np.where(np.isnan(stated), size, stated)
+    stated = table.filled(Quantity("tag_size_m", high=1e3, positive=True, optional=True, hint="metres"), np.nan)
+    size = np.where(np.isnan(stated), size, stated)
     sizeless = np.flatnonzero(given[:, 0] & np.isnan(size) & np.isnan(detections.position_sensor_m).any(axis=1))
     if len(sizeless):
         hint = f"a column tag_size_m, or size_m under [tags] of {CAMERA_FILE}"
@@ -323,7 +312,7 @@ def _points(table: Table, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
     camera = np.array([one.intrinsics is not None for one in rig.sensors])[sensor]
     baseline = np.array(rig.baseline_m)[sensor]
     _need_camera(table, ~camera, POINT[0], rig)
-    left = np.stack([table.numbers(replace(_pixel(name), optional=False)) for name in POINT], axis=1)
+    left = np.stack([table.numbers(_pixel(name, optional=False)) for name in POINT], axis=1)
     if RIGHT[0] not in table:
         position, covariance = directions(left, sensor, rig.sensors)
         return {"position_sensor_m": position, "covariance_sensor_m2": covariance}
@@ -332,9 +321,9 @@ def _points(table: Table, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
         hint = f"baseline_m of the left camera in {CAMERA_FILE}"
         raise table.error("the baseline is unknown", row=int(lone[0]), field=RIGHT[0], hint=hint)
     right = left.copy()
-    right[:, 0] = table.numbers(replace(_pixel(RIGHT[0]), optional=False))
-    if RIGHT[1] in table:
-        right[:, 1] = table.numbers(replace(_pixel(RIGHT[1]), optional=False))
+    for axis, name in enumerate(RIGHT):
+        if name in table:
+            right[:, axis] = table.numbers(_pixel(name, optional=False))
     position, covariance = np.full((len(table), 3), np.nan), np.full((len(table), 3, 3), np.nan)
     for number, one in enumerate(rig.sensors):
         rows = np.flatnonzero(sensor == number)

@@ -26,12 +26,12 @@ from evermap.types import (
     FloatArray,
     IntArray,
     Landmarks,
+    Odometry,
     Recording,
     Sensor,
-    SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
-    rows_of,
+    Trajectory,
 )
 
 LONGEST_S = 0.5
@@ -43,16 +43,11 @@ def write_native(
     folder: str | Path,
     format: Literal["csv", "parquet"] = "csv",  # noqa: A002 (the word that callers expect)
 ) -> Path:
-    """Write a recording as a native folder and returns the folder.
+    """Write a recording as a native folder, which must not exist or be empty, in 'csv' or 'parquet'; return the folder.
 
     Odometry is written as velocities, in space as poses; detections as range and bearing, in space as positions,
     orientations and corners. What is derived from files is not written: `source`, `warnings` and the line numbers of
     detections.
-
-    Args:
-        recording: what to write.
-        folder: is created; must not exist, or be empty.
-        format: 'csv' or 'parquet'.
 
     Raises:
         ConfigError: `format` is neither 'csv' nor 'parquet'.
@@ -73,14 +68,10 @@ def write_native(
 
 
 def write_session(recording: Recording | SpatialRecording, file: str | Path) -> Path:
-    """Write what a map needs of a recording to a zip in the native format, and return its path.
+    """Write what a map needs of a recording (rows in the order of time) to a zip in the native format; return its path.
 
     Odometry is composed between frames, numbers but stamps are of single precision, and truth is left out: twelve
     minutes of a robot with odometry at 84 Hz take 81 kB instead of 370 kB. Motion from frame to frame stays as it was.
-
-    Args:
-        recording: what to write, its rows in the order of time.
-        file: a zip; an older one is replaced.
 
     Raises:
         InputError: it cannot be written; nothing is changed then.
@@ -112,7 +103,7 @@ def _composed(odometry: Any, frame_s: FloatArray) -> Any:
     kept[1:] |= silent
     rows = np.flatnonzero(kept)
     if isinstance(odometry, SpatialOdometry):
-        return rows_of(odometry, rows)
+        return odometry[rows]
     twist = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
     pose = np.zeros((len(stamp_s), 3))
     step = se2.exp(twist[:-1] * np.diff(stamp_s)[:, None])
@@ -121,7 +112,7 @@ def _composed(odometry: Any, frame_s: FloatArray) -> Any:
     driven = se2.log(se2.between(pose[rows[:-1]], pose[rows[1:]])) / np.diff(stamp_s[rows])[:, None]
     held = np.diff(rows, append=rows[-1] + 1) == 1  # a single row is kept as it is
     twist = np.where(held[:, None], twist[rows], np.vstack([driven, twist[-1]]))
-    return replace(rows_of(odometry, rows), forward_mps=twist[:, 0], lateral_mps=twist[:, 1], angular_radps=twist[:, 2])
+    return replace(odometry[rows], forward_mps=twist[:, 0], lateral_mps=twist[:, 1], angular_radps=twist[:, 2])
 
 
 def _single(columns: dict[str, Any]) -> dict[str, Any]:
@@ -136,99 +127,95 @@ def _single(columns: dict[str, Any]) -> dict[str, Any]:
 
 def _contents(recording: Recording | SpatialRecording) -> tuple[dict[str, str], dict[str, dict[str, Any]]]:
     """Texts of its settings files, and columns of its tables."""
-    settings = _settings(recording)
+    settings = Settings(
+        name=recording.name,
+        robot=recording.robot,
+        clock=recording.clock,
+        frames_complete=recording.frames.complete,
+        class_names=_class_names(recording),
+        sensor=recording.sensor if isinstance(recording, Recording) else Sensor(),
+    )
     if isinstance(recording, Recording):
         return {SENSOR_FILE: sensor_toml(settings)}, native_tables(recording)
     known = {name: said for name, said in recording.symmetries.items() if name in _class_names(recording)}
-    return rig_toml(recording.sensors, settings, known), spatial_tables(recording)
+    return rig_toml(recording.sensors, settings, known), native_tables(recording)
 
 
-def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
-    """Return columns of every table that the recording has something for: arrays, or lists of text."""
-    odometry, detections, names = recording.odometry, recording.detections, _class_names(recording)
-    tables: dict[str, dict[str, Any]] = {
-        "odometry": {
-            name: getattr(odometry, name) for name in ("stamp_s", "forward_mps", "lateral_mps", "angular_radps")
-        },
-        "detections": {
-            "stamp_s": recording.frames.stamp_s[detections.frame],
-            "landmark_id": _called(detections.landmark_id, recording.landmark_names),
-            "range_m": detections.range_m,
-            "bearing_rad": detections.bearing_rad,
-        },
-        "frames": {"stamp_s": recording.frames.stamp_s},
-    }
+def native_tables(recording: Recording | SpatialRecording) -> dict[str, dict[str, Any]]:
+    """Return columns of every table that the recording has something for: arrays, or lists of text.
+
+    In space columns that hold nothing are left out.
+    """
+    detections, names, called = recording.detections, _class_names(recording), recording.landmark_names
+    tables: dict[str, dict[str, Any]] = {}
+    if recording.odometry is not None:
+        tables["odometry"] = _odometry(recording.odometry)
+    seen = _in_plane(recording) if isinstance(recording, Recording) else _in_space(recording)
+    tables["detections"] = {"stamp_s": recording.frames.stamp_s[detections.frame], **seen}
     if np.any(detections.class_id != UNKNOWN):
         tables["detections"]["class_id"] = labels_of(detections.class_id, names)
-    tables["detections"] |= _features(detections)
-    for name in ("sigma_range_m", "sigma_bearing_rad"):
-        sigma = getattr(detections, name)
-        if not np.all(np.isnan(sigma)):
-            tables["detections"][name] = sigma
+    if detections.features is not None:
+        tables["detections"] |= dict(zip(detections.feature_names, detections.features.T, strict=True))
+    if isinstance(detections, Detections):
+        tables["detections"] |= _given(_columns(detections, "sigma_range_m", "sigma_bearing_rad"))
+    tables["frames"] = {"stamp_s": recording.frames.stamp_s}
     if recording.truth is not None:
-        pose = zip(("x_m", "y_m", "theta_rad"), recording.truth.pose_world_robot.T, strict=True)
-        tables["truth"] = {"stamp_s": recording.truth.stamp_s, **dict(pose)}
+        tables["truth"] = _posed(recording.truth)
     if recording.true_landmarks is not None:
-        tables["landmarks"] = _survey(recording.true_landmarks, recording.landmark_names, names)
+        tables["landmarks"] = _survey(recording.true_landmarks, called, names)
     if recording.robot_sightings is not None:
-        shown = ("stamp_s", "robot_id", "range_m", "bearing_rad")
-        tables["robot_sightings"] = {name: getattr(recording.robot_sightings, name) for name in shown}
-    if len(recording.objects):
-        landmark_id = _called(recording.objects[:, 0], recording.landmark_names)
+        tables["robot_sightings"] = _columns(recording.robot_sightings, "stamp_s", "robot_id", "range_m", "bearing_rad")
+    if isinstance(recording, Recording) and len(recording.objects):
+        landmark_id = _called(recording.objects[:, 0], called)
         tables["objects"] = {"landmark_id": landmark_id, "object_id": recording.objects[:, 1]}
     return tables
 
 
-def spatial_tables(recording: SpatialRecording) -> dict[str, dict[str, Any]]:
-    """Return columns as `native_tables`, of a recording in space; columns that hold nothing are left out."""
-    odometry, detections, names = recording.odometry, recording.detections, _class_names(recording)
-    tables: dict[str, dict[str, Any]] = {}
-    if odometry is not None:
-        variances = dict(zip(VARIANCES, odometry.variance.T, strict=True))
-        tables["odometry"] = {"stamp_s": odometry.stamp_s, **_pose(odometry.pose_world_robot), **_given(variances)}
+def _posed(path: Trajectory | SpatialOdometry) -> dict[str, FloatArray]:
+    pose = path.pose_world_robot
+    names = (*AT, *QUATERNION) if pose.shape[1] == 7 else ("x_m", "y_m", "theta_rad")
+    return {"stamp_s": path.stamp_s, **dict(zip(names, pose.T, strict=True))}
+
+
+def _columns(table: Any, *names: str) -> dict[str, FloatArray]:
+    return {name: getattr(table, name) for name in names}
+
+
+def _odometry(odometry: Odometry | SpatialOdometry) -> dict[str, FloatArray]:
+    if isinstance(odometry, Odometry):
+        return _columns(odometry, "stamp_s", "forward_mps", "lateral_mps", "angular_radps")
+    return {**_posed(odometry), **_given(dict(zip(VARIANCES, odometry.variance.T, strict=True)))}
+
+
+def _in_plane(recording: Recording) -> dict[str, Any]:
+    detections = recording.detections
+    landmark_id = _called(detections.landmark_id, recording.landmark_names)
+    return {"landmark_id": landmark_id, **_columns(detections, "range_m", "bearing_rad")}
+
+
+def _in_space(recording: SpatialRecording) -> dict[str, Any]:
+    detections = recording.detections
     sensors = [sensor.name for sensor in recording.sensors]
-    corner = detections.corner_px.reshape(-1, 8)
-    tables["detections"] = {
-        "stamp_s": recording.frames.stamp_s[detections.frame],
+    details = {
+        **dict(zip(QUATERNION, detections.rotation.T, strict=True)),
+        **upper_triangle(detections.covariance_sensor_m2, COVARIANCE),
+        "sigma_rad": detections.sigma_rad,
+        **dict(zip(CORNERS, detections.corner_px.reshape(-1, 8).T, strict=True)),
+        "tag_size_m": detections.tag_size_m,
+        **dict(zip(BOX, detections.size_m.T, strict=True)),
+        "score": detections.score,
+    }
+    return {
         "sensor": [sensors[row] for row in detections.sensor.tolist()],
         "landmark_id": _called(detections.landmark_id, recording.landmark_names),
         **dict(zip(AT, detections.position_sensor_m.T, strict=True)),
-        **_given(
-            {
-                **dict(zip(QUATERNION, detections.rotation.T, strict=True)),
-                **upper_triangle(detections.covariance_sensor_m2, COVARIANCE),
-                "sigma_rad": detections.sigma_rad,
-                **dict(zip(CORNERS, corner.T, strict=True)),
-                "tag_size_m": detections.tag_size_m,
-                **dict(zip(BOX, detections.size_m.T, strict=True)),
-                "score": detections.score,
-            }
-        ),
+        **_given(details),
     }
-    if np.any(detections.class_id != UNKNOWN):
-        tables["detections"]["class_id"] = labels_of(detections.class_id, names)
-    tables["detections"] |= _features(detections)
-    tables["frames"] = {"stamp_s": recording.frames.stamp_s}
-    if recording.truth is not None:
-        tables["truth"] = {"stamp_s": recording.truth.stamp_s, **_pose(recording.truth.pose_world_robot)}
-    if recording.true_landmarks is not None:
-        tables["landmarks"] = _survey(recording.true_landmarks, recording.landmark_names, names)
-    return tables
-
-
-def _pose(pose: FloatArray) -> dict[str, FloatArray]:
-    return dict(zip((*AT, *QUATERNION), pose.T, strict=True))
 
 
 def _given(columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
     """The columns in which anything is known."""
     return {name: column for name, column in columns.items() if not np.all(np.isnan(column))}
-
-
-def _features(detections: Detections | SpatialDetections) -> dict[str, FloatArray]:
-    return (
-        {} if detections.features is None else dict(zip(detections.feature_names, detections.features.T, strict=True))
-    )
 
 
 def _survey(landmarks: Landmarks, names: Mapping[int, str], class_names: tuple[str, ...]) -> dict[str, Any]:
@@ -244,17 +231,6 @@ def _called(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
     if not names.keys() & set(landmark_id.tolist()):
         return landmark_id
     return ["" if number == UNKNOWN else names.get(number, str(number)) for number in landmark_id.tolist()]
-
-
-def _settings(recording: Recording | SpatialRecording) -> Settings:
-    return Settings(
-        name=recording.name,
-        robot=recording.robot,
-        clock=recording.clock,
-        frames_complete=recording.frames.complete,
-        class_names=_class_names(recording),
-        sensor=recording.sensor if isinstance(recording, Recording) else Sensor(),
-    )
 
 
 def _class_names(recording: Recording | SpatialRecording) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ import numpy as np
 from evermap.errors import ConfigError, DataError, InputError
 from evermap.geometry import se3
 from evermap.io.files import content_of, write_atomic
-from evermap.io.text import parse_json
+from evermap.io.text import is_number, parse_json
 from evermap.types import FloatArray, Landmarks
 
 MOST_CELLS = 50_000_000
@@ -87,15 +87,14 @@ def write_speed_mask(
     the greatest `p_wrong` of the landmarks that are near it, and never so much that less than `LEAST_SPEED` remains.
 
     Args:
-        landmarks: a map; one in space is seen from above.
+        landmarks: and `path`, `cell_m`, as of `write_grid`.
         p_wrong: (L,) probability of each that it is not as the map says: gone, or there after all.
         path: the YAML.
         cell_m: edge of a cell [m].
         radius_m: how far around a landmark it is slow [m].
 
     Raises:
-        DataError: there is no landmark.
-        ConfigError: the grid would have more than `MOST_CELLS` cells.
+        DataError, ConfigError: as `write_grid`.
     """
     slower = np.rint(100.0 * np.minimum(p_wrong, 1.0 - LEAST_SPEED)) / 100.0
     drawn, origin_m = _drawn(landmarks, slower, Path(path), cell_m, radius_m)
@@ -238,7 +237,7 @@ def _nodes(document: Mapping[str, Any], path: Path) -> dict[int, tuple[float, fl
         if geometry["type"] != "Point":
             continue
         at = geometry.get("coordinates")
-        if not isinstance(at, list) or len(at) < 2 or not all(map(_is_number, at[:2])):
+        if not isinstance(at, list) or len(at) < 2 or not all(map(is_number, at[:2])):
             raise _wrong("has no coordinates x, y", path, number)
         if max(map(abs, at[:2])) > FARTHEST_M:
             raise _wrong("is implausibly far away", path, number)
@@ -287,7 +286,7 @@ def _doubtful(feature: dict[str, Any], edge: RouteEdge, path: Path, number: int)
         return feature
     metadata = feature["properties"].get("metadata", {})
     own: Any = metadata.get("penalty", 0.0) if isinstance(metadata, dict) else None
-    if not _is_number(own):
+    if not is_number(own):
         raise _wrong("has no number as properties.metadata.penalty", path, number)
     told = {**metadata, "penalty": float(own) + edge.penalty_m, "p_blocked": edge.p_blocked}
     return {**feature, "properties": {**feature["properties"], "metadata": told}}
@@ -298,10 +297,6 @@ def _whole(properties: Mapping[str, Any], name: str, path: Path, number: int) ->
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
         raise _wrong(f"has no whole number as properties.{name}", path, number)
     return value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
 
 
 def _wrong(problem: str, path: Path, number: int) -> InputError:

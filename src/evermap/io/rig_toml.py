@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import inf, pi
+from math import inf, nan, pi
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ _LIMITS: dict[str, dict[str, tuple[float, float]]] = {
 }
 """Sections of `sensor.toml`; their keys are valid for a camera, too, but for that of the odometry."""
 _OF_CAMERA = {key: limits for name, keys in _LIMITS.items() if name != "odometry" for key, limits in keys.items()}
+_LENGTH = (1e-4, 1e3)
 _ANGLES = ("roll_rad", "pitch_rad", "yaw_rad")
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 """Names that need no quotation marks in TOML."""
@@ -53,8 +54,8 @@ class Rig:
 
     settings: Settings = field(default_factory=Settings)
     sensors: tuple[SpatialSensor, ...] = (SpatialSensor(),)
-    baseline_m: tuple[float, ...] = (float("nan"),)
-    tag_size_m: float = float("nan")
+    baseline_m: tuple[float, ...] = (nan,)
+    tag_size_m: float = nan
     tag_sizes: Mapping[int, float] = field(default_factory=dict)
     symmetries: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -80,11 +81,11 @@ def read_rig(files: FileSet, warnings: list[str]) -> Rig:
         for section, keys in _LIMITS.items():
             known = ("kind", *keys) if section == "sensor" else tuple(keys)
             content = _known(reader, section, reader.document.get(section, {}), known)
-            values |= {key: reader.number(section, key, content[key], *keys[key]) for key in keys if key in content}
+            values |= reader.limited(section, content, keys)
         values["kind"] = reader.choice("sensor", "kind", SensorKind, UNKNOWN_KIND)
         mount = _mount(reader, "mount", reader.section("mount", _MOUNT))
         common = replace(common, mount_robot_sensor=mount, **values)
-        _check_range(reader, "limits", common)
+        reader.check_order("limits", common, "range_min_m", "range_max_m")
     if CAMERA_FILE not in files:
         if SENSOR_FILE not in files:
             warnings.append(
@@ -129,11 +130,7 @@ def _key(name: str) -> str:
 def cameras(reader: TomlReader, settings: Settings, common: SpatialSensor, also: tuple[str, ...] = ()) -> Rig:
     """Return the sensors in the sections `[camera.NAME]` of a document, and what its section `[tags]` says.
 
-    Args:
-        reader: of the document.
-        settings: of the recording.
-        common: what holds for all sensors.
-        also: further keys that a section may have.
+    `common` holds for all sensors; `also` are further keys that a section may have.
 
     Raises:
         InputError: a key is unknown, or its value of the wrong type or out of its limits.
@@ -145,11 +142,7 @@ def cameras(reader: TomlReader, settings: Settings, common: SpatialSensor, also:
     for name, content in listed.items():
         section = f"camera.{name}"
         _known(reader, section, content, (*_CAMERA, *also))
-        values: dict[str, Any] = {
-            key: reader.number(section, key, content[key], *limits)
-            for key, limits in _OF_CAMERA.items()
-            if key in content
-        }
+        values: dict[str, Any] = reader.limited(section, content, _OF_CAMERA)
         if "mount" in content:
             inner = f"{section}.mount"
             values["mount_robot_sensor"] = _mount(reader, inner, reader.checked(inner, content["mount"], _MOUNT))
@@ -157,12 +150,9 @@ def cameras(reader: TomlReader, settings: Settings, common: SpatialSensor, also:
             values["kind"] = reader.choice(section, "kind", SensorKind, UNKNOWN_KIND, content)
         values |= _lens(reader, section, content)
         sensor = replace(common, name=name, **values)
-        _check_range(reader, section, sensor)
+        reader.check_order(section, sensor, "range_min_m", "range_max_m")
         sensors.append(sensor)
-        baseline = content.get("baseline_m")
-        baselines.append(
-            float("nan") if baseline is None else reader.number(section, "baseline_m", baseline, 1e-4, 1e3)
-        )
+        baselines.append(reader.limited(section, content, {"baseline_m": _LENGTH}).get("baseline_m", nan))
     size_m, sizes = _tags(reader)
     return Rig(settings, tuple(sensors), tuple(baselines), size_m, sizes)
 
@@ -178,20 +168,18 @@ def _known(reader: TomlReader, section: str, content: Any, known: tuple[str, ...
 def _lens(reader: TomlReader, section: str, content: dict[str, Any]) -> dict[str, Any]:
     """How a camera projects; nothing for a sensor that is no camera."""
     if "intrinsics" not in content:
+        hint = "intrinsics = [fx, fy, cx, cy] in pixels"
         for key in ("model", "distortion", "baseline_m"):
             if key in content:
-                raise reader.error(
-                    section, key, "needs intrinsics, too", hint="intrinsics = [fx, fy, cx, cy] in pixels"
-                )
+                raise reader.error(section, key, "needs intrinsics, too", hint)
         return {}
     intrinsics = reader.numbers(section, "intrinsics", content["intrinsics"], (4,))
     if min(intrinsics[:2]) <= 0.0:
         raise reader.error(section, "intrinsics", "focal lengths must be positive", hint="[fx, fy, cx, cy] in pixels")
     model = content.get("model", "pinhole")
     if model not in CAMERA_MODELS:
-        raise reader.error(
-            section, "model", f"unknown camera model '{model}'", hint="one of " + ", ".join(CAMERA_MODELS)
-        )
+        hint = "one of " + ", ".join(CAMERA_MODELS)
+        raise reader.error(section, "model", f"unknown camera model '{model}'", hint)
     distortion = reader.numbers(section, "distortion", content.get("distortion", []), (0, *CAMERA_MODELS[model]))
     found: dict[str, Any] = {"intrinsics": intrinsics, "distortion": distortion, "distortion_model": model}
     if "resolution_px" in content:
@@ -217,14 +205,12 @@ def _mount(reader: TomlReader, section: str, content: dict[str, Any]) -> tuple[f
 
 def _tags(reader: TomlReader) -> tuple[float, dict[int, float]]:
     content = reader.section("tags", ("size_m", "sizes"))
-    size_m = float("nan")
-    if "size_m" in content:
-        size_m = reader.number("tags", "size_m", content["size_m"], 1e-4, 1e3)
+    size_m = reader.limited("tags", content, {"size_m": _LENGTH}).get("size_m", nan)
     sizes = content.get("sizes", {})
     if not isinstance(sizes, dict):
         raise reader.error("tags", "sizes", "must be a section", hint="[tags.sizes] with lines such as 17 = 0.2")
     return size_m, {
-        int(name) if name.isdecimal() else landmark_id_of(name): reader.number("tags.sizes", name, size, 1e-4, 1e3)
+        int(name) if name.isdecimal() else landmark_id_of(name): reader.number("tags.sizes", name, size, *_LENGTH)
         for name, size in sizes.items()
     }
 
@@ -245,8 +231,3 @@ def _symmetries(reader: TomlReader, class_names: tuple[str, ...] | None) -> dict
             raise reader.error("symmetries", name, str(error), hint=HINT) from None
         found[name] = texts
     return found
-
-
-def _check_range(reader: TomlReader, section: str, sensor: SpatialSensor) -> None:
-    if sensor.range_min_m >= sensor.range_max_m:
-        raise reader.error(section, "range_max_m", "must be greater than range_min_m")

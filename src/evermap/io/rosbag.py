@@ -84,9 +84,8 @@ def read_tag_bag(
     camera_of = {topic: camera for camera, topic in enumerate(tag_topics) if topic}
 
     def driven(message: Any, _: float) -> None:
-        odometry.append(
-            (stamp_of(message), *pose_of(message.pose.pose), *np.diagonal(message.pose.covariance.reshape(6, 6)))
-        )
+        variance = np.diagonal(message.pose.covariance.reshape(6, 6))
+        odometry.append((stamp_of(message), *pose_of(message.pose.pose), *variance))
 
     def seen_by(camera: int) -> Handler:
         def handle(message: Any, _: float) -> None:
@@ -295,10 +294,12 @@ def _unpacked(path: Path, folder: Path) -> Path:
 def _tags(message: Any) -> list[tuple[float, ...]]:
     """Id, wrong bits, and u, v of four corners of each tag."""
     found = message.apriltags if hasattr(message, "apriltags") else message.detections
-    return [
-        (float(tag.id), float(tag.hamming), *(value for corner in tag.corners for value in (corner.x, corner.y)))
-        for tag in found
-    ]
+    return [(float(tag.id), float(tag.hamming), *corners_of(tag)) for tag in found]
+
+
+def corners_of(tag: Any) -> tuple[float, ...]:
+    """Return u, v of the four corners of a tag."""
+    return tuple(value for corner in tag.corners for value in (corner.x, corner.y))
 
 
 def pose_of(message: Any) -> tuple[float, ...]:

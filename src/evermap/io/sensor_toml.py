@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from math import inf, pi
@@ -12,7 +13,7 @@ from typing import Any, TypeVar
 
 from evermap.errors import InputError, suggestion
 from evermap.io.text import decode_text, reason
-from evermap.types import Clock, Sensor, SensorKind
+from evermap.types import Clock, Sensor, SensorKind, SpatialSensor
 
 FORMAT_VERSION = 1
 UNKNOWN_KIND = "unknown kind of sensor"
@@ -63,7 +64,7 @@ def parse_sensor_toml(data: bytes, path: Path) -> Settings:
     values: dict[str, dict[str, float]] = {}
     for section, keys in _LIMITS.items():
         content = reader.section(section, ("kind", *keys) if section == "sensor" else tuple(keys))
-        values[section] = {key: reader.number(section, key, content[key], *keys[key]) for key in keys if key in content}
+        values[section] = reader.limited(section, content, keys)
     return reader.recording(_sensor(values, reader))
 
 
@@ -107,10 +108,8 @@ def _sensor(values: dict[str, dict[str, float]], reader: TomlReader) -> Sensor:
     numbers: dict[str, Any] = {k: v for part in values.values() for k, v in part.items()}
     kind = reader.choice("sensor", "kind", SensorKind, UNKNOWN_KIND)
     sensor = Sensor(**numbers, kind=kind, mount_robot_sensor=(x_m, y_m, theta_rad))
-    if sensor.range_min_m >= sensor.range_max_m:
-        raise reader.error("limits", "range_max_m", "must be greater than range_min_m")
-    if sensor.bearing_min_rad >= sensor.bearing_max_rad:
-        raise reader.error("limits", "bearing_max_rad", "must be greater than bearing_min_rad")
+    reader.check_order("limits", sensor, "range_min_m", "range_max_m")
+    reader.check_order("limits", sensor, "bearing_min_rad", "bearing_max_rad")
     return sensor
 
 
@@ -155,6 +154,17 @@ class TomlReader:
             hint = "angles in radians" if key.endswith("_rad") else None
             raise self.error(section, key, f"{number:g} is outside [{low:g}, {high:g}]", hint)
         return number
+
+    def limited(
+        self, section: str, content: Mapping[str, Any], limits: Mapping[str, tuple[float, float]]
+    ) -> dict[str, float]:
+        """Return the keys of a section that have limits, as far as it has them."""
+        return {key: self.number(section, key, content[key], *limits[key]) for key in limits if key in content}
+
+    def check_order(self, section: str, sensor: Sensor | SpatialSensor, low: str, high: str) -> None:
+        """Raise InputError unless one limit of a sensor is below another."""
+        if getattr(sensor, low) >= getattr(sensor, high):
+            raise self.error(section, high, f"must be greater than {low}")
 
     def numbers(self, section: str, key: str, value: Any, counts: tuple[int, ...]) -> tuple[float, ...]:
         if not isinstance(value, list) or len(value) not in counts:

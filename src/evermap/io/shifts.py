@@ -25,11 +25,7 @@ class Shift:
     rotation_rad: float = 0.0
 
     def undone(self, first_stamp_s: float) -> MapChange:
-        """Return what an estimate that is given the shifted map should find: the world lies the other way.
-
-        Args:
-            first_stamp_s: of the recording; the change happened before it.
-        """
+        """Return the change that a recording from a stamp on shows against the shifted map: the other way."""
         x, y = self.displacement_m
         return MapChange(
             landmark_ids=tuple(sorted(self.landmark_ids)),

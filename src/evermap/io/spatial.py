@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +24,6 @@ from evermap.types import (
     SpatialOdometry,
     SpatialSensor,
     Trajectory,
-    rows_of,
 )
 from evermap.valid import QUATERNION as QUANTITIES
 from evermap.valid import X_M, Y_M, Z_M, Quantity, is_covariance
@@ -56,9 +55,8 @@ def quaternions(table: Table, *, optional: bool = False) -> FloatArray:
     wrong = np.flatnonzero(~(np.abs(length - 1.0) <= 1e-2) & ~absent)
     if len(wrong):
         row, hint = int(wrong[0]), "scalar last; all four or none"
-        problem = (
-            "is incomplete" if np.isnan(length[row]) else f"is not a unit quaternion, its length is {length[row]:g}"
-        )
+        odd = f"is not a unit quaternion, its length is {length[row]:g}"
+        problem = "is incomplete" if np.isnan(length[row]) else odd
         raise table.error(problem, row=row, field="qx, qy, qz, qw", hint=hint)
     return unit(given)
 
@@ -82,19 +80,19 @@ def posed_odometry(table: Table, variances: tuple[str, ...], clock: Clock, warni
     """Return the odometry in a table of poses, with the columns of their six variances as far as it has them."""
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
-    unknown = np.full(len(table), np.nan)
-    variance = [
-        table.numbers(Quantity(name, 0.0, 1e12, optional=True)) if name in table else unknown for name in variances
-    ]
+    variance = [table.filled(Quantity(name, 0.0, 1e12, optional=True), np.nan) for name in variances]
     return SpatialOdometry(stamp_s[keep], poses(table)[keep], np.stack(variance, axis=1)[keep], clock=clock)
 
 
-def true_poses(table: Table, clock: Clock, warnings: list[str]) -> Trajectory:
-    """Return the truth in a table of poses."""
+def true_poses(
+    table: Table, clock: Clock, warnings: list[str], of: Callable[[Table], FloatArray] = poses
+) -> Trajectory:
+    """Return the truth in a table of poses (R, 3) or (R, 7), which a function reads."""
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
-    pose = poses(table)[keep]
-    return Trajectory(stamp_s[keep], pose, np.zeros((len(pose), 6, 6)), frame="truth", clock=clock)
+    pose = of(table)[keep]
+    size = 6 if pose.shape[1] == 7 else 3
+    return Trajectory(stamp_s[keep], pose, np.zeros((len(pose), size, size)), frame="truth", clock=clock)
 
 
 def sensor_rows(table: Table, column: str, sensors: Sequence[SpatialSensor], file: str) -> IntArray:
@@ -149,12 +147,7 @@ def boxes(table: Table, *, flat: bool = False) -> FloatArray:
 
 
 def spatial_detections(frame: IntArray, **given: Any) -> SpatialDetections:
-    """Return detections of which only some columns are known: ids are `UNKNOWN` and numbers nan in all others.
-
-    Args:
-        frame: (M,) row of `Frames`.
-        **given: columns of `SpatialDetections`, by name.
-    """
+    """Return detections in frames (M,) with the given columns: in all others ids are `UNKNOWN` and numbers nan."""
     count = len(frame)
     shapes: dict[str, tuple[int, ...]] = {
         "position_sensor_m": (3,), "rotation": (4,), "covariance_sensor_m2": (3, 3), "sigma_rad": (),
@@ -194,7 +187,7 @@ def with_tag_poses(
     if broken.any():
         warnings.append(f"{counted(int(broken.sum()), 'tag')} left out: their corners are not those of a square")
     filled = replace(detections, position_sensor_m=position, rotation=rotation)
-    return rows_of(filled, ~sizeless & ~broken) if (sizeless | broken).any() else filled
+    return filled[~sizeless & ~broken] if (sizeless | broken).any() else filled
 
 
 def directions(pixel: FloatArray, sensor: IntArray, sensors: Sequence[SpatialSensor]) -> tuple[FloatArray, FloatArray]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,19 @@ from evermap.io.text import clock_of_date, date_s, decode_text, parse_float, quo
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, landmark_id_of
 from evermap.valid import STAMP_S, Quantity
 
+
+class _Lazy:
+    """A package that is loaded when something of it is first used."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(import_module(self._name), name)
+
+
+pa, pc, pq, arrow_csv = map(_Lazy, ("pyarrow", "pyarrow.compute", "pyarrow.parquet", "pyarrow.csv"))
+
 ENDINGS = (".csv", ".csv.gz", ".parquet")
 FORMULA = r"^'*[=+@\t\r-]"
 """Begin of a cell that a spreadsheet would execute, or that looks as if it had been guarded against that."""
@@ -26,18 +40,18 @@ _LARGEST_ID = 2**53
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
-    """Columns by name, as cells of text or as numbers (nan where empty).
+class NamedColumns:
+    """Columns of a file by name, however their cells are held.
 
     Attributes:
         path: file it came from, for messages.
-        columns: name -> cells.
+        columns: name -> R cells.
         line: (R,) line numbers in the file; for Parquet the row, for GeoJSON the feature, counted from 1.
         header_line: where the names of the columns stand, None where that is not a line of text.
     """
 
     path: Path
-    columns: Mapping[str, Sequence[str] | FloatArray]
+    columns: Mapping[str, Any]
     line: IntArray
     header_line: int | None = None
 
@@ -65,6 +79,35 @@ class Table:
                 has = ", ".join(self.columns) or "none"
                 raise self.error("missing column", row=None, field=name, hint=f"the file has {has}")
 
+    def has_any(self, names: Iterable[str]) -> bool:
+        """Return whether at least one of the columns is there."""
+        return any(name in self.columns for name in names)
+
+    def has_all(self, names: Sequence[str], hint: str) -> bool:
+        """Return whether columns are there; raise InputError where only some of them are."""
+        for name in names if self.has_any(names) else ():
+            if name not in self:
+                raise self.error("missing column", row=None, field=name, hint=hint)
+        return self.has_any(names)
+
+    def numbers(self, quantity: Quantity) -> FloatArray:
+        """Return a numeric column, checked against its limits. Shape (R,); nan where an optional cell is empty."""
+        raise NotImplementedError
+
+    def filled(self, quantity: Quantity, default: float) -> FloatArray:
+        """Return an optional column (R,), with what an empty cell, or no such column, means."""
+        if quantity.name not in self:
+            return np.full(len(self), float(default))
+        values = self.numbers(quantity)
+        return np.where(np.isnan(values), default, values)
+
+
+class Table(NamedColumns):
+    """Columns as cells of text or as numbers (nan where empty)."""
+
+    __slots__ = ()
+    columns: Mapping[str, Sequence[str] | FloatArray]
+
     def one_form(self, first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:
         """Return which of two ways to say the same the table uses; raises InputError where it mixes them."""
         if self.has_any(first) and self.has_any(second):
@@ -72,12 +115,7 @@ class Table:
             raise self.error(problem, row=None, hint="keep one form")
         return second if self.has_any(second) else first
 
-    def has_any(self, names: Iterable[str]) -> bool:
-        """Return whether at least one of the columns is there."""
-        return any(name in self.columns for name in names)
-
     def numbers(self, quantity: Quantity) -> FloatArray:
-        """Return a numeric column, checked against its limits. Shape (R,); nan where an optional cell is empty."""
         cells = self.columns[quantity.name]
         if isinstance(cells, np.ndarray):
             values: FloatArray = cells
@@ -87,16 +125,15 @@ class Table:
         return values
 
     def ids(self, name: str, *, optional: bool, names: dict[int, str] | None = None) -> IntArray:
-        """Return whole numbers from 0; empty or -1 means `UNKNOWN` if `optional`. Shape (R,).
+        """Return whole numbers from 0; empty or -1, or no such column, means `UNKNOWN` if `optional`. Shape (R,).
 
-        Args:
-            name: of the column.
-            optional: whether a cell may be empty.
-            names: takes up the texts of cells that are not numbers, by their id (`landmark_id_of`); None refuses them.
+        `names` takes up the texts of cells that are not numbers, by their id (`landmark_id_of`); None refuses them.
 
         Raises:
             InputError: a fraction, a negative number, or nothing where an id is needed; two texts with one id.
         """
+        if optional and name not in self:
+            return np.full(len(self), UNKNOWN, dtype=np.int64)
         if names is not None and not isinstance(self.columns[name], np.ndarray):
             return self._named_ids(name, optional, names)
         values = self.numbers(Quantity(name, UNKNOWN, _LARGEST_ID, optional=True, hint="whole numbers from 0"))
@@ -109,6 +146,10 @@ class Table:
             raise self.error(problem, row=row, field=name, hint="an id is a whole number from 0")
         return whole.astype(np.int64)
 
+    def counts(self, name: str) -> IntArray:
+        """Return whole numbers from 0; zeros where there is no such column. Shape (R,)."""
+        return self.ids(name, optional=False) if name in self else np.zeros(len(self), dtype=np.int64)
+
     def _named_ids(self, name: str, optional: bool, names: dict[int, str]) -> IntArray:
         """Ids of a column in which some may be texts."""
         cells = self.labels(name)
@@ -119,7 +160,7 @@ class Table:
                 problem = f"{quote(text)} and {quote(other)} have the same hash"
                 raise self.error(problem, row=cells.index(text), field=name, hint="rename one of them")
         plain = [str(landmark_id_of(cell)) if cell in texts else cell for cell in cells]
-        return Table(self.path, {name: plain}, self.line, self.header_line).ids(name, optional=optional)
+        return replace(self, columns={name: plain}).ids(name, optional=optional)
 
     def labels(self, name: str) -> list[str]:
         """Return a column of names, '' where empty. Whole numbers are converted to text."""
@@ -206,7 +247,8 @@ def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
             warnings.append(f"{path.name}: 1 unfinished last line ({number}) left out")
         else:
             raise InputError(f"{len(cells)} cells instead of {len(names)} ({', '.join(names)})", path=path, line=number)
-    if rows and content[-1][0] == len(lines) and len(rows) == len(content) - 1 and _broken(rows[-1][-1], rows[:-1]):
+    unended = len(rows) == len(content) - 1 and content[-1][0] == len(lines)
+    if unended and _is_broken([row[-1] for row in rows]):
         warnings.append(f"{path.name}: 1 unfinished last line ({len(lines)}) left out")
         rows.pop()
     columns: Iterable[Sequence[str]] = zip(*rows, strict=True) if rows else [()] * len(names)
@@ -234,9 +276,6 @@ def read_parquet(data: bytes, path: Path) -> Any:
     Raises:
         InputError: not Parquet, damaged, or a repeated column name.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     try:
         # without threads: one that still runs while the process ends aborts it
         table = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True).read(use_threads=False)
@@ -251,18 +290,14 @@ def read_parquet(data: bytes, path: Path) -> Any:
 
 def parquet_bytes(columns: Mapping[str, Any], metadata: dict[str, str] | None = None) -> bytes:
     """Return a Parquet file of arrays and lists of text ('' becomes null), with checksums against later damage."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    arrays = [arrow_cells(cells, _not_empty(cells)) for cells in columns.values()]
+    arrays = [
+        arrow_cells(cells, np.array([*map(bool, cells)], dtype=np.bool_) if isinstance(cells, list) else None)
+        for cells in columns.values()
+    ]
     table = pa.Table.from_arrays(arrays, names=list(columns))
     sink = pa.BufferOutputStream()
     pq.write_table(table.replace_schema_metadata(metadata or {}), sink, compression="zstd", write_page_checksum=True)
     return bytes(sink.getvalue().to_pybytes())
-
-
-def _not_empty(cells: Any) -> BoolArray | None:
-    return np.array([bool(cell) for cell in cells], dtype=np.bool_) if isinstance(cells, list) else None
 
 
 def arrow_cells(cells: Any, known: BoolArray | None = None) -> Any:
@@ -274,8 +309,6 @@ def arrow_cells(cells: Any, known: BoolArray | None = None) -> Any:
         cells: R cells.
         known: (R,) False where a cell is null; None for no null.
     """
-    import pyarrow as pa
-
     valid = None if known is None else pa.py_buffer(np.packbits(known, bitorder="little"))
     if not isinstance(cells, list):
         values = np.ascontiguousarray(cells)
@@ -357,9 +390,9 @@ def _split(line: str, path: Path, number: int) -> list[str]:
         raise InputError(f"quotation marks do not match ({error})", path=path, line=number) from None
 
 
-def _broken(cell: str, others: list[list[str]]) -> bool:
-    """Return whether a cell is not a number in a column of numbers."""
-    return not _is_number(cell) and bool(others) and all(_is_number(row[-1]) for row in others[-8:])
+def _is_broken(column: list[str]) -> bool:
+    """Return whether the last cell is not a number, in a column of numbers."""
+    return len(column) > 1 and not _is_number(column[-1]) and all(map(_is_number, column[-9:-1]))
 
 
 def _is_number(cell: str) -> bool:
@@ -371,8 +404,6 @@ def _is_number(cell: str) -> bool:
 
 
 def _arrow_column(column: Any, path: Path, name: str) -> list[str] | FloatArray:
-    import pyarrow as pa
-
     kind = column.type
     if pa.types.is_dictionary(kind):
         kind = kind.value_type
@@ -392,7 +423,5 @@ def _arrow_column(column: Any, path: Path, name: str) -> list[str] | FloatArray:
 
 def dates_as_text(column: Any) -> list[str]:
     """Return timestamps of a Parquet column, with or without a zone, as ISO 8601; '' where null."""
-    import pyarrow as pa
-
     dates = column.cast(pa.timestamp("us", tz=column.type.tz), safe=False).to_pylist()
     return ["" if date is None else date.isoformat() for date in dates]

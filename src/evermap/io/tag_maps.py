@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ def map_of_survey(table: Table) -> Table:
         **dict(zip(QUATERNION, rotation.T, strict=True)),
         "tag_size_m": table.numbers(Quantity("size_m", 0.0, 1e3, positive=True, hint="metres")),
     }
-    return Table(table.path, columns, table.line, table.header_line)
+    return replace(table, columns=columns)
 
 
 def tags_of_tagslam(data: bytes, path: Path) -> Table:

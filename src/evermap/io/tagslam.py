@@ -8,25 +8,24 @@ the rig, in which `camera_poses.yaml` gives the cameras. What the authors mended
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.geometry import se3
-from evermap.io.assemble import SAME_STAMP_S, finish_recording, forward_stamps
+from evermap.io.assemble import finish_recording, forward_stamps, looks_of
 from evermap.io.files import FileSet, Reader, find_file_set
-from evermap.io.landmarks import landmarks_from_table
+from evermap.io.landmarks import survey_of
 from evermap.io.native_space import CORNERS
+from evermap.io.rig_toml import Rig
 from evermap.io.rosbag import BAG_ENDINGS, MOST_HAMMING, TagSightings, read_tag_bag
 from evermap.io.spatial import of_rig, posed_odometry, sensor_rows, spatial_detections, true_poses, with_tag_poses
 from evermap.io.table import ENDINGS, Table, parse_table
 from evermap.io.tag_maps import map_of_survey, pose_of
-from evermap.io.text import counted
+from evermap.io.text import counted, is_number
 from evermap.io.yaml import parse_yaml
 from evermap.types import (
     Clock,
@@ -48,25 +47,20 @@ _VARIANCES = ("cxx", "cyy", "czz", "crr", "cpp", "cww")
 _MODELS = {"equidistant": "equidistant", "radtan": "radtan", "plumb_bob": "radtan", "pinhole": "pinhole"}
 
 
-@dataclass(frozen=True, slots=True)
-class TagRig:
+class TagRig(NamedTuple):
     """The calibration files.
 
     Attributes:
-        sensors: the cameras.
+        rig: the cameras, and the sizes of tags.
         tag_topics: on which each camera's tags come in a bag.
         odometry_topic: of the odometry in a bag; '' where there is none.
         mount_rig_odometry: (7,) pose of the odometry's body in the rig's frame.
-        tag_size_m: edges of tags that are listed, by id.
-        default_size_m: edge of all others; nan where it is not known.
     """
 
-    sensors: tuple[SpatialSensor, ...]
+    rig: Rig
     tag_topics: tuple[str, ...]
     odometry_topic: str
     mount_rig_odometry: FloatArray
-    tag_size_m: Mapping[int, float]
-    default_size_m: float
 
 
 def read_tagslam(path: str | Path, robot: int | None = None) -> SpatialRecording:
@@ -152,25 +146,21 @@ def _recording(
         warnings.append(f"{counted(int(doubtful.sum()), 'tag')} with more than {MOST_HAMMING} wrong bits left out")
     order = np.flatnonzero(~doubtful)
     order = order[np.argsort(seen.stamp_s[order], kind="stable")]
-    looked = np.unique(np.concatenate([seen.looked_s, seen.stamp_s]))
-    looked = looked[np.diff(looked, prepend=-np.inf) > SAME_STAMP_S]
-    frame = np.clip(np.searchsorted(looked, seen.stamp_s[order] + SAME_STAMP_S) - 1, 0, None)
-    tag_id = seen.tag_id[order]
-    sizes = [setup.tag_size_m.get(tag, setup.default_size_m) for tag in tag_id.tolist()]
+    looked, frame = looks_of(np.concatenate([seen.looked_s, seen.stamp_s]), seen.stamp_s[order])
     detections = spatial_detections(
-        np.asarray(frame, dtype=np.int64),
+        frame,
         sensor=seen.camera[order],
-        landmark_id=tag_id,
+        landmark_id=seen.tag_id[order],
         corner_px=seen.corner_px[order],
-        tag_size_m=np.array(sizes, dtype=np.float64),
+        tag_size_m=setup.rig.size_of(seen.tag_id[order]),
         source_line=seen.line[order],
     )
     recording = SpatialRecording(
         name=f"TagSLAM {files.title}",
         odometry=odometry,
         frames=Frames(looked, complete=seen.complete, clock=Clock.UNIX),
-        detections=with_tag_poses(detections, setup.sensors, warnings),
-        sensors=setup.sensors,
+        detections=with_tag_poses(detections, setup.rig.sensors, warnings),
+        sensors=setup.rig.sensors,
         truth=_reference(files, warnings),
         true_landmarks=_survey(files, warnings),
         source=str(path),
@@ -213,7 +203,8 @@ def _setup(files: FileSet) -> TagRig:
     odometry = pose_of(mounted["T_body_odom"], files.path_of(SETTINGS), "T_body_odom") if mounted else se3.identity()
     sizes, default = _sizes(files, bodies, content.get("default_body"))
     topic = next((str(body["odom_topic"]) for body in bodies.values() if "odom_topic" in body), "")
-    return TagRig(tuple(sensors), tuple(topics), topic, odometry, sizes, default)
+    rig = Rig(sensors=tuple(sensors), tag_size_m=default, tag_sizes=sizes)
+    return TagRig(rig, tuple(topics), topic, odometry)
 
 
 def _bodies(files: FileSet, content: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -262,13 +253,12 @@ def _sightings(files: FileSet, setup: TagRig, warnings: list[str]) -> TagSightin
     corner = np.stack([table.numbers(Quantity(name, -1e6, 1e6, hint="pixels")) for name in CORNERS], axis=1)
     stamp_s = forward_stamps(table)
     frames = _table(files, "frames", warnings)
-    count = len(table)
     return TagSightings(
         looked_s=stamp_s if frames is None else forward_stamps(frames),
         stamp_s=stamp_s,
-        camera=sensor_rows(table, "camera", setup.sensors, CAMERAS),
+        camera=sensor_rows(table, "camera", setup.rig.sensors, CAMERAS),
         tag_id=table.ids("tag_id", optional=False),
-        hamming=table.ids("hamming", optional=False) if "hamming" in table else np.zeros(count, dtype=np.int64),
+        hamming=table.counts("hamming"),
         corner_px=corner.reshape(-1, 4, 2),
         line=np.asarray(table.line, dtype=np.int64),
         complete=frames is not None,
@@ -291,9 +281,7 @@ def _reference(files: FileSet, warnings: list[str]) -> Trajectory | None:
 
 def _survey(files: FileSet, warnings: list[str]) -> Landmarks | None:
     table = _table(files, "survey", warnings)
-    if table is None or len(table) == 0:
-        return None
-    return landmarks_from_table(map_of_survey(table), sigma_m=0.0, clock=Clock.UNIX)
+    return survey_of(map_of_survey(table) if table is not None and len(table) else None, clock=Clock.UNIX)
 
 
 def _table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
@@ -319,12 +307,8 @@ def _numbers(
     files: FileSet, name: str, content: Any, key: str, inside: str, counts: tuple[int, ...]
 ) -> tuple[float, ...]:
     values = _get(files, name, content, key, inside) or []
-    if not isinstance(values, list) or len(values) not in counts or not all(_is_number(value) for value in values):
+    if not isinstance(values, list) or len(values) not in counts or not all(map(is_number, values)):
         wanted = " or ".join(map(str, counts))
         field = f"{inside}.{key}"
         raise InputError(f"must be a list of {wanted} numbers", path=files.path_of(name), field=field)
     return tuple(map(float, values))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

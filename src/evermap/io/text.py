@@ -1,14 +1,20 @@
-"""Bytes of a text file to lines, with any line end and with the line number of what is not text."""
+"""Text files: lines, with any line end and with the number of one that is not text; numbers between blanks; JSON."""
 
 from __future__ import annotations
 
+import io
 import json
+import math
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from evermap.errors import InputError
-from evermap.types import Clock
+from evermap.types import Clock, FloatArray, IntArray, Tabular
+from evermap.valid import Quantity
 
 
 def decode_text(data: bytes, path: Path) -> str:
@@ -73,6 +79,11 @@ def parse_json(data: bytes, path: Path, **how: Any) -> Any:
         raise InputError(f"not valid JSON: {reason(error)}", path=path) from None
 
 
+def is_number(value: Any) -> bool:
+    """Return whether a value of a document is a finite number, and no truth value."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
+
+
 def counted(count: int, noun: str) -> str:
     """Return '1 row', '2 rows'."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
@@ -89,3 +100,84 @@ def quote(cell: str) -> str:
     """Return a cell of the user's file for a message: short and printable."""
     short = cell if len(cell) <= 24 else cell[:21] + "..."
     return f"'{''.join(c if c.isprintable() else '?' for c in short)}'"
+
+
+@dataclass(frozen=True, slots=True)
+class Rows(Tabular):
+    """A table of numbers without a header, as in MRCLAM's `.dat` and TUM files, each within the limits of its quantity.
+
+    Attributes:
+        values: (R, C) one column a quantity.
+        line: (R,) line numbers in the file.
+        path: file it came from, for messages.
+    """
+
+    values: FloatArray
+    line: IntArray
+    path: Path
+
+    def error(self, problem: str, *, row: int, field: str | None = None, hint: str | None = None) -> InputError:
+        """Return an error that names file, line and column."""
+        return InputError(problem, path=self.path, line=int(self.line[row]), field=field, hint=hint)
+
+    def column(self, index: int) -> FloatArray:
+        """Return one column, contiguous. Shape (R,)."""
+        return np.ascontiguousarray(self.values[:, index])
+
+
+def parse_rows(data: bytes, path: Path, quantities: tuple[Quantity, ...], warnings: list[str]) -> Rows:
+    """Return numbers of a file; `#` starts a comment anywhere, lines may end in any way.
+
+    A last line with too few numbers, or with a broken number and no line end, was cut off while it was written:
+    it is left out, and `warnings` gets a remark.
+
+    Raises:
+        InputError: a line has the wrong number of columns or something that is not a number; a value is not finite or
+            out of its limits; the file is not text.
+    """
+    text = decode_text(data, path)
+    lines = text.split("\n")
+    given = [number for number, content in enumerate(lines, 1) if content.strip() and content.lstrip()[0] != "#"]
+    line = np.array(given, dtype=np.int64)
+    values = _parse_fast(text, len(quantities)) if len(line) else np.zeros((0, len(quantities)))
+    if values is None or len(values) != len(line):
+        values, line = _parse_carefully(lines, line, path, quantities, warnings)
+    for index, quantity in enumerate(quantities):
+        quantity.check(values[:, index], path=path, line=line)
+    return Rows(values, line, path)
+
+
+def _parse_fast(text: str, columns: int) -> FloatArray | None:
+    try:
+        values = np.loadtxt(io.StringIO(text), comments="#", ndmin=2)
+    except ValueError:
+        return None
+    return values if values.shape[1] == columns else None
+
+
+def _parse_carefully(
+    lines: list[str], line: IntArray, path: Path, quantities: tuple[Quantity, ...], warnings: list[str]
+) -> tuple[FloatArray, IntArray]:
+    """Parse what numpy could not, to find the line at fault."""
+    values = np.empty((len(line), len(quantities)))
+    for row, number in enumerate(line):
+        cells = lines[number - 1].split("#")[0].split()
+        last = row == len(line) - 1
+        unfinished = last and number == len(lines)
+        problem: InputError | None = None
+        if len(cells) != len(quantities):
+            unfinished = last and len(cells) < len(quantities)
+            wanted = f"{len(quantities)} ({' '.join(quantity.name for quantity in quantities)})"
+            problem = InputError(f"{len(cells)} columns instead of {wanted}", path=path, line=int(number))
+        for column, (cell, quantity) in enumerate(zip(cells, quantities, strict=False)):
+            try:
+                values[row, column] = parse_float(cell)
+            except ValueError:
+                wrong = f"{quote(cell)} is not a number"
+                problem = problem or InputError(wrong, path=path, line=int(number), field=quantity.name)
+        if problem is not None and unfinished:
+            warnings.append(f"{path.name}: 1 unfinished last line ({number}) left out")
+            return values[:row], line[:row]
+        if problem is not None:
+            raise problem
+    return values, line

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,8 @@ from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.io.assemble import check_forward, last_of_equal
 from evermap.io.files import content_of, write_atomic
-from evermap.io.rows import Rows, parse_rows
 from evermap.io.spatial import unit
+from evermap.io.text import Rows, parse_rows
 from evermap.types import Clock, FloatArray, Trajectory
 from evermap.valid import QUATERNION, STAMP_S, X_M, Y_M, Z_M
 
@@ -41,12 +42,7 @@ def read_tum(
 ) -> Trajectory:
     """Return a trajectory with zero covariance, from a file that may be gzipped.
 
-    Args:
-        path: of the file.
-        frame: of the trajectory.
-        clock: of its stamps.
-        in_space: whether poses are kept as they are; else the heading is taken from the quaternion, and z and tilt are
-            left out.
+    Unless it is to be `in_space`, the heading is taken from the quaternion, and z and tilt are left out.
 
     Raises:
         InputError: the file is missing or malformed, time runs backwards, or a quaternion is not of unit length.
@@ -80,11 +76,7 @@ def poses_in_order(rows: Rows, warnings: list[str]) -> tuple[FloatArray, FloatAr
 def pose_rows(data: bytes, path: Path, warnings: list[str], *, zeros: bool = False) -> Rows:
     """Return the rows of a TUM file, stamp and pose, with quaternions at unit length.
 
-    Args:
-        data: content of the file.
-        path: of the file, for messages.
-        warnings: gets a remark on an unfinished last line.
-        zeros: whether seven zeros may stand for no pose.
+    `warnings` gets a remark on an unfinished last line; `zeros`: seven zeros may stand for no pose.
 
     Raises:
         InputError: a line is malformed, or a quaternion is not of unit length within a hundredth.
@@ -98,4 +90,4 @@ def pose_rows(data: bytes, path: Path, warnings: list[str], *, zeros: bool = Fal
     values = rows.values.copy()
     given = values[:, 4:].any(axis=1)
     values[given, 4:] = unit(values[given, 4:])
-    return Rows(path, values, rows.line)
+    return replace(rows, values=values)

@@ -15,9 +15,8 @@ from evermap.errors import InputError
 from evermap.geometry import se3
 from evermap.io.assemble import SAME_STAMP_S, finish_recording
 from evermap.io.files import FileSet, Reader, find_file_set
-from evermap.io.rows import Rows
 from evermap.io.spatial import spatial_detections
-from evermap.io.text import counted
+from evermap.io.text import Rows, counted
 from evermap.io.tum import pose_rows, poses_in_order
 from evermap.types import (
     FloatArray,
@@ -36,15 +35,10 @@ _DETECTIONS = re.compile(r"detections_(.+?)\.tum(\.gz)?")
 
 
 def read_ycbv(path: str | Path, robot: int | None = None) -> SpatialRecording:
-    """Return the recording of a folder of TUM files.
+    """Return the recording of a folder of TUM files, or a zip of it; `robot` must be None.
 
-    Args:
-        path: the folder, or a zip of it.
-        robot: must be None.
-
-    Returns:
-        Frames at the stamps of the odometry; one class an object; the camera is the robot. True landmarks are the
-        objects' typical poses over all frames that have both truths.
+    Frames are at the stamps of the odometry; one class an object; the camera is the robot. True landmarks are the
+    objects' typical poses over all frames that have both truths.
 
     Raises:
         InputError: a file is missing or malformed, with its line.
@@ -101,12 +95,12 @@ def _trajectory(files: FileSet, name: str, warnings: list[str]) -> Trajectory | 
 def _detections(files: FileSet, names: list[str], stamp_s: FloatArray, warnings: list[str]) -> SpatialDetections:
     frames, poses, kinds, lines = [], [], [], []
     for kind, name in enumerate(names):
-        rows = _seen(pose_rows(*_file(files, f"detections_{name}"), warnings, zeros=True))
+        rows = _seen(files, f"detections_{name}", warnings)
         somewhere = rows.values[:, 1:4].any(axis=1)
         if not somewhere.all():
             degenerate = counted(int(np.sum(~somewhere)), "detection")
             warnings.append(f"{rows.path.name}: {degenerate} at the camera's own place left out")
-            rows = Rows(rows.path, rows.values[somewhere], rows.line[somewhere])
+            rows = rows[np.flatnonzero(somewhere)]
         frames.append(_row_of(rows, stamp_s))
         poses.append(rows.values[:, 1:])
         kinds.append(np.full(len(rows), kind))
@@ -125,10 +119,10 @@ def _detections(files: FileSet, names: list[str], stamp_s: FloatArray, warnings:
     )
 
 
-def _seen(rows: Rows) -> Rows:
-    """The rows that are not seven zeros."""
-    seen = rows.values[:, 1:].any(axis=1)
-    return Rows(rows.path, rows.values[seen], rows.line[seen])
+def _seen(files: FileSet, name: str, warnings: list[str]) -> Rows:
+    """The rows of a file that are not seven zeros."""
+    rows = pose_rows(*_file(files, name), warnings, zeros=True)
+    return rows[np.flatnonzero(rows.values[:, 1:].any(axis=1))]
 
 
 def _row_of(rows: Rows, stamp_s: FloatArray) -> IntArray:
@@ -146,7 +140,7 @@ def _true_landmarks(files: FileSet, names: list[str], truth: Trajectory, warning
     for name in names:
         if _name(files, f"object_truth_{name}") is None:
             continue
-        rows = _seen(pose_rows(*_file(files, f"object_truth_{name}"), warnings, zeros=True))
+        rows = _seen(files, f"object_truth_{name}", warnings)
         both = np.isin(rows.column(0).round(6), truth.stamp_s.round(6))
         at = np.searchsorted(truth.stamp_s, rows.column(0)[both] - SAME_STAMP_S)
         if len(at):

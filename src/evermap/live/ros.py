@@ -28,7 +28,7 @@ from evermap.io.bag import (
     stated_settings,
 )
 from evermap.io.bag_messages import OBJECT_FIELDS, POSES, BagContent, SeenColumns, handler_of, objects_in_space
-from evermap.io.cdr import Cdr
+from evermap.io.cdr import parts_of
 from evermap.io.rosbag import Topic, pose_of, ros2_types, seconds, stamp_of
 from evermap.live.engine import Engine
 from evermap.live.feed import Reading, SensorLook, Velocity, in_time
@@ -97,7 +97,7 @@ class Listener:
 
     def __init__(self, sensor: Sensor, stated: Path | None, say: Callable[[str], None]) -> None:
         self._mount, self._say = np.array(sensor.mount_robot_sensor), say
-        self._types, self._content = Cdr(ros2_types()), BagContent()
+        self._types, self._content = ros2_types(), BagContent()
         self._handlers: dict[str, Any] = {}
         self._sources: dict[str, object] = {}
         self._said: set[str] = set()
@@ -131,7 +131,7 @@ class Listener:
         if (looks := self._objects(message)) is not None:
             return looks
         try:
-            handler(self._types.decode(message.raw, message.kind), message.received_s)
+            handler(self._types.deserialize_cdr(message.raw, message.kind), message.received_s)
         except KeyError:
             self._once(f"the type {message.kind} of {message.topic} is unknown: it is not read")
             return []
@@ -158,7 +158,7 @@ class Listener:
             return None
         if topic not in [one.topic for one in self.settings.sensors.values()]:
             return []
-        if (parts := self._types.parts(message.raw, message.kind, OBJECT_FIELDS)) is None:
+        if (parts := parts_of(message.raw, message.kind, OBJECT_FIELDS)) is None:
             return None
         look = content.take_look(topic, parts.stamp_s, message.received_s, parts.frame)
         try:

@@ -63,11 +63,7 @@ class Company(Shown):
         return cls(names, SitesPosterior.of(stay), SitesPosterior.of(absence, improper=True), tuple(sites))
 
     def lifetimes(self, site: int | None = None) -> dict[str, Lifetimes]:
-        """Return the lifetimes of all classes at a site, '' for a class that no site has.
-
-        Args:
-            site: its number; None for a site that has no map yet.
-        """
+        """Return the lifetimes of all classes at a site, '' for a class that no site has; None for a new site."""
         of_stays, of_absences = (None, None) if site is None else _aligned(self.sites[site], self.class_names)
         stay, absence = self.stay.site(of_stays), self.absence.site(of_absences)
         rows = {name: row for row, name in enumerate(self.class_names) if name}
@@ -91,23 +87,16 @@ def collect(
     cluster: str | None = None,
     progress: Progress | None = None,
 ) -> list[ClassEvidence]:
-    """Return the evidence of each of many maps on its classes, in their order.
+    """Return the evidence of each of many maps (files or addresses) on its classes, in their order.
 
-    Args:
-        maps: files or addresses; the workers of a cluster reach them under the same names.
-        settings: what is learned from.
-        workers: processes on this machine, by Dask; 1 for this one alone. None: one for each core, if Dask is there.
-        cluster: address of a Dask scheduler, as tcp://host:8786, in the place of processes here.
-        progress: told after every map.
+    How the work is spread is as of `spread_over`; workers of a cluster reach the maps under the same names.
 
     Raises:
         InputError: a map that is missing or damaged.
-        MissingExtraError: workers or a cluster are asked for, and Dask is not installed.
-        ConfigError: no scheduler answers, a worker dies, or has no evermap.
+        MissingExtraError, ConfigError: as `spread_over`.
     """
-    found = spread_over(
-        maps, partial(_evidence, settings=settings), workers=workers, cluster=cluster, progress=progress
-    )
+    evidence = partial(_evidence, settings=settings)
+    found = spread_over(maps, evidence, workers=workers, cluster=cluster, progress=progress)
     for site in found:
         if isinstance(site, EvermapError):
             raise site
@@ -124,20 +113,13 @@ def reenter_all(
     cluster: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Reentered | EvermapError]:
-    """Enter all sessions of many maps again (`runs.sessions.reenter`); returns the results by site.
+    """Enter all sessions of many maps, by the names of their sites, again (`sessions.reenter`); return the results.
 
-    Args:
-        maps: files or addresses by the names of their sites; the workers of a cluster reach them, and `out`, under the
-            same names.
-        out: folder of the copies, `SITE.evermap`, from which an attempt that was stopped is continued.
-        config: settings of all sessions; None for those of each.
-        adopt: append them to the maps.
-        workers: and what follows it as `collect` takes them.
-        cluster: address of a Dask scheduler.
-        progress: told after every map.
+    Copies, `SITE.evermap` in the folder `out`, are what an attempt that was stopped is continued from. How the work is
+    spread is as of `spread_over`; workers of a cluster reach the maps and `out` under the same names.
 
     Raises:
-        MissingExtraError, ConfigError: as `collect`; what is wrong with a map is its result.
+        MissingExtraError, ConfigError: as `spread_over`; what is wrong with a map is its result.
     """
     works = {where: out / f"{site}.evermap" for site, where in maps.items()}
     again = partial(_again, works=works, config=config, adopt=adopt)
@@ -158,12 +140,13 @@ def spread_over(
     Args:
         items: the names.
         apply: the function; an `EvermapError` that it raises is its answer, as Dask would raise another.
-        workers: and what follows it as `collect` takes them.
-        cluster: address of a Dask scheduler.
+        workers: processes on this machine, by Dask; 1 for this one alone. None: one for each core, if Dask is there.
+        cluster: address of a Dask scheduler, as tcp://host:8786, in the place of processes here.
         progress: told after every one.
 
     Raises:
-        MissingExtraError, ConfigError: as `collect`.
+        MissingExtraError: workers or a cluster are asked for, and Dask is not installed.
+        ConfigError: no scheduler answers, a worker dies, or has no evermap.
     """
     found: dict[int, Any] = {}
     with _spread(len(items), workers, cluster) as spread:
@@ -245,7 +228,6 @@ def _on_dask(client: Client, apply: Callable[[str], Any], items: Sequence[str]) 
             yield number, future.result()
         except (KilledWorker, ModuleNotFoundError) as error:
             problem = f"a worker crashed, or has no evermap: {error}"
-            raise ConfigError(
-                problem, path=items[number], hint="more memory; the same evermap on all workers"
-            ) from error
+            hint = "more memory; the same evermap on all workers"
+            raise ConfigError(problem, path=items[number], hint=hint) from error
         future.release()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,12 +43,17 @@ def write_looks(path: str | Path) -> Path:
     Raises:
         InputError: the file exists, or cannot be written.
     """
-    return write_new(path, csv_text(_look_columns(), comment=_ABOUT_LOOKS))
+    columns = _columns(("stamp_s", "feature_id", "class_id", "detected", "present"), _looks())
+    return write_new(path, csv_text(columns, comment=_ABOUT_LOOKS))
 
 
-def _look_columns() -> dict[str, Any]:
+def _columns(names: Sequence[str], rows: Iterable[tuple[str, ...]]) -> dict[str, list[str]]:
+    return dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
+
+
+def _looks() -> Iterator[tuple[str, ...]]:
+    """Cells of each row."""
     random = np.random.default_rng(8)
-    columns: dict[str, list[str]] = {"stamp_s": [], "feature_id": [], "class_id": [], "detected": [], "present": []}
     for day in range(_WEEK_DAYS):
         for hour in np.arange(8.0, 18.0, 0.5):  # half-hourly patrols, by day only
             stamp_s = day * _DAY_S + hour * _HOUR_S + float(random.integers(0, 900))
@@ -57,15 +62,9 @@ def _look_columns() -> dict[str, Any]:
                     continue  # not in view this time
                 there = any(begin <= stamp_s / _DAY_S < end for begin, end in stays)
                 detected = random.random() < (1.0 - _P_MISS if there else _P_FALSE)
-                _append(columns, stamp_s, name, kind, str(int(detected)), str(int(there)))
+                yield f"{stamp_s:.0f}", name, kind, str(int(detected)), str(int(there))
     for name, (kind, _) in _THERE_DAYS.items():
-        _append(columns, (_WEEK_DAYS + 1) * _DAY_S, name, kind, "", "")
-    return columns
-
-
-def _append(columns: dict[str, list[str]], stamp_s: float, *cells: str) -> None:
-    for column, cell in zip(columns.values(), (f"{stamp_s:.0f}", *cells), strict=True):
-        column.append(cell)
+        yield f"{(_WEEK_DAYS + 1) * _DAY_S:.0f}", name, kind, "", ""
 
 
 # ------------------------------------------- detections: a robot passes through a yard seven times a day
@@ -103,13 +102,8 @@ def write_detections(path: str | Path) -> Path:
     Raises:
         InputError: the file exists, or cannot be written.
     """
-    columns: dict[str, list[str]] = {
-        name: []
-        for name in ("stamp_s", "class_id", "x_m", "y_m", "z_m", "sigma_m", "sensor_x_m", "sensor_y_m", "sensor_z_m")
-    }
-    for cells in _rows(np.random.default_rng(12)):
-        for column, cell in zip(columns.values(), cells, strict=True):
-            column.append(cell)
+    names = ("stamp_s", "class_id", "x_m", "y_m", "z_m", "sigma_m", "sensor_x_m", "sensor_y_m", "sensor_z_m")
+    columns = _columns(names, _rows(np.random.default_rng(12)))
     return write_new(path, csv_text(columns, comment=_ABOUT_DETECTIONS))
 
 

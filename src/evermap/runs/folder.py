@@ -23,11 +23,11 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack
 
 from evermap import __version__
-from evermap.errors import ConfigError
+from evermap.errors import ConfigError, MissingExtraError
 from evermap.interrupts import held, kept, temporary
 from evermap.io.files import write_atomic
 from evermap.runs.summary import SUMMARY_SCHEMA_VERSION, RunInfo, change_dict, changes_text, summary_dict, timing_dict
-from evermap.types import AnyRecording, Innovations, SlamResult
+from evermap.types import AnyRecording, SlamResult
 
 if TYPE_CHECKING:
     from evermap.metrics.summary import Evaluation
@@ -101,10 +101,8 @@ class RunFolder:
     def finish(self, summary: dict[str, Any], *more: str) -> dict[str, Any]:
         """Write `summary.json` and return its content as plain JSON values, with the names of all files as `outputs`.
 
-        Args:
-            summary: content; what is missing of the keys that every summary has is added. Settings of a study are its
-                configuration.
-            more: names of files that are still to be written.
+        What is missing of the keys that every summary has is added; settings of a study are its configuration. Files of
+        the names in `more` are still to be written.
         """
         head = {
             "schema_version": SUMMARY_SCHEMA_VERSION,
@@ -181,9 +179,8 @@ class RunFolder:
         except OSError:
             return refused
         kept(beside, f"the results are in {beside}")
-        return ConfigError(
-            f"{refused.problem}; the new results are in {beside}", path=self.out, field="out", hint=refused.hint
-        )
+        problem = f"{refused.problem}; the new results are in {beside}"
+        return ConfigError(problem, path=self.out, field="out", hint=refused.hint)
 
 
 def check_replaceable(
@@ -191,12 +188,9 @@ def check_replaceable(
 ) -> None:
     """Check that results may be written to `out`: it does not exist, is empty, or holds an output of evermap alone.
 
-    Args:
-        out: the folder.
-        force: it may hold other files, too; they will stay. Not those of an older run that were changed since: they
-            are in the way of the new ones.
-        inputs: files and folders that are read; none may be `out` or in it, whatever `force` says. They need not exist.
-        renew: an older output of evermap may be replaced without `force`.
+    With `force` it may hold other files, too, but none of an older run that was changed since: it is in the way of the
+    new one. None of the `inputs`, which need not exist, may be `out` or in it, whatever `force` says. Without `renew`
+    an older output of evermap needs `force`, too.
 
     Raises:
         ConfigError: what is wrong with it.
@@ -208,30 +202,24 @@ def check_replaceable(
         raise ConfigError("would replace the working or home folder", path=out, field="out", hint="a folder below it")
     for path in (one for one in inputs if one):
         if any(_is_within(place, folder) for place in _real_places(Path(path)) for folder in (out, shown.absolute())):
-            raise ConfigError(
-                f"contains '{path}', which this command reads", path=out, field="out", hint="a separate folder"
-            )
+            problem = f"contains '{path}', which this command reads"
+            raise ConfigError(problem, path=out, field="out", hint="a separate folder")
     if not out.exists():
         return
     ours, foreign = _whose(out)
     if not force and not renew and (ours or foreign):
         raise ConfigError("is not empty", path=out, field="out", hint="another folder, or `force` to write into it")
     listed = _manifest(out)
-    in_the_way = [name for name in foreign if not force or name in listed or name == SUMMARY]
-    if in_the_way:
-        name = in_the_way[0]
+    for name in (one for one in foreign if not force or one in listed or one == SUMMARY):
         what = "which was changed since evermap wrote it" if name in listed else "which no evermap run wrote"
         hint = "another folder" if force else "another folder, or `force` to keep it and write into the folder"
         raise ConfigError(f"contains '{name}', {what}", path=out, field="out", hint=hint)
 
 
 def check_output_file(path: str | Path, *, inputs: Iterable[str | Path | None] = (), ending: str = "") -> None:
-    """Check that a single file may be written: it is not an input, and no living map.
+    """Check that a single file may be written: it is none of the inputs, and no living map.
 
-    Args:
-        path: the file; an older one of that name is replaced.
-        inputs: files and folders that are read.
-        ending: only an older file of this ending is replaced.
+    An older file of that name is replaced; if an `ending` is given, only one that has it.
 
     Raises:
         ConfigError: what is wrong with it.
@@ -399,14 +387,14 @@ def write_run(
     """Evaluate a run and write its folder; return the content of `summary.json`.
 
     Args:
-        out: the folder; an older run there is replaced at the end (see `RunFolder`).
+        out: the folder, with `force` and `inputs` (beside the recording's) as of `RunFolder`.
         recording: what was processed.
         result: what came out.
         config: a `Config`, or any mapping that JSON can hold; None if there is none.
         info: what the numbers alone cannot say: command, seeds, measured times.
         sections: parts that the caller adds to the report.
-        force: write into a folder that holds other files, too; they stay.
-        inputs: files and folders that were read, beside the recording's.
+        force: see `out`.
+        inputs: see `out`.
         asked: `figures`, `report`, `scene` or `mcap`, see `Asked`.
 
     Raises:
@@ -424,7 +412,11 @@ def write_run(
         _write_estimates(folder, result)
         draw = _choose(asked.get("figures"), wanted, "figures")
         tell = _choose(asked.get("report"), wanted, "report")
-        drawn = _draw(recording, result, evaluation, timing) if draw or tell else ()
+        drawn: tuple[NamedFigure, ...] = ()
+        if draw or tell:
+            from evermap.viz.run_figures import draw_figures
+
+            drawn = draw_figures(recording, result, evaluation, real_time_factor=timing["real_time_factor"])
         if draw:
             _write_figures(folder, drawn)
         remarks = _write_extras(folder, recording, result, evaluation, asked, wanted)
@@ -459,6 +451,7 @@ def _plain(config: Any) -> Any:
 
 def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
     from evermap.io.landmarks import write_map_geojson, write_map_parquet
+    from evermap.io.table import parquet_bytes
     from evermap.io.tum import write_tum
     from evermap.runs.object_changes import object_changes_text
 
@@ -468,7 +461,7 @@ def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
     write_map_geojson(result.landmarks, folder.path("map.geojson"))
     for rank, alternative in enumerate(result.alternatives, start=1):
         write_map_geojson(alternative.landmarks, folder.path(f"alternative_{rank}.geojson"))
-    _write_innovations(result.innovations, folder.path("innovations.parquet"))
+    folder.path("innovations.parquet").write_bytes(parquet_bytes(result.innovations._columns()))
     folder.path("changes.jsonl").write_text(changes_text(map(change_dict, result.changes)), encoding="utf-8")
     folder.path("object_changes.csv").write_text(object_changes_text(result), encoding="utf-8")
     if result.followed is not None:
@@ -476,21 +469,6 @@ def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
 
         for name, content in track_files(result.followed).items():
             folder.path(name).write_bytes(content())
-
-
-def _write_innovations(innovations: Innovations, path: Path) -> None:
-    """Write one row per detection with a prediction; columns as the attributes of `Innovations`."""
-    from evermap.io.table import parquet_bytes
-
-    path.write_bytes(parquet_bytes(innovations._columns()))
-
-
-def _draw(
-    recording: AnyRecording, result: SlamResult, evaluation: Evaluation, timing: Mapping[str, Any]
-) -> tuple[NamedFigure, ...]:
-    from evermap.viz.run_figures import draw_figures
-
-    return draw_figures(recording, result, evaluation, real_time_factor=timing["real_time_factor"])
 
 
 def _write_figures(folder: RunFolder, figures: Sequence[NamedFigure]) -> None:
@@ -511,19 +489,17 @@ def _write_extras(
         from evermap.viz.rerun_scene import write_scene
 
         scene = partial(write_scene, recording, result, folder.path("scene.rrd"), evaluation=evaluation)
-        remarks += _if_installed("scene.rrd", scene, must=asked.get("scene") is True)
+        remarks += if_installed("scene.rrd", scene, must=asked.get("scene") is True)
     if _choose(asked.get("mcap"), wanted, "mcap", default=False):
         from evermap.runs.mcap import write_mcap
 
         messages = partial(write_mcap, recording, result, folder.path("run.mcap"))
-        remarks += _if_installed("run.mcap", messages, must=asked.get("mcap") is True)
+        remarks += if_installed("run.mcap", messages, must=asked.get("mcap") is True)
     return remarks
 
 
-def _if_installed(name: str, write: Callable[[], object], *, must: bool) -> list[str]:
-    """Writes a file for which a package may be missing; where it is only a default, a remark says so then."""
-    from evermap.errors import MissingExtraError
-
+def if_installed(name: str, write: Callable[[], object], *, must: bool = False) -> list[str]:
+    """Write a file for which a package may be missing; return a remark then, unless it must be written."""
     try:
         write()
     except MissingExtraError as error:

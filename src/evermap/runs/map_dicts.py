@@ -6,16 +6,16 @@ import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from evermap.io.landmarks import labels_of
+from evermap.io.spatial import AT
 from evermap.runs.summary import change_dict
-from evermap.types import UNKNOWN, FloatArray, json_number
+from evermap.types import FloatArray, json_number
 
 if TYPE_CHECKING:
     from evermap.maps.diff import Difference
     from evermap.maps.living import LivingMap
     from evermap.maps.store import MapStore, Revision
     from evermap.maps.why import Answer
-
-AXES = ("x_m", "y_m", "z_m")
 
 
 def revision_dict(item: Revision) -> dict[str, Any]:
@@ -37,18 +37,14 @@ def revision_dict(item: Revision) -> dict[str, Any]:
 
 
 def landmark_dicts(living: LivingMap, p_ahead: FloatArray | None = None) -> list[dict[str, Any]]:
-    """Return every landmark at its most probable place.
-
-    Args:
-        living: the map.
-        p_ahead: (L,) probability that each stands there at the time that was asked for; None for the map's own.
-    """
+    """Return every landmark at its most probable place; `p_ahead` (L,) is P(exists) at another time than the map's."""
     import numpy as np
 
     from evermap.geometry.chunked import blocks
     from evermap.maps.living import clique_rows
 
     members, site = living.members, living.site_of()
+    classes = labels_of(members.class_id, living.class_names)
     place = living.place_row(members.landmark_id, site)
     p_exists = living.p_exists()
     p_ahead = p_exists if p_ahead is None else p_ahead
@@ -64,11 +60,11 @@ def landmark_dicts(living: LivingMap, p_ahead: FloatArray | None = None) -> list
             {
                 "landmark": int(members.landmark_id[row]),
                 "label": living.label(int(members.landmark_id[row])),
-                "class": class_name(living, int(members.class_id[row])),
+                "class": classes[row],
                 "clique": int(members.clique_id[row]),
                 "p_exists": float(p_exists[row]),
                 "p_ahead": json_number(float(p_ahead[row])),
-                **dict(zip(AXES, at_m, strict=False)),
+                **dict(zip(AT, at_m, strict=False)),
                 **({"rotation": _rotation(living, int(place[row]))} if living.dim == 3 else {}),
                 "sigma_m": float(np.sqrt(np.trace(own[place[row]]) / living.dim)) if placed else None,
                 "since_s": json_number(float(living.sites.since_s[at[row]])) if placed else None,
@@ -90,12 +86,7 @@ def _rotation(living: LivingMap, place: int) -> list[float] | None:
 
 
 def pose_dicts(store: MapStore, revision: int | None = None, at_s: float = math.inf) -> list[dict[str, Any]]:
-    """Return where each robot was in its newest session, with the path that it had driven in it.
-
-    Args:
-        store: the map.
-        revision: whose sessions; None for the newest.
-        at_s: leave out what is later.
+    """Return where each robot was in its newest session of a revision until a time, with the path that it had driven.
 
     Raises:
         DamagedMapError: a path is not what was written.
@@ -131,14 +122,15 @@ def prior_dicts(living: LivingMap) -> list[dict[str, Any]]:
     """Return what users said of lifetimes, by class; '' for all classes of which they said nothing."""
     from evermap.survival.text import prior_text
 
+    names = labels_of(living.lives.prior_class_id, living.class_names)
     return [
         {
-            "class": class_name(living, class_id),
+            "class": name,
             "stay": prior_text(life.stay),
             "absence": prior_text(life.absence) if life.tells_absence else None,
             "worth_stays": life.n_stays,
         }
-        for class_id, life in zip(living.lives.prior_class_id.tolist(), living.lives.prior, strict=True)
+        for name, life in zip(names, living.lives.prior, strict=True)
     ]
 
 
@@ -147,10 +139,10 @@ def life_dicts(living: LivingMap) -> list[dict[str, Any]]:
     from evermap.maps.lives import EVERYWHERE
     from evermap.survival.text import prior_text
 
-    lives = living.lives
+    lives, names = living.lives, labels_of(living.lives.class_id, living.class_names)
     return [
         {
-            "class": class_name(living, class_id),
+            "class": name,
             "chunk": None if EVERYWHERE in chunk else chunk,
             "chunk_m": lives.chunk_m,
             "stay": prior_text(life.stay),
@@ -158,7 +150,7 @@ def life_dicts(living: LivingMap) -> list[dict[str, Any]]:
             "stays": life.n_stays,
             "stays_that_ended": life.n_ended,
         }
-        for class_id, chunk, life in zip(lives.class_id.tolist(), lives.chunk.tolist(), lives.life, strict=True)
+        for name, chunk, life in zip(names, lives.chunk.tolist(), lives.life, strict=True)
     ]
 
 
@@ -214,13 +206,6 @@ def answer_dict(answer: Answer) -> dict[str, Any]:
             "p_exists": [json_number(value) for value in seen.p_exists.tolist()],
         },
     }
-
-
-def class_name(living: LivingMap, class_id: int) -> str:
-    """Return '' for a class that is not known, its number for one without a name."""
-    if class_id == UNKNOWN:
-        return ""
-    return living.class_names[class_id] if class_id < len(living.class_names) else str(class_id)
 
 
 def diff_dict(found: Difference) -> dict[str, Any]:

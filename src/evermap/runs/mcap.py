@@ -28,7 +28,6 @@ from evermap.types import (
     SlamResult,
     SpatialRecording,
     Trajectory,
-    rows_of,
 )
 
 TOPICS = {
@@ -64,9 +63,8 @@ def write_mcap(recording: AnyRecording, result: SlamResult, path: Path) -> None:
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
     except ImportError:
-        raise MissingExtraError(
-            "MCAP needs the package rosbags, which is not installed", hint="pip install 'evermap[ros]'"
-        ) from None
+        problem = "MCAP needs the package rosbags, which is not installed"
+        raise MissingExtraError(problem, hint="pip install 'evermap[ros]'") from None
     ros = Ros(ros2_types())
     with tempfile.TemporaryDirectory() as folder:
         with Writer(Path(folder) / "run", version=8, storage_plugin=StoragePlugin.MCAP) as bag:
@@ -160,8 +158,7 @@ def _motion(ros: Ros, recording: AnyRecording, result: SlamResult) -> Iterator[_
     known = len(alone) == len(poses)
     drift = se3.compose(poses, se3.inverse(alone)) if known else poses
     for row, stamp_s in enumerate(path.stamp_s.tolist()):
-        frames = [("map", "odom", drift[row])]
-        frames.append(("odom", "base_link", alone[row] if known else se3.identity()))
+        frames = [("map", "odom", drift[row]), ("odom", "base_link", alone[row] if known else se3.identity())]
         yield stamp_s, "/tf", ros.transforms(stamp_s, frames)
         if known:
             yield stamp_s, "/odom", ros.odometry(stamp_s, alone[row])
@@ -231,7 +228,7 @@ def _detections(ros: Ros, recording: AnyRecording) -> Iterator[_Stamped]:
         spread = np.zeros((len(seen), 6, 6))
         ids, frames, classes = seen.landmark_id, seen.frame, seen.class_id
     else:
-        flat = rows_of(recording.detections, np.isfinite(recording.detections.bearing_rad))  # a position takes both
+        flat = recording.detections[np.isfinite(recording.detections.bearing_rad)]  # a position takes both
         ids, frames, classes = flat.landmark_id, flat.frame, flat.class_id
         bearing, zero = flat.bearing_rad, np.zeros(len(flat))
         at = np.stack([flat.range_m * np.cos(bearing), flat.range_m * np.sin(bearing), zero], axis=1)
@@ -266,17 +263,13 @@ def _map(ros: Ros, landmarks: Landmarks, start_s: float) -> Iterator[_Stamped]:
 
 
 def drawn(ros: Ros, landmarks: Landmarks, stamp_s: FloatArray) -> Iterator[tuple[Any, Any]]:
-    """Yield a marker and an entity of a scene for each landmark, as opaque as it probably exists.
-
-    Args:
-        ros: makes the messages.
-        landmarks: (L) what to draw.
-        stamp_s: (L,) from when on.
-    """
+    """Yield a marker and a scene entity for each landmark from `stamp_s` (L,) on, as opaque as it probably exists."""
     from evermap.viz.rerun_scene import rgb
     from evermap.viz.style import LANDMARK
 
-    pose, size = poses_of(landmarks), _sizes(landmarks)
+    pose = poses_of(landmarks)
+    size = np.full((len(landmarks), 3), np.nan) if landmarks.size_m is None else landmarks.size_m
+    size = np.where(np.isnan(size), POINT_M, np.maximum(size, PLATE_M))
     labels = labels_of(landmarks.class_id, landmarks.class_names)
     none, tint = ros.make("builtin_interfaces/Duration", 0, 0), rgb(LANDMARK)
     nothing = np.zeros(0, dtype=np.uint8)
@@ -311,11 +304,6 @@ def poses_of(landmarks: Landmarks) -> FloatArray:
     return np.hstack([at, np.where(np.isnan(turn), se3.NO_TURN, turn)])
 
 
-def _sizes(landmarks: Landmarks) -> FloatArray:
-    size = np.full((len(landmarks), 3), np.nan) if landmarks.size_m is None else landmarks.size_m
-    return np.where(np.isnan(size), POINT_M, np.maximum(size, PLATE_M))
-
-
 def _entity(
     ros: Ros, stamp_s: float, name: str, body: Any, said: Mapping[str, str], text: str, pose: FloatArray
 ) -> Any:
@@ -348,14 +336,9 @@ def _changes(ros: Ros, result: SlamResult, start_s: float) -> Iterator[_Stamped]
 
 
 def told(ros: Ros, change: MapChange, stamp_s: float, name: str, there: Mapping[int, FloatArray]) -> tuple[Any, Any]:
-    """Return a change as a line and as an arrow in a scene, which is None if none of its landmarks is known.
+    """Return a change as a line and as a named arrow in a scene from `stamp_s` on, or None without a known landmark.
 
-    Args:
-        ros: makes the messages.
-        change: what changed.
-        stamp_s: from when on it is shown.
-        name: of the arrow.
-        there: (3,) positions of landmarks by their ids, after the change.
+    `there` has positions (3,) of landmarks by their ids, after the change.
     """
     from evermap.viz.rerun_scene import rgb
     from evermap.viz.style import ALERT

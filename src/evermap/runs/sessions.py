@@ -16,7 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evermap import __version__
-from evermap.errors import DataError, EvermapError, InputError, printable
+from evermap.config import Config, parse_config, to_toml
+from evermap.errors import ConfigError, DataError, EvermapError, InputError, printable
+from evermap.maps.diff import edits, grown, net
+from evermap.maps.living import LivingMap
 from evermap.maps.store import (
     Attachment,
     MapStore,
@@ -27,17 +30,18 @@ from evermap.maps.store import (
     StaleRevisionError,
     open_store,
 )
+from evermap.maps.store.content import DamagedError
+from evermap.maps.store.measured import RECORDING, TRAJECTORY, pack_recording, pack_trajectory, unpack_recording
 from evermap.show import Shown
 from evermap.types import Progress
+from evermap.valid import check_type
 
 if TYPE_CHECKING:
-    from evermap.config import Config
     from evermap.existence.lifetimes import Lifetimes
     from evermap.maps.lives import Life
-    from evermap.maps.living import LivingMap
     from evermap.maps.sessions.session import Session
     from evermap.maps.store.sql import SqlStore
-    from evermap.types import AnyRecording, IntArray, Landmarks, MapChange
+    from evermap.types import AnyRecording, Clock, IntArray, Landmarks, MapChange
 
 
 class TwiceError(InputError):
@@ -81,8 +85,6 @@ class Entered(Shown):
     @property
     def grown(self) -> IntArray:
         """New landmarks whose appearance was not observed."""
-        from evermap.maps.diff import grown
-
         return grown(self.newest.members.landmark_id, self.living, self.changes)
 
     def commit(
@@ -93,10 +95,10 @@ class Entered(Shown):
         command: str = "",
         wall_s: float = np.nan,
     ) -> int:
-        """Commit the map as the next revision; returns its number.
+        """Commit the map as the next revision of the store that the session was entered into; returns its number.
 
         Args:
-            store: that the session was entered into.
+            store: the map.
             config: settings of the session, as `enter_session` was given them.
             command: the command line.
             wall_s: what estimating took.
@@ -104,9 +106,6 @@ class Entered(Shown):
         Raises:
             StaleRevisionError: another commit came in between.
         """
-        from evermap.config import Config, to_toml
-        from evermap.maps.store.measured import TRAJECTORY, pack_trajectory
-
         config, recording = config or Config(), self.session.recording
         stamps = recording.frames.stamp_s
         provenance = Provenance(
@@ -153,7 +152,7 @@ def enter_session(
 
     Args:
         store: the map.
-        recording: the session, in space where those of the map are.
+        recording: in space where the sessions of the map are.
         config: settings of this session; the others are brought in again with their own.
         priors: how long things of a class stay, and stay away, as `maps.learning.with_priors` takes them; they stay in
             the map.
@@ -167,11 +166,8 @@ def enter_session(
         UnbridgedError: it is late, and with it a later session of the map is not found any more.
         DataError, NumericalError: as `pipeline.run_session`.
     """
-    from evermap.config import Config
     from evermap.maps.learning import with_priors
-    from evermap.maps.store.measured import RECORDING, pack_recording
     from evermap.pipeline import run_session
-    from evermap.valid import check_type
 
     check_type(recording)
     head = store.head()
@@ -186,32 +182,20 @@ def enter_session(
     if not start_s < newest.session_start_s:
         session = run_session(recording, said, config, progress=progress)
         return Entered(session, newest, session.living, session.changes, (), head, {RECORDING: data})
-    late = _enter_late(store, recording, said, config, _history(store, head), data, progress)
-    return replace(late, parent=head)  # whatever came in since `head` was read makes the commit stale
+    return _enter_late(store, head, recording, said, config, data, progress)
 
 
 def begin_map(store: MapStore, landmarks: Landmarks, recording: AnyRecording, source: str) -> int:
-    """Commit surveyed landmarks as the first revision of an empty map; returns its number.
+    """Commit surveyed landmarks with covariances as the first revision of an empty map; returns its number.
 
-    Args:
-        store: the map.
-        landmarks: with covariances; what is not stated must have a value.
-        recording: the first session, whose clock the map has, and whose classes.
-        source: where they come from.
+    The map has the clock of the first session's recording; `source` says where the landmarks come from.
 
     Raises:
         ConfigError: the map has landmarks already.
     """
-    from evermap.errors import ConfigError
-    from evermap.maps.living import LivingMap
-
     if len(store.load().places):
-        raise ConfigError(
-            "this map has landmarks already",
-            field="prior_map",
-            path=store.where,
-            hint="only a new map can begin with a prior map",
-        )
+        hint = "only a new map can begin with a prior map"
+        raise ConfigError("this map has landmarks already", field="prior_map", path=store.where, hint=hint)
     living = replace(LivingMap.begun(landmarks), clock=recording.clock)
     said = Provenance(kind=RevisionKind.EDIT, source=source, note=f"{len(landmarks)} surveyed landmarks")
     return store.commit(living, said, parent=store.head())
@@ -227,14 +211,9 @@ WORDS: Mapping[str, Mapping[str, bool]] = {
 def edit_landmarks(
     store: MapStore, landmarks: Sequence[str], word: str, *, note: str = "", command: str = ""
 ) -> tuple[int, tuple[int, ...], str]:
-    """Commit an operator's edit of landmarks, unless it changes nothing.
+    """Commit an operator's edit of landmarks (ids or names) by one of `WORDS`, unless it changes nothing.
 
-    Args:
-        store: the map.
-        landmarks: ids or names.
-        word: one of `WORDS`.
-        note: added to what the log says.
-        command: what was typed.
+    The log gets the `note`, and the `command` that was typed.
 
     Returns:
         The newest revision, the landmarks that changed, and what the log says.
@@ -243,8 +222,6 @@ def edit_landmarks(
         InputError: a landmark is not in the map.
         StaleRevisionError: another commit came in between.
     """
-    from evermap.maps.diff import edits
-
     parent = store.head()
     before = after = store.load(parent)
     for name in landmarks:
@@ -264,20 +241,20 @@ def edit_landmarks(
 
 def _enter_late(
     store: MapStore,
+    head: int,
     recording: AnyRecording,
     newest: LivingMap,
     config: Config | None,
-    steps: list[_Step],
     data: bytes,
     progress: Progress | None,
 ) -> Entered:
-    """A session that belongs before some of the steps of the history: these are taken once more, after it."""
-    from evermap.config import Config
-    from evermap.maps.diff import net
-    from evermap.maps.store.measured import RECORDING
+    """A session that belongs before some of the steps of the history: these are taken once more, after it.
+
+    Whatever came in since `head` was read makes the commit stale.
+    """
     from evermap.pipeline import run_session
 
-    head, start_s = store.head(), float(recording.frames.stamp_s[0])
+    steps, start_s = _history(store, head), float(recording.frames.stamp_s[0])
     first = _first_again(steps, start_s)
     parent = steps[first].revision.parent
     try:
@@ -289,12 +266,7 @@ def _enter_late(
     later = sorted(steps[first:], key=lambda step: step.start_s)
     # ids that were given since are not given again
     living = replace(base, n_cliques_ever=newest.n_cliques_ever, n_sites_ever=newest.n_sites_ever)
-    # what users said of lifetimes is of no time
-    names, lives = newest.class_names, newest.lives
-    lives = replace(base.lives, prior_class_id=lives.prior_class_id, prior=lives.prior)
-    living = replace(living, class_names=names, lives=lives) if len(lives.prior) else living
-    if not len(living.places):
-        living = replace(living, clock=recording.clock)
+    living = _with_words(living, newest, recording.clock)
     told = [(store.changes(step.revision.number)[::-1], True) for step in reversed(steps[first:])]
     for step in (step for step in later if step.start_s <= start_s):
         living, changes = _again(store, step, living)
@@ -326,12 +298,8 @@ def _first_again(steps: Sequence[_Step], start_s: float) -> int:
 
 
 def at_time(store: MapStore, stamp_s: float) -> LivingMap:
-    """Return the map of a store as it was at a time: of the last revision whose sessions had all begun; the first for
-    earlier.
-
-    Args:
-        store: the map.
-        stamp_s: seconds of its clock.
+    """Return the map of a store as it was at a time [s]: of the last revision whose sessions had all begun; the first
+    for earlier.
     """
     living = store.load()
     if not stamp_s < living.session_start_s:
@@ -377,9 +345,6 @@ def _kept_recording(store: MapStore, kept: Attachment, number: int) -> AnyRecord
     Raises:
         InputError: this evermap cannot read it.
     """
-    from evermap.maps.store.content import DamagedError
-    from evermap.maps.store.measured import unpack_recording
-
     try:
         return unpack_recording(store.attached(kept))
     except DamagedError as error:
@@ -410,8 +375,6 @@ def _ends(recording: AnyRecording) -> tuple[float, float]:
 
 def _recordings(store: MapStore, head: int) -> dict[int, Attachment]:
     """Stored recordings of a revision and those before it."""
-    from evermap.maps.store.measured import RECORDING
-
     return {item.revision: item for item in store.attachments(store.lineage(head)) if item.name == RECORDING}
 
 
@@ -448,8 +411,6 @@ def _again(store: MapStore, step: _Step, living: LivingMap) -> tuple[LivingMap, 
 
 
 def _edited_again(store: MapStore, step: _Step, living: LivingMap) -> LivingMap:
-    from evermap.maps.diff import edits
-
     for landmark, word in edits(store.members(step.revision.parent), store.members(step.revision.number)):
         if landmark in living.members.landmark_id:
             living = living.edited(landmark, **WORDS[word])
@@ -458,7 +419,6 @@ def _edited_again(store: MapStore, step: _Step, living: LivingMap) -> LivingMap:
 
 def _session_again(store: MapStore, step: _Step, living: LivingMap, config: Config | None = None) -> Session:
     """A session that a map has had before, with its own settings unless there are others."""
-    from evermap.config import parse_config
     from evermap.pipeline import run_session
 
     assert step.recording is not None
@@ -554,7 +514,8 @@ def _reentered(store: SqlStore, work: Path, config: Config | None) -> Reentered:
         kept = _taken_over(earlier, fresh, base, steps, config)
         living = fresh.load()
         if not kept:
-            living = _before_sessions(living, store.load(head))
+            newest = store.load(head)
+            living = _with_words(living, newest, newest.clock)
         for step in steps[kept:]:
             living = _entered_again(store, fresh, step, living, config)
         revision = fresh.head()
@@ -563,20 +524,17 @@ def _reentered(store: SqlStore, work: Path, config: Config | None) -> Reentered:
     return Reentered(len(sessions), sum(s.recording is not None for s in steps[:kept]), head, revision, adopted=False)
 
 
-def _before_sessions(living: LivingMap, newest: LivingMap) -> LivingMap:
-    """The map before its first session, with what users said of lifetimes, which is of no time."""
+def _with_words(living: LivingMap, newest: LivingMap, clock: Clock) -> LivingMap:
+    """An earlier map with what users said of lifetimes, which is of no time; one without places gets a clock."""
     lives = replace(living.lives, prior_class_id=newest.lives.prior_class_id, prior=newest.lives.prior)
     living = replace(living, class_names=newest.class_names, lives=lives) if len(lives.prior) else living
-    return living if len(living.places) else replace(living, clock=newest.clock)
+    return living if len(living.places) else replace(living, clock=clock)
 
 
 def _entered_again(
     store: MapStore, fresh: MapStore, step: _Step, living: LivingMap, config: Config | None
 ) -> LivingMap:
     """Commit a session or an edit to the copy of a map; returns the map after it."""
-    from evermap.config import to_toml
-    from evermap.maps.store.measured import RECORDING, TRAJECTORY, pack_trajectory
-
     said = step.revision.provenance
     if step.recording is None:
         living = _edited_again(store, step, living)
@@ -615,8 +573,6 @@ def _said(living: LivingMap) -> dict[str, Life]:
 
 def _taken_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequence[_Step], config: Config | None) -> int:
     """Copy what an earlier attempt has entered alike, from its first step on; returns the number of steps."""
-    from evermap.config import to_toml
-    from evermap.maps.store.measured import RECORDING, TRAJECTORY
     from evermap.maps.store.sql import SqlStore
 
     if earlier is None or not _written_by(earlier):

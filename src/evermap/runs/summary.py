@@ -48,7 +48,6 @@ class RunInfo:
         processing_s: wall time spent on estimating, without waiting for a live recording and without writing the
             outputs; None takes the sum of the steps.
         total_s: wall time of everything so far; None if not measured.
-        peak_memory_mb: of the process; None asks the operating system.
         grown: number of landmarks that a living map grew by; None without a map.
         accepted: whether the session was entered into the map; None without one.
     """
@@ -58,7 +57,6 @@ class RunInfo:
     read_s: float | None = None
     processing_s: float | None = None
     total_s: float | None = None
-    peak_memory_mb: float | None = None
     grown: int | None = None
     accepted: bool | None = None
 
@@ -77,15 +75,14 @@ def summary_head(
         info: command and seeds.
         config: the sections of the configuration in effect, as JSON values.
         source: what was read, '' for what was made in memory.
-        timing: seconds by step; the total, peak memory and date are added where they are missing.
+        timing: seconds by step; peak memory and date are added, and the total where it is missing.
         warnings: remarks.
     """
     times = {**({} if info.read_s is None else {"read_s": info.read_s}), **timing}
     if "total_s" not in times:
         times["total_s"] = sum(seconds for name, seconds in times.items() if name.endswith("_s") and seconds)
-    if "peak_memory_mb" not in times:
-        times["peak_memory_mb"] = json_number(peak_memory_mb() if info.peak_memory_mb is None else info.peak_memory_mb)
-    times.setdefault("written_at", datetime.now(UTC).isoformat(timespec="seconds"))
+    times["peak_memory_mb"] = json_number(peak_memory_mb())
+    times["written_at"] = datetime.now(UTC).isoformat(timespec="seconds")
     return {
         "schema_version": SUMMARY_SCHEMA_VERSION,
         "evermap": __version__,
@@ -113,14 +110,7 @@ def summary_dict(
 ) -> dict[str, Any]:
     """Return the content of `summary.json` but for `outputs`, which `RunFolder.finish` adds. Pure.
 
-    Args:
-        recording: the processed recording.
-        result: of the run.
-        metrics: `metrics_dict(...)`.
-        config: configuration as JSON values.
-        info: command and seeds.
-        timing: `timing_dict(...)`.
-        warnings: remarks beyond those of the recording and the result.
+    `metrics` are of `metrics_dict`, `timing` is of `timing_dict`; `warnings` are beyond those of recording and result.
     """
     size = result.trajectory.pose_world_robot.shape[1]
     remarks = [*recording.warnings, *result.warnings, *warnings]
@@ -136,7 +126,7 @@ def summary_dict(
         "metrics": dict(metrics),
         "accepted": info.accepted,
         "counts": {**_counts(recording, result), "landmarks_grown": info.grown},
-        "changes": [change_dict(change) for change in result.changes],
+        "changes": [*map(change_dict, result.changes)],
         "alternatives": [
             {"changes": [*map(change_dict, other.changes)], "probability": json_number(other.probability)}
             for other in result.alternatives
@@ -157,10 +147,7 @@ def _frame_text(frame: str, size: int) -> str:
 def change_dict(change: MapChange, *, stamp_s: float | None = None, decided_s: float | None = None) -> dict[str, Any]:
     """Return a change as every verb writes and prints it: the same keys in the same order, null where nothing is known.
 
-    Args:
-        change: what changed.
-        stamp_s: when it most probably happened, where that is estimated.
-        decided_s: the look at which it became clear, where that is told.
+    `stamp_s` is when it most probably happened, `decided_s` the look at which it became clear, where that is told.
     """
     return {
         "landmarks": [int(identity) for identity in change.landmark_ids],
@@ -204,14 +191,11 @@ def changes_text(changes: Iterable[Mapping[str, Any]]) -> str:
 
 
 def timing_dict(recording: AnyRecording, result: SlamResult, info: RunInfo) -> dict[str, Any]:
-    """Return what the run cost: real-time factor, step latencies [ms], total [s] and peak memory [MB]. Not
-    reproducible.
-    """
+    """Return what the run cost: real-time factor, step latencies [ms] and total [s]. Not reproducible."""
     step_ms = 1e3 * result.step_s
     p50, p99 = np.percentile(step_ms, [50, 99]) if len(step_ms) else (None, None)
     processing_s = float(np.sum(result.step_s)) if info.processing_s is None else info.processing_s
     lasted_s = _processed_s(recording, result)
-    memory_mb = peak_memory_mb() if info.peak_memory_mb is None else info.peak_memory_mb
     return {
         "real_time_factor": lasted_s / processing_s if processing_s > 0 and lasted_s > 0 else None,
         "processing_s": processing_s,
@@ -219,8 +203,6 @@ def timing_dict(recording: AnyRecording, result: SlamResult, info: RunInfo) -> d
         "step_p50_ms": json_number(p50),
         "step_p99_ms": json_number(p99),
         "step_max_ms": json_number(step_ms.max()) if len(step_ms) else None,
-        "peak_memory_mb": json_number(memory_mb),
-        "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
 

@@ -27,7 +27,6 @@ from evermap.types import (
     SpatialRecording,
     SpatialSensor,
     Trajectory,
-    rows_of,
 )
 
 WRITTEN = {".rrd": "scene.rrd", ".mcap": "run.mcap"}
@@ -130,12 +129,10 @@ def _innovations(path: Path) -> Innovations:
     from evermap.io.table import parse_parquet
 
     table = parse_parquet(path.read_bytes(), path)
-    columns = {name: np.asarray(column, dtype=np.float64) for name, column in table.columns.items()}
-    whole = {name: columns[name].astype(np.int64) for name in ("detection", "landmark_id")}
-    dof = columns["dof"].astype(np.int64) if "dof" in columns else None
-    return Innovations(
-        columns["stamp_s"], whole["detection"], whole["landmark_id"], columns["nis"], columns["p_inlier"], dof
-    )
+    columns: dict[str, Any] = {name: table.columns[name] for name in Innovations.__dataclass_fields__ if name in table}
+    if "dof" in columns:
+        columns["dof"] = np.asarray(columns["dof"], dtype=np.int64)
+    return Innovations(**columns)
 
 
 def _nothing(name: str, clock: Clock) -> SpatialRecording:
@@ -155,6 +152,6 @@ def _result(path: Trajectory, online: Trajectory, landmarks: Landmarks, **more: 
         innovations=Innovations(none, none.astype(np.int64), none.astype(np.int64), none, none),
         misses=Misses.empty(),
         step_s=none,
-        dead_reckoning=rows_of(path, np.zeros(0, dtype=np.int64)),
+        dead_reckoning=path[np.zeros(0, dtype=np.int64)],
         **more,
     )

@@ -92,7 +92,7 @@ def test_a_grid_is_regular_and_causal(tmp_path: Path) -> None:
     for k in range(0, len(result.beliefs), 5):
         expected = by_hand(looks, result.beliefs.feature[k], result.beliefs.stamp_s[k], PRIOR)
         np.testing.assert_allclose(result.beliefs.p_exists[k], expected, rtol=1e-9)
-    np.testing.assert_allclose(result.forecasts.stamp_s, looks.now_s + np.array([0.0, 100.0, 200.0, 300.0]))
+    np.testing.assert_allclose(result.forecasts.stamp_s, looks.span.last_look_s + np.array([0.0, 100.0, 200.0, 300.0]))
 
 
 def test_forecasts_begin_at_the_latest_look_and_say_how_long_things_stay(tmp_path: Path) -> None:

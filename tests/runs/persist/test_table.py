@@ -37,7 +37,7 @@ def test_all_columns_in_any_order_of_rows(tmp_path: Path) -> None:
     np.testing.assert_array_equal(table.present, [1.0, np.nan, 0.0, 1.0])
     assert table.class_names == ("door",)
     np.testing.assert_array_equal(table.class_of_feature, [-1, 0])
-    assert table.now_s == 5.0
+    assert table.span.last_look_s == 5.0
 
     looks = table.looks(table.order())
     np.testing.assert_array_equal(looks.first, [0, 2, 3])

@@ -179,14 +179,7 @@ def forecast_stamps(span: Span, config: PersistConfig) -> FloatArray:
 
 
 def forecasts_of(models: ModelOfEach, looks: Looks, stamp_s: FloatArray, p_exists: FloatArray) -> Forecasts:
-    """Return forecasts with what each model expects from their first instant on.
-
-    Args:
-        models: the model of every feature.
-        looks: by feature and time.
-        stamp_s: (N,) instants of the forecast.
-        p_exists: (F, N) presence then.
-    """
+    """Return forecasts `p_exists` (F, N) at instants (N,), with what each model expects from the first of these on."""
     outlook = np.full((3, looks.n_features), np.nan)
     for k, model in enumerate(models.models):
         mine = np.flatnonzero(models.of_feature == k)

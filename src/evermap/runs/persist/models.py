@@ -57,6 +57,11 @@ class ModelOfEach:
         """Return the same about some of the features."""
         return ModelOfEach(self.models, self.names, self.of_feature[features])
 
+    def never_leave(self) -> dict[str, float]:
+        """Return the share of the features that never leave, by class, where the lifetime says so."""
+        shares = (getattr(getattr(model, "prior", None), "p_never_leaves", 0.0) for model in self.models)
+        return dict(zip(self.names, map(float, shares), strict=True))
+
     def to_dict(self) -> dict[str, Any]:
         """Return the models by the name of their class."""
         return {name or "all": model.to_dict() for name, model in zip(self.names, self.models, strict=True)}
@@ -103,15 +108,8 @@ def _one_stay(config: PersistConfig, table: LookTable) -> ModelOfEach:
 
 
 def ask(model: PresenceFilter, looks: Looks, *questions: tuple[IntArray, FloatArray]) -> tuple[list[FloatArray], Track]:
-    """Return answers to several lists of (feature, time) in one pass over the looks.
-
-    Args:
-        model: of the features.
-        looks: at F features.
-        questions: (N,) features and (N,) times each, in any order.
-
-    Returns:
-        (N,) probabilities of presence for each list, and the track with all of them.
+    """Return answers to several lists of (N,) features and (N,) times, in any order, in one pass over the looks: (N,)
+    probabilities of presence for each list, and the track with all of them.
     """
     feature = np.concatenate([features for features, _ in questions])
     stamp_s = np.concatenate([stamps for _, stamps in questions])
@@ -151,8 +149,6 @@ MOST_STEPS = 20_000_000
 MOST_BINS = 2_000_000
 """Maximum ten-minute steps of one feature for learning phases: 38 years."""
 
-Progress = Callable[[float], None]
-
 
 @dataclass(frozen=True, slots=True)
 class LearnedModels:
@@ -186,7 +182,7 @@ def learn_models(
     looks: Looks,
     config: PersistConfig,
     *,
-    progress: Progress | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> LearnedModels:
     """Learn presence models from looks alone.
 
@@ -251,13 +247,7 @@ def _check_span(looks: Looks, kind: str) -> None:
 
 
 def grouping_of(table: LookTable | PartedLooks, counts: IntArray, config: PersistConfig) -> str:
-    """Return what is said; else by class where there are classes, by feature where each has a lot to say, else all.
-
-    Args:
-        table: of the features.
-        counts: (F,) looks of each.
-        config: choices.
-    """
+    """Return what is said; else 'class' where there are classes, 'feature' if each has many looks (F,), 'all'."""
     if config.per != AUTO:
         return config.per
     if table.class_names:
@@ -284,13 +274,7 @@ def groups_of(table: LookTable | PartedLooks, per: str) -> Iterator[tuple[str, I
 
 
 def save_models(models: ModelOfEach, per: str, path: str | Path) -> Path:
-    """Write models to a JSON file and return its path.
-
-    Args:
-        models: the models and their names.
-        per: 'all', 'class' or 'feature': what the names are of.
-        path: the file.
-    """
+    """Write models to a JSON file; `per` ('all', 'class' or 'feature') is what they are named by. Returns the path."""
     named = dict(zip(models.names, models.models, strict=True)) if per != "all" else {"": models.models[0]}
     return storage.save_models(storage.NamedModels(named, per), path)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -18,7 +17,6 @@ from evermap.survival.durations import duration_text
 from evermap.types import Clock, FloatArray, IntArray
 from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.style import NamedFigure
-from evermap.viz.time_axis import guess_clock
 
 MOST_ROWS = 100
 """Of a table on the page."""
@@ -27,16 +25,11 @@ MOST_ROWS = 100
 def render_report(
     result: PersistResult, summary: Mapping[str, Any], figures: Sequence[NamedFigure], clock: Clock
 ) -> str:
-    """Return the page as text. Contains no address outside of itself, and nothing in it is executed.
-
-    Args:
-        result: of `run_persist`.
-        summary: the content of `summary.json`.
-        figures: as `draw_run` gives them.
-        clock: of the stamps.
-    """
+    """Return the page as text. Contains no address outside of itself, and nothing in it is executed."""
     drawn = {figure.name: figure_html(figure) for figure in figures}
     alone = [html for name, html in drawn.items() if name.startswith("feature-")]
+    names = ("command", "config", "model", "learning", "versions", "timing")
+    provenance = json.dumps({name: summary[name] for name in names}, indent=2, ensure_ascii=False)
     parts = [
         _cards(summary),
         warnings_note(summary["warnings"]),
@@ -45,7 +38,7 @@ def render_report(
         _changes(result, clock),
         _forecasts(result),
         "<h2>Single features</h2>" + "\n".join(alone) if alone else "",
-        f"<h2>Source and settings</h2><pre>{escape(_provenance(summary))}</pre>",
+        f"<h2>Source and settings</h2><pre>{escape(provenance)}</pre>",
     ]
     counts, source = summary["counts"], escape(str(summary["source"]) or "a table in memory")
     lead = (
@@ -83,14 +76,12 @@ def _changes(result: PersistResult, clock: Clock) -> str:
     changes, names = result.changes, result.table.names
     if len(changes) == 0:
         return ""
+    times = (changes.stamp_s, changes.earliest_s, changes.latest_s, changes.decided_s)
     rows = [
         (
             escape(names[changes.feature[k]]),
             "returned" if changes.returned[k] else "vanished",
-            *(
-                stamp_text(getattr(changes, name)[k], clock)
-                for name in ("stamp_s", "earliest_s", "latest_s", "decided_s")
-            ),
+            *(stamp_text(times_s[k], clock) for times_s in times),
             f"{changes.confidence[k]:.3f}",
         )
         for k in range(len(changes) - 1, max(-1, len(changes) - 1 - MOST_ROWS), -1)
@@ -119,7 +110,7 @@ def _forecasts(result: PersistResult) -> str:
             escape(names[k]),
             f"{forecasts.p_exists[k, 0]:.3f}",
             f"{forecasts.p_exists[k, -1]:.3f}",
-            *(_time(float(times_s[k])) for times_s in outlooks.values()),
+            *("–" if np.isnan(times_s[k]) else duration_text(float(times_s[k])) for times_s in outlooks.values()),
         )
         for k in believed[:MOST_ROWS].tolist()
     ]
@@ -129,16 +120,6 @@ def _forecasts(result: PersistResult) -> str:
     return f"<h2>Forecasts</h2>{table(head, rows, numbers=range(1, len(head)))}{note}"
 
 
-def _time(seconds: float) -> str:
-    return "–" if math.isnan(seconds) else duration_text(seconds)
-
-
-def _provenance(summary: Mapping[str, Any]) -> str:
-    """Command, configuration and versions."""
-    shown = {name: summary[name] for name in ("command", "config", "model", "learning", "versions", "timing")}
-    return json.dumps(shown, indent=2, ensure_ascii=False)
-
-
 RASTER_ROWS = 60
 _RASTER_COLUMNS = 480
 _CURVE_POINTS = 400
@@ -146,25 +127,13 @@ _PIXELS = 1200
 """Columns of a figure: with more looks, each column shows the lowest and the highest belief, and one tick per kind."""
 
 
-def clock_of(result: PersistResult) -> Clock:
-    """Return the clock of the table's stamps; where the table does not say, guess."""
-    return result.table.clock or guess_clock(result.table.stamp_s)
-
-
-def draw_run(result: PersistResult, *, figures: int, clock: Clock | None = None) -> Iterator[NamedFigure]:
-    """Draw the figures one by one, so that a progress bar can follow.
-
-    Args:
-        result: of `run_persist`.
-        figures: how many features get a figure of their own.
-        clock: of the stamps; None guesses.
-    """
-    clock = clock or clock_of(result)
+def draw_run(result: PersistResult, clock: Clock) -> Iterator[NamedFigure]:
+    """Draw the figures one by one, so that a progress bar can follow."""
     yield _overview(result, clock)
     if result.scores is not None and result.reliability is not None:
         yield _calibration(result)
     taken: set[str] = set()
-    for feature in most_interesting(result, figures).tolist():
+    for feature in most_interesting(result, result.config.figures).tolist():
         yield _feature(result, feature, clock, taken)
 
 
@@ -174,7 +143,7 @@ def most_interesting(result: PersistResult, n: int) -> IntArray:
 
 
 def most_changed(changes: IntArray, looks: IntArray, n: int) -> IntArray:
-    """Return `most_interesting`, given the changes and the looks of each feature."""
+    """Return `most_interesting` by the changes and the looks of each feature."""
     return np.sort(np.lexsort((-looks, -changes))[:n])
 
 
@@ -189,20 +158,15 @@ def _overview(result: PersistResult, clock: Clock) -> NamedFigure:
     track = result.models.only(features).track(looks, Instants.same_for_all(len(features), middle_s))
     row = {feature: k for k, feature in enumerate(features.tolist())}
     changes = result.changes
-    marks = [
-        (row[feature], stamp_s, returned)
-        for feature, stamp_s, returned in zip(
-            changes.feature.tolist(), changes.stamp_s.tolist(), changes.returned.tolist(), strict=True
-        )
-        if feature in row
-    ]
+    columns = (changes.feature.tolist(), changes.stamp_s.tolist(), changes.returned.tolist())
+    marks = [(row[of], stamp_s, returned) for of, stamp_s, returned in zip(*columns, strict=True) if of in row]
     names = [result.table.names[feature] for feature in features.tolist()]
     figure = plot_raster(
         names,
         edge_s,
         track.p_present.reshape(len(features), -1),
         changes=marks,
-        forecast_from_s=result.table.now_s,
+        forecast_from_s=result.table.span.last_look_s,
         clock=clock,
     )
     total = len(result.totals.p_now)
@@ -246,7 +210,7 @@ def _feature(result: PersistResult, feature: int, clock: Clock, taken: set[str])
         track.p_present,
         looks=(looks.stamp_s[shown], looks.detected[shown]),
         truth_s=there,
-        forecast_from_s=result.table.now_s,
+        forecast_from_s=result.table.span.last_look_s,
         title=f"feature {name if len(name) <= 60 else name[:59] + '…'}",
         clock=clock,
     )

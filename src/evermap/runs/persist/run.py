@@ -280,15 +280,13 @@ def remarks(config: PersistConfig, models: ModelOfEach, totals: Totals) -> list[
     told = _odd_looks(totals)
     if config.learns and totals.looks > config.learn_from:
         told.append(f"the model learned from at most {config.learn_from:,} of {totals.looks:,} looks (`learn_from`)")
-    for name, model in zip(models.names, models.models, strict=True):
-        stay = getattr(getattr(model, "prior", None), "p_never_leaves", 0.0)
+    for name, stay in models.never_leave().items():
         if stay > 0.0:
             whose = f"class {quote(name)}: " if name else ""
             told.append(f"{whose}{100.0 * stay:.3g} % of the features never leave, by the prior")
     if totals.unborn and config.stays_once:
-        told.append(
-            f"{counted(totals.unborn, 'belief')} left empty: a feature has no belief before its first detection"
-        )
+        empty = counted(totals.unborn, "belief")
+        told.append(f"{empty} left empty: a feature has no belief before its first detection")
     if totals.features_back and config.stays_once:
         back = counted(totals.features_back, "feature")
         told.append(f"{back} returned, which lifetimes of one stay rule out: try `recurrent`")
@@ -320,14 +318,10 @@ def _named(error: NumericalError, table: LookTable, order: IntArray) -> Exceptio
     if error.row is None:
         return error
     row = order[table.looked[order]][error.row]
-    return InputError(
-        f"feature {quote(table.names[table.feature[row]])} at {table.stamp_s[row]:.15g} s: this observation is "
-        "impossible, whether the feature is there or gone",
-        path=table.source or None,
-        line=int(table.line[row]),
-        field="detected",
-        hint=error.hint,
-    )
+    look = f"feature {quote(table.names[table.feature[row]])} at {table.stamp_s[row]:.15g} s"
+    problem = f"{look}: this observation is impossible, whether the feature is there or gone"
+    line = int(table.line[row])
+    return InputError(problem, path=table.source or None, line=line, field="detected", hint=error.hint)
 
 
 class _Steps:

@@ -14,7 +14,7 @@ from evermap.config import PersistConfig
 from evermap.errors import ConfigError, InputError
 from evermap.existence.protocol import Looks, feature_of, firsts_of
 from evermap.io.columns import Columns, natural_order, parquet_batches, read_columns
-from evermap.io.table import arrow_cells
+from evermap.io.table import arrow_cells, pa, pq
 from evermap.io.text import counted, quote
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
 from evermap.valid import STAMP_S, Quantity
@@ -79,9 +79,8 @@ class LookTable:
         if self.class_of_feature.shape != (self.n_features,):
             problem = f"{len(self.class_of_feature)} classes for {self.n_features} features"
             raise InputError(problem, field="class_of_feature")
-        columns = {
-            name: getattr(self, name) for name in ("feature", "detected", "p_miss", "p_false", "present", "line")
-        }
+        names = ("feature", "detected", "p_miss", "p_false", "present", "line")
+        columns = {name: getattr(self, name) for name in names}
         for name, column in columns.items():
             if column is not None and column.shape != self.stamp_s.shape:
                 problem = f"shape {column.shape} where stamp_s has {self.stamp_s.shape}"
@@ -134,11 +133,6 @@ class LookTable:
         looked_s = self.stamp_s[self.looked]
         times_s = (self.stamp_s.min(), self.stamp_s.max(), looked_s.min(), looked_s.max())
         return Span(*map(float, times_s))
-
-    @property
-    def now_s(self) -> float:
-        """Time of the latest look."""
-        return self.span.last_look_s
 
     def order(self) -> IntArray:
         """Return (R,) the rows by feature and time."""
@@ -293,7 +287,7 @@ def read_truth(path: str | Path, looks: LookTable) -> tuple[Truth, tuple[str, ..
 
 def _explain_missing(table: Columns) -> None:
     """More than 'missing column' about the two columns that tables of looks lack most often."""
-    if set(table.cells) - {*_REQUIRED, *_OPTIONAL}:
+    if set(table.columns) - {*_REQUIRED, *_OPTIONAL}:
         return  # a name that is nearly right is the likelier mistake
     if "feature_id" not in table:
         hint = "add it, with one and the same value if there is only one feature"
@@ -323,9 +317,8 @@ def _classes(table: Columns, feature: IntArray, names: tuple[str, ...]) -> tuple
     if other.size:
         row = int(other[0])
         first = class_names[of_feature[feature[row]]]
-        problem = (
-            f"feature {quote(names[feature[row]])} is {quote(class_names[of_row[row]])} here and {quote(first)} above"
-        )
+        whose, here = quote(names[feature[row]]), quote(class_names[of_row[row]])
+        problem = f"feature {whose} is {here} here and {quote(first)} above"
         raise table.error(problem, row=row, field="class_id", hint="one class per feature")
     return tuple(class_names), of_feature
 
@@ -368,12 +361,9 @@ class PartedLooks:
 
     @classmethod
     def split(cls, path: Path, folder: Path, config: PersistConfig) -> PartedLooks:
-        """Read a table twice, some rows at a time: what features there are, then which part each row belongs to.
+        """Read a table twice, some rows at a time: what features there are, then which part in a folder each row is of.
 
-        Args:
-            path: the table.
-            folder: for the parts.
-            config: of it `rows_at_once`, at most, unless one feature has more, `p_miss` and `p_false`.
+        Of the configuration it takes `rows_at_once`, at most, unless one feature has more, `p_miss` and `p_false`.
 
         Raises:
             InputError, ConfigError: as `read_looks`; a table with truth, which is scored in one piece only.
@@ -400,8 +390,6 @@ class PartedLooks:
 
     def part(self, number: int) -> tuple[LookTable, IntArray]:
         """Return a part, and which row of the whole table each of its rows is, counted from 0."""
-        import pyarrow.parquet as pq
-
         read = pq.read_table(self.files[number], use_threads=False)
         cells = {name: read[name].combine_chunks() for name in read.column_names}
         row, rank = (cells.pop(name).to_numpy() for name in ("row", "rank"))
@@ -476,9 +464,6 @@ def _surveyed(path: Path) -> _Surveyed:
 
 def _route(path: Path, rank: Mapping[str, int], edges: IntArray, files: Sequence[Path]) -> None:
     """Write each row to the file of its feature."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     with ExitStack() as stack:
         writers: dict[int, Any] = {}
         for table in parquet_batches(path):
@@ -487,7 +472,7 @@ def _route(path: Path, rank: Mapping[str, int], edges: IntArray, files: Sequence
             part = np.searchsorted(edges, ranks, side="right") - 1
             order = np.argsort(part, kind="stable")
             numbers = {"row": arrow_cells(table.line - 1), "rank": arrow_cells(ranks)}
-            batch = pa.table({**table.cells, **numbers}).take(arrow_cells(order))
+            batch = pa.table({**table.columns, **numbers}).take(arrow_cells(order))
             start = np.searchsorted(part[order], np.arange(len(files) + 1))
             for number in np.unique(part):
                 if number not in writers:

@@ -22,6 +22,7 @@ from evermap.config.tables import NO_RECURRENCE
 from evermap.errors import ConfigError, EvermapError
 from evermap.io.columns import csv_bytes, named, needs_quotes
 from evermap.io.table import arrow_cells
+from evermap.metrics.belief import Reliability
 from evermap.runs.folder import RunFolder
 from evermap.runs.persist.models import (
     LearnedModels,
@@ -31,12 +32,13 @@ from evermap.runs.persist.models import (
     learn_models,
     save_models,
 )
-from evermap.runs.persist.report import MOST_ROWS, RASTER_ROWS, clock_of, draw_run, most_changed, render_report
+from evermap.runs.persist.report import MOST_ROWS, RASTER_ROWS, draw_run, most_changed, render_report
 from evermap.runs.persist.run import PersistResult, Totals, remarks, run_persist
 from evermap.runs.persist.table import PartedLooks
 from evermap.runs.summary import RunInfo, change_dict, changes_text, summary_head
 from evermap.types import ChangeKind, Clock, FloatArray, IntArray, MapChange, json_number, landmark_id_of
 from evermap.viz.style import NamedFigure, save_png, save_svg
+from evermap.viz.time_axis import guess_clock
 
 
 def write_persist(
@@ -51,14 +53,8 @@ def write_persist(
 ) -> dict[str, Any]:
     """Write the folder of a run and return the content of `summary.json`.
 
-    Args:
-        out: the folder; an older run there is replaced at the end.
-        result: of `run_persist`; `result.config.figures` features get a figure of their own.
-        clock: of the stamps, for the figures; None guesses.
-        info: command and measured times.
-        force: write into a folder that holds other files, too; they stay.
-        inputs: files that were read, beside the table.
-        progress: told after each figure.
+    `result.config.figures` features get a figure of their own, after each of which `progress` is told. Without a
+    `clock` of the stamps it is guessed. `out`, `force` and `inputs` (beside the table) are as of `RunFolder`.
 
     Raises:
         ConfigError: `out` must not or cannot be written.
@@ -70,10 +66,8 @@ def write_persist(
         folder.path("changes.jsonl").write_text(_changes(result, _numbered(result.table.names)), encoding="utf-8")
         if result.learned is not None:
             save_models(result.models, result.learned.per, folder.path("model.json"))
-        timing = {
-            **{f"{name}_s": seconds for name, seconds in result.step_s.items()},
-            "write_s": perf_counter() - start,
-        }
+        timing = {f"{name}_s": seconds for name, seconds in result.step_s.items()}
+        timing["write_s"] = perf_counter() - start
         return _finished(folder, result, clock, info or RunInfo(), timing, progress)
 
 
@@ -87,9 +81,10 @@ def _finished(
 ) -> dict[str, Any]:
     """Draw, and write summary and report."""
     start = perf_counter()
+    clock = clock or result.table.clock or guess_clock(result.table.stamp_s)
     drawn: list[NamedFigure] = []
     total = min(result.config.figures, result.table.n_features) + 1 + (result.scores is not None)
-    for figure in draw_run(result, figures=result.config.figures, clock=clock):
+    for figure in draw_run(result, clock):
         save_png(figure.figure, folder.path(f"figures/{figure.name}.png"))
         save_svg(figure.figure, folder.path(f"figures/{figure.name}.svg"))
         drawn.append(figure)
@@ -97,8 +92,7 @@ def _finished(
             progress(len(drawn), total)
     timing = {**timing, "draw_s": perf_counter() - start}
     summary = folder.finish(persist_summary(result, info=info, timing=timing), "report.html")
-    page = render_report(result, summary, drawn, clock or clock_of(result))
-    folder.path("report.html").write_text(page, encoding="utf-8")
+    folder.path("report.html").write_text(render_report(result, summary, drawn, clock), encoding="utf-8")
     return summary
 
 
@@ -113,21 +107,11 @@ def persist_in_parts(
     cluster: str | None = None,
     progress: Callable[[float, float], None] | None = None,
 ) -> dict[str, Any]:
-    """Write what `run_persist` and `write_persist` make of a Parquet table, but in parts of `config.rows_at_once` rows;
-    returns the summary.
+    """Write what `run_persist` and `write_persist` make of a Parquet table, but in parts of `config.rows_at_once` rows.
 
     In memory there are a part for each worker, and a few hundred bytes a feature. A part has all rows of its features.
-
-    Args:
-        folder: of the run.
-        path: the table, a file or a folder of files.
-        config: choices.
-        clock: of the stamps, for the figures; None guesses.
-        info: command and measured times.
-        workers: and `cluster`, as `runs.company.spread_over`; a cluster reaches `path` and the folder under the same
-            names.
-        cluster: address of a Dask scheduler.
-        progress: told after each part.
+    How the work is spread is as of `runs.company.spread_over`; a cluster reaches the table, which may be a folder of
+    files, and the folder of the run under the same names. Returns the summary.
 
     Raises:
         ConfigError, InputError, DataError: as `read_looks`, `run_persist` and `write_persist`; a model for each feature
@@ -232,10 +216,8 @@ def _join_rows(path: Path, scratch: Path, parted: PartedLooks, quoted: bool) -> 
             size = min(_ROWS, parted.rows - start)
             stamp_s, p, feature = np.empty(size), np.empty(size), np.empty(size, dtype=np.int64)
             for number in range(len(parted.files)):
-                row, *columns = (
-                    np.load(scratch / f"{name}-{number}.npy", mmap_mode="r")
-                    for name in ("row", "stamp_s", "p", "feature")
-                )
+                pieces = (scratch / f"{name}-{number}.npy" for name in ("row", "stamp_s", "p", "feature"))
+                row, *columns = (np.load(piece, mmap_mode="r") for piece in pieces)
                 a, b = np.searchsorted(row, (start, start + size))
                 for into, column in zip((stamp_s, p, feature), columns, strict=True):
                     into[row[a:b] - start] = column[a:b]
@@ -245,9 +227,8 @@ def _join_rows(path: Path, scratch: Path, parted: PartedLooks, quoted: bool) -> 
 
 def _shown(parted: PartedLooks, done: Sequence[_Part], totals: Totals, config: PersistConfig) -> IntArray:
     """The features of which figures and report tell."""
-    changed = most_changed(
-        np.concatenate([part.changes for part in done]), parted.looks, max(RASTER_ROWS, config.figures)
-    )
+    changes = np.concatenate([part.changes for part in done])
+    changed = most_changed(changes, parted.looks, max(RASTER_ROWS, config.figures))
     decided_s, stamp_s, feature = np.concatenate([part.latest for part in done], axis=1)
     latest = feature[np.lexsort((feature, stamp_s, decided_s))][-MOST_ROWS:].astype(np.int64)
     return np.unique(np.concatenate([changed, latest, np.flatnonzero(~np.isnan(totals.p_now))[:MOST_ROWS]]))
@@ -276,11 +257,11 @@ def persist_summary(result: PersistResult, *, info: RunInfo, timing: dict[str, f
         "detector": {
             name: dict(zip(("least", "most"), getattr(totals, name), strict=True)) for name in ("p_miss", "p_false")
         },
-        "never_leave_share": _never_leave(result),
+        "never_leave_share": {name or "all": share for name, share in result.models.never_leave().items()},
         "expected_present_now": json_number(float(np.nansum(totals.p_now))),
         "merged_mass": json_number(totals.merged_mass),
         "metrics": None if result.scores is None else {k: json_number(v) for k, v in asdict(result.scores).items()},
-        "reliability": None if result.reliability is None else _reliability(result),
+        "reliability": None if result.reliability is None else _reliability(result.reliability),
     }
 
 
@@ -334,18 +315,10 @@ def _changes(result: PersistResult, numbers: bool) -> str:
     return changes_text(rows)
 
 
-def _never_leave(result: PersistResult) -> dict[str, float]:
-    """Share of the features that never leave, by class, where the lifetime says so."""
-    models = zip(result.models.names, result.models.models, strict=True)
-    return {name or "all": float(getattr(getattr(m, "prior", None), "p_never_leaves", 0.0)) for name, m in models}
-
-
-def _reliability(result: PersistResult) -> dict[str, list[Any]]:
-    bins = result.reliability
-    assert bins is not None
+def _reliability(bins: Reliability) -> dict[str, list[Any]]:
     return {
         "edge": bins.edge.tolist(),
         "count": bins.count.tolist(),
-        "belief": [json_number(value) for value in bins.belief.tolist()],
-        "present": [json_number(value) for value in bins.present.tolist()],
+        "belief": [*map(json_number, bins.belief.tolist())],
+        "present": [*map(json_number, bins.present.tolist())],
     }

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,31 +14,23 @@ import numpy as np
 from evermap.errors import ConfigError, InputError
 from evermap.geometry import se3
 from evermap.io.columns import Columns, read_columns
+from evermap.io.native_space import IMAGE_BOX
+from evermap.io.spatial import BOX as SIDES
+from evermap.io.spatial import COVARIANCE
+from evermap.io.table import ENDINGS
 from evermap.io.text import quote
 from evermap.tracking.frame import DetectionTable, Poses, in_world
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
-from evermap.valid import STAMP_S, X_M, Quantity
+from evermap.valid import QUATERNION, STAMP_S, X_M, Y_M, Z_M, Quantity
 
-_FARTHEST_M = X_M.high
-POSITION = tuple(
-    Quantity(name, -_FARTHEST_M, _FARTHEST_M, optional=True, hint="metres") for name in ("x_m", "y_m", "z_m")
-)
-SENSOR = tuple(
-    Quantity(name, -_FARTHEST_M, _FARTHEST_M, hint="metres, in every row")
-    for name in ("sensor_x_m", "sensor_y_m", "sensor_z_m")
-)
+POSITION = tuple(replace(axis, optional=True) for axis in (X_M, Y_M, Z_M))
+SENSOR = tuple(replace(axis, name=f"sensor_{axis.name}", hint="metres, in every row") for axis in (X_M, Y_M, Z_M))
 SIGMA = Quantity("sigma_m", 0.0, 1e6, positive=True, optional=True, hint="metres; empty where unknown")
 SCORE = Quantity("score", -1e9, 1e9, optional=True, hint="the detector's confidence, on any scale")
-SIZE = tuple(
-    Quantity(name, 0.0, 1e4, positive=True, optional=True, hint="metres, in every row with a position")
-    for name in ("length_m", "width_m", "height_m")
-)
+_HINT = "metres, in every row with a position"
+SIZE = tuple(Quantity(name, 0.0, 1e4, positive=True, optional=True, hint=_HINT) for name in SIDES)
 YAW = Quantity("yaw_rad", -1e4, 1e4, optional=True, hint="radians, counter-clockwise from x")
 BOX = (*SIZE, YAW)
-IMAGE_BOX = ("left_px", "top_px", "right_px", "bottom_px")
-"""Columns of a detector's box in the image, which are not used."""
-COVARIANCE = tuple(f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
-ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _REQUIRED = (STAMP_S.name, *(quantity.name for quantity in POSITION))
 _OPTIONAL = (
     "class_id", *COVARIANCE, SIGMA.name, SCORE.name, *(quantity.name for quantity in (*BOX, *SENSOR)), *IMAGE_BOX,
@@ -101,13 +94,9 @@ def read_detections(path: str | Path, *, min_score: float | None = None) -> Dete
 
 def _boxes(table: Columns, rows: IntArray) -> FloatArray | None:
     """(M, 4) sizes and headings."""
-    named = [quantity.name for quantity in BOX if quantity.name in table]
-    if not named:
+    hint = "length_m, width_m, height_m and yaw_rad, or none of them"
+    if not table.has_all([quantity.name for quantity in BOX], hint):
         return None
-    for quantity in BOX:
-        if quantity.name not in table:
-            hint = "length_m, width_m, height_m and yaw_rad, or none of them"
-            raise table.error("missing column", row=None, field=quantity.name, hint=hint)
     box = np.stack([table.numbers(quantity) for quantity in BOX], axis=1)[rows]
     missing = np.argwhere(np.isnan(box))
     if len(missing):
@@ -119,18 +108,16 @@ def _boxes(table: Columns, rows: IntArray) -> FloatArray | None:
 
 def _strong(table: Columns, min_score: float | None) -> BoolArray:
     """(R,) whether the score, where there is one, is high enough."""
-    if min_score is None:
+    if min_score is None or (SCORE.name not in table and min_score <= 0.0):
         return np.ones(len(table), dtype=np.bool_)
     if SCORE.name not in table:
-        if min_score > 0.0:
-            raise ConfigError("the table has no scores", field="min_score", hint="a column score in the table")
-        return np.ones(len(table), dtype=np.bool_)
+        raise ConfigError("the table has no scores", field="min_score", hint="a column score in the table")
     return np.asarray(~(table.numbers(SCORE) < min_score))
 
 
 def _appearance_columns(table: Columns) -> list[str]:
     """`appearance_0` and so on, without a gap."""
-    found = sorted(int(name[11:]) for name in table.cells if re.fullmatch(r"appearance_\d+", name))
+    found = sorted(int(name[11:]) for name in table.columns if re.fullmatch(r"appearance_\d+", name))
     for number, name in enumerate(found):
         if number != name:
             raise table.error("missing column", row=None, field=f"appearance_{number}", hint="numbers from 0 on")
@@ -146,18 +133,15 @@ def _appearances(table: Columns, names: Sequence[str], rows: IntArray) -> FloatA
 
 def _covariances(table: Columns, rows: IntArray) -> FloatArray | None:
     """(M, 3, 3), nan where a detection has none."""
-    named = [name for name in COVARIANCE if name in table]
-    if named and SIGMA.name in table:
-        raise table.error("duplicates sigma_m", row=None, field=named[0], hint="keep one of the two")
     if SIGMA.name in table:
+        for name in COVARIANCE:
+            if name in table:
+                raise table.error("duplicates sigma_m", row=None, field=name, hint="keep one of the two")
         return np.asarray(np.square(table.numbers(SIGMA))[rows, None, None] * np.eye(3))
-    if not named:
+    if not table.has_all(COVARIANCE, f"all of {', '.join(COVARIANCE)}, or none"):
         return None
-    for name in COVARIANCE:
-        if name not in table:
-            raise table.error("missing column", row=None, field=name, hint=f"all of {', '.join(COVARIANCE)}, or none")
     matrix = np.empty((len(rows), 3, 3))
-    for name, (i, j) in zip(COVARIANCE, ENTRIES, strict=True):
+    for name, i, j in zip(COVARIANCE, *np.triu_indices(3), strict=True):
         matrix[:, i, j] = matrix[:, j, i] = table.numbers(Quantity(name, -1e12, 1e12, optional=True))[rows]
     given = ~np.isnan(matrix)
     whole = np.atleast_1d(given.all(axis=(1, 2)))
@@ -165,42 +149,29 @@ def _covariances(table: Columns, rows: IntArray) -> FloatArray | None:
     wrong = (given.any(axis=(1, 2)) & ~whole) | (np.linalg.eigvalsh(filled)[:, 0] <= 0.0)
     if wrong.any():
         row = int(rows[np.argmax(wrong)])
-        raise table.error(
-            "is not a covariance: not positive definite", row=row, field=COVARIANCE[0], hint="or leave it empty"
-        )
+        problem = "is not a covariance: not positive definite"
+        raise table.error(problem, row=row, field=COVARIANCE[0], hint="or leave it empty")
     return np.where(whole[:, None, None], matrix, np.nan)
 
 
 def _sensor(table: Columns, frame: IntArray, n_frames: int) -> FloatArray | None:
     """(F, 3) where the sensor was."""
-    named = [quantity.name for quantity in SENSOR if quantity.name in table]
-    if not named:
+    if not table.has_all([quantity.name for quantity in SENSOR], "all three, or none"):
         return None
-    for quantity in SENSOR:
-        if quantity.name not in table:
-            raise table.error("missing column", row=None, field=quantity.name, hint="all three, or none")
     of_row = np.stack([table.numbers(quantity) for quantity in SENSOR], axis=1)
     sensor = np.empty((n_frames, 3))
     sensor[frame[::-1]] = of_row[::-1]  # of several assignments the last one holds: the first row
     elsewhere = np.flatnonzero(np.abs(of_row - sensor[frame]).max(axis=1) > 1e-6)
     if elsewhere.size:
-        hint = "one position per stamp"
-        raise table.error(
-            "the sensor has two positions in one frame", row=int(elsewhere[0]), field=SENSOR[0].name, hint=hint
-        )
+        problem, row = "the sensor has two positions in one frame", int(elsewhere[0])
+        raise table.error(problem, row=row, field=SENSOR[0].name, hint="one position per stamp")
     return sensor
 
 
 def read_confusion(path: str | Path, class_names: Sequence[str]) -> FloatArray:
-    """Return a table with a row a true class: its name in `class_id`, and a column for each class that it is detected
-    as.
+    """Return (C, C) `P(detected class | true class)` of a `.csv`, `.csv.gz` or `.parquet` table.
 
-    Args:
-        path: a `.csv`, `.csv.gz` or `.parquet` file.
-        class_names: the C classes of the detections.
-
-    Returns:
-        (C, C) `P(detected class | true class)`, a row a true class.
+    It has a row for each true class: its name in `class_id`, and a column for each class that it is detected as.
 
     Raises:
         InputError: a class is missing or there twice, or a row is not a distribution; by line and column.
@@ -230,17 +201,11 @@ def read_confusion(path: str | Path, class_names: Sequence[str]) -> FloatArray:
     return confusion
 
 
-_QUATERNION = tuple(Quantity(name, -2.0, 2.0, hint="a unit quaternion") for name in ("qx", "qy", "qz", "qw"))
-_PLACE = tuple(Quantity(quantity.name, quantity.low, quantity.high, hint="metres") for quantity in POSITION)
+_POSE = (X_M, Y_M, Z_M, *(replace(one, hint="a unit quaternion") for one in QUATERNION))
 
 
 def read_input(path: str | Path, *, min_score: float | None = None) -> DetectionTable:
-    """Return the detections of a table, or of a folder with the tables `detections`, in a sensor's frame, and
-    `odometry`, its poses.
-
-    Args:
-        path: what `read_detections` takes, or a folder.
-        min_score: detections with a lower score are left out.
+    """Return what `read_detections` takes, or of a folder its tables `detections`, in a sensor's frame, and `odometry`.
 
     Raises:
         InputError: a folder without these tables, or anything wrong in them.
@@ -253,7 +218,7 @@ def read_input(path: str | Path, *, min_score: float | None = None) -> Detection
 
 def _table_of(folder: Path, name: str) -> Path:
     """Return the table of a name in a folder, of whichever kind it is."""
-    for ending in (".csv", ".csv.gz", ".parquet"):
+    for ending in ENDINGS:
         if (folder / f"{name}{ending}").is_file():
             return folder / f"{name}{ending}"
     hint = "detections.csv in the sensor's frame and odometry.csv, or the table itself for detections in the world"
@@ -267,11 +232,11 @@ def read_poses(path: Path) -> Poses:
         InputError: anything wrong in the file, by line and column.
     """
     table = read_columns(path, [])
-    table.expect((STAMP_S.name, *(q.name for q in (*_PLACE, *_QUATERNION))), tuple(table.cells))
+    table.expect((STAMP_S.name, *(one.name for one in _POSE)), tuple(table.columns))
     if len(table) == 0:
         raise InputError("has no rows below its header", path=path, hint="one row per pose")
     stamp_s = table.numbers(STAMP_S)
-    pose = np.stack([table.numbers(quantity) for quantity in (*_PLACE, *_QUATERNION)], axis=1)
+    pose = np.stack([table.numbers(quantity) for quantity in _POSE], axis=1)
     short = np.flatnonzero(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1.0) > 1e-2)
     if short.size:
         raise table.error("is not of length one", row=int(short[0]), field="qx", hint="a unit quaternion")

@@ -6,7 +6,7 @@ Lifetimes are grouped by class or place; every estimator also gives a prior that
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,10 +91,7 @@ class LifetimeGroup:
 
 
 def read_lifetimes(path: str | Path) -> LifetimeTable:
-    """Return a table with `left, right` and perhaps `entry, weight, class_id, x_m, y_m`.
-
-    Args:
-        path: a `.csv`, `.csv.gz` or `.parquet` file; rows in any order.
+    """Return a CSV (also gzipped) or Parquet table with `left, right` and perhaps `entry, weight, class_id, x_m, y_m`.
 
     Raises:
         InputError: anything wrong in the file, by line and column.
@@ -136,13 +133,9 @@ def read_lifetimes(path: str | Path) -> LifetimeTable:
 def lifetimes_csv(
     data: CensoredLifetimes, class_names: Sequence[str], class_of_row: IntArray, xy_m: FloatArray
 ) -> bytes:
-    """Return a table that `read_lifetimes` reads.
+    """Return a table that `read_lifetimes` reads, of N lifetimes, their classes (N,) and places on the ground (N, 2).
 
-    Args:
-        data: N lifetimes, of which `entry_s` and `weight` are written where they say something.
-        class_names: classes.
-        class_of_row: (N,) index into them.
-        xy_m: (N, 2) where on the ground.
+    Columns `entry` and `weight` are written where they say something.
     """
     right = np.where(np.isinf(data.right_s), np.nan, data.right_s)
     columns = {"left": data.left_s, "right": right}
@@ -216,13 +209,9 @@ def _refuse(table: Columns, bad: BoolArray, field: str, problem: Callable[[int],
 
 def _positions(table: Columns) -> FloatArray:
     """(N, 2), nan where there are none."""
-    if ("x_m" in table) != ("y_m" in table):
-        missing = "y_m" if "x_m" in table else "x_m"
-        raise table.error("missing column", row=None, field=missing, hint="both x_m and y_m, or neither")
-    if "x_m" not in table:
+    if not table.has_all(("x_m", "y_m"), "both x_m and y_m, or neither"):
         return np.full((len(table), 2), np.nan)
-    optional = [Quantity(q.name, q.low, q.high, optional=True, hint=q.hint) for q in (X_M, Y_M)]
-    return np.stack([table.numbers(quantity) for quantity in optional], axis=1)
+    return np.stack([table.numbers(replace(axis, optional=True)) for axis in (X_M, Y_M)], axis=1)
 
 
 NPMLE, KAPLAN_MEIER, BEST, GP = "npmle", "kaplan-meier", "best", "gp"
@@ -261,14 +250,9 @@ def check_estimator(name: str) -> None:
 
 
 def estimates(name: str, table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterator[LifetimeEstimate]:
-    """Yield the estimate of each group, one after the other, for a progress bar.
+    """Yield the estimate of each group by one of `estimators()`, one after the other, for a progress bar.
 
     The Gaussian process learns from all groups what they have in common; the others see one group at a time.
-
-    Args:
-        name: one of `estimators()`.
-        table: the lifetimes.
-        groups: of them.
 
     Raises:
         ConfigError: an unknown name.
@@ -288,11 +272,7 @@ def estimates(name: str, table: LifetimeTable, groups: Sequence[LifetimeGroup]) 
 
 
 def estimate(name: str, data: CensoredLifetimes) -> LifetimeEstimate:
-    """Fit lifetimes by themselves.
-
-    Args:
-        name: one of `estimators()` but for the Gaussian process.
-        data: N lifetimes.
+    """Fit N lifetimes by themselves, by one of `estimators()` but for the Gaussian process.
 
     Raises:
         DataError, NumericalError: as `estimates`.

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from evermap.io.columns import csv_bytes, named
+from evermap.io.spatial import COVARIANCE, upper_triangle
 from evermap.io.table import parquet_bytes
-from evermap.runs.track.detections import COVARIANCE, ENTRIES
 from evermap.runs.track.lifetimes import LIFETIME_COLUMNS, lifetimes_csv
 from evermap.tracking.record import BOX_COLUMNS
 from evermap.tracking.run import TrackResult
 from evermap.tracking.tracklets import TrackState
 from evermap.types import UNKNOWN, FloatArray, IntArray
+
+_Columns = Mapping[str, tuple[tuple[str, ...], IntArray] | FloatArray | IntArray]
+"""By name; columns of names hold the names and their indices."""
 
 
 def track_files(result: TrackResult) -> dict[str, Callable[[], bytes]]:
@@ -30,8 +33,8 @@ def track_files(result: TrackResult) -> dict[str, Callable[[], bytes]]:
     }
 
 
-def _tracks(result: TrackResult) -> dict[str, tuple[tuple[str, ...], IntArray] | FloatArray | IntArray]:
-    """Return one row per object and frame; columns of names hold the names and their indices."""
+def _tracks(result: TrackResult) -> _Columns:
+    """Return one row per object and frame."""
     tracks = result.tracks
     return {
         "stamp_s": tracks.stamp_s,
@@ -57,12 +60,11 @@ def _beliefs(result: TrackResult) -> dict[str, FloatArray]:
         found |= {name: tracks.box[:, k] for k, name in enumerate(BOX_COLUMNS)}
         sigma = np.sqrt(tracks.box_variance)
         found |= {f"sigma_{name}": sigma[:, k] for k, name in enumerate(BOX_COLUMNS)}
-        entries = zip(COVARIANCE, ENTRIES, strict=True)
-        found |= {name: tracks.position_covariance_m2[:, i, j] for name, (i, j) in entries}
+        found |= upper_triangle(tracks.position_covariance_m2, COVARIANCE)
     return found
 
 
-def _spells(result: TrackResult) -> dict[str, tuple[tuple[str, ...], IntArray] | FloatArray | IntArray]:
+def _spells(result: TrackResult) -> _Columns:
     """Return one row per spell, with empty cells for unknown begins and ends."""
     spells = result.spells
     return {
@@ -112,12 +114,12 @@ def _axes(prefix: str, unit: str, vectors: FloatArray) -> dict[str, FloatArray]:
     return {f"{prefix}{axis}{unit}": vectors[:, k] for k, axis in enumerate("xyz")}
 
 
-def _with_names(columns: dict[str, Any]) -> dict[str, Any]:
+def _with_names(columns: _Columns) -> dict[str, Any]:
     """Return the columns for `csv_bytes`."""
     return {name: named(*cells) if isinstance(cells, tuple) else cells for name, cells in columns.items()}
 
 
-def _with_lists(columns: dict[str, Any]) -> dict[str, Any]:
+def _with_lists(columns: _Columns) -> dict[str, Any]:
     """Return the columns for `parquet_bytes`."""
     return {
         name: np.array(cells[0], dtype=object)[cells[1]].tolist() if isinstance(cells, tuple) else cells

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from evermap.errors import MissingExtraError
-from evermap.runs.folder import RunFolder
+from evermap.runs.folder import RunFolder, if_installed
 from evermap.runs.summary import RunInfo, summary_head
 from evermap.runs.track.tables import track_files
 from evermap.tracking.run import TrackResult
@@ -53,12 +53,9 @@ def write_track(
                 progress(k + 1, len(files) + 1)
         written = perf_counter()
         save_png(plot_track_run(result), folder.path("figures/objects.png"))
-        remarks = _scene(result, folder) if scene else []
-        timing: dict[str, float] = {
-            "track_s": result.seconds,
-            "write_s": written - start,
-            "draw_s": perf_counter() - written,
-        }
+        rerun = folder.path("scene.rrd")
+        remarks = if_installed(rerun.name, partial(write_recording, result, rerun)) if scene else []
+        timing = {"track_s": result.seconds, "write_s": written - start, "draw_s": perf_counter() - written}
         summary = track_summary(result, info=info or RunInfo(), timing=timing)
         summary["warnings"] += remarks
         return folder.finish(summary)
@@ -89,15 +86,6 @@ def track_summary(result: TrackResult, *, info: RunInfo, timing: Mapping[str, An
         },
         "classes": {name or "all": _of_class(result, k, class_of_track) for k, name in enumerate(table.class_names)},
     }
-
-
-def _scene(result: TrackResult, folder: RunFolder) -> list[str]:
-    """Writes the recording; a remark where it cannot be."""
-    try:
-        write_recording(result, folder.path("scene.rrd"))
-    except MissingExtraError as error:
-        return [f"scene.rrd was left out: {error.one_line()}"]
-    return []
 
 
 def _of_class(result: TrackResult, class_id: int, class_of_track: IntArray) -> dict[str, Any]:
