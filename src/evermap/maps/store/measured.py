@@ -186,14 +186,16 @@ class CliqueLooks(NamedTuple):
     name: bytes
 
 
-def evidence_to_chunks(evidence: Evidence) -> tuple[Chunk, list[Chunk]]:
-    """Return the index of what a session saw, and a chunk for each clique."""
+def evidence_to_chunks(evidence: Evidence | None) -> list[Chunk]:
+    """Return the index of what a session saw, then a chunk for each clique; nothing where it saw nothing."""
+    if evidence is None or not len(evidence):
+        return []
     listed, parts = [], []
     for clique in np.unique(evidence.clique_id):
         mine = evidence[evidence.clique_id == clique]
         parts.append(Chunk("|u1", _looks_to_bytes(mine)))
         listed.append([int(clique), float(mine.stamp_s.min()), float(mine.stamp_s.max()), parts[-1].name.hex()])
-    return text_chunk(json.dumps(listed)), parts
+    return [text_chunk(json.dumps(listed)), *parts]
 
 
 def read_index(text: str) -> list[CliqueLooks]:
