@@ -196,7 +196,7 @@ def log_evidence_of_motion(
     count = len(before_m)
     if count == 1:
         spread = covariance_m2[0] + sigma_m**2 * np.eye(before_m.shape[1])
-        return -0.5 * float(_square(after_m - before_m, spread[None])[0] + _log_det(2.0 * math.pi * spread))
+        return float(log_density(after_m - before_m, spread[None])[0])
     middle, new_middle = before_m.mean(axis=0), after_m.mean(axis=0)
     group = PLANE if before_m.shape[1] == PLANE.point_dim else SPACE
     axes, turns = group.point_dim, group.dim - group.point_dim
@@ -216,19 +216,20 @@ def log_evidence_of_motion(
         shift = shift + step[:axes]
         turn = group.rotation_of(group.exp(np.append(np.zeros(axes), step[axes:]))) @ turn
     residual = after_m - middle - shift - arm @ turn.T
-    log_likelihood = -0.5 * float(np.sum(_square(residual, covariance_m2) + _log_det(2.0 * math.pi * covariance_m2)))
+    log_likelihood = float(np.sum(log_density(residual, covariance_m2)))
     log_prior = -0.5 * float(shift @ shift) / sigma_m**2 - 0.5 * axes * math.log(2.0 * math.pi * sigma_m**2)
-    log_width = 0.5 * group.dim * math.log(2.0 * math.pi) - 0.5 * float(_log_det(information))
+    log_width = 0.5 * group.dim * math.log(2.0 * math.pi) - 0.5 * float(np.linalg.slogdet(information)[1])
     return log_likelihood + log_prior - math.log(ALL_TURNS[axes]) + log_width
 
 
-def _square(residual: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(n,) squared Mahalanobis lengths."""
-    return np.asarray(np.einsum("ni,ni->n", residual, np.linalg.solve(covariance, residual[..., None])[..., 0]))
+def squared_length(off: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return (...,) squared Mahalanobis lengths of differences (..., D)."""
+    return np.asarray(np.einsum("...i,...i->...", off, np.linalg.solve(covariance, off[..., None])[..., 0]))
 
 
-def _log_det(matrix: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.slogdet(matrix)[1])
+def log_density(off: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return (...,) log densities of differences (..., D) of mean zero."""
+    return np.asarray(-0.5 * (squared_length(off, covariance) + np.linalg.slogdet(2.0 * math.pi * covariance)[1]))
 
 
 def _extent(position: FloatArray) -> float:
@@ -278,8 +279,6 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
     parted = Sites(new_id[stands], owner[stands], p_here, p_kept, since[stands], seen[stands])
     moved = replace(places, site_id=new_id[into[part.ravel()]])
     order = np.lexsort((moved.landmark_id, moved.site_id))
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
     no_more = np.setdiff1d(sites.clique_id, owner)
     lost, owners = set(no_more.tolist()), dict(zip(parted.site_id.tolist(), parted.clique_id.tolist(), strict=True))
     whose = zip(stays.clique_id.tolist(), stays.site_id.tolist(), strict=True)
@@ -294,7 +293,7 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
         stays=stays[~(np.isin(stays.clique_id, no_more) & (stays.gone_s == np.inf))],
         n_cliques_ever=max(living.n_cliques_ever, int(clique_id.max(initial=-1)) + 1),
         n_sites_ever=living.n_sites_ever + int(np.count_nonzero(~keeps)),
-    ), rank
+    ), np.argsort(order)
 
 
 def _keepers(site: IntArray, owner: IntArray, before: IntArray) -> BoolArray:

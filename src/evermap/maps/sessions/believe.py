@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from evermap.config import LivingConfig
 from evermap.existence.sites import Evidence, SiteBeliefs, SiteDynamics, SiteLooks, SiteSensor, follow_sites
 from evermap.maps.lives import Life
-from evermap.maps.living import LivingMap, Sites, class_of, clique_rows, site_middles
+from evermap.maps.living import EXISTS, LivingMap, Sites, class_of, clique_rows, site_middles
+from evermap.maps.sessions.extend import Extended, first_and_last
 from evermap.maps.sessions.looks import PlaceLooks
 from evermap.sensing.sightlines import Lines, nominal_lines
 from evermap.survival.step import never_leaves
-from evermap.types import BoolArray, FloatArray, IntArray, Sensor, rows_of
+from evermap.types import FloatArray, IntArray, Sensor, rows_of
+
+
+@dataclass(frozen=True, slots=True)
+class Believed:
+    """The map with the session's beliefs.
+
+    Attributes:
+        living: all but stays and what is learned.
+        log_evidence: (C,) what the session's looks say for 'it stands at one of its sites' against 'it is away', as a
+            log likelihood ratio, by clique, in the order of `living.clique_rows`.
+        evidence: of every clique and frame.
+    """
+
+    living: LivingMap
+    log_evidence: FloatArray
+    evidence: Evidence
 
 
 def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
@@ -46,11 +63,6 @@ def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
     )
 
 
-def predicted(living: LivingMap, config: LivingConfig, until_s: float) -> FloatArray:
-    """Return the (S,) probability that each site is occupied at a later instant."""
-    return aged(living, config, until_s).p_here
-
-
 def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
     """Return the sites of a map with beliefs predicted to a later instant, without looks."""
     if not config.existence or len(living.sites) == 0:
@@ -61,64 +73,73 @@ def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
     nothing = SiteLooks(np.zeros(0), none, none, none, np.zeros(0, dtype=np.bool_))
     lines = nominal_lines(np.zeros(0), living.sightlines.rules)
     after = _followed(living, living.sites.p_here, nothing, lines, config, start_s, until_s, 0.01)
-    return with_beliefs(living.sites, living.sites.p_here, after)
+    return _with_beliefs(living.sites, living.sites.p_here, after)
 
 
-def with_beliefs(sites: Sites, p_start: FloatArray, after: SiteBeliefs) -> Sites:
+def _with_beliefs(sites: Sites, p_start: FloatArray, after: SiteBeliefs) -> Sites:
     """Return sites (S,) with beliefs after a gap, and the part of each that is the last seen stay."""
     never_left = np.divide(sites.p_kept, p_start, out=np.zeros(len(sites)), where=p_start > 0.0)
     return replace(sites, p_here=after.p_here, p_kept=after.p_stayed * np.minimum(never_left, 1.0))
 
 
 def believed(
-    living: LivingMap,
-    p_start: FloatArray,
-    looks: PlaceLooks,
-    sensor: Sensor,
-    config: LivingConfig,
-    start_s: float,
-    until_s: float,
-) -> SiteBeliefs:
-    """Return beliefs after the looks of a session.
+    entry: Extended, seen: PlaceLooks, sensor: Sensor, span_s: tuple[float, float], config: LivingConfig
+) -> Believed:
+    """Return the map with the beliefs and the counts of a session.
 
     Args:
-        living: the map, with the sites that the session found.
-        p_start: (S,) beliefs at `start_s`.
-        looks: of the session.
+        entry: the map with what the session found.
+        seen: looks of the session.
         sensor: whose false detections are counted with.
+        span_s: begin and end of the session.
         config: which parts of the engine are on.
-        start_s: beginning of the session.
-        until_s: its end.
     """
-    p_false = p_false_of(sensor, living)
-    rows = rows_of(looks.rows, looks.counts)
-    # what another robot's session saw until its end is in the beliefs: looks before that count as at that instant
-    start_s, until_s = max(start_s, living.stamp_s), max(until_s, living.stamp_s)
-    rows = replace(rows, stamp_s=np.maximum(rows.stamp_s, start_s))
-    return _followed(living, p_start, rows, looks.lines, config, start_s, until_s, p_false)
-
-
-def evidence(living: LivingMap, beliefs: SiteBeliefs) -> Evidence:
-    """Return the evidence on every clique, frame by frame."""
-    cliques, _ = clique_rows(living.sites)
-    return replace(beliefs.trace, clique_id=cliques[beliefs.trace.clique_id])
-
-
-def said(living: LivingMap, beliefs: SiteBeliefs) -> FloatArray:
-    """Return the (C,) log likelihood ratio of a session's looks, for 'it is present' against 'it is away'."""
-    cliques, row = clique_rows(living.sites)
-    before, after = (
-        np.clip(np.bincount(row, p, minlength=len(cliques)), 1e-12, 1.0 - 1e-12)
-        for p in (beliefs.p_before, beliefs.p_here)
+    (start_s, end_s), living, rows, sites = span_s, entry.living, seen.rows, entry.living.sites
+    until_s, hit, missed = max(end_s, living.stamp_s), rows.hit, seen.counts & ~rows.hit
+    places = replace(
+        living.places,
+        n_hits=living.places.n_hits + np.bincount(seen.place[hit], minlength=len(living.places)),
+        n_misses=living.places.n_misses + np.bincount(seen.place[missed], minlength=len(living.places)),
     )
-    return np.asarray(np.log(after / (1.0 - after)) - np.log(before / (1.0 - before)))
+    first, last = first_and_last(rows.site[hit], rows.stamp_s[hit], len(sites))
+    cliques, row = clique_rows(sites)
+    log_evidence, evidence = np.zeros(len(cliques)), Evidence.empty()
+    if config.existence:
+        # a look at an empty place gives a detection of its landmark by chance: a wrong identity
+        p_false = min(max(sensor.p_false / max(len(living.members), 10), 1e-5), 0.1)
+        # what another robot's session saw until its end is in the beliefs: looks before that count as at that instant
+        from_s, counted = max(start_s, living.stamp_s), rows_of(rows, seen.counts)
+        counted = replace(counted, stamp_s=np.maximum(counted.stamp_s, from_s))
+        after = _followed(living, entry.p_start, counted, seen.lines, config, from_s, until_s, p_false)
+        sites = _with_beliefs(sites, entry.p_start, after)
+        log_evidence = _log_odds(row, after.p_here, len(cliques)) - _log_odds(row, after.p_before, len(cliques))
+        evidence = replace(after.trace, clique_id=cliques[after.trace.clique_id])
+    else:
+        sites = replace(sites, p_here=_as_seen(living, rows.site[hit], last))
+    stood = (entry.p_start >= EXISTS) & ~entry.is_new
+    arrived = np.isfinite(first) & ~stood & (sites.p_here >= EXISTS)
+    since_s = np.where(arrived & ~entry.is_new, first, sites.since_s)
+    sites = replace(sites, since_s=since_s, seen_s=np.maximum(sites.seen_s, last))
+    living = replace(living, stamp_s=until_s, session_start_s=start_s, places=places, sites=sites)
+    return Believed(living, log_evidence, evidence)
 
 
-def p_false_of(sensor: Sensor, living: LivingMap) -> float:
-    """Return the probability that a look at an empty place gives a detection of its landmark: a wrong identity, by
-    chance.
-    """
-    return min(max(sensor.p_false / max(len(living.members), 10), 1e-5), 0.1)
+def _log_odds(clique: IntArray, p_here: FloatArray, n: int) -> FloatArray:
+    """(n,) log odds that a clique stands at one of its sites, by the row of the clique of each (S,)."""
+    p = np.clip(np.bincount(clique, p_here, minlength=n), 1e-12, 1.0 - 1e-12)
+    return np.asarray(np.log(p / (1.0 - p)))
+
+
+def _as_seen(living: LivingMap, hit_site: IntArray, last_s: FloatArray) -> FloatArray:
+    """Return beliefs without decay: a clique is where it was seen last."""
+    p_here = living.sites.p_here.copy()
+    _, clique = clique_rows(living.sites)
+    seen = np.unique(hit_site)
+    for row in np.unique(clique[seen]):
+        mine = np.flatnonzero(clique == row)
+        p_here[mine] = 0.0
+        p_here[mine[np.argmax(last_s[mine])]] = 1.0
+    return p_here
 
 
 def _followed(
@@ -140,13 +161,8 @@ def _followed(
         SiteSensor(lines, p_false, use_misses=config.misses),
         start_s=start_s,
         until_s=until_s,
-        held=_pinned(living, cliques),
+        held=np.isin(cliques, living.members.clique_id[living.members.pinned]),
     )
-
-
-def _pinned(living: LivingMap, cliques: IntArray) -> BoolArray:
-    """(C,) cliques of which an operator said that they are never to be removed."""
-    return np.isin(cliques, living.members.clique_id[living.members.pinned])
 
 
 def _lives(living: LivingMap, config: LivingConfig, class_id: IntArray, position_m: FloatArray) -> list[Life]:

@@ -152,8 +152,12 @@ def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArra
 
 def _windows(rows: IntArray, seen: SeenBoxes, size: int) -> list[IntArray]:
     """Boxes, some at a time, in the order in which they were met."""
-    order = rows[np.argsort(seen.first_s[rows], kind="stable")]
-    return [order[k : k + size] for k in range(0, max(len(order) - size // 2, 1), size // 2)] if len(order) > 1 else []
+    return windows(rows[np.argsort(seen.first_s[rows], kind="stable")], size) if len(rows) > 1 else []
+
+
+def windows(rows: IntArray, size: int) -> list[IntArray]:
+    """Return rows, `size` at a time, each half of them with those before and half with those after."""
+    return [rows[k : k + size] for k in range(0, max(len(rows) - size // 2, 1), size // 2)]
 
 
 def _agreed(

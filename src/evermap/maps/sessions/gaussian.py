@@ -51,8 +51,6 @@ def with_session(
         (P + N, 2) and (2 (P + N), 2 (P + N)).
     """
     count, new = len(position_m), len(session_m) - len(seen)
-    if count == 0:  # a map begins
-        return session_m, session_covariance_m2
     dim = position_m.shape[1]
     s = se2.xy_rows(seen, dim)
     k = len(s)

@@ -24,9 +24,10 @@ from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.geometry.group import SPACE, group_of
 from evermap.geometry.rigid import rigid
+from evermap.maps.bodies import log_density, squared_length
 from evermap.maps.living import EXISTS, LivingMap
 from evermap.maps.sessions.believe import aged
-from evermap.maps.sessions.box_search import TESTED_M2
+from evermap.maps.sessions.box_search import TESTED_M2, windows
 from evermap.maps.sessions.gaussian import drifted
 from evermap.maps.sessions.placing import SMALLEST_P, one_to_one
 from evermap.maps.sessions.session import admitted
@@ -359,8 +360,8 @@ class _Assigned:
         some, k = some[kept], k[kept]
         off, variance = at[some] - place_m[k], loose.wide_m[some] ** 2 + where.drift_m**2
         spread = covariance_m2[k] + variance[:, None, None] * np.eye(self._dim)
-        score = np.log(p[k]) + _log_density(off, spread) - math.log(self._density)
-        score[_squared(off, spread) > GATE[self._dim]] = -np.inf
+        score = np.log(p[k]) + log_density(off, spread) - math.log(self._density)
+        score[squared_length(off, spread) > GATE[self._dim]] = -np.inf
         p_own = self._slam.association.p_own
         found = most_probable(loose.row[some], k, score, frame, len(place_m), p_own)
         rows = np.flatnonzero(found >= len(local))
@@ -410,7 +411,7 @@ class _Assigned:
         rows = se2.xy_rows(k, self._dim)
         known = of_places(self._living.covariance_m2, stood.row[m], self._dim)
         covariance = drifted(where.joint_m2[np.ix_(rows, rows)] + known, where.drift_m)
-        own = _log_density(off, blocks(covariance, self._dim)) if len(m) else np.zeros(0)
+        own = log_density(off, blocks(covariance, self._dim)) if len(m) else np.zeros(0)
         against = own - stands[some]
         conflict = (k[:, None] == k) | (stood.landmark[m][:, None] == stood.landmark[m])
         gate = GATE[self._dim]
@@ -436,7 +437,7 @@ class _Assigned:
         best = self._overlaid(named, of_named, self._index(of_named), self._alike, fewest=self._dim)
         if not best and len(stands) >= self._settings.fewest:
             index = self._index(stands)
-            for some in _windows(every):
+            for some in windows(every, WINDOW):
                 best = max(best, self._overlaid(some, stands, index, allowed), key=len)
                 if len(best) >= WINDOW:  # all of one
                     break
@@ -460,7 +461,7 @@ class _Assigned:
         held = np.flatnonzero(member >= 0)
         of = member[held][:, None] == stood.landmark
         apart = (together[:, held] @ of.astype(np.float64)) > 0.0
-        for some in _windows(left):
+        for some in windows(left, WINDOW):
             off = np.linalg.norm(where.position_m[some][:, None] - stood.position_m[stands], axis=2)
             near = stands[off.min(axis=0, initial=np.inf) < self._settings.bent_m]
             pairs = self._overlaid(some, near, self._index(near), self._alike & ~apart)
@@ -542,14 +543,14 @@ class _Assigned:
         k, m = np.nonzero(self._alike[some] & free & (away < self._settings.farthest_m))
         step, drift_m2 = off[k, m], where.drift_m**2 * np.eye(self._dim)
         spread = where.covariance_m2[k] + stood.covariance_m2[m] + drift_m2
-        stands = np.log(stood.p[m]) + _log_density(step, spread)
-        moved = np.log(stood.p_away[m] * self._overlay.share_nudged) + _log_density(step, spread + nudge_m2)
+        stands = np.log(stood.p[m]) + log_density(step, spread)
+        moved = np.log(stood.p_away[m] * self._overlay.share_nudged) + log_density(step, spread + nudge_m2)
         # beside what was found it would have been found
         missed = np.log1p(-self._settings.p_found * (1.0 - stood.p_away)) * (
             away.min(axis=0, initial=np.inf) < self._beside_m
         )
         stands, moved = (odds - math.log(self._density) - missed[m] for odds in (stands, moved))
-        stands[_squared(step, spread) > GATE[self._dim]] = -np.inf
+        stands[squared_length(step, spread) > GATE[self._dim]] = -np.inf
         if self._local.rotation is not None:
             rules = self._slam.association.space
             angle = se3.angle_between(se3.turn(where.rotation[k]), se3.turn(stood.rotation[m]))
@@ -628,17 +629,3 @@ class _Assigned:
             if not together[[k]][:, np.flatnonzero(found == one)].sum():
                 found[k] = one
         return found
-
-
-def _windows(rows: IntArray) -> list[IntArray]:
-    """Landmarks, some at a time, in the order in which they were met."""
-    return [rows[k : k + WINDOW] for k in range(0, max(len(rows) - WINDOW // 2, 1), WINDOW // 2)]
-
-
-def _squared(step: FloatArray, spread: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("ki,ki->k", step, np.linalg.solve(spread, step[..., None])[..., 0]))
-
-
-def _log_density(step: FloatArray, spread: FloatArray) -> FloatArray:
-    log_det = np.linalg.slogdet(2.0 * math.pi * spread)[1]
-    return np.asarray(-0.5 * (_squared(step, spread) + log_det))

@@ -13,9 +13,10 @@ from evermap.geometry import se2, se3
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import consensus, rigid
 from evermap.geometry.symmetry import Symmetries
-from evermap.maps.living import LivingMap, Places
+from evermap.maps.bodies import squared_length
+from evermap.maps.living import LivingMap, Places, rows_among
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
-from evermap.maps.vicinity import Vicinity, cliques_of, near
+from evermap.maps.vicinity import Vicinity, near
 from evermap.slam.calibration import FORWARD, SLOPE, CalibrationPrior
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
@@ -130,8 +131,7 @@ class Turned(NamedTuple):
             each = []
             for sigma in sigmas_rad:
                 wide = spread + sigma**2 * np.eye(3)
-                squared = np.einsum("ki,ki->k", off, np.linalg.solve(wide, off[..., None])[..., 0])
-                each.append(-0.5 * squared - 0.5 * np.linalg.slogdet(wide)[1])
+                each.append(-0.5 * squared_length(off, wide) - 0.5 * np.linalg.slogdet(wide)[1])
             return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(each)))
 
         return np.where(known, log_density(settings.stood_rad) - log_density(settings.turned_rad), 0.0)
@@ -164,9 +164,8 @@ def laid_over(
         turned: of a session in space, where it lies about; its positions have three coordinates.
     """
     members, places, sites = living.members, living.places, living.sites
-    at = np.minimum(np.searchsorted(members.landmark_id, landmark_id), max(len(members) - 1, 0))
-    known = members.landmark_id[at] == landmark_id if len(members) else np.zeros(len(landmark_id), np.bool_)
-    seen = np.flatnonzero(known)
+    at = rows_among(members.landmark_id, landmark_id)
+    seen = np.flatnonzero(at >= 0)
     used = np.flatnonzero(np.isin(places.landmark_id, landmark_id[seen]))
     landmark = np.searchsorted(landmark_id[seen], places.landmark_id[used])
     if len(used) < 2:
@@ -230,7 +229,7 @@ def unbent(
     """
     home = _homes(living, p_site, where)
     moved, stands = np.flatnonzero((where.place < 0) & (home >= 0)), np.flatnonzero(where.place >= 0)
-    places, body = living.places, living.members.clique_id[_members(living, where)]
+    places, body = living.places, living.members.clique_id[rows_among(living.members.landmark_id, where.landmark_id)]
     place, probability = where.place.copy(), where.probability.copy()
     while len(moved):
         motion, agree = consensus(position_m[moved], places.position_m[home[moved]])
@@ -259,18 +258,11 @@ def all_at_home(living: LivingMap, p_site: FloatArray, where: Laid) -> Laid:
     return replace(where, place=np.where(where.place >= 0, where.place, home))
 
 
-def _members(living: LivingMap, where: Laid) -> IntArray:
-    """(K,) rows of the map's members; arbitrary rows for landmarks that the map does not know."""
-    rows = np.searchsorted(living.members.landmark_id, where.landmark_id)
-    return np.minimum(rows, max(len(living.members) - 1, 0))
-
-
 def _homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
     """(K,) rows of the map's places at which landmarks are most probably expected; -1 for none."""
     site = replace(living, sites=replace(living.sites, p_here=p_site)).site_of()
-    at = _members(living, where)
-    known = living.members.landmark_id[at] == where.landmark_id
-    return np.where(known, living.place_row(where.landmark_id, site[at]), -1)
+    at = rows_among(living.members.landmark_id, where.landmark_id)
+    return np.where(at >= 0, living.place_row(where.landmark_id, site[at]), -1)
 
 
 def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid:
@@ -302,32 +294,34 @@ def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid
 
 
 def widened(
-    seen: Vicinity, where: Laid, path_m: FloatArray, sensor: Sensor, config: LivingConfig
+    living: LivingMap,
+    part: LivingMap,
+    named: IntArray,
+    where: Laid,
+    path_m: FloatArray,
+    sensor: Sensor,
+    config: LivingConfig,
 ) -> tuple[Vicinity, Laid]:
-    """Return the part of a large map with all that a sensor may have seen on a path (N, 2 or 3), and where a session
-    lies in it.
+    """Return the part of a large map that a session can touch, and where it lies there.
+
+    Args:
+        living: the map.
+        part: that the session is laid over: all of it, or a part.
+        named: cliques that are touched in any case.
+        where: it lies in `part`.
+        path_m: (N, 2 or 3) of the sensor: what it may have seen is touched.
+        sensor: of the session.
+        config: by which beliefs age, and how far from what a sensor may see is near.
     """
-    living, reach_m = seen.whole, sensor.range_max_m + config.near_m
+    reach_m = sensor.range_max_m + config.near_m
     cliques, box = living.sites.clique_id, np.array([-np.inf, -np.inf, np.inf, np.inf])
     if np.isfinite(reach_m):  # else all there is may be in view
         cliques, box = near(living, path_m, reach_m)
-    vicinity = Vicinity.of(living, np.union1d(np.unique(seen.part.sites.clique_id), cliques), config, box)
-    at = where.place >= 0
-    place = where.place.copy()
-    places = seen.part.places[place[at]]
+    vicinity = Vicinity.of(living, np.union1d(named, cliques), config, box)
+    at, place = where.place >= 0, where.place.copy()
+    places = part.places[place[at]]
     place[at] = vicinity.part.place_row(places.landmark_id, places.site_id)
     return vicinity, replace(where, place=place)
-
-
-def around(
-    living: LivingMap, where: Laid, path_m: FloatArray, sensor: Sensor, config: LivingConfig
-) -> tuple[Vicinity, Laid]:
-    """Return the part of a large map that a session can touch, and where it lies there, by rows of the whole."""
-    at = where.place >= 0
-    seen = Vicinity.of(living, cliques_of(living, where.landmark_id[at]), config)
-    place, places = where.place.copy(), living.places[where.place[at]]
-    place[at] = seen.part.place_row(places.landmark_id, places.site_id)
-    return widened(seen, replace(where, place=place), path_m, sensor, config)
 
 
 HEAVY_STEPS = 6
@@ -373,7 +367,7 @@ def refitted(
     Raises:
         NumericalError: no finite optimum.
     """
-    problem, start = _in_map(outcome, prior, pose_map_session, size, *held)
+    problem, start = _in_map(outcome, prior, pose_map_session, size, held)
     noise = outcome.noise.noise
     solved = smoother, estimate, _ = _solved(problem, noise, start, robust=robust)
     straightened = False
@@ -386,15 +380,10 @@ def refitted(
 
 
 def _in_map(
-    outcome: Outcome,
-    prior: CalibrationPrior,
-    pose_map_session: FloatArray,
-    size: float,
-    row: IntArray,
-    mean_m: FloatArray,
-    covariance_m2: FloatArray,
+    outcome: Outcome, prior: CalibrationPrior, pose_map_session: FloatArray, size: float, held: Held
 ) -> tuple[Problem, Estimate]:
     """The problem of a session with the map as its prior, and where to start; arguments as of `refitted`."""
+    row, mean_m, covariance_m2 = held
     count = len(outcome.problem.landmark_mean)
     mean, information = np.zeros((count, 2)), np.zeros((2 * count, 2 * count))
     at = se2.xy_rows(row)

@@ -253,7 +253,7 @@ def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tupl
     if where is None:
         return seen, None
     path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
-    return widened(seen, where, path, alone.recording.sensor, config)
+    return widened(living, seen.part, named, where, path, alone.recording.sensor, config)
 
 
 def refit(

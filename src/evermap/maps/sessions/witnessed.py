@@ -12,6 +12,8 @@ import numpy as np
 
 from evermap.existence.sites import Evidence
 from evermap.maps.living import LivingMap, clique_rows
+from evermap.maps.sessions.believe import Believed
+from evermap.maps.sessions.extend import Extended
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Watch
 from evermap.sensing.sightlines import KNOWN
 from evermap.types import FloatArray, IntArray, rows_of
@@ -44,19 +46,19 @@ class Witnessed:
         """Return none."""
         return cls(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), np.zeros(0))
 
-    def sites(self, living: LivingMap, landmark_id: IntArray, place: IntArray) -> IntArray:
-        """Return (W,) rows of their sites, -1 for none, from landmarks (K,) at places (K,)."""
-        row = np.full(len(self.landmark_id), -1, dtype=np.int64)
-        _, mine, at = np.intersect1d(self.landmark_id, landmark_id, return_indices=True)
-        row[mine] = np.searchsorted(living.sites.site_id, living.places.site_id[place[at]])
-        return row
+    def sites(self, entry: Extended) -> IntArray:
+        """Return (W,) rows of their sites in the map with the session, -1 for none."""
+        place, living = entry.places_of(self.landmark_id), entry.living
+        site = np.searchsorted(living.sites.site_id, np.append(living.places.site_id, -1)[place])
+        return np.where(place >= 0, site, -1)
 
-    def unlooked(self, watch: Watch, landmark_id: IntArray, place: IntArray) -> Watch:
+    def unlooked(self, watch: Watch, entry: Extended) -> Watch:
         """Return the watched places without those of these landmarks before they arrived and after they left."""
-        since, until = np.full(1 + int(place.max(initial=0)), -np.inf), np.full(1 + int(place.max(initial=0)), np.inf)
-        _, mine, at = np.intersect1d(self.landmark_id, landmark_id, return_indices=True)
-        since[place[at]] = np.nan_to_num(self.since_s[mine] + self.when_s, nan=-np.inf)
-        until[place[at]] = np.nan_to_num(self.until_s[mine] - self.when_s, nan=np.inf)
+        place = entry.places_of(self.landmark_id)
+        mine, count = place >= 0, 1 + int(entry.place.max(initial=0))
+        since, until = np.full(count, -np.inf), np.full(count, np.inf)
+        since[place[mine]] = np.nan_to_num(self.since_s[mine] + self.when_s, nan=-np.inf)
+        until[place[mine]] = np.nan_to_num(self.until_s[mine] - self.when_s, nan=np.inf)
         listed = watch.listed
         row = np.minimum(listed.landmark, len(since) - 1)
         ours = listed.landmark < len(since)
@@ -65,26 +67,23 @@ class Witnessed:
         return watch._replace(listed=listed.rows(there))
 
 
-def departed(
-    living: LivingMap, log_evidence: FloatArray, evidence: Evidence, seen: PlaceLooks, what: Witnessed, site: IntArray
-) -> tuple[LivingMap, FloatArray, Evidence, PlaceLooks]:
-    """Return the map with observed departures, and their evidence: by clique, by frame, and as a look.
+def departed(now: Believed, seen: PlaceLooks, what: Witnessed, entry: Extended) -> tuple[Believed, PlaceLooks]:
+    """Return the map with observed departures, their evidence by clique and by frame, and looks that have them.
 
     Args:
-        living: the map with the beliefs of the session's looks.
-        log_evidence: (C,) of these for 'it stands somewhere', by clique.
-        evidence: of cliques, frame by frame.
-        seen: looks of the session.
+        now: the map with the beliefs of the session's looks.
+        seen: these.
         what: that was seen.
-        site: (W,) rows of the sites of these, -1 for none.
+        entry: the map with what the session found.
     """
+    site, living = what.sites(entry), now.living
     left = np.flatnonzero(np.isfinite(what.until_s) & (site >= 0))
     if not len(left):
-        return living, log_evidence, evidence, seen
+        return now, seen
     sites, (cliques, clique_of) = living.sites, clique_rows(living.sites)
     at, p_left = site[left], np.clip(what.probability[left], LEAST_P, MOST_P)
     clique = clique_of[at]
-    p_here, p_kept, log_evidence = sites.p_here.copy(), sites.p_kept.copy(), log_evidence.copy()
+    p_here, p_kept, log_evidence = sites.p_here.copy(), sites.p_kept.copy(), now.log_evidence.copy()
     p_here[at] *= 1.0 - p_left
     p_kept[at] *= 1.0 - p_left
     log_evidence[clique] = -WITNESSED_NATS
@@ -94,9 +93,9 @@ def departed(
     of_left = Evidence(
         cliques[clique], stamp_s, none, one, np.ones(len(left)), np.log1p(-p_left), np.clip(total[clique], 0.0, 1.0)
     )
-    evidence = evidence.joined(of_left)
+    evidence = now.evidence.joined(of_left)
     evidence = evidence[np.lexsort((evidence.stamp_s, evidence.clique_id))]
-    return living, log_evidence, evidence, _with_looks(living, seen, at, clique, stamp_s)
+    return Believed(living, log_evidence, evidence), _with_looks(living, seen, at, clique, stamp_s)
 
 
 def _with_looks(
@@ -131,20 +130,20 @@ def _with_looks(
     )
 
 
-def arrived(came: Arrivals, living: LivingMap, before: LivingMap, what: Witnessed, site: IntArray) -> Arrivals:
+def arrived(came: Arrivals, living: LivingMap, what: Witnessed, entry: Extended) -> Arrivals:
     """Return arrivals with the observed ones, and departures among these.
 
     Args:
         came: by earlier looks.
-        living: the map with the sites of the session.
-        before: as the session found it.
+        living: the map with the beliefs of the session.
         what: that was seen.
-        site: (W,) rows of the sites of these, -1 for none.
+        entry: the map with what the session found.
     """
+    site = what.sites(entry)
     seen = {
         int(site[k]): (float(what.since_s[k] - what.when_s), float(what.probability[k]))
         for k in np.flatnonzero(np.isfinite(what.since_s) & (site >= 0))
     }
-    new = ~np.isin(living.sites.site_id[site], before.sites.site_id) | np.isfinite(what.since_s)
+    new = ~np.isin(living.sites.site_id[site], entry.before.sites.site_id) | np.isfinite(what.since_s)
     left = np.flatnonzero(np.isfinite(what.until_s) & (site >= 0) & new)
     return replace(came, came=seen, left_s={int(site[k]): float(what.until_s[k] + what.when_s) for k in left})
