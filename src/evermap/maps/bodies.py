@@ -48,17 +48,10 @@ class Fate(IntEnum):
 
 
 def group(position_m: FloatArray, class_id: IntArray, *, reach_m: float) -> IntArray:
-    """Return cliques by proximity within a class; landmarks without a class are separate cliques.
+    """Return cliques by proximity within a class: (L,) numbers from 0, in the order of their first landmarks.
 
-    Complete linkage: no two landmarks of a clique are farther apart than `reach_m`, the closest are joined first.
-
-    Args:
-        position_m: (L, 2) places.
-        class_id: (L,) classes, negative for none.
-        reach_m: largest extent of a clique.
-
-    Returns:
-        (L,) numbers of cliques from 0, in the order of their first landmarks.
+    Complete linkage: no two landmarks (L, 2) of a clique are farther apart than `reach_m`, the closest are joined
+    first. Landmarks without a class (negative) are separate cliques.
     """
     from scipy.cluster.hierarchy import fcluster, linkage
 
@@ -241,19 +234,13 @@ def _logit(p: float) -> float:
 
 
 def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntArray]:
-    """Return the map after its landmarks were assigned to other cliques.
+    """Return the map after its landmarks (L,) were assigned to other cliques, new ones from `living.n_cliques_ever` on,
+    and (P,) where each row of its places has gone.
 
     A site of a clique that is taken apart becomes one for each part; its stays are those of the part that keeps the
     site. Where cliques are put together, the sites at which they most probably stood become one; their other sites hold
     places of some landmarks only. Stays that went on of a clique that is no more are left out: they go on in the one
     that it is part of now.
-
-    Args:
-        living: the map.
-        clique_id: (L,) clique of each landmark; new ones have ids from `living.n_cliques_ever` on.
-
-    Returns:
-        The map, and (P,) where each row of its places has gone.
     """
     members, sites, places, stays = living.members, living.sites, living.places, living.stays
     of_place = np.searchsorted(sites.site_id, places.site_id)
@@ -323,12 +310,8 @@ def _of_sum_one(owner: IntArray, p_here: FloatArray) -> FloatArray:
 
 
 def without_missed(before: LivingMap, after: LivingMap, settings: GroupingConfig = USUAL) -> LivingMap:
-    """Return the map after a session, with members that were missed alone split off their bodies.
-
-    Args:
-        before: the map as the session found it.
-        after: as the session leaves it, beliefs and counts up to date.
-        settings: how bodies move; and that misses of one session come in runs.
+    """Return the map `after` a session, with members that were missed alone split off their bodies; `before` is the map
+    as the session found it.
     """
     members = after.members
     site = after.site_of()

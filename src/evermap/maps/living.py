@@ -504,10 +504,8 @@ class LivingMap(Shown):
         return np.asarray(blocks(self.covariance_m2, self.dim)[row] + size)
 
     def sighted_rows(self, p_site: FloatArray) -> Landmarks:
-        """Return every place as a record of its own, in the order of `places`: what a robot may meet.
-
-        Args:
-            p_site: (S,) probability of every site.
+        """Return every place as a record of its own, in the order of `places`: what a robot may meet, by the
+        probability (S,) of every site.
         """
         site = np.searchsorted(self.sites.site_id, self.places.site_id)
         member = np.searchsorted(self.members.landmark_id, self.places.landmark_id)

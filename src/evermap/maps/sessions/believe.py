@@ -85,15 +85,7 @@ def _with_beliefs(sites: Sites, p_start: FloatArray, after: SiteBeliefs) -> Site
 def believed(
     entry: Extended, seen: PlaceLooks, sensor: Sensor, span_s: tuple[float, float], config: LivingConfig
 ) -> Believed:
-    """Return the map with the beliefs and the counts of a session.
-
-    Args:
-        entry: the map with what the session found.
-        seen: looks of the session.
-        sensor: whose false detections are counted with.
-        span_s: begin and end of the session.
-        config: which parts of the engine are on.
-    """
+    """Return the map with the beliefs and the counts of a session, which goes from one instant to another."""
     (start_s, end_s), living, rows, sites = span_s, entry.living, seen.rows, entry.living.sites
     until_s, hit, missed = max(end_s, living.stamp_s), rows.hit, seen.counts & ~rows.hit
     places = replace(

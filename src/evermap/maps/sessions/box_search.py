@@ -80,10 +80,7 @@ class MapBoxes(NamedTuple):
 def placed(seen: SeenBoxes, known: MapBoxes, *, metre: bool) -> tuple[FloatArray, float] | None:
     """Return the motion (7,) from a session to the map, and the factor on its lengths; None if these are ambiguous.
 
-    Args:
-        seen: boxes of the session, in the frame of its odometry.
-        known: those of the map.
-        metre: the session's metre is known: the factor is 1.
+    The session is in the frame of its odometry. Where its `metre` is known the factor is 1.
     """
     if not len(known.place) or not len(seen.place):
         return None
@@ -126,12 +123,10 @@ def _factor(own_m: FloatArray, there_m: FloatArray, settings: BoxesConfig) -> fl
 
 
 def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArray, IntArray]:
-    """Return matching rows of boxes of a session and of the map, by their constellation.
+    """Return matching rows of boxes of a session, in the map as far as it is known, and of the map, by their
+    constellation.
 
-    Args:
-        seen: boxes of the session, in the map as far as it is known.
-        known: those of the map.
-        place: (K,) rows of the map's places at which those of the session stand, -1 for none.
+    Those of the session stand at places (K,) of the map, -1 for none.
     """
     found: dict[int, int] = {}
     left = np.flatnonzero((place < 0) & np.isfinite(seen.size_m[:, 0]))

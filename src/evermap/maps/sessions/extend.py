@@ -80,14 +80,8 @@ class Extended:
 
 
 def extended(living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig, drift_m: float) -> Extended:
-    """Enter what a session found.
-
-    Args:
-        living: the map as it was.
-        p_site: (S,) belief in its sites, at the beginning of the session.
-        found: the session's landmarks.
-        config: how far landmarks of one body may be apart.
-        drift_m: by which places may have been off when the session was solved.
+    """Return the map with what a session found, by beliefs (S,) in its sites when the session began, and by how much
+    places may have been off when it was solved.
     """
     before, living, p_site, found = _with_bodies(living, p_site, found, config, drift_m)
     members, cliques_ever = _with_members(living, found, config)

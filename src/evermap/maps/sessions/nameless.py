@@ -193,17 +193,12 @@ class Where(NamedTuple):
 def held_at(
     local: LocalMap, held: IntArray, position_m: FloatArray, covariance_m2: FloatArray, config: OverlayConfig
 ) -> Where:
-    """Return the landmarks of a session in the map, given that some of them are at places of the map.
+    """Return the landmarks of a session in the map, given that some of them (H,) are at places (H, D), of covariance (D
+    H, D H), of the map.
 
     Gaussian conditioning of the session, with a motion that is free, on the differences of those that are held. Of each
-    of these the difference is predicted by the others alone, from the inverse of the covariance of all.
-
-    Args:
-        local: the session, in a frame of its own.
-        held: (H,) rows of those that are held.
-        position_m: (H, D) their places.
-        covariance_m2: (D H, D H) of these.
-        config: how far what stands may be off; the most probable is taken.
+    of these the difference is predicted by the others alone, from the inverse of the covariance of all. What stands may
+    be off by the most probable one of some drifts.
     """
     motion, dim = rigid(local.place[held], position_m), local.dim
     group = group_of(motion)
@@ -334,12 +329,8 @@ class _Assigned:
         return member, where
 
     def glimpsed(self, member: IntArray, where: Where | None, frame: IntArray) -> tuple[IntArray, IntArray]:
-        """Return rows of detections too few for a landmark, at places where one stands, and of the members seen there.
-
-        Args:
-            member: (K,) as of `members`.
-            where: as of `members`.
-            frame: (M,) of all detections of the recording.
+        """Return rows of detections too few for a landmark, at places where one stands, and of the members seen there;
+        `member` and `where` as of `members`, and the frames (M,) of all detections of the recording.
         """
         stood, loose, local = self._stood, self._found.loose, self._local.place
         there = np.flatnonzero((stood.p >= EXISTS) & ~np.isin(stood.landmark, member))
@@ -582,12 +573,8 @@ class _Assigned:
         """Return log odds (K, L) of being members, also where another one of their class was.
 
         Two that were exchanged share the choice of the other one. A landmark that is where another one was, while none
-        is where it was, has that choice for itself.
-
-        Args:
-            table: without that.
-            held: rows that are certain.
-            at_place: (Q,) rows, members and log odds of being at a place of these, whatever they are like.
+        is where it was, has that choice for itself. Rows that are held are certain; `at_place` has (Q,) rows, members
+        and log odds of being at a place of these, whatever they are like.
         """
         k, member, stands = at_place
         odds, home = np.full(len(table), -np.inf), np.full(len(table), -1, dtype=np.int64)

@@ -152,16 +152,10 @@ def laid_over(
     config: LivingConfig,
     turned: Turned | None = None,
 ) -> Laid | None:
-    """Align a session with the map; None if no landmarks match.
+    """Align landmarks (K,) of a session with the map; None if none match.
 
-    Args:
-        living: the map.
-        p_site: (S,) probability of its sites, at the beginning of the session.
-        landmark_id: (K,) landmarks of the session.
-        position_m: (K, 2) in its own frame.
-        covariance_m2: (2 K, 2 K).
-        config: `search` and `overlay`, see `overlay.lay_over`.
-        turned: of a session in space, where it lies about; its positions have three coordinates.
+    By the probability (S,) of the map's sites at the beginning of the session, and positions (K, 2) in its own frame
+    with covariance (2 K, 2 K), in space with 3 for 2, where it lies about as `turned` tells.
     """
     members, places, sites = living.members, living.places, living.sites
     at = rows_among(members.landmark_id, landmark_id)
@@ -217,15 +211,8 @@ def unbent(
     One wrong identity after a blind stretch may turn all that follows. Then everything seen there seems to have moved,
     by one and the same motion, which things that really move do not. Such landmarks are laid at their places again, and
     the session is straightened when it is solved with the map. What moved alike in the midst of things that stand has
-    moved: a bend takes all that is in view along.
-
-    Args:
-        living: the map.
-        p_site: (S,) belief in its sites.
-        where: as most landmarks have it.
-        position_m: (K, 2) landmarks of `where` in the session's frame.
-        together: (K, K) frames in which two of them were seen.
-        settings: which bodies moved alike.
+    moved: a bend takes all that is in view along, as told by the frames in which two landmarks were seen `together` (K,
+    K). Positions (K, 2) are in the session's frame, and beliefs (S,) those in the map's sites.
     """
     home = _homes(living, p_site, where)
     moved, stands = np.flatnonzero((where.place < 0) & (home >= 0)), np.flatnonzero(where.place >= 0)
@@ -266,14 +253,9 @@ def _homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
 
 
 def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid:
-    """Return rarely seen landmarks, assigned to the sites that others of their body occupy.
+    """Return rarely seen landmarks (K,), assigned to the sites that others of their body occupy.
 
     Whether their sightings fit there is seen when the session is solved with the map.
-
-    Args:
-        living: the map.
-        where: where all others lie.
-        landmark_id: (K,) those.
     """
     members, places = living.members, living.places
     names = np.intersect1d(landmark_id, members.landmark_id)
@@ -302,16 +284,10 @@ def widened(
     sensor: Sensor,
     config: LivingConfig,
 ) -> tuple[Vicinity, Laid]:
-    """Return the part of a large map that a session can touch, and where it lies there.
+    """Return the part of a large map that a session can touch, and where it lies there, if it lies in a `part` of the
+    map.
 
-    Args:
-        living: the map.
-        part: that the session is laid over: all of it, or a part.
-        named: cliques that are touched in any case.
-        where: it lies in `part`.
-        path_m: (N, 2 or 3) of the sensor: what it may have seen is touched.
-        sensor: of the session.
-        config: by which beliefs age, and how far from what a sensor may see is near.
+    That are cliques that are named, and what the sensor may have seen on its path (N, 2 or 3).
     """
     reach_m = sensor.range_max_m + config.near_m
     cliques, box = living.sites.clique_id, np.array([-np.inf, -np.inf, np.inf, np.inf])
@@ -355,14 +331,8 @@ def refitted(
 ) -> tuple[Outcome, bool]:
     """Return the session solved in the frame of the map, and whether it had to be corrected for a distortion.
 
-    Args:
-        outcome: of the session alone.
-        prior: of the calibration states.
-        pose_map_session: (3,) where the session's frame is in the map.
-        size: metres of the map for one of the session's graph.
-        held: landmarks that are at places of the map.
-        settings: when it was bent, and how it is straightened then.
-        robust: explain outliers.
+    Its own frame is in the map at (3,), and `size` metres of the map are one of its graph. A robust solution explains
+    outliers.
 
     Raises:
         NumericalError: no finite optimum.

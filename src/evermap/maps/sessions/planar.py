@@ -172,13 +172,8 @@ def solve_session(
 
 
 def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = True) -> Localised[PlanarVisit]:
-    """Return a session that was solved alone, solved again at its alignment with a map.
-
-    Args:
-        alone: the session.
-        living: the map, with its classes (`session.admitted`).
-        config: settings.
-        cut: solve without doubtful frames (`doubtful`), if there are any.
+    """Return a session that was solved alone, solved again at its alignment with a map, whose classes it has
+    (`session.admitted`); and `cut`, without doubtful frames (`doubtful`), if there are any.
     """
     settings, known = config.living, len(living.places) > 0
     lost = Localised.lost(PlanarVisit(alone), living, CONTRADICTED if known else DISTORTED)
@@ -343,11 +338,6 @@ def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> tuple[B
     Where the odometry was silent, a session falls into parts, if what was seen does not tie them. Those that show none
     of the map, or in a map that begins, all but the largest, may be anywhere. And where most sightings of a stretch
     contradict all others, its poses are wrong, or the identities.
-
-    Args:
-        visit: the session, solved with the map as its prior.
-        where: it lies in the map; None for a map's first.
-        config: `fit`.
     """
     outcome, settings = visit.outcome, config.fit
     problem, pose, marginals = outcome.problem, outcome.graph_estimate.pose, outcome.graph_marginals
@@ -384,12 +374,8 @@ def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> tuple[B
 
 
 def without(visit: Solved, untied: BoolArray, wrong: BoolArray) -> Recording | None:
-    """Return the recording of a session without doubtful frames; None where most of what is tied contradicts the rest.
-
-    Args:
-        visit: the session.
-        untied: (F,) frames that nothing ties to the rest, see `doubtful`.
-        wrong: (F,) frames that contradict it.
+    """Return the recording of a session without frames (F,) that are untied or wrong, see `doubtful`; None where most
+    of what is tied contradicts the rest.
     """
     recording, doubt = visit.recording, untied | wrong
     if not doubt.any():

@@ -198,14 +198,8 @@ def judged(
 ) -> Judged:
     """Return the map after the session, the changes, the evidence and the misses.
 
-    What was found goes into the map, then hits and misses into beliefs, and those into decisions.
-
-    Args:
-        living: the map before the session, resized to it.
-        where: the session lies in the map; None for a map's first.
-        visit: the session, solved with the map as its prior.
-        config: which parts of the engine are on.
-        known: the same, judged without knowing what the session teaches of lifetimes; None for the first time.
+    What was found goes into the map, then hits and misses into beliefs, and those into decisions. A map's first session
+    lies nowhere. Lifetimes that the session teaches are `known` when it is judged for the second time.
     """
     if known is not None:
         living = replace(living, lives=replace(known.living.lives, looks_s=living.lives.looks_s))
@@ -242,15 +236,8 @@ def missed(living: LivingMap, seen: PlaceLooks, visit: Visit) -> Misses:
 def decided(
     entry: Extended, now: Believed, seen: PlaceLooks, visit: Visit, config: LivingConfig, classes: ClassLives | None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
-    """Return the map with updated stays and without forgotten cliques, and the changes since the previous session.
-
-    Args:
-        entry: the map as the session found it, and what it found.
-        now: with the session's beliefs.
-        seen: looks of the session.
-        visit: the session.
-        config: which parts of the engine are on.
-        classes: how long things stay, as the session teaches; None for nothing.
+    """Return the map with updated stays and without forgotten cliques, and the changes since the previous session, by
+    what it teaches of how long things stay, None for nothing.
     """
     before = entry.before
     came = arrivals(before, now.living, seen, visit.floor_sensor, config.looks)
@@ -376,14 +363,7 @@ def judged_so_far(
     living: LivingMap, sighting: Sighting, sensor: Sensor, config: LivingConfig, classes: ClassLives | None = None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """Return the map with beliefs after a part of a drive, from the causal poses, and the changes since the last
-    report; without places that the map does not have yet, and bodies.
-
-    Args:
-        living: the map before it.
-        sighting: what was seen of its places.
-        sensor: of the robot.
-        config: which parts of the engine are on.
-        classes: how long things stay, as `lives_of` tells; None where nothing is known of it.
+    report; without places that the map does not have yet, and bodies. How long things stay is as `lives_of` tells.
     """
     start_s, end_s = (max(float(stamp_s), living.stamp_s) for stamp_s in sighting.stamp_s[[0, -1]])
     living = replace(living, sightlines=replace(living.sightlines, rules=config.sight))

@@ -302,14 +302,8 @@ def localised_in_space(
     remarks: tuple[str, ...] = (),
     progress: Progress | None = None,
 ) -> Localised[SpatialVisit]:
-    """Return a session solved at its alignment with a map, or with the part of a large one that it can observe.
-
-    Args:
-        recording: the session.
-        living: the map, with its classes (`session.admitted`).
-        config: settings.
-        remarks: on the recording.
-        progress: told after every frame.
+    """Return a session solved at its alignment with a map, or with the part of a large one that it can observe. The map
+    has the session's classes (`session.admitted`).
     """
     settings, intake = config.living, prepare_space(recording, config.slam.space, remarks)
     large, named = len(living.places) > settings.whole_places, cliques_of(living, names_of(intake).ravel())

@@ -68,14 +68,7 @@ class Witnessed:
 
 
 def departed(now: Believed, seen: PlaceLooks, what: Witnessed, entry: Extended) -> tuple[Believed, PlaceLooks]:
-    """Return the map with observed departures, their evidence by clique and by frame, and looks that have them.
-
-    Args:
-        now: the map with the beliefs of the session's looks.
-        seen: these.
-        what: that was seen.
-        entry: the map with what the session found.
-    """
+    """Return the map with observed departures, their evidence by clique and by frame, and looks that have them."""
     site, living = what.sites(entry), now.living
     left = np.flatnonzero(np.isfinite(what.until_s) & (site >= 0))
     if not len(left):
@@ -131,14 +124,7 @@ def _with_looks(
 
 
 def arrived(came: Arrivals, living: LivingMap, what: Witnessed, entry: Extended) -> Arrivals:
-    """Return arrivals with the observed ones, and departures among these.
-
-    Args:
-        came: by earlier looks.
-        living: the map with the beliefs of the session.
-        what: that was seen.
-        entry: the map with what the session found.
-    """
+    """Return arrivals by earlier looks, with the observed ones, and departures among these."""
     site = what.sites(entry)
     seen = {
         int(site[k]): (float(what.since_s[k] - what.when_s), float(what.probability[k]))

@@ -155,11 +155,8 @@ _PARTS = {"changes", "attachments", "lost", "n_cliques_ever", "n_sites_ever"}
 
 
 def lineage(origin: Mapping[int, int], number: int) -> tuple[int, ...]:
-    """Return the ancestors of a revision and itself, oldest first, without lost ones.
-
-    Args:
-        origin: the revision whose map each one started from: its parent, or what it restored.
-        number: the one; 0 has none.
+    """Return the ancestors of a revision and itself, oldest first, without lost ones; 0 has none. The origin of each is
+    the revision whose map it started from: its parent, or what it restored.
     """
     line = []
     while number > 0:

@@ -253,11 +253,7 @@ class MapStore(Protocol):
         ...
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
-        """Return the attachments of revisions, oldest first, without reading them.
-
-        Args:
-            revisions: which; None for those of `lineage()`.
-        """
+        """Return the attachments of revisions, oldest first, without reading them; None for those of `lineage()`."""
         ...
 
     def attached(self, attachment: Attachment) -> bytes:

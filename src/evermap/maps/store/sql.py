@@ -255,15 +255,8 @@ class SqlStore(Shown):
         provenance: Provenance | None = None,
         lost: Mapping[int, bytes | None] | None = None,
     ) -> int:
-        """Commit the map of an older revision again, so that no id that was given since is given twice.
-
-        Args:
-            old: the map.
-            revision: where it comes from.
-            head: the newest revision.
-            next_ids: next free ids of cliques and sites.
-            provenance: of the new revision.
-            lost: revisions that damage has destroyed, see `Record`.
+        """Commit the map of an older revision again, so that no id of cliques and sites that was given since is given
+        twice. `lost` are revisions that damage has destroyed, see `Record`.
         """
         restored = replace(
             old,
@@ -374,14 +367,10 @@ class SqlStore(Shown):
         pruned: Mapping[int, str],
         made: tuple[str, str] | None = None,
     ) -> None:
-        """Put revisions from elsewhere into an empty store.
+        """Put revisions from elsewhere into an empty store: stored bytes by name, and names of records by number.
 
-        Args:
-            chunks: stored bytes by name.
-            records: names of the records by number; what is missing up to `head` is lost.
-            head: number of the newest.
-            pruned: revisions without content, and since when.
-            made: when and by which evermap the store was made; None for now and by this one.
+        Records that are missing up to the newest, `head`, are lost. Revisions that are pruned have no content, since
+        when is told; and `made` is when and by which evermap the store was made, None for now and by this one.
         """
         with self._transaction(writes=True) as connection:
             if made is not None:
@@ -703,11 +692,8 @@ def is_anchor(values: Sequence[Any]) -> bool:
 
 
 def announce(connection: Connection, what: str) -> None:
-    """Tell all who listen (`postgres.Announcements`) once the transaction is committed; nothing in SQLite.
-
-    Args:
-        connection: of the transaction.
-        what: the schema of a site, '' for all.
+    """Tell all who listen (`postgres.Announcements`) the schema of a site, '' for all, once the transaction is
+    committed; nothing in SQLite.
     """
     if connection.dialect.name == "postgresql":
         connection.execute(select(func.pg_notify(CHANNEL, what)))

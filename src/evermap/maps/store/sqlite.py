@@ -167,12 +167,7 @@ def survey(path: Path) -> Verification | None:
 
 
 def snapshot(store: SqlStore, path: Path, revision: int) -> None:
-    """Write a map of any store, up to a revision, as a file; of equal maps the files are equal.
-
-    Args:
-        store: the map.
-        path: a file that does not exist.
-        revision: the newest that the file is to have.
+    """Write a map of any store, up to a revision, as a file that does not exist; of equal maps the files are equal.
 
     Raises:
         DamagedMapError: the store is damaged.
@@ -192,15 +187,8 @@ def snapshot(store: SqlStore, path: Path, revision: int) -> None:
 
 
 def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> tuple[int, Path]:
-    """Go back to an intact revision of a damaged file: every intact one is kept, the damaged file is set aside.
-
-    Args:
-        path: the map.
-        revision: whose content the new revision gets; 0 is the empty map.
-        provenance: of the new revision.
-
-    Returns:
-        Its number, and where the damaged file is.
+    """Go back to an intact revision of a damaged file, 0 for the empty map: every intact one is kept, the damaged file
+    is set aside. Returns the number of the new revision, and where the damaged file is.
 
     Raises:
         DamagedMapError: that revision is not intact.
