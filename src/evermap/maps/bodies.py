@@ -15,8 +15,9 @@ detected as often as ever or less, and that share of its own usual rate is what 
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import IntEnum
 from typing import NamedTuple
@@ -105,12 +106,16 @@ def regrouped(
         (L,) cliques. Of one that is split the largest part keeps the id, with those that were not seen.
     """
     log_wrong = np.log(np.broadcast_to(np.asarray(p_wrong, dtype=np.float64), clique_id.shape))
-    moves = _Moves(*displaced, settings.move_sigma_m)
-    one_body = _logit(settings.p_one_body)
-    label, moved = clique_id.copy(), []
+
+    @functools.cache
+    def log_evidence(rows: tuple[int, ...]) -> float:
+        before_m, after_m, covariance_m2 = (part[list(rows)] for part in displaced)
+        return log_evidence_of_motion(before_m, after_m, covariance_m2, settings.move_sigma_m)
+
+    label, moved, one_body = clique_id.copy(), [], _logit(settings.p_one_body)
     for name in np.unique(clique_id[fate != Fate.UNSEEN]):
         of_fate = {one: np.flatnonzero((clique_id == name) & (fate == one)) for one in Fate}
-        bodies = moves.joined([np.array([row]) for row in of_fate[Fate.MOVED]], lambda _a, _b: one_body)
+        bodies = _joined([np.array([row]) for row in of_fate[Fate.MOVED]], log_evidence, lambda _a, _b: one_body)
         moved += bodies
         parts = [*bodies, *(of_fate[one] for one in (Fate.STAYED, Fate.GONE) if len(of_fate[one]))]
         parts.sort(key=len, reverse=True)
@@ -130,46 +135,37 @@ def regrouped(
 
     # what did not move with its clique is a clique of its own by now, unless it was mistaken
     whole = [body for body in moved if (fate[(label == label[body[0]]) & (fate != Fate.UNSEEN)] == Fate.MOVED).all()]
-    for body in moves.joined(whole, log_prior):
+    for body in _joined(whole, log_evidence, log_prior):
         names = np.unique(label[body])
         label[np.isin(label, names)] = names[0]
     return label
 
 
-class _Moves:
-    """Evidence of displacements for one rigid motion of a set of landmarks."""
+def _joined(
+    sets: Sequence[IntArray],
+    log_evidence: Callable[[tuple[int, ...]], float],
+    log_prior: Callable[[IntArray, IntArray], float],
+) -> list[IntArray]:
+    """Sets of rows, joined as long as the odds are for it, the best pair first."""
+    sets = list(sets)
 
-    def __init__(self, before_m: FloatArray, after_m: FloatArray, covariance_m2: FloatArray, sigma_m: float) -> None:
-        self._before, self._after, self._covariance, self._sigma_m = before_m, after_m, covariance_m2, sigma_m
-        self._known: dict[tuple[int, ...], float] = {}
+    def evidence(rows: IntArray) -> float:
+        return log_evidence(tuple(sorted(rows.tolist())))
 
-    def log_evidence(self, rows: IntArray) -> float:
-        key = tuple(sorted(rows.tolist()))
-        if key not in self._known:
-            mine = np.array(key)
-            self._known[key] = log_evidence_of_motion(
-                self._before[mine], self._after[mine], self._covariance[mine], self._sigma_m
-            )
-        return self._known[key]
-
-    def joined(self, sets: list[IntArray], log_prior: Callable[[IntArray, IntArray], float]) -> list[IntArray]:
-        """Return sets joined as long as the odds are for it, the best pair first."""
-        sets = list(sets)
-        while True:
-            best, pair = 0.0, None
-            for i, a in enumerate(sets):
-                for j, b in enumerate(sets[:i]):
-                    odds = log_prior(a, b)
-                    if odds > -math.inf:
-                        both = self.log_evidence(np.concatenate([a, b]))
-                        odds += both - self.log_evidence(a) - self.log_evidence(b)
-                    if odds > best:
-                        best, pair = odds, (i, j)
-            if pair is None:
-                return sets
-            i, j = pair
-            sets[j] = np.sort(np.concatenate([sets[j], sets[i]]))
-            del sets[i]
+    while True:
+        best, pair = 0.0, None
+        for i, a in enumerate(sets):
+            for j, b in enumerate(sets[:i]):
+                odds = log_prior(a, b)
+                if odds > -math.inf:
+                    odds += evidence(np.concatenate([a, b])) - evidence(a) - evidence(b)
+                if odds > best:
+                    best, pair = odds, (i, j)
+        if pair is None:
+            return sets
+        i, j = pair
+        sets[j] = np.sort(np.concatenate([sets[j], sets[i]]))
+        del sets[i]
 
 
 def log_evidence_of_motion(

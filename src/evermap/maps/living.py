@@ -205,14 +205,8 @@ class MemberTraits(_Rows):
     def of(self, landmark_id: IntArray, columns: Sequence[str]) -> tuple[FloatArray, IntArray]:
         """Return (K, C) values of landmarks, nan where there is none, and the numbers of sessions."""
         wanted = np.array([landmark_id_of(name) for name in columns], dtype=np.int64)
-        names, kinds = np.unique(self.landmark_id), np.unique(self.column_id)
-        code = np.searchsorted(names, self.landmark_id) * len(kinds) + np.searchsorted(kinds, self.column_id)
-        name, kind = np.searchsorted(names, landmark_id), np.searchsorted(kinds, wanted)
-        known = np.isin(landmark_id, names)[:, None] & np.isin(wanted, kinds)
-        asked = np.where(known, name[:, None] * len(kinds) + kind, -1)
-        row = np.searchsorted(code, asked)
-        found = known & (np.append(code, -1)[row] == asked)
-        row = np.where(found, row, len(self))
+        asked = np.repeat(landmark_id, len(wanted)), np.tile(wanted, len(landmark_id))
+        row = pair_rows((self.landmark_id, self.column_id), asked).reshape(-1, len(wanted))
         return np.append(self.value, np.nan)[row], np.append(self.sessions, 0)[row]
 
     def met(self, landmark_id: IntArray, columns: Sequence[str], value: FloatArray) -> MemberTraits:
@@ -243,6 +237,12 @@ class Metres(_Rows):
     log_metre: FloatArray
     log_variance: FloatArray
     information: FloatArray
+
+    @classmethod
+    def of(cls, robot: str, log_variance: float, information: float) -> Self:
+        """Return that of one robot, '' for sessions without a name, which has the metre of the map."""
+        name = landmark_id_of(robot) if robot else 0
+        return cls(np.array([name]), np.zeros(1), np.array([log_variance]), np.array([information]))
 
 
 @dataclass(frozen=True, slots=True)

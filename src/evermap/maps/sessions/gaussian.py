@@ -285,9 +285,9 @@ def settled_by(
     if not robot and not len(metres):
         return settled(*shown, session, living.log_size_variance, living.log_size_information, settings), metres
     if not len(metres):  # sessions without a name, or a survey
-        metres = Metres(*map(np.array, ([0], [0.0], [living.log_size_variance], [living.log_size_information])))
+        metres = Metres.of("", living.log_size_variance, living.log_size_information)
     if name not in metres.robot_id:
-        metres = metres.joined(Metres(*map(np.array, ([name], [0.0], [session[1] ** 2], [UNHEARD]))))
+        metres = metres.joined(Metres.of(robot, session[1] ** 2, UNHEARD))
     row = int(np.flatnonzero(metres.robot_id == name)[0])
     log_metre, variance, information = (
         column.copy() for column in (metres.log_metre, metres.log_variance, metres.information)

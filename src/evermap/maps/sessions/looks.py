@@ -148,7 +148,9 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
         living,
         p_start,
         rows,
-        _Seen(clear, beside & clear, unknown),
+        clear,
+        beside & clear,
+        unknown,
         lambda some: (eye[frame[some], :2], floor_m[place[some]]),
         settings,
     )
@@ -189,23 +191,19 @@ def _unwitnessed(rows: SiteLooks, was_unknown: BoolArray, n: int, least: int) ->
     return np.array([np.sum(there & (found == 0)), np.sum(there & (found > 0))], dtype=np.float64)
 
 
-class _Seen(NamedTuple):
-    """Return (N,) masks of looks along clear lines, those with a sighting nearby or behind, and unknown lines."""
-
-    clear: BoolArray
-    beside: BoolArray
-    unknown: BoolArray
-
-
 def _hidden(
     living: LivingMap,
     p_start: FloatArray,
     rows: SiteLooks,
-    seen: _Seen,
+    clear: BoolArray,
+    beside: BoolArray,
+    unknown: BoolArray,
     ends: Callable[[IntArray], tuple[FloatArray, FloatArray]],
     settings: LooksConfig,
 ) -> tuple[BoolArray, IntArray, FloatArray]:
     """Return looks that count, the (C,) state of the lines to each clique, and its (C,) probability of being hidden.
+
+    By masks (N,) of looks along clear lines, of those with a sighting nearby or behind, and of unknown lines.
 
     A miss with a witness counts for what it is: something else was seen along the line. Without one the line may be
     closed in this session, the more probably the more cliques are missed from there together: one door hides them all,
@@ -213,7 +211,6 @@ def _hidden(
     """
     cliques, row = clique_rows(living.sites)
     n, least = len(cliques), settings.witnesses
-    clear, beside, unknown = seen
     hits, n_clear, n_beside, n_unknown = (
         np.bincount(rows.clique[some], minlength=n) for some in (rows.hit, clear, beside, unknown)
     )

@@ -480,47 +480,36 @@ class _Assigned:
 
         What is ambiguous if places may deviate much between sessions may not be if they deviate little.
         """
-        drifts_m = sorted({max(self._overlay.drifts_m), min(self._overlay.drifts_m)}, reverse=True)
-        tried = (self._overlaid_at(some, stands, index, allowed, drift_m, fewest) for drift_m in drifts_m)
-        return next(filter(None, tried), [])
-
-    def _overlaid_at(
-        self,
-        some: IntArray,
-        stands: IntArray,
-        index: PlaceIndex | None,
-        allowed: BoolArray,
-        drift_m: float,
-        fewest: int,
-    ) -> list[tuple[int, int]]:
-        """Return the same at one deviation of places between sessions."""
         fewest, rules = fewest or self._settings.fewest, self._slam.association.constellation
         if len(some) < fewest or len(stands) < fewest:
             return []
-        (at, spread), local, motions = self._about(stands, drift_m), self._local.part(some), None
-        area_m2 = float(np.prod(np.sort(np.ptp(at, axis=0))[-2:] + 10.0))
+        local, motions = self._local.part(some), None
+        area_m2 = float(np.prod(np.sort(np.ptp(self._stood.position_m[stands], axis=0))[-2:] + 10.0))
         by_chance = math.log(max(len(some), 2) ** 2 * max(len(stands), 2) ** 2)  # pairs of both, each a motion
         if index is not None:
             motions = list(index.motions(local.place, local.beside_m))
             if not motions:
                 return []
             laid = group_of(motions[0]).transform(np.array(motions)[:, None], local.place)
-            near = index.around(laid.reshape(-1, self._dim), 2.0 * rules.near_m)
-            at, spread, stands = at[near], spread[near], stands[near]
-        pairs = agreed_pairs(
-            local,
-            LocalMap(at, block_diag(*spread), None if local.rotation is None else self._stood.rotation[stands]),
-            allowed[np.ix_(some, stands)],
-            density=self._density,
-            probability=self._slam.association.p_merge,
-            motions=motions,
-            margins_nats=(
-                rules.certain_nats + max(math.log(area_m2 / TESTED_M2), 0.0),
-                min(rules.certain_nats + by_chance, rules.lead_nats),
-            ),
-            settings=self._slam,
-        )
-        return [(int(some[k]), int(stands[m])) for k, m in pairs]
+            stands = stands[index.around(laid.reshape(-1, self._dim), 2.0 * rules.near_m)]
+        for drift_m in sorted({max(self._overlay.drifts_m), min(self._overlay.drifts_m)}, reverse=True):
+            at, spread = self._about(stands, drift_m)
+            pairs = agreed_pairs(
+                local,
+                LocalMap(at, block_diag(*spread), None if local.rotation is None else self._stood.rotation[stands]),
+                allowed[np.ix_(some, stands)],
+                density=self._density,
+                probability=self._slam.association.p_merge,
+                motions=motions,
+                margins_nats=(
+                    rules.certain_nats + max(math.log(area_m2 / TESTED_M2), 0.0),
+                    min(rules.certain_nats + by_chance, rules.lead_nats),
+                ),
+                settings=self._slam,
+            )
+            if pairs:
+                return [(int(some[k]), int(stands[m])) for k, m in pairs]
+        return []
 
     def _odds(
         self, some: IntArray, where: Where, free: BoolArray

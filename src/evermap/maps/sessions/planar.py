@@ -13,18 +13,8 @@ from evermap.geometry import se2
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap, Metres
-from evermap.maps.sessions import believe
+from evermap.maps.sessions import believe, gaussian
 from evermap.maps.sessions.extend import Extended, Found, first_and_last
-from evermap.maps.sessions.gaussian import (
-    Size,
-    drifted,
-    log_ratio,
-    of_unknown_size,
-    own_landmarks,
-    resized,
-    settled,
-    settled_by,
-)
 from evermap.maps.sessions.looks import Sighting, Watch
 from evermap.maps.sessions.placing import (
     ANYWAY,
@@ -49,17 +39,7 @@ from evermap.slam.check import unusable
 from evermap.slam.cleaning import some_frames
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.streaming import Outcome, silent_links
-from evermap.types import (
-    UNKNOWN,
-    BoolArray,
-    FloatArray,
-    IntArray,
-    Progress,
-    Recording,
-    Sensor,
-    SlamResult,
-    landmark_id_of,
-)
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Progress, Recording, Sensor, SlamResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +51,8 @@ class PlanarVisit:
     """
 
     solved: Solved
+    witnessed = Witnessed.nothing()
+    """Observed arrivals and departures: none, since nothing is tracked."""
 
     @property
     def recording(self) -> Recording:
@@ -97,11 +79,6 @@ class PlanarVisit:
         """The sensor."""
         return self.recording.sensor
 
-    @property
-    def witnessed(self) -> Witnessed:
-        """Observed arrivals and departures: none, since nothing is tracked."""
-        return Witnessed.nothing()
-
     def concluded(self, scratch: str = "first_pose") -> SlamResult:
         """Return the session as the estimator has it; without a map in the frame that is called `scratch`."""
         return of_slam.concluded(self.solved, scratch)
@@ -112,8 +89,7 @@ class PlanarVisit:
         information = 1.0 / variance if variance > 0.0 else np.inf
         living = replace(living, log_size_variance=variance, log_size_information=information)
         if robot := self.recording.robot:
-            first = [landmark_id_of(robot)], [0.0], [variance], [information]
-            living = replace(living, metres=Metres(*map(np.array, first)))
+            living = replace(living, metres=Metres.of(robot, variance, information))
         return living
 
     def found(self, where: Laid | None, living: LivingMap, config: LivingConfig) -> Found:  # noqa: ARG002
@@ -122,7 +98,7 @@ class PlanarVisit:
         begins, in_place = where is None, None
         if where is not None:
             in_place = np.searchsorted(visit.prepared.landmark_id, where.landmark_id[where.place >= 0])
-        own = own_landmarks(visit.outcome, config.fit, in_place)
+        own = gaussian.own_landmarks(visit.outcome, config.fit, in_place)
         detection, landmark = _inliers(visit, config.fit.inlier)
         stamps = visit.recording.frames.stamp_s[visit.recording.detections.frame[detection]]
         count = len(visit.prepared.landmark_id)
@@ -210,10 +186,10 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
 
 def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingConfig) -> Laid | None:
     """Return the alignment of the session with the map; None if no landmarks match."""
-    own = own_landmarks(alone.outcome, config.fit)
+    own = gaussian.own_landmarks(alone.outcome, config.fit)
     names = alone.prepared.landmark_id[own.row]
     log_sigma = np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance))
-    where = laid_over(living, p_site, names, own.position_m, of_unknown_size(own, float(log_sigma)), config)
+    where = laid_over(living, p_site, names, own.position_m, gaussian.of_unknown_size(own, float(log_sigma)), config)
     if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
         return None
     if config.search == "joint":
@@ -241,7 +217,7 @@ def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tupl
 
     That is what the sensor may have seen on its way, once the session is laid over those that it names, and some more.
     """
-    own = own_landmarks(alone.outcome, config.fit)
+    own = gaussian.own_landmarks(alone.outcome, config.fit)
     named = cliques_of(living, alone.prepared.landmark_id[own.row])
     seen = Vicinity.of(living, named, config)
     where = laid(seen.part, believe.aged(seen.part, config, alone.start_s).p_here, alone, config)
@@ -262,21 +238,21 @@ def refit(
     outcome, names = alone.outcome, alone.prepared.landmark_id
     size = outcome.scale
     if outcome.log_scale_sigma > 0.0:
-        own = own_landmarks(outcome, config.fit)
+        own = gaussian.own_landmarks(outcome, config.fit)
         _, mine, theirs = np.intersect1d(names[own.row], where.landmark_id[where.place >= 0], return_indices=True)
         places = where.place[where.place >= 0][theirs]
-        shown = log_ratio(
+        shown = gaussian.log_ratio(
             own.position_m[mine],
             of_places(own.covariance_m2, mine),
             living.places.position_m[places],
-            drifted(of_places(living.covariance_m2, places), where.drift_m),
+            gaussian.drifted(of_places(living.covariance_m2, places), where.drift_m),
         )
         own_metre = 0.0, outcome.log_scale_sigma
         if part:  # it does not change the metre of the rest
-            found = settled(*shown, own_metre, living.log_size_variance, np.inf, config.metre)
+            found = gaussian.settled(*shown, own_metre, living.log_size_variance, np.inf, config.metre)
         else:
-            found, metres = settled_by(shown, own_metre, living, alone.recording.robot, config.metre)
-            living = resized(living, found, metres)
+            found, metres = gaussian.settled_by(shown, own_metre, living, alone.recording.robot, config.metre)
+            living = gaussian.resized(living, found, metres)
         size *= found.session_factor
         alone = _remarked(alone, shown[0], found, config.metre)
 
@@ -285,7 +261,7 @@ def refit(
         row = np.searchsorted(names, where.landmark_id[stand])
         position = living.places.position_m[where.place[stand]]
         motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
-        covariance = drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
+        covariance = gaussian.drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
         return refitted(
             outcome, outcome.prior, motion, size, Held(row, position, covariance), settings=config.fit, robust=robust
         )
@@ -311,7 +287,7 @@ def refit(
     return living, where, replace(alone, outcome=solved)
 
 
-def _remarked(alone: Solved, log_ratio: float, found: Size, settings: MetreConfig) -> Solved:
+def _remarked(alone: Solved, log_ratio: float, found: gaussian.Size, settings: MetreConfig) -> Solved:
     """A session with a remark where its metre contradicts the map's, or its robot's those of the others."""
     contradicts = found.off > settings.contradicts
     if not (contradicts or found.apart):

@@ -42,16 +42,10 @@ _MOST_POSES = 200
 """Of a stored trajectory, which is for pictures."""
 _TABLES: dict[str, Any] = {"odometry": Odometry, "frames": Frames, "detections": Detections, "sensor": Sensor}
 _IN_SPACE: dict[str, Any] = {"odometry": SpatialOdometry, "frames": Frames, "detections": SpatialDetections}
-_SHEET = (
-    "kind",
-    "sigma_scale",
-    "sigma_offset_m",
-    "sigma_angle_rad",
-    "sigma_position_m",
-    "sigma_odometer_scale",
-    "sigma_askew_rad",
-)
-_LATER = ("features", "feature_names", *_SHEET)
+_LATER = (
+    "features", "feature_names", "kind", "sigma_scale", "sigma_offset_m", "sigma_angle_rad", "sigma_position_m",
+    "sigma_odometer_scale", "sigma_askew_rad",
+)  # fmt: skip
 """What is kept only where there is any: equal recordings have the bytes that they had before there was."""
 _PLAIN = ("name", "source", "class_names", "clock")
 
