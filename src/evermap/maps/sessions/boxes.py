@@ -25,12 +25,11 @@ from evermap.geometry.chunked import blocks
 from evermap.geometry.rigid import consensus
 from evermap.maps.bodies import squared_length
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.believe import aged
+from evermap.maps.sessions.believe import Witnessed, aged
 from evermap.maps.sessions.box_search import GATE, MapBoxes, half_turn, in_space, placed, regained
 from evermap.maps.sessions.box_visit import BoxVisit, SeenBoxes, seen_boxes
 from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, one_to_one, widened
 from evermap.maps.sessions.spatial import SpatialVisit, localised_in_space
-from evermap.maps.sessions.witnessed import Witnessed
 from evermap.maps.vicinity import cliques_of
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.moving import TrafficIntake, has_traffic, rescaled, solve_in_traffic, take_in_traffic

@@ -32,7 +32,6 @@ from evermap.maps.sessions.placing import (
     widened,
     with_glimpsed,
 )
-from evermap.maps.sessions.witnessed import Witnessed
 from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.slam import result as of_slam
 from evermap.slam.check import unusable
@@ -51,7 +50,7 @@ class PlanarVisit:
     """
 
     solved: Solved
-    witnessed = Witnessed.nothing()
+    witnessed = believe.Witnessed.nothing()
     """Observed arrivals and departures: none, since nothing is tracked."""
 
     @property

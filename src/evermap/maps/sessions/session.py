@@ -14,13 +14,12 @@ from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap
 from evermap.maps.sessions import believe, decide
-from evermap.maps.sessions.believe import Believed
+from evermap.maps.sessions.believe import Believed, arrived, departed
 from evermap.maps.sessions.extend import Extended, Found, extended
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Sighting, Watch, arrivals, looked_at
 from evermap.maps.sessions.placing import Laid, Localised
 from evermap.maps.sessions.planar import PlanarVisit
 from evermap.maps.sessions.spatial import SpatialVisit
-from evermap.maps.sessions.witnessed import arrived, departed
 from evermap.maps.vicinity import in_chunks
 from evermap.show import Shown
 from evermap.slam.association.features import medians

@@ -17,12 +17,11 @@ from evermap.config import Config, LivingConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.maps.living import EXISTS, Dated, LivingMap
-from evermap.maps.sessions.believe import aged
+from evermap.maps.sessions.believe import Witnessed, aged
 from evermap.maps.sessions.extend import Extended, Found, first_and_last
 from evermap.maps.sessions.gaussian import anchored, drifted
 from evermap.maps.sessions.looks import Watch
 from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, Turned, laid_over, places_in, widened
-from evermap.maps.sessions.witnessed import Witnessed
 from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.sensing import learned
 from evermap.sensing.profile import Assumed, Field, Projection
