@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from evermap.config import LifetimeConfig
 from evermap.errors import ConfigError, suggestion
 from evermap.existence.lifetimes import Lifetimes
-from evermap.maps.lives import EVERYWHERE, Life, Lives, general_purpose
+from evermap.maps.lives import DAY_S, EVERYWHERE, Life, Lives, general_purpose
 from evermap.maps.living import LivingMap, Stays
 from evermap.survival import LifetimePrior, PiecewiseConstantHazard
 from evermap.survival.class_lifetimes import (
@@ -117,11 +117,6 @@ class History:
         """Return (C + 1,) counts, or weights, of rows (K,) per class, and in total."""
         each = np.ones(len(rows)) if weight is None else weight
         return np.append(np.bincount(self.kind[rows], each[rows], minlength=len(self.class_ids)), each[rows].sum())
-
-    @property
-    def gap_s(self) -> float:
-        """Between two looks, as a rule; a day as long as there was one look."""
-        return float(np.median(np.diff(self.looks_s))) if len(self.looks_s) > 1 else 86_400.0
 
     def sightings(self, back_by_stay: FloatArray, back_rate: FloatArray) -> Sightings:
         """Return the recent stays as samples, with events that may have been missed between looks."""
@@ -237,7 +232,8 @@ class _Learned:
         back_by_hop = self.p_hop * history.shares(history.there_again, history.hopped_twice)
         here_again = history.shares(history.back_here, history.away & np.isfinite(history.back_s))
         # of those that a look missed: who is back before nobody can miss, and counts as one who never left
-        gap_s = history.gap_s
+        looks_s = history.looks_s
+        gap_s = float(np.median(np.diff(looks_s))) if len(looks_s) > 1 else DAY_S  # between two looks, as a rule
         back = [
             -self.absence.curve(row).log_conditional_survival(gap_s, 2.0 * gap_s) / gap_s
             for row in range(n_classes + 1)

@@ -65,11 +65,6 @@ class Laid:
     drift_m: float
     assumed: BoolArray
 
-    def as_seen(self) -> Laid:
-        """Return the same without assumed matches."""
-        place = np.where(self.assumed, ELSEWHERE, self.place)
-        return replace(self, place=place, assumed=np.zeros(len(place), dtype=np.bool_))
-
 
 def places_in(where: Laid | None, landmark_id: IntArray) -> tuple[IntArray, FloatArray]:
     """Return (N,) places of landmarks of a session, and their probabilities; -1 and 1 for those that have none."""
@@ -139,8 +134,7 @@ class Turned(NamedTuple):
 
 def _turns(rotation: FloatArray) -> FloatArray:
     """Poses (K, 7) at the origin with orientations (K, 4); of nan with none."""
-    known = np.isfinite(rotation[:, :1])
-    return np.hstack([np.zeros((len(rotation), 3)), np.where(known, rotation, se3.NO_TURN)])
+    return se3.turn(np.where(np.isfinite(rotation[:, :1]), rotation, se3.NO_TURN))
 
 
 def laid_over(

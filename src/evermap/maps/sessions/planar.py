@@ -16,6 +16,7 @@ from evermap.maps.living import LivingMap, Metres
 from evermap.maps.sessions import believe, gaussian
 from evermap.maps.sessions.extend import Extended, Found, first_and_last
 from evermap.maps.sessions.looks import Sighting, Watch
+from evermap.maps.sessions.overlay import ELSEWHERE
 from evermap.maps.sessions.placing import (
     ANYWAY,
     CONTRADICTED,
@@ -267,7 +268,8 @@ def refit(
 
     solved, straightened = in_map(where)
     if where.assumed.any() and solved.inlier.mean() < (1.0 - config.fit.most_lost) * outcome.inlier.mean():
-        as_seen = where.as_seen()
+        place = np.where(where.assumed, ELSEWHERE, where.place)
+        as_seen = replace(where, place=place, assumed=np.zeros_like(where.assumed))
         other, straightened_too = in_map(as_seen)
         if other.inlier.mean() > solved.inlier.mean():  # it was not bent: they did move together
             where, solved, straightened = as_seen, other, straightened_too

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import fields, replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from evermap.maps.store.measured import evidence_to_chunks, looks_of, read_index
 from evermap.maps.store.protocol import (
     Attachment,
     DamagedMapError,
+    MapStore,
     Provenance,
     PrunedRevisionError,
     Pruning,
@@ -52,7 +53,7 @@ _LONGEST = 900_000_000
 """Bytes of an attachment; a database takes no more in one piece."""
 
 
-class SqlStore(Shown):
+class SqlStore(Shown, MapStore):
     """`MapStore` over an engine of SQLAlchemy, see there. Tables are made or brought up to date.
 
     Args:
@@ -126,22 +127,13 @@ class SqlStore(Shown):
         return self.load().plot(title=f"{self.where}, revision {self.head()}")
 
     def close(self) -> None:
-        """Let go of all connections."""
         self._engine.dispose()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
     def head(self) -> int:
-        """Return the newest revision."""
         with self._transaction() as connection:
             return self._anchor(connection)[0]
 
     def log(self) -> tuple[Revision, ...]:
-        """Return all revisions."""
         with self._transaction() as connection:
             records = self._chain(connection)[0]
             stored = self._fetched(connection, {record.config for record in records.values()})
@@ -149,12 +141,10 @@ class SqlStore(Shown):
             return tuple(record.revision(configs[record.config]) for _, record in sorted(records.items()))
 
     def lineage(self, revision: int | None = None) -> tuple[int, ...]:
-        """Return the revisions that are in one."""
         with self._transaction() as connection:
             return self._lineage(connection, revision)
 
     def load(self, revision: int | None = None) -> LivingMap:
-        """Return the map as it was committed."""
         with self._transaction() as connection:
             number = self._known(connection, revision)
             if number == 0:
@@ -166,7 +156,6 @@ class SqlStore(Shown):
             return self._unpacked(connection, record)
 
     def members(self, revision: int | None = None) -> Members:
-        """Return the landmarks of a revision."""
         with self._transaction() as connection:
             number = self._known(connection, revision)
             if number == 0:
@@ -236,7 +225,6 @@ class SqlStore(Shown):
         return number
 
     def revert(self, revision: int, provenance: Provenance | None = None) -> int:
-        """Return a new revision with the content of an older one."""
         with self._transaction() as connection:
             head = self._known(connection, None)
             number = self._known(connection, revision)
@@ -268,7 +256,6 @@ class SqlStore(Shown):
         return self.commit(restored, origin, parent=head, restores=revision, lost=lost)
 
     def prune(self, keep: int = 10, *, also: Collection[int] = (), dry_run: bool = False) -> Pruning:
-        """Delete the content that only old revisions hold."""
         if keep < 1:
             raise ConfigError(f"{keep} is less than 1", field="keep", hint="1 keeps the newest revision only")
         with self._transaction(writes=not dry_run) as connection:
@@ -293,13 +280,11 @@ class SqlStore(Shown):
         return Pruning(tuple(sorted(old)), tuple(sorted(kept)), len(doomed), n_bytes)
 
     def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
-        """Return changes of one revision."""
         with self._transaction() as connection:
             number = self._known(connection, revision)
             return self._record(connection, number).changes if number else ()
 
     def changes_of(self, landmark_id: int | None = None) -> tuple[tuple[int, MapChange], ...]:
-        """Return changes of a landmark, or of all."""
         with self._transaction() as connection:
             records = self._chain(connection)[0]
         told = ((number, change) for number, record in sorted(records.items()) for change in record.changes)
@@ -313,7 +298,6 @@ class SqlStore(Shown):
         since_s: float = -np.inf,
         revisions: Collection[int] | None = None,
     ) -> Evidence:
-        """Return what sessions saw."""
         kept = [Evidence.empty()]
         with self._transaction() as connection:
             wanted: dict[bytes, set[int | None]] = {}  # None: every clique
@@ -335,12 +319,10 @@ class SqlStore(Shown):
         return found[np.argsort(found.stamp_s, kind="stable")]
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
-        """Return the attachments of revisions."""
         with self._transaction() as connection:
             return tuple(item for record in self._records_of(connection, revisions) for item in record.attached())
 
     def attached(self, attachment: Attachment) -> bytes:
-        """Return the bytes of an attachment."""
         with self._transaction() as connection:
             name = content.name_of(attachment.digest)
             return Chunk.of_stored(name, "|u1", self._fetched(connection, [name])[name]).raw
