@@ -118,10 +118,13 @@ def named_in(recording: AnyRecordingT, living: LivingMap, config: Config) -> Any
         DataError: too few frames with detections, or too many for the memory; in space, no odometry.
     """
     found, name, landmark_id = _met(recording, living, config)
-    names = _new_names(found, recording, landmark_id)
-    for row, text in names.items():
+    start = f"{recording.frames.stamp_s[0]:.3f}".rstrip("0").rstrip(".")
+    texts: dict[int, str] = {}
+    for row in np.flatnonzero(landmark_id == UNKNOWN).tolist():  # class, number in the session, and its first stamp
+        kind = int(found.of_kind[row, 0])
+        text = f"{recording.class_names[kind] if kind >= 0 else 'landmark'}-{row + 1}@{start}"
         landmark_id[row] = landmark_id_of(text)
-    texts = {landmark_id_of(text): text for text in names.values()}
+        texts[landmark_id_of(text)] = text
     named = with_ids(recording, found.landmark_row, name, landmark_id)
     return replace(named, landmark_names={**recording.landmark_names, **texts})
 
@@ -163,14 +166,6 @@ def _met(
         rows, glimpsed = assigned.glimpsed(member, where, recording.detections.frame)
         name[rows] = living.members.landmark_id[glimpsed]
     return found, name, landmark_id
-
-
-def _new_names(found: Associated | AssociatedInSpace, recording: AnyRecording, landmark_id: IntArray) -> dict[int, str]:
-    """Return names of new landmarks: class, number in the session, and its first stamp."""
-    start = f"{recording.frames.stamp_s[0]:.3f}".rstrip("0").rstrip(".")
-    kind, words = found.of_kind[:, 0], recording.class_names
-    new = np.flatnonzero(landmark_id == UNKNOWN).tolist()
-    return {row: f"{words[kind[row]] if kind[row] >= 0 else 'landmark'}-{row + 1}@{start}" for row in new}
 
 
 class Where(NamedTuple):

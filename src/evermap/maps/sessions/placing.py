@@ -158,15 +158,12 @@ def laid_over(
     landmark = np.searchsorted(landmark_id[seen], places.landmark_id[used])
     if len(used) < 2:
         return None
-    clique_ids, clique = np.unique(members.clique_id[at[seen]], return_inverse=True)
+    _, first, clique = np.unique(members.clique_id[at[seen]], return_index=True, return_inverse=True)
     used_sites, site = np.unique(places.site_id[used], return_inverse=True)
     site_rows = np.searchsorted(sites.site_id, used_sites)
     log_turned = np.zeros(len(used))
     if turned is not None:
         log_turned = turned.log_odds(seen[landmark], places[used], config.overlay)
-    total = np.zeros(len(clique_ids))
-    of_known = np.isin(sites.clique_id, clique_ids)
-    np.add.at(total, np.searchsorted(clique_ids, sites.clique_id[of_known]), p_site[of_known])
     found = lay_over(
         Sighted(position_m[seen], of_places(covariance_m2, seen, living.dim), clique.ravel().astype(np.int64)),
         Known(
@@ -175,7 +172,7 @@ def laid_over(
             landmark=landmark,
             site=site.ravel().astype(np.int64),
             log_p_site=np.log(np.maximum(p_site[site_rows], SMALLEST_P)),
-            log_p_elsewhere=np.log(np.maximum(1.0 - total, SMALLEST_P)),
+            log_p_elsewhere=np.log(np.maximum(1.0 - living.p_of_sites(p_site)[at[seen[first]]], SMALLEST_P)),
             log_turned=log_turned,
         ),
         config.search,
@@ -208,7 +205,7 @@ def unbent(
     moved: a bend takes all that is in view along, as told by the frames in which two landmarks were seen `together` (K,
     K). Positions (K, 2) are in the session's frame, and beliefs (S,) those in the map's sites.
     """
-    home = _homes(living, p_site, where)
+    home = homes(living, p_site, where)
     moved, stands = np.flatnonzero((where.place < 0) & (home >= 0)), np.flatnonzero(where.place >= 0)
     places, body = living.places, living.members.clique_id[rows_among(living.members.landmark_id, where.landmark_id)]
     place, probability = where.place.copy(), where.probability.copy()
@@ -233,14 +230,8 @@ def unbent(
     return replace(where, place=place, probability=probability, assumed=(where.place < 0) & (place >= 0))
 
 
-def all_at_home(living: LivingMap, p_site: FloatArray, where: Laid) -> Laid:
-    """Return where a session lies if nothing has moved: every landmark of the map at its most probable place."""
-    home = _homes(living, p_site, where)
-    return replace(where, place=np.where(where.place >= 0, where.place, home))
-
-
-def _homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
-    """(K,) rows of the map's places at which landmarks are most probably expected; -1 for none."""
+def homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
+    """Return (K,) rows of the map's places at which landmarks are most probably expected; -1 for none."""
     site = replace(living, sites=replace(living.sites, p_here=p_site)).site_of()
     at = rows_among(living.members.landmark_id, where.landmark_id)
     return np.where(at >= 0, living.place_row(where.landmark_id, site[at]), -1)

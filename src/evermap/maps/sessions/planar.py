@@ -25,7 +25,7 @@ from evermap.maps.sessions.placing import (
     Held,
     Laid,
     Localised,
-    all_at_home,
+    homes,
     laid_over,
     places_in,
     refitted,
@@ -179,7 +179,8 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
                     return localised(solve_session(some, visit.prepared.warnings, config), living, config, cut=False)
                 except (DataError, NumericalError):  # too little is left
                     return lost
-        if where is not None and not fits(visit, alone, settings):
+        # what fits together by itself does not fit once it is held there
+        if where is not None and visit.outcome.inlier.mean() < settings.fit.least_fit * alone.outcome.inlier.mean():
             return lost
     return Localised(PlanarVisit(visit), part, where, vicinity)
 
@@ -274,7 +275,8 @@ def refit(
         if other.inlier.mean() > solved.inlier.mean():  # it was not bent: they did move together
             where, solved, straightened = as_seen, other, straightened_too
     if straightened:
-        at_home = all_at_home(living, p_site, where)
+        # where it lies if nothing has moved
+        at_home = replace(where, place=np.where(where.place >= 0, where.place, homes(living, p_site, where)))
         solved, _ = in_map(at_home)
         landmark = alone.prepared.problem.landmark_row[: len(solved.inlier)]
         n_fit, count = (np.bincount(landmark, w, minlength=len(names)) for w in (solved.inlier, np.ones(len(landmark))))
@@ -300,13 +302,6 @@ def _remarked(alone: Solved, log_ratio: float, found: gaussian.Size, settings: M
         "odometer have drifted; it is entered in the scale of the map"
     )
     return replace(alone, prepared=replace(alone.prepared, warnings=(*alone.prepared.warnings, remark)))
-
-
-def fits(visit: Solved, alone: Solved, config: LivingConfig) -> bool:
-    """Return False for a session that the map contradicts: what fits together by itself does not fit once it is held
-    there.
-    """
-    return bool(visit.outcome.inlier.mean() >= config.fit.least_fit * alone.outcome.inlier.mean())
 
 
 def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> tuple[BoolArray, BoolArray]:
