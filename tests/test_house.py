@@ -71,8 +71,8 @@ OF_THE_CODE = frozenset(
     live.inbox.BURST_S live.judge.REST_S live.ros.GUESS_S live.ros.TOLD_S live.ros.SEEN_P live.ros.WAIT_S
     maps.sessions.box_search.GATE maps.sessions.box_search.TESTED_M2 maps.sessions.boxes.LEAST_P
     maps.sessions.nameless.HELD_NATS maps.sessions.nameless.GATE
-    maps.sessions.placing.SMALLEST_P maps.sessions.witnessed.WITNESSED_NATS maps.sessions.witnessed.LEAST_P
-    maps.sessions.witnessed.MOST_P runs.persist.changes._SHORTEST_GAP_S sensing.kernels.FAR_OUT
+    maps.sessions.placing.SMALLEST_P maps.sessions.believe.WITNESSED_NATS maps.sessions.believe.LEAST_P
+    maps.sessions.believe.MOST_P runs.persist.changes._SHORTEST_GAP_S sensing.kernels.FAR_OUT
     slam.association.associator.LEAST_LEFT slam.association.associator.SAME_NATS slam.association.consensus.IMPLIED_M2
     slam.association.consensus.LEAST_M2 slam.association.in_space.FAR_M
     slam.association.particles.FEWEST_PARTICLES slam.association.particles.GATE slam.association.splitting.LEAST_M2

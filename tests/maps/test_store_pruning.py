@@ -181,7 +181,7 @@ def test_the_map_goes_on_as_if_nothing_was_pruned(path: Path, tmp_path: Path) ->
 
 
 def test_from_a_damaged_map_nothing_is_deleted(path: Path) -> None:
-    with open_store(path) as store, store._reading() as connection:  # type: ignore[attr-defined]
+    with open_store(path) as store, store._transaction() as connection:  # type: ignore[attr-defined]
         content = store._record(connection, 7).content  # type: ignore[attr-defined]
     with sqlite3.connect(path) as database:
         database.execute("DELETE FROM chunk WHERE name = ?", (content,))

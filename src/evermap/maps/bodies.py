@@ -15,8 +15,9 @@ detected as often as ever or less, and that share of its own usual rate is what 
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import IntEnum
 from typing import NamedTuple
@@ -48,17 +49,10 @@ class Fate(IntEnum):
 
 
 def group(position_m: FloatArray, class_id: IntArray, *, reach_m: float) -> IntArray:
-    """Return cliques by proximity within a class; landmarks without a class are separate cliques.
+    """Return cliques by proximity within a class: (L,) numbers from 0, in the order of their first landmarks.
 
-    Complete linkage: no two landmarks of a clique are farther apart than `reach_m`, the closest are joined first.
-
-    Args:
-        position_m: (L, 2) places.
-        class_id: (L,) classes, negative for none.
-        reach_m: largest extent of a clique.
-
-    Returns:
-        (L,) numbers of cliques from 0, in the order of their first landmarks.
+    Complete linkage: no two landmarks (L, 2) of a clique are farther apart than `reach_m`, the closest are joined
+    first. Landmarks without a class (negative) are separate cliques.
     """
     from scipy.cluster.hierarchy import fcluster, linkage
 
@@ -112,12 +106,16 @@ def regrouped(
         (L,) cliques. Of one that is split the largest part keeps the id, with those that were not seen.
     """
     log_wrong = np.log(np.broadcast_to(np.asarray(p_wrong, dtype=np.float64), clique_id.shape))
-    moves = _Moves(*displaced, settings.move_sigma_m)
-    one_body = _logit(settings.p_one_body)
-    label, moved = clique_id.copy(), []
+
+    @functools.cache
+    def log_evidence(rows: tuple[int, ...]) -> float:
+        before_m, after_m, covariance_m2 = (part[list(rows)] for part in displaced)
+        return log_evidence_of_motion(before_m, after_m, covariance_m2, settings.move_sigma_m)
+
+    label, moved, one_body = clique_id.copy(), [], _logit(settings.p_one_body)
     for name in np.unique(clique_id[fate != Fate.UNSEEN]):
         of_fate = {one: np.flatnonzero((clique_id == name) & (fate == one)) for one in Fate}
-        bodies = moves.joined([np.array([row]) for row in of_fate[Fate.MOVED]], lambda _a, _b: one_body)
+        bodies = _joined([np.array([row]) for row in of_fate[Fate.MOVED]], log_evidence, lambda _a, _b: one_body)
         moved += bodies
         parts = [*bodies, *(of_fate[one] for one in (Fate.STAYED, Fate.GONE) if len(of_fate[one]))]
         parts.sort(key=len, reverse=True)
@@ -137,46 +135,37 @@ def regrouped(
 
     # what did not move with its clique is a clique of its own by now, unless it was mistaken
     whole = [body for body in moved if (fate[(label == label[body[0]]) & (fate != Fate.UNSEEN)] == Fate.MOVED).all()]
-    for body in moves.joined(whole, log_prior):
+    for body in _joined(whole, log_evidence, log_prior):
         names = np.unique(label[body])
         label[np.isin(label, names)] = names[0]
     return label
 
 
-class _Moves:
-    """Evidence of displacements for one rigid motion of a set of landmarks."""
+def _joined(
+    sets: Sequence[IntArray],
+    log_evidence: Callable[[tuple[int, ...]], float],
+    log_prior: Callable[[IntArray, IntArray], float],
+) -> list[IntArray]:
+    """Sets of rows, joined as long as the odds are for it, the best pair first."""
+    sets = list(sets)
 
-    def __init__(self, before_m: FloatArray, after_m: FloatArray, covariance_m2: FloatArray, sigma_m: float) -> None:
-        self._before, self._after, self._covariance, self._sigma_m = before_m, after_m, covariance_m2, sigma_m
-        self._known: dict[tuple[int, ...], float] = {}
+    def evidence(rows: IntArray) -> float:
+        return log_evidence(tuple(sorted(rows.tolist())))
 
-    def log_evidence(self, rows: IntArray) -> float:
-        key = tuple(sorted(rows.tolist()))
-        if key not in self._known:
-            mine = np.array(key)
-            self._known[key] = log_evidence_of_motion(
-                self._before[mine], self._after[mine], self._covariance[mine], self._sigma_m
-            )
-        return self._known[key]
-
-    def joined(self, sets: list[IntArray], log_prior: Callable[[IntArray, IntArray], float]) -> list[IntArray]:
-        """Return sets joined as long as the odds are for it, the best pair first."""
-        sets = list(sets)
-        while True:
-            best, pair = 0.0, None
-            for i, a in enumerate(sets):
-                for j, b in enumerate(sets[:i]):
-                    odds = log_prior(a, b)
-                    if odds > -math.inf:
-                        both = self.log_evidence(np.concatenate([a, b]))
-                        odds += both - self.log_evidence(a) - self.log_evidence(b)
-                    if odds > best:
-                        best, pair = odds, (i, j)
-            if pair is None:
-                return sets
-            i, j = pair
-            sets[j] = np.sort(np.concatenate([sets[j], sets[i]]))
-            del sets[i]
+    while True:
+        best, pair = 0.0, None
+        for i, a in enumerate(sets):
+            for j, b in enumerate(sets[:i]):
+                odds = log_prior(a, b)
+                if odds > -math.inf:
+                    odds += evidence(np.concatenate([a, b])) - evidence(a) - evidence(b)
+                if odds > best:
+                    best, pair = odds, (i, j)
+        if pair is None:
+            return sets
+        i, j = pair
+        sets[j] = np.sort(np.concatenate([sets[j], sets[i]]))
+        del sets[i]
 
 
 def log_evidence_of_motion(
@@ -196,7 +185,7 @@ def log_evidence_of_motion(
     count = len(before_m)
     if count == 1:
         spread = covariance_m2[0] + sigma_m**2 * np.eye(before_m.shape[1])
-        return -0.5 * float(_square(after_m - before_m, spread[None])[0] + _log_det(2.0 * math.pi * spread))
+        return float(log_density(after_m - before_m, spread[None])[0])
     middle, new_middle = before_m.mean(axis=0), after_m.mean(axis=0)
     group = PLANE if before_m.shape[1] == PLANE.point_dim else SPACE
     axes, turns = group.point_dim, group.dim - group.point_dim
@@ -216,19 +205,20 @@ def log_evidence_of_motion(
         shift = shift + step[:axes]
         turn = group.rotation_of(group.exp(np.append(np.zeros(axes), step[axes:]))) @ turn
     residual = after_m - middle - shift - arm @ turn.T
-    log_likelihood = -0.5 * float(np.sum(_square(residual, covariance_m2) + _log_det(2.0 * math.pi * covariance_m2)))
+    log_likelihood = float(np.sum(log_density(residual, covariance_m2)))
     log_prior = -0.5 * float(shift @ shift) / sigma_m**2 - 0.5 * axes * math.log(2.0 * math.pi * sigma_m**2)
-    log_width = 0.5 * group.dim * math.log(2.0 * math.pi) - 0.5 * float(_log_det(information))
+    log_width = 0.5 * group.dim * math.log(2.0 * math.pi) - 0.5 * float(np.linalg.slogdet(information)[1])
     return log_likelihood + log_prior - math.log(ALL_TURNS[axes]) + log_width
 
 
-def _square(residual: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(n,) squared Mahalanobis lengths."""
-    return np.asarray(np.einsum("ni,ni->n", residual, np.linalg.solve(covariance, residual[..., None])[..., 0]))
+def squared_length(off: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return (...,) squared Mahalanobis lengths of differences (..., D)."""
+    return np.asarray(np.einsum("...i,...i->...", off, np.linalg.solve(covariance, off[..., None])[..., 0]))
 
 
-def _log_det(matrix: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.slogdet(matrix)[1])
+def log_density(off: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return (...,) log densities of differences (..., D) of mean zero."""
+    return np.asarray(-0.5 * (squared_length(off, covariance) + np.linalg.slogdet(2.0 * math.pi * covariance)[1]))
 
 
 def _extent(position: FloatArray) -> float:
@@ -240,19 +230,13 @@ def _logit(p: float) -> float:
 
 
 def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntArray]:
-    """Return the map after its landmarks were assigned to other cliques.
+    """Return the map after its landmarks (L,) were assigned to other cliques, new ones from `living.n_cliques_ever` on,
+    and (P,) where each row of its places has gone.
 
     A site of a clique that is taken apart becomes one for each part; its stays are those of the part that keeps the
     site. Where cliques are put together, the sites at which they most probably stood become one; their other sites hold
     places of some landmarks only. Stays that went on of a clique that is no more are left out: they go on in the one
     that it is part of now.
-
-    Args:
-        living: the map.
-        clique_id: (L,) clique of each landmark; new ones have ids from `living.n_cliques_ever` on.
-
-    Returns:
-        The map, and (P,) where each row of its places has gone.
     """
     members, sites, places, stays = living.members, living.sites, living.places, living.stays
     of_place = np.searchsorted(sites.site_id, places.site_id)
@@ -278,8 +262,6 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
     parted = Sites(new_id[stands], owner[stands], p_here, p_kept, since[stands], seen[stands])
     moved = replace(places, site_id=new_id[into[part.ravel()]])
     order = np.lexsort((moved.landmark_id, moved.site_id))
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
     no_more = np.setdiff1d(sites.clique_id, owner)
     lost, owners = set(no_more.tolist()), dict(zip(parted.site_id.tolist(), parted.clique_id.tolist(), strict=True))
     whose = zip(stays.clique_id.tolist(), stays.site_id.tolist(), strict=True)
@@ -294,7 +276,7 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
         stays=stays[~(np.isin(stays.clique_id, no_more) & (stays.gone_s == np.inf))],
         n_cliques_ever=max(living.n_cliques_ever, int(clique_id.max(initial=-1)) + 1),
         n_sites_ever=living.n_sites_ever + int(np.count_nonzero(~keeps)),
-    ), rank
+    ), np.argsort(order)
 
 
 def _keepers(site: IntArray, owner: IntArray, before: IntArray) -> BoolArray:
@@ -324,12 +306,8 @@ def _of_sum_one(owner: IntArray, p_here: FloatArray) -> FloatArray:
 
 
 def without_missed(before: LivingMap, after: LivingMap, settings: GroupingConfig = USUAL) -> LivingMap:
-    """Return the map after a session, with members that were missed alone split off their bodies.
-
-    Args:
-        before: the map as the session found it.
-        after: as the session leaves it, beliefs and counts up to date.
-        settings: how bodies move; and that misses of one session come in runs.
+    """Return the map `after` a session, with members that were missed alone split off their bodies; `before` is the map
+    as the session found it.
     """
     members = after.members
     site = after.site_of()

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from evermap.config import LifetimeConfig
 from evermap.errors import ConfigError, suggestion
 from evermap.existence.lifetimes import Lifetimes
-from evermap.maps.lives import EVERYWHERE, Life, Lives, general_purpose
+from evermap.maps.lives import DAY_S, EVERYWHERE, Life, Lives, general_purpose
 from evermap.maps.living import LivingMap, Stays
 from evermap.survival import LifetimePrior, PiecewiseConstantHazard
 from evermap.survival.class_lifetimes import (
@@ -44,13 +44,16 @@ AGES_AT_ONCE = 50
 """Of which the longest credible lifetimes are asked together: each takes a quarter of a megabyte."""
 
 
-@dataclass(frozen=True, slots=True)
 class History:
     """Stays by clique, then by time, with the event after each.
 
-    Attributes:
-        stays: K of them.
+    Args:
+        stays: of a map, in any order.
         looks_s: (M,) ends of sessions.
+        settings: which stays are recent, and how firmly classes lean on each other.
+
+    Attributes:
+        stays: K of them, in order.
         class_ids: (C,) classes there are.
         kind: (K,) row of the class.
         recent: whether it is one of the newest of its class.
@@ -60,30 +63,14 @@ class History:
         to_known: whether the next stay is at a site that had been known; `had_choice` whether there was one.
         back_here: whether the next stay is at this very site.
         there_again: hopped twice and was where it had been; `hopped_twice` whether it did.
-        strength: events that the average over classes counts for in the probabilities of one.
     """
 
-    stays: Stays
-    looks_s: FloatArray
-    class_ids: IntArray
-    kind: IntArray
-    recent: BoolArray
-    hopped: BoolArray
-    away: BoolArray
-    seen_away_s: FloatArray
-    back_s: FloatArray
-    to_known: BoolArray
-    had_choice: BoolArray
-    back_here: BoolArray
-    there_again: BoolArray
-    hopped_twice: BoolArray
-    strength: float
-
-    @classmethod
-    def of(cls, stays: Stays, looks_s: FloatArray, settings: LifetimeConfig = USUAL) -> Self:
-        """Learn from the stays of a map in any order."""
-        stays = stays[np.lexsort((stays.first_s, stays.clique_id))]
-        class_ids, kind = np.unique(stays.class_id, return_inverse=True)
+    def __init__(self, stays: Stays, looks_s: FloatArray, settings: LifetimeConfig) -> None:
+        self.stays = stays = stays[np.lexsort((stays.first_s, stays.clique_id))]
+        self.looks_s, self._strength = looks_s, settings.strength
+        self.class_ids, kind = np.unique(stays.class_id, return_inverse=True)
+        self.kind = kind.ravel()
+        self.recent = _newest(self.kind, stays.first_s, settings.newest)
         n = len(stays)
         after = np.minimum(np.arange(n) + 1, n - 1)
         has_next = np.append(stays.clique_id[1:] == stays.clique_id[:-1], False)
@@ -95,10 +82,10 @@ class History:
         came = np.where(np.isfinite(elsewhere_s), looked + 1, np.searchsorted(looks_s, first_s))
         ended = np.isfinite(stays.gone_s)
         gone = np.searchsorted(looks_s, stays.gone_s)
-        hopped = has_next & ended & (came <= gone)
-        back_s = np.where(has_next, stays.first_s[after], np.inf)
-        seen_away_s = np.maximum(np.where(has_next, elsewhere_s, looks_s[-1]), stays.gone_s)
-        away = ended & ~hopped & (seen_away_s < back_s)
+        self.hopped = has_next & ended & (came <= gone)
+        self.back_s = np.where(has_next, stays.first_s[after], np.inf)
+        self.seen_away_s = np.maximum(np.where(has_next, elsewhere_s, looks_s[-1]), stays.gone_s)
+        self.away = ended & ~self.hopped & (self.seen_away_s < self.back_s)
 
         # what was known of a clique when it turned up again
         pair = np.stack([stays.clique_id, site], axis=1)
@@ -107,24 +94,11 @@ class History:
         known = np.cumsum(is_new)
         begin = np.flatnonzero(np.append(True, ~has_next[:-1]))
         known = known - np.repeat(known[begin] - 1, np.diff(np.append(begin, n)))  # sites of the clique until then
-        hopped_twice = hopped & hopped[after] & has_next
-        return cls(
-            stays=stays,
-            looks_s=looks_s,
-            class_ids=class_ids,
-            kind=kind.ravel(),
-            recent=_newest(kind.ravel(), stays.first_s, settings.newest),
-            hopped=hopped,
-            away=away,
-            seen_away_s=seen_away_s,
-            back_s=back_s,
-            to_known=~is_new[after],
-            had_choice=has_next & ((hopped & (known > 1)) | away),
-            back_here=site_after == site,
-            there_again=site[after[after]] == site,
-            hopped_twice=hopped_twice,
-            strength=settings.strength,
-        )
+        self.to_known = ~is_new[after]
+        self.had_choice = has_next & ((self.hopped & (known > 1)) | self.away)
+        self.back_here = site_after == site
+        self.there_again = site[after[after]] == site
+        self.hopped_twice = self.hopped & self.hopped[after] & has_next
 
     def shares(self, event: BoolArray, chance: BoolArray) -> FloatArray:
         """Return (C + 1,) probability of an event for each class, and for one never seen; classes lean on their
@@ -132,20 +106,15 @@ class History:
         """
         chances, events = (self.counts(self.recent & rows, self.stays.p_gone) for rows in (chance, event & chance))
         # classes differ: every one counts for one event at most, however often it was seen
-        weight = 1.0 / (chances[:-1] + self.strength)
+        weight = 1.0 / (chances[:-1] + self._strength)
         average = (0.5 + events[:-1] @ weight) / (1.0 + chances[:-1] @ weight)
-        of_classes = (events[:-1] + self.strength * average) / (chances[:-1] + self.strength)
+        of_classes = (events[:-1] + self._strength * average) / (chances[:-1] + self._strength)
         return np.append(of_classes, average)
 
     def counts(self, rows: BoolArray, weight: FloatArray | None = None) -> FloatArray:
         """Return (C + 1,) counts, or weights, of rows (K,) per class, and in total."""
         each = np.ones(len(rows)) if weight is None else weight
         return np.append(np.bincount(self.kind[rows], each[rows], minlength=len(self.class_ids)), each[rows].sum())
-
-    @property
-    def gap_s(self) -> float:
-        """Between two looks, as a rule; a day as long as there was one look."""
-        return float(np.median(np.diff(self.looks_s))) if len(self.looks_s) > 1 else 86_400.0
 
     def sightings(self, back_by_stay: FloatArray, back_rate: FloatArray) -> Sightings:
         """Return the recent stays as samples, with events that may have been missed between looks."""
@@ -198,8 +167,8 @@ class ClassLives:
         if not len(stays):
             nothing = ClassPosterior.of(np.zeros((0, len(LOG_MEAN), len(LOG_SHAPE))))
             return cls(replace(before, looks_s=looks_s), np.zeros(0, dtype=np.int64), nothing)
-        history = History.of(stays, looks_s, settings)
-        learned = _learned(history, before, settings)
+        history = History(stays, looks_s, settings)
+        learned = _Learned(history, before, settings)
         entries: list[tuple[int, tuple[int, int], Life]] = []
         for row, class_id in enumerate(history.class_ids.tolist()):
             life = learned.life(row)
@@ -216,15 +185,8 @@ class ClassLives:
     def band(
         self, class_id: int, ages_s: ArrayLike, confidence: float = 0.95
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return `P(stay > age)` of a class at ages (N,), and the bounds of its credible interval.
-
-        Args:
-            class_id: of the class; any that was never seen for a new one.
-            ages_s: (N,) in seconds.
-            confidence: probability that the truth lies between the bounds, at each age by itself.
-
-        Returns:
-            (N,) posterior mean, lower and upper bound.
+        """Return `P(stay > age)` of a class at ages (N,) [s]: (N,) posterior mean, and lower and upper bound of the
+        credible interval at each age by itself. All classes that were never seen are alike.
         """
         found = np.flatnonzero(self.class_ids == class_id)
         return self.stay.band(int(found[0]) if len(found) else -1, ages_s, confidence)
@@ -240,20 +202,59 @@ class ClassLives:
         return upper
 
 
-@dataclass(frozen=True, slots=True)
 class _Learned:
-    """Posteriors and probabilities of all classes, the last row of one that was never seen."""
+    """Posteriors and probabilities of all classes, the last row of one that was never seen.
 
-    of_stays: FloatArray
-    of_absences: FloatArray
-    stay: ClassPosterior
-    absence: ClassPosterior
-    p_hop: FloatArray
-    p_known: FloatArray
-    n_stays: IntArray
-    n_ended: IntArray
+    Attributes:
+        stay, absence: posteriors; of_stays, of_absences: (C, M, A) their log likelihoods.
+        p_hop, p_known: (C + 1,) as of `Life`.
+        n_stays, n_ended: (C + 1,) recent stays, and those of them that ended.
+    """
+
+    def __init__(self, history: History, before: Lives, settings: LifetimeConfig) -> None:
+        stays, n_classes = history.stays, len(history.class_ids)
+        ended = np.isfinite(stays.gone_s)
+        said = [before.prior_of(class_id) for class_id in history.class_ids.tolist()]
+        away = np.flatnonzero(history.recent & history.away)
+        log_likelihood = absence_log_likelihood(
+            stays.last_s[away], stays.gone_s[away], history.seen_away_s[away], history.back_s[away]
+        )
+        log_likelihood *= stays.p_gone[away, None, None]
+        self.of_absences = _by_class(log_likelihood, history.kind[away], n_classes)
+        absences_said = [
+            life.n_stays * absence_said(life.absence, settings) if life and life.tells_absence else None
+            for life in said
+        ]
+        self.absence = ClassPosterior.of(self.of_absences, _stacked(absences_said), improper=True)
+        self.p_hop = history.shares(history.hopped, ended)
+        back_by_hop = self.p_hop * history.shares(history.there_again, history.hopped_twice)
+        here_again = history.shares(history.back_here, history.away & np.isfinite(history.back_s))
+        # of those that a look missed: who is back before nobody can miss, and counts as one who never left
+        looks_s = history.looks_s
+        gap_s = float(np.median(np.diff(looks_s))) if len(looks_s) > 1 else DAY_S  # between two looks, as a rule
+        back = [
+            -self.absence.curve(row).log_conditional_survival(gap_s, 2.0 * gap_s) / gap_s
+            for row in range(n_classes + 1)
+        ]
+        back_rate = (1.0 - self.p_hop) * here_again * np.array(back)
+        kind = history.kind[history.recent]
+        seen = history.sightings(back_by_hop[kind], back_rate[kind])
+        log_likelihood = stay_log_likelihood(seen)
+        doubted = ended[history.recent] & (stays.p_gone[history.recent] < settings.sure)
+        if doubted.any():  # expected log likelihood: perhaps it goes on
+            p_gone = stays.p_gone[history.recent][doubted, None, None]
+            going_on = rows_of(seen, doubted)
+            going_on = replace(going_on, gone_s=np.full(len(going_on.gone_s), np.inf))
+            log_likelihood[doubted] = p_gone * log_likelihood[doubted] + (1.0 - p_gone) * stay_log_likelihood(going_on)
+        self.of_stays = _by_class(log_likelihood, kind, n_classes)
+        stays_said = [life.n_stays * stay_said(life.stay, settings) if life else None for life in said]
+        self.stay = ClassPosterior.of(self.of_stays, _stacked(stays_said))
+        self.p_known = history.shares(history.to_known, history.had_choice)
+        self.n_stays = history.counts(history.recent).astype(np.int64)
+        self.n_ended = history.counts(history.recent & ended).astype(np.int64)
 
     def life(self, row: int) -> Life:
+        """Return the lifetimes of a class."""
         return Life(
             stay=self.stay.curve(row),
             absence=self.absence.curve(row),
@@ -262,44 +263,6 @@ class _Learned:
             n_stays=int(self.n_stays[row]),
             n_ended=int(self.n_ended[row]),
         )
-
-
-def _learned(history: History, before: Lives, settings: LifetimeConfig) -> _Learned:
-    stays, n_classes = history.stays, len(history.class_ids)
-    ended = np.isfinite(stays.gone_s)
-    said = [before.prior_of(class_id) for class_id in history.class_ids.tolist()]
-    away = np.flatnonzero(history.recent & history.away)
-    log_likelihood = absence_log_likelihood(
-        stays.last_s[away], stays.gone_s[away], history.seen_away_s[away], history.back_s[away]
-    )
-    log_likelihood *= stays.p_gone[away, None, None]
-    of_absences = _by_class(log_likelihood, history.kind[away], n_classes)
-    absences_said = [
-        life.n_stays * absence_said(life.absence, settings) if life and life.tells_absence else None for life in said
-    ]
-    absence = ClassPosterior.of(of_absences, _stacked(absences_said), improper=True)
-    p_hop = history.shares(history.hopped, ended)
-    back_by_hop = p_hop * history.shares(history.there_again, history.hopped_twice)
-    here_again = history.shares(history.back_here, history.away & np.isfinite(history.back_s))
-    # of those that a look missed: who is back before nobody can miss, and counts as one who never left
-    gap_s = history.gap_s
-    back = [-absence.curve(row).log_conditional_survival(gap_s, 2.0 * gap_s) / gap_s for row in range(n_classes + 1)]
-    back_rate = (1.0 - p_hop) * here_again * np.array(back)
-    kind = history.kind[history.recent]
-    seen = history.sightings(back_by_hop[kind], back_rate[kind])
-    log_likelihood = stay_log_likelihood(seen)
-    doubted = ended[history.recent] & (stays.p_gone[history.recent] < settings.sure)
-    if doubted.any():  # expected log likelihood: perhaps it goes on
-        p_gone = stays.p_gone[history.recent][doubted, None, None]
-        going_on = rows_of(seen, doubted)
-        going_on = replace(going_on, gone_s=np.full(len(going_on.gone_s), np.inf))
-        log_likelihood[doubted] = p_gone * log_likelihood[doubted] + (1.0 - p_gone) * stay_log_likelihood(going_on)
-    of_stays = _by_class(log_likelihood, kind, n_classes)
-    stays_said = [life.n_stays * stay_said(life.stay, settings) if life else None for life in said]
-    stay = ClassPosterior.of(of_stays, _stacked(stays_said))
-    p_known = history.shares(history.to_known, history.had_choice)
-    counts = (history.counts(mask).astype(np.int64) for mask in (history.recent, history.recent & ended))
-    return _Learned(of_stays, of_absences, stay, absence, p_hop, p_known, *counts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,9 +289,9 @@ class ClassEvidence:
             stay, absence = (np.zeros((0, len(LOG_MEAN), len(second))) for second in (LOG_SHAPE, LOGIT_RETURN))
             none = np.zeros(0, dtype=np.int64)
             return cls((), stay, absence, none, none)
-        history = History.of(living.stays, living.lives.looks_s, settings)
+        history = History(living.stays, living.lives.looks_s, settings)
         untold = replace(living.lives, prior_class_id=np.zeros(0, dtype=np.int64), prior=())
-        learned, names = _learned(history, untold, settings), dict(enumerate(living.class_names))
+        learned, names = _Learned(history, untold, settings), dict(enumerate(living.class_names))
         class_names = tuple(names.get(class_id, "") for class_id in history.class_ids.tolist())
         return cls(class_names, learned.of_stays, learned.of_absences, learned.n_stays[:-1], learned.n_ended[:-1])
 

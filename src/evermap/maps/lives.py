@@ -72,11 +72,8 @@ class Lives:
     prior: tuple[Life, ...] = ()
 
     def of(self, class_id: int, position_m: FloatArray | None = None) -> Life:
-        """Return the life of a class (or `UNKNOWN`): learned, else given, else learned over all classes.
-
-        Args:
-            class_id: of the class.
-            position_m: (2,), in space (3,), where; None for the whole floor.
+        """Return the life of a class (or `UNKNOWN`), at a position (2,), in space (3,), or on the whole floor: learned,
+        else given, else learned over all classes.
         """
         if position_m is not None:
             here = np.floor(np.asarray(position_m)[:2] / self.chunk_m).astype(np.int64)

@@ -182,7 +182,7 @@ class Boxes(_Rows):
 
     def of(self, landmark_id: IntArray) -> FloatArray:
         """Return (K, 3) sizes of landmarks, nan of others."""
-        row = _rows_among(self.landmark_id, landmark_id)
+        row = rows_among(self.landmark_id, landmark_id)
         return np.asarray(np.vstack([self.size_m, np.full((1, 3), np.nan)])[row])
 
 
@@ -205,14 +205,8 @@ class MemberTraits(_Rows):
     def of(self, landmark_id: IntArray, columns: Sequence[str]) -> tuple[FloatArray, IntArray]:
         """Return (K, C) values of landmarks, nan where there is none, and the numbers of sessions."""
         wanted = np.array([landmark_id_of(name) for name in columns], dtype=np.int64)
-        names, kinds = np.unique(self.landmark_id), np.unique(self.column_id)
-        code = np.searchsorted(names, self.landmark_id) * len(kinds) + np.searchsorted(kinds, self.column_id)
-        name, kind = np.searchsorted(names, landmark_id), np.searchsorted(kinds, wanted)
-        known = np.isin(landmark_id, names)[:, None] & np.isin(wanted, kinds)
-        asked = np.where(known, name[:, None] * len(kinds) + kind, -1)
-        row = np.searchsorted(code, asked)
-        found = known & (np.append(code, -1)[row] == asked)
-        row = np.where(found, row, len(self))
+        asked = np.repeat(landmark_id, len(wanted)), np.tile(wanted, len(landmark_id))
+        row = pair_rows((self.landmark_id, self.column_id), asked).reshape(-1, len(wanted))
         return np.append(self.value, np.nan)[row], np.append(self.sessions, 0)[row]
 
     def met(self, landmark_id: IntArray, columns: Sequence[str], value: FloatArray) -> MemberTraits:
@@ -243,6 +237,12 @@ class Metres(_Rows):
     log_metre: FloatArray
     log_variance: FloatArray
     information: FloatArray
+
+    @classmethod
+    def of(cls, robot: str, log_variance: float, information: float) -> Self:
+        """Return that of one robot, '' for sessions without a name, which has the metre of the map."""
+        name = landmark_id_of(robot) if robot else 0
+        return cls(np.array([name]), np.zeros(1), np.array([log_variance]), np.array([information]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,17 +399,16 @@ class LivingMap(Shown):
             raise InputError(problem, field="at", hint="an older revision: store.load(number)")
         p_here = self.sites.p_here
         if (at is not None or len(self.dated)) and np.isfinite(self.stamp_s):
-            from evermap.config import LivingConfig
-            from evermap.maps.sessions.believe import predicted
+            from evermap.maps.sessions.believe import aged
 
-            p_here = predicted(self, LivingConfig(), self.stamp_s if at is None else at)
+            p_here = aged(self, USUAL, self.stamp_s if at is None else at).p_here
         return self.p_of_sites(p_here)
 
     def p_of_sites(self, p_here: FloatArray) -> FloatArray:
         """Return (L,) what the sites of each landmark's clique have in sum, of (S,)."""
         cliques, row = np.unique(self.sites.clique_id, return_inverse=True)
         total = np.append(np.bincount(row, p_here, minlength=len(cliques)), 0.0)  # row -1 is the last
-        return np.asarray(total[_rows_among(cliques, self.members.clique_id)], dtype=np.float64)
+        return np.asarray(total[rows_among(cliques, self.members.clique_id)], dtype=np.float64)
 
     def believed_s(self) -> FloatArray:
         """Return (S,) instants at which the beliefs in the sites held."""
@@ -423,7 +422,7 @@ class LivingMap(Shown):
         clique = self.sites.clique_id[order]
         last = np.flatnonzero(np.diff(clique, append=-1) != 0)  # one a clique, by clique
         site = np.append(self.sites.site_id[order[last]], UNKNOWN)
-        return np.asarray(site[_rows_among(clique[last], self.members.clique_id)])
+        return np.asarray(site[rows_among(clique[last], self.members.clique_id)])
 
     def told_site(self) -> IntArray:
         """Return (L,) `site_id` of the current stay of each landmark's clique; `UNKNOWN` if away.
@@ -434,7 +433,7 @@ class LivingMap(Shown):
         known = np.isin(self.members.clique_id, self.stays.clique_id)
         goes_on = np.flatnonzero(self.stays.gone_s == np.inf)
         order = goes_on[np.argsort(self.stays.clique_id[goes_on], kind="stable")]
-        at = _rows_among(self.stays.clique_id[order], self.members.clique_id)
+        at = rows_among(self.stays.clique_id[order], self.members.clique_id)
         told = np.append(self.stays.site_id[order], UNKNOWN)[at]
         return np.asarray(np.where(at >= 0, told, np.where(known, UNKNOWN, site)))
 
@@ -505,10 +504,8 @@ class LivingMap(Shown):
         return np.asarray(blocks(self.covariance_m2, self.dim)[row] + size)
 
     def sighted_rows(self, p_site: FloatArray) -> Landmarks:
-        """Return every place as a record of its own, in the order of `places`: what a robot may meet.
-
-        Args:
-            p_site: (S,) probability of every site.
+        """Return every place as a record of its own, in the order of `places`: what a robot may meet, by the
+        probability (S,) of every site.
         """
         site = np.searchsorted(self.sites.site_id, self.places.site_id)
         member = np.searchsorted(self.members.landmark_id, self.places.landmark_id)
@@ -548,8 +545,8 @@ class LivingMap(Shown):
         )
 
 
-def _rows_among(ids: IntArray, asked: IntArray) -> IntArray:
-    """(N,) first row of each id among sorted ones, -1 where it is missing."""
+def rows_among(ids: IntArray, asked: IntArray) -> IntArray:
+    """Return (N,) the first row of each id among sorted ones, -1 where it is missing."""
     row = np.searchsorted(ids, asked)
     return np.where(np.append(ids, -1)[row] == asked, row, -1)
 

@@ -9,6 +9,7 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 
 from evermap.geometry.chunked import Part
+from evermap.maps.lives import Lives
 from evermap.sensing.sightlines import SightLines, Views
 from evermap.types import IntArray
 
@@ -17,6 +18,7 @@ Table = TypeVar("Table", bound=Any)
 ROWS = 2048
 """Of a shelf, about."""
 _COLUMNS = {
+    Lives: ("class_id", "chunk", "life"),
     SightLines: ("site_id", "landmark_id", "cell", "hits", "looks"),
     Views: ("cell", "heading", "stamp_s", "frames"),
 }

@@ -49,14 +49,10 @@ class Vicinity:
         *,
         jointly: bool = True,
     ) -> Vicinity:
-        """Take some cliques of a map.
+        """Take some cliques (C,) of a map.
 
-        Args:
-            living: the map.
-            cliques: (C,) their ids, of any order.
-            config: by which beliefs age.
-            views_within: (4,) `(x_min, y_min, x_max, y_max)` of the views that matter; None for none of them.
-            jointly: with the joint covariance of the places; False for looks alone, which move none: each by itself.
+        Views matter within `(x_min, y_min, x_max, y_max)`; None for none of them. Looks alone move no place: these need
+        not be known `jointly`, but each by itself.
         """
         part, place = _of_cliques(living, cliques)
         sight = _sight(living)

@@ -10,7 +10,8 @@ import pytest
 from evermap.config import LivingConfig
 from evermap.existence.sites import SiteLooks
 from evermap.maps.living import LivingMap, clique_rows
-from evermap.maps.sessions.believe import believed, said
+from evermap.maps.sessions.believe import believed
+from evermap.maps.sessions.extend import Extended
 from evermap.maps.sessions.looks import PlaceLooks, Sighting, Watch, looked_at
 from evermap.sensing.sightlines import SightLines
 from evermap.types import FloatArray, Sensor
@@ -49,10 +50,12 @@ def looks_of(living: LivingMap, seen: tuple[int, ...], frames: int = 12) -> Plac
 
 def evidence(living: LivingMap, looks: PlaceLooks) -> dict[int, float]:
     """By landmark: what looks say for 'it stands there'."""
-    after = believed(living, living.sites.p_here, looks, SENSOR, ALONE, 1000.0, 1020.0)
+    none = np.zeros(0, dtype=np.int64)
+    entry = Extended(living, living, none, none, living.sites.p_here, np.zeros(len(living.sites), dtype=np.bool_))
+    said = believed(entry, looks, SENSOR, (1000.0, 1020.0), ALONE).log_evidence
     cliques, _ = clique_rows(living.sites)
     row = np.searchsorted(cliques, living.members.clique_id)
-    return dict(zip(living.members.landmark_id.tolist(), said(living, after)[row].tolist(), strict=True))
+    return dict(zip(living.members.landmark_id.tolist(), said[row].tolist(), strict=True))
 
 
 def rows_of_landmark(living: LivingMap, looks: PlaceLooks, landmark: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.maps.lives import Lives
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.believe import predicted
+from evermap.maps.sessions.believe import aged
 from evermap.maps.sessions.session import Session, begun_with
 from evermap.pipeline import run_session
 from evermap.slam.cleaning import some_frames
@@ -424,7 +424,7 @@ def test_without_misses_nothing_is_learned_from_what_is_not_seen(
     name = left[0][0]
     # time alone, by lifetimes that know what the session found standing
     alone = replace(sessions[0].living, lives=session.living.lives)
-    only_time = predicted(alone, config.living, session.living.stamp_s)
+    only_time = aged(alone, config.living, session.living.stamp_s).p_here
     clique = sessions[0].living.members.clique_id[sessions[0].living.members.landmark_id == name]
     expected = only_time[np.isin(sessions[0].living.sites.clique_id, clique)].sum()
     assert p_exists(session.living, name) == pytest.approx(expected, abs=0.02)
@@ -438,8 +438,8 @@ def test_without_returns_what_is_gone_is_never_expected_back(left: tuple[list[in
     mine = np.isin(living.sites.clique_id, clique)
     later_s = living.stamp_s + 30 * 86_400.0
     now = living.sites.p_here[mine].sum()
-    assert predicted(living, settings().living, later_s)[mine].sum() > now + 0.02
-    assert predicted(living, settings(returns=False).living, later_s)[mine].sum() <= now
+    assert aged(living, settings().living, later_s).p_here[mine].sum() > now + 0.02
+    assert aged(living, settings(returns=False).living, later_s).p_here[mine].sum() <= now
 
 
 def test_without_cliques_each_landmark_is_a_body(still: tuple[BuildingSimulation, list[Session]]) -> None:

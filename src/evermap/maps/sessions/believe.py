@@ -1,19 +1,46 @@
-"""Beliefs of the map's cliques: predicted to a session by their lifetimes, and updated by its hits and misses."""
+"""Beliefs of the map's cliques: predicted to a session by their lifetimes, and updated by its hits and misses.
+
+And by arrivals and departures that were observed: a tracker that sees a car drive off knows more than a thousand misses
+of it would say, since what is missed may be hidden. So the belief that it stands ends there and then, and of looks only
+one remains: the first at which it was gone.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from evermap.config import LivingConfig
 from evermap.existence.sites import Evidence, SiteBeliefs, SiteDynamics, SiteLooks, SiteSensor, follow_sites
 from evermap.maps.lives import Life
-from evermap.maps.living import LivingMap, Sites, class_of, clique_rows, site_middles
-from evermap.maps.sessions.looks import PlaceLooks
-from evermap.sensing.sightlines import Lines, nominal_lines
+from evermap.maps.living import EXISTS, LivingMap, Sites, class_of, clique_rows, site_middles
+from evermap.maps.sessions.extend import Extended, first_and_last
+from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Watch
+from evermap.sensing.sightlines import KNOWN, Lines, nominal_lines
 from evermap.survival.hazards import never_leaves
-from evermap.types import BoolArray, FloatArray, IntArray, Sensor, rows_of
+from evermap.types import FloatArray, IntArray, Sensor, rows_of
+
+WITNESSED_NATS = 50.0
+"""Log likelihood ratio of having been seen to leave: more than any lifetime outweighs."""
+LEAST_P, MOST_P = 1e-6, 1.0 - 1e-6
+"""Bounds of a probability whose logarithm is taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Believed:
+    """The map with the session's beliefs.
+
+    Attributes:
+        living: all but stays and what is learned.
+        log_evidence: (C,) what the session's looks say for 'it stands at one of its sites' against 'it is away', as a
+            log likelihood ratio, by clique, in the order of `living.clique_rows`.
+        evidence: of every clique and frame.
+    """
+
+    living: LivingMap
+    log_evidence: FloatArray
+    evidence: Evidence
 
 
 def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
@@ -46,11 +73,6 @@ def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
     )
 
 
-def predicted(living: LivingMap, config: LivingConfig, until_s: float) -> FloatArray:
-    """Return the (S,) probability that each site is occupied at a later instant."""
-    return aged(living, config, until_s).p_here
-
-
 def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
     """Return the sites of a map with beliefs predicted to a later instant, without looks."""
     if not config.existence or len(living.sites) == 0:
@@ -61,64 +83,65 @@ def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
     nothing = SiteLooks(np.zeros(0), none, none, none, np.zeros(0, dtype=np.bool_))
     lines = nominal_lines(np.zeros(0), living.sightlines.rules)
     after = _followed(living, living.sites.p_here, nothing, lines, config, start_s, until_s, 0.01)
-    return with_beliefs(living.sites, living.sites.p_here, after)
+    return _with_beliefs(living.sites, living.sites.p_here, after)
 
 
-def with_beliefs(sites: Sites, p_start: FloatArray, after: SiteBeliefs) -> Sites:
+def _with_beliefs(sites: Sites, p_start: FloatArray, after: SiteBeliefs) -> Sites:
     """Return sites (S,) with beliefs after a gap, and the part of each that is the last seen stay."""
     never_left = np.divide(sites.p_kept, p_start, out=np.zeros(len(sites)), where=p_start > 0.0)
     return replace(sites, p_here=after.p_here, p_kept=after.p_stayed * np.minimum(never_left, 1.0))
 
 
 def believed(
-    living: LivingMap,
-    p_start: FloatArray,
-    looks: PlaceLooks,
-    sensor: Sensor,
-    config: LivingConfig,
-    start_s: float,
-    until_s: float,
-) -> SiteBeliefs:
-    """Return beliefs after the looks of a session.
-
-    Args:
-        living: the map, with the sites that the session found.
-        p_start: (S,) beliefs at `start_s`.
-        looks: of the session.
-        sensor: whose false detections are counted with.
-        config: which parts of the engine are on.
-        start_s: beginning of the session.
-        until_s: its end.
-    """
-    p_false = p_false_of(sensor, living)
-    rows = rows_of(looks.rows, looks.counts)
-    # what another robot's session saw until its end is in the beliefs: looks before that count as at that instant
-    start_s, until_s = max(start_s, living.stamp_s), max(until_s, living.stamp_s)
-    rows = replace(rows, stamp_s=np.maximum(rows.stamp_s, start_s))
-    return _followed(living, p_start, rows, looks.lines, config, start_s, until_s, p_false)
-
-
-def evidence(living: LivingMap, beliefs: SiteBeliefs) -> Evidence:
-    """Return the evidence on every clique, frame by frame."""
-    cliques, _ = clique_rows(living.sites)
-    return replace(beliefs.trace, clique_id=cliques[beliefs.trace.clique_id])
-
-
-def said(living: LivingMap, beliefs: SiteBeliefs) -> FloatArray:
-    """Return the (C,) log likelihood ratio of a session's looks, for 'it is present' against 'it is away'."""
-    cliques, row = clique_rows(living.sites)
-    before, after = (
-        np.clip(np.bincount(row, p, minlength=len(cliques)), 1e-12, 1.0 - 1e-12)
-        for p in (beliefs.p_before, beliefs.p_here)
+    entry: Extended, seen: PlaceLooks, sensor: Sensor, span_s: tuple[float, float], config: LivingConfig
+) -> Believed:
+    """Return the map with the beliefs and the counts of a session, which goes from one instant to another."""
+    (start_s, end_s), living, rows, sites = span_s, entry.living, seen.rows, entry.living.sites
+    until_s, hit, missed = max(end_s, living.stamp_s), rows.hit, seen.counts & ~rows.hit
+    places = replace(
+        living.places,
+        n_hits=living.places.n_hits + np.bincount(seen.place[hit], minlength=len(living.places)),
+        n_misses=living.places.n_misses + np.bincount(seen.place[missed], minlength=len(living.places)),
     )
-    return np.asarray(np.log(after / (1.0 - after)) - np.log(before / (1.0 - before)))
+    first, last = first_and_last(rows.site[hit], rows.stamp_s[hit], len(sites))
+    cliques, row = clique_rows(sites)
+    log_evidence, evidence = np.zeros(len(cliques)), Evidence.empty()
+    if config.existence:
+        # a look at an empty place gives a detection of its landmark by chance: a wrong identity
+        p_false = min(max(sensor.p_false / max(len(living.members), 10), 1e-5), 0.1)
+        # what another robot's session saw until its end is in the beliefs: looks before that count as at that instant
+        from_s, counted = max(start_s, living.stamp_s), rows_of(rows, seen.counts)
+        counted = replace(counted, stamp_s=np.maximum(counted.stamp_s, from_s))
+        after = _followed(living, entry.p_start, counted, seen.lines, config, from_s, until_s, p_false)
+        sites = _with_beliefs(sites, entry.p_start, after)
+        log_evidence = _log_odds(row, after.p_here, len(cliques)) - _log_odds(row, after.p_before, len(cliques))
+        evidence = replace(after.trace, clique_id=cliques[after.trace.clique_id])
+    else:
+        sites = replace(sites, p_here=_as_seen(living, rows.site[hit], last))
+    stood = (entry.p_start >= EXISTS) & ~entry.is_new
+    arrived = np.isfinite(first) & ~stood & (sites.p_here >= EXISTS)
+    since_s = np.where(arrived & ~entry.is_new, first, sites.since_s)
+    sites = replace(sites, since_s=since_s, seen_s=np.maximum(sites.seen_s, last))
+    living = replace(living, stamp_s=until_s, session_start_s=start_s, places=places, sites=sites)
+    return Believed(living, log_evidence, evidence)
 
 
-def p_false_of(sensor: Sensor, living: LivingMap) -> float:
-    """Return the probability that a look at an empty place gives a detection of its landmark: a wrong identity, by
-    chance.
-    """
-    return min(max(sensor.p_false / max(len(living.members), 10), 1e-5), 0.1)
+def _log_odds(clique: IntArray, p_here: FloatArray, n: int) -> FloatArray:
+    """(n,) log odds that a clique stands at one of its sites, by the row of the clique of each (S,)."""
+    p = np.clip(np.bincount(clique, p_here, minlength=n), 1e-12, 1.0 - 1e-12)
+    return np.asarray(np.log(p / (1.0 - p)))
+
+
+def _as_seen(living: LivingMap, hit_site: IntArray, last_s: FloatArray) -> FloatArray:
+    """Return beliefs without decay: a clique is where it was seen last."""
+    p_here = living.sites.p_here.copy()
+    _, clique = clique_rows(living.sites)
+    seen = np.unique(hit_site)
+    for row in np.unique(clique[seen]):
+        mine = np.flatnonzero(clique == row)
+        p_here[mine] = 0.0
+        p_here[mine[np.argmax(last_s[mine])]] = 1.0
+    return p_here
 
 
 def _followed(
@@ -140,13 +163,8 @@ def _followed(
         SiteSensor(lines, p_false, use_misses=config.misses),
         start_s=start_s,
         until_s=until_s,
-        held=_pinned(living, cliques),
+        held=np.isin(cliques, living.members.clique_id[living.members.pinned]),
     )
-
-
-def _pinned(living: LivingMap, cliques: IntArray) -> BoolArray:
-    """(C,) cliques of which an operator said that they are never to be removed."""
-    return np.isin(cliques, living.members.clique_id[living.members.pinned])
 
 
 def _lives(living: LivingMap, config: LivingConfig, class_id: IntArray, position_m: FloatArray) -> list[Life]:
@@ -158,3 +176,114 @@ def _lives(living: LivingMap, config: LivingConfig, class_id: IntArray, position
         life = living.lives.of(kind, middle) if config.learn_lifetimes else living.lives.said(kind)
         found.append(life if config.returns else replace(life, absence=never_leaves()))
     return [found[k] for k in which.ravel().tolist()]
+
+
+@dataclass(frozen=True, slots=True)
+class Witnessed:
+    """Landmarks that a session saw arriving or leaving: (W,) rows.
+
+    Attributes:
+        landmark_id: which.
+        since_s, until_s: when it arrived, and when it left; nan if that was not seen.
+        probability: of that.
+        when_s: half width of the intervals of both times.
+    """
+
+    landmark_id: IntArray
+    since_s: FloatArray
+    until_s: FloatArray
+    probability: FloatArray
+    when_s: float = 0.0
+
+    @classmethod
+    def nothing(cls) -> Witnessed:
+        """Return none."""
+        return cls(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), np.zeros(0))
+
+    def sites(self, entry: Extended) -> IntArray:
+        """Return (W,) rows of their sites in the map with the session, -1 for none."""
+        place, living = entry.places_of(self.landmark_id), entry.living
+        site = np.searchsorted(living.sites.site_id, np.append(living.places.site_id, -1)[place])
+        return np.where(place >= 0, site, -1)
+
+    def unlooked(self, watch: Watch, entry: Extended) -> Watch:
+        """Return the watched places without those of these landmarks before they arrived and after they left."""
+        place = entry.places_of(self.landmark_id)
+        mine, count = place >= 0, 1 + int(entry.place.max(initial=0))
+        since, until = np.full(count, -np.inf), np.full(count, np.inf)
+        since[place[mine]] = np.nan_to_num(self.since_s[mine] + self.when_s, nan=-np.inf)
+        until[place[mine]] = np.nan_to_num(self.until_s[mine] - self.when_s, nan=np.inf)
+        listed = watch.listed
+        row = np.minimum(listed.landmark, len(since) - 1)
+        ours = listed.landmark < len(since)
+        stamp_s = watch.stamp_s[listed.pose]
+        there = ~ours | listed.hit | ((stamp_s > since[row]) & (stamp_s < until[row]))
+        return watch._replace(listed=listed.rows(there))
+
+
+def departed(now: Believed, seen: PlaceLooks, what: Witnessed, entry: Extended) -> tuple[Believed, PlaceLooks]:
+    """Return the map with observed departures, their evidence by clique and by frame, and looks that have them."""
+    site, living = what.sites(entry), now.living
+    left = np.flatnonzero(np.isfinite(what.until_s) & (site >= 0))
+    if not len(left):
+        return now, seen
+    sites, (cliques, clique_of) = living.sites, clique_rows(living.sites)
+    at, p_left = site[left], np.clip(what.probability[left], LEAST_P, MOST_P)
+    clique = clique_of[at]
+    p_here, p_kept, log_evidence = sites.p_here.copy(), sites.p_kept.copy(), now.log_evidence.copy()
+    p_here[at] *= 1.0 - p_left
+    p_kept[at] *= 1.0 - p_left
+    log_evidence[clique] = -WITNESSED_NATS
+    living = replace(living, sites=replace(sites, p_here=p_here, p_kept=p_kept))
+    total = np.bincount(clique_of, p_here, minlength=len(cliques))
+    stamp_s, none, one = what.until_s[left] + what.when_s, np.zeros(len(left), np.int64), np.ones(len(left), np.int64)
+    of_left = Evidence(
+        cliques[clique], stamp_s, none, one, np.ones(len(left)), np.log1p(-p_left), np.clip(total[clique], 0.0, 1.0)
+    )
+    evidence = now.evidence.joined(of_left)
+    evidence = evidence[np.lexsort((evidence.stamp_s, evidence.clique_id))]
+    return Believed(living, log_evidence, evidence), _with_looks(living, seen, at, clique, stamp_s)
+
+
+def _with_looks(
+    living: LivingMap, seen: PlaceLooks, site: IntArray, clique: IntArray, stamp_s: FloatArray
+) -> PlaceLooks:
+    """Looks with one more at each of some sites, which finds nothing and cannot be mistaken."""
+    rows, lines, n = seen.rows, seen.lines, len(site)
+    place = np.searchsorted(living.places.site_id, living.sites.site_id[site])
+    last = np.array([np.append(np.flatnonzero(seen.place == one), -1)[-2:][0] for one in place.tolist()])
+    cell = np.append(seen.cell, 0)[last]
+    nothing, lines_of = np.zeros(n, dtype=np.bool_), len(lines.hits)
+    rows = replace(
+        rows,
+        stamp_s=np.append(rows.stamp_s, stamp_s),
+        clique=np.append(rows.clique, clique),
+        site=np.append(rows.site, site),
+        key=np.append(rows.key, np.full(n, lines_of)),
+        hit=np.append(rows.hit, nothing),
+    )
+    sure = lines._replace(
+        p_free=np.append(lines.p_free, 1.0), hits=np.append(lines.hits, KNOWN), misses=np.append(lines.misses, 1.0)
+    )
+    order = np.lexsort((rows.stamp_s, rows.clique))
+    return replace(
+        seen,
+        rows=rows_of(rows, order),
+        place=np.append(seen.place, place)[order],
+        cell=np.append(seen.cell, cell)[order],
+        lines=sure,
+        counts=np.append(seen.counts, ~nothing)[order],
+        settled=np.append(seen.settled, nothing)[order],
+    )
+
+
+def arrived(came: Arrivals, living: LivingMap, what: Witnessed, entry: Extended) -> Arrivals:
+    """Return arrivals by earlier looks, with the observed ones, and departures among these."""
+    site = what.sites(entry)
+    seen = {
+        int(site[k]): (float(what.since_s[k] - what.when_s), float(what.probability[k]))
+        for k in np.flatnonzero(np.isfinite(what.since_s) & (site >= 0))
+    }
+    new = ~np.isin(living.sites.site_id[site], entry.before.sites.site_id) | np.isfinite(what.since_s)
+    left = np.flatnonzero(np.isfinite(what.until_s) & (site >= 0) & new)
+    return replace(came, came=seen, left_s={int(site[k]): float(what.until_s[k] + what.when_s) for k in left})

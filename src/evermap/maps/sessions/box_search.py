@@ -80,10 +80,7 @@ class MapBoxes(NamedTuple):
 def placed(seen: SeenBoxes, known: MapBoxes, *, metre: bool) -> tuple[FloatArray, float] | None:
     """Return the motion (7,) from a session to the map, and the factor on its lengths; None if these are ambiguous.
 
-    Args:
-        seen: boxes of the session, in the frame of its odometry.
-        known: those of the map.
-        metre: the session's metre is known: the factor is 1.
+    The session is in the frame of its odometry. Where its `metre` is known the factor is 1.
     """
     if not len(known.place) or not len(seen.place):
         return None
@@ -126,12 +123,10 @@ def _factor(own_m: FloatArray, there_m: FloatArray, settings: BoxesConfig) -> fl
 
 
 def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArray, IntArray]:
-    """Return matching rows of boxes of a session and of the map, by their constellation.
+    """Return matching rows of boxes of a session, in the map as far as it is known, and of the map, by their
+    constellation.
 
-    Args:
-        seen: boxes of the session, in the map as far as it is known.
-        known: those of the map.
-        place: (K,) rows of the map's places at which those of the session stand, -1 for none.
+    Those of the session stand at places (K,) of the map, -1 for none.
     """
     found: dict[int, int] = {}
     left = np.flatnonzero((place < 0) & np.isfinite(seen.size_m[:, 0]))
@@ -152,8 +147,12 @@ def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArra
 
 def _windows(rows: IntArray, seen: SeenBoxes, size: int) -> list[IntArray]:
     """Boxes, some at a time, in the order in which they were met."""
-    order = rows[np.argsort(seen.first_s[rows], kind="stable")]
-    return [order[k : k + size] for k in range(0, max(len(order) - size // 2, 1), size // 2)] if len(order) > 1 else []
+    return windows(rows[np.argsort(seen.first_s[rows], kind="stable")], size) if len(rows) > 1 else []
+
+
+def windows(rows: IntArray, size: int) -> list[IntArray]:
+    """Return rows, `size` at a time, each half of them with those before and half with those after."""
+    return [rows[k : k + size] for k in range(0, max(len(rows) - size // 2, 1), size // 2)]
 
 
 def _agreed(

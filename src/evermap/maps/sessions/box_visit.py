@@ -173,7 +173,7 @@ class BoxVisit(SpatialVisit):
         another box hides was not looked at.
         """
         settings = config.boxes
-        watch = self.witnessed.unlooked(super().watched(entry, config), entry.landmark_id, entry.place)
+        watch = self.witnessed.unlooked(super().watched(entry, config), entry)
         recording, listed = self.taken.recording, watch.listed
         frame = np.searchsorted(recording.frames.stamp_s, watch.stamp_s - 1e-3)
         rows, at = self._detected()

@@ -11,6 +11,7 @@ probably the map's box still stands. Held by these, the session is solved again,
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,20 +23,14 @@ from evermap.errors import NumericalError
 from evermap.geometry import se3
 from evermap.geometry.chunked import blocks
 from evermap.geometry.rigid import consensus
+from evermap.maps.bodies import squared_length
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.believe import aged
-from evermap.maps.sessions.box_search import (
-    GATE,
-    MapBoxes,
-    half_turn,
-    in_space,
-    placed,
-    regained,
-)
+from evermap.maps.sessions.believe import Witnessed, aged
+from evermap.maps.sessions.box_search import GATE, MapBoxes, half_turn, in_space, placed, regained
 from evermap.maps.sessions.box_visit import BoxVisit, SeenBoxes, seen_boxes
-from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, around, one_to_one
+from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, one_to_one, widened
 from evermap.maps.sessions.spatial import SpatialVisit, localised_in_space
-from evermap.maps.sessions.witnessed import Witnessed
+from evermap.maps.vicinity import cliques_of
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.moving import TrafficIntake, has_traffic, rescaled, solve_in_traffic, take_in_traffic
 from evermap.slam.space.problem import PlacePrior
@@ -69,55 +64,32 @@ def localised(
         return localised_in_space(recording, living, config, remarks, progress)
     settings, taken = config.living, take_in_traffic(recording, config.slam.space, config.track)
     p_site = aged(living, settings, float(taken.recording.frames.stamp_s[0])).p_here
-    seen, where = visited_in_traffic(taken, living, p_site, config, progress)
-    visit: SpatialVisit = seen
-    if where is None and len(living.places):
-        return Localised.lost(visit, living, NOT_FOUND)
-    part, vicinity = visit.named(living), None
-    if where is not None and len(living.places) > settings.whole_places:
-        vicinity, where = around(part, where, visit.path_m, visit.floor_sensor, settings)
-        part = vicinity.part
-    return Localised(visit, part, where, vicinity)
-
-
-def visited_in_traffic(
-    taken: TrafficIntake, living: LivingMap, p_site: FloatArray, config: Config, progress: Progress | None = None
-) -> tuple[BoxVisit, Laid | None]:
-    """Return a session solved within a map, and its alignment; None if the map is empty, or does not match.
-
-    Args:
-        taken: static objects of the session.
-        living: the map.
-        p_site: (S,) probability of its sites, at the beginning of the session.
-        config: settings.
-        progress: told after every frame.
-
-    Raises:
-        NumericalError: no finite optimum.
-    """
-    settings = config.living.boxes
-    solved, known = _by_itself(taken, progress, settings), MapBoxes.of(living, p_site, config)
+    solved, known = _by_itself(taken, progress, settings.boxes), MapBoxes.of(living, p_site, config)
     found = _placed(taken, solved, living, known) if len(living.places) else None
     if found is not None and found[1] != 1.0:
         taken = rescaled(taken, found[1])
-        solved = _by_itself(taken, None, settings)
+        solved = _by_itself(taken, None, settings.boxes)
         found = _placed(taken, solved, living, known)
-    if found is None:
-        return _visit(taken, solved, _Matched.nothing(solved), living, config), None
-    try:
-        held, matched = _settled(taken, replace(solved, optimum=_moved(solved.optimum, found[0])), living, known)
-    except NumericalError:  # what was held contradicts itself
-        return _visit(taken, solved, _Matched.nothing(solved), living, config), None
-    if not _agrees(taken, held, matched, living, known):
-        return _visit(taken, solved, _Matched.nothing(solved), living, config), None
-    visit = _visit(taken, held, matched, living, config)
-    order = np.argsort(visit.landmark_id, kind="stable")
-    laid = Laid(
+    held = None
+    if found is not None:
+        with suppress(NumericalError):  # what was held contradicts itself
+            held = _settled(taken, replace(solved, optimum=_moved(solved.optimum, found[0])), living, known)
+    if held is None or not _agrees(taken, *held, living, known):
+        alone: SpatialVisit = _visit(taken, solved, _Matched.nothing(solved), living, config)
+        return Localised.lost(alone, living, NOT_FOUND) if len(living.places) else Localised(alone, alone.named(living))
+    visit: SpatialVisit = _visit(taken, *held, living, config)
+    order, matched = np.argsort(visit.landmark_id, kind="stable"), held[1]
+    assumed = np.zeros(len(order), dtype=np.bool_)
+    where = Laid(
         visit.landmark_id[order], se3.identity(), matched.place[order], matched.probability[order],
-        settings.drift_m,
-        np.zeros(len(order), dtype=np.bool_),
+        settings.boxes.drift_m, assumed,
     )  # fmt: skip
-    return visit, laid
+    part, vicinity = visit.named(living), None
+    if len(living.places) > settings.whole_places:
+        named = cliques_of(part, where.landmark_id[where.place >= 0])
+        vicinity, where = widened(part, part, named, where, visit.path_m, visit.floor_sensor, settings)
+        part = vicinity.part
+    return Localised(visit, part, where, vicinity)
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,7 +313,7 @@ def _log_odds(seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> FloatArr
         seen.covariance_m2[:, None, :2, :2] + known.covariance_m2[None, :, :2, :2] + settings.drift_m**2 * np.eye(2)
     )
     spread = spread + (loose_m**2)[:, None, None, None] * np.eye(2)
-    squared = np.einsum("kmi,kmi->km", off, np.linalg.solve(spread, off[..., None])[..., 0])
+    squared = squared_length(off, spread)
     tails = (1.0 - settings.far_share, 1.0), (settings.far_share, settings.far_factor)
     near, far = (math.log(share) - 0.5 * squared / wide**2 - 2.0 * math.log(wide) for share, wide in tails)
     odds = np.logaddexp(near, far) - 0.5 * np.linalg.slogdet(spread)[1] - math.log(2.0 * math.pi * settings.density)

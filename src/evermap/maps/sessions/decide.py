@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,27 +15,6 @@ from evermap.maps.sessions.looks import Arrivals, PlaceLooks
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange, landmark_id_of
 
 USUAL = DecisionConfig()
-
-
-@dataclass(frozen=True, slots=True)
-class Standing:
-    """Occupied sites of cliques: their ids, and the row of the site of each, -1 if it is away."""
-
-    clique_id: IntArray
-    site: IntArray
-
-    def of(self, clique_id: int) -> int:
-        """Return the row of a clique's site; -1 where it is away or unknown."""
-        return int(np.append(self.site, -1)[_found(self.clique_id, clique_id)])
-
-
-def standing(living: LivingMap) -> Standing:
-    """Return the site of every clique that is more probable than all alternatives."""
-    cliques, row = clique_rows(living.sites)
-    site = np.full(len(cliques), -1, dtype=np.int64)
-    likely = np.flatnonzero(living.sites.p_here >= EXISTS)
-    site[row[likely]] = likely
-    return Standing(cliques, site)
 
 
 def decided(
@@ -66,15 +44,15 @@ def decided(
             that are credible. None where nothing is known of lifetimes.
         settings: how much it takes.
     """
-    session = _Session.of(before, after, looks, log_evidence, arrivals, start_s, longest, settings)
-    told = _told(before, after)
+    session = _Session(before, after, looks, log_evidence, arrivals, start_s, longest, settings)
+    told, hidden, shown = _told(before, after), session.hidden, session.shown
     for row, clique in enumerate(session.cliques.tolist()):
-        session.weigh(row)
+        if session.missed[row] and not session.was_hit[row]:  # the more probably hidden, the more it stands there
+            hidden[session.sight[row]] += 1.0 - session.p_away[row]
         if clique in told:
             session.told_before(row, *told[clique])
         else:
             session.was_away(row)
-    hidden, shown = session.hidden, session.shown
     hidden[2], shown[2] = looks.unwitnessed
     after = replace(
         after,
@@ -85,52 +63,23 @@ def decided(
     return after, with_swaps(session.found, before, after, settings)
 
 
-@dataclass(frozen=True, slots=True)
 class _Session:
     """What is decided of cliques one after the other; columns of stays, sites and sight are written to as it goes.
 
     Attributes:
-        cliques: (C,) ids; site: (C,) row of the most probable site of each.
+        cliques: (C,) ids; site: (C,) row of the most probable site of each; stands: (C,) whether it is there.
         p_away: (C,) probability that it stands nowhere; log_evidence: (C,) of the looks, for 'it stands somewhere'.
-        least: (C,) evidence against it that it takes to tell that it vanished; least_evidence: that it was missed.
+        least: (C,) evidence against it that it takes to tell that it vanished; missed: (C,) whether it was missed.
         hits, misses: (S,) by site; was_hit: (C,) whether it was seen at any of its sites.
         newest: row of the last stay by clique.
         last_s, gone_s, p_gone: (K,) of the stays; p_kept, since_s: (S,) of the sites.
-        settings: of decisions.
         hidden, shown: (3,) expected numbers of cliques that were there and not seen, and seen, by `PlaceLooks.sight`.
         begun: clique, site, not there before, first and last sighting of new stays; when they ended, and how probably.
         found: changes.
     """
 
-    before: LivingMap
-    after: LivingMap
-    looks: PlaceLooks
-    arrivals: Arrivals
-    start_s: float
-    cliques: IntArray
-    site: IntArray
-    p_away: FloatArray
-    log_evidence: FloatArray
-    least: FloatArray
-    least_evidence: float
-    settings: DecisionConfig
-    hits: IntArray
-    misses: IntArray
-    was_hit: BoolArray
-    newest: dict[int, int]
-    last_s: FloatArray
-    gone_s: FloatArray
-    p_gone: FloatArray
-    p_kept: FloatArray
-    since_s: FloatArray
-    hidden: FloatArray
-    shown: FloatArray
-    begun: list[tuple[int, int, float, float, float, float, float]]
-    found: list[MapChange]
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         before: LivingMap,
         after: LivingMap,
         looks: PlaceLooks,
@@ -139,80 +88,61 @@ class _Session:
         start_s: float,
         longest: ClassLives | None,
         settings: DecisionConfig,
-    ) -> Self:
-        """Return the state before anything is decided."""
+    ) -> None:
+        self.before, self.after, self.looks, self.log_evidence = before, after, looks, log_evidence
+        self.arrivals, self.start_s, self.settings = arrivals, start_s, settings
         sites, stays = after.sites, after.stays
-        cliques, row = clique_rows(sites)
-        count = len(cliques)
-        hits, misses = _counted(looks, len(sites))
-        site, newest_s = np.zeros(count, dtype=np.int64), np.full(count, -np.inf)
+        self.cliques, row = clique_rows(sites)
+        count = len(self.cliques)
+        hit: BoolArray = looks.rows.hit
+        self.hits = np.bincount(looks.rows.site[hit], minlength=len(sites))
+        self.misses = np.bincount(looks.rows.site[~hit & looks.counts], minlength=len(sites))
+        self.was_hit = np.bincount(row, self.hits, minlength=count) > 0
+        self.site, newest_s = np.zeros(count, dtype=np.int64), np.full(count, -np.inf)
         order = np.argsort(-sites.p_here, kind="stable")[::-1]
-        site[row[order]] = order  # the last that is written is the most probable, the first of equal ones
-        np.maximum.at(newest_s, row, sites.seen_s)
-        least = np.full(count, settings.least_evidence)
+        self.site[row[order]] = order  # the last that is written is the most probable, the first of equal ones
+        self.stands = sites.p_here[self.site] >= EXISTS
+        self.p_away = np.clip(1.0 - np.bincount(row, sites.p_here, minlength=count), 0.0, 1.0)
+        self.missed, self.sight = log_evidence <= -settings.least_evidence, looks.sight % 2
+        self.least = np.full(count, settings.least_evidence)
         if longest is not None:
+            np.maximum.at(newest_s, row, sites.seen_s)
             age_s = np.maximum(after.stamp_s - newest_s, 0.0)
-            p_stays = longest.longest(class_of(after, cliques), age_s, settings.credible)
+            p_stays = longest.longest(class_of(after, self.cliques), age_s, settings.credible)
             p_stays = np.clip(p_stays, 1e-12, 1.0 - 1e-12)
-            least = np.maximum(least, np.log(p_stays / (1.0 - p_stays)))
-        return cls(
-            before=before,
-            after=after,
-            looks=looks,
-            arrivals=arrivals,
-            start_s=start_s,
-            cliques=cliques,
-            site=site,
-            p_away=np.clip(1.0 - np.bincount(row, sites.p_here, minlength=count), 0.0, 1.0),
-            log_evidence=log_evidence,
-            least=least,
-            least_evidence=settings.least_evidence,
-            settings=settings,
-            hits=hits,
-            misses=misses,
-            was_hit=np.bincount(row, hits, minlength=count) > 0,
-            newest={clique: k for k, clique in enumerate(stays.clique_id.tolist())},
-            last_s=stays.last_s.copy(),
-            gone_s=stays.gone_s.copy(),
-            p_gone=stays.p_gone.copy(),
-            p_kept=sites.p_kept.copy(),
-            since_s=sites.since_s.copy(),
-            hidden=np.zeros(3),
-            shown=np.zeros(3),
-            begun=[],
-            found=[],
-        )
-
-    def weigh(self, row: int) -> None:
-        """Update the probability of being hidden by a clique that was missed and is present."""
-        if self._missed(row) and not self.was_hit[row]:
-            self.hidden[self._sight(row)] += 1.0 - self.p_away[row]
+            self.least = np.maximum(self.least, np.log(p_stays / (1.0 - p_stays)))
+        self.newest = {clique: k for k, clique in enumerate(stays.clique_id.tolist())}
+        self.last_s, self.gone_s, self.p_gone = stays.last_s.copy(), stays.gone_s.copy(), stays.p_gone.copy()
+        self.p_kept, self.since_s = sites.p_kept.copy(), sites.since_s.copy()
+        self.hidden, self.shown = np.zeros(3), np.zeros(3)
+        self.begun: list[tuple[int, int, float, float, float, float, float]] = []
+        self.found: list[MapChange] = []
 
     def told_before(self, row: int, old: int, stay: int) -> None:
         """Decide on a clique that occupied the site `old`, by the stay `stay` (-1 for none)."""
         site = int(self.site[row])
-        if self._stands(row) and site == old:
+        if self.stands[row] and site == old:
             self._goes_on(row, stay)
-        elif self._stands(row) and self.hits[site]:
+        elif self.stands[row] and self.hits[site]:
             self._moved(row, old, stay)
         elif (
-            not self._stands(row)
+            not self.stands[row]
             and self.misses[old]
             and self.log_evidence[row] <= -self.least[row]
             and self.p_away[row] >= EXISTS
         ):
             self._vanished(row, old, stay)
-        elif stay >= 0 and self._missed(row):
+        elif stay >= 0 and self.missed[row]:
             self.p_gone[stay] = self.p_away[row]
 
     def was_away(self, row: int) -> None:
         """Decide on a clique that was away, or is new."""
         clique, site, sites = int(self.cliques[row]), int(self.site[row]), self.after.sites
         newest = self.newest.get(clique, -1)
-        if site in self.arrivals.left_s and not self._stands(row):
+        if site in self.arrivals.left_s and not self.stands[row]:
             self._came_and_left(row, site, newest)
             return
-        if not (self._stands(row) and self.hits[site]):
+        if not (self.stands[row] and self.hits[site]):
             if newest >= 0 and np.isfinite(self.gone_s[newest]):
                 at = _row(self.after, int(self.after.stays.site_id[newest]))
                 self.p_gone[newest] = np.clip(1.0 - self.p_kept[at], 0.0, 1.0) if at >= 0 else self.p_gone[newest]
@@ -221,7 +151,7 @@ class _Session:
         share = min(self.p_kept[site] / sites.p_here[site], 1.0)
         self.p_kept[site] = sites.p_here[site]
         same = newest >= 0 and self.after.stays.site_id[newest] == sites.site_id[site]
-        self.hidden[self._sight(row)] += share * self.p_gone[newest] if same else 0.0
+        self.hidden[self.sight[row]] += share * self.p_gone[newest] if same else 0.0
         if same and share >= 1.0 - EXISTS:  # it had never left
             self.last_s[newest], self.gone_s[newest], self.p_gone[newest] = seen_s, np.inf, 0.0
             at = _row(self.before, int(sites.site_id[site]))
@@ -241,30 +171,10 @@ class _Session:
         stays = replace(self.after.stays, last_s=self.last_s, gone_s=self.gone_s, p_gone=self.p_gone)
         if not self.begun:
             return stays
-        columns = (np.array(part) for part in zip(*self.begun, strict=True))
-        clique_id, site, elsewhere_s, first_s, last_s, gone_s, p_gone = columns
-        fresh = Stays(
-            clique_id,
-            self.after.sites.site_id[site],
-            class_of(self.after, clique_id),
-            site_middles(self.after)[site],
-            elsewhere_s,
-            first_s,
-            last_s,
-            gone_s,
-            p_gone,
-        )
-        stays = stays.joined(fresh)
+        clique_id, site, *times = (np.array(part) for part in zip(*self.begun, strict=True))
+        site_id, middle_m = self.after.sites.site_id[site], site_middles(self.after)[site]
+        stays = stays.joined(Stays(clique_id, site_id, class_of(self.after, clique_id), middle_m, *times))
         return stays[np.argsort(stays.first_s, kind="stable")]
-
-    def _stands(self, row: int) -> bool:
-        return bool(self.after.sites.p_here[self.site[row]] >= EXISTS)
-
-    def _missed(self, row: int) -> bool:
-        return bool(self.log_evidence[row] <= -self.least_evidence)
-
-    def _sight(self, row: int) -> int:
-        return int(self.looks.sight[row]) % 2
 
     def _goes_on(self, row: int, stay: int) -> None:
         site, sites = int(self.site[row]), self.after.sites
@@ -275,10 +185,10 @@ class _Session:
             self.last_s[stay] = max(self.last_s[stay], sites.seen_s[site])
             if self.hits[site]:  # if it was missed before, it was hidden then
                 share = min(self.p_kept[site] / sites.p_here[site], 1.0)
-                self.hidden[self._sight(row)] += share * self.p_gone[stay]
-                self.shown[self._sight(row)] += 1.0
+                self.hidden[self.sight[row]] += share * self.p_gone[stay]
+                self.shown[self.sight[row]] += 1.0
                 self.p_gone[stay] = 0.0
-            elif self._missed(row):
+            elif self.missed[row]:
                 self.p_gone[stay] = self.p_away[row]
         if self.hits[site]:
             self.p_kept[site] = sites.p_here[site]
@@ -340,27 +250,20 @@ class _Session:
         self._tell(ChangeKind.VANISHED, site, -1, last_s, max(left_s, last_s), p_away, 0, int(self.misses[site]))
 
     def _tell(
-        self,
-        kind: ChangeKind,
-        left: int,
-        site: int,
-        from_s: float,
-        to_s: float,
-        probability: float,
-        n_hits: int,
-        n_misses: int,
+        self, kind: ChangeKind, left: int, site: int, from_s: float, to_s: float, p: float, n_hits: int, n_misses: int
     ) -> None:
-        """Return the change of a clique from one site (row, -1 for none) to another."""
+        """Tell the change of a clique from one site (row, -1 for none) to another."""
         away = np.full(self.after.dim, np.nan), 0.0
         step, turn = _motion(self.after, left, site) if site >= 0 and left >= 0 else away
+        there = self.after.places.site_id == self.after.sites.site_id[site if site >= 0 else left]
         change = MapChange(
-            landmark_ids=_members_at(self.after, site if site >= 0 else left),
+            landmark_ids=tuple(np.sort(self.after.places.landmark_id[there]).tolist()),
             kind=kind,
             stamp_from_s=from_s if np.isfinite(from_s) else float("nan"),
             stamp_to_s=to_s,
             displacement_m=tuple(step.tolist()),
             rotation_rad=turn,
-            probability=float(min(max(probability, 0.0), 1.0)),
+            probability=float(min(max(p, 0.0), 1.0)),
             n_hits=n_hits,
             n_misses=n_misses,
         )
@@ -375,13 +278,10 @@ def _told(before: LivingMap, after: LivingMap) -> dict[int, tuple[int, int]]:
         site = _row(after, int(stays.site_id[row]))
         if site >= 0:
             told[int(stays.clique_id[row])] = (site, row)
-    known = set(stays.clique_id.tolist())
-    then = standing(before)
-    for clique, at in zip(then.clique_id.tolist(), then.site.tolist(), strict=True):
-        if clique not in known and at >= 0:  # part of a body that stood there
-            site = _row(after, int(before.sites.site_id[at]))
-            if site >= 0:
-                told[clique] = (site, -1)
+    then, known = before.sites[before.sites.p_here >= EXISTS], set(stays.clique_id.tolist())
+    for clique, site_id in dict(zip(then.clique_id.tolist(), then.site_id.tolist(), strict=True)).items():
+        if clique not in known and (site := _row(after, site_id)) >= 0:  # part of a body that stood there
+            told[clique] = (site, -1)
     return told
 
 
@@ -461,20 +361,11 @@ def _first_miss(looks: PlaceLooks, site: int, last_s: float, start_s: float) -> 
     return float(looks.rows.stamp_s[rows].min()) if rows.any() else max(start_s, float(np.nextafter(last_s, np.inf)))
 
 
-def _counted(looks: PlaceLooks, count: int) -> tuple[IntArray, IntArray]:
-    hit: BoolArray = looks.rows.hit
-    hits = np.bincount(looks.rows.site[hit], minlength=count)
-    return hits, np.bincount(looks.rows.site[~hit & looks.counts], minlength=count)
-
-
 def _row(living: LivingMap, site_id: int) -> int:
-    return _found(living.sites.site_id, site_id)
-
-
-def _found(ids: IntArray, wanted: int) -> int:
-    """Return the row of an id among sorted ones, -1 if it is not among them."""
-    at = int(np.searchsorted(ids, wanted))
-    return at if at < len(ids) and ids[at] == wanted else -1
+    """Return the row of a site by its id, -1 if it is not there."""
+    ids = living.sites.site_id
+    at = int(np.searchsorted(ids, site_id))
+    return at if at < len(ids) and ids[at] == site_id else -1
 
 
 def _last_site(before: LivingMap, after: LivingMap, clique: int) -> int:
@@ -483,13 +374,6 @@ def _last_site(before: LivingMap, after: LivingMap, clique: int) -> int:
     if not len(mine):
         return -1
     return _row(after, int(before.sites.site_id[mine[np.argmax(before.sites.seen_s[mine])]]))
-
-
-def _members_at(living: LivingMap, site: int) -> tuple[int, ...]:
-    if site < 0:
-        return ()
-    rows = living.places.site_id == living.sites.site_id[site]
-    return tuple(int(name) for name in np.sort(living.places.landmark_id[rows]))
 
 
 def without_strays(living: LivingMap) -> LivingMap:

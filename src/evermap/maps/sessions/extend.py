@@ -80,28 +80,21 @@ class Extended:
 
 
 def extended(living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig, drift_m: float) -> Extended:
-    """Enter what a session found.
-
-    Args:
-        living: the map as it was.
-        p_site: (S,) belief in its sites, at the beginning of the session.
-        found: the session's landmarks.
-        config: how far landmarks of one body may be apart.
-        drift_m: by which places may have been off when the session was solved.
+    """Return the map with what a session found, by beliefs (S,) in its sites when the session began, and by how much
+    places may have been off when it was solved.
     """
     before, living, p_site, found = _with_bodies(living, p_site, found, config, drift_m)
     members, cliques_ever = _with_members(living, found, config)
     clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id)]
-    site_of = _standing_at(living, found, clique)
-
-    new = np.flatnonzero(found.place < 0)
+    stands, new = np.flatnonzero(found.place >= 0), np.flatnonzero(found.place < 0)
+    seen = found.place[stands]
+    site_of = dict(zip(clique[stands].tolist(), living.places.site_id[seen].tolist(), strict=True))
     fresh = np.unique(clique[new][[int(c) not in site_of for c in clique[new]]])  # cliques that get a new site
     new_ids = living.n_sites_ever + np.arange(len(fresh))
-    site_of |= {int(c): int(s) for c, s in zip(fresh, new_ids, strict=True)}
-    site = np.array([site_of[int(c)] for c in clique[new]], dtype=np.int64)
+    site_of |= zip(fresh.tolist(), new_ids.tolist(), strict=True)
+    site = np.array([site_of[c] for c in clique[new].tolist()], dtype=np.int64)
 
-    order = np.concatenate([np.flatnonzero(found.place >= 0), new])
-    seen = found.place[found.place >= 0]
+    order = np.concatenate([stands, new])
     position, covariance = found.position_m[order], taken(found.covariance_m2, order, living.dim)
     if len(living.places):
         position, covariance = with_session(
@@ -117,8 +110,6 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
     places = _turned(replace(places, position_m=position), found, seen, new)
     sites, p_start, is_new = _with_sites(living, p_site, found, clique, (fresh, new_ids), config.decisions.new_clique_p)
     sorted_rows = np.lexsort((places.landmark_id, places.site_id))
-    rank = np.empty(len(sorted_rows), dtype=np.int64)
-    rank[sorted_rows] = np.arange(len(sorted_rows))
     place = found.place.copy()
     place[new] = len(living.places) + np.arange(len(new))
     return Extended(
@@ -133,7 +124,7 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
             n_sites_ever=living.n_sites_ever + len(fresh),
         ),
         found.landmark_id,
-        rank[place],
+        np.argsort(sorted_rows)[place],
         p_start,
         is_new,
     )
@@ -282,12 +273,6 @@ def _torn(living: LivingMap, clique_id: IntArray, found: Found, reach_m: float) 
             label[member[body]] = next_id
             next_id += 1
     return label
-
-
-def _standing_at(living: LivingMap, found: Found, clique: IntArray) -> dict[int, int]:
-    """Return the known site that every clique occupies."""
-    rows = np.flatnonzero(found.place >= 0)
-    return {int(clique[k]): int(living.places.site_id[found.place[k]]) for k in rows}
 
 
 def _with_sites(

@@ -51,8 +51,6 @@ def with_session(
         (P + N, 2) and (2 (P + N), 2 (P + N)).
     """
     count, new = len(position_m), len(session_m) - len(seen)
-    if count == 0:  # a map begins
-        return session_m, session_covariance_m2
     dim = position_m.shape[1]
     s = se2.xy_rows(seen, dim)
     k = len(s)
@@ -164,11 +162,8 @@ class OwnLandmarks:
 def own_landmarks(outcome: Outcome, settings: FitConfig = USUAL, in_place: IntArray | None = None) -> OwnLandmarks:
     """Return the Gaussian of a session's landmarks, in its own scale: that of the map if it was solved with one.
 
-    Args:
-        outcome: of the session.
-        settings: how many sightings make a landmark: one may carry a wrong identity, which is hardly ever the right one
-            of a landmark that stands where the map has it.
-        in_place: rows of landmarks that were laid at places of the map.
+    How many sightings make a landmark is a matter of settings: one may carry a wrong identity, which is hardly ever the
+    right one of a landmark that stands where the map has it. Rows of those that do are `in_place`.
     """
     estimate = outcome.graph_estimate
     landmark = outcome.problem.landmark_row[: len(outcome.inlier)]
@@ -184,12 +179,8 @@ def own_landmarks(outcome: Outcome, settings: FitConfig = USUAL, in_place: IntAr
 
 
 def _misread(outcome: Outcome, n_fit: FloatArray, settings: FitConfig) -> BoolArray:
-    """Return (L,) landmarks that are misread detections of another one at the same place.
-
-    Args:
-        outcome: of the session.
-        n_fit: (L,) inliers of each landmark; 0 for those that are not believed anyway.
-        settings: how near, and how seldom beside the other one.
+    """(L,) landmarks that are misread detections of another one at the same place, by the inliers (L,) of each; 0 for
+    those that are not believed anyway.
     """
     from scipy.spatial import cKDTree
 
@@ -287,20 +278,16 @@ def settled_by(
     Errors of the metre are a robot's, alike in all its sessions. So each robot has the mean of its sessions, as
     `settled` has it, and the map what its robots have together (`agreed`), however long each of them drives.
 
-    Args:
-        shown: the log of the map's size over that of the session, and its variance (`log_ratio`).
-        session: as of `settled`.
-        living: the map.
-        robot: whose session it is; '' where nobody said.
-        settings: of metres.
+    Shown is the log of the map's size over that of the session, and its variance (`log_ratio`); the session's own metre
+    is as of `settled`. The robot is '' where nobody said whose session it is.
     """
     metres, name = living.metres, landmark_id_of(robot) if robot else 0
     if not robot and not len(metres):
         return settled(*shown, session, living.log_size_variance, living.log_size_information, settings), metres
     if not len(metres):  # sessions without a name, or a survey
-        metres = Metres(*map(np.array, ([0], [0.0], [living.log_size_variance], [living.log_size_information])))
+        metres = Metres.of("", living.log_size_variance, living.log_size_information)
     if name not in metres.robot_id:
-        metres = metres.joined(Metres(*map(np.array, ([name], [0.0], [session[1] ** 2], [UNHEARD]))))
+        metres = metres.joined(Metres.of(robot, session[1] ** 2, UNHEARD))
     row = int(np.flatnonzero(metres.robot_id == name)[0])
     log_metre, variance, information = (
         column.copy() for column in (metres.log_metre, metres.log_variance, metres.information)
@@ -321,17 +308,13 @@ def settled_by(
 
 
 def agreed(log_metre: FloatArray, sigma: FloatArray, settings: MetreConfig = USUAL_METRE) -> tuple[float, FloatArray]:
-    """Return the scale on which robots agree, and for each of them the probability that its own has drifted.
+    """Return the scale on which robots agree, and for each of them the probability that its own has drifted, by the log
+    metre of each (R,), and its standard deviation by its priors.
 
-    The metre of a robot is off by what its priors say, or, as robots of one make may agree better than that, by a
-    share of it that is one for all; that of a robot that has drifted, by some times more, whatever the share. Metre
-    (with a flat prior) and share are integrated over. So one robot in five that is off by no more than its priors
-    allow is told by the agreement of the others, and where robots scatter as they are said to, their mean counts.
-
-    Args:
-        log_metre: (R,) what each robot says.
-        sigma: (R,) standard deviations by its priors.
-        settings: of metres.
+    The metre of a robot is off by what its priors say, or, as robots of one make may agree better than that, by a share
+    of it that is one for all; that of a robot that has drifted, by some times more, whatever the share. Metre (with a
+    flat prior) and share are integrated over. So one robot in five that is off by no more than its priors allow is told
+    by the agreement of the others, and where robots scatter as they are said to, their mean counts.
     """
     if len(log_metre) == 1:
         return float(log_metre[0]), np.zeros(1)
@@ -354,13 +337,8 @@ def log_ratio(
     """Return the log of the map's scale over the session's, and its variance: a similarity by generalised least
     squares.
 
+    Of landmarks (K, 2) with covariance (2 K, 2 K), in the session's frame and metres, the scale held, and in the map.
     Where residuals are larger than the covariances allow, as in a session that is bent, the variance grows with them.
-
-    Args:
-        session_m: (K, 2) landmarks in the session's frame and metres.
-        session_m2: (2 K, 2 K) their covariance, the scale held.
-        map_m: (K, 2) the same in the map.
-        map_m2: (2 K, 2 K) covariance of these.
     """
     middle = session_m.mean(axis=0)
     if not (session_m != middle).any():  # a point has no size

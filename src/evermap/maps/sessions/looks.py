@@ -102,11 +102,8 @@ class PlaceLooks:
 def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: LivingConfig) -> PlaceLooks:
     """Return which places of a map were looked at, frame by frame, and which of them were seen.
 
-    Args:
-        living: the map, with the sites that the session found.
-        p_start: (S,) beliefs in these when it began.
-        watch: at which of its places the session looked, and which it saw.
-        config: `looks`; without `learn_sight` nothing is ever in the way.
+    The map has the sites that the session found, with beliefs (S,) when it began. Without `learn_sight` nothing is ever
+    in the way.
     """
     from evermap.sensing.kernels import close_to_hits, grouped, witnessed
 
@@ -151,7 +148,9 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
         living,
         p_start,
         rows,
-        _Seen(clear, beside & clear, unknown),
+        clear,
+        beside & clear,
+        unknown,
         lambda some: (eye[frame[some], :2], floor_m[place[some]]),
         settings,
     )
@@ -160,14 +159,8 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
 
 
 def _rate(rows: SiteLooks, p_detect: FloatArray, known: BoolArray, n_sites: int, rules: SightConfig) -> float:
-    """Return the rate of a session, by what was missed between the first and the last time that a site was seen.
-
-    Args:
-        rows: looks of the session.
-        p_detect: (K,) detection probability along each line before the session.
-        known: (K,) lines that are known to be clear.
-        n_sites: of the map.
-        rules: how far sessions differ.
+    """The rate of a session, by what was missed between the first and the last time that a site was seen; of lines (K,)
+    their detection probability before the session, and whether they are known to be clear.
     """
     first, last = first_and_last(rows.site[rows.hit], rows.stamp_s[rows.hit], n_sites)
     there = (rows.stamp_s > first[rows.site]) & (rows.stamp_s < last[rows.site]) & known[rows.key]
@@ -198,23 +191,19 @@ def _unwitnessed(rows: SiteLooks, was_unknown: BoolArray, n: int, least: int) ->
     return np.array([np.sum(there & (found == 0)), np.sum(there & (found > 0))], dtype=np.float64)
 
 
-class _Seen(NamedTuple):
-    """Return (N,) masks of looks along clear lines, those with a sighting nearby or behind, and unknown lines."""
-
-    clear: BoolArray
-    beside: BoolArray
-    unknown: BoolArray
-
-
 def _hidden(
     living: LivingMap,
     p_start: FloatArray,
     rows: SiteLooks,
-    seen: _Seen,
+    clear: BoolArray,
+    beside: BoolArray,
+    unknown: BoolArray,
     ends: Callable[[IntArray], tuple[FloatArray, FloatArray]],
     settings: LooksConfig,
 ) -> tuple[BoolArray, IntArray, FloatArray]:
     """Return looks that count, the (C,) state of the lines to each clique, and its (C,) probability of being hidden.
+
+    By masks (N,) of looks along clear lines, of those with a sighting nearby or behind, and of unknown lines.
 
     A miss with a witness counts for what it is: something else was seen along the line. Without one the line may be
     closed in this session, the more probably the more cliques are missed from there together: one door hides them all,
@@ -222,7 +211,6 @@ def _hidden(
     """
     cliques, row = clique_rows(living.sites)
     n, least = len(cliques), settings.witnesses
-    clear, beside, unknown = seen
     hits, n_clear, n_beside, n_unknown = (
         np.bincount(rows.clique[some], minlength=n) for some in (rows.hit, clear, beside, unknown)
     )
@@ -248,13 +236,8 @@ def _hidden(
 
 
 def _sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) -> IntArray:
-    """Return the (C,) number of sides from which each clique was looked at, at least one.
-
-    Args:
-        clique: (N,) of the looks that count, and missed.
-        away: (N, 2) from the places to the sensor.
-        n: number of cliques.
-        settings: what is a side.
+    """(C,) number of sides from which each of `n` cliques was looked at, at least one, by the cliques (N,) of the looks
+    that count and missed, and (N, 2) from the places to the sensor.
     """
     every = settings.sides
     side = np.floor(np.mod(np.arctan2(away[:, 1], away[:, 0]), 2.0 * np.pi) * (every / (2.0 * np.pi))).astype(np.int64)
@@ -304,14 +287,8 @@ class Arrivals:
 def arrivals(
     before: LivingMap, after: LivingMap, looks: PlaceLooks, sensor: Sensor, settings: LooksConfig = USUAL
 ) -> Arrivals:
-    """Return what earlier sessions saw of the places of new sites.
-
-    Args:
-        before: the map as the session found it.
-        after: with the sites that it found.
-        looks: of the session, at places of `after`.
-        sensor: of the session.
-        settings: what counts as a look.
+    """Return what earlier sessions saw of the places of new sites: of the map before, and after the session found
+    these.
     """
     new = np.flatnonzero(~np.isin(after.sites.site_id, before.sites.site_id))
     looked, p_appeared = np.full(len(new), -np.inf), np.zeros(len(new))
@@ -350,10 +327,9 @@ def arrivals(
 def came_after(survival: FloatArray, p_missed: FloatArray, p_always: float) -> FloatArray:
     """Return the (K,) probability that something came after each look at its place, all of which missed it.
 
-    Args:
-        survival: (K,) of the times since the looks, the oldest first: of the ages that it may have.
-        p_missed: (K,) probability of each miss if it was there.
-        p_always: the part of these that they have in common: that it was hidden in all of them.
+    By the survival (K,) of the times since the looks, the oldest first, that is of the ages that it may have; the
+    probability (K,) of each miss if it was there; and the part of these that they have in common: that it was hidden in
+    all.
     """
     came = np.diff(survival, prepend=0.0, append=1.0)  # before the first look, between two, after the last
     by_chance = np.cumprod(((p_missed - p_always) / (1.0 - p_always))[::-1])[::-1]

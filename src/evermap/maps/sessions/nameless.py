@@ -24,9 +24,10 @@ from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.geometry.group import SPACE, group_of
 from evermap.geometry.rigid import rigid
+from evermap.maps.bodies import log_density, squared_length
 from evermap.maps.living import EXISTS, LivingMap
 from evermap.maps.sessions.believe import aged
-from evermap.maps.sessions.box_search import TESTED_M2
+from evermap.maps.sessions.box_search import TESTED_M2, windows
 from evermap.maps.sessions.gaussian import drifted
 from evermap.maps.sessions.placing import SMALLEST_P, one_to_one
 from evermap.maps.sessions.session import admitted
@@ -117,10 +118,13 @@ def named_in(recording: AnyRecordingT, living: LivingMap, config: Config) -> Any
         DataError: too few frames with detections, or too many for the memory; in space, no odometry.
     """
     found, name, landmark_id = _met(recording, living, config)
-    names = _new_names(found, recording, landmark_id)
-    for row, text in names.items():
+    start = f"{recording.frames.stamp_s[0]:.3f}".rstrip("0").rstrip(".")
+    texts: dict[int, str] = {}
+    for row in np.flatnonzero(landmark_id == UNKNOWN).tolist():  # class, number in the session, and its first stamp
+        kind = int(found.of_kind[row, 0])
+        text = f"{recording.class_names[kind] if kind >= 0 else 'landmark'}-{row + 1}@{start}"
         landmark_id[row] = landmark_id_of(text)
-    texts = {landmark_id_of(text): text for text in names.values()}
+        texts[landmark_id_of(text)] = text
     named = with_ids(recording, found.landmark_row, name, landmark_id)
     return replace(named, landmark_names={**recording.landmark_names, **texts})
 
@@ -164,14 +168,6 @@ def _met(
     return found, name, landmark_id
 
 
-def _new_names(found: Associated | AssociatedInSpace, recording: AnyRecording, landmark_id: IntArray) -> dict[int, str]:
-    """Return names of new landmarks: class, number in the session, and its first stamp."""
-    start = f"{recording.frames.stamp_s[0]:.3f}".rstrip("0").rstrip(".")
-    kind, words = found.of_kind[:, 0], recording.class_names
-    new = np.flatnonzero(landmark_id == UNKNOWN).tolist()
-    return {row: f"{words[kind[row]] if kind[row] >= 0 else 'landmark'}-{row + 1}@{start}" for row in new}
-
-
 class Where(NamedTuple):
     """Landmarks of a session in a map, each predicted by all matched ones except itself.
 
@@ -192,17 +188,12 @@ class Where(NamedTuple):
 def held_at(
     local: LocalMap, held: IntArray, position_m: FloatArray, covariance_m2: FloatArray, config: OverlayConfig
 ) -> Where:
-    """Return the landmarks of a session in the map, given that some of them are at places of the map.
+    """Return the landmarks of a session in the map, given that some of them (H,) are at places (H, D), of covariance (D
+    H, D H), of the map.
 
     Gaussian conditioning of the session, with a motion that is free, on the differences of those that are held. Of each
-    of these the difference is predicted by the others alone, from the inverse of the covariance of all.
-
-    Args:
-        local: the session, in a frame of its own.
-        held: (H,) rows of those that are held.
-        position_m: (H, D) their places.
-        covariance_m2: (D H, D H) of these.
-        config: how far what stands may be off; the most probable is taken.
+    of these the difference is predicted by the others alone, from the inverse of the covariance of all. What stands may
+    be off by the most probable one of some drifts.
     """
     motion, dim = rigid(local.place[held], position_m), local.dim
     group = group_of(motion)
@@ -333,12 +324,8 @@ class _Assigned:
         return member, where
 
     def glimpsed(self, member: IntArray, where: Where | None, frame: IntArray) -> tuple[IntArray, IntArray]:
-        """Return rows of detections too few for a landmark, at places where one stands, and of the members seen there.
-
-        Args:
-            member: (K,) as of `members`.
-            where: as of `members`.
-            frame: (M,) of all detections of the recording.
+        """Return rows of detections too few for a landmark, at places where one stands, and of the members seen there;
+        `member` and `where` as of `members`, and the frames (M,) of all detections of the recording.
         """
         stood, loose, local = self._stood, self._found.loose, self._local.place
         there = np.flatnonzero((stood.p >= EXISTS) & ~np.isin(stood.landmark, member))
@@ -359,8 +346,8 @@ class _Assigned:
         some, k = some[kept], k[kept]
         off, variance = at[some] - place_m[k], loose.wide_m[some] ** 2 + where.drift_m**2
         spread = covariance_m2[k] + variance[:, None, None] * np.eye(self._dim)
-        score = np.log(p[k]) + _log_density(off, spread) - math.log(self._density)
-        score[_squared(off, spread) > GATE[self._dim]] = -np.inf
+        score = np.log(p[k]) + log_density(off, spread) - math.log(self._density)
+        score[squared_length(off, spread) > GATE[self._dim]] = -np.inf
         p_own = self._slam.association.p_own
         found = most_probable(loose.row[some], k, score, frame, len(place_m), p_own)
         rows = np.flatnonzero(found >= len(local))
@@ -410,7 +397,7 @@ class _Assigned:
         rows = se2.xy_rows(k, self._dim)
         known = of_places(self._living.covariance_m2, stood.row[m], self._dim)
         covariance = drifted(where.joint_m2[np.ix_(rows, rows)] + known, where.drift_m)
-        own = _log_density(off, blocks(covariance, self._dim)) if len(m) else np.zeros(0)
+        own = log_density(off, blocks(covariance, self._dim)) if len(m) else np.zeros(0)
         against = own - stands[some]
         conflict = (k[:, None] == k) | (stood.landmark[m][:, None] == stood.landmark[m])
         gate = GATE[self._dim]
@@ -436,7 +423,7 @@ class _Assigned:
         best = self._overlaid(named, of_named, self._index(of_named), self._alike, fewest=self._dim)
         if not best and len(stands) >= self._settings.fewest:
             index = self._index(stands)
-            for some in _windows(every):
+            for some in windows(every, WINDOW):
                 best = max(best, self._overlaid(some, stands, index, allowed), key=len)
                 if len(best) >= WINDOW:  # all of one
                     break
@@ -460,7 +447,7 @@ class _Assigned:
         held = np.flatnonzero(member >= 0)
         of = member[held][:, None] == stood.landmark
         apart = (together[:, held] @ of.astype(np.float64)) > 0.0
-        for some in _windows(left):
+        for some in windows(left, WINDOW):
             off = np.linalg.norm(where.position_m[some][:, None] - stood.position_m[stands], axis=2)
             near = stands[off.min(axis=0, initial=np.inf) < self._settings.bent_m]
             pairs = self._overlaid(some, near, self._index(near), self._alike & ~apart)
@@ -488,47 +475,36 @@ class _Assigned:
 
         What is ambiguous if places may deviate much between sessions may not be if they deviate little.
         """
-        drifts_m = sorted({max(self._overlay.drifts_m), min(self._overlay.drifts_m)}, reverse=True)
-        tried = (self._overlaid_at(some, stands, index, allowed, drift_m, fewest) for drift_m in drifts_m)
-        return next(filter(None, tried), [])
-
-    def _overlaid_at(
-        self,
-        some: IntArray,
-        stands: IntArray,
-        index: PlaceIndex | None,
-        allowed: BoolArray,
-        drift_m: float,
-        fewest: int,
-    ) -> list[tuple[int, int]]:
-        """Return the same at one deviation of places between sessions."""
         fewest, rules = fewest or self._settings.fewest, self._slam.association.constellation
         if len(some) < fewest or len(stands) < fewest:
             return []
-        (at, spread), local, motions = self._about(stands, drift_m), self._local.part(some), None
-        area_m2 = float(np.prod(np.sort(np.ptp(at, axis=0))[-2:] + 10.0))
+        local, motions = self._local.part(some), None
+        area_m2 = float(np.prod(np.sort(np.ptp(self._stood.position_m[stands], axis=0))[-2:] + 10.0))
         by_chance = math.log(max(len(some), 2) ** 2 * max(len(stands), 2) ** 2)  # pairs of both, each a motion
         if index is not None:
             motions = list(index.motions(local.place, local.beside_m))
             if not motions:
                 return []
             laid = group_of(motions[0]).transform(np.array(motions)[:, None], local.place)
-            near = index.around(laid.reshape(-1, self._dim), 2.0 * rules.near_m)
-            at, spread, stands = at[near], spread[near], stands[near]
-        pairs = agreed_pairs(
-            local,
-            LocalMap(at, block_diag(*spread), None if local.rotation is None else self._stood.rotation[stands]),
-            allowed[np.ix_(some, stands)],
-            density=self._density,
-            probability=self._slam.association.p_merge,
-            motions=motions,
-            margins_nats=(
-                rules.certain_nats + max(math.log(area_m2 / TESTED_M2), 0.0),
-                min(rules.certain_nats + by_chance, rules.lead_nats),
-            ),
-            settings=self._slam,
-        )
-        return [(int(some[k]), int(stands[m])) for k, m in pairs]
+            stands = stands[index.around(laid.reshape(-1, self._dim), 2.0 * rules.near_m)]
+        for drift_m in sorted({max(self._overlay.drifts_m), min(self._overlay.drifts_m)}, reverse=True):
+            at, spread = self._about(stands, drift_m)
+            pairs = agreed_pairs(
+                local,
+                LocalMap(at, block_diag(*spread), None if local.rotation is None else self._stood.rotation[stands]),
+                allowed[np.ix_(some, stands)],
+                density=self._density,
+                probability=self._slam.association.p_merge,
+                motions=motions,
+                margins_nats=(
+                    rules.certain_nats + max(math.log(area_m2 / TESTED_M2), 0.0),
+                    min(rules.certain_nats + by_chance, rules.lead_nats),
+                ),
+                settings=self._slam,
+            )
+            if pairs:
+                return [(int(some[k]), int(stands[m])) for k, m in pairs]
+        return []
 
     def _odds(
         self, some: IntArray, where: Where, free: BoolArray
@@ -542,14 +518,14 @@ class _Assigned:
         k, m = np.nonzero(self._alike[some] & free & (away < self._settings.farthest_m))
         step, drift_m2 = off[k, m], where.drift_m**2 * np.eye(self._dim)
         spread = where.covariance_m2[k] + stood.covariance_m2[m] + drift_m2
-        stands = np.log(stood.p[m]) + _log_density(step, spread)
-        moved = np.log(stood.p_away[m] * self._overlay.share_nudged) + _log_density(step, spread + nudge_m2)
+        stands = np.log(stood.p[m]) + log_density(step, spread)
+        moved = np.log(stood.p_away[m] * self._overlay.share_nudged) + log_density(step, spread + nudge_m2)
         # beside what was found it would have been found
         missed = np.log1p(-self._settings.p_found * (1.0 - stood.p_away)) * (
             away.min(axis=0, initial=np.inf) < self._beside_m
         )
         stands, moved = (odds - math.log(self._density) - missed[m] for odds in (stands, moved))
-        stands[_squared(step, spread) > GATE[self._dim]] = -np.inf
+        stands[squared_length(step, spread) > GATE[self._dim]] = -np.inf
         if self._local.rotation is not None:
             rules = self._slam.association.space
             angle = se3.angle_between(se3.turn(where.rotation[k]), se3.turn(stood.rotation[m]))
@@ -581,12 +557,8 @@ class _Assigned:
         """Return log odds (K, L) of being members, also where another one of their class was.
 
         Two that were exchanged share the choice of the other one. A landmark that is where another one was, while none
-        is where it was, has that choice for itself.
-
-        Args:
-            table: without that.
-            held: rows that are certain.
-            at_place: (Q,) rows, members and log odds of being at a place of these, whatever they are like.
+        is where it was, has that choice for itself. Rows that are held are certain; `at_place` has (Q,) rows, members
+        and log odds of being at a place of these, whatever they are like.
         """
         k, member, stands = at_place
         odds, home = np.full(len(table), -np.inf), np.full(len(table), -1, dtype=np.int64)
@@ -628,17 +600,3 @@ class _Assigned:
             if not together[[k]][:, np.flatnonzero(found == one)].sum():
                 found[k] = one
         return found
-
-
-def _windows(rows: IntArray) -> list[IntArray]:
-    """Landmarks, some at a time, in the order in which they were met."""
-    return [rows[k : k + WINDOW] for k in range(0, max(len(rows) - WINDOW // 2, 1), WINDOW // 2)]
-
-
-def _squared(step: FloatArray, spread: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("ki,ki->k", step, np.linalg.solve(spread, step[..., None])[..., 0]))
-
-
-def _log_density(step: FloatArray, spread: FloatArray) -> FloatArray:
-    log_det = np.linalg.slogdet(2.0 * math.pi * spread)[1]
-    return np.asarray(-0.5 * (_squared(step, spread) + log_det))

@@ -13,9 +13,10 @@ from evermap.geometry import se2, se3
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import consensus, rigid
 from evermap.geometry.symmetry import Symmetries
-from evermap.maps.living import LivingMap, Places
+from evermap.maps.bodies import squared_length
+from evermap.maps.living import LivingMap, Places, rows_among
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
-from evermap.maps.vicinity import Vicinity, cliques_of, near
+from evermap.maps.vicinity import Vicinity, near
 from evermap.slam.calibration import FORWARD, SLOPE, CalibrationPrior
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
@@ -63,11 +64,6 @@ class Laid:
     probability: FloatArray
     drift_m: float
     assumed: BoolArray
-
-    def as_seen(self) -> Laid:
-        """Return the same without assumed matches."""
-        place = np.where(self.assumed, ELSEWHERE, self.place)
-        return replace(self, place=place, assumed=np.zeros(len(place), dtype=np.bool_))
 
 
 def places_in(where: Laid | None, landmark_id: IntArray) -> tuple[IntArray, FloatArray]:
@@ -130,8 +126,7 @@ class Turned(NamedTuple):
             each = []
             for sigma in sigmas_rad:
                 wide = spread + sigma**2 * np.eye(3)
-                squared = np.einsum("ki,ki->k", off, np.linalg.solve(wide, off[..., None])[..., 0])
-                each.append(-0.5 * squared - 0.5 * np.linalg.slogdet(wide)[1])
+                each.append(-0.5 * squared_length(off, wide) - 0.5 * np.linalg.slogdet(wide)[1])
             return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(each)))
 
         return np.where(known, log_density(settings.stood_rad) - log_density(settings.turned_rad), 0.0)
@@ -139,8 +134,7 @@ class Turned(NamedTuple):
 
 def _turns(rotation: FloatArray) -> FloatArray:
     """Poses (K, 7) at the origin with orientations (K, 4); of nan with none."""
-    known = np.isfinite(rotation[:, :1])
-    return np.hstack([np.zeros((len(rotation), 3)), np.where(known, rotation, se3.NO_TURN)])
+    return se3.turn(np.where(np.isfinite(rotation[:, :1]), rotation, se3.NO_TURN))
 
 
 def laid_over(
@@ -152,34 +146,24 @@ def laid_over(
     config: LivingConfig,
     turned: Turned | None = None,
 ) -> Laid | None:
-    """Align a session with the map; None if no landmarks match.
+    """Align landmarks (K,) of a session with the map; None if none match.
 
-    Args:
-        living: the map.
-        p_site: (S,) probability of its sites, at the beginning of the session.
-        landmark_id: (K,) landmarks of the session.
-        position_m: (K, 2) in its own frame.
-        covariance_m2: (2 K, 2 K).
-        config: `search` and `overlay`, see `overlay.lay_over`.
-        turned: of a session in space, where it lies about; its positions have three coordinates.
+    By the probability (S,) of the map's sites at the beginning of the session, and positions (K, 2) in its own frame
+    with covariance (2 K, 2 K), in space with 3 for 2, where it lies about as `turned` tells.
     """
     members, places, sites = living.members, living.places, living.sites
-    at = np.minimum(np.searchsorted(members.landmark_id, landmark_id), max(len(members) - 1, 0))
-    known = members.landmark_id[at] == landmark_id if len(members) else np.zeros(len(landmark_id), np.bool_)
-    seen = np.flatnonzero(known)
+    at = rows_among(members.landmark_id, landmark_id)
+    seen = np.flatnonzero(at >= 0)
     used = np.flatnonzero(np.isin(places.landmark_id, landmark_id[seen]))
     landmark = np.searchsorted(landmark_id[seen], places.landmark_id[used])
     if len(used) < 2:
         return None
-    clique_ids, clique = np.unique(members.clique_id[at[seen]], return_inverse=True)
+    _, first, clique = np.unique(members.clique_id[at[seen]], return_index=True, return_inverse=True)
     used_sites, site = np.unique(places.site_id[used], return_inverse=True)
     site_rows = np.searchsorted(sites.site_id, used_sites)
     log_turned = np.zeros(len(used))
     if turned is not None:
         log_turned = turned.log_odds(seen[landmark], places[used], config.overlay)
-    total = np.zeros(len(clique_ids))
-    of_known = np.isin(sites.clique_id, clique_ids)
-    np.add.at(total, np.searchsorted(clique_ids, sites.clique_id[of_known]), p_site[of_known])
     found = lay_over(
         Sighted(position_m[seen], of_places(covariance_m2, seen, living.dim), clique.ravel().astype(np.int64)),
         Known(
@@ -188,7 +172,7 @@ def laid_over(
             landmark=landmark,
             site=site.ravel().astype(np.int64),
             log_p_site=np.log(np.maximum(p_site[site_rows], SMALLEST_P)),
-            log_p_elsewhere=np.log(np.maximum(1.0 - total, SMALLEST_P)),
+            log_p_elsewhere=np.log(np.maximum(1.0 - living.p_of_sites(p_site)[at[seen[first]]], SMALLEST_P)),
             log_turned=log_turned,
         ),
         config.search,
@@ -218,19 +202,12 @@ def unbent(
     One wrong identity after a blind stretch may turn all that follows. Then everything seen there seems to have moved,
     by one and the same motion, which things that really move do not. Such landmarks are laid at their places again, and
     the session is straightened when it is solved with the map. What moved alike in the midst of things that stand has
-    moved: a bend takes all that is in view along.
-
-    Args:
-        living: the map.
-        p_site: (S,) belief in its sites.
-        where: as most landmarks have it.
-        position_m: (K, 2) landmarks of `where` in the session's frame.
-        together: (K, K) frames in which two of them were seen.
-        settings: which bodies moved alike.
+    moved: a bend takes all that is in view along, as told by the frames in which two landmarks were seen `together` (K,
+    K). Positions (K, 2) are in the session's frame, and beliefs (S,) those in the map's sites.
     """
-    home = _homes(living, p_site, where)
+    home = homes(living, p_site, where)
     moved, stands = np.flatnonzero((where.place < 0) & (home >= 0)), np.flatnonzero(where.place >= 0)
-    places, body = living.places, living.members.clique_id[_members(living, where)]
+    places, body = living.places, living.members.clique_id[rows_among(living.members.landmark_id, where.landmark_id)]
     place, probability = where.place.copy(), where.probability.copy()
     while len(moved):
         motion, agree = consensus(position_m[moved], places.position_m[home[moved]])
@@ -253,35 +230,17 @@ def unbent(
     return replace(where, place=place, probability=probability, assumed=(where.place < 0) & (place >= 0))
 
 
-def all_at_home(living: LivingMap, p_site: FloatArray, where: Laid) -> Laid:
-    """Return where a session lies if nothing has moved: every landmark of the map at its most probable place."""
-    home = _homes(living, p_site, where)
-    return replace(where, place=np.where(where.place >= 0, where.place, home))
-
-
-def _members(living: LivingMap, where: Laid) -> IntArray:
-    """(K,) rows of the map's members; arbitrary rows for landmarks that the map does not know."""
-    rows = np.searchsorted(living.members.landmark_id, where.landmark_id)
-    return np.minimum(rows, max(len(living.members) - 1, 0))
-
-
-def _homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
-    """(K,) rows of the map's places at which landmarks are most probably expected; -1 for none."""
+def homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
+    """Return (K,) rows of the map's places at which landmarks are most probably expected; -1 for none."""
     site = replace(living, sites=replace(living.sites, p_here=p_site)).site_of()
-    at = _members(living, where)
-    known = living.members.landmark_id[at] == where.landmark_id
-    return np.where(known, living.place_row(where.landmark_id, site[at]), -1)
+    at = rows_among(living.members.landmark_id, where.landmark_id)
+    return np.where(at >= 0, living.place_row(where.landmark_id, site[at]), -1)
 
 
 def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid:
-    """Return rarely seen landmarks, assigned to the sites that others of their body occupy.
+    """Return rarely seen landmarks (K,), assigned to the sites that others of their body occupy.
 
     Whether their sightings fit there is seen when the session is solved with the map.
-
-    Args:
-        living: the map.
-        where: where all others lie.
-        landmark_id: (K,) those.
     """
     members, places = living.members, living.places
     names = np.intersect1d(landmark_id, members.landmark_id)
@@ -302,32 +261,28 @@ def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid
 
 
 def widened(
-    seen: Vicinity, where: Laid, path_m: FloatArray, sensor: Sensor, config: LivingConfig
+    living: LivingMap,
+    part: LivingMap,
+    named: IntArray,
+    where: Laid,
+    path_m: FloatArray,
+    sensor: Sensor,
+    config: LivingConfig,
 ) -> tuple[Vicinity, Laid]:
-    """Return the part of a large map with all that a sensor may have seen on a path (N, 2 or 3), and where a session
-    lies in it.
+    """Return the part of a large map that a session can touch, and where it lies there, if it lies in a `part` of the
+    map.
+
+    That are cliques that are named, and what the sensor may have seen on its path (N, 2 or 3).
     """
-    living, reach_m = seen.whole, sensor.range_max_m + config.near_m
+    reach_m = sensor.range_max_m + config.near_m
     cliques, box = living.sites.clique_id, np.array([-np.inf, -np.inf, np.inf, np.inf])
     if np.isfinite(reach_m):  # else all there is may be in view
         cliques, box = near(living, path_m, reach_m)
-    vicinity = Vicinity.of(living, np.union1d(np.unique(seen.part.sites.clique_id), cliques), config, box)
-    at = where.place >= 0
-    place = where.place.copy()
-    places = seen.part.places[place[at]]
+    vicinity = Vicinity.of(living, np.union1d(named, cliques), config, box)
+    at, place = where.place >= 0, where.place.copy()
+    places = part.places[place[at]]
     place[at] = vicinity.part.place_row(places.landmark_id, places.site_id)
     return vicinity, replace(where, place=place)
-
-
-def around(
-    living: LivingMap, where: Laid, path_m: FloatArray, sensor: Sensor, config: LivingConfig
-) -> tuple[Vicinity, Laid]:
-    """Return the part of a large map that a session can touch, and where it lies there, by rows of the whole."""
-    at = where.place >= 0
-    seen = Vicinity.of(living, cliques_of(living, where.landmark_id[at]), config)
-    place, places = where.place.copy(), living.places[where.place[at]]
-    place[at] = seen.part.place_row(places.landmark_id, places.site_id)
-    return widened(seen, replace(where, place=place), path_m, sensor, config)
 
 
 HEAVY_STEPS = 6
@@ -361,19 +316,13 @@ def refitted(
 ) -> tuple[Outcome, bool]:
     """Return the session solved in the frame of the map, and whether it had to be corrected for a distortion.
 
-    Args:
-        outcome: of the session alone.
-        prior: of the calibration states.
-        pose_map_session: (3,) where the session's frame is in the map.
-        size: metres of the map for one of the session's graph.
-        held: landmarks that are at places of the map.
-        settings: when it was bent, and how it is straightened then.
-        robust: explain outliers.
+    Its own frame is in the map at (3,), and `size` metres of the map are one of its graph. A robust solution explains
+    outliers.
 
     Raises:
         NumericalError: no finite optimum.
     """
-    problem, start = _in_map(outcome, prior, pose_map_session, size, *held)
+    problem, start = _in_map(outcome, prior, pose_map_session, size, held)
     noise = outcome.noise.noise
     solved = smoother, estimate, _ = _solved(problem, noise, start, robust=robust)
     straightened = False
@@ -386,15 +335,10 @@ def refitted(
 
 
 def _in_map(
-    outcome: Outcome,
-    prior: CalibrationPrior,
-    pose_map_session: FloatArray,
-    size: float,
-    row: IntArray,
-    mean_m: FloatArray,
-    covariance_m2: FloatArray,
+    outcome: Outcome, prior: CalibrationPrior, pose_map_session: FloatArray, size: float, held: Held
 ) -> tuple[Problem, Estimate]:
     """The problem of a session with the map as its prior, and where to start; arguments as of `refitted`."""
+    row, mean_m, covariance_m2 = held
     count = len(outcome.problem.landmark_mean)
     mean, information = np.zeros((count, 2)), np.zeros((2 * count, 2 * count))
     at = se2.xy_rows(row)

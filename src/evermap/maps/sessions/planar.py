@@ -13,19 +13,10 @@ from evermap.geometry import se2
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap, Metres
-from evermap.maps.sessions import believe
+from evermap.maps.sessions import believe, gaussian
 from evermap.maps.sessions.extend import Extended, Found, first_and_last
-from evermap.maps.sessions.gaussian import (
-    Size,
-    drifted,
-    log_ratio,
-    of_unknown_size,
-    own_landmarks,
-    resized,
-    settled,
-    settled_by,
-)
 from evermap.maps.sessions.looks import Sighting, Watch
+from evermap.maps.sessions.overlay import ELSEWHERE
 from evermap.maps.sessions.placing import (
     ANYWAY,
     CONTRADICTED,
@@ -34,7 +25,7 @@ from evermap.maps.sessions.placing import (
     Held,
     Laid,
     Localised,
-    all_at_home,
+    homes,
     laid_over,
     places_in,
     refitted,
@@ -42,24 +33,13 @@ from evermap.maps.sessions.placing import (
     widened,
     with_glimpsed,
 )
-from evermap.maps.sessions.witnessed import Witnessed
 from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.slam import result as of_slam
 from evermap.slam.check import unusable
 from evermap.slam.cleaning import some_frames
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.streaming import Outcome, silent_links
-from evermap.types import (
-    UNKNOWN,
-    BoolArray,
-    FloatArray,
-    IntArray,
-    Progress,
-    Recording,
-    Sensor,
-    SlamResult,
-    landmark_id_of,
-)
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Progress, Recording, Sensor, SlamResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +51,8 @@ class PlanarVisit:
     """
 
     solved: Solved
+    witnessed = believe.Witnessed.nothing()
+    """Observed arrivals and departures: none, since nothing is tracked."""
 
     @property
     def recording(self) -> Recording:
@@ -97,11 +79,6 @@ class PlanarVisit:
         """The sensor."""
         return self.recording.sensor
 
-    @property
-    def witnessed(self) -> Witnessed:
-        """Observed arrivals and departures: none, since nothing is tracked."""
-        return Witnessed.nothing()
-
     def concluded(self, scratch: str = "first_pose") -> SlamResult:
         """Return the session as the estimator has it; without a map in the frame that is called `scratch`."""
         return of_slam.concluded(self.solved, scratch)
@@ -112,8 +89,7 @@ class PlanarVisit:
         information = 1.0 / variance if variance > 0.0 else np.inf
         living = replace(living, log_size_variance=variance, log_size_information=information)
         if robot := self.recording.robot:
-            first = [landmark_id_of(robot)], [0.0], [variance], [information]
-            living = replace(living, metres=Metres(*map(np.array, first)))
+            living = replace(living, metres=Metres.of(robot, variance, information))
         return living
 
     def found(self, where: Laid | None, living: LivingMap, config: LivingConfig) -> Found:  # noqa: ARG002
@@ -122,7 +98,7 @@ class PlanarVisit:
         begins, in_place = where is None, None
         if where is not None:
             in_place = np.searchsorted(visit.prepared.landmark_id, where.landmark_id[where.place >= 0])
-        own = own_landmarks(visit.outcome, config.fit, in_place)
+        own = gaussian.own_landmarks(visit.outcome, config.fit, in_place)
         detection, landmark = _inliers(visit, config.fit.inlier)
         stamps = visit.recording.frames.stamp_s[visit.recording.detections.frame[detection]]
         count = len(visit.prepared.landmark_id)
@@ -172,13 +148,8 @@ def solve_session(
 
 
 def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = True) -> Localised[PlanarVisit]:
-    """Return a session that was solved alone, solved again at its alignment with a map.
-
-    Args:
-        alone: the session.
-        living: the map, with its classes (`session.admitted`).
-        config: settings.
-        cut: solve without doubtful frames (`doubtful`), if there are any.
+    """Return a session that was solved alone, solved again at its alignment with a map, whose classes it has
+    (`session.admitted`); and `cut`, without doubtful frames (`doubtful`), if there are any.
     """
     settings, known = config.living, len(living.places) > 0
     lost = Localised.lost(PlanarVisit(alone), living, CONTRADICTED if known else DISTORTED)
@@ -208,17 +179,18 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
                     return localised(solve_session(some, visit.prepared.warnings, config), living, config, cut=False)
                 except (DataError, NumericalError):  # too little is left
                     return lost
-        if where is not None and not fits(visit, alone, settings):
+        # what fits together by itself does not fit once it is held there
+        if where is not None and visit.outcome.inlier.mean() < settings.fit.least_fit * alone.outcome.inlier.mean():
             return lost
     return Localised(PlanarVisit(visit), part, where, vicinity)
 
 
 def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingConfig) -> Laid | None:
     """Return the alignment of the session with the map; None if no landmarks match."""
-    own = own_landmarks(alone.outcome, config.fit)
+    own = gaussian.own_landmarks(alone.outcome, config.fit)
     names = alone.prepared.landmark_id[own.row]
     log_sigma = np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance))
-    where = laid_over(living, p_site, names, own.position_m, of_unknown_size(own, float(log_sigma)), config)
+    where = laid_over(living, p_site, names, own.position_m, gaussian.of_unknown_size(own, float(log_sigma)), config)
     if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
         return None
     if config.search == "joint":
@@ -246,14 +218,14 @@ def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tupl
 
     That is what the sensor may have seen on its way, once the session is laid over those that it names, and some more.
     """
-    own = own_landmarks(alone.outcome, config.fit)
+    own = gaussian.own_landmarks(alone.outcome, config.fit)
     named = cliques_of(living, alone.prepared.landmark_id[own.row])
     seen = Vicinity.of(living, named, config)
     where = laid(seen.part, believe.aged(seen.part, config, alone.start_s).p_here, alone, config)
     if where is None:
         return seen, None
     path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
-    return widened(seen, where, path, alone.recording.sensor, config)
+    return widened(living, seen.part, named, where, path, alone.recording.sensor, config)
 
 
 def refit(
@@ -267,21 +239,21 @@ def refit(
     outcome, names = alone.outcome, alone.prepared.landmark_id
     size = outcome.scale
     if outcome.log_scale_sigma > 0.0:
-        own = own_landmarks(outcome, config.fit)
+        own = gaussian.own_landmarks(outcome, config.fit)
         _, mine, theirs = np.intersect1d(names[own.row], where.landmark_id[where.place >= 0], return_indices=True)
         places = where.place[where.place >= 0][theirs]
-        shown = log_ratio(
+        shown = gaussian.log_ratio(
             own.position_m[mine],
             of_places(own.covariance_m2, mine),
             living.places.position_m[places],
-            drifted(of_places(living.covariance_m2, places), where.drift_m),
+            gaussian.drifted(of_places(living.covariance_m2, places), where.drift_m),
         )
         own_metre = 0.0, outcome.log_scale_sigma
         if part:  # it does not change the metre of the rest
-            found = settled(*shown, own_metre, living.log_size_variance, np.inf, config.metre)
+            found = gaussian.settled(*shown, own_metre, living.log_size_variance, np.inf, config.metre)
         else:
-            found, metres = settled_by(shown, own_metre, living, alone.recording.robot, config.metre)
-            living = resized(living, found, metres)
+            found, metres = gaussian.settled_by(shown, own_metre, living, alone.recording.robot, config.metre)
+            living = gaussian.resized(living, found, metres)
         size *= found.session_factor
         alone = _remarked(alone, shown[0], found, config.metre)
 
@@ -290,19 +262,21 @@ def refit(
         row = np.searchsorted(names, where.landmark_id[stand])
         position = living.places.position_m[where.place[stand]]
         motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
-        covariance = drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
+        covariance = gaussian.drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
         return refitted(
             outcome, outcome.prior, motion, size, Held(row, position, covariance), settings=config.fit, robust=robust
         )
 
     solved, straightened = in_map(where)
     if where.assumed.any() and solved.inlier.mean() < (1.0 - config.fit.most_lost) * outcome.inlier.mean():
-        as_seen = where.as_seen()
+        place = np.where(where.assumed, ELSEWHERE, where.place)
+        as_seen = replace(where, place=place, assumed=np.zeros_like(where.assumed))
         other, straightened_too = in_map(as_seen)
         if other.inlier.mean() > solved.inlier.mean():  # it was not bent: they did move together
             where, solved, straightened = as_seen, other, straightened_too
     if straightened:
-        at_home = all_at_home(living, p_site, where)
+        # where it lies if nothing has moved
+        at_home = replace(where, place=np.where(where.place >= 0, where.place, homes(living, p_site, where)))
         solved, _ = in_map(at_home)
         landmark = alone.prepared.problem.landmark_row[: len(solved.inlier)]
         n_fit, count = (np.bincount(landmark, w, minlength=len(names)) for w in (solved.inlier, np.ones(len(landmark))))
@@ -316,7 +290,7 @@ def refit(
     return living, where, replace(alone, outcome=solved)
 
 
-def _remarked(alone: Solved, log_ratio: float, found: Size, settings: MetreConfig) -> Solved:
+def _remarked(alone: Solved, log_ratio: float, found: gaussian.Size, settings: MetreConfig) -> Solved:
     """A session with a remark where its metre contradicts the map's, or its robot's those of the others."""
     contradicts = found.off > settings.contradicts
     if not (contradicts or found.apart):
@@ -330,24 +304,12 @@ def _remarked(alone: Solved, log_ratio: float, found: Size, settings: MetreConfi
     return replace(alone, prepared=replace(alone.prepared, warnings=(*alone.prepared.warnings, remark)))
 
 
-def fits(visit: Solved, alone: Solved, config: LivingConfig) -> bool:
-    """Return False for a session that the map contradicts: what fits together by itself does not fit once it is held
-    there.
-    """
-    return bool(visit.outcome.inlier.mean() >= config.fit.least_fit * alone.outcome.inlier.mean())
-
-
 def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> tuple[BoolArray, BoolArray]:
     """Return (F,) frames of a session that nothing ties to the rest, and (F,) that contradict it: neither are entered.
 
     Where the odometry was silent, a session falls into parts, if what was seen does not tie them. Those that show none
     of the map, or in a map that begins, all but the largest, may be anywhere. And where most sightings of a stretch
     contradict all others, its poses are wrong, or the identities.
-
-    Args:
-        visit: the session, solved with the map as its prior.
-        where: it lies in the map; None for a map's first.
-        config: `fit`.
     """
     outcome, settings = visit.outcome, config.fit
     problem, pose, marginals = outcome.problem, outcome.graph_estimate.pose, outcome.graph_marginals
@@ -384,12 +346,8 @@ def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> tuple[B
 
 
 def without(visit: Solved, untied: BoolArray, wrong: BoolArray) -> Recording | None:
-    """Return the recording of a session without doubtful frames; None where most of what is tied contradicts the rest.
-
-    Args:
-        visit: the session.
-        untied: (F,) frames that nothing ties to the rest, see `doubtful`.
-        wrong: (F,) frames that contradict it.
+    """Return the recording of a session without frames (F,) that are untied or wrong, see `doubtful`; None where most
+    of what is tied contradicts the rest.
     """
     recording, doubt = visit.recording, untied | wrong
     if not doubt.any():

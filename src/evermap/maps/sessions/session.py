@@ -12,14 +12,14 @@ from evermap.errors import DataError
 from evermap.existence.sites import Evidence
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
-from evermap.maps.living import EXISTS, LivingMap, clique_rows
+from evermap.maps.living import EXISTS, LivingMap
 from evermap.maps.sessions import believe, decide
-from evermap.maps.sessions.extend import Extended, Found, extended, first_and_last
+from evermap.maps.sessions.believe import Believed, arrived, departed
+from evermap.maps.sessions.extend import Extended, Found, extended
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Sighting, Watch, arrivals, looked_at
 from evermap.maps.sessions.placing import Laid, Localised
 from evermap.maps.sessions.planar import PlanarVisit
 from evermap.maps.sessions.spatial import SpatialVisit
-from evermap.maps.sessions.witnessed import arrived, departed
 from evermap.maps.vicinity import in_chunks
 from evermap.show import Shown
 from evermap.slam.association.features import medians
@@ -32,7 +32,6 @@ from evermap.types import (
     AnyRecording,
     Detections,
     FloatArray,
-    IntArray,
     Landmarks,
     MapChange,
     Misses,
@@ -73,22 +72,6 @@ class Session(Shown):
     changes: tuple[MapChange, ...]
     evidence: Evidence
     set_aside: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Believed:
-    """The map with the session's beliefs.
-
-    Attributes:
-        living: all but stays and what is learned.
-        log_evidence: (C,) what the session's looks say for 'it stands at one of its sites' against 'it is away', as a
-            log likelihood ratio, by clique, in the order of `living.clique_rows`.
-        evidence: of every clique and frame.
-    """
-
-    living: LivingMap
-    log_evidence: FloatArray
-    evidence: Evidence
 
 
 def admitted(recording: RecordingT, living: LivingMap) -> tuple[RecordingT, LivingMap]:
@@ -137,8 +120,15 @@ def opened(living: LivingMap | None, recording: AnyRecording) -> LivingMap:
     elif begun.dim == 3 and not len(living.places):
         living = replace(living, places=begun.places, stays=begun.stays, clock=begun.clock)
     if len(recording.frames):
-        living = living.from_now_on(float(recording.frames.stamp_s[0]))
-    check_in_order(recording, living)
+        start_s = float(recording.frames.stamp_s[0])
+        living = living.from_now_on(start_s)
+        if start_s < living.session_start_s:
+            raise DataError(
+                f"{recording.name}: begins at {start_s:.1f} s, before the newest session of the map, "
+                f"{living.session_start_s:.1f} s",
+                field="stamp_s",
+                hint="evermap.enter_session(store, recording), or evermap slam --map FILE, enter it at its time",
+            )
     return living
 
 
@@ -146,18 +136,6 @@ def _empty(recording: AnyRecording) -> LivingMap:
     """A map before its first session, in the plane or in space as a recording of it."""
     in_space = isinstance(recording, SpatialRecording)
     return LivingMap.in_space(recording.clock) if in_space else LivingMap(clock=recording.clock)
-
-
-def check_in_order(recording: AnyRecording, living: LivingMap) -> None:
-    """Raise `DataError` for a session that begins before the newest one of the map."""
-    stamps = recording.frames.stamp_s
-    if len(stamps) and stamps[0] < living.session_start_s:
-        raise DataError(
-            f"{recording.name}: begins at {stamps[0]:.1f} s, before the newest session of the map, "
-            f"{living.session_start_s:.1f} s",
-            field="stamp_s",
-            hint="evermap.enter_session(store, recording), or evermap slam --map FILE, enter it at its time",
-        )
 
 
 def repaired(recording: AnyRecording) -> AnyRecording:
@@ -185,7 +163,7 @@ def same_drive(one: tuple[FloatArray, ...], other: tuple[FloatArray, ...]) -> bo
 
 def begun_with(session: Session, recording: AnyRecording) -> Session:
     """Return a session of a map that began with its recording, whatever of that was left out: sessions are in the order
-    of their recordings (`check_in_order`).
+    of their recordings (`opened`).
     """
     if not session.found:
         return session
@@ -219,14 +197,8 @@ def judged(
 ) -> Judged:
     """Return the map after the session, the changes, the evidence and the misses.
 
-    What was found goes into the map, then hits and misses into beliefs, and those into decisions.
-
-    Args:
-        living: the map before the session, resized to it.
-        where: the session lies in the map; None for a map's first.
-        visit: the session, solved with the map as its prior.
-        config: which parts of the engine are on.
-        known: the same, judged without knowing what the session teaches of lifetimes; None for the first time.
+    What was found goes into the map, then hits and misses into beliefs, and those into decisions. A map's first session
+    lies nowhere. Lifetimes that the session teaches are `known` when it is judged for the second time.
     """
     if known is not None:
         living = replace(living, lives=replace(known.living.lives, looks_s=living.lives.looks_s))
@@ -236,60 +208,13 @@ def judged(
     found = visit.found(where, living, config) if known is None else known.found
     living, drift_m = (visit.begun(living), 0.0) if where is None else (living, where.drift_m)
     entry = extended(living, aged.p_here, found, config, drift_m)
-    seen, eye = looks(entry, visit, config)
-    now = believed(entry, seen, visit.floor_sensor, (visit.start_s, visit.end_s), config)
-    now, seen = _without_departed(entry, now, seen, visit)
-    after, changes = decided(entry, now, seen, visit, config, known.classes if known is not None else None)
-    after, classes = learned(after, seen, replace(entry, living=now.living), eye, config)
-    return Judged(after, changes, now.evidence, missed(now.living, seen, visit), classes, found)
-
-
-def looks(entry: Extended, visit: Visit, config: LivingConfig) -> tuple[PlaceLooks, FloatArray]:
-    """Return which places of the map were looked at in the session, and which of them were seen; and (F, 3) sensor
-    poses.
-    """
     watch = visit.watched(entry, config)
-    return looked_at(entry.living, entry.p_start, watch, config), watch.eye
-
-
-def believed(
-    entry: Extended, seen: PlaceLooks, sensor: Sensor, span_s: tuple[float, float], config: LivingConfig
-) -> Believed:
-    """Return the map with the beliefs and the counts of the session, which goes from one instant to another."""
-    start_s, end_s = span_s
-    living, rows = entry.living, seen.rows
-    hit, missed = rows.hit, seen.counts & ~rows.hit
-    places = replace(
-        living.places,
-        n_hits=living.places.n_hits + np.bincount(seen.place[hit], minlength=len(living.places)),
-        n_misses=living.places.n_misses + np.bincount(seen.place[missed], minlength=len(living.places)),
-    )
-    first, last = first_and_last(rows.site[hit], rows.stamp_s[hit], len(living.sites))
-    sites = living.sites
-    if config.existence:
-        beliefs = believe.believed(living, entry.p_start, seen, sensor, config, start_s, end_s)
-        sites, log_evidence = believe.with_beliefs(sites, entry.p_start, beliefs), believe.said(living, beliefs)
-        evidence = believe.evidence(living, beliefs)
-    else:
-        sites = replace(sites, p_here=_as_seen(living, rows.site[hit], last))
-        log_evidence, evidence = np.zeros(len(np.unique(sites.clique_id))), Evidence.empty()
-    stood = (entry.p_start >= EXISTS) & ~entry.is_new
-    arrived = np.isfinite(first) & ~stood & (sites.p_here >= EXISTS)
-    sites = replace(
-        sites,
-        since_s=np.where(arrived & ~entry.is_new, first, living.sites.since_s),
-        seen_s=np.maximum(living.sites.seen_s, last),
-    )
-    until_s = max(end_s, living.stamp_s)
-    living = replace(living, stamp_s=until_s, session_start_s=start_s, places=places, sites=sites)
-    return Believed(living, log_evidence, evidence)
-
-
-def _without_departed(entry: Extended, now: Believed, seen: PlaceLooks, visit: Visit) -> tuple[Believed, PlaceLooks]:
-    """Return beliefs and looks with the observed departures."""
-    site = visit.witnessed.sites(entry.living, entry.landmark_id, entry.place)
-    living, said, evidence, seen = departed(now.living, now.log_evidence, now.evidence, seen, visit.witnessed, site)
-    return Believed(living, said, evidence), seen
+    seen = looked_at(entry.living, entry.p_start, watch, config)
+    now = believe.believed(entry, seen, visit.floor_sensor, (visit.start_s, visit.end_s), config)
+    now, seen = departed(now, seen, visit.witnessed, entry)
+    after, changes = decided(entry, now, seen, visit, config, known.classes if known is not None else None)
+    after, classes = learned(after, seen, replace(entry, living=now.living), watch.eye, config)
+    return Judged(after, changes, now.evidence, missed(now.living, seen, visit), classes, found)
 
 
 def missed(living: LivingMap, seen: PlaceLooks, visit: Visit) -> Misses:
@@ -310,24 +235,15 @@ def missed(living: LivingMap, seen: PlaceLooks, visit: Visit) -> Misses:
 def decided(
     entry: Extended, now: Believed, seen: PlaceLooks, visit: Visit, config: LivingConfig, classes: ClassLives | None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
-    """Return the map with updated stays and without forgotten cliques, and the changes since the previous session.
-
-    Args:
-        entry: the map as the session found it, and what it found.
-        now: with the session's beliefs.
-        seen: looks of the session.
-        visit: the session.
-        config: which parts of the engine are on.
-        classes: how long things stay, as the session teaches; None for nothing.
+    """Return the map with updated stays and without forgotten cliques, and the changes since the previous session, by
+    what it teaches of how long things stay, None for nothing.
     """
     before = entry.before
     came = arrivals(before, now.living, seen, visit.floor_sensor, config.looks)
-    site = visit.witnessed.sites(entry.living, entry.landmark_id, entry.place)
-    came = arrived(came, now.living, before, visit.witnessed, site)
+    came = arrived(came, now.living, visit.witnessed, entry)
     after, changes = decide.decided(
         before, now.living, seen, now.log_evidence, came, visit.start_s, classes, settings=config.decisions
     )
-    changes = tuple(change.named(after.landmark_names) for change in changes)
     if not config.learn_sight:
         after = replace(after, sightlines=before.sightlines)
     if config.cliques and config.existence and config.misses:
@@ -433,8 +349,8 @@ def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult
     empty = replace(_empty(visit.recording), class_names=visit.recording.class_names)
     empty = replace(empty, sightlines=replace(empty.sightlines, rules=config.sight))
     entry = extended(empty, np.zeros(0), found, config, 0.0)
-    seen, _ = looks(entry, visit, config)
-    now = believed(entry, seen, visit.floor_sensor, (visit.start_s, visit.end_s), config).living
+    seen = looked_at(entry.living, entry.p_start, visit.watched(entry, config), config)
+    now = believe.believed(entry, seen, visit.floor_sensor, (visit.start_s, visit.end_s), config).living
     judged_now = now.landmarks(p_least=0.0)
     row = np.searchsorted(judged_now.landmark_id, mapped.landmark_id)
     p_exists = judged_now.p_exists[row] if config.existence else mapped.p_exists
@@ -442,30 +358,11 @@ def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult
     return replace(slam, landmarks=mapped, misses=missed(now, seen, visit))
 
 
-def _as_seen(living: LivingMap, hit_site: IntArray, last_s: FloatArray) -> FloatArray:
-    """Return beliefs without decay: a clique is where it was seen last."""
-    p_here = living.sites.p_here.copy()
-    _, clique = clique_rows(living.sites)
-    seen = np.unique(hit_site)
-    for row in np.unique(clique[seen]):
-        mine = np.flatnonzero(clique == row)
-        p_here[mine] = 0.0
-        p_here[mine[np.argmax(last_s[mine])]] = 1.0
-    return p_here
-
-
 def judged_so_far(
     living: LivingMap, sighting: Sighting, sensor: Sensor, config: LivingConfig, classes: ClassLives | None = None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """Return the map with beliefs after a part of a drive, from the causal poses, and the changes since the last
-    report; without places that the map does not have yet, and bodies.
-
-    Args:
-        living: the map before it.
-        sighting: what was seen of its places.
-        sensor: of the robot.
-        config: which parts of the engine are on.
-        classes: how long things stay, as `lives_of` tells; None where nothing is known of it.
+    report; without places that the map does not have yet, and bodies. How long things stay is as `lives_of` tells.
     """
     start_s, end_s = (max(float(stamp_s), living.stamp_s) for stamp_s in sighting.stamp_s[[0, -1]])
     living = replace(living, sightlines=replace(living.sightlines, rules=config.sight))
@@ -476,7 +373,7 @@ def judged_so_far(
     seen = looked_at(living, aged.p_here, Watch.of(sighting, living.places.position_m, sensor, looks), config)
     none = np.zeros(0, dtype=np.int64)
     entry = Extended(living, living, none, none, aged.p_here, np.zeros(len(living.sites), dtype=np.bool_))
-    now = believed(entry, seen, sensor, (start_s, end_s), config)
+    now = believe.believed(entry, seen, sensor, (start_s, end_s), config)
     nowhere = Arrivals(none, np.zeros(0), np.zeros(0))
     settings = config.decisions
     after, changes = decide.decided(

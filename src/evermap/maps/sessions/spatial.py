@@ -17,12 +17,11 @@ from evermap.config import Config, LivingConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.maps.living import EXISTS, Dated, LivingMap
-from evermap.maps.sessions.believe import aged
+from evermap.maps.sessions.believe import Witnessed, aged
 from evermap.maps.sessions.extend import Extended, Found, first_and_last
 from evermap.maps.sessions.gaussian import anchored, drifted
 from evermap.maps.sessions.looks import Watch
 from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, Turned, laid_over, places_in, widened
-from evermap.maps.sessions.witnessed import Witnessed
 from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.sensing import learned
 from evermap.sensing.profile import Assumed, Field, Projection
@@ -295,25 +294,6 @@ def _near_hits(stamp_s: FloatArray, detected: BoolArray, within_s: float) -> Boo
     return np.asarray((stamp_s[:, None] - before <= within_s) | (after - stamp_s[:, None] <= within_s))
 
 
-def visited(
-    intake: SpatialIntake,
-    recording: SpatialRecording,
-    living: LivingMap,
-    p_site: FloatArray,
-    config: LivingConfig,
-    progress: Progress | None = None,
-) -> tuple[SpatialVisit, Laid | None]:
-    """Return a session solved within a map, and its alignment; None if no landmarks match."""
-    if not len(living.places):
-        return SpatialVisit(recording, intake, solve_space(intake, None, progress=progress)), None
-    solved = solve_space(intake, standing(living, p_site), progress=progress)
-    visit = SpatialVisit(recording, intake, _numbered(intake, solved, living))
-    where = _laid(visit, living, p_site, config)
-    if where is None or np.count_nonzero(where.place >= 0) < 2:
-        return visit, None
-    return replace(visit, solved=replace(visit.solved, optimum=_held(visit, living, where), from_map=None)), where
-
-
 def localised_in_space(
     recording: SpatialRecording,
     living: LivingMap,
@@ -321,25 +301,25 @@ def localised_in_space(
     remarks: tuple[str, ...] = (),
     progress: Progress | None = None,
 ) -> Localised[SpatialVisit]:
-    """Return a session solved at its alignment with a map, or with the part of a large one that it can observe.
-
-    Args:
-        recording: the session.
-        living: the map, with its classes (`session.admitted`).
-        config: settings.
-        remarks: on the recording.
-        progress: told after every frame.
+    """Return a session solved at its alignment with a map, or with the part of a large one that it can observe. The map
+    has the session's classes (`session.admitted`).
     """
     settings, intake = config.living, prepare_space(recording, config.slam.space, remarks)
-    part, vicinity = living, None
-    if len(living.places) > settings.whole_places:
-        vicinity = Vicinity.of(living, cliques_of(living, names_of(intake).ravel()), settings)
-        part = vicinity.part
-    visit, where = visited(intake, recording, part, aged(part, settings, intake.start_s).p_here, settings, progress)
-    if where is None and len(living.places):
+    large, named = len(living.places) > settings.whole_places, cliques_of(living, names_of(intake).ravel())
+    part = Vicinity.of(living, named, settings).part if large else living
+    p_site = aged(part, settings, intake.start_s).p_here
+    if not len(part.places):
+        visit = SpatialVisit(recording, intake, solve_space(intake, None, progress=progress))
+        return Localised.lost(visit, living, NOT_FOUND) if large else Localised(visit, visit.named(part))
+    solved = solve_space(intake, standing(part, p_site), progress=progress)
+    visit = SpatialVisit(recording, intake, _numbered(intake, solved, part))
+    where = _laid(visit, part, p_site, settings)
+    if where is None or np.count_nonzero(where.place >= 0) < 2:
         return Localised.lost(visit, living, NOT_FOUND)
-    if vicinity is not None and where is not None:
-        vicinity, where = widened(vicinity, where, visit.path_m, visit.floor_sensor, settings)
+    visit = replace(visit, solved=replace(visit.solved, optimum=_held(visit, part, where), from_map=None))
+    vicinity = None
+    if large:
+        vicinity, where = widened(living, part, named, where, visit.path_m, visit.floor_sensor, settings)
         part = vicinity.part
     return Localised(visit, visit.named(part), where, vicinity)
 

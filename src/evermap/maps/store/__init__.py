@@ -67,7 +67,7 @@ def open_store(where: str | Path, *, create: bool = False) -> MapStore:
 
 def is_address(where: str | Path) -> bool:
     """Return whether a map is in a server's database, and not in a file."""
-    return str(where).startswith(_POSTGRES)
+    return str(where).startswith("postgresql:")
 
 
 def _open(where: str | Path, *, create: bool) -> SqlStore:
@@ -115,9 +115,6 @@ def revert_store(where: str | Path, revision: int, provenance: Provenance | None
         with open_store(where) as store:
             return store.revert(revision, provenance), None
     return rescue(_path(where), revision, provenance)
-
-
-_POSTGRES = "postgresql:"
 
 
 def _path(where: str | Path) -> Path:

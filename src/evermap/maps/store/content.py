@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from evermap.errors import EvermapError, InputError
 from evermap.geometry.chunked import ChunkedCovariance, Part, blocks
+from evermap.maps import shelves
 from evermap.maps.lives import Life
-from evermap.maps.living import AXES, TURNS, LivingMap, Members, Places, Sites, Stays
-from evermap.maps.shelves import Sight
+from evermap.maps.living import AXES, TURNS, LivingMap
 from evermap.sensing.sightlines import SightLines, Views
 from evermap.survival.base import LifetimePrior
 from evermap.survival.text import prior_from_dict, prior_to_dict
@@ -115,6 +115,11 @@ def read_text(name: bytes, stored: bytes) -> str:
         raise DamagedError(f"a text is not valid UTF-8: {error}") from None
 
 
+def text_of(name: bytes, fetch: Fetch) -> str:
+    """Read a text by its name."""
+    return read_text(name, fetch([name])[name])
+
+
 def json_object(text: str | bytes) -> dict[str, Any]:
     """Parse a JSON object.
 
@@ -167,7 +172,7 @@ def pack(living: LivingMap) -> tuple[bytes, dict[bytes, Chunk]]:
         chunks.update((chunk.name, chunk) for chunk in kept)
         columns[column] = ["<f8", [len(kept)], False, [chunk.name.hex() for chunk in kept]]
     form = FORMAT if living.dim == 2 else IN_SPACE
-    manifest = text_chunk(json.dumps({"format": form, "values": values, "columns": columns}, default=_scalar))
+    manifest = text_chunk(json.dumps({"format": form, "values": values, "columns": columns}, default=_plain))
     return manifest.name, {**chunks, manifest.name: manifest}
 
 
@@ -300,19 +305,7 @@ def names_in(name: bytes, fetch: Fetch, table: str = "") -> set[bytes]:
     return {name, *(name_of(part) for names in listed for part in names)}
 
 
-_EQUALLY_LONG = {
-    "members": tuple(item.name for item in fields(Members)),
-    "sites": tuple(item.name for item in fields(Sites)),
-    "places": tuple(item.name for item in fields(Places)),
-    "stays": tuple(item.name for item in fields(Stays)),
-    "dated": ("site_id", "stamp_s"),
-    "boxes": ("landmark_id", "size_m"),
-    "traits": ("landmark_id", "column_id", "value", "sessions"),
-    "metres": ("robot_id", "log_metre", "log_variance", "information"),
-    "lives": ("class_id", "chunk", "life"),
-    "sightlines": ("site_id", "landmark_id", "cell", "hits", "looks"),
-    "views": ("cell", "heading", "stamp_s", "frames"),
-}
+_TABLES = ("members", "sites", "places", "stays", "dated", "boxes", "traits", "metres", "lives", "sightlines", "views")
 _LEAST = {
     "members.class_id": UNKNOWN, "stays.class_id": UNKNOWN, "lives.class_id": UNKNOWN, "lives.prior_class_id": UNKNOWN,
     "members.clique_id": 0, "sites.clique_id": 0, "stays.clique_id": 0, "sites.site_id": 0, "stays.site_id": 0,
@@ -347,9 +340,10 @@ def flaw(living: LivingMap) -> str:
 
 def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
     """Columns of one length."""
-    for table, names in _EQUALLY_LONG.items():
-        if len({len(getattr(getattr(living, table), name)) for name in names}) > 1:
-            yield f"columns of different lengths in '{table}'"
+    for name in _TABLES:
+        table = getattr(living, name)
+        if len({len(getattr(table, column)) for column in shelves.columns(table)}) > 1:
+            yield f"columns of different lengths in '{name}'"
     if living.sight is not None and (problem := living.sight.flaw()):
         yield problem
     if len(living.lives.prior_class_id) != len(living.lives.prior):
@@ -408,11 +402,10 @@ def _flaws_of_values(living: LivingMap) -> Iterator[str]:
     if living.lives.chunk_m <= 0.0 or living.sightlines.cell_m <= 0.0 or living.views.cell_m <= 0.0:
         yield "a cell without size"
     covariance = living.covariance_m2
-    read = (
-        [part.values for part in covariance.parts if part.is_read] if isinstance(covariance, ChunkedCovariance) else []
-    )
-    whole = covariance.each_m2 if isinstance(covariance, ChunkedCovariance) else covariance
-    if not all(np.isfinite(values).all() for values in (whole, *read)):
+    read = [covariance]
+    if isinstance(covariance, ChunkedCovariance):
+        read = [covariance.each_m2, *(part.values for part in covariance.parts if part.is_read)]
+    if not all(np.isfinite(values).all() for values in read):
         yield "'covariance_m2' is not finite"
         return
     if living.log_size_variance < 0.0 or np.any(_variances(blocks(covariance, living.dim)) < -1e-9):
@@ -448,7 +441,8 @@ def _collect(value: Any, prefix: str, arrays: dict[str, NDArray[Any]], values: d
         if name in {*_NOT_STORED, *_PARTS} or part is None or (name in _NEWER and not np.size(part)):
             continue
         if name in _LIFE:
-            text = json.dumps([_life_to_dict(life) for life in part], default=_scalar)
+            lives = [{item.name: getattr(life, item.name) for item in fields(life)} for life in part]
+            text = json.dumps(lives, default=_plain)
             arrays[name] = np.frombuffer(text.encode(), np.uint8)
         elif isinstance(part, np.ndarray):
             arrays[name] = part
@@ -473,7 +467,9 @@ def _build(default: Any, prefix: str, parts: dict[str, Any]) -> Any:
             content[item.name] = _build(ChunkedCovariance.empty(default.dim), name + ".", parts)
         elif name == "sight":
             large = "sight.lines.parts" in parts
-            content[item.name] = _build(Sight.of(SightLines.empty(), Views.empty()), "sight.", parts) if large else None
+            content[item.name] = (
+                _build(shelves.Sight.of(SightLines.empty(), Views.empty()), "sight.", parts) if large else None
+            )
         elif is_dataclass(part):
             content[item.name] = _build(part, name + ".", parts)
         elif name not in parts:
@@ -550,7 +546,7 @@ def _unfolded(lower: FloatArray, size: int) -> FloatArray:
 
 def _manifest(name: bytes, fetch: Fetch) -> Any:
     """The values and the columns of a map, of the types that they have to have."""
-    content = json_object(read_text(name, fetch([name])[name]))
+    content = json_object(text_of(name, fetch))
     if content.get("format") not in (1, FORMAT, IN_SPACE):
         raise DamagedError(f"columns of format {content.get('format')!r}, this evermap reads 1 to {IN_SPACE}")
     columns = content.get("columns")
@@ -578,7 +574,10 @@ def _lives_from_bytes(values: NDArray[Any]) -> tuple[Life, ...]:
     """What `_collect` wrote of `lives.life`."""
     try:
         listed = json.loads(values.tobytes())
-        lives = tuple(_life_from_dict(life) for life in listed)
+        lives = tuple(
+            Life(**{name: prior_from_dict(part) if isinstance(part, dict) else part for name, part in life.items()})
+            for life in listed
+        )
     except (ValueError, TypeError, AttributeError, RecursionError, EvermapError) as error:
         raise DamagedError(f"the learned lifetimes cannot be read: {error}") from None
     for life in lives:
@@ -589,22 +588,6 @@ def _lives_from_bytes(values: NDArray[Any]) -> tuple[Life, ...]:
     return lives
 
 
-def _life_to_dict(life: Life) -> dict[str, Any]:
-    values = {item.name: getattr(life, item.name) for item in fields(life)}
-    return {name: _plain(value) for name, value in values.items()}
-
-
-def _life_from_dict(content: Mapping[str, Any]) -> Life:
-    values: dict[str, Any] = {
-        name: prior_from_dict(part) if isinstance(part, dict) else part for name, part in content.items()
-    }
-    return Life(**values)
-
-
 def _plain(value: Any) -> Any:
-    return value if isinstance(value, int | float | np.number) else prior_to_dict(value)
-
-
-def _scalar(value: Any) -> Any:
-    """Of numpy's numbers, for JSON."""
-    return value.item()
+    """Return a prior, or one of numpy's numbers, as JSON has it."""
+    return value.item() if isinstance(value, np.generic) else prior_to_dict(value)

@@ -14,37 +14,21 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from evermap.maps.store.content import Chunk, DamagedError, json_object, name_of, text_chunk
+from evermap.maps.store.content import Chunk, DamagedError, Fetch, json_object, name_of, names_in, text_chunk, text_of
+from evermap.maps.store.measured import CliqueLooks, read_index
 from evermap.maps.store.protocol import Attachment, Provenance, Revision, RevisionKind
 from evermap.types import ChangeKind, MapChange, or_nan
 
 FORMAT, IN_SPACE = 1, 2
 """Of records; those with changes in space an older evermap cannot read."""
+_COUNT, _NUMBER = (int, type(None)), (float, int, type(None))
 _TYPES: Mapping[str, type | tuple[type, ...]] = {
-    "number": int,
-    "parent": int,
-    "restores": (int, type(None)),
-    "created_at": str,
-    "evermap_version": str,
-    "kind": str,
-    "recording": str,
-    "source": str,
-    "command": str,
-    "seed": (int, type(None)),
-    "stamp_from_s": (float, int, type(None)),
-    "stamp_to_s": (float, int, type(None)),
-    "wall_s": (float, int, type(None)),
-    "note": str,
-    "robot": str,
-    "n_landmarks": int,
-    "n_existing": int,
-    "n_grown": (int, type(None)),
-    "n_cliques_ever": int,
-    "n_sites_ever": int,
-    "changes": list,
-    "attachments": dict,
-    "lost": dict,
-}
+    "number": int, "parent": int, "restores": _COUNT, "created_at": str, "evermap_version": str,
+    "kind": str, "recording": str, "source": str, "command": str, "seed": _COUNT,
+    "stamp_from_s": _NUMBER, "stamp_to_s": _NUMBER, "wall_s": _NUMBER, "note": str, "robot": str,
+    "n_landmarks": int, "n_existing": int, "n_grown": _COUNT, "n_cliques_ever": int, "n_sites_ever": int,
+    "changes": list, "attachments": dict, "lost": dict,
+}  # fmt: skip
 """Values of a record, and their types in JSON; null for nan."""
 _SHOWN = 5
 _MAY_BE_NAN = ("stamp_from_s", "stamp_to_s", "wall_s")
@@ -85,10 +69,16 @@ class Record:
         restores = self.about["restores"]
         return self.number - 1 if restores is None else int(restores)
 
-    def parts(self) -> set[bytes]:
-        """Return the chunks that it names, without those named by its content and its evidence."""
-        named = {self.content, self.config, *(name for name, _ in self.attachments.values())}
-        return named | ({self.evidence} if self.evidence is not None else set())
+    def looks(self, fetch: Fetch) -> list[CliqueLooks]:
+        """Return where its looks are stored, by clique."""
+        return [] if self.evidence is None else read_index(text_of(self.evidence, fetch))
+
+    def chunks(self, fetch: Fetch, table: str = "") -> set[bytes]:
+        """Return the names of all its chunks but its own; of its content, those of one table if that is named."""
+        found = names_in(self.content, fetch, table) | {self.config, *(name for name, _ in self.attachments.values())}
+        if self.evidence is not None:
+            found |= {self.evidence, *(row.name for row in self.looks(fetch))}
+        return found
 
     def attached(self) -> list[Attachment]:
         """Return its attachments."""
@@ -165,11 +155,8 @@ _PARTS = {"changes", "attachments", "lost", "n_cliques_ever", "n_sites_ever"}
 
 
 def lineage(origin: Mapping[int, int], number: int) -> tuple[int, ...]:
-    """Return the ancestors of a revision and itself, oldest first, without lost ones.
-
-    Args:
-        origin: the revision whose map each one started from: its parent, or what it restored.
-        number: the one; 0 has none.
+    """Return the ancestors of a revision and itself, oldest first, without lost ones; 0 has none. The origin of each is
+    the revision whose map it started from: its parent, or what it restored.
     """
     line = []
     while number > 0:

@@ -42,16 +42,10 @@ _MOST_POSES = 200
 """Of a stored trajectory, which is for pictures."""
 _TABLES: dict[str, Any] = {"odometry": Odometry, "frames": Frames, "detections": Detections, "sensor": Sensor}
 _IN_SPACE: dict[str, Any] = {"odometry": SpatialOdometry, "frames": Frames, "detections": SpatialDetections}
-_SHEET = (
-    "kind",
-    "sigma_scale",
-    "sigma_offset_m",
-    "sigma_angle_rad",
-    "sigma_position_m",
-    "sigma_odometer_scale",
-    "sigma_askew_rad",
-)
-_LATER = ("features", "feature_names", *_SHEET)
+_LATER = (
+    "features", "feature_names", "kind", "sigma_scale", "sigma_offset_m", "sigma_angle_rad", "sigma_position_m",
+    "sigma_odometer_scale", "sigma_askew_rad",
+)  # fmt: skip
 """What is kept only where there is any: equal recordings have the bytes that they had before there was."""
 _PLAIN = ("name", "source", "class_names", "clock")
 
@@ -186,14 +180,16 @@ class CliqueLooks(NamedTuple):
     name: bytes
 
 
-def evidence_to_chunks(evidence: Evidence) -> tuple[Chunk, list[Chunk]]:
-    """Return the index of what a session saw, and a chunk for each clique."""
+def evidence_to_chunks(evidence: Evidence | None) -> list[Chunk]:
+    """Return the index of what a session saw, then a chunk for each clique; nothing where it saw nothing."""
+    if evidence is None or not len(evidence):
+        return []
     listed, parts = [], []
     for clique in np.unique(evidence.clique_id):
         mine = evidence[evidence.clique_id == clique]
         parts.append(Chunk("|u1", _looks_to_bytes(mine)))
         listed.append([int(clique), float(mine.stamp_s.min()), float(mine.stamp_s.max()), parts[-1].name.hex()])
-    return text_chunk(json.dumps(listed)), parts
+    return [text_chunk(json.dumps(listed)), *parts]
 
 
 def read_index(text: str) -> list[CliqueLooks]:

@@ -47,7 +47,7 @@ def open_postgres(address: str, *, create: bool) -> SqlStore:
     def explain(problem: str) -> InputError:
         return DamagedMapError(f"damaged: {problem}", path=where, hint="restore a backup")
 
-    return SqlStore.opened(engine, where, create=create, explain=explain)
+    return SqlStore(engine, where, create=create, explain=explain)
 
 
 def split_address(address: str) -> tuple[URL, str]:

@@ -147,10 +147,8 @@ class MapStore(Protocol):
     `revision` is None the newest is meant.
     """
 
-    @property
-    def where(self) -> str:
-        """Path or address, for messages."""
-        ...
+    where: str
+    """Path or address, for messages."""
 
     def head(self) -> int:
         """Return the newest revision; 0 if there is none yet."""
@@ -253,11 +251,7 @@ class MapStore(Protocol):
         ...
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
-        """Return the attachments of revisions, oldest first, without reading them.
-
-        Args:
-            revisions: which; None for those of `lineage()`.
-        """
+        """Return the attachments of revisions, oldest first, without reading them; None for those of `lineage()`."""
         ...
 
     def attached(self, attachment: Attachment) -> bytes:
@@ -268,6 +262,8 @@ class MapStore(Protocol):
         """Let go of the file or the connection."""
         ...
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(self, *error: object) -> None: ...
+    def __exit__(self, *error: object) -> None:
+        self.close()

@@ -53,9 +53,6 @@ def checksum(version: int, created_at: str, writer: str, head: int, record: byte
     return hashlib.sha256(json.dumps(values).encode()).digest()
 
 
-Migration = Callable[[Connection], None]
-
-
 def migrate(connection: Connection, version: int) -> None:
     """Bring the tables from `version` to `SCHEMA_VERSION`.
 
@@ -64,11 +61,6 @@ def migrate(connection: Connection, version: int) -> None:
     """
     for step in MIGRATIONS[version - 1 :]:
         step(connection)
-    _seal(connection)
-
-
-def _seal(connection: Connection) -> None:
-    """Set the version, and the checksum of the row that has it."""
     row = connection.execute(text("SELECT created_at, evermap_version, head, record FROM store")).one()
     if not (isinstance(row[0], str) and isinstance(row[1], str)):
         raise DamagedError("the row of 'store' is not valid")
@@ -200,5 +192,5 @@ def _put(connection: Connection, raw: bytes) -> bytes:
     return name
 
 
-MIGRATIONS: tuple[Migration, ...] = (_landmarks_of_changes, _records, _pruned)
+MIGRATIONS: tuple[Callable[[Connection], None], ...] = (_landmarks_of_changes, _records, _pruned)
 """Number k leads from schema k + 1 to k + 2. Never changed once released: they speak SQL, not the tables of today."""

@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from dataclasses import fields, replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Connection, Engine, bindparam, delete, func, insert, inspect, select, update
 from sqlalchemy.exc import DBAPIError, IntegrityError
 from sqlalchemy.schema import CreateSchema
@@ -26,6 +27,7 @@ from evermap.maps.store.measured import evidence_to_chunks, looks_of, read_index
 from evermap.maps.store.protocol import (
     Attachment,
     DamagedMapError,
+    MapStore,
     Provenance,
     PrunedRevisionError,
     Pruning,
@@ -51,51 +53,41 @@ _LONGEST = 900_000_000
 """Bytes of an attachment; a database takes no more in one piece."""
 
 
-class SqlStore(Shown):
-    """`MapStore` over an engine of SQLAlchemy, see there. Made by `opened`."""
+class SqlStore(Shown, MapStore):
+    """`MapStore` over an engine of SQLAlchemy, see there. Tables are made or brought up to date.
+
+    Args:
+        engine: of the database.
+        where: path or address, for messages.
+        create: make the tables where there are none.
+        explain: makes the error of a problem with the bytes, saying what is whole; None where there is no map.
+        tidy: called once old tables have been replaced, or content deleted.
+
+    Raises:
+        InputError: as of `open_store`.
+    """
 
     def __init__(
         self,
         engine: Engine,
         where: str,
-        explain: Callable[[str], InputError | None] = lambda _: None,
+        *,
+        create: bool,
+        explain: Callable[[str], InputError | None],
         tidy: Callable[[], None] = lambda: None,
     ) -> None:
-        self._engine = engine
-        self._where = where
-        self._explain = explain
-        self._tidy = tidy
+        self.where = where
+        self._engine, self._explain, self._tidy = engine, explain, tidy
         self._records: dict[bytes, Record] = {}  # they never change, and their names are their checksums
         self._history: tuple[Any, int, dict[int, Record], dict[int, bytes | None]] | None = None  # of `_chain`
         self._checked: set[bytes] = set()  # chunks that this object has read, and found to be what was written
-
-    @classmethod
-    def opened(
-        cls,
-        engine: Engine,
-        where: str,
-        *,
-        create: bool,
-        tidy: Callable[[], None] = lambda: None,
-        explain: Callable[[str], InputError | None] = lambda _: None,
-    ) -> SqlStore:
-        """Return the store behind an engine; its tables are made or brought up to date. Errors as `open_store`.
-
-        Args:
-            engine: of the database.
-            where: path or address, for messages.
-            create: make the tables where there are none.
-            tidy: called once old tables have been replaced, or content deleted.
-            explain: makes the error of a problem with the bytes, saying what is whole; None where there is no map.
-        """
-        store = cls(engine, where, explain, tidy)
-        with store._reading() as connection:
-            version = store._schema_version(connection)
+        with self._transaction() as connection:
+            version = self._schema_version(connection)
         if version == 0 and not create:
             raise InputError("contains no map", path=where, hint="evermap slam INPUT --map FILE writes one")
         if version < schema.SCHEMA_VERSION:
-            with store._writing() as connection:
-                version = store._schema_version(connection)  # somebody may have been faster
+            with self._transaction(writes=True) as connection:
+                version = self._schema_version(connection)  # somebody may have been faster
                 if version == 0:
                     if own := engine.get_execution_options().get("schema"):
                         connection.execute(CreateSchema(own, if_not_exists=True))
@@ -107,21 +99,15 @@ class SqlStore(Shown):
                     migrate(connection, version)
             if version > 0:
                 tidy()
-        return store
-
-    @property
-    def where(self) -> str:
-        """Path or address."""
-        return self._where
 
     def _facts(self) -> dict[str, Any]:
         try:
             log = self.log()
         except InputError as error:  # a damaged file shows itself, too
-            return {"where": self._where, "damaged": error.problem}
+            return {"where": self.where, "damaged": error.problem}
         newest = log[-1] if log else None
         about = {"recording": newest.provenance.recording, "existing": newest.n_existing} if newest else {}
-        return {"where": self._where, "revisions": len(log), "head": newest.number if newest else 0, **about}
+        return {"where": self.where, "revisions": len(log), "head": newest.number if newest else 0, **about}
 
     def to_pandas(self) -> Any:
         """Return the history as a data frame, a row a revision.
@@ -138,39 +124,28 @@ class SqlStore(Shown):
 
     def plot(self) -> Figure:
         """Draw the newest map; returns a matplotlib figure."""
-        return self.load().plot(title=f"{self._where}, revision {self.head()}")
+        return self.load().plot(title=f"{self.where}, revision {self.head()}")
 
     def close(self) -> None:
-        """Let go of all connections."""
         self._engine.dispose()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
     def head(self) -> int:
-        """Return the newest revision."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             return self._anchor(connection)[0]
 
     def log(self) -> tuple[Revision, ...]:
-        """Return all revisions."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             records = self._chain(connection)[0]
             stored = self._fetched(connection, {record.config for record in records.values()})
             configs = {name: content.read_text(name, data) for name, data in stored.items()}
             return tuple(record.revision(configs[record.config]) for _, record in sorted(records.items()))
 
     def lineage(self, revision: int | None = None) -> tuple[int, ...]:
-        """Return the revisions that are in one."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             return self._lineage(connection, revision)
 
     def load(self, revision: int | None = None) -> LivingMap:
-        """Return the map as it was committed."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             number = self._known(connection, revision)
             if number == 0:
                 return LivingMap()
@@ -181,15 +156,12 @@ class SqlStore(Shown):
             return self._unpacked(connection, record)
 
     def members(self, revision: int | None = None) -> Members:
-        """Return the landmarks of a revision."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             number = self._known(connection, revision)
             if number == 0:
                 return LivingMap().members
-            name, columns = self._record(connection, number).content, [item.name for item in fields(Members)]
-            listed = [content.MEMBERS + column for column in columns]
-            found = content.unpack_columns(name, listed, lambda keys: self._fetched(connection, keys))
-            return Members(**{column: found[content.MEMBERS + column] for column in columns})
+            names = [item.name for item in fields(Members)]
+            return Members(*self._columns(connection, self._record(connection, number), *names))
 
     def commit(
         self,
@@ -205,39 +177,40 @@ class SqlStore(Shown):
     ) -> int:
         """Return a new revision, whole or not at all; what takes time is done before the store is locked.
 
-        Args:
-            living: and what follows it as `MapStore.commit` takes them.
-            provenance: where it comes from.
-            changes: how it differs from its parent.
-            evidence: what the session saw.
-            parent: the revision that the map was made from.
-            attachments: bytes to keep with it.
-            restores: the revision that is brought back.
-            lost: revisions that damage has destroyed, see `Record`.
+        Arguments are those of `MapStore.commit`; `restores` is the revision that is brought back, and `lost` are those
+        that damage has destroyed, see `Record`.
         """
         problem = content.flaw(living)
         if problem:
-            raise NumericalError(f"not a map that can be kept: {problem}", path=self._where)
+            raise NumericalError(f"not a map that can be kept: {problem}", path=self.where)
         name, chunks = content.pack(living)
-        config = content.text_chunk(provenance.config)
-        chunks[config.name] = config
-        index = self._with_evidence(evidence, chunks)
+        config, looks = content.text_chunk(provenance.config), evidence_to_chunks(evidence)
+        chunks |= {chunk.name: chunk for chunk in (config, *looks)}
         attached = self._attach(attachments or {}, chunks)
         number = parent + 1
-        told = _told(provenance, living, number=number, parent=parent, restores=restores)
+        told = about(
+            provenance,
+            number=number,
+            parent=parent,
+            restores=restores,
+            created_at=now_utc(),
+            evermap_version=__version__,
+            n_landmarks=len(living.members),
+            n_existing=int(np.sum((living.p_of_sites(living.sites.p_here) >= 0.5) & ~living.members.deleted)),
+        )
         stored = {key: chunk.stored() for key, chunk in chunks.items() if key not in self._checked}
-        with self._writing() as connection:
+        with self._transaction(writes=True) as connection:
             head, before = self._anchor(connection)
             if head != parent:
                 problem = f"revision {head} was committed after revision {parent} was read; nothing was written"
                 hint = "run it again, which continues from the newest"
-                raise StaleRevisionError(problem, path=self._where, hint=hint)
+                raise StaleRevisionError(problem, path=self.where, hint=hint)
             record = Record(
                 {**told, "n_grown": 0 if restores is not None else self._n_grown(connection, parent, living, changes)},
                 before,
                 name,
                 config.name,
-                index,
+                looks[0].name if looks else None,
                 tuple(changes),
                 attached,
                 (living.n_cliques_ever, living.n_sites_ever),
@@ -252,14 +225,13 @@ class SqlStore(Shown):
         return number
 
     def revert(self, revision: int, provenance: Provenance | None = None) -> int:
-        """Return a new revision with the content of an older one."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             head = self._known(connection, None)
             number = self._known(connection, revision)
             next_ids = self._record(connection, head).next_ids if head else (0, 0)
         old = self.load(number)
         if number == head:
-            raise InputError(f"revision {number} is the newest already", path=self._where, hint="an older one")
+            raise InputError(f"revision {number} is the newest already", path=self.where, hint="an older one")
         return self.restore(old, number, head, next_ids, provenance)
 
     def restore(
@@ -271,15 +243,8 @@ class SqlStore(Shown):
         provenance: Provenance | None = None,
         lost: Mapping[int, bytes | None] | None = None,
     ) -> int:
-        """Commit the map of an older revision again, so that no id that was given since is given twice.
-
-        Args:
-            old: the map.
-            revision: where it comes from.
-            head: the newest revision.
-            next_ids: next free ids of cliques and sites.
-            provenance: of the new revision.
-            lost: revisions that damage has destroyed, see `Record`.
+        """Commit the map of an older revision again, so that no id of cliques and sites that was given since is given
+        twice. `lost` are revisions that damage has destroyed, see `Record`.
         """
         restored = replace(
             old,
@@ -291,10 +256,9 @@ class SqlStore(Shown):
         return self.commit(restored, origin, parent=head, restores=revision, lost=lost)
 
     def prune(self, keep: int = 10, *, also: Collection[int] = (), dry_run: bool = False) -> Pruning:
-        """Delete the content that only old revisions hold."""
         if keep < 1:
             raise ConfigError(f"{keep} is less than 1", field="keep", hint="1 keeps the newest revision only")
-        with self._reading() if dry_run else self._writing() as connection:
+        with self._transaction(writes=not dry_run) as connection:
             records, pruned = self._chain(connection)[0], self._pruned(connection)
             newest = {*sorted(records)[-keep:], *self._lineage(connection, None)[-keep:]}
             kept = (newest | (records.keys() & {*also})) - pruned.keys()
@@ -316,14 +280,12 @@ class SqlStore(Shown):
         return Pruning(tuple(sorted(old)), tuple(sorted(kept)), len(doomed), n_bytes)
 
     def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
-        """Return changes of one revision."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             number = self._known(connection, revision)
             return self._record(connection, number).changes if number else ()
 
     def changes_of(self, landmark_id: int | None = None) -> tuple[tuple[int, MapChange], ...]:
-        """Return changes of a landmark, or of all."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             records = self._chain(connection)[0]
         told = ((number, change) for number, record in sorted(records.items()) for change in record.changes)
         return tuple((number, change) for number, change in told if landmark_id in (None, *change.landmark_ids))
@@ -336,9 +298,8 @@ class SqlStore(Shown):
         since_s: float = -np.inf,
         revisions: Collection[int] | None = None,
     ) -> Evidence:
-        """Return what sessions saw."""
         kept = [Evidence.empty()]
-        with self._reading() as connection:
+        with self._transaction() as connection:
             wanted: dict[bytes, set[int | None]] = {}  # None: every clique
             for record in self._records_of(connection, revisions):
                 clique = clique_id if landmark_id is None else self._clique_of(connection, record, landmark_id)
@@ -358,19 +319,17 @@ class SqlStore(Shown):
         return found[np.argsort(found.stamp_s, kind="stable")]
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
-        """Return the attachments of revisions."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             return tuple(item for record in self._records_of(connection, revisions) for item in record.attached())
 
     def attached(self, attachment: Attachment) -> bytes:
-        """Return the bytes of an attachment."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             name = content.name_of(attachment.digest)
             return Chunk.of_stored(name, "|u1", self._fetched(connection, [name])[name]).raw
 
     def named(self, revision: int | None = None) -> tuple[int, str]:
         """Return a revision's number (None for the newest) and its name, a checksum of it and all before it."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             number, name = self._anchor(connection)
             if revision is not None:
                 number, table = self._known(connection, revision), schema.revision.c
@@ -379,7 +338,7 @@ class SqlStore(Shown):
 
     def rows(self) -> list[list[Any]]:
         """Return all rows of all tables, as they are stored."""
-        with self._reading() as connection:
+        with self._transaction() as connection:
             return [list(row) for table in schema.metadata.sorted_tables for row in connection.execute(select(table))]
 
     def fill(
@@ -390,16 +349,12 @@ class SqlStore(Shown):
         pruned: Mapping[int, str],
         made: tuple[str, str] | None = None,
     ) -> None:
-        """Put revisions from elsewhere into an empty store.
+        """Put revisions from elsewhere into an empty store: stored bytes by name, and names of records by number.
 
-        Args:
-            chunks: stored bytes by name.
-            records: names of the records by number; what is missing up to `head` is lost.
-            head: number of the newest.
-            pruned: revisions without content, and since when.
-            made: when and by which evermap the store was made; None for now and by this one.
+        Records that are missing up to the newest, `head`, are lost. Revisions that are pruned have no content, since
+        when is told; and `made` is when and by which evermap the store was made, None for now and by this one.
         """
-        with self._writing() as connection:
+        with self._transaction(writes=True) as connection:
             if made is not None:
                 values = {"created_at": made[0], "evermap_version": made[1]}
                 connection.execute(update(schema.store).values(values))
@@ -418,19 +373,16 @@ class SqlStore(Shown):
         Raises:
             StaleRevisionError: the newest of this one is none of the other's.
         """
-        with other._reading() as theirs, self._writing() as connection:
+        with other._transaction() as theirs, self._transaction(writes=True) as connection:
             named: dict[int, Any] = {row.number: row.record for row in theirs.execute(select(schema.revision))}
             (head, anchor), (last, newest) = self._anchor(connection), other._anchor(theirs)
             if named.get(head) != anchor:
-                problem = f"revision {head} is not in {other._where}; nothing was written"
-                raise StaleRevisionError(problem, path=self._where, hint="run it again")
+                problem = f"revision {head} is not in {other.where}; nothing was written"
+                raise StaleRevisionError(problem, path=self.where, hint="run it again")
             fetch, wanted = partial(other._fetched, theirs), {named[number] for number in named if number > head}
             for number, record in other._chain(theirs, head + 1)[0].items():
                 if number > head:
-                    wanted |= record.parts() | content.names_in(record.content, fetch)
-                    if record.evidence is not None:
-                        index = content.read_text(record.evidence, fetch([record.evidence])[record.evidence])
-                        wanted |= {row.name for row in read_index(index)}
+                    wanted |= record.chunks(fetch)
             for some in _batches(sorted(wanted)):
                 there = connection.execute(select(schema.chunk.c.name).where(schema.chunk.c.name.in_(some))).scalars()
                 rows = [{"name": name, "data": data} for name, data in fetch(set(some) - set(there)).items()]
@@ -441,14 +393,6 @@ class SqlStore(Shown):
                 self._move_anchor(connection, last, newest)
         return last
 
-    def _with_evidence(self, evidence: Evidence | None, chunks: dict[bytes, Chunk]) -> bytes | None:
-        """The name of the index of what a session saw, None for nothing; its chunks are added to `chunks`."""
-        if evidence is None or not len(evidence):
-            return None
-        listed, looks = evidence_to_chunks(evidence)
-        chunks.update((part.name, part) for part in (listed, *looks))
-        return listed.name
-
     def _n_grown(
         self, connection: Connection, parent: int, living: LivingMap, changes: Sequence[MapChange]
     ) -> int | None:
@@ -456,10 +400,7 @@ class SqlStore(Shown):
         known = np.zeros(0, dtype=np.int64)
         try:
             if parent:
-                content_of, column = self._record(connection, parent).content, "members.landmark_id"
-                known = content.unpack_columns(content_of, [column], lambda keys: self._fetched(connection, keys))[
-                    column
-                ]
+                (known,) = self._columns(connection, self._record(connection, parent), "landmark_id")
         except (DamagedError, InputError):
             return None
         return len(grown(known, living, changes))
@@ -474,7 +415,7 @@ class SqlStore(Shown):
                 attached[name] = content.name_of(item.digest), item.n_bytes
                 continue
             if len(item) > _LONGEST:
-                raise ConfigError(f"has {len(item)} bytes, more than {_LONGEST}", path=self._where, field=name)
+                raise ConfigError(f"has {len(item)} bytes, more than {_LONGEST}", path=self.where, field=name)
             chunk = Chunk("|u1", bytes(item))
             chunks[chunk.name] = chunk
             attached[name] = chunk.name, len(item)
@@ -482,19 +423,16 @@ class SqlStore(Shown):
 
     def _put(self, connection: Connection, chunks: Mapping[bytes, Chunk], stored: Mapping[bytes, bytes]) -> None:
         """Store the chunks that are not there yet; one that is there, but damaged, is written anew."""
-        present: dict[bytes, bytes | None] = {}
-        question = select(schema.chunk.c.name).where(schema.chunk.c.name.in_(bindparam("names", expanding=True)))
-        for some in _batches(chunks):
-            present.update((bytes(row[0]), None) for row in connection.execute(question, {"names": some}))
-        unread = present.keys() - self._checked
-        for key, data in self._fetched(connection, unread & chunks.keys(), missing_ok=True).items():
+        column = schema.chunk.c.name
+        question = select(column).where(column.in_(bindparam("names", expanding=True)))
+        answers = (connection.execute(question, {"names": some}) for some in _batches(chunks))
+        present = {bytes(row[0]) for answer in answers for row in answer}
+        for key, data in self._fetched(connection, (present - self._checked) & chunks.keys(), missing_ok=True).items():
             try:
                 Chunk.of_stored(key, chunks[key].dtype, data)
             except DamagedError:
-                connection.execute(
-                    update(schema.chunk).where(schema.chunk.c.name == key).values(data=chunks[key].stored())
-                )
-        new = sorted(chunks.keys() - present.keys())
+                connection.execute(update(schema.chunk).where(column == key).values(data=chunks[key].stored()))
+        new = sorted(chunks.keys() - present)
         rows = [{"name": key, "data": stored[key] if key in stored else chunks[key].stored()} for key in new]
         if rows:
             connection.execute(insert(schema.chunk), rows)
@@ -506,11 +444,7 @@ class SqlStore(Shown):
         fetch = partial(self._fetched, connection)
         found = {name for number in old for name in content.names_in(records[number].content, fetch)}
         for number, record in records.items():
-            found -= content.names_in(record.content, fetch, "" if number in kept else content.MEMBERS)
-            found -= record.parts()
-            if record.evidence is not None:
-                index = content.read_text(record.evidence, fetch([record.evidence])[record.evidence])
-                found -= {row.name for row in read_index(index)}
+            found -= record.chunks(fetch, "" if number in kept else content.MEMBERS)
         return found
 
     def _pruned(self, connection: Connection) -> dict[int, str]:
@@ -521,7 +455,7 @@ class SqlStore(Shown):
         utc = since.replace("T", " ").replace("+00:00", " UTC")
         gone = f"is pruned since {utc}" if since else "was pruned or lost to damage"
         problem = f"the content of revision {number} {gone}; kept: {ranges(kept)}"
-        return PrunedRevisionError(problem, path=self._where, hint="one of these, or an older copy of the file")
+        return PrunedRevisionError(problem, path=self.where, hint="one of these, or an older copy of the file")
 
     def _anchor(self, connection: Connection) -> tuple[int, bytes | None]:
         """The newest revision, and the name of its record: of these all others are checked."""
@@ -586,15 +520,14 @@ class SqlStore(Shown):
         """
         found, _ = self._chain(connection, number)
         if number not in found:
-            hint = f"evermap map log {self._where}"
-            raise InputError(f"revision {number} was lost to damage of the file", path=self._where, hint=hint)
+            hint = f"evermap map log {self.where}"
+            raise InputError(f"revision {number} was lost to damage of the file", path=self.where, hint=hint)
         return found[number]
 
     def _records_of(self, connection: Connection, revisions: Collection[int] | None) -> list[Record]:
         """Records of some revisions, oldest first; of the lineage of the newest if not told which."""
         records, _ = self._chain(connection)
-        head, _ = self._anchor(connection)
-        wanted = lineage({k: r.origin for k, r in records.items()}, head) if revisions is None else sorted(revisions)
+        wanted = self._lineage(connection, None) if revisions is None else sorted(revisions)
         return [records[number] for number in wanted if number in records]
 
     def _unpacked(self, connection: Connection, record: Record) -> LivingMap:
@@ -617,11 +550,15 @@ class SqlStore(Shown):
 
     def _clique_of(self, connection: Connection, record: Record, landmark_id: int) -> int | None:
         """The clique that a landmark belonged to in a revision."""
-        names = ("members.landmark_id", "members.clique_id")
-        columns = content.unpack_columns(record.content, names, lambda keys: self._fetched(connection, keys))
-        row = np.flatnonzero(columns["members.landmark_id"] == landmark_id)
-        cliques = columns["members.clique_id"]
+        landmarks, cliques = self._columns(connection, record, "landmark_id", "clique_id")
+        row = np.flatnonzero(landmarks == landmark_id)
         return int(cliques[row[0]]) if len(row) and row[0] < len(cliques) else None
+
+    def _columns(self, connection: Connection, record: Record, *names: str) -> list[NDArray[Any]]:
+        """Columns of the landmarks of a revision, without the rest of its map."""
+        listed = [content.MEMBERS + name for name in names]
+        found = content.unpack_columns(record.content, listed, partial(self._fetched, connection))
+        return [found[name] for name in listed]
 
     def _fetched(
         self, connection: Connection, names: Iterable[bytes], *, missing_ok: bool = False
@@ -649,7 +586,7 @@ class SqlStore(Shown):
         if not tables:
             return 0
         if "store" not in tables or "revision" not in tables:
-            raise InputError("is a database, but not an evermap map", path=self._where, hint="another file")
+            raise InputError("is a database, but not an evermap map", path=self.where, hint="another file")
         version = connection.execute(select(schema.store.c.schema_version)).scalar()
         if not isinstance(version, int) or version < 1:
             raise DamagedError(f"its schema version is {version!r}")
@@ -657,7 +594,7 @@ class SqlStore(Shown):
             problem = (
                 f"a map of schema version {version}; this evermap, {__version__}, knows up to {schema.SCHEMA_VERSION}"
             )
-            raise InputError(problem, path=self._where, hint="open it with a newer evermap")
+            raise InputError(problem, path=self.where, hint="open it with a newer evermap")
         columns = {column["name"] for column in inspect(connection).get_columns("store")}
         today = set(tables) == schema.metadata.tables.keys() and columns == set(schema.store.columns.keys())
         if (version < schema.SCHEMA_VERSION) == today:
@@ -670,7 +607,7 @@ class SqlStore(Shown):
         number = head if revision is None else revision
         if not 0 <= number <= head:
             there = f"it has {head} of them" if head else "it has none yet"
-            raise InputError(f"no revision {number}; {there}", path=self._where, hint=f"evermap map log {self._where}")
+            raise InputError(f"no revision {number}; {there}", path=self.where, hint=f"evermap map log {self.where}")
         return number
 
     def _lineage(self, connection: Connection, revision: int | None) -> tuple[int, ...]:
@@ -679,34 +616,25 @@ class SqlStore(Shown):
         return lineage({k: record.origin for k, record in records.items()}, number)
 
     @contextmanager
-    def _reading(self) -> Iterator[Connection]:
-        with self._plainly(), self._engine.connect() as connection, connection.begin():
-            yield connection
-
-    @contextmanager
-    def _writing(self) -> Iterator[Connection]:
-        with self._plainly(), self._engine.execution_options(writes=True).connect() as connection, connection.begin():
-            yield connection
-
-    @contextmanager
-    def _plainly(self) -> Iterator[None]:
-        """Return the failure of the database, in one line."""
+    def _transaction(self, *, writes: bool = False) -> Iterator[Connection]:
+        """A transaction; failures of the database are errors of one line."""
         try:
-            yield
+            with self._engine.execution_options(writes=writes).connect() as connection, connection.begin():
+                yield connection
         except (DamagedError, UnicodeDecodeError) as error:  # the latter even from the driver's own messages
             raise self._damaged(str(error)) from error
         except IntegrityError as error:
             raise StaleRevisionError(
-                f"another process committed at the same time: {error.orig}", path=self._where, hint="run it again"
+                f"another process committed at the same time: {error.orig}", path=self.where, hint="run it again"
             ) from error
         except DBAPIError as error:
             message = str(error.orig)
             for part, problem, hint in _FAILURES:
                 if part in message:
-                    raise InputError(problem, path=self._where, hint=hint) from error
+                    raise InputError(problem, path=self.where, hint=hint) from error
             if self._engine.dialect.name == "postgresql":  # that checks its own pages
                 hint = "check the address, the rights of the user, and that the server runs"
-                raise StoreUnavailableError(f"PostgreSQL: {message}", path=self._where, hint=hint) from error
+                raise StoreUnavailableError(f"PostgreSQL: {message}", path=self.where, hint=hint) from error
             raise self._damaged(message) from error
 
     def _damaged(self, problem: str) -> InputError:
@@ -715,8 +643,8 @@ class SqlStore(Shown):
         if explained is not None:
             return explained
         if "is not a database" in problem:
-            return InputError("is not an evermap map", path=self._where, hint="another file")
-        return DamagedMapError(f"damaged: {problem}", path=self._where, hint="a copy of the file")
+            return InputError("is not an evermap map", path=self.where, hint="another file")
+        return DamagedMapError(f"damaged: {problem}", path=self.where, hint="a copy of the file")
 
 
 _STORE_COLUMNS = ("schema_version", "created_at", "evermap_version", "head", "record")
@@ -746,11 +674,8 @@ def is_anchor(values: Sequence[Any]) -> bool:
 
 
 def announce(connection: Connection, what: str) -> None:
-    """Tell all who listen (`postgres.Announcements`) once the transaction is committed; nothing in SQLite.
-
-    Args:
-        connection: of the transaction.
-        what: the schema of a site, '' for all.
+    """Tell all who listen (`postgres.Announcements`) the schema of a site, '' for all, once the transaction is
+    committed; nothing in SQLite.
     """
     if connection.dialect.name == "postgresql":
         connection.execute(select(func.pg_notify(CHANNEL, what)))
@@ -759,18 +684,6 @@ def announce(connection: Connection, what: str) -> None:
 def now_utc() -> str:
     """Return ISO 8601, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def _told(provenance: Provenance, living: LivingMap, **numbers: int | None) -> dict[str, Any]:
-    """Return the fields of a new revision's record."""
-    return about(
-        provenance,
-        **numbers,
-        created_at=now_utc(),
-        evermap_version=__version__,
-        n_landmarks=len(living.members),
-        n_existing=int(np.sum((living.p_of_sites(living.sites.p_here) >= 0.5) & ~living.members.deleted)),
-    )
 
 
 def _batches(names: Iterable[bytes]) -> Iterator[list[bytes]]:

@@ -24,9 +24,9 @@ from evermap.maps.living import LivingMap
 from evermap.maps.store import content
 from evermap.maps.store.content import DTYPES, NAME_BYTES, Chunk, DamagedError
 from evermap.maps.store.history import Record, ranges, read_pruned
-from evermap.maps.store.measured import looks_of, read_index
+from evermap.maps.store.measured import looks_of
 from evermap.maps.store.protocol import DamagedMapError, Provenance
-from evermap.maps.store.sql import SqlStore
+from evermap.maps.store.sql import SqlStore, is_anchor
 
 _PATIENCE_S = 20.0
 """So long one waits for another process to finish its commit."""
@@ -48,7 +48,7 @@ def open_sqlite(path: Path, *, create: bool) -> SqlStore:
         found = survey(path)
         return None if found is None else found.error(path, problem)
 
-    return SqlStore.opened(engine, str(path), create=create, tidy=lambda: _compact(engine), explain=explain)
+    return SqlStore(engine, str(path), create=create, tidy=lambda: _compact(engine), explain=explain)
 
 
 def _compact(engine: Engine) -> None:
@@ -130,14 +130,11 @@ class Verification:
             number = min(self.damaged)
             others = f", and {len(self.damaged) - 1} more revisions" if len(self.damaged) > 1 else ""
             told.append(f"revision {number}: {self.damaged[number]}{others}")
-        what = "damaged: " + "; ".join(told)
-        if not self.intact:
-            error = DamagedMapError(f"{what}; no revision is intact", path=path, hint="a copy of the file")
-        else:
-            whole = f"revision{'s' if len(self.intact) > 1 else ''} {ranges(self.intact)}"
-            are = "are" if len(self.intact) > 1 else "is"
-            hint = f"evermap map revert {path} {self.intact[-1]}"
-            error = DamagedMapError(f"{what}; {whole} {are} intact", path=path, hint=hint)
+        whole, hint = "no revision is", "a copy of the file"
+        if self.intact:
+            listed, hint = ranges(self.intact), f"evermap map revert {path} {self.intact[-1]}"
+            whole = f"revisions {listed} are" if len(self.intact) > 1 else f"revision {listed} is"
+        error = DamagedMapError(f"damaged: {'; '.join(told)}; {whole} intact", path=path, hint=hint)
         error.intact = self.intact
         return error
 
@@ -166,17 +163,11 @@ def survey(path: Path) -> Verification | None:
         return None
     if not found.records and found.anchor is None:
         return None
-    intact, pruned, damaged = found.verdicts(deep=False)
-    return Verification(found.head, intact, damaged, tuple(sorted(found.lost)), (), len(found.chunks), 0, pruned)
+    return found.verified(deep=False)
 
 
 def snapshot(store: SqlStore, path: Path, revision: int) -> None:
-    """Write a map of any store, up to a revision, as a file; of equal maps the files are equal.
-
-    Args:
-        store: the map.
-        path: a file that does not exist.
-        revision: the newest that the file is to have.
+    """Write a map of any store, up to a revision, as a file that does not exist; of equal maps the files are equal.
 
     Raises:
         DamagedMapError: the store is damaged.
@@ -196,27 +187,20 @@ def snapshot(store: SqlStore, path: Path, revision: int) -> None:
 
 
 def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> tuple[int, Path]:
-    """Go back to an intact revision of a damaged file: every intact one is kept, the damaged file is set aside.
-
-    Args:
-        path: the map.
-        revision: whose content the new revision gets; 0 is the empty map.
-        provenance: of the new revision.
-
-    Returns:
-        Its number, and where the damaged file is.
+    """Go back to an intact revision of a damaged file, 0 for the empty map: every intact one is kept, the damaged file
+    is set aside. Returns the number of the new revision, and where the damaged file is.
 
     Raises:
         DamagedMapError: that revision is not intact.
     """
     _finish_transactions(path)
     found = _Found.of_file(path)
-    intact, pruned, damaged = found.verdicts(deep=True)
-    if revision != 0 and revision not in intact:
+    checked = found.verified()
+    pruned, damaged = checked.pruned, checked.damaged
+    if revision != 0 and revision not in checked.intact:
         why = "its content is pruned" if revision in pruned else damaged.get(revision, "there is no such revision")
-        checked = Verification(found.head, intact, damaged, (), (), 0, 0)
         raise checked.error(path, f"revision {revision}: {why}")
-    records = {number: found.records[number] for number in (*intact, *pruned)}
+    records = {number: found.records[number] for number in (*checked.intact, *pruned)}
     next_ids = [max((record.next_ids[k] for record in found.records.values()), default=0) for k in (0, 1)]
     before = {number: found.names.get(number - 1) if number - 1 in records else None for number in damaged}
     lost = {**{number: name if number - 1 in records else None for number, name in found.lost.items()}, **before}
@@ -264,9 +248,9 @@ class _Found:
         since = {number: self.pruned[number] for number in numbers if number in self.pruned}
         store.fill({name: self.chunks[name] for name in sorted(kept)}, names, head, since, made)
 
-    def verified(self, problems: Iterable[str], n_bytes: int) -> Verification:
-        """Return the verification, including the maps themselves."""
-        intact, pruned, damaged = self.verdicts(deep=True)
+    def verified(self, problems: Iterable[str] = (), n_bytes: int = 0, *, deep: bool = True) -> Verification:
+        """Return the verification; `deep` includes the maps themselves."""
+        intact, pruned, damaged = self.verdicts(deep=deep)
         lost = tuple(sorted(self.lost))
         return Verification(self.head, intact, damaged, lost, tuple(problems), len(self.chunks), n_bytes, pruned)
 
@@ -295,8 +279,6 @@ class _Found:
 
     @classmethod
     def _of_rows(cls, rows: Iterable[list[Any]]) -> _Found:
-        from evermap.maps.store.sql import is_anchor
-
         chunks: dict[bytes, bytes] = {}
         listed: set[bytes] = set()
         anchor: tuple[int, bytes | None] | None = None
@@ -364,14 +346,10 @@ class _Found:
 
     def closure(self, record: Record) -> set[bytes]:
         """Return names of all chunks of a revision but its record; `DamagedError` if one is not there."""
-        content.read_text(record.config, self.fetch([record.config])[record.config])
-        table = content.MEMBERS if record.number in self.pruned else ""
-        names = content.names_in(record.content, self.fetch, table) | record.parts()
-        if record.evidence is not None:
-            index = read_index(content.read_text(record.evidence, self.fetch([record.evidence])[record.evidence]))
-            names |= {row.name for row in index}
-            for row in index:
-                looks_of(row.clique_id, self.fetch([row.name])[row.name], row.name)
+        content.text_of(record.config, self.fetch)
+        names = record.chunks(self.fetch, content.MEMBERS if record.number in self.pruned else "")
+        for row in record.looks(self.fetch):
+            looks_of(row.clique_id, self.fetch([row.name])[row.name], row.name)
         self.fetch(names)
         return names
 

@@ -204,10 +204,10 @@ def _live(day: _Day) -> tuple[_Evening, ...]:
 
 def snapshot_of(living: LivingMap, config: LivingConfig, until_s: float) -> Snapshot:
     """What a map says now and expects at `until_s`, nan for no forecast."""
-    from evermap.maps.sessions.believe import predicted
+    from evermap.maps.sessions.believe import aged
 
     site = np.searchsorted(living.sites.site_id, living.places.site_id)
-    later = living.sites.p_here if np.isnan(until_s) else predicted(living, config, until_s)
+    later = living.sites.p_here if np.isnan(until_s) else aged(living, config, until_s).p_here
     return Snapshot(
         landmarks=living.landmarks(),
         place_id=living.places.landmark_id,

@@ -279,12 +279,12 @@ class _Truth:
     def forecasts(self, living: LivingMap, session: int, pose: FloatArray) -> list[tuple[float, bool]]:
         """For every landmark that the map knows: P(it stands at its place in the next session), and whether it did."""
         from evermap.config import LivingConfig
-        from evermap.maps.sessions.believe import predicted
+        from evermap.maps.sessions.believe import aged
 
         next_s = float(self.start_s[session + 1])
         if next_s < living.stamp_s or not len(living.sites):
             return []
-        p_next = predicted(living, LivingConfig(), next_s)
+        p_next = aged(living, LivingConfig(), next_s).p_here
         records = living.landmarks()
         row = living.place_row(records.landmark_id, _site_of(living, records.landmark_id))
         p = p_next[np.searchsorted(living.sites.site_id, living.places.site_id[row])]
