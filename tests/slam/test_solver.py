@@ -17,8 +17,7 @@ from evermap.geometry import se2
 from evermap.slam import streaming
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import beliefs, prepare
-from evermap.slam.local_filter import LocalFilter, columns
-from evermap.slam.motion import Motion
+from evermap.slam.local_filter import LocalFilter, Motion, columns
 from evermap.slam.problem import Estimate
 from evermap.slam.session_filter import SessionFilter
 from evermap.slam.smoother import Smoother

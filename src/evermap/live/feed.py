@@ -13,8 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.live.engine import Engine, Numbers
-from evermap.live.now import Now
+from evermap.live.engine import Engine, Now, Numbers
 from evermap.types import Recording
 
 

@@ -11,6 +11,7 @@ from bisect import bisect_left, insort
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -335,8 +336,25 @@ def _columns(rows: FloatArray) -> list[FloatArray]:
     return [np.ascontiguousarray(column) for column in rows.T]
 
 
-def about(name: str, sensor: Sensor, clock: Clock, class_names: tuple[str, ...]) -> Recording:
-    """Return a recording without readings."""
+def recording_of(sensor: object, name: str, clock: Clock, class_names: tuple[str, ...]) -> Recording:
+    """Return a recording without readings, of a sensor or a `sensor.toml`.
+
+    Raises:
+        InputError: neither.
+    """
+    if isinstance(sensor, str | Path):
+        from evermap.io.sensor_toml import parse_sensor_toml
+
+        path = Path(sensor)
+        try:
+            said = parse_sensor_toml(path.read_bytes(), path)
+        except OSError as error:
+            raise InputError(f"cannot be read: {error.strerror}", path=path, hint="a sensor.toml") from None
+        name, sensor, clock = said.name or name, said.sensor, said.clock
+        class_names = said.class_names or class_names
+    if not isinstance(sensor, Sensor):
+        hint = "evermap.Sensor(range_max_m=8.0), or the path of a sensor.toml"
+        raise InputError(f"a Sensor is needed, not {type(sensor).__name__}", field="sensor", hint=hint)
     none, no = np.zeros(0), np.zeros(0, dtype=np.int64)
     nothing = Detections(no, no, none, none, no, none, none, no)
     odometry, frames = Odometry(none, none, none, none, clock), Frames(none, clock=clock)

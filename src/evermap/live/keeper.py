@@ -16,7 +16,6 @@ from evermap.compiled import single_threaded
 from evermap.config import Config
 from evermap.errors import EvermapError, InputError
 from evermap.live.inbox import Inbox
-from evermap.live.now import check_fits
 from evermap.live.spool import Brought, Spool, enter_waiting
 from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store
@@ -93,7 +92,7 @@ class Keeper:
             self.feed()
         try:
             living = self.load(create=mapping)[0] if living is None else living
-            check_fits(living, clock)
+            _check_fits(living, clock)
         except EvermapError:
             self.close()
             raise
@@ -213,3 +212,15 @@ class Keeper:
     def _take(self, brought: Brought) -> None:
         if brought.problem:
             self._told.warnings.append(f"{brought.name}: not entered: {brought.problem}")
+
+
+def _check_fits(living: LivingMap, clock: Clock) -> None:
+    """Raise `InputError` for a map in space, or of another clock."""
+    if living.dim != 2:
+        raise InputError(
+            "a map in space", field="map", hint="sessions in space are solved when they end: enter_session"
+        )
+    if len(living.places) and living.clock != clock:
+        problem = f"stamps are on the clock '{clock}', those of the map on '{living.clock}'"
+        hint = f"clock = '{living.clock}' in sensor.toml, or evermap.Engine(..., clock='{living.clock}')"
+        raise InputError(problem, field="clock", hint=hint)

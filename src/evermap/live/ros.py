@@ -30,9 +30,8 @@ from evermap.io.bag import (
 from evermap.io.bag_messages import OBJECT_FIELDS, POSES, BagContent, SeenColumns, handler_of, objects_in_space
 from evermap.io.cdr import Cdr
 from evermap.io.rosbag import Topic, pose_of, ros2_types, seconds, stamp_of
-from evermap.live.engine import Engine
+from evermap.live.engine import Engine, Now
 from evermap.live.feed import Reading, SensorLook, Velocity, in_time
-from evermap.live.now import Now
 from evermap.live.wires import OURS, Mailbox, Message, Wire
 from evermap.runs.mcap import (
     Ros,

@@ -111,20 +111,12 @@ class CalibrationPrior:
         mean, free = np.array([spec.mean for spec in SPECS]), np.full(N_STATES, calibrated)
         for name, value in settings.fix.items():
             if name not in NAMES:
-                raise ConfigError(
-                    f"unknown calibration state '{name}'",
-                    field="slam.calibration.fix",
-                    hint=", ".join(NAMES),
-                )
+                problem = f"unknown calibration state '{name}'"
+                raise ConfigError(problem, field="slam.calibration.fix", hint=", ".join(NAMES))
             mean[NAMES.index(name)] = value
             free[NAMES.index(name)] = False
-        prior = cls(
-            mean,
-            np.array([settings.sigma[name] for name in NAMES]),
-            free,
-            p_mount=settings.p_needed_mount,
-            settings=settings,
-        )
+        sigma = np.array([settings.sigma[name] for name in NAMES])
+        prior = cls(mean, sigma, free, p_mount=settings.p_needed_mount, settings=settings)
         return prior if sensor is None else prior._as_stated(sensor)
 
     def _as_stated(self, sensor: Sensor) -> CalibrationPrior:
@@ -143,13 +135,10 @@ class CalibrationPrior:
         for state, value in sheet.items():
             if value is not None:
                 sigma[state] = max(value, LEAST_SIGMA)
-        askew = (
-            self.settings.sigma_askew_rad
-            if sensor.sigma_askew_rad is None
-            else max(sensor.sigma_askew_rad, LEAST_SIGMA)
-        )
+        stated = sensor.sigma_askew_rad
+        askew = self.settings.sigma_askew_rad if stated is None else max(stated, LEAST_SIGMA)
         angle_share = 0.0
-        if sensor.sigma_angle_rad is not None or sensor.sigma_askew_rad is not None:
+        if sensor.sigma_angle_rad is not None or stated is not None:
             angle_share = sigma[BEARING] ** 2 / (sigma[BEARING] ** 2 + askew**2)
         sigma[BEARING] = np.hypot(sigma[BEARING], askew)
         known = sensor.kind not in (None, SensorKind.LASER)
@@ -205,9 +194,7 @@ class CalibrationPrior:
         `k_v / (1 + a1)` explains every reading as well. So the graph holds `a1` at its mean, lets the forward scale
         carry the uncertainty of both, and `split_scale` divides what it found between them afterwards.
         """
-        if not self.shares_scale:
-            return self
-        return self.relative(0.0)
+        return self.relative(0.0) if self.shares_scale else self
 
     def relative(self, slope_sigma: float) -> CalibrationPrior:
         """Return the prior of the states in the metres of a range sensor whose slope is known as well as this one's.

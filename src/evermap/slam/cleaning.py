@@ -87,9 +87,8 @@ def spikes(stamp_s: FloatArray, velocity: FloatArray, settings: CleaningConfig) 
     step_s = np.minimum(np.append(step_s, np.inf), np.insert(step_s, 0, np.inf))
     step_s = np.maximum(step_s, np.median(step_s))  # rows that are stamped when they arrive may come in bursts
     usual = np.stack([running_median(column, settings.around) for column in velocity])
-    return np.asarray(
-        np.any(np.abs(velocity - usual) > np.maximum(settings.hardest * step_s, settings.sharpest), axis=0)
-    )
+    most = np.maximum(settings.hardest * step_s, settings.sharpest)
+    return np.asarray(np.any(np.abs(velocity - usual) > most, axis=0))
 
 
 def of_ranges_only(detections: Detections, settings: CleaningConfig) -> bool:
@@ -235,14 +234,11 @@ def _while_driving(
     """Drop frames far before the first or after the last odometry, where the motion is unknown."""
     if len(odometry) == 0:
         return frames, detections
-    near = (frames.stamp_s >= odometry.stamp_s[0] - settings.stray_s) & (
-        frames.stamp_s <= odometry.stamp_s[-1] + settings.stray_s
-    )
+    stray_s, stamp_s = settings.stray_s, frames.stamp_s
+    near = (stamp_s >= odometry.stamp_s[0] - stray_s) & (stamp_s <= odometry.stamp_s[-1] + stray_s)
     if near.all():
         return frames, detections
-    _remark(
-        remarks, f"frames more than {settings.stray_s:g} s before or after the odometry dropped", int(np.sum(~near))
-    )
+    _remark(remarks, f"frames more than {stray_s:g} s before or after the odometry dropped", int(np.sum(~near)))
     return some_frames(frames, detections, near)
 
 
@@ -272,9 +268,8 @@ def _fresh(
         alike &= column == column[at]
     repeated = (count > 0) & (np.bincount(detections.frame, alike, minlength=len(frames)) == count)
     least = np.where(count > 1, 1.0, SINGLE) * settings.moved
-    repeated &= _moved_since(
-        np.maximum.accumulate(np.where(repeated, 0, np.arange(len(frames)))), frames, odometry, least
-    )
+    since = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(frames))))
+    repeated &= _moved_since(since, frames, odometry, least)
     if not repeated.any():
         return frames, detections
     _remark(remarks, "frames dropped that repeat the previous one although the robot moved", int(repeated.sum()))
@@ -286,8 +281,7 @@ def _moved_since(row: IntArray, frames: Frames, odometry: Odometry, most: FloatA
     speed = np.stack([np.hypot(odometry.forward_mps, odometry.lateral_mps), np.abs(odometry.angular_radps)])
     way = np.pad(np.cumsum(speed[:, :-1] * np.diff(odometry.stamp_s), axis=1), ((0, 0), (1, 0)))
     at = np.stack([np.interp(frames.stamp_s, odometry.stamp_s, column) for column in way])
-    moved: BoolArray = np.any(at - at[:, row] > most, axis=0)
-    return moved
+    return np.asarray(np.any(at - at[:, row] > most, axis=0))
 
 
 def _mended(what: str, stamp_s: FloatArray, settings: CleaningConfig, remarks: list[str]) -> FloatArray:
@@ -342,8 +336,7 @@ def running_median(values: FloatArray, around: int) -> FloatArray:
     if len(values) == 0:
         return values
     padded = np.pad(values, around // 2, mode="edge")
-    middle: FloatArray = np.median(np.lib.stride_tricks.sliding_window_view(padded, around), axis=1)
-    return middle
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, around), axis=1))
 
 
 def set_forward(stamp_s: FloatArray, other_s: FloatArray, settings: CleaningConfig) -> tuple[int, float] | None:

@@ -15,14 +15,17 @@ from evermap.compiled import kept
 from evermap.slam.kernels import (
     AT_PLACES,
     N_MOTION,
+    N_NOISE,
     N_SENSOR,
     N_STATES,
     adjoint,
     composed,
     detection_residual,
     inlier_weight,
+    integrate_odometry,
     inverted,
     kernel,
+    odometry_covariance,
     sandwich,
     wrapped,
 )
@@ -111,6 +114,22 @@ def along_turn(x: float, y: float, turn: float) -> tuple[float, float]:
         return x - 0.5 * turn * y, y + 0.5 * turn * x
     s, c = math.sin(turn) / turn, (1.0 - math.cos(turn)) / turn
     return s * x - c * y, c * x + s * y
+
+
+@kernel
+def driven(
+    stamp: FloatArray, velocity: FloatArray, unknown: FloatArray, start_s: float, stop_s: float, states: FloatArray,
+    free: Any, sigma: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Return increment, derivatives by free states, and covariance of the motion between two instants: `Motion`."""
+    increment, by_states = np.zeros(3), np.zeros((3, N_MOTION))
+    kinds, covariance = np.zeros((N_NOISE, 3, 3)), np.zeros((3, 3))
+    integrate_odometry(stamp, velocity, unknown, start_s, stop_s, states, increment, by_states, kinds, covariance)
+    odometry_covariance(kinds, covariance, sigma**2, covariance)
+    for k in range(N_MOTION):
+        if not free[N_SENSOR + k]:
+            by_states[:, k] = 0.0
+    return increment, by_states, covariance
 
 
 @kernel
@@ -256,10 +275,8 @@ def update(
         return nis, weight
     place, where, part = np.empty((count, 2)), np.arange(size), np.empty((size, size))
     for k in range(2 * count):
-        place[k // 2, k % 2], where[AT_PLACES + k] = (
-            position[row[slot[k // 2]], k % 2],
-            AT_PLACES + 2 * slot[k // 2] + k % 2,
-        )
+        place[k // 2, k % 2] = position[row[slot[k // 2]], k % 2]
+        where[AT_PLACES + k] = AT_PLACES + 2 * slot[k // 2] + k % 2
     for k in range(size):
         for other in range(size):
             part[k, other] = covariance[where[k], where[other]]
@@ -362,14 +379,9 @@ def _surprises(
 
 @kernel
 def _weigh_by_the_others(
-    spread: FloatArray,
-    pull: FloatArray,
-    sigma: FloatArray,
-    log_odds: FloatArray,
-    heavy: bool,
-    credible: FloatArray,
+    spread: FloatArray, pull: FloatArray, sigma: FloatArray, log_odds: FloatArray, heavy: bool, credible: FloatArray,
     weight: FloatArray,
-) -> float:
+) -> float:  # fmt: skip
     """Compute weights, at most `credible`, from each detection's innovation given all others; return the largest
     change.
 

@@ -125,14 +125,8 @@ def beliefs(sensor: Sensor, settings: SlamConfig) -> tuple[CalibrationPrior, Noi
 
 def _in_rows(prior_map: Landmarks, landmark_id: IntArray) -> PriorMap | None:
     """The prior map in the order of this session's landmarks; a sigma of zero means 1 mm."""
-    rows = {int(identity): k for k, identity in enumerate(prior_map.landmark_id)}
-    mean = np.zeros((len(landmark_id), 2))
-    information = np.zeros((len(landmark_id), 2, 2))
-    given = np.zeros(len(landmark_id), dtype=bool)
-    for k, identity in enumerate(landmark_id):
-        if int(identity) in rows:
-            row = rows[int(identity)]
-            given[k] = True
-            mean[k] = prior_map.position_m[row]
-            information[k] = np.linalg.inv(prior_map.covariance_m2[row] + 1e-6 * np.eye(2))
-    return PriorMap(mean, information, given)
+    _, own, row = np.intersect1d(landmark_id, prior_map.landmark_id, return_indices=True)
+    mean, information = np.zeros((len(landmark_id), 2)), np.zeros((len(landmark_id), 2, 2))
+    mean[own] = prior_map.position_m[row]
+    information[own] = np.linalg.inv(prior_map.covariance_m2[row] + 1e-6 * np.eye(2))
+    return PriorMap(mean, information, np.isin(np.arange(len(landmark_id)), own))

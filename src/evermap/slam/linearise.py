@@ -129,14 +129,6 @@ def _detection_residuals(
     jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     for m in range(len(pose_row)):
         detection_residual(
-            pose[pose_row[m]],
-            landmark[landmark_row[m]],
-            states,
-            mount,
-            reading[m, 0],
-            reading[m, 1],
-            out[m],
-            jx,
-            jl,
-            jc,
-        )
+            pose[pose_row[m]], landmark[landmark_row[m]], states, mount, reading[m, 0], reading[m, 1], out[m],
+            jx, jl, jc,
+        )  # fmt: skip

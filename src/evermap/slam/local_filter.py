@@ -23,11 +23,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.filter_kernels import BELIEVED, drive_on, innovations, update
+from evermap.slam.filter_kernels import BELIEVED, drive_on, driven, innovations, update
 from evermap.slam.kernels import AT_PLACES, N_STATES
-from evermap.slam.motion import Motion
-from evermap.slam.problem import Estimate, Marginals
-from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.slam.problem import Drive, Estimate, Marginals, Noise, Problem
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 UNKNOWN_VARIANCE = 1e4
 """Of a place before its first sighting, m^2: where nothing is known, but not so wide that digits are lost."""
@@ -41,6 +40,36 @@ FEWEST_SLOTS = 16
 NEIGHBOURS = 8
 """Places, the nearest, to which a place is tied while it is not in the covariance."""
 NO_PLACES, NO_GAIN, NO_ODDS, NOWHERE = np.arange(0), np.zeros((2, 0)), np.zeros(0), np.zeros((0, 2, 2))
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Odometry between two poses.
+
+    Attributes:
+        increment: (3,) the second pose seen from the first.
+        by_states: (3, 4) its derivative, at its end, by delay, scales and slip; zero where these are not free.
+        covariance: (3, 3) its noise.
+    """
+
+    increment: FloatArray
+    by_states: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def between(cls, problem: Problem, noise: Noise, row: int, states: FloatArray) -> Motion:
+        """Return from pose `row - 1` to pose `row`."""
+        return cls.over(
+            problem.drive, problem.stamp_s[row - 1], problem.stamp_s[row], states, problem.prior.free, noise
+        )
+
+    @classmethod
+    def over(
+        cls, drive: Drive, start_s: float, stop_s: float, states: FloatArray, free: BoolArray, noise: Noise
+    ) -> Motion:
+        """Return between two instants, with (11,) calibration states of which some are `free`."""
+        odometry = drive.stamp_s, drive.velocity, drive.unknown
+        return cls(*driven(*odometry, start_s, stop_s, states, free, noise.odometry))
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,14 +225,11 @@ class LocalFilter:
             by_pose: (2, 14) its derivatives by the pose and the calibration states.
             spread: (2, 2) covariance by the reading's own noise.
         """
-        self.know_of(row + 1)
-        self._make_room(1)
-        self._enter(row, NO_PLACES, NO_GAIN, spread)
+        self.meet(row, place, spread)
         own = slice(AT_PLACES + 2 * int(self._slot[row]), AT_PLACES + 2 * int(self._slot[row]) + 2)
         across = by_pose @ self.covariance[:AT_PLACES]
         self.covariance[own], self.covariance[:, own] = across, across.T
         self.covariance[own, own] = across[:, :AT_PLACES] @ by_pose.T + spread
-        self.position[row] = place
 
     def compare(
         self, rows: IntArray, reading: FloatArray, sigma: FloatArray, own: FloatArray = NOWHERE
@@ -312,21 +338,17 @@ class LocalFilter:
     def _return(self, row: int, ties: Ties) -> None:
         """Put a known place back where those of its neighbours that are in the covariance take it."""
         there = np.flatnonzero(self._slot[ties.rows] >= 0) if len(ties.rows) else NO_PLACES
-        given, own = ties.rows[there], ties.joint[:2, :2]
+        given, own, gain = ties.rows[there], ties.joint[:2, :2], NO_GAIN
+        at = 2 + (2 * there[:, None] + [0, 1]).ravel()
         if len(there):
-            at = 2 + (2 * there[:, None] + [0, 1]).ravel()
             known = ties.joint[np.ix_(at, at)] + LEAST_VARIANCE * np.eye(len(at))
-            gain: FloatArray = np.linalg.solve(known, ties.joint[at, :2]).T
-            moved = (self.position[given] - ties.neighbours[there]).ravel()
-            self._enter(row, given, gain, own - gain @ ties.joint[at, :2])
-        else:
-            gain, moved = NO_GAIN, NO_ODDS
-            self._enter(row, given, gain, own)
+            gain = np.linalg.solve(known, ties.joint[at, :2]).T
+        self._enter(row, given, gain, own - gain @ ties.joint[at, :2])
         if self._considered:  # whatever its neighbours are held to be
             slot = AT_PLACES + 2 * int(self._slot[row])
             self.covariance[slot : slot + 2, slot : slot + 2] = own
         else:
-            self.position[row] = ties.place + gain @ moved
+            self.position[row] = ties.place + gain @ (self.position[given] - ties.neighbours[there]).ravel()
 
     def _enter(self, row: int, given: IntArray, gain: FloatArray, spread: FloatArray) -> None:
         """Put a place in a free slot."""

@@ -23,8 +23,7 @@ from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.filter_kernels import BY_OTHERS
 from evermap.slam.kernels import AT_PLACES, N_SENSOR
 from evermap.slam.known_places import KnownPlaces, LocalTrack, Neighbourhood, Placed
-from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
-from evermap.slam.motion import Motion
+from evermap.slam.local_filter import NO_PLACES, LocalFilter, Motion, columns
 from evermap.slam.problem import Drive, Noise
 from evermap.slam.streaming import sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor

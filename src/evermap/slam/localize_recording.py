@@ -14,14 +14,13 @@ from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.geometry.chunked import JointCovariance
 from evermap.sensing.visibility import NominalField
-from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.estimate import fed
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import FrameSightings, Localizer, Located
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive, Noise
-from evermap.slam.result import described
+from evermap.slam.result import dead_reckoning, described
 from evermap.types import (
     UNKNOWN,
     BoolArray,
@@ -198,8 +197,6 @@ def _result(
     pose[:, 2] = se2.wrap(pose[:, 2])
     spread = np.array([one.covariance for one in run.located])[placed]
     trajectory = Trajectory(stamps[run.frame[placed]], pose, spread, frame="prior_map", clock=recording.clock)
-    reported = CalibrationPrior.from_settings(calibrated=False).mean
-    reckoned, spread = dead_reckoned(trajectory.stamp_s - recording.odometry.stamp_s[0], drive, reported, START)
     misses = run.misses(places)
     noise = localizer.noise
     fit = NoiseFit(noise, np.zeros_like(noise.detection), np.zeros_like(noise.odometry))
@@ -211,7 +208,7 @@ def _result(
         innovations=run.innovations(recording),
         misses=misses,
         step_s=run.step_s[placed],
-        dead_reckoning=replace(trajectory, pose_world_robot=se2.compose(pose[0], reckoned), covariance=spread),
+        dead_reckoning=dead_reckoning(trajectory, drive, recording.odometry.stamp_s[0]),
         warnings=tuple(_warnings(recording, run, places)),
         interrupted=run.interrupted,
     )

@@ -79,18 +79,14 @@ def refine_noise(
         noise: levels so far.
         start: levels that `start.pseudo_count` imaginary residuals vouch for.
     """
-    free, pseudo = problem.prior.free, start.pseudo_count
-    residual = detection_residuals(problem, estimate)
+    pseudo, residual = start.pseudo_count, detection_residuals(problem, estimate)
     learned = np.where(np.isfinite(problem.sigma_given), 0.0, weights[:, None])
     left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
     squares, counts = (learned * residual**2).sum(axis=0), (learned * np.maximum(left, 0.0)).sum(axis=0)
     detection = np.sqrt((squares + pseudo * start.detection**2) / (counts + pseudo))
+    driven = problem.drive.between(problem.stamp_s, estimate.states)
     pulls, chances, fisher = _odometry_sums(
-        estimate.pose,
-        problem.drive.between(problem.stamp_s, estimate.states),
-        noise.odometry**2,
-        free,
-        marginals.explained_odometry,
+        estimate.pose, driven, noise.odometry**2, problem.prior.free, marginals.explained_odometry
     )
     # tr(W P_k) is a count only after multiplying by the variance
     count = np.maximum(noise.odometry**2 * chances, 0.0)
@@ -145,11 +141,7 @@ def _inflation(fisher: FloatArray) -> FloatArray:
 
 @kernel
 def _odometry_sums(
-    pose: FloatArray,
-    driven: Intervals,
-    variance: FloatArray,
-    free: Any,
-    explained: FloatArray,
+    pose: FloatArray, driven: Intervals, variance: FloatArray, free: Any, explained: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return for every kind of odometry noise, with `L = W - W V W`: sums of `e' W P_k W e` and of `tr(L P_k)`.
 

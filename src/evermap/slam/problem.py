@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -258,14 +258,13 @@ class Problem:
         With `last_is_blind`, before the detections of the last of them.
         """
         stop = int(np.searchsorted(self.pose_row, n_poses - last_is_blind))
-        return replace(
-            self,
-            stamp_s=self.stamp_s[:n_poses],
-            pose_row=self.pose_row[:stop],
-            landmark_row=self.landmark_row[:stop],
-            reading=self.reading[:stop],
-            sigma_given=self.sigma_given[:stop],
-        )
+        return replace(self.seeing(slice(stop)), stamp_s=self.stamp_s[:n_poses])
+
+    def seeing(self, rows: IntArray | BoolArray | slice) -> Problem:
+        """Return the problem with some of its detections only."""
+        names = ("pose_row", "landmark_row", "reading", "sigma_given")
+        some: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
+        return replace(self, **some)
 
 
 def independent(blocks: FloatArray) -> sparse.csr_array:
@@ -454,21 +453,18 @@ class Marginals:
 
     def joint(self, landmarks: IntArray, *, poses: IntArray | None = None, states: bool = False) -> FloatArray:
         """Return the joint covariance of some poses, some landmarks and, if wanted, the states, in this order."""
-        part = self._block
-        rank = np.cumsum(self.known) - 1
-        rows = np.asarray(landmarks, dtype=np.int64)
-        known = self.known[rows]
-        every = [
-            np.zeros(0, dtype=np.int64) if poses is None else part.first + poses,
-            part.landmarks[rank[rows[known]]],
-        ]
+        part, rows = self._block, np.asarray(landmarks, dtype=np.int64)
+        known, n_poses = self.known[rows], 0 if poses is None else len(poses)
+        every = [self._variables(rows[known])]
+        if poses is not None:
+            every.insert(0, part.first + poses)
         if states:
             every.append(part.border + np.arange(2))
         found = self._solved.joint(np.concatenate(every))
         if known.all():
             return found
-        n_poses = 3 * len(every[0])
-        kept = np.concatenate([np.ones(n_poses, bool), np.repeat(known, 2), np.ones(N_STATES if states else 0, bool)])
+        before, after = np.ones(3 * n_poses, bool), np.ones(N_STATES if states else 0, bool)
+        kept = np.concatenate([before, np.repeat(known, 2), after])
         joint = np.zeros((len(kept), len(kept)))
         joint[np.ix_(kept, kept)] = found
         return joint
@@ -481,14 +477,17 @@ class Marginals:
             poses: (P,) rows.
             by: (V, R, 3 P + 2 L + 11) the matrices.
         """
-        part, rank = self._block, np.cumsum(self.known) - 1
-        every = [part.first + poses, part.landmarks[rank[landmarks]], part.border + np.arange(2)]
+        every = [self._block.first + poses, self._variables(landmarks), self._block.border + np.arange(2)]
         return self._solved.each(np.concatenate(every), by)
 
     def product(self, landmarks: IntArray, matrix: FloatArray) -> FloatArray:
         """Return (2 L, K) the joint covariance of known landmarks (L,) times a matrix (2 L, K), without the former."""
+        return self._solved.product(self._variables(landmarks), matrix)
+
+    def _variables(self, landmarks: IntArray) -> IntArray:
+        """Variables of known landmarks (K,)."""
         rank = np.cumsum(self.known) - 1
-        return self._solved.product(self._block.landmarks[rank[np.asarray(landmarks, dtype=np.int64)]], matrix)
+        return self._block.landmarks[rank[np.asarray(landmarks, dtype=np.int64)]]
 
     @cached_property
     def shared(self) -> FloatArray:

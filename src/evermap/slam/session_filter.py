@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evermap.slam.filter_kernels import BELIEVED, HEAVY
-from evermap.slam.local_filter import MOST_ACTIVE, NO_PLACES, LocalFilter
-from evermap.slam.motion import Motion
+from evermap.slam.local_filter import NO_PLACES, LocalFilter, Motion
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.types import FloatArray, IntArray
@@ -24,11 +23,10 @@ class SessionFilter(LocalFilter):
             added before stays as it was until `restart`.
         noise: standard deviations.
         robust: down-weight outliers (Cauchy, decided when the detection comes).
-        most: places in the covariance.
     """
 
-    def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True, most: int = MOST_ACTIVE) -> None:
-        super().__init__(problem.mount, problem.prior, most=most)
+    def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True) -> None:
+        super().__init__(problem.mount, problem.prior)
         self.problem = problem
         self._robust, self._noise = robust, noise
         self.covariance[:3, :3] = np.eye(3) / problem.start_information

@@ -110,26 +110,25 @@ class Smoother:
         other._structure = self._structure
         return other
 
-    def optimum(
+    def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6) -> Estimate:
+        """Return the values at which `solved_in_slices` ends.
+
+        Raises:
+            NumericalError: no finite optimum.
+        """
+        return exhausted(self.solved_in_slices(start, iterations=iterations, tolerance=tolerance))[0]
+
+    def solved_in_slices(
         self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6, settled: float = 0.0
-    ) -> Estimate:
-        """Run damped Gauss-Newton from `start`, until steps or what they gain are small.
+    ) -> Slices[tuple[Estimate, Marginals]]:
+        """Run damped Gauss-Newton in slices; return the optimum and the covariances that its last step was made with.
 
         Args:
             start: values to start from.
             iterations: at most.
             tolerance: largest move (m or rad) of a step that ends it.
             settled: gain of a step that ends it, in nats.
-
-        Raises:
-            NumericalError: no finite optimum.
         """
-        return exhausted(self.solved_in_slices(start, iterations=iterations, tolerance=tolerance, settled=settled))[0]
-
-    def solved_in_slices(
-        self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6, settled: float = 0.0
-    ) -> Slices[tuple[Estimate, Marginals]]:
-        """Return what `optimum` does, in slices, and the covariances that its last step was made with."""
         estimate = start
         now = yield from self.linearised_in_slices(estimate)
         damping = 0.0

@@ -22,8 +22,8 @@ from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior, needed, seated
 from evermap.slam.filter_kernels import told
 from evermap.slam.kernels import N_STATES
+from evermap.slam.local_filter import Motion
 from evermap.slam.method import Explanation, Method, Static
-from evermap.slam.motion import Motion
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Drive, Estimate, Marginals, Noise, Problem, independent
 from evermap.slam.session_filter import SessionFilter
@@ -473,10 +473,6 @@ class StreamingSlam:
             yield min(CAUGHT_UP_MS + OF_PAIR_MS * len(detections) ** 2, 0.5 * SLICES_A_FRAME)
         self._filter, self._landmark = following, landmark
 
-    def _restart(self, estimate: Estimate) -> None:
-        self._landmark = estimate.landmark.copy()
-        self._filter.restart(estimate, self._noise, self._problem)
-
     def _can_align(self, *, final: bool = False) -> bool:
         """Return whether most landmarks of the map seen so far have its relative positions; two at the end."""
         assert self._prior_map is not None
@@ -520,7 +516,8 @@ class StreamingSlam:
         )
         done = self._n_poses
         self.online_pose[:done] = se2.compose(pose_map_world, self.online_pose[:done])
-        self._restart(moved)
+        self._landmark = moved.landmark.copy()
+        self._filter.restart(moved, self._noise, self._problem)
         self._job = self._relinearised(learn=True)
         self._owed_ms = self._a_frame_ms()
         self.work()
@@ -618,7 +615,7 @@ def _rejoined(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> E
         piece = (problem.pose_row >= first) & (problem.pose_row < last)
         at = sighted_at(estimate.pose[problem.pose_row], problem.reading, estimate.states, problem.mount)
         mine, theirs = (
-            _middles(problem.landmark_row[some], at[some], len(estimate.landmark)) for some in (piece, ~piece)
+            middles(problem.landmark_row[some], at[some], len(estimate.landmark)) for some in (piece, ~piece)
         )
         both = np.flatnonzero(np.isfinite(mine[:, 0]) & np.isfinite(theirs[:, 0]))
         motion, agree = consensus(mine[both], theirs[both])
@@ -676,8 +673,8 @@ def silent_links(problem: Problem, estimate: Estimate, loose_rad: float) -> Bool
     return np.asarray(floor[:, 2, 2] > loose_rad**2)
 
 
-def _middles(row: IntArray, at: FloatArray, count: int) -> FloatArray:
-    """(L, 2) medians of positions (M, 2) of landmarks (M,); nan of those with none."""
+def middles(row: IntArray, at: FloatArray, count: int) -> FloatArray:
+    """Return (L, 2) medians of positions (M, 2) of landmarks (M,); nan of those with none."""
     middle = np.full((count, 2), np.nan)
     for j in np.unique(row):
         middle[j] = np.median(at[row == j], axis=0)
@@ -699,13 +696,10 @@ def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray, fewest: 
     sightings = np.bincount(problem.landmark_row, minlength=len(estimate.landmark))
     agreeing = np.bincount(problem.landmark_row, weights=weights > 0.5, minlength=len(estimate.landmark))
     # a vote would only set a landmark of a prior map against that map
-    disputed = (sightings >= fewest) & (agreeing < 0.5 * sightings) & ~problem.mapped
-    lost: IntArray = np.flatnonzero(disputed).astype(np.int64)
-    if len(lost) == 0:
+    disputed: BoolArray = (sightings >= fewest) & (agreeing < 0.5 * sightings) & ~problem.mapped
+    if not disputed.any():
         return estimate
-    landmark = estimate.landmark.copy()
-    for j in lost:
-        mine = np.flatnonzero(problem.landmark_row == j)
-        at = sighted_at(estimate.pose[problem.pose_row[mine]], problem.reading[mine], estimate.states, problem.mount)
-        landmark[j] = np.median(at, axis=0)
-    return Estimate(estimate.pose, landmark, estimate.states)
+    theirs = problem.seeing(disputed[problem.landmark_row])
+    at = sighted_at(estimate.pose[theirs.pose_row], theirs.reading, estimate.states, problem.mount)
+    middle = middles(theirs.landmark_row, at, len(disputed))
+    return replace(estimate, landmark=np.where(disputed[:, None], middle, estimate.landmark))

@@ -144,8 +144,8 @@ class PlanarVisit:
     def watched(self, entry: Extended, config: LivingConfig) -> Watch:
         """Return at which places of the map the session looked, by the nominal field of view."""
         visit = self.solved
-        recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
-        trajectory = of_slam.trajectory(prepared, outcome, recording, "")
+        recording, prepared = visit.recording, visit.prepared
+        trajectory = of_slam.trajectory(visit, "")
         stamps = recording.frames.stamp_s
         frames = np.flatnonzero((stamps >= visit.start_s) & (stamps <= visit.end_s + 1e-9)).astype(np.int64)
         pose = trajectory.pose_world_robot[of_slam.rows_at(trajectory, recording, frames)]

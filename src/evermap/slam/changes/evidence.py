@@ -20,7 +20,7 @@ from evermap.slam.calibration import SLOPE, CalibrationPrior
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import sighted_at
+from evermap.slam.streaming import middles, sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
 TINY_INFORMATION = 1e-6
@@ -252,34 +252,23 @@ def _piece(
     pose_row = problem.pose_row[used]
     count = len(landmark)
     part = replace(
-        problem,
+        problem.seeing(used),
         stamp_s=problem.stamp_s[start:last],
         pose_row=pose_row - start,
         landmark_row=row.astype(np.int64),
-        reading=problem.reading[used],
-        sigma_given=problem.sigma_given[used],
         prior=CalibrationPrior(prior.mean, np.full(N_STATES, np.inf), prior.free),
         start_information=0.0,
         landmark_mean=np.zeros((count, 2)),
         landmark_information=sparse.csr_array((2 * count, 2 * count)),
     )
-    position = _copies(part, estimate, pose_row, landmark)
+    sighted = sighted_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
+    position = middles(part.landmark_row, sighted, count)  # of the landmarks by the poses of this window alone
     local = Estimate(estimate.pose[start:last], position, estimate.states)
     ends = np.unique([0, last - start - 1])
     information, right = Smoother(part, noise).information(local, ends[::-1])
     if len(ends) == 1:  # a window of one pose: it is the first and there is no other
         information, right = np.pad(information, ((3, 0), (3, 0))), np.pad(right, (3, 0))
     return _Piece(landmark, position, information, right)
-
-
-def _copies(part: Problem, estimate: Estimate, pose_row: IntArray, landmark: IntArray) -> FloatArray:
-    """Return the landmarks of a window by its poses alone: the median of their sightings."""
-    if len(landmark) == 0:
-        return np.zeros((0, 2))
-    points = sighted_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
-    order = np.argsort(part.landmark_row, kind="stable")
-    groups = np.split(points[order], np.cumsum(np.bincount(part.landmark_row, minlength=len(landmark)))[:-1])
-    return np.array([np.median(group, axis=0) for group in groups]).reshape(-1, 2)
 
 
 def in_sensor_metres(estimate: Estimate, prior: CalibrationPrior) -> Estimate:

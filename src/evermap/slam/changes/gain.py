@@ -171,14 +171,9 @@ def _products(
 
 @kernel
 def _columns_of(
-    value: FloatArray,
-    scale: FloatArray,
-    width: IntArray,
-    first: IntArray,
-    start: IntArray,
-    column: FloatArray,
+    value: FloatArray, scale: FloatArray, width: IntArray, first: IntArray, start: IntArray, column: FloatArray,
     tangent: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Columns (C,) at the unknowns (Y,), and their derivatives (C, Y)."""
     tangent[:] = 0.0
     for g in range(1, len(width)):

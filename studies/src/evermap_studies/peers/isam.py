@@ -16,7 +16,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from evermap.geometry import se2
 from evermap.slam.kernels import N_STATES
-from evermap.slam.motion import Motion
+from evermap.slam.local_filter import Motion
 from evermap.slam.problem import ConditionalPrior, Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.types import FloatArray, IntArray
