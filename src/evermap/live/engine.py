@@ -205,9 +205,8 @@ class Engine:
         Raises:
             InputError: values that cannot be, or so late that frames after it are processed.
         """
-        self._inbox.detections(
-            stamp_s, (landmark_id, range_m, bearing_rad, class_name, sigma_range_m, sigma_bearing_rad)
-        )
+        columns = landmark_id, range_m, bearing_rad, class_name, sigma_range_m, sigma_bearing_rad
+        self._inbox.detections(stamp_s, columns)
 
     @single_threaded()
     def step(self) -> Now:

@@ -100,9 +100,8 @@ class Inbox:
         Raises:
             InputError: no finite numbers, or the stamp is before frames that were processed.
         """
-        for quantity, value in zip(
-            (STAMP_S, FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS), (stamp_s, *velocity), strict=True
-        ):
+        quantities = STAMP_S, FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS
+        for quantity, value in zip(quantities, (stamp_s, *velocity), strict=True):
             _check(quantity, value)
         forward_mps, lateral_mps, angular_radps = (float(part) for part in velocity)
         row = float(stamp_s), forward_mps, lateral_mps, angular_radps
@@ -142,9 +141,8 @@ class Inbox:
                     break
                 frame = self._pending.pop(0)
                 before_s, self.settled_s = self.settled_s, stamp_s
-                found.append(
-                    (frame, self._window(min(stamp_s, max(before_s, self.first_s))), self._keep(frame, before_s))
-                )
+                window = self._window(min(stamp_s, max(before_s, self.first_s)))
+                found.append((frame, window, self._keep(frame, before_s)))
         return found
 
     def window(self) -> FloatArray:
@@ -254,10 +252,8 @@ class Inbox:
     def _rows(self, ids: Any, ranges: Any, bearings: Any, classes: Any, *sigmas: Any) -> FloatArray:
         names = [ids] if isinstance(ids, str) else list(ids)
         rows = np.full((len(names), 6), np.nan)
-        rows[:, 0] = [self._number(name) for name in names]
-        if classes is None:
-            rows[:, 3] = UNKNOWN
-        else:
+        rows[:, 0], rows[:, 3] = [self._number(name) for name in names], UNKNOWN
+        if classes is not None:
             rows[:, 3] = [self._class(name) for name in _column(list(classes), len(names), "class_name")]
         given = zip((1, 2, 4, 5), (RANGE_M, BEARING_RAD, SIGMA_RANGE_M, SIGMA_BEARING_RAD), strict=True)
         for (column, quantity), values in zip(given, (ranges, bearings, *sigmas), strict=True):
@@ -303,11 +299,7 @@ def joined(parts: Sequence[Recording]) -> Recording:
 
 
 def _recorded(
-    about: Recording,
-    odometry: FloatArray,
-    frames: list[LiveFrame],
-    classes: tuple[str, ...],
-    texts: dict[int, str],
+    about: Recording, odometry: FloatArray, frames: list[LiveFrame], classes: tuple[str, ...], texts: dict[int, str]
 ) -> Recording:
     stamp_s, forward_mps, lateral_mps, angular_radps = _columns(odometry)
     rows = np.concatenate([np.zeros((0, 6)), *(one.rows for one in frames)])

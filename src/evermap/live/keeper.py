@@ -131,9 +131,8 @@ class Keeper:
                 continue
             del self._jobs[name]
             if (error := job.exception()) is not None:
-                defect = (
-                    "" if isinstance(error, EvermapError | OSError) else f"a bug in evermap: {type(error).__name__}: "
-                )
+                known = isinstance(error, EvermapError | OSError)
+                defect = "" if known else f"a bug in evermap: {type(error).__name__}: "
                 self._told.warnings.append(f"{name}: {defect}{error}")
         if self._child is None or self._child.poll() is None:
             return False
@@ -217,9 +216,8 @@ class Keeper:
 def _check_fits(living: LivingMap, clock: Clock) -> None:
     """Raise `InputError` for a map in space, or of another clock."""
     if living.dim != 2:
-        raise InputError(
-            "a map in space", field="map", hint="sessions in space are solved when they end: enter_session"
-        )
+        hint = "sessions in space are solved when they end: enter_session"
+        raise InputError("a map in space", field="map", hint=hint)
     if len(living.places) and living.clock != clock:
         problem = f"stamps are on the clock '{clock}', those of the map on '{living.clock}'"
         hint = f"clock = '{living.clock}' in sensor.toml, or evermap.Engine(..., clock='{living.clock}')"

@@ -240,10 +240,9 @@ class Listener:
         placed = how.stated_mount or not remarks  # else where `sensor.toml` says
         names: dict[int, str] = {}
         labels = sorted(set(seen.label) - {""})
+        columns = seen, np.zeros_like(seen.look), seen.look, labels, names
         try:
-            found = detections_of(
-                _NO_PATH, settings, (sensor,), (seen, np.zeros_like(seen.look), seen.look, labels, names), remarks
-            )
+            found = detections_of(_NO_PATH, settings, (sensor,), columns, remarks)
         except EvermapError as error:
             raise InputError(f"{topic}: {error.problem}", hint=error.hint) from None
         for remark in remarks:
@@ -454,12 +453,8 @@ class Teller:
             return
         self._stamp_s = now.stamp_s
         ros, here = self._ros, now.pose_world_robot
-        path = replace(
-            now.online,
-            stamp_s=np.array([now.stamp_s]),
-            pose_world_robot=here[None],
-            covariance=now.covariance[None],
-        )
+        stamp_s, covariance = np.array([now.stamp_s]), now.covariance[None]
+        path = replace(now.online, stamp_s=stamp_s, pose_world_robot=here[None], covariance=covariance)
         message = ros.posed(now.stamp_s, in_space(here[None])[0], ros_covariance(path)[0])
         self._send(_POSE, message, now.stamp_s)
         if driven is not None:

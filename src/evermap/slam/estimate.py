@@ -66,13 +66,7 @@ def solve(
 ) -> Solved:
     """Estimate poses, landmarks, calibration and noise of a recording.
 
-    Args:
-        recording: cleaned, with known identities.
-        settings: of the estimator.
-        prior_map: landmarks to localise in; None maps from scratch.
-        remarks: on the recording.
-        realtime: process at the recording's pace.
-        progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.
+    As `pipeline.run_slam`, of a cleaned recording with known identities; `remarks` on it are the first warnings.
 
     Raises:
         DataError: fewer than two frames with a landmark of known identity.

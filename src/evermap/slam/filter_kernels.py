@@ -187,19 +187,9 @@ def innovations(
     pose: FloatArray, states: FloatArray, covariance: FloatArray, place: FloatArray, slot: Any, own: FloatArray,
     reading: FloatArray, sigma: FloatArray, mount: FloatArray, free: Any,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
-    """Compare K detections with one place each, each pair separately: `S = H P H' + R`.
+    """Compare K detections, range and bearing, with one place (2,) each, each pair separately: `S = H P H' + R`.
 
-    Args:
-        pose: (3,) of the state.
-        states: (11,) of it.
-        covariance: of it.
-        place: (K, 2).
-        slot: (K,) where the place stands in the covariance, -1 where it does not.
-        own: (K, 2, 2) covariance of places without a slot.
-        reading: (K, 2) range and bearing.
-        sigma: (K, 2) their noise.
-        mount: (3,) pose of the sensor on the robot.
-        free: (11,) which calibration states are estimated.
+    `slot` (K,) says where a place stands in the covariance; where it is -1, `own` (K, 2, 2) is that of the place.
 
     Returns:
         (K,) squared Mahalanobis distance, (K,) `log |S|`, (K, 2) residual and (K, 2, 12) its derivatives by pose,

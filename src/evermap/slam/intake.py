@@ -83,12 +83,9 @@ def prepare(
     used = np.flatnonzero(~anonymous & ~outside)
     pose_frame, pose_row = np.unique(detections.frame[used], return_inverse=True)
     if len(pose_frame) < 2:
-        raise DataError(
-            f"{recording.name}: landmarks of known identity were seen in {len(pose_frame)} frames, at least 2 needed",
-            hint=WITHOUT_IDS
-            if anonymous.all()
-            else "check landmark ids, and that detections and odometry share one clock",
-        )
+        seen = f"landmarks of known identity were seen in {len(pose_frame)} frames, at least 2 needed"
+        hint = "check landmark ids, and that detections and odometry share one clock"
+        raise DataError(f"{recording.name}: {seen}", hint=WITHOUT_IDS if anonymous.all() else hint)
     landmark_id, landmark_row = np.unique(detections.landmark_id[used], return_inverse=True)
     start_s = float(odometry.stamp_s[0])
     velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
@@ -112,14 +109,11 @@ def prepare(
 
 def beliefs(sensor: Sensor, settings: SlamConfig) -> tuple[CalibrationPrior, Noise]:
     """Return the prior of the calibration states and the noise levels before the first frame."""
-    prior = CalibrationPrior.from_settings(
-        settings.calibration, calibrated=settings.sensor_model == "calibrated", sensor=sensor
-    )
+    calibrated = settings.sensor_model == "calibrated"
+    prior = CalibrationPrior.from_settings(settings.calibration, calibrated=calibrated, sensor=sensor)
     start = start_noise(settings.noise, settings.outlier_log_odds)
-    nominal = [sensor.sigma_range_m, sensor.sigma_bearing_rad]
-    detection = np.array(
-        [default if given is None else given for given, default in zip(nominal, start.detection, strict=True)]
-    )
+    nominal = np.array([sensor.sigma_range_m, sensor.sigma_bearing_rad], dtype=np.float64)  # None becomes nan
+    detection = np.where(np.isnan(nominal), start.detection, nominal)
     return prior, replace(start, detection=detection, odometry=start.odometry * settings.odometry_noise_factor)
 
 

@@ -84,8 +84,7 @@ class KnownPlaces:
         """Return (L,) row of the most probable place of every landmark, by id."""
         order = np.lexsort((self.p_here, self.landmark_id))
         last = np.append(self.landmark_id[1:] != self.landmark_id[:-1], True)[: len(order)]
-        rows: IntArray = order[last]
-        return rows
+        return np.asarray(order[last])
 
 
 class Neighbourhood:

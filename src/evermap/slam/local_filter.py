@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -122,16 +123,12 @@ class LocalFilter:
     @property
     def active(self) -> IntArray:
         """Rows of the places in the covariance."""
-        active: IntArray = self._row[self._row != UNKNOWN]
-        return active
+        return np.asarray(self._row[self._row != UNKNOWN])
 
     def lean_on(self, position: FloatArray, joint: Callable[[IntArray], FloatArray], *, tied: bool = True) -> None:
-        """Take places (L, 2) from a solution or a map; `joint` returns the covariance (2 k, 2 k) of some rows of it.
+        """Take places (L, 2), nan where not known, from a solution or a map.
 
-        Args:
-            position: where they are; nan where they are not known.
-            joint: of their covariance; called as `joint(rows)`.
-            tied: False where all are independent.
+        `joint(rows)` returns the covariance (2 k, 2 k) of some of them; where all are independent they are not `tied`.
         """
         self._given_position, self._given_joint = position, joint
         self._neighbours = NEIGHBOURS if tied else 0
@@ -200,14 +197,9 @@ class LocalFilter:
         given: IntArray = NO_PLACES,
         gain: FloatArray = NO_GAIN,
     ) -> None:
-        """Put a new place at `place` (2,).
+        """Put a new place, of all places `row`, at `place` (2,).
 
-        Args:
-            row: of all places.
-            place: where it is.
-            spread: (2, 2) its covariance, given others.
-            given: (k,) these, in the covariance.
-            gain: (2, 2 k) how it follows them.
+        Its covariance is `spread` (2, 2), `given` others (k,), in the covariance, which it follows by `gain` (2, 2 k).
         """
         self.know_of(row + 1)
         self._make_room(1)
@@ -218,12 +210,7 @@ class LocalFilter:
         """Initialise a place from a sighting at the newest pose, in a map whose places are only considered.
 
         It is as wrong as the pose is now, and stays there: the pose is held by it, but gets no better than it was.
-
-        Args:
-            row: of all places, behind those of the map.
-            place: (2,) where it is.
-            by_pose: (2, 14) its derivatives by the pose and the calibration states.
-            spread: (2, 2) covariance by the reading's own noise.
+        `by_pose` (2, 14) are its derivatives by the pose and the calibration states, `spread` (2, 2) is of the reading.
         """
         self.meet(row, place, spread)
         own = slice(AT_PLACES + 2 * int(self._slot[row]), AT_PLACES + 2 * int(self._slot[row]) + 2)
@@ -234,14 +221,7 @@ class LocalFilter:
     def compare(
         self, rows: IntArray, reading: FloatArray, sigma: FloatArray, own: FloatArray = NOWHERE
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Compare detections with a place each, as `filter_kernels.innovations`.
-
-        Args:
-            rows: (k,) the places.
-            reading: (k, 2) range and bearing.
-            sigma: (k, 2) their noise.
-            own: (k, 2, 2) covariance of the places, where some are not in that of the filter.
-        """
+        """Compare detections (k, 2) with a place each, as `filter_kernels.innovations`."""
         return innovations(
             self.pose, self.states, self.covariance, self.position[rows], self._slot[rows], own, reading, sigma,
             self._mount, self._free,
@@ -265,10 +245,8 @@ class LocalFilter:
 
     def know_of(self, count: int) -> None:
         """Make room for so many places in all; nothing is known of new ones."""
-        more = count - len(self.position)
-        if more > 0:
-            self.position = np.pad(self.position, ((0, more), (0, 0)), constant_values=np.nan)
-            self._slot = np.pad(self._slot, (0, more), constant_values=-1)
+        self.position = grown(self.position, count)
+        self._slot = grown(self._slot, count, -1)
 
     def _make_room(self, count: int) -> None:
         """Have so many free slots: new ones as long as there are few, else those that were not used for longest."""
@@ -365,8 +343,15 @@ def columns(slots: IntArray) -> IntArray:
     return np.asarray(AT_PLACES + (2 * slots[:, None] + [0, 1]).ravel(), dtype=np.int64)
 
 
+def grown(rows: Any, count: int, missing: float = np.nan) -> Any:
+    """Return rows, so many at least: those that are missing have a value for that; the same array where none is."""
+    more = count - len(rows)
+    if more <= 0:
+        return rows
+    return np.pad(rows, [(0, more), *[(0, 0)] * (rows.ndim - 1)], constant_values=missing)
+
+
 def _nearest(position: FloatArray, to: FloatArray, count: int) -> IntArray:
     """Return rows of the nearest points, the nearest first."""
     away = ((position - to) ** 2).sum(axis=1)
-    near: IntArray = np.argsort(away, kind="stable")[:count]
-    return near
+    return np.asarray(np.argsort(away, kind="stable")[:count])

@@ -75,7 +75,9 @@ def localize(
     start_s = float(odometry.stamp_s[0])
     velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
     drive = Drive.from_rows(odometry.stamp_s - start_s, velocity, config.slam.odometry)
-    landmarks, places = _existing(landmarks, joint_m2)
+    covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2
+    places = KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists).existing()
+    landmarks = landmarks[np.flatnonzero(landmarks.p_exists > 0.0)]
     warm_up()
     localizer = Localizer(
         places, recording.sensor, prior.gaussian(), noise, settings=config.slam.localize, looks=config.living.looks
@@ -83,19 +85,9 @@ def localize(
     frame = np.flatnonzero((stamps >= start_s) & (stamps <= odometry.stamp_s[-1]))
     run = _feed(localizer, recording, frame, drive, realtime=realtime, progress=progress)
     if not run.placed.any():
-        raise DataError(
-            f"{recording.name}: cannot localise in the map: too few of the detected landmarks have the relative "
-            f"positions of the map",
-            hint="check that it is the map of this place",
-        )
+        problem = "cannot localise in the map: too few of the detected landmarks have the relative positions of the map"
+        raise DataError(f"{recording.name}: {problem}", hint="check that it is the map of this place")
     return _result(recording, run, localizer, prior, drive, landmarks, places)
-
-
-def _existing(landmarks: Landmarks, joint_m2: JointCovariance | None) -> tuple[Landmarks, KnownPlaces]:
-    """Return the landmarks that may exist, and the same as the localiser wants them."""
-    covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2
-    places = KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists).existing()
-    return landmarks[np.flatnonzero(landmarks.p_exists > 0.0)], places
 
 
 @dataclass(frozen=True, slots=True)

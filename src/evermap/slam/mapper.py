@@ -151,6 +151,7 @@ class Mapper:
         return replace(found, covariance_m2=covariance, p_exists=np.full(len(known), p_exists))
 
     def _grow(self, stamp_s: float, seen: FrameSightings, known: IntArray) -> None:
+        """Pass the rows so far and the `known` ones of a frame to the stream."""
         names = seen.landmark_id[known].tolist()
         for name in names:
             self._row.setdefault(name, len(self._row))
@@ -159,10 +160,6 @@ class Mapper:
         self._landmark_row.add([self._row[name] for name in names])
         self._reading.add(seen.reading[known])
         self._sigma.add(seen.sigma_given[known])
-        self._told()
-
-    def _told(self) -> None:
-        """Pass the present rows to the stream."""
         rows, new = self._odometry.rows, len(self._row) - len(self._problem.landmark_mean)
         information = self._problem.landmark_information
         self._problem = replace(

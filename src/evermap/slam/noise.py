@@ -26,12 +26,7 @@ from evermap.types import FloatArray
 
 
 def start_noise(settings: NoiseConfig, outlier_log_odds: float = 7.0) -> Noise:
-    """Return the levels that a run starts from; wide: too little noise would lock the first mistake in.
-
-    Args:
-        settings: the levels.
-        outlier_log_odds: see `Noise`.
-    """
+    """Return the levels that a run starts from; wide: too little noise would lock the first mistake in."""
     return Noise(
         detection=np.array([settings.sigma_range_m, settings.sigma_bearing_rad]),
         odometry=np.array(
@@ -69,15 +64,10 @@ class NoiseFit:
 def refine_noise(
     problem: Problem, estimate: Estimate, marginals: Marginals, weights: FloatArray, noise: Noise, start: Noise = START
 ) -> NoiseFit:
-    """Take one step towards the restricted-likelihood noise levels.
+    """Take one step from `noise` towards the restricted-likelihood noise levels.
 
-    Args:
-        problem: the measurements.
-        estimate: the optimum under `noise`.
-        marginals: covariances at `estimate`, made with `noise`.
-        weights: (M,) inlier probabilities.
-        noise: levels so far.
-        start: levels that `start.pseudo_count` imaginary residuals vouch for.
+    `estimate` is the optimum under `noise`, with its covariances and the inlier probabilities (M,); `start` are levels
+    that `start.pseudo_count` imaginary residuals vouch for.
     """
     pseudo, residual = start.pseudo_count, detection_residuals(problem, estimate)
     learned = np.where(np.isfinite(problem.sigma_given), 0.0, weights[:, None])
@@ -135,8 +125,7 @@ def _inflation(fisher: FloatArray) -> FloatArray:
     """Factor by which each variance is known less well because others act on the same residuals (>= 1)."""
     scale = np.sqrt(np.maximum(np.diag(fisher), 1e-300))
     correlation = fisher / np.outer(scale, scale) + 1e-3 * np.eye(len(fisher))
-    inflation: FloatArray = np.maximum(np.diag(np.linalg.inv(correlation)), 1.0)
-    return inflation
+    return np.asarray(np.maximum(np.diag(np.linalg.inv(correlation)), 1.0))
 
 
 @kernel

@@ -96,17 +96,10 @@ def linearise_interval(
     intervals: Intervals, i: int, pose: FloatArray, variance: FloatArray, free: Any, residual: FloatArray,
     jacobian: FloatArray, information: FloatArray,
 ) -> None:  # fmt: skip
-    """Linearise the odometry of interval `i` at poses `i` and `i + 1`.
+    """Linearise the odometry of interval `i` at poses `i` and `i + 1` of (N, 3), by the `free` (11,) states.
 
-    Args:
-        intervals: the odometry.
-        i: which interval.
-        pose: (N, 3) all poses.
-        variance: (5,) of each kind of noise.
-        free: (11,) which calibration states are.
-        residual: (3,) out, that of `kernels.odometry_residual`.
-        jacobian: (3, 10) out, its derivatives by both poses and by delay, scales and slip.
-        information: (3, 3) out, inverse covariance.
+    Filled in are `residual` (3,) of `kernels.odometry_residual`, its derivatives (3, 10) by both poses and by delay,
+    scales and slip, and the information (3, 3) of noise with a variance (5,) of each kind.
     """
     odometry_covariance(intervals.noise[i], intervals.floor[i], variance, information)
     invert_3x3(information, information)

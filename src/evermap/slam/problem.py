@@ -151,8 +151,7 @@ class ConditionalPrior:
 
     def place(self, landmark: FloatArray, landmark_mean: FloatArray) -> FloatArray:
         """Return (2,) where the landmark is expected with the others at `landmark` (L, 2)."""
-        place: FloatArray = self.mean + self.gain @ (landmark[self.given] - landmark_mean[self.given]).ravel()
-        return place
+        return np.asarray(self.mean + self.gain @ (landmark[self.given] - landmark_mean[self.given]).ravel())
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,8 +198,7 @@ class Problem:
     @property
     def mapped(self) -> BoolArray:
         """(L,) landmarks that a prior map holds."""
-        held: BoolArray = self.landmark_information.diagonal()[::2] > 0.0
-        return held
+        return np.asarray(self.landmark_information.diagonal()[::2] > 0.0)
 
     def with_places(self, count: int) -> Problem:
         """Return the problem with room for so many places; new ones have no prior."""
@@ -311,8 +309,7 @@ class Estimate:
     @property
     def known(self) -> BoolArray:
         """(L,) landmarks that have a position."""
-        known: BoolArray = np.isfinite(self.landmark[:, 0])
-        return known
+        return np.asarray(np.isfinite(self.landmark[:, 0]))
 
 
 @dataclass(frozen=True, slots=True)

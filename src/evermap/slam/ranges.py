@@ -62,18 +62,16 @@ def with_bearings(recording: Recording, settings: SlamConfig) -> tuple[Recording
         return recording, ()
     if settings.unknown_ids or np.any(blind & (seen.landmark_id == UNKNOWN)):
         problem = f"{recording.name}: detections without a bearing need a landmark_id"
-        raise DataError(
-            problem, field="bearing_rad", hint="the number of the beacon; leave out what associates by geometry"
-        )
+        hint = "the number of the beacon; leave out what associates by geometry"
+        raise DataError(problem, field="bearing_rad", hint=hint)
     stamp_s, odometry_s = frames[seen.frame], recording.odometry.stamp_s
     rows = np.flatnonzero(blind & (stamp_s >= odometry_s[0]) & (stamp_s <= odometry_s[-1]))
     eye, way_m = _eyes(recording, stamp_s[rows], settings)
     bearing, sigma = seen.bearing_rad.copy(), seen.sigma_bearing_rad.copy()
     bearing[blind], sigma[blind] = 0.0, ANY_BEARING_RAD
     landmark_id = seen.landmark_id.copy()
-    offset_m = float(
-        CalibrationPrior.from_settings(settings.calibration, calibrated=True, sensor=recording.sensor).sigma[BIAS]
-    )
+    prior = CalibrationPrior.from_settings(settings.calibration, calibrated=True, sensor=recording.sensor)
+    offset_m = float(prior.sigma[BIAS])
     noise_m = recording.sensor.sigma_range_m or settings.noise.sigma_range_m
     for name in np.unique(seen.landmark_id[rows]).tolist():
         mine = np.flatnonzero(seen.landmark_id[rows] == name)

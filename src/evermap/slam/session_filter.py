@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evermap.slam.filter_kernels import BELIEVED, HEAVY
-from evermap.slam.local_filter import NO_PLACES, LocalFilter, Motion
+from evermap.slam.local_filter import NO_PLACES, LocalFilter, Motion, grown
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.types import FloatArray, IntArray
@@ -35,13 +35,9 @@ class SessionFilter(LocalFilter):
         self._new_pose: list[FloatArray] = []
 
     def restart(self, estimate: Estimate, noise: Noise, problem: Problem, marginals: Marginals | None = None) -> None:
-        """Restart at `estimate`, an optimum of the first poses, with other noise, other places or other priors.
+        """Restart at `estimate`, an optimum of the first poses and all places that they saw.
 
-        Args:
-            estimate: values of the first poses, and of all places that they saw.
-            noise: standard deviations from here on.
-            problem: the measurements.
-            marginals: covariances at `estimate`, where they are known already.
+        From here on with other noise, other places or other priors; `marginals` where they are known already.
         """
         self.problem, self._noise, self._free = problem, noise, problem.prior.free
         n = len(estimate.pose)
@@ -70,11 +66,9 @@ class SessionFilter(LocalFilter):
         return self.compare(places, *self._readings(detections))[:2]
 
     def add(self, row: int, landmark: FloatArray) -> None:
-        """Add the detections of pose `row`, to which the filter was driven.
+        """Add the detections of pose `row`, one more than the last, to which the filter was driven.
 
-        Args:
-            row: the pose, one more than the last.
-            landmark: (L, 2) positions of places, used for those that are seen for the first time.
+        Places that are seen for the first time are at `landmark` (L, 2).
         """
         detections = self.problem.detections_of(row)
         rows = self.problem.landmark_row[detections]
@@ -91,8 +85,7 @@ class SessionFilter(LocalFilter):
 
     def estimate(self) -> Estimate:
         """Return values of everything so far; poses since the last restart as they were when they were added."""
-        landmark = np.full((len(self.problem.landmark_mean), 2), np.nan)
-        landmark[: len(self.position)] = self.position
+        landmark = grown(self.position, len(self.problem.landmark_mean)).copy()
         return Estimate(np.vstack([self._old_pose, *self._new_pose]), landmark, self.states.copy())
 
     def _readings(self, detections: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -344,9 +344,7 @@ class Smoother:
         factors = Factors(
             np.append(0, np.cumsum(np.concatenate(width))).astype(np.int64),
             np.concatenate([part.ravel() for part in tied]).astype(np.int64),
-            np.concatenate(
-                [np.full(n - 1, 3), np.full(len(place), 2), [3], np.array([len(root) for root in roots], dtype=int)]
-            ).astype(np.int64),
+            np.append(np.repeat([3, 2, 3], [n - 1, len(place), 1]), [len(root) for root in roots]).astype(np.int64),
             np.concatenate([leaf_of_pose[steps], leaf_of_pose[problem.pose_row], [0], prior_leaf]).astype(np.int64),
         )
         yield MS * len(place)

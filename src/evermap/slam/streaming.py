@@ -22,7 +22,7 @@ from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior, needed, seated
 from evermap.slam.filter_kernels import told
 from evermap.slam.kernels import N_STATES
-from evermap.slam.local_filter import Motion
+from evermap.slam.local_filter import Motion, grown
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Drive, Estimate, Marginals, Noise, Problem, independent
@@ -215,16 +215,14 @@ class StreamingSlam:
         Args:
             problem: all so far; rows that were there stay, new landmarks come last.
         """
-        poses, detections = (len(rows) for rows in (self.online_pose, self.nis))
+        poses, detections = len(self.online_pose), len(self.nis)
         if len(problem.stamp_s) > poses:  # room for as many again: a frame must not cost what was before it
-            more = max(len(problem.stamp_s), 2 * poses) - poses
-            self.online_pose = np.pad(self.online_pose, ((0, more), (0, 0)), constant_values=np.nan)
-            self.online_covariance = np.pad(self.online_covariance, ((0, more), *[(0, 0)] * 2), constant_values=np.nan)
+            room = max(len(problem.stamp_s), 2 * poses)
+            self.online_pose = grown(self.online_pose, room)
+            self.online_covariance = grown(self.online_covariance, room)
         if len(problem.pose_row) > detections:
-            more = max(len(problem.pose_row), 2 * detections) - detections
-            self.nis = np.pad(self.nis, (0, more), constant_values=np.nan)
-        new = len(problem.landmark_mean) - len(self._landmark)
-        landmark = np.pad(self._landmark, ((0, new), (0, 0)), constant_values=np.nan) if new else self._landmark
+            self.nis = grown(self.nis, max(len(problem.pose_row), 2 * detections))
+        landmark = grown(self._landmark, len(problem.landmark_mean))
         self._adopt(replace(problem, prior=self._problem.prior), landmark)
         self._filter.problem = self._problem
 
@@ -315,13 +313,9 @@ class StreamingSlam:
     def _converged(
         self, problem: Problem, estimate: Estimate, noise: Noise, near: Smoother | None = None
     ) -> tuple[Smoother, Estimate, NoiseFit]:
-        """The optimum and its noise levels, in turns until neither changes.
+        """The optimum and its noise levels from these values, in turns until neither changes.
 
-        Args:
-            problem: the measurements.
-            estimate: where to begin.
-            noise: levels to begin with.
-            near: of the same problem but for its prior, where these were found: it is known what is an outlier.
+        They were found by the smoother `near`, of the same problem but for its prior: it is known what is an outlier.
         """
         fit, ahead = None, Extrapolation()
         smoother = Smoother(problem, noise, robust=self._robust) if near is None else near
@@ -363,19 +357,16 @@ class StreamingSlam:
         landmark_row = self._problem.landmark_row.copy()
         landmark_row[detections] = places
         count = max(len(self._landmark), int(places.max()) + 1)
-        new = ((0, count - len(self._landmark)), (0, 0))
-        self._adopt(
-            replace(self._problem, landmark_row=landmark_row).with_places(count),
-            np.pad(self._landmark, new, constant_values=np.nan),
-        )
+        problem = replace(self._problem, landmark_row=landmark_row).with_places(count)
+        self._adopt(problem, grown(self._landmark, count))
         self._filter.problem = self._problem
 
     def _adopt(self, problem: Problem, landmark: FloatArray) -> None:
         """Other places from here on, perhaps more of them or fewer; the first are the landmarks as before."""
-        missing = len(landmark) - len(self._n_compared)
+        count = len(landmark)
         self._problem, self._landmark = problem, landmark
-        self._n_compared = np.pad(self._n_compared, (0, max(missing, 0)))[: len(landmark)]
-        self._n_surprising = np.pad(self._n_surprising, (0, max(missing, 0)))[: len(landmark)]
+        self._n_compared = grown(self._n_compared, count, 0)[:count]
+        self._n_surprising = grown(self._n_surprising, count, 0)[:count]
 
     def _compare(self, detections: IntArray) -> None:
         landmark = self._problem.landmark_row[detections]
@@ -461,9 +452,7 @@ class StreamingSlam:
         landmark = estimate.landmark.copy()
         for row in counted(n):
             following.problem = self._problem
-            landmark = np.pad(
-                landmark, ((0, len(self._problem.landmark_mean) - len(landmark)), (0, 0)), constant_values=np.nan
-            )
+            landmark = grown(landmark, len(self._problem.landmark_mean))
             if row == self._n_poses:
                 break
             following.drive(following.motion(row))
@@ -535,14 +524,8 @@ def divided(
 ) -> Outcome:
     """Return what a session knows at its optimum, with what only shows together divided as its sensor states it.
 
-    Args:
-        solved: the final optimum, in the graph's metres.
-        prior: of the calibration states as the user means it.
-        p_needed: (11,) probability of each state to be another than stated.
-        noise: levels at which it was solved.
-        revision: the method's last word.
-        aligned: True where lengths and frame are those of a map.
-        others: what other robots say of its lengths (`CalibrationPrior.metre`).
+    `solved` is the final optimum in the graph's metres, `prior` as the user means it, the rest as in `Outcome`;
+    `others` is what other robots say of its lengths (`CalibrationPrior.metre`).
     """
     smoother, estimate, marginals = solved
     believed, worth = prior, smoother.worth(estimate, marginals)
@@ -685,13 +668,7 @@ def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray, fewest: 
     """Move landmarks to the median of their sightings where most sightings disagree with them.
 
     A landmark whose first sighting carried the wrong identity starts in the wrong place, from where all right
-    sightings look like outliers.
-
-    Args:
-        problem: the measurements so far.
-        estimate: where they put everything.
-        weights: (M,) inlier weights of the detections.
-        fewest: sightings that vote, at least.
+    sightings look like outliers. At least `fewest` vote, by inlier weights (M,).
     """
     sightings = np.bincount(problem.landmark_row, minlength=len(estimate.landmark))
     agreeing = np.bincount(problem.landmark_row, weights=weights > 0.5, minlength=len(estimate.landmark))

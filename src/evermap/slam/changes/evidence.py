@@ -184,13 +184,9 @@ def _joined(pieces: Sequence[_Piece]) -> tuple[FloatArray, FloatArray, int]:
 
 
 def compare(evidence: WindowEvidence, mean: FloatArray, covariance: FloatArray, mapped: BoolArray) -> Comparison:
-    """Set the evidence against a map.
+    """Set the evidence against a map of means (L, 2) with covariances (L, 2, 2).
 
-    Args:
-        evidence: of the copies.
-        mean: (L, 2) the map.
-        covariance: (L, 2, 2) its uncertainty.
-        mapped: (L,) landmarks that it holds; for the others only what happens during the session shows.
+    Of landmarks that it does not hold, not `mapped` (L,), only what happens during the session shows.
     """
     seen = np.unique(evidence.landmark)
     column = np.searchsorted(seen, evidence.landmark)

@@ -231,5 +231,4 @@ def log_onset(n_windows: int) -> FloatArray:
     """Return (W,) log prior of the window from which on a group has moved: before the session as likely as within."""
     if n_windows == 1:
         return np.zeros(1)
-    table: FloatArray = np.log(np.append(0.5, np.full(n_windows - 1, 0.5 / (n_windows - 1))))
-    return table
+    return np.asarray(np.log(np.append(0.5, np.full(n_windows - 1, 0.5 / (n_windows - 1)))))

@@ -208,14 +208,7 @@ Search = Callable[[WindowEvidence, Hypotheses | None], tuple[Comparison, Hypothe
 def without_transients(
     evidence: WindowEvidence, position: FloatArray, prior: ChangesConfig, search: Search
 ) -> WindowEvidence:
-    """Return the evidence without copies that are displaced alone.
-
-    Args:
-        evidence: of all copies.
-        position: (L, 2) mapped positions.
-        prior: how changes are distributed.
-        search: how changes are looked for.
-    """
+    """Return the evidence without copies that are displaced alone, from mapped positions (L, 2)."""
     comparison, found = search(evidence, None)
     for _ in range(len(evidence.landmark)):
         copy = np.arange(len(evidence.landmark))
@@ -247,8 +240,7 @@ def _gains(comparison: Comparison, sigma_m: float) -> FloatArray:
     pull = comparison.pull.reshape(count, 2)
     inner = precision + np.eye(2) / sigma_m**2
     solved = np.linalg.solve(inner, pull[:, :, None])[:, :, 0]
-    gains: FloatArray = 0.5 * (pull * solved).sum(axis=1) - 0.5 * np.linalg.slogdet(sigma_m**2 * inner)[1]
-    return gains
+    return np.asarray(0.5 * (pull * solved).sum(axis=1) - 0.5 * np.linalg.slogdet(sigma_m**2 * inner)[1])
 
 
 def _explained_away(
