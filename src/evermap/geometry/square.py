@@ -37,12 +37,9 @@ class SquarePoses(NamedTuple):
 
 
 def square_poses(corner_px: FloatArray, size_m: FloatArray, sensor: SpatialSensor) -> SquarePoses:
-    """Return the poses of square tags in the camera's frame from their corners.
+    """Return the poses of square tags, with edges (M,), in the camera's frame.
 
-    Args:
-        corner_px: (M, 4, 2) in the order of `SpatialDetections.corner_px`.
-        size_m: (M,) length of an edge.
-        sensor: the camera.
+    Corners (M, 4, 2) are in the order of `SpatialDetections.corner_px`.
     """
     corner_px, size_m = np.asarray(corner_px, dtype=np.float64), np.asarray(size_m, dtype=np.float64)
     ray = unproject(corner_px, sensor)

@@ -122,11 +122,9 @@ class Inbox:
             self._in_time(frame.stamp_s, partial(self._put_frame, frame))
 
     def ready(self, delay_s: float, *, everything: bool = False) -> list[tuple[LiveFrame, FloatArray, bool]]:
-        """Take out the frames before which nothing can come any more.
+        """Take out the frames before which nothing can come any more, or everything.
 
-        Args:
-            delay_s: how much later than the frames odometry is needed.
-            everything: all that there are; nothing will come any more.
+        Odometry is needed up to `delay_s` after a frame.
 
         Returns:
             LiveFrame, odometry (n, 4) from some seconds before it until the newest, and whether it is kept for the map.

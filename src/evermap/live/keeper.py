@@ -48,12 +48,7 @@ class News:
 class Keeper:
     """The sessions of a map file, including the current one.
 
-    Args:
-        path: the map; None for a map in memory, of which nothing is kept.
-        config: settings.
-        inbox: the readings.
-        told: what the engine tells.
-        threads: False does everything at once.
+    Of a map in memory, without a path, nothing is kept; without `threads` everything is done at once.
     """
 
     def __init__(self, path: Path | None, config: Config, inbox: Inbox, told: News, *, threads: bool) -> None:

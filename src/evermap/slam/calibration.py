@@ -235,9 +235,7 @@ class CalibrationPrior:
     def metre(self, states: FloatArray, covariance: FloatArray) -> tuple[float, float, float]:
         """Return the log factor by which the graph's lengths are too long according to a robot's priors.
 
-        Args:
-            states: (11,) estimate in which nothing but these priors says what a metre is.
-            covariance: (11, 11) of it.
+        Nothing but these says what a metre is in the states (11,), with a covariance (11, 11).
 
         Returns:
             The logarithm; the variance that it has from the estimate; and the precision that the priors give it.
@@ -302,13 +300,9 @@ class CalibrationPrior:
     def split_angle(self, states: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
         """Divide what the graph holds as bearing bias between the angle of the sensor and the robot's driving askew.
 
-        Args:
-            states: (11,) estimate.
-            covariance: (11, 11) of it.
-
         Returns:
-            States and covariance with the sensor's part alone; the robot's part [rad], to the left of its front where
-            positive, and its standard deviation.
+            States (11,) and covariance with the sensor's part alone; the robot's part [rad], to the left of its front
+            where positive, and its standard deviation.
         """
         if not self._shares_angle:
             return states, covariance, 0.0, 0.0
@@ -332,14 +326,10 @@ class CalibrationPrior:
         return float((1.0 - self.angle_share) * states[BEARING]) if self._shares_angle else 0.0
 
     def front(self, states: FloatArray, mount: FloatArray) -> FloatArray:
-        """Return the pose (3,) of the robot's front relative to the poses of the graph.
+        """Return the pose (3,) of the robot's front relative to the poses of the graph, which has the states (11,).
 
         There the robot drives along its front and the sensor is turned by the whole bearing bias; where it is the robot
         that drives askew, its front is turned the other way. Where the sensor is stays as it was.
-
-        Args:
-            states: (11,) estimate, as the graph has it.
-            mount: (3,) stated pose of the sensor on the robot.
         """
         askew = self._askew(states)
         if askew == 0.0:
@@ -383,13 +373,8 @@ def needed(prior: CalibrationPrior, states: FloatArray, covariance: FloatArray, 
     """Return the (11,) probability that each free state differs from its stated value, nan for others.
 
     Every subset of states is weighed by its evidence against all as stated: of a Gaussian likelihood of the states,
-    which the estimate under the priors holds, in closed form (Savage and Dickey's ratio).
-
-    Args:
-        prior: under which they were estimated.
-        states: (11,) estimate.
-        covariance: (11, 11) of it.
-        worth: (11,) variances by the errors as they were found, in those of independent errors (`Smoother.worth`).
+    which the estimate (11,) under the prior holds, in closed form (Savage and Dickey's ratio). `worth` (11,) are
+    variances by the errors as they were found, in those of independent errors (`Smoother.worth`).
     """
     free = np.flatnonzero(prior.free)
     probability = np.full(N_STATES, np.nan)

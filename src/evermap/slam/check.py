@@ -106,12 +106,9 @@ class Check(Shown):
 
 
 def findings(recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> tuple[Finding, ...]:
-    """Return everything that is odd about a valid recording, the worst first.
+    """Return everything that is odd about a valid recording, the worst first; its truth is not looked at.
 
-    Args:
-        recording: valid, with the sensor's limits in force. Its truth is not looked at.
-        identities: False where the identities of its detections are not used.
-        settings: what counts as odd.
+    The sensor's limits are in force; `identities` is False where those of its detections are not used.
     """
     found = [*_motion(recording, settings), *_limits(recording)]
     if identities:
@@ -431,15 +428,12 @@ def screened(
 ) -> tuple[AnyRecordingT, tuple[str, ...]]:
     """Return a recording without ids that other detections contradict, and remarks on it.
 
-    Args:
-        recording: what a reader returned, or anything else; a recording in space, or without ids to use, as it is.
-        config: settings.
-        prior_map: landmarks that are checked with it.
-        repair: leave out what is impossible in a recording in the plane (`slam.cleaning`), instead of refusing it.
+    A recording in space, or one without ids to use, is returned as it is. With `repair`, what is impossible in a
+    recording in the plane is left out (`slam.cleaning`), instead of refused.
 
     Raises:
-        InputError: no recording, or values that cannot be, in it or in the prior map.
-        DataError: nothing can be estimated from it.
+        InputError: no recording, or values that cannot be, in it or in the prior map. DataError: nothing can be
+        estimated from it.
     """
     from evermap.slam.ranges import with_bearings
     from evermap.slam.space.moving import has_traffic

@@ -303,11 +303,7 @@ def _remark(remarks: list[str], what: str, count: int) -> None:
 
 
 def restored(stamp_s: FloatArray, settings: CleaningConfig) -> tuple[FloatArray, FloatArray]:
-    """Return the stamps of a clock that is never set back.
-
-    Args:
-        stamp_s: (N,) in the order of arrival, anything.
-        settings: what is a step, and what a stray stamp.
+    """Return the stamps (N,) of a clock that is never set back, of any stamps in the order of arrival.
 
     Returns:
         (N,) stamps, nan where one is none; late ones still stand where they arrived. And (K,) by how much the clock was
@@ -340,15 +336,10 @@ def running_median(values: FloatArray, around: int) -> FloatArray:
 
 
 def set_forward(stamp_s: FloatArray, other_s: FloatArray, settings: CleaningConfig) -> tuple[int, float] | None:
-    """Return whether a clock was set forward, judged by another stream of the same robot.
+    """Return whether a clock was set forward, judged by another stream of the same robot; both increase.
 
     It was, if this stream seems to end later than the other, and has a pause of just that length in which the other
     goes on.
-
-    Args:
-        stamp_s: (N,) increasing.
-        other_s: (M,) increasing.
-        settings: what is a step.
 
     Returns:
         First row after the step and the step's size [s]; None if it was not.

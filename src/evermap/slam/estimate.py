@@ -100,12 +100,8 @@ def fed(
 ) -> tuple[FloatArray, bool]:
     """Process frame after frame, at the recording's pace if wanted, until the end or an interrupt.
 
-    Args:
-        stamp_s: (F,) of the frames.
-        step: processes the frame of a row.
-        least: frames without which an interrupt leaves nothing, and is raised.
-        realtime: wait until each frame is due.
-        progress: told after every frame.
+    An interrupt before the end of the `least` frames leaves nothing, and is raised. `step` processes the frame of a
+    row.
 
     Returns:
         (F',) seconds per processed frame, and whether it was interrupted.

@@ -162,12 +162,8 @@ def told(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the pose (3,) of the robot's front in metres, and its covariance (3, 3), in its own frame.
 
-    Args:
-        pose: (3,) of the state.
-        covariance: of the state, the pose first.
-        front: (3,) seen from the pose.
-        scale: metres in a unit of the state.
-        in_map: True in the frame of the poses, False in that of the front at the first of them.
+    The pose of the state is the first in its covariance, `front` (3,) is seen from it, `scale` are metres in a unit of
+    the state. The frame is that of the poses in a map, else that of the front at the first of them.
     """
     seen, back = composed(pose, front), inverted(front)
     if not in_map:

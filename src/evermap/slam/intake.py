@@ -68,15 +68,13 @@ def prepare(
     Raises:
         DataError: fewer than two frames with a landmark of known identity.
     """
-    odometry, detections = recording.odometry, recording.detections
-    if len(odometry) == 0:
-        raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
+    drive, odometry_s, detections = Drive.of(recording, settings), recording.odometry.stamp_s, recording.detections
     stamps = recording.frames.stamp_s
     warnings = list(remarks)
     anonymous = detections.landmark_id == UNKNOWN
     if anonymous.any():
         warnings.append(f"{int(anonymous.sum())} detections without identity not used")
-    moving = (stamps >= odometry.stamp_s[0]) & (stamps <= odometry.stamp_s[-1])
+    moving = (stamps >= odometry_s[0]) & (stamps <= odometry_s[-1])
     outside = ~anonymous & ~moving[detections.frame]
     if outside.any():
         warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
@@ -87,11 +85,10 @@ def prepare(
         hint = "check landmark ids, and that detections and odometry share one clock"
         raise DataError(f"{recording.name}: {seen}", hint=WITHOUT_IDS if anonymous.all() else hint)
     landmark_id, landmark_row = np.unique(detections.landmark_id[used], return_inverse=True)
-    start_s = float(odometry.stamp_s[0])
-    velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
+    start_s = float(odometry_s[0])
     problem = Problem(
         stamp_s=stamps[pose_frame] - start_s,
-        drive=Drive.from_rows(odometry.stamp_s - start_s, velocity, settings),
+        drive=drive,
         pose_row=pose_row.astype(np.int64),
         landmark_row=landmark_row.astype(np.int64),
         reading=np.column_stack([detections.range_m[used], detections.bearing_rad[used]]),

@@ -88,12 +88,7 @@ class KnownPlaces:
 
 
 class Neighbourhood:
-    """Points near others, at the cost of what is near.
-
-    Args:
-        position_m: (P, 2).
-        reach_m: radius of 'near'; inf for everywhere.
-    """
+    """Points (P, 2), and which of them are within reach of a place; all where the reach is inf."""
 
     def __init__(self, position_m: FloatArray, reach_m: float) -> None:
         from scipy.spatial import cKDTree  # takes a tenth of a second
@@ -136,9 +131,7 @@ class Placed(NamedTuple):
 class LocalTrack:
     """A drive by odometry alone, and where landmarks were seen during it, in the frame of its first pose.
 
-    Args:
-        mount: (3,) pose of the sensor on the robot.
-        settings: when a place in the map is known.
+    `mount` is the pose (3,) of the sensor on the robot.
     """
 
     def __init__(self, mount: FloatArray, settings: LocalizeConfig) -> None:

@@ -92,11 +92,8 @@ class Ties:
 class LocalFilter:
     """The newest pose, the calibration states and the places around; nothing is known of the pose before `hold`.
 
-    Args:
-        mount: (3,) pose of the sensor on the robot.
-        prior: of the calibration states.
-        most: places in the covariance, unless a single frame sees more.
-        considered: no detection moves a place.
+    At `most` so many places stand in the covariance, unless a single frame sees more. If `considered`, no detection
+    moves a place.
     """
 
     def __init__(

@@ -22,12 +22,7 @@ from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Sensor
 
 
 class Growing:
-    """Rows that are added at the end, at a constant cost each on average.
-
-    Args:
-        shape: of a row.
-        kind: type of its numbers.
-    """
+    """Rows of one shape that are added at the end, at a constant cost each on average."""
 
     def __init__(self, *shape: int, kind: Any = np.float64) -> None:
         self._data = np.zeros((64, *shape), dtype=kind)
@@ -51,14 +46,7 @@ class Growing:
 
 
 class Mapper:
-    """Feed frames in order with `step`.
-
-    Args:
-        sensor: its mount.
-        prior: of the calibration states.
-        noise: where the noise levels start.
-        settings: of the estimator.
-    """
+    """Feed frames in order with `step`; `noise` is where the noise levels start."""
 
     def __init__(self, sensor: Sensor, prior: CalibrationPrior, noise: Noise, settings: SlamConfig) -> None:
         self._stamps, self._odometry = Growing(), Growing(5)

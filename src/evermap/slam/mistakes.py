@@ -157,11 +157,7 @@ def _longer(factor: float, why: str) -> Mistake:
 def likeliest(pairs: Pairs, undone: Mistake, told: Container[str], settings: CheckConfig) -> Mistake | None:
     """Return the mistake that explains most of the rest, if it certainly explains anything.
 
-    Args:
-        pairs: of sightings.
-        undone: the mistakes found so far.
-        told: codes of mistakes that are not looked for.
-        settings: what is sure.
+    Those found so far are `undone`; codes in `told` are not looked for.
     """
     before = pairs.residual(undone)[0]
     candidates = [*pairs.units, *pairs.angles, *(_longer(factor, pairs.why_longer) for factor in _FACTORS)]

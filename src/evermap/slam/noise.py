@@ -102,8 +102,8 @@ class Extrapolation:
 
     def ahead(self, before: Noise, after: Noise) -> Noise:
         """Return levels to go on from, given those before and after a step."""
-        level = np.log(np.concatenate([before.detection, before.odometry]))
-        step = np.log(np.concatenate([after.detection, after.odometry])) - level
+        level = np.log(before.levels)
+        step = np.log(after.levels) - level
         self._levels, self._steps = [*self._levels, level][-MIXED:], [*self._steps, step][-MIXED:]
         if len(self._steps) > 1:
             by_level, by_step = np.diff(self._levels, axis=0).T, np.diff(self._steps, axis=0).T

@@ -56,12 +56,9 @@ class Preintegration:
     def between(
         self, stamp_s: FloatArray, states: FloatArray, odometry: tuple[FloatArray, FloatArray, FloatArray]
     ) -> Slices[Intervals]:
-        """Return the intervals between consecutive poses, in slices.
+        """Return the intervals between consecutive poses, of instants (N,), for states (11,), in slices.
 
-        Args:
-            stamp_s: (N,) instants of the poses.
-            states: (11,) calibration states.
-            odometry: stamps (n,), velocities (n, 3) and unknown variance (n,), the same at every call.
+        `odometry`, stamps (n,), velocities (n, 4) and unknown variance (n,), is the same at every call.
         """
         kept = self._intervals
         if kept is not None and np.array_equal(self._motion_states, states[N_SENSOR:]):

@@ -11,12 +11,14 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from evermap.config import OdometryConfig
+from evermap.errors import DataError
+from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import N_STATES, kernel
 from evermap.slam.preintegration import Intervals, Preintegration
 from evermap.slam.sparse.elimination import Spread
 from evermap.slam.sparse.system import Factorised, Slices, exhausted
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray, Recording
 
 USUAL = OdometryConfig()
 FEWEST_ROWS = 20
@@ -65,6 +67,19 @@ class Drive:
         return self._preintegration.between(stamp_s, states, (self.stamp_s, self.velocity, self.unknown))
 
     @classmethod
+    def of(cls, recording: Recording, settings: OdometryConfig = USUAL) -> Drive:
+        """Return the odometry of a recording, as `from_rows`; stamps count from its first row.
+
+        Raises:
+            DataError: there is none.
+        """
+        odometry = recording.odometry
+        if len(odometry) == 0:
+            raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
+        velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
+        return cls.from_rows(odometry.stamp_s - odometry.stamp_s[0], velocity, settings)
+
+    @classmethod
     def from_rows(cls, stamp_s: FloatArray, velocity: FloatArray, settings: OdometryConfig = USUAL) -> Drive:
         """Return velocities as reported; silences longer than `silence_s` become 'standing still, but who knows'.
 
@@ -93,16 +108,11 @@ class Drive:
 
 
 def beyond_jitter(stamp_s: FloatArray, turn_radps: FloatArray, settings: OdometryConfig = USUAL) -> FloatArray:
-    """Return (n,) turn rates without what may be jitter of their report, each by rows until itself.
+    """Return (n,) turn rates [rad/s] without what may be jitter of their report, each by rows until itself.
 
     A scale that acts on jitter explains it by a scale of zero: where a robot drives straight on, poses do not jitter as
     its gyroscope does, and every row says so (attenuation by errors in variables: Fuller 1987, section 1.1). So a turn
     counts by the share of its square, on average over `turn_s`, that stands out of the jitter.
-
-    Args:
-        stamp_s: (n,) strictly increasing.
-        turn_radps: (n,) as reported [rad/s].
-        settings: `turn_s` and `stands_out`.
     """
     turn = np.ascontiguousarray(turn_radps, dtype=np.float64)
     return _beyond(np.ascontiguousarray(stamp_s, dtype=np.float64), turn, settings.turn_s, settings.stands_out)
@@ -306,6 +316,10 @@ class Estimate:
     landmark: FloatArray
     states: FloatArray
 
+    def moved(self, by: FloatArray) -> Estimate:
+        """Return everything moved together by a motion (3,)."""
+        return Estimate(se2.compose(by, self.pose), se2.transform(by, self.landmark), self.states)
+
     @property
     def known(self) -> BoolArray:
         """(L,) landmarks that have a position."""
@@ -328,6 +342,11 @@ class Noise:
     odometry: FloatArray
     outlier_log_odds: float
     pseudo_count: float = 1.0
+
+    @property
+    def levels(self) -> FloatArray:
+        """(7,) of detections, then of odometry."""
+        return np.concatenate([self.detection, self.odometry])
 
     def of_detections(self, sigma_given: FloatArray) -> FloatArray:
         """Return (M, 2) standard deviation of every detection: its own where it came with one."""
@@ -366,13 +385,7 @@ class Marginals:
     """
 
     def __init__(
-        self,
-        solved: Factorised,
-        n_poses: int,
-        n_detections: int,
-        known: BoolArray,
-        *,
-        block: Block | None = None,
+        self, solved: Factorised, n_poses: int, n_detections: int, known: BoolArray, *, block: Block | None = None
     ) -> None:
         self._solved, self._n, self._m, self.known = solved, n_poses, n_detections, known
         n_known = int(known.sum())
@@ -469,10 +482,7 @@ class Marginals:
     def each(self, landmarks: IntArray, poses: IntArray, by: FloatArray) -> FloatArray:
         """Return (V, R, R) the covariances of what each of V matrices makes of some poses, known landmarks and states.
 
-        Args:
-            landmarks: (L,) rows, all known.
-            poses: (P,) rows.
-            by: (V, R, 3 P + 2 L + 11) the matrices.
+        The matrices `by` are (V, R, 3 P + 2 L + 11).
         """
         every = [self._block.first + poses, self._variables(landmarks), self._block.border + np.arange(2)]
         return self._solved.each(np.concatenate(every), by)

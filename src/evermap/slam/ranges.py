@@ -97,10 +97,7 @@ def with_bearings(recording: Recording, settings: SlamConfig) -> tuple[Recording
 
 def _eyes(recording: Recording, stamp_s: FloatArray, settings: SlamConfig) -> tuple[FloatArray, FloatArray]:
     """Return poses (M, 3) of the sensor at stamps (M,) by odometry alone, and how far it had gone (M,)."""
-    odometry = recording.odometry
-    velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
-    start_s = float(odometry.stamp_s[0])
-    drive = Drive.from_rows(odometry.stamp_s - start_s, velocity, settings.odometry)
+    drive, start_s = Drive.of(recording, settings.odometry), float(recording.odometry.stamp_s[0])
     instants, row = np.unique(np.append(start_s, stamp_s), return_inverse=True)
     mean = CalibrationPrior.from_settings(settings.calibration, calibrated=False).mean
     pose, _ = dead_reckoned(instants - start_s, drive, mean, START)

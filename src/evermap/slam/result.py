@@ -261,8 +261,7 @@ def _evident(p_needed: float, before: float) -> bool:
 def _levels(fit: NoiseFit) -> list[ParameterEstimate]:
     """Noise levels as records."""
     names = ("sigma_range_m", "sigma_bearing_rad", *NOISE_NAMES)
-    levels = np.concatenate([fit.noise.detection, fit.noise.odometry])
-    started = np.concatenate([START.detection, START.odometry])
+    levels, started = fit.noise.levels, START.levels
     relative = np.concatenate([fit.detection_relative, fit.odometry_relative])
     meanings = (
         "noise of a range",

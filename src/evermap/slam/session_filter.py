@@ -15,14 +15,11 @@ ROOM_SHARE = 0.75
 
 
 class SessionFilter(LocalFilter):
-    """The filter of a `Problem`: its newest pose, with its places and priors.
+    """The filter of a `Problem`: its newest pose, with its places and priors; if `robust`, with the Cauchy's tails.
 
-    Args:
-        problem: the measurements; rows beyond those added are not looked at. May be exchanged between two steps for one
-            whose coming detections belong to other places, or that has more frames or places at the end; what was
-            added before stays as it was until `restart`.
-        noise: standard deviations.
-        robust: down-weight outliers (Cauchy, decided when the detection comes).
+    Rows of the problem beyond those added are not looked at. It may be exchanged between two steps for one whose coming
+    detections belong to other places, or that has more frames or places at the end; what was added before stays as it
+    was until `restart`.
     """
 
     def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True) -> None:

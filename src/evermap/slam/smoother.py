@@ -78,11 +78,8 @@ class Equations:
 class Smoother:
     """Optimum and covariances of one `Problem` at given noise.
 
-    Args:
-        problem: the measurements.
-        noise: standard deviations.
-        heavy: outliers have the Cauchy's tails, as while the estimate may still be far off.
-        robust: explain outliers instead of believing every identity.
+    If `heavy`, outliers have the Cauchy's tails, as while the estimate may still be far off; if `robust`, outliers are
+    explained, instead of every identity believed.
     """
 
     def __init__(self, problem: Problem, noise: Noise, *, heavy: bool = False, robust: bool = True) -> None:
@@ -101,10 +98,7 @@ class Smoother:
     def under(self, noise: Noise, *, heavy: bool, problem: Problem | None = None) -> Smoother:
         """Return the smoother at other noise; its structure is kept.
 
-        Args:
-            noise: standard deviations.
-            heavy: as of the class.
-            problem: one that differs only in its start and in the prior of the calibration states; None: the same.
+        Another `problem` may differ only in its start and in the prior of the calibration states.
         """
         other = Smoother(self.problem if problem is None else problem, noise, heavy=heavy, robust=self.robust)
         other._structure = self._structure
@@ -123,11 +117,8 @@ class Smoother:
     ) -> Slices[tuple[Estimate, Marginals]]:
         """Run damped Gauss-Newton in slices; return the optimum and the covariances that its last step was made with.
 
-        Args:
-            start: values to start from.
-            iterations: at most.
-            tolerance: largest move (m or rad) of a step that ends it.
-            settled: gain of a step that ends it, in nats.
+        It ends after so many iterations, or with a step that moves nothing by `tolerance` (m or rad) or gains less than
+        `settled` nats.
         """
         estimate = start
         now = yield from self.linearised_in_slices(estimate)

@@ -298,8 +298,7 @@ class StreamingSlam:
         if np.array_equal(start, problem.start_pose):
             return problem, estimate
         turn = se2.compose(start, se2.inverse(problem.start_pose))
-        pose, landmark = se2.compose(turn, estimate.pose), se2.transform(turn, estimate.landmark)
-        return replace(problem, start_pose=start), Estimate(pose, landmark, estimate.states)
+        return replace(problem, start_pose=start), estimate.moved(turn)
 
     def _optimum(
         self, smoother: Smoother, problem: Problem, estimate: Estimate, fit: NoiseFit, *, most: int = 30
@@ -489,11 +488,8 @@ class StreamingSlam:
         mean, given = np.pad(prior_map.mean, ((0, new), (0, 0))), np.pad(prior_map.given, (0, new))
         both = given & estimate.known
         pose_map_world, _ = consensus(estimate.landmark[both], mean[both])
-        moved = Estimate(
-            se2.compose(pose_map_world, estimate.pose),
-            np.where(both[:, None], mean, se2.transform(pose_map_world, estimate.landmark)),
-            estimate.states,
-        )
+        moved = estimate.moved(pose_map_world)
+        moved = replace(moved, landmark=np.where(both[:, None], mean, moved.landmark))
         self._aligned, self._scale = True, 1.0
         self._problem = replace(
             self._problem,
@@ -559,9 +555,7 @@ def divided(
 
 def levels_settled(before: Noise, after: Noise, within: float) -> bool:
     """Return whether no noise level changed by more than this share of itself."""
-    old = np.concatenate([before.detection, before.odometry])
-    new = np.concatenate([after.detection, after.odometry])
-    return bool(np.all(np.abs(new / old - 1.0) < within))
+    return bool(np.all(np.abs(after.levels / before.levels - 1.0) < within))
 
 
 def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount: FloatArray) -> FloatArray:

@@ -225,15 +225,15 @@ def _laid_together(
     pose, robots = [], []
     metric = not all(member.prior.shares_scale for member in members)
     for r, (member, (problem, estimate), by) in enumerate(zip(members, own, motion, strict=True)):
-        at, pose_r = se2.transform(by, estimate.landmark), se2.compose(by, estimate.pose)
-        new = np.isfinite(at[:, 0]) & np.isnan(landmark[places[r], 0])
-        landmark[places[r][new]] = at[new]
+        moved = estimate.moved(by)
+        new = moved.known & np.isnan(landmark[places[r], 0])
+        landmark[places[r][new]] = moved.landmark[new]
         prior, held = member.prior, problem.start_information if r == 0 else ALIGNED_INFORMATION
         if not metric:  # in the scale of the first one's ranges: of all that the priors allow a small map is preferred
             prior = prior.relative(np.sqrt(2.0) * prior.sigma[SLOPE] if r else 0.0)
-        placed = replace(problem, start_pose=pose_r[0], start_information=held, prior=prior)
+        placed = replace(problem, start_pose=moved.pose[0], start_information=held, prior=prior)
         robots.append(Smoother(placed, member.outcome.noise.noise, robust=member.settings.robust))
-        pose.append(pose_r)
+        pose.append(moved.pose)
     start_s = np.array([member.prepared.start_s for member in members])
     sigma = np.array([robot.noise.detection for robot in robots])
     states = np.concatenate([estimate.states for _, estimate in own])
@@ -312,8 +312,7 @@ def _ahead(first: Solved, joint: Together, estimate: Estimate) -> tuple[Together
     for robot in joint.robots:
         turned = replace(robot.problem, start_pose=se2.compose(turn, robot.problem.start_pose))
         robots.append(Smoother(turned, robot.noise, robust=robot.robust))
-    pose, landmark = se2.compose(turn, estimate.pose), se2.transform(turn, estimate.landmark)
-    return joint.of(robots, joint.sigma), Estimate(pose, landmark, estimate.states)
+    return joint.of(robots, joint.sigma), estimate.moved(turn)
 
 
 def _divided(

@@ -120,15 +120,11 @@ def landmark_evidence(
 ) -> WindowEvidence:
     """Eliminate poses and calibration of a linearised problem, window by window.
 
-    Args:
-        problem: the measurements; its priors of start and landmarks are left out.
-        estimate: where to linearise; every landmark that was seen has a position.
-        noise: the noise levels.
-        prior: of the calibration, as the user means it.
-        bounds: (W + 1,) first pose of every window, and the number of poses.
-        fewest: sightings that make a copy, at least: one or two may be wrong identities.
-        sized: divide range slope and size by their priors; else positions stay in the metres of the sensor, which is
-            enough where there is no map to compare with.
+    The problem's priors of start and landmarks are left out; every landmark that was seen has a position in the
+    estimate, and `prior` is of the calibration as the user means it. Windows begin at the poses `bounds` (W + 1,), of
+    which the last is the number of poses. A copy takes the `fewest` sightings at least: one or two may be wrong
+    identities. If `sized`, range slope and size are divided by their priors; else positions stay in the metres of the
+    sensor, which is enough where there is no map to compare with.
     """
     estimate = in_sensor_metres(estimate, prior)
     held = prior.without_scale()

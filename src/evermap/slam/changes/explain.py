@@ -172,15 +172,8 @@ def parting_time(
 ) -> tuple[float, tuple[float, float]]:
     """Return the first stamp [s] at the new places, and two stamps between which the change happened.
 
-    Args:
-        problem: the measurements; `landmark_row` says which landmark was seen.
-        estimate: poses and states.
-        noise: the noise levels.
-        members: (k,) landmarks of the group.
-        old: (k, 2) their places before.
-        new: (k, 2) and after.
-        within_s: the change is known to lie between these two stamps.
-        interval: probability that it lies between the stamps returned.
+    Landmarks `members` (k,) of a group changed from `old` (k, 2) to `new` places, between two stamps `within_s`; with
+    probability `interval` it was between the stamps returned.
     """
     stamp_s = problem.stamp_s[problem.pose_row]
     inside = (stamp_s >= within_s[0]) & (stamp_s <= within_s[1])

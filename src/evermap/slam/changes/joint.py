@@ -15,7 +15,6 @@ import numpy as np
 from scipy import sparse
 
 from evermap.config import SlamConfig
-from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, in_sensor_metres, landmark_evidence
@@ -48,11 +47,7 @@ def may_search(n_frames: int, *, in_map: bool) -> bool:
 class Joint(Method):
     """Method that finds groups of moved landmarks, before the session or within it.
 
-    Args:
-        n_landmarks: landmarks of the session.
-        calibration: priors of the calibration states as the user means them.
-        given: the map to compare with; None where there is none.
-        settings: how changes are distributed, and what is believed of sightings.
+    `calibration` are the priors of the calibration states as the user means them, `given` is the map to compare with.
     """
 
     def __init__(
@@ -101,7 +96,7 @@ class Joint(Method):
         motion, agree = consensus(estimate.landmark[both], self._given.mean[both])
         if np.count_nonzero(agree) < 2:
             return estimate
-        return Estimate(se2.compose(motion, estimate.pose), se2.transform(motion, estimate.landmark), estimate.states)
+        return estimate.moved(motion)
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
         """Search at the present estimate, and at the end of the session again at the resulting one."""

@@ -60,14 +60,8 @@ def weigh(
 ) -> Verdict:
     """Search for changes, and compute their probabilities.
 
-    Args:
-        evidence: of all copies.
-        given: the map, with its own covariance.
-        prior: how changes are distributed.
-        n_windows: windows of the evidence.
-        before: what was found last time; one start of the search.
-        spared: no copy of this evidence is displaced alone.
-        thorough: try all degrees of belief, else those of `before`.
+    What was found `before` is one start of the search; if not `thorough`, its degree of belief is the only one that is
+    tried. If `spared`, no copy of this evidence is displaced alone.
     """
     factor = 1.0 if before is None else before.map_factor
     usual = prior.softness_m[(len(prior.softness_m) - 1) // 2]

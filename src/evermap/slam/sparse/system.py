@@ -174,14 +174,7 @@ BATCH = 64
 
 
 class System:
-    """Structure of a least-squares problem: the place of every elimination.
-
-    Args:
-        dim: (V,) numbers of each variable.
-        factors: what ties them.
-        coordinate: (leaves, axes), see `tree_of`.
-        border: (B,) variables that are kept to the last, for example what all factors share.
-        tree: of all these, if it is known; see `tree_of`.
+    """Structure of a least-squares problem: the place of every elimination; see `tree_of`.
 
     Raises:
         DataError: a factor that does not fit into memory.
