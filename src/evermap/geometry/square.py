@@ -63,7 +63,9 @@ def _infinitesimal(plane: FloatArray, size_m: FloatArray) -> FloatArray:
     narrow = turn[:, :2, :2] - at[:, :, None] * turn[:, 2:, :2]
     flat = _solved(np.where(np.isfinite(narrow), narrow, np.eye(2)), slope)
     gram = np.swapaxes(flat, 1, 2) @ flat
-    largest = 0.5 * (_trace(gram) + np.sqrt(np.maximum(_trace(gram) ** 2 - 4.0 * _det(gram), 0.0)))
+    trace = gram[:, 0, 0] + gram[:, 1, 1]
+    determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] * gram[:, 1, 0]
+    largest = 0.5 * (trace + np.sqrt(np.maximum(trace**2 - 4.0 * determinant, 0.0)))
     flat = flat / np.sqrt(largest)[:, None, None]
     rest = np.eye(2) - np.swapaxes(flat, 1, 2) @ flat
     lift = np.sqrt(np.maximum(rest[:, [0, 1], [0, 1]], 0.0))
@@ -187,11 +189,3 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         fine = np.linalg.slogdet(matrix)[0] != 0.0
         found[fine] = np.linalg.solve(matrix[fine], right[fine])
         return found
-
-
-def _trace(matrix: FloatArray) -> FloatArray:
-    return np.asarray(matrix[:, 0, 0] + matrix[:, 1, 1])
-
-
-def _det(matrix: FloatArray) -> FloatArray:
-    return np.asarray(matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] * matrix[:, 1, 0])

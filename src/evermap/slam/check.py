@@ -75,20 +75,6 @@ class Check(Shown):
     findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
 
-    @classmethod
-    def of(cls, recording: AnyRecording, settings: SlamConfig) -> Check:
-        """Count and compare a valid recording."""
-        from evermap.slam.space.moving import has_traffic
-
-        if isinstance(recording, SpatialRecording):
-            found = findings_in_space(recording, settings)
-        else:
-            found = findings(recording, identities=settings.unknown_ids is not True, settings=settings.check)
-        anonymous = (recording.detections.landmark_id == UNKNOWN).all()
-        if anonymous and not (settings.unknown_ids or has_traffic(recording)):
-            found = (*found, Finding("no-identities", f"no detection has a landmark_id: {WITHOUT_IDS}"))
-        return cls(recording.name, recording.source, contents(recording), found, recording.warnings)
-
     @property
     def usable(self) -> bool:
         """Whether the recording is usable."""
@@ -471,10 +457,18 @@ def check_recording(recording: AnyRecording, config: Config | None = None) -> Ch
         InputError: no recording, or one with values that cannot be.
         DataError: nothing can be estimated from it.
     """
+    from evermap.slam.space.moving import has_traffic
+
     config = config or Config()
+    settings = config.slam
     if isinstance(recording, SpatialRecording):
         validate_spatial(recording)
         recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
+        found = findings_in_space(recording, settings)
     else:
         recording = valid(recording, config.sensor)
-    return Check.of(recording, config.slam)
+        found = findings(recording, identities=settings.unknown_ids is not True, settings=settings.check)
+    anonymous = (recording.detections.landmark_id == UNKNOWN).all()
+    if anonymous and not (settings.unknown_ids or has_traffic(recording)):
+        found = (*found, Finding("no-identities", f"no detection has a landmark_id: {WITHOUT_IDS}"))
+    return Check(recording.name, recording.source, contents(recording), found, recording.warnings)

@@ -9,7 +9,7 @@ world (compare the compressed filter of Guivant and Nebot 2001, whose far places
 with what ties it to its nearest neighbours; where it comes back it is where these take it. Those that a batch solution
 or a map knows are tied as that says, exactly.
 
-The stream (`session_filter`), the association of detections without identities and the localisation in a fixed map all
+The stream (`SessionFilter`), the association of detections without identities and the localisation in a fixed map all
 drive this filter. In a fixed map places are only considered (Schmidt 1966): they are wrong, by what their covariance
 says, and wrong in the same way in every frame. A filter that takes that for fresh noise of each detection believes
 after a hundred frames in its pose to a tenth of the map's error.
@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.filter_kernels import BELIEVED, drive_on, driven, innovations, update
+from evermap.slam.filter_kernels import BELIEVED, HEAVY, drive_on, driven, innovations, update
 from evermap.slam.kernels import AT_PLACES, N_STATES
 from evermap.slam.problem import Drive, Estimate, Marginals, Noise, Problem
+from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 UNKNOWN_VARIANCE = 1e4
@@ -40,6 +41,8 @@ FEWEST_SLOTS = 16
 """Places that there is room for at first."""
 NEIGHBOURS = 8
 """Places, the nearest, to which a place is tied while it is not in the covariance."""
+ROOM_SHARE = 0.75
+"""Of the places that there is room for, those that a restart brings in at most."""
 NO_PLACES, NO_GAIN, NO_ODDS, NOWHERE = np.arange(0), np.zeros((2, 0)), np.zeros(0), np.zeros((0, 2, 2))
 
 
@@ -333,6 +336,92 @@ class LocalFilter:
         self.covariance[own], self.covariance[:, own] = across, across.T
         self.covariance[own, own] = across[:, others] @ gain.T + 0.5 * (spread + spread.T)
         self._row[slot], self._slot[row], self._used_at[slot] = row, slot, self._now
+
+
+class SessionFilter(LocalFilter):
+    """The filter of a `Problem`: its newest pose, with its places and priors; if `robust`, with the Cauchy's tails.
+
+    Rows of the problem beyond those added are not looked at. It may be exchanged between two steps for one whose coming
+    detections belong to other places, or that has more frames or places at the end; what was added before stays as it
+    was until `restart`.
+    """
+
+    def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True) -> None:
+        super().__init__(problem.mount, problem.prior)
+        self.problem = problem
+        self._robust, self._noise = robust, noise
+        self.covariance[:3, :3] = np.eye(3) / problem.start_information
+        self.hold(problem.start_pose, self.states, self.covariance, NO_PLACES, self.position)
+        self._old_pose = np.zeros((0, 3))
+        self._new_pose: list[FloatArray] = []
+
+    def restart(self, estimate: Estimate, noise: Noise, problem: Problem, marginals: Marginals | None = None) -> None:
+        """Restart at `estimate`, an optimum of the first poses and all places that they saw.
+
+        From here on with other noise, other places or other priors; `marginals` where they are known already.
+        """
+        self.problem, self._noise, self._free = problem, noise, problem.prior.free
+        n = len(estimate.pose)
+        room = max(int(ROOM_SHARE * self._most), len(np.unique(problem.landmark_row[problem.detections_of(n - 1)])))
+        if marginals is None:
+            marginals = Smoother(problem.until(n), noise, heavy=True, robust=self._robust).marginals(estimate)
+        recent = problem.landmark_row[: np.searchsorted(problem.pose_row, n)][::-1]
+        seen, first = np.unique(recent[: 50 * self._most], return_index=True)
+        rows = seen[np.argsort(first, kind="stable")][:room]
+        if np.count_nonzero(estimate.known) <= room:
+            rows = np.flatnonzero(estimate.known)
+        self.begin(estimate, marginals, n - 1, rows[estimate.known[rows]])
+        self._old_pose, self._new_pose = estimate.pose[:-1], [self.pose.copy()]
+
+    def motion(self, row: int) -> Motion:
+        """Return odometry from the previous pose to pose `row`, with the present states."""
+        return Motion.between(self.problem, self._noise, row, self.states)
+
+    def distances(self, detections: IntArray, places: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Compare detections (k,) of the newest pose, before they are used, with known places (k,).
+
+        Returns:
+            (k,) squared Mahalanobis distances with `S = H P H' + R`, and (k,) `log |S|`.
+        """
+        self.bring(places)
+        return self.compare(places, *self._readings(detections))[:2]
+
+    def add(self, row: int, landmark: FloatArray) -> None:
+        """Add the detections of pose `row`, one more than the last, to which the filter was driven.
+
+        Places that are seen for the first time are at `landmark` (L, 2).
+        """
+        detections = self.problem.detections_of(row)
+        rows = self.problem.landmark_row[detections]
+        self.know_of(len(self.problem.landmark_mean))
+        new = np.isnan(self.position[rows, 0])
+        if np.count_nonzero(new):
+            self.bring(rows[~new])
+            for j in dict.fromkeys(rows[new].tolist()):
+                self._meet(j, landmark)
+        else:
+            self.bring(rows)
+        self.update(rows, *self._readings(detections), weighing=HEAVY if self._robust else BELIEVED)
+        self._new_pose.append(self.pose.copy())
+
+    def estimate(self) -> Estimate:
+        """Return values of everything so far; poses since the last restart as they were when they were added."""
+        landmark = grown(self.position, len(self.problem.landmark_mean)).copy()
+        return Estimate(np.vstack([self._old_pose, *self._new_pose]), landmark, self.states.copy())
+
+    def _readings(self, detections: IntArray) -> tuple[FloatArray, FloatArray]:
+        return self.problem.reading[detections], self._noise.of_detections(self.problem.sigma_given[detections])
+
+    def _meet(self, row: int, landmark: FloatArray) -> None:
+        """Put a place that is seen for the first time at its prior, given those in the covariance, or at `landmark`."""
+        problem, active = self.problem, np.zeros(len(self.problem.landmark_mean), dtype=bool)
+        active[self.active] = True
+        prior = problem.conditional_prior(row, active)
+        if prior.information.any():
+            place = prior.place(self.position, problem.landmark_mean)
+            self.meet(row, place, np.asarray(np.linalg.inv(prior.information)), prior.given, prior.gain)
+        else:
+            self.meet(row, landmark[row])
 
 
 def columns(slots: IntArray) -> IntArray:

@@ -82,10 +82,14 @@ def refine_noise(
     count = np.maximum(noise.odometry**2 * chances, 0.0)
     squares_odometry = noise.odometry**4 * pulls
     odometry = np.sqrt((squares_odometry + pseudo * start.odometry**2) / (count + pseudo))
+    # a variance is known less well where others act on the same residuals
+    scale = np.sqrt(np.maximum(np.diag(fisher), 1e-300))
+    correlation = fisher / np.outer(scale, scale) + 1e-3 * np.eye(len(fisher))
+    inflation = np.maximum(np.diag(np.linalg.inv(correlation)), 1.0)
     return NoiseFit(
         Noise(detection, odometry, noise.outlier_log_odds),
         1.0 / np.sqrt(2.0 * (counts + pseudo)),
-        np.sqrt(_inflation(fisher) / (2.0 * (count + pseudo))),
+        np.sqrt(inflation / (2.0 * (count + pseudo))),
     )
 
 
@@ -119,13 +123,6 @@ LEAST_MIXED = 1e-2
 """Relative size of differences between steps that are not rounding, or the values that settle beside them."""
 LARGEST_STEP = 0.5
 """Of the logarithm of a level."""
-
-
-def _inflation(fisher: FloatArray) -> FloatArray:
-    """Factor by which each variance is known less well because others act on the same residuals (>= 1)."""
-    scale = np.sqrt(np.maximum(np.diag(fisher), 1e-300))
-    correlation = fisher / np.outer(scale, scale) + 1e-3 * np.eye(len(fisher))
-    return np.asarray(np.maximum(np.diag(np.linalg.inv(correlation)), 1.0))
 
 
 @kernel

@@ -22,11 +22,10 @@ from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior, needed, seated
 from evermap.slam.filter_kernels import told
 from evermap.slam.kernels import N_STATES
-from evermap.slam.local_filter import Motion, grown
+from evermap.slam.local_filter import Motion, SessionFilter, grown
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Drive, Estimate, Marginals, Noise, Problem, independent
-from evermap.slam.session_filter import SessionFilter
 from evermap.slam.smoother import COST_SLACK, Smoother
 from evermap.slam.sparse.system import Slices, exhausted
 from evermap.types import BoolArray, FloatArray, IntArray

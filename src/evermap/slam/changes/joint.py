@@ -30,6 +30,7 @@ from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
 
 VISIT_MARGIN, MOST_VISITS = 0.5, 8
 """Visits that get windows of their own: this share of the interval around it, and this many."""
+DISAGREES = "the prior map disagrees with the detections, and no change explains it: cannot localise in it"
 ROUNDS = 6
 """Searches at the end of a session, at most."""
 POSES_A_WINDOW, MOST_WINDOWS, MOST_ITEMS = 60, 12, 400
@@ -145,11 +146,9 @@ class Joint(Method):
             problem, estimate, self._current(), self._changes(self._groups, verdict.probability, base)
         )
         if final:
-            revision = replace(
-                revision,
-                rivals=self._rivals(base, evidence, believed, estimate, noise, bounds),
-                warnings=self._warnings(in_map=in_map),
-            )
+            lost = in_map and not self._groups and verdict.misfit > self._prior.disagreement
+            rivals = self._rivals(base, evidence, believed, estimate, noise, bounds)
+            revision = replace(revision, rivals=rivals, warnings=(DISAGREES,) if lost else ())
             self._concluded = revision
         return revision
 
@@ -204,12 +203,6 @@ class Joint(Method):
                 )
             )
         return tuple(rivals)
-
-    def _warnings(self, *, in_map: bool) -> tuple[str, ...]:
-        assert self.verdict is not None
-        if in_map and not self._groups and self.verdict.misfit > self._prior.disagreement:
-            return ("the prior map disagrees with the detections, and no change explains it: cannot localise in it",)
-        return ()
 
     def _weighed(
         self, evidence: WindowEvidence, given: GivenMap, n_windows: int, *, thorough: bool

@@ -39,7 +39,7 @@ def _landmark_key(row: int) -> int:
 
 
 class IncrementalSmoother:
-    """The incremental solver to compare `session_filter.SessionFilter` with.
+    """The incremental solver to compare `local_filter.SessionFilter` with.
 
     The tree holds the last poses only. What the older ones say about them, about the landmarks and the states is one
     linear factor, so that a step costs what the map costs, whatever the age of the recording.
