@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -34,7 +33,6 @@ class Prepared:
         landmark_id: (L,) ids behind the problem's landmark rows.
         prior_map: the map to localise in, in those rows.
         warnings: what was left out, counted.
-        names: texts behind landmark ids.
     """
 
     problem: Problem
@@ -44,7 +42,6 @@ class Prepared:
     landmark_id: IntArray
     prior_map: PriorMap | None
     warnings: tuple[str, ...]
-    names: Mapping[int, str] = field(default_factory=dict)
 
     def given_map(self) -> GivenMap | None:
         """Return the prior map as the joint search compares with it: landmark by landmark, with covariances."""
@@ -101,7 +98,7 @@ def prepare(
         landmark_information=sparse.csr_array((2 * len(landmark_id), 2 * len(landmark_id))),
     )
     in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
-    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings), recording.landmark_names)
+    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings))
 
 
 def beliefs(sensor: Sensor, settings: SlamConfig) -> tuple[CalibrationPrior, Noise]:

@@ -494,7 +494,7 @@ class Marginals:
     def _variables(self, landmarks: IntArray) -> IntArray:
         """Variables of known landmarks (K,)."""
         rank = np.cumsum(self.known) - 1
-        return self._block.landmarks[rank[np.asarray(landmarks, dtype=np.int64)]]
+        return np.asarray(self._block.landmarks[rank[np.asarray(landmarks, dtype=np.int64)]])
 
     @cached_property
     def shared(self) -> FloatArray:

@@ -155,7 +155,7 @@ def _changes(solved: Solved, moved: tuple[MapChange, ...]) -> tuple[MapChange, .
             stamp_from_s=change.stamp_from_s + prepared.start_s,
             stamp_to_s=change.stamp_to_s + prepared.start_s,
             displacement_m=(change.displacement_m[0] * scale, change.displacement_m[1] * scale),
-        ).named(prepared.names)
+        ).named(solved.recording.landmark_names)
         for change in moved
     )
 

@@ -394,9 +394,9 @@ def without(visit: Solved, untied: BoolArray, wrong: BoolArray) -> Recording | N
     recording, doubt = visit.recording, untied | wrong
     if not doubt.any():
         return recording
-    frames, detections = some_frames(recording.frames, recording.detections, ~doubt)
+    some = some_frames(recording, ~doubt)
     n_tied = np.count_nonzero(~untied[recording.detections.frame])
-    if 2 * len(detections) < n_tied or len(np.unique(detections.frame)) < 2:
+    if 2 * len(some.detections) < n_tied or len(np.unique(some.detections.frame)) < 2:
         return None
     start_s = recording.frames.stamp_s[0]
     spans = np.flatnonzero(np.diff(np.concatenate([[False], doubt, [False]])))
@@ -406,7 +406,7 @@ def without(visit: Solved, untied: BoolArray, wrong: BoolArray) -> Recording | N
         f"{int(doubt.sum())} frames left out ({told}{', ...' if len(spans) > 6 else ''} after the first): most of "
         f"their detections contradict the rest, or the odometry was silent and nothing connects them to it"
     )
-    return replace(recording, frames=frames, detections=detections, warnings=(*recording.warnings, remark))
+    return replace(some, warnings=(*recording.warnings, remark))
 
 
 def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved, near_m: float) -> None:
