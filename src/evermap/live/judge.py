@@ -56,9 +56,8 @@ class Judge:
         self._mount = np.array(sensor.mount_robot_sensor, dtype=np.float64)
         self._classes = lives_of(living, config.living)
         self._table = living.landmarks()
-        self._glances: list[_Glance] = (
-            [] if before is None else [one for one in before._glances if one.stamp_s > living.stamp_s]
-        )
+        earlier: list[_Glance] = [] if before is None else before._glances
+        self._glances = [one for one in earlier if one.stamp_s > living.stamp_s]
         self._news = News()
         self._after: tuple[LivingMap, Vicinity | None] = living, None
         self.rest_s = 0.0

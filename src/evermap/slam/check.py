@@ -271,11 +271,10 @@ def _limits_in_space(recording: SpatialRecording) -> list[Finding]:
     """Readings beyond what a sensor is said to reach or to show, and corners that no calibration goes with."""
     detections, (far, aside) = recording.detections, _beyond(recording)
     most = f"up to {_ranges(recording)[far].max(initial=0.0):.4g} m"
+    other = "the calibration is for another resolution"
     found = [
         *_outside("beyond-range", far, f"detections are beyond range_max_m, {most}", _OTHER_UNIT),
-        *_outside(
-            "beyond-view", aside, "tags have corners outside of the image", "the calibration is for another resolution"
-        ),
+        *_outside("beyond-view", aside, "tags have corners outside of the image", other),
     ]
     blind = np.array([sensor.intrinsics is None for sensor in recording.sensors])[detections.sensor]
     blind &= np.isfinite(detections.corner_px[:, 0, 0])

@@ -84,9 +84,8 @@ def solve(
         settings=settings,
         method=_method(prepared, prior, recording.sensor, settings),
     )
-    step_s, interrupted = fed(
-        prepared.problem.stamp_s, lambda _: slam.step(), least=2, realtime=realtime, progress=progress
-    )
+    stamp_s = prepared.problem.stamp_s
+    step_s, interrupted = fed(stamp_s, lambda _: slam.step(), least=2, realtime=realtime, progress=progress)
     return Solved(recording, prepared, slam.finish(), slam, prior, step_s, interrupted, settings)
 
 

@@ -63,9 +63,8 @@ class Motion:
     @classmethod
     def between(cls, problem: Problem, noise: Noise, row: int, states: FloatArray) -> Motion:
         """Return from pose `row - 1` to pose `row`."""
-        return cls.over(
-            problem.drive, problem.stamp_s[row - 1], problem.stamp_s[row], states, problem.prior.free, noise
-        )
+        start_s, stop_s = problem.stamp_s[row - 1 : row + 1]
+        return cls.over(problem.drive, start_s, stop_s, states, problem.prior.free, noise)
 
     @classmethod
     def over(

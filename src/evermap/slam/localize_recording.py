@@ -67,9 +67,8 @@ def localize(
     places = KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists).existing()
     landmarks = landmarks[np.flatnonzero(landmarks.p_exists > 0.0)]
     warm_up()
-    localizer = Localizer(
-        places, recording.sensor, prior.gaussian(), noise, settings=config.slam.localize, looks=config.living.looks
-    )
+    settings, looks = config.slam.localize, config.living.looks
+    localizer = Localizer(places, recording.sensor, prior.gaussian(), noise, settings=settings, looks=looks)
     run = _feed(localizer, recording, drive, realtime=realtime, progress=progress)
     if not run.placed.any():
         problem = "cannot localise in the map: too few of the detected landmarks have the relative positions of the map"
@@ -184,9 +183,8 @@ def _result(run: _Run, prior: CalibrationPrior, drive: Drive, landmarks: Landmar
     pose = np.array([one.pose for one in run.located])[placed]
     pose[:, 2] = se2.wrap(pose[:, 2])
     spread = np.array([one.covariance for one in run.located])[placed]
-    trajectory = Trajectory(
-        recording.frames.stamp_s[run.frame[placed]], pose, spread, frame="prior_map", clock=recording.clock
-    )
+    stamp_s = recording.frames.stamp_s[run.frame[placed]]
+    trajectory = Trajectory(stamp_s, pose, spread, frame="prior_map", clock=recording.clock)
     noise = localizer.noise
     fit = NoiseFit(noise, np.zeros_like(noise.detection), np.zeros_like(noise.odometry))
     return SlamResult(

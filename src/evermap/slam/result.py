@@ -283,9 +283,8 @@ def dead_reckoning(trajectory: Trajectory, drive: Drive, start_s: float) -> Traj
     """Return odometry alone, believed as reported, from the first pose on; `drive` counts from `start_s`."""
     plain = CalibrationPrior.from_settings(calibrated=False)
     pose, covariance = dead_reckoned(trajectory.stamp_s - start_s, drive, plain.mean, START)
-    return replace(
-        trajectory, pose_world_robot=se2.compose(trajectory.pose_world_robot[0], pose), covariance=covariance
-    )
+    pose = se2.compose(trajectory.pose_world_robot[0], pose)
+    return replace(trajectory, pose_world_robot=pose, covariance=covariance)
 
 
 def _dense_stamps(stamps: FloatArray, last_s: float) -> FloatArray:

@@ -260,9 +260,8 @@ class StreamingSlam:
         self._job = None
         problem, estimate = self._method.unprejudiced(self._problem.until(self._n_poses), self._filter.estimate())
         if self._robust:  # a landmark whose first sighting was misread may be disputed since the last relinearisation
-            estimate = exhausted(
-                _voted(Smoother(problem, self._noise, heavy=True), estimate, self._settings.fewest_sightings)
-            )
+            smoother = Smoother(problem, self._noise, heavy=True)
+            estimate = exhausted(_voted(smoother, estimate, self._settings.fewest_sightings))
         smoother, estimate, fit = self._converged(problem, estimate, self._noise)
         if self._robust:
             better = _readmitted(smoother, _rejoined(smoother, estimate, self._settings), self._settings)
@@ -313,7 +312,7 @@ class StreamingSlam:
     ) -> tuple[Smoother, Estimate, NoiseFit]:
         """The optimum and its noise levels from these values, in turns until neither changes.
 
-        They were found by the smoother `near`, of the same problem but for its prior: it is known what is an outlier.
+        Where the smoother `near`, of the same problem but for its prior, found them, it is known what is an outlier.
         """
         fit, ahead = None, Extrapolation()
         smoother = Smoother(problem, noise, robust=self._robust) if near is None else near

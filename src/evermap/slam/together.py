@@ -237,9 +237,8 @@ def _laid_together(
     start_s = np.array([member.prepared.start_s for member in members])
     sigma = np.array([robot.noise.detection for robot in robots])
     states = np.concatenate([estimate.states for _, estimate in own])
-    return Together(robots, places, start_s - start_s.min(), met, sigma), Estimate(
-        np.concatenate(pose), landmark, states
-    )
+    joint = Together(robots, places, start_s - start_s.min(), met, sigma)
+    return joint, Estimate(np.concatenate(pose), landmark, states)
 
 
 def _levelled(

@@ -142,9 +142,8 @@ class Joint(Method):
             self._given = given
         if not heavy:
             estimate = smoother.under(noise, heavy=False).optimum(estimate, iterations=5, tolerance=1e-4)
-        revision = Explanation(
-            problem, estimate, self._current(), self._changes(self._groups, verdict.probability, base)
-        )
+        changes = self._changes(self._groups, verdict.probability, base)
+        revision = Explanation(problem, estimate, self._current(), changes)
         if final:
             lost = in_map and not self._groups and verdict.misfit > self._prior.disagreement
             rivals = self._rivals(base, evidence, believed, estimate, noise, bounds)

@@ -88,7 +88,7 @@ class Factorised:
         return np.asarray(root.T @ root)
 
     def spread(self, n_pairs: int = 0) -> Slices[Spread]:
-        """Return covariances of all variables, with the border, and of what each factor ties, in slices; see `Spread`."""
+        """Return covariances of all variables, with the border, and of what each factor ties, in slices: `Spread`."""
         tree, factors, border = self.system.tree, self.system.factors, self.border_covariance()
         room = spread_room(tree, factors, border, n_pairs)
         for low, high, share in self.system.cuts(tree.own * tree.size**2 + tree.size**2):
@@ -152,9 +152,8 @@ class Factorised:
         try:
             root, lower = cho_factor(self.information)
         except (LinAlgError, ValueError):
-            raise NumericalError(
-                "the measurements do not determine a solution", hint="check units and stamps"
-            ) from None
+            problem = "the measurements do not determine a solution"
+            raise NumericalError(problem, hint="check units and stamps") from None
         return root, bool(lower)
 
 
