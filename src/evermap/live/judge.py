@@ -56,8 +56,8 @@ class Judge:
         self._mount = np.array(sensor.mount_robot_sensor, dtype=np.float64)
         self._classes = lives_of(living, config.living)
         self._table = living.landmarks()
-        earlier: list[_Glance] = [] if before is None else before._glances
-        self._glances = [one for one in earlier if one.stamp_s > living.stamp_s]
+        earlier = () if before is None else before._glances
+        self._glances: list[_Glance] = [one for one in earlier if one.stamp_s > living.stamp_s]
         self._news = News()
         self._after: tuple[LivingMap, Vicinity | None] = living, None
         self.rest_s = 0.0

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from evermap.slam.mistakes import HONEST, USUAL, likeliest, off, pairs_of
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
-    AnyRecordingT,
     BoolArray,
     FloatArray,
     Landmarks,
@@ -408,17 +407,25 @@ def valid(recording: Recording, sensor: SensorConfig, prior_map: Landmarks | Non
     return replace(recording, sensor=sensor.applied_to(recording.sensor))
 
 
+@overload
 def screened(
-    recording: AnyRecordingT, config: Config, prior_map: Landmarks | None = None, *, repair: bool = False
-) -> tuple[AnyRecordingT, tuple[str, ...]]:
+    recording: Recording, config: Config, prior_map: Landmarks | None = ..., *, repair: bool = ...
+) -> tuple[Recording, tuple[str, ...]]: ...
+@overload
+def screened(
+    recording: SpatialRecording, config: Config, prior_map: Landmarks | None = ..., *, repair: bool = ...
+) -> tuple[SpatialRecording, tuple[str, ...]]: ...
+def screened(
+    recording: Any, config: Config, prior_map: Landmarks | None = None, *, repair: bool = False
+) -> tuple[Any, tuple[str, ...]]:
     """Return a recording without ids that other detections contradict, and remarks on it.
 
     A recording in space, or one without ids to use, is returned as it is. With `repair`, what is impossible in a
     recording in the plane is left out (`slam.cleaning`), instead of refused.
 
     Raises:
-        InputError: no recording, or values that cannot be, in it or in the prior map. DataError: nothing can be
-        estimated from it.
+        InputError: no recording, or values that cannot be, in it or in the prior map.
+        DataError: nothing can be estimated from it.
     """
     from evermap.slam.ranges import with_bearings
     from evermap.slam.space.moving import has_traffic
