@@ -329,7 +329,7 @@ class CalibrationPrior:
         """Return the pose (3,) of the robot's front relative to the poses of the graph, which has the states (11,).
 
         There the robot drives along its front and the sensor is turned by the whole bearing bias; where it is the robot
-        that drives askew, its front is turned the other way. Where the sensor is stays as it was.
+        that drives askew, its front is turned the other way. Where the sensor is, stated at `mount` (3,), stays.
         """
         askew = self._askew(states)
         if askew == 0.0:

@@ -99,8 +99,7 @@ def fed(
 ) -> tuple[FloatArray, bool]:
     """Process frame after frame, at the recording's pace if wanted, until the end or an interrupt.
 
-    An interrupt before the end of the `least` frames leaves nothing, and is raised. `step` processes the frame of a
-    row.
+    `step` processes the frame of a row. An interrupt before `least` of the (F,) frames are done is raised.
 
     Returns:
         (F',) seconds per processed frame, and whether it was interrupted.
