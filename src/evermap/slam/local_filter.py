@@ -345,8 +345,8 @@ class SessionFilter(LocalFilter):
     was until `restart`.
     """
 
-    def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True) -> None:
-        super().__init__(problem.mount, problem.prior)
+    def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True, most: int = MOST_ACTIVE) -> None:
+        super().__init__(problem.mount, problem.prior, most=most)
         self.problem = problem
         self._robust, self._noise = robust, noise
         self.covariance[:3, :3] = np.eye(3) / problem.start_information
