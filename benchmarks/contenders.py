@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.world import World
 from evermap.geometry import se2
-from evermap.slam.motion import Motion
+from evermap.slam.local_filter import Motion
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
 from evermap.types import FloatArray

@@ -18,8 +18,8 @@ import numpy as np
 from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces
+from evermap.slam.local_filter import Motion
 from evermap.slam.localize import FrameSightings, Localizer
-from evermap.slam.motion import Motion
 from evermap.slam.problem import Drive, Noise
 from evermap.types import FloatArray, Sensor
 

@@ -19,8 +19,8 @@ import evermap as em
 from evermap.config import Config
 from evermap.errors import ConfigError
 from evermap.io.rosbag import ros2_types
+from evermap.live.engine import Now
 from evermap.live.feed import run_live
-from evermap.live.now import Now
 from evermap.maps.living import LivingMap
 from evermap.types import Recording, Trajectory, rows_of
 from evermap.viz.rerun_scene import LiveScene

@@ -14,10 +14,9 @@ from recordings import building, first_seconds
 from evermap.config import SlamConfig
 from evermap.geometry import se2
 from evermap.slam.intake import prepare
-from evermap.slam.motion import Motion
+from evermap.slam.local_filter import Motion, SessionFilter
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
-from evermap.slam.session_filter import SessionFilter
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import StreamingSlam
 from evermap.types import Recording

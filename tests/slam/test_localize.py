@@ -27,8 +27,8 @@ from evermap.sensing.visibility import NominalField
 from evermap.slam import localize
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces, Neighbourhood
+from evermap.slam.local_filter import Motion
 from evermap.slam.localize import FrameSightings, Localizer
-from evermap.slam.motion import Motion
 from evermap.slam.problem import Drive
 
 COUNT, SIDE_M = 40, 14.0

@@ -12,10 +12,9 @@ from drives import FRAME_S, NOISE, SENSOR, World, driven, nees, place_randomly, 
 from evermap.config import SlamConfig
 from evermap.geometry import se2
 from evermap.slam.calibration import SLOPE, CalibrationPrior
-from evermap.slam.local_filter import LocalFilter
+from evermap.slam.local_filter import LocalFilter, Motion
 from evermap.slam.localize import FrameSightings
 from evermap.slam.mapper import Mapper
-from evermap.slam.motion import Motion
 
 TURN_SCALE, SETTINGS = 7, SlamConfig(robust=False, estimate_noise=False)
 BLIND = range(50, 80)

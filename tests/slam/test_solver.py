@@ -17,10 +17,8 @@ from evermap.geometry import se2
 from evermap.slam import streaming
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import beliefs, prepare
-from evermap.slam.local_filter import LocalFilter, columns
-from evermap.slam.motion import Motion
+from evermap.slam.local_filter import LocalFilter, Motion, SessionFilter, columns
 from evermap.slam.problem import Estimate
-from evermap.slam.session_filter import SessionFilter
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import StreamingSlam, sighted_at
 from evermap_studies.peers.isam import IncrementalSmoother

@@ -23,9 +23,8 @@ from evermap.interrupts import kept, watched
 
 if TYPE_CHECKING:
     from evermap.config import Config
-    from evermap.live.engine import Engine
+    from evermap.live.engine import Engine, Now
     from evermap.live.feed import Reading
-    from evermap.live.now import Now
     from evermap.live.ros import Listener
     from evermap.live.wires import Mailbox, Wire
     from evermap.types import AnyRecording, MapChange, Sensor

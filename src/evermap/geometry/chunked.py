@@ -44,11 +44,7 @@ Joint = Callable[[IntArray, IntArray], FloatArray]
 
 
 class Part:
-    """Blocks of the pairs whose first chunk is one of `CHUNKS_A_PART`; read when they are asked for.
-
-    Args:
-        values: the blocks, or what returns them.
-    """
+    """Blocks of the pairs whose first chunk is one of `CHUNKS_A_PART`; read when they are asked for."""
 
     __slots__ = ("_values", "name")
 
@@ -201,12 +197,9 @@ class ChunkedCovariance:
         return replace(self, chunk=chunk, each_m2=self.each_m2[rows], parts=parts)
 
     def _parts(self, now: _Index, fresh: dict[int, FloatArray], was: IntArray) -> tuple[Part, ...]:
-        """Parts of new pairs (Q',): those of which nothing is fresh are the same, others are put together.
+        """Parts of new pairs (Q',), indexed by `now`: the same where nothing is `fresh`, else put together.
 
-        Args:
-            now: of the new pairs.
-            fresh: blocks of those that are new.
-            was: (Q',) the old row of the others.
+        Blocks that are not fresh are those of the old rows `was` (Q',).
         """
         index, parts = self._index, []
         for g, (begin, end) in enumerate(itertools.pairwise(now.group.tolist())):

@@ -62,12 +62,7 @@ def right_jacobian_inverse(bracket: FloatArray, q: FloatArray) -> FloatArray:
     """
     d = inverse_coefficient(q)
     d, by_d = d[..., None, None], inverse_slope(q, d)[..., None, None]
-    square, rest = _square_and_rest(bracket, q)
+    square = bracket @ bracket
+    rest = bracket @ square + q[..., None, None] * bracket  # zero in the plane
     one = np.eye(bracket.shape[-1])
     return np.asarray(one + 0.5 * bracket + d * square - by_d * (rest @ bracket))
-
-
-def _square_and_rest(bracket: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """`A^2` and `A (A^2 + q)`; the latter is zero in the plane."""
-    square = bracket @ bracket
-    return square, bracket @ square + q[..., None, None] * bracket

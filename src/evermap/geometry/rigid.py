@@ -16,11 +16,7 @@ AT_ONCE = 200_000
 
 
 def consensus(
-    source: FloatArray,
-    target: FloatArray,
-    *,
-    landmark: IntArray | None = None,
-    weight: FloatArray | None = None,
+    source: FloatArray, target: FloatArray, *, landmark: IntArray | None = None, weight: FloatArray | None = None
 ) -> tuple[FloatArray, BoolArray]:
     """Return the motion that brings most points near their partners, over all motions defined by two of them.
 

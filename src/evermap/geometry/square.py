@@ -37,12 +37,9 @@ class SquarePoses(NamedTuple):
 
 
 def square_poses(corner_px: FloatArray, size_m: FloatArray, sensor: SpatialSensor) -> SquarePoses:
-    """Return the poses of square tags in the camera's frame from their corners.
+    """Return the poses of square tags, with edges (M,), in the camera's frame.
 
-    Args:
-        corner_px: (M, 4, 2) in the order of `SpatialDetections.corner_px`.
-        size_m: (M,) length of an edge.
-        sensor: the camera.
+    Corners (M, 4, 2) are in the order of `SpatialDetections.corner_px`.
     """
     corner_px, size_m = np.asarray(corner_px, dtype=np.float64), np.asarray(size_m, dtype=np.float64)
     ray = unproject(corner_px, sensor)
@@ -66,7 +63,9 @@ def _infinitesimal(plane: FloatArray, size_m: FloatArray) -> FloatArray:
     narrow = turn[:, :2, :2] - at[:, :, None] * turn[:, 2:, :2]
     flat = _solved(np.where(np.isfinite(narrow), narrow, np.eye(2)), slope)
     gram = np.swapaxes(flat, 1, 2) @ flat
-    largest = 0.5 * (_trace(gram) + np.sqrt(np.maximum(_trace(gram) ** 2 - 4.0 * _det(gram), 0.0)))
+    trace = gram[:, 0, 0] + gram[:, 1, 1]
+    determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] * gram[:, 1, 0]
+    largest = 0.5 * (trace + np.sqrt(np.maximum(trace**2 - 4.0 * determinant, 0.0)))
     flat = flat / np.sqrt(largest)[:, None, None]
     rest = np.eye(2) - np.swapaxes(flat, 1, 2) @ flat
     lift = np.sqrt(np.maximum(rest[:, [0, 1], [0, 1]], 0.0))
@@ -190,11 +189,3 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         fine = np.linalg.slogdet(matrix)[0] != 0.0
         found[fine] = np.linalg.solve(matrix[fine], right[fine])
         return found
-
-
-def _trace(matrix: FloatArray) -> FloatArray:
-    return np.asarray(matrix[:, 0, 0] + matrix[:, 1, 1])
-
-
-def _det(matrix: FloatArray) -> FloatArray:
-    return np.asarray(matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] * matrix[:, 1, 0])

@@ -81,7 +81,7 @@ class Symmetry:
             return found
         best = self.twisted(pose, reference)
         angle = se3.angle_between(best, reference)
-        for turn in _poses(self.turns[1:]):
+        for turn in se3.turn(self.turns[1:]):
             other = self.twisted(se3.compose(pose, turn), reference)
             off = se3.angle_between(other, reference)
             best = np.where((off < angle - SAME)[..., None], other, best)
@@ -97,8 +97,8 @@ class Symmetry:
         off = se3.between(pose, other)[..., 3:]
         cosine = np.abs(off @ self.turns.T)
         if self.axis >= 0:
-            about = _poses(np.eye(4)[self.axis][None])
-            cosine = np.hypot(cosine, off @ se3.compose(_poses(self.turns), about)[:, 3:].T)
+            about = se3.turn(np.eye(4)[self.axis][None])
+            cosine = np.hypot(cosine, off @ se3.compose(se3.turn(self.turns), about)[:, 3:].T)
         return np.asarray(2.0 * np.arccos(np.clip(cosine.max(axis=-1), 0.0, 1.0)))
 
 
@@ -187,12 +187,12 @@ def _closed(generators: list[FloatArray], axis: int) -> FloatArray:
     """(G, 4) all products; of those that differ by a turn about the axis one."""
     found, new = se3.identity(1), se3.identity(1)
     if axis >= 0:
-        up = [abs(se3.rotation_of(_poses(one))[axis, axis]) for one in generators]
+        up = [abs(se3.rotation_of(se3.turn(one))[axis, axis]) for one in generators]
         if any(cosine < 1.0 - SAME for cosine in up):
             raise ValueError("a rotated axis generates all rotations; that is 'any'")
     group = Symmetry(axis)
     while len(new):
-        products = [se3.compose(one, _poses(turn)) for one in new for turn in generators]
+        products = [se3.compose(one, se3.turn(turn)) for one in new for turn in generators]
         new = np.zeros((0, 7))
         for one in products:
             if group.angle_between(found, one).min() > 1e-6:
@@ -200,8 +200,3 @@ def _closed(generators: list[FloatArray], axis: int) -> FloatArray:
         if len(found) > MOST_TURNS:
             raise ValueError("the rotations do not generate a finite group")
     return found[:, 3:]
-
-
-def _poses(turns: FloatArray) -> FloatArray:
-    """Poses at the origin."""
-    return np.concatenate([np.zeros((*turns.shape[:-1], 3)), turns], axis=-1)

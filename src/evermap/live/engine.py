@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -19,10 +20,9 @@ import numpy as np
 from evermap.compiled import single_threaded
 from evermap.config import Config
 from evermap.errors import ConfigError
-from evermap.live.inbox import Inbox, LiveFrame
+from evermap.live.inbox import Inbox, LiveFrame, recording_of
 from evermap.live.judge import Judge, warm_up
 from evermap.live.keeper import Keeper, News
-from evermap.live.now import Now, recording_of, trajectory_of
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import aged
 from evermap.runs.sessions import Entered
@@ -32,10 +32,39 @@ from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import FrameSightings, Localizer, Located
 from evermap.slam.mapper import Mapper
 from evermap.slam.problem import Drive
-from evermap.types import Clock, FloatArray, IntArray, Landmarks, Sensor
+from evermap.types import Clock, FloatArray, IntArray, Landmarks, MapChange, Sensor, Trajectory
 from evermap.valid import check_sensor
 
 Numbers = Sequence[float] | FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Now:
+    """Present state of the robot and its map.
+
+    Attributes:
+        stamp_s: of the newest odometry; nan before any.
+        pose_world_robot: (3,) there; nan while it is not known.
+        covariance: (3, 3) of it, in the robot's frame.
+        frame: 'prior_map', or 'first_pose' where there is no map yet.
+        lost: the pose is not known, or kept by odometry alone while it is searched for.
+        online: poses of the frames that this step has processed.
+        in_view: landmarks that are in view, or should be, with the probability that each exists.
+        changes: what has become certain since the last step.
+        revision: newest one of the map that the robot is in; 0 before any.
+        warnings: what else there is to tell since the last step.
+    """
+
+    stamp_s: float
+    pose_world_robot: FloatArray
+    covariance: FloatArray
+    frame: str
+    lost: bool
+    online: Trajectory
+    in_view: Landmarks
+    changes: tuple[MapChange, ...] = ()
+    revision: int = 0
+    warnings: tuple[str, ...] = ()
 
 
 class Engine:
@@ -176,9 +205,8 @@ class Engine:
         Raises:
             InputError: values that cannot be, or so late that frames after it are processed.
         """
-        self._inbox.detections(
-            stamp_s, (landmark_id, range_m, bearing_rad, class_name, sigma_range_m, sigma_bearing_rad)
-        )
+        columns = landmark_id, range_m, bearing_rad, class_name, sigma_range_m, sigma_bearing_rad
+        self._inbox.detections(stamp_s, columns)
 
     @single_threaded()
     def step(self) -> Now:
@@ -372,9 +400,17 @@ class Engine:
             covariance=covariance,
             frame=frame,
             lost=located is None or located.lost or bool(np.isnan(pose[0])),
-            online=trajectory_of(online, frame, self._living.clock),
+            online=_trajectory_of(online, frame, self._living.clock),
             in_view=self._in_view,
             changes=changes,
             revision=self._keeper.revision,
             warnings=warnings,
         )
+
+
+def _trajectory_of(online: list[tuple[float, FloatArray, FloatArray]], frame: str, clock: Clock) -> Trajectory:
+    """Return the poses that are known, of stamps, poses and covariances."""
+    known = [one for one in online if math.isfinite(one[1][0])]
+    stamps, poses, spread = zip(*known, strict=True) if known else ((), (), ())
+    pose, covariance = np.array(poses).reshape(-1, 3), np.array(spread).reshape(-1, 3, 3)
+    return Trajectory(np.array(stamps), pose, covariance, frame, clock)

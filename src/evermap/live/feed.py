@@ -13,8 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.live.engine import Engine, Numbers
-from evermap.live.now import Now
+from evermap.live.engine import Engine, Now, Numbers
 from evermap.types import Recording
 
 
@@ -45,11 +44,9 @@ _Stamped = TypeVar("_Stamped", bound=tuple[Any, ...])
 
 
 def replayed(recording: Recording, *, paced: bool = False) -> Iterator[Reading | None]:
-    """Yield the readings of a recording in the order of their stamps, and None after every frame.
+    """Yield the readings of a recording in the plane in the order of their stamps, and None after every frame.
 
-    Args:
-        recording: in the plane.
-        paced: as fast as they came, not at once.
+    If `paced`, as fast as they came, not at once.
     """
     odometry, seen = recording.odometry, recording.detections
     first = np.searchsorted(seen.frame, np.arange(len(recording.frames) + 1))
@@ -69,13 +66,7 @@ def replayed(recording: Recording, *, paced: bool = False) -> Iterator[Reading |
 
 
 def in_time(stamped: Iterable[_Stamped], *, paced: bool, speed: float = 1.0) -> Iterator[_Stamped]:
-    """Yield what begins with a stamp [s], at once, or as fast as it came.
-
-    Args:
-        stamped: by their stamps.
-        paced: as fast as they came.
-        speed: times as fast.
-    """
+    """Yield what begins with a stamp [s], by their stamps, at once, or if `paced` `speed` times as fast as it came."""
     began_s, first_s = time.monotonic(), None
     for one in stamped:
         if paced:
@@ -87,13 +78,9 @@ def in_time(stamped: Iterable[_Stamped], *, paced: bool, speed: float = 1.0) -> 
 def run_live(
     engine: Engine, readings: Iterable[Reading | None], tell: Callable[[Now], None], refused: Callable[[str], None]
 ) -> None:
-    """Feed an engine until the readings end, with a step for every None among them.
+    """Feed an engine until the readings end, with a step for every None among them: no other waits.
 
-    Args:
-        engine: that is fed.
-        readings: as they come; None where no other waits.
-        tell: called with what is known after every step.
-        refused: called with one line for a reading that is not taken; the others go on.
+    `tell` is called with what is known after every step, `refused` with one line for a reading that is not taken.
     """
     for reading in readings:
         try:

@@ -11,6 +11,7 @@ from bisect import bisect_left, insort
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -99,9 +100,8 @@ class Inbox:
         Raises:
             InputError: no finite numbers, or the stamp is before frames that were processed.
         """
-        for quantity, value in zip(
-            (STAMP_S, FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS), (stamp_s, *velocity), strict=True
-        ):
+        quantities = STAMP_S, FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS
+        for quantity, value in zip(quantities, (stamp_s, *velocity), strict=True):
             _check(quantity, value)
         forward_mps, lateral_mps, angular_radps = (float(part) for part in velocity)
         row = float(stamp_s), forward_mps, lateral_mps, angular_radps
@@ -122,11 +122,9 @@ class Inbox:
             self._in_time(frame.stamp_s, partial(self._put_frame, frame))
 
     def ready(self, delay_s: float, *, everything: bool = False) -> list[tuple[LiveFrame, FloatArray, bool]]:
-        """Take out the frames before which nothing can come any more.
+        """Take out the frames before which nothing can come any more, or everything.
 
-        Args:
-            delay_s: how much later than the frames odometry is needed.
-            everything: all that there are; nothing will come any more.
+        Odometry is needed up to `delay_s` after a frame.
 
         Returns:
             LiveFrame, odometry (n, 4) from some seconds before it until the newest, and whether it is kept for the map.
@@ -141,9 +139,8 @@ class Inbox:
                     break
                 frame = self._pending.pop(0)
                 before_s, self.settled_s = self.settled_s, stamp_s
-                found.append(
-                    (frame, self._window(min(stamp_s, max(before_s, self.first_s))), self._keep(frame, before_s))
-                )
+                window = self._window(min(stamp_s, max(before_s, self.first_s)))
+                found.append((frame, window, self._keep(frame, before_s)))
         return found
 
     def window(self) -> FloatArray:
@@ -253,10 +250,8 @@ class Inbox:
     def _rows(self, ids: Any, ranges: Any, bearings: Any, classes: Any, *sigmas: Any) -> FloatArray:
         names = [ids] if isinstance(ids, str) else list(ids)
         rows = np.full((len(names), 6), np.nan)
-        rows[:, 0] = [self._number(name) for name in names]
-        if classes is None:
-            rows[:, 3] = UNKNOWN
-        else:
+        rows[:, 0], rows[:, 3] = [self._number(name) for name in names], UNKNOWN
+        if classes is not None:
             rows[:, 3] = [self._class(name) for name in _column(list(classes), len(names), "class_name")]
         given = zip((1, 2, 4, 5), (RANGE_M, BEARING_RAD, SIGMA_RANGE_M, SIGMA_BEARING_RAD), strict=True)
         for (column, quantity), values in zip(given, (ranges, bearings, *sigmas), strict=True):
@@ -302,11 +297,7 @@ def joined(parts: Sequence[Recording]) -> Recording:
 
 
 def _recorded(
-    about: Recording,
-    odometry: FloatArray,
-    frames: list[LiveFrame],
-    classes: tuple[str, ...],
-    texts: dict[int, str],
+    about: Recording, odometry: FloatArray, frames: list[LiveFrame], classes: tuple[str, ...], texts: dict[int, str]
 ) -> Recording:
     stamp_s, forward_mps, lateral_mps, angular_radps = _columns(odometry)
     rows = np.concatenate([np.zeros((0, 6)), *(one.rows for one in frames)])
@@ -335,8 +326,25 @@ def _columns(rows: FloatArray) -> list[FloatArray]:
     return [np.ascontiguousarray(column) for column in rows.T]
 
 
-def about(name: str, sensor: Sensor, clock: Clock, class_names: tuple[str, ...]) -> Recording:
-    """Return a recording without readings."""
+def recording_of(sensor: object, name: str, clock: Clock, class_names: tuple[str, ...]) -> Recording:
+    """Return a recording without readings, of a sensor or a `sensor.toml`.
+
+    Raises:
+        InputError: neither.
+    """
+    if isinstance(sensor, str | Path):
+        from evermap.io.sensor_toml import parse_sensor_toml
+
+        path = Path(sensor)
+        try:
+            said = parse_sensor_toml(path.read_bytes(), path)
+        except OSError as error:
+            raise InputError(f"cannot be read: {error.strerror}", path=path, hint="a sensor.toml") from None
+        name, sensor, clock = said.name or name, said.sensor, said.clock
+        class_names = said.class_names or class_names
+    if not isinstance(sensor, Sensor):
+        hint = "evermap.Sensor(range_max_m=8.0), or the path of a sensor.toml"
+        raise InputError(f"a Sensor is needed, not {type(sensor).__name__}", field="sensor", hint=hint)
     none, no = np.zeros(0), np.zeros(0, dtype=np.int64)
     nothing = Detections(no, no, none, none, no, none, none, no)
     odometry, frames = Odometry(none, none, none, none, clock), Frames(none, clock=clock)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from evermap.config import Config, LivingConfig
 from evermap.live.inbox import LiveFrame
+from evermap.live.keeper import News
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.looks import Sighting
 from evermap.maps.sessions.session import judged_so_far, lives_of
@@ -40,12 +41,8 @@ class _Glance(NamedTuple):
 class Judge:
     """Accumulated looks at a map, evaluated from time to time by another thread.
 
-    Args:
-        living: the map.
-        places: the same as the localiser has it.
-        sensor: of the robot.
-        config: settings.
-        before: of the map as it was, whose looks at what is later than this one go on.
+    `places` are the map as the localiser has it. Looks of the one `before`, of the map as it was, go on where they are
+    later than this map.
     """
 
     def __init__(
@@ -59,11 +56,9 @@ class Judge:
         self._mount = np.array(sensor.mount_robot_sensor, dtype=np.float64)
         self._classes = lives_of(living, config.living)
         self._table = living.landmarks()
-        self._glances: list[_Glance] = (
-            [] if before is None else [one for one in before._glances if one.stamp_s > living.stamp_s]
-        )
-        self._known: set[tuple[Any, ...]] = set()
-        self._found: list[MapChange] = []
+        earlier = () if before is None else before._glances
+        self._glances: list[_Glance] = [one for one in earlier if one.stamp_s > living.stamp_s]
+        self._news = News()
         self._after: tuple[LivingMap, Vicinity | None] = living, None
         self.rest_s = 0.0
         """Minimum time until the next update."""
@@ -108,22 +103,18 @@ class Judge:
             p_exists = self._table.p_exists.copy()
             p_exists[at] = judged.p_exists
             self._table = replace(self._table, p_exists=p_exists)
-            for change in changes:
-                if (key := (change.kind, change.landmark_ids)) not in self._known:
-                    self._known.add(key)
-                    self._found.append(change)
+            self._news.add(changes)
         if glances[-1].stamp_s - glances[0].stamp_s > self._config.live.beliefs_s:
             whole = self.living
             with self._lock:
                 self._whole, self._after = whole, (whole, None)
                 self._glances = self._glances[len(glances) :]
-                self._known.clear()
+                self._news.known.clear()
 
-    def told(self) -> list[MapChange]:
+    def told(self) -> tuple[MapChange, ...]:
         """Return changes that were not returned before."""
         with self._lock:
-            found, self._found = self._found, []
-        return found
+            return self._news.taken()[0]
 
     def in_view(self, located: Located) -> Landmarks:
         """Return the landmarks that are, or should be, in view, with their present beliefs."""

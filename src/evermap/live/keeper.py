@@ -16,7 +16,6 @@ from evermap.compiled import single_threaded
 from evermap.config import Config
 from evermap.errors import EvermapError, InputError
 from evermap.live.inbox import Inbox
-from evermap.live.now import check_fits
 from evermap.live.spool import Brought, Spool, enter_waiting
 from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store
@@ -49,12 +48,7 @@ class News:
 class Keeper:
     """The sessions of a map file, including the current one.
 
-    Args:
-        path: the map; None for a map in memory, of which nothing is kept.
-        config: settings.
-        inbox: the readings.
-        told: what the engine tells.
-        threads: False does everything at once.
+    Of a map in memory, without a path, nothing is kept; without `threads` everything is done at once.
     """
 
     def __init__(self, path: Path | None, config: Config, inbox: Inbox, told: News, *, threads: bool) -> None:
@@ -93,7 +87,7 @@ class Keeper:
             self.feed()
         try:
             living = self.load(create=mapping)[0] if living is None else living
-            check_fits(living, clock)
+            _check_fits(living, clock)
         except EvermapError:
             self.close()
             raise
@@ -132,9 +126,8 @@ class Keeper:
                 continue
             del self._jobs[name]
             if (error := job.exception()) is not None:
-                defect = (
-                    "" if isinstance(error, EvermapError | OSError) else f"a bug in evermap: {type(error).__name__}: "
-                )
+                known = isinstance(error, EvermapError | OSError)
+                defect = "" if known else f"a bug in evermap: {type(error).__name__}: "
                 self._told.warnings.append(f"{name}: {defect}{error}")
         if self._child is None or self._child.poll() is None:
             return False
@@ -213,3 +206,14 @@ class Keeper:
     def _take(self, brought: Brought) -> None:
         if brought.problem:
             self._told.warnings.append(f"{brought.name}: not entered: {brought.problem}")
+
+
+def _check_fits(living: LivingMap, clock: Clock) -> None:
+    """Raise `InputError` for a map in space, or of another clock."""
+    if living.dim != 2:
+        hint = "sessions in space are solved when they end: enter_session"
+        raise InputError("a map in space", field="map", hint=hint)
+    if len(living.places) and living.clock != clock:
+        problem = f"stamps are on the clock '{clock}', those of the map on '{living.clock}'"
+        hint = f"clock = '{living.clock}' in sensor.toml, or evermap.Engine(..., clock='{living.clock}')"
+        raise InputError(problem, field="clock", hint=hint)

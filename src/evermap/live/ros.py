@@ -19,32 +19,14 @@ import numpy as np
 
 from evermap.errors import EvermapError, InputError
 from evermap.geometry import se2, se3
-from evermap.io.bag import (
-    BagSettings,
-    detections_of,
-    guessed_settings,
-    mounted_sensor,
-    stamps_of,
-    stated_settings,
-)
+from evermap.io.bag import BagSettings, detections_of, guessed_settings, mounted_sensor, stamps_of, stated_settings
 from evermap.io.bag_messages import OBJECT_FIELDS, POSES, BagContent, SeenColumns, handler_of, objects_in_space
 from evermap.io.cdr import parts_of
 from evermap.io.rosbag import Topic, pose_of, ros2_types, seconds, stamp_of
-from evermap.live.engine import Engine
+from evermap.live.engine import Engine, Now
 from evermap.live.feed import Reading, SensorLook, Velocity, in_time
-from evermap.live.now import Now
 from evermap.live.wires import OURS, Mailbox, Message, Wire
-from evermap.runs.mcap import (
-    Ros,
-    drawn,
-    entity_id,
-    in_space,
-    nanoseconds,
-    robot_messages,
-    ros_covariance,
-    told,
-    where,
-)
+from evermap.runs.mcap import Ros, drawn, entity_id, in_space, nanoseconds, robot_messages, ros_covariance, told, where
 from evermap.types import (
     ANY_RANGE_M2,
     UNKNOWN,
@@ -241,10 +223,9 @@ class Listener:
         placed = how.stated_mount or not remarks  # else where `sensor.toml` says
         names: dict[int, str] = {}
         labels = sorted(set(seen.label) - {""})
+        columns = seen, np.zeros_like(seen.look), seen.look, labels, names
         try:
-            found = detections_of(
-                _NO_PATH, settings, (sensor,), (seen, np.zeros_like(seen.look), seen.look, labels, names), remarks
-            )
+            found = detections_of(_NO_PATH, settings, (sensor,), columns, remarks)
         except EvermapError as error:
             raise InputError(f"{topic}: {error.problem}", hint=error.hint) from None
         for remark in remarks:
@@ -275,10 +256,7 @@ class Listener:
 def heard(mailbox: Mailbox, listener: Listener, refused: Callable[[str], None]) -> Iterator[Reading | None]:
     """Yield readings as they arrive, without end, and None after every frame and if none waits.
 
-    Args:
-        mailbox: where messages come in.
-        listener: reads them.
-        refused: called with one line for a message that is not taken.
+    `refused` is called with one line for a message that is not taken.
     """
     stepped = False
     while True:
@@ -299,11 +277,7 @@ def spoken(
 ) -> Iterator[Reading | None]:
     """Yield the readings of a listener for messages made from a recording, and None after each.
 
-    Args:
-        recording: of any kind.
-        listener: reads them.
-        refused: called with one line for a message that is not taken.
-        paced: as fast as they came, not at once.
+    `refused` is called with one line for a message that is not taken; `paced` messages come as fast as they did.
     """
     for stamp_s, topic, kind, raw in in_time(robot_messages(recording), paced=paced):
         yield from _read(listener, Message(topic, kind, raw, stamp_s, "recording"), refused)
@@ -311,13 +285,9 @@ def spoken(
 
 
 def play(recording: AnyRecording, wires: Sequence[Wire], going_on: Callable[[], None], *, speed: float = 1.0) -> int:
-    """Publish the messages of a recorded drive; returns their number.
+    """Publish the messages of a recorded drive, `speed` times as fast as it was driven; returns their number.
 
-    Args:
-        recording: of any kind.
-        wires: to whom.
-        going_on: called before each message; what it raises ends the drive.
-        speed: times as fast as it was driven.
+    `going_on` is called before each message; what it raises ends the drive.
     """
     count = 0
     for stamp_s, topic, kind, raw in in_time(robot_messages(recording), paced=True, speed=speed):
@@ -390,12 +360,7 @@ def _show(message: Any, scene: Scene) -> None:
 
 
 class Teller:
-    """Publishes the outputs of an engine in a separate thread: the newest pose, and all changes.
-
-    Args:
-        engine: whose landmarks are told.
-        wires: to whom.
-    """
+    """Publishes the outputs of an engine on wires, in a separate thread: the newest pose, and all changes."""
 
     def __init__(self, engine: Engine, wires: Sequence[Wire]) -> None:
         self._engine, self._wires = engine, wires
@@ -455,12 +420,8 @@ class Teller:
             return
         self._stamp_s = now.stamp_s
         ros, here = self._ros, now.pose_world_robot
-        path = replace(
-            now.online,
-            stamp_s=np.array([now.stamp_s]),
-            pose_world_robot=here[None],
-            covariance=now.covariance[None],
-        )
+        stamp_s, covariance = np.array([now.stamp_s]), now.covariance[None]
+        path = replace(now.online, stamp_s=stamp_s, pose_world_robot=here[None], covariance=covariance)
         message = ros.posed(now.stamp_s, in_space(here[None])[0], ros_covariance(path)[0])
         self._send(_POSE, message, now.stamp_s)
         if driven is not None:

@@ -155,7 +155,6 @@ class Zenoh:
         ]
 
     def announce(self, topic: str, kind: str) -> None:
-        """Let others know of a topic before anything is sent on it."""
         package, _, name = kind.split("/")
         key = f"{self._domain}{topic}/{package}::msg::dds_::{name}_/{self._types.hash_rihs01(kind)}"
         how: dict[str, Any] = {"congestion_control": self._zenoh.CongestionControl.DROP}
@@ -166,7 +165,6 @@ class Zenoh:
         self._publishers[topic] = declare(key, **how)
 
     def send(self, topic: str, kind: str, raw: bytes, stamp_ns: int) -> None:  # noqa: ARG002 (the protocol's)
-        """Send a message, without waiting for anybody."""
         if topic not in self._publishers:
             self.announce(topic, kind)
         number = self._numbers[topic] = self._numbers.get(topic, 0) + 1
@@ -174,7 +172,6 @@ class Zenoh:
         self._publishers[topic].put(raw, attachment=attached)
 
     def close(self) -> None:
-        """End the session."""
         with suppress(self._zenoh.ZError):
             self._session.close()
 
@@ -211,9 +208,8 @@ class Foxglove:
         try:
             import foxglove
         except ImportError:
-            raise MissingExtraError(
-                "Foxglove's WebSocket needs the package foxglove-sdk", field="foxglove", hint=HINT
-            ) from None
+            problem = "Foxglove's WebSocket needs the package foxglove-sdk"
+            raise MissingExtraError(problem, field="foxglove", hint=HINT) from None
         from foxglove.websocket import Capability
 
         self._foxglove, self._types = foxglove, ros2_types()
@@ -237,20 +233,17 @@ class Foxglove:
         self.about = f"Foxglove: open ws://{host or 'localhost'}:{self.port}, or {self._server.app_url()}"
 
     def announce(self, topic: str, kind: str) -> None:
-        """Let others know of a topic before anything is sent on it."""
         text = self._types.generate_msgdef(kind, ros_version=2)[0].encode()
         schema = self._foxglove.Schema(name=kind, encoding="ros2msg", data=text)
         how: dict[str, Any] = {"schema": schema, "message_encoding": "cdr", "context": self._context}
         self._channels[topic] = self._foxglove.Channel(topic, **how)
 
     def send(self, topic: str, kind: str, raw: bytes, stamp_ns: int) -> None:
-        """Send a message, without waiting for anybody."""
         if topic not in self._channels:
             self.announce(topic, kind)
         self._channels[topic].log(raw, log_time=stamp_ns)
 
     def close(self) -> None:
-        """End the server."""
         self._server.stop()
 
 

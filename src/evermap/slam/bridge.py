@@ -52,20 +52,8 @@ def bridged(
         (K, 3) poses and (K, 3, 3) covariances in the robot's frame.
     """
     out, spread = np.empty((len(stamp_s), 3)), np.empty((len(stamp_s), 3, 3))
-    _bridge(
-        stamp_s,
-        pose_stamp_s,
-        pose,
-        covariance,
-        consecutive,
-        drive.stamp_s,
-        drive.velocity,
-        drive.unknown,
-        states,
-        noise.odometry**2,
-        out,
-        spread,
-    )
+    odometry = drive.stamp_s, drive.velocity, drive.unknown
+    _bridge(stamp_s, pose_stamp_s, pose, covariance, consecutive, *odometry, states, noise.odometry**2, out, spread)
     return out, _semidefinite(0.5 * (spread + spread.transpose(0, 2, 1)))
 
 
@@ -91,15 +79,9 @@ def _write(pose: FloatArray, out: FloatArray) -> None:
 
 @kernel
 def _reckon(
-    stamp: FloatArray,
-    odometry_stamp: FloatArray,
-    velocity: FloatArray,
-    unknown: FloatArray,
-    states: FloatArray,
-    variance: FloatArray,
-    out: FloatArray,
-    spread: FloatArray,
-) -> None:
+    stamp: FloatArray, odometry_stamp: FloatArray, velocity: FloatArray, unknown: FloatArray, states: FloatArray,
+    variance: FloatArray, out: FloatArray, spread: FloatArray,
+) -> None:  # fmt: skip
     increment, motion, noise, floor = np.zeros(3), np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
     for i in range(1, len(stamp)):
         integrate_odometry(
@@ -117,19 +99,10 @@ def _reckon(
 
 @kernel
 def _bridge(
-    stamp: FloatArray,
-    pose_stamp: FloatArray,
-    pose: FloatArray,
-    covariance: FloatArray,
-    consecutive: FloatArray,
-    odometry_stamp: FloatArray,
-    velocity: FloatArray,
-    unknown: FloatArray,
-    states: FloatArray,
-    variance: FloatArray,
-    out: FloatArray,
-    spread: FloatArray,
-) -> None:
+    stamp: FloatArray, pose_stamp: FloatArray, pose: FloatArray, covariance: FloatArray, consecutive: FloatArray,
+    odometry_stamp: FloatArray, velocity: FloatArray, unknown: FloatArray, states: FloatArray, variance: FloatArray,
+    out: FloatArray, spread: FloatArray,
+) -> None:  # fmt: skip
     n = len(pose_stamp)
     motion, noise, floor = np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
     increment, collected = np.zeros((2, 3)), np.zeros((2, 3, 3))

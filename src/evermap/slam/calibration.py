@@ -111,20 +111,12 @@ class CalibrationPrior:
         mean, free = np.array([spec.mean for spec in SPECS]), np.full(N_STATES, calibrated)
         for name, value in settings.fix.items():
             if name not in NAMES:
-                raise ConfigError(
-                    f"unknown calibration state '{name}'",
-                    field="slam.calibration.fix",
-                    hint=", ".join(NAMES),
-                )
+                problem = f"unknown calibration state '{name}'"
+                raise ConfigError(problem, field="slam.calibration.fix", hint=", ".join(NAMES))
             mean[NAMES.index(name)] = value
             free[NAMES.index(name)] = False
-        prior = cls(
-            mean,
-            np.array([settings.sigma[name] for name in NAMES]),
-            free,
-            p_mount=settings.p_needed_mount,
-            settings=settings,
-        )
+        sigma = np.array([settings.sigma[name] for name in NAMES])
+        prior = cls(mean, sigma, free, p_mount=settings.p_needed_mount, settings=settings)
         return prior if sensor is None else prior._as_stated(sensor)
 
     def _as_stated(self, sensor: Sensor) -> CalibrationPrior:
@@ -143,13 +135,10 @@ class CalibrationPrior:
         for state, value in sheet.items():
             if value is not None:
                 sigma[state] = max(value, LEAST_SIGMA)
-        askew = (
-            self.settings.sigma_askew_rad
-            if sensor.sigma_askew_rad is None
-            else max(sensor.sigma_askew_rad, LEAST_SIGMA)
-        )
+        stated = sensor.sigma_askew_rad
+        askew = self.settings.sigma_askew_rad if stated is None else max(stated, LEAST_SIGMA)
         angle_share = 0.0
-        if sensor.sigma_angle_rad is not None or sensor.sigma_askew_rad is not None:
+        if sensor.sigma_angle_rad is not None or stated is not None:
             angle_share = sigma[BEARING] ** 2 / (sigma[BEARING] ** 2 + askew**2)
         sigma[BEARING] = np.hypot(sigma[BEARING], askew)
         known = sensor.kind not in (None, SensorKind.LASER)
@@ -205,9 +194,7 @@ class CalibrationPrior:
         `k_v / (1 + a1)` explains every reading as well. So the graph holds `a1` at its mean, lets the forward scale
         carry the uncertainty of both, and `split_scale` divides what it found between them afterwards.
         """
-        if not self.shares_scale:
-            return self
-        return self.relative(0.0)
+        return self.relative(0.0) if self.shares_scale else self
 
     def relative(self, slope_sigma: float) -> CalibrationPrior:
         """Return the prior of the states in the metres of a range sensor whose slope is known as well as this one's.
@@ -248,9 +235,7 @@ class CalibrationPrior:
     def metre(self, states: FloatArray, covariance: FloatArray) -> tuple[float, float, float]:
         """Return the log factor by which the graph's lengths are too long according to a robot's priors.
 
-        Args:
-            states: (11,) estimate in which nothing but these priors says what a metre is.
-            covariance: (11, 11) of it.
+        Nothing but these says what a metre is in the states (11,), with a covariance (11, 11).
 
         Returns:
             The logarithm; the variance that it has from the estimate; and the precision that the priors give it.
@@ -315,13 +300,9 @@ class CalibrationPrior:
     def split_angle(self, states: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
         """Divide what the graph holds as bearing bias between the angle of the sensor and the robot's driving askew.
 
-        Args:
-            states: (11,) estimate.
-            covariance: (11, 11) of it.
-
         Returns:
-            States and covariance with the sensor's part alone; the robot's part [rad], to the left of its front where
-            positive, and its standard deviation.
+            States (11,) and covariance with the sensor's part alone; the robot's part [rad], to the left of its front
+            where positive, and its standard deviation.
         """
         if not self._shares_angle:
             return states, covariance, 0.0, 0.0
@@ -345,14 +326,10 @@ class CalibrationPrior:
         return float((1.0 - self.angle_share) * states[BEARING]) if self._shares_angle else 0.0
 
     def front(self, states: FloatArray, mount: FloatArray) -> FloatArray:
-        """Return the pose (3,) of the robot's front relative to the poses of the graph.
+        """Return the pose (3,) of the robot's front relative to the poses of the graph, which has the states (11,).
 
         There the robot drives along its front and the sensor is turned by the whole bearing bias; where it is the robot
-        that drives askew, its front is turned the other way. Where the sensor is stays as it was.
-
-        Args:
-            states: (11,) estimate, as the graph has it.
-            mount: (3,) stated pose of the sensor on the robot.
+        that drives askew, its front is turned the other way. Where the sensor is, stated at `mount` (3,), stays.
         """
         askew = self._askew(states)
         if askew == 0.0:
@@ -396,13 +373,8 @@ def needed(prior: CalibrationPrior, states: FloatArray, covariance: FloatArray, 
     """Return the (11,) probability that each free state differs from its stated value, nan for others.
 
     Every subset of states is weighed by its evidence against all as stated: of a Gaussian likelihood of the states,
-    which the estimate under the priors holds, in closed form (Savage and Dickey's ratio).
-
-    Args:
-        prior: under which they were estimated.
-        states: (11,) estimate.
-        covariance: (11, 11) of it.
-        worth: (11,) variances by the errors as they were found, in those of independent errors (`Smoother.worth`).
+    which the estimate (11,) under the prior holds, in closed form (Savage and Dickey's ratio). `worth` (11,) are
+    variances by the errors as they were found, in those of independent errors (`Smoother.worth`).
     """
     free = np.flatnonzero(prior.free)
     probability = np.full(N_STATES, np.nan)

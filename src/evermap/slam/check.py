@@ -38,6 +38,8 @@ from evermap.valid import WITHOUT_IDS, check_landmarks, validate, validate_spati
 
 OUTSIDE = 0.05
 """Share of the image size by which undistorted corners of tags may lie outside of the image."""
+_OTHER_UNIT = "another unit than metres, or a wrong limit"
+_OTHER_SIGN = "another unit or sign, or wrong limits"
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,20 +74,6 @@ class Check(Shown):
     findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
 
-    @classmethod
-    def of(cls, recording: AnyRecording, settings: SlamConfig) -> Check:
-        """Count and compare a valid recording."""
-        from evermap.slam.space.moving import has_traffic
-
-        if isinstance(recording, SpatialRecording):
-            found = findings_in_space(recording, settings)
-        else:
-            found = findings(recording, identities=settings.unknown_ids is not True, settings=settings.check)
-        anonymous = (recording.detections.landmark_id == UNKNOWN).all()
-        if anonymous and not (settings.unknown_ids or has_traffic(recording)):
-            found = (*found, Finding("no-identities", f"no detection has a landmark_id: {WITHOUT_IDS}"))
-        return cls(recording.name, recording.source, contents(recording), found, recording.warnings)
-
     @property
     def usable(self) -> bool:
         """Whether the recording is usable."""
@@ -103,12 +91,9 @@ class Check(Shown):
 
 
 def findings(recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> tuple[Finding, ...]:
-    """Return everything that is odd about a valid recording, the worst first.
+    """Return everything that is odd about a valid recording, the worst first; its truth is not looked at.
 
-    Args:
-        recording: valid, with the sensor's limits in force. Its truth is not looked at.
-        identities: False where the identities of its detections are not used.
-        settings: what counts as odd.
+    The sensor's limits are in force; `identities` is False where those of its detections are not used.
     """
     found = [*_motion(recording, settings), *_limits(recording)]
     if identities:
@@ -237,8 +222,8 @@ def _seen(recording: Recording) -> dict[str, Any]:
     aside |= detections.bearing_rad < sensor.bearing_min_rad
     known = detections.bearing_rad[np.isfinite(detections.bearing_rad)]
     return {
-        "range_m": [float(edge) for edge in np.quantile(detections.range_m, [0.0, 0.5, 1.0])],
-        "bearing_rad": [float(edge) for edge in np.quantile(known, [0.0, 0.5, 1.0])] if len(known) else None,
+        "range_m": np.quantile(detections.range_m, [0.0, 0.5, 1.0]).tolist(),
+        "bearing_rad": np.quantile(known, [0.0, 0.5, 1.0]).tolist() if len(known) else None,
         "without_bearing": len(detections) - len(known),
         "beyond_range_max": int(np.sum(detections.range_m > sensor.range_max_m)),
         "outside_view": int(np.sum(aside)),
@@ -251,14 +236,12 @@ def _seen_in_space(recording: SpatialRecording) -> dict[str, Any]:
     ranged = range_m[np.isfinite(range_m)]
     far, aside = _beyond(recording)
     return {
-        "by_sensor": {
-            sensor.name: int(np.sum(detections.sensor == row)) for row, sensor in enumerate(recording.sensors)
-        },
+        "by_sensor": {one.name: int(np.sum(detections.sensor == row)) for row, one in enumerate(recording.sensors)},
         "with_corners": int(np.isfinite(detections.corner_px[:, 0, 0]).sum()),
         "with_orientation": int(np.isfinite(detections.rotation[:, 0]).sum()),
         "with_size": int(np.isfinite(detections.size_m[:, 0]).sum()),
         "without_range": int(np.sum(~np.isfinite(range_m))),
-        "range_m": [float(edge) for edge in np.quantile(ranged, [0.0, 0.5, 1.0])] if len(ranged) else None,
+        "range_m": np.quantile(ranged, [0.0, 0.5, 1.0]).tolist() if len(ranged) else None,
         "beyond_range_max": int(far.sum()),
         "outside_view": int(aside.sum()),
     }
@@ -268,8 +251,7 @@ def _ranges(recording: SpatialRecording) -> FloatArray:
     """(M,) distances from the sensor; nan where only the direction was seen."""
     from evermap.slam.space.intake import positions_of, without_range
 
-    range_m = np.linalg.norm(positions_of(recording), axis=1)
-    return np.where(without_range(recording), np.nan, range_m)
+    return np.where(without_range(recording), np.nan, np.linalg.norm(positions_of(recording), axis=1))
 
 
 def _beyond(recording: SpatialRecording) -> tuple[BoolArray, BoolArray]:
@@ -287,26 +269,18 @@ def _beyond(recording: SpatialRecording) -> tuple[BoolArray, BoolArray]:
 def _limits_in_space(recording: SpatialRecording) -> list[Finding]:
     """Readings beyond what a sensor is said to reach or to show, and corners that no calibration goes with."""
     detections, (far, aside) = recording.detections, _beyond(recording)
-    found = []
-    if far.any():
-        why = "another unit than metres, or a wrong limit" if np.mean(far) > 0.05 else "outliers"
-        most = f"up to {_ranges(recording)[far].max():.4g} m"
-        found.append(
-            Finding("beyond-range", f"{int(far.sum())} of {len(far)} detections are beyond range_max_m, {most}: {why}")
-        )
-    if aside.any():
-        why = "the calibration is for another resolution" if np.mean(aside) > 0.05 else "outliers"
-        found.append(
-            Finding("beyond-view", f"{int(aside.sum())} of {len(aside)} tags have corners outside of the image: {why}")
-        )
+    most = f"up to {_ranges(recording)[far].max(initial=0.0):.4g} m"
+    other = "the calibration is for another resolution"
+    found = [
+        *_outside("beyond-range", far, f"detections are beyond range_max_m, {most}", _OTHER_UNIT),
+        *_outside("beyond-view", aside, "tags have corners outside of the image", other),
+    ]
     blind = np.array([sensor.intrinsics is None for sensor in recording.sensors])[detections.sensor]
     blind &= np.isfinite(detections.corner_px[:, 0, 0])
     if blind.any():
         name = recording.sensors[int(detections.sensor[blind][0])].name
-        message = (
-            f"camera '{name}' has no calibration: the corners of {int(blind.sum())} tags are not used, only their poses"
-        )
-        found.append(Finding("no-calibration", message))
+        unused = f"the corners of {int(blind.sum())} tags are not used, only their poses"
+        found.append(Finding("no-calibration", f"camera '{name}' has no calibration: {unused}"))
     return found
 
 
@@ -351,26 +325,19 @@ def _limits(recording: Recording) -> list[Finding]:
     slack_rad = 4.0 * (sensor.sigma_bearing_rad or 0.0125)
     far, bearing = detections.range_m > sensor.range_max_m + slack_m, detections.bearing_rad
     aside = (bearing > sensor.bearing_max_rad + slack_rad) | (bearing < sensor.bearing_min_rad - slack_rad)
-    found = []
-    if far.any():
-        most = f"up to {detections.range_m.max():.4g} m"
-        found.append(
-            Finding(
-                "beyond-range",
-                f"{int(far.sum())} of {len(far)} ranges lie beyond range_max_m = {sensor.range_max_m:g}, {most}: "
-                + ("another unit than metres, or a wrong limit" if np.mean(far) > 0.05 else "outliers"),
-            )
-        )
-    if aside.any():
-        view = f"{sensor.bearing_min_rad:.4g} to {sensor.bearing_max_rad:.4g} rad"
-        found.append(
-            Finding(
-                "beyond-view",
-                f"{int(aside.sum())} of {len(aside)} bearings lie outside of the field of view, {view}: "
-                + ("another unit or sign, or wrong limits" if np.mean(aside) > 0.05 else "outliers"),
-            )
-        )
-    return found
+    most = f"range_max_m = {sensor.range_max_m:g}, up to {detections.range_m.max(initial=0.0):.4g} m"
+    view = f"{sensor.bearing_min_rad:.4g} to {sensor.bearing_max_rad:.4g} rad"
+    return [
+        *_outside("beyond-range", far, f"ranges lie beyond {most}", _OTHER_UNIT),
+        *_outside("beyond-view", aside, f"bearings lie outside of the field of view, {view}", _OTHER_SIGN),
+    ]
+
+
+def _outside(code: str, off: BoolArray, what: str, cause: str) -> list[Finding]:
+    """Readings that are `off` (M,) limits; a `cause` of so many that they are no outliers."""
+    if not off.any():
+        return []
+    return [Finding(code, f"{int(off.sum())} of {len(off)} {what}: {cause if np.mean(off) > 0.05 else 'outliers'}")]
 
 
 def _identities(recording: AnyRecording, settings: CheckConfig) -> list[Finding]:
@@ -453,11 +420,8 @@ def screened(
 ) -> tuple[Any, tuple[str, ...]]:
     """Return a recording without ids that other detections contradict, and remarks on it.
 
-    Args:
-        recording: what a reader returned, or anything else; a recording in space, or without ids to use, as it is.
-        config: settings.
-        prior_map: landmarks that are checked with it.
-        repair: leave out what is impossible in a recording in the plane (`slam.cleaning`), instead of refusing it.
+    A recording in space, or one without ids to use, is returned as it is. With `repair`, what is impossible in a
+    recording in the plane is left out (`slam.cleaning`), instead of refused.
 
     Raises:
         InputError: no recording, or values that cannot be, in it or in the prior map.
@@ -479,9 +443,7 @@ def screened(
         remarks = odd(recording, identities=settings.unknown_ids is not True, settings=settings.check)
         recording, told = with_bearings(recording, settings)
         remarks = (*remarks, *told)
-    if (
-        settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording)
-    ):  # the tracker assigns identities
+    if settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording):  # the tracker assigns ids
         return recording, remarks
     voted = without_contradicted_ids(recording, settings)
     remarks = (*remarks, *voted.warnings[len(recording.warnings) :])
@@ -501,10 +463,18 @@ def check_recording(recording: AnyRecording, config: Config | None = None) -> Ch
         InputError: no recording, or one with values that cannot be.
         DataError: nothing can be estimated from it.
     """
+    from evermap.slam.space.moving import has_traffic
+
     config = config or Config()
+    settings = config.slam
     if isinstance(recording, SpatialRecording):
         validate_spatial(recording)
         recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
+        found = findings_in_space(recording, settings)
     else:
         recording = valid(recording, config.sensor)
-    return Check.of(recording, config.slam)
+        found = findings(recording, identities=settings.unknown_ids is not True, settings=settings.check)
+    anonymous = (recording.detections.landmark_id == UNKNOWN).all()
+    if anonymous and not (settings.unknown_ids or has_traffic(recording)):
+        found = (*found, Finding("no-identities", f"no detection has a landmark_id: {WITHOUT_IDS}"))
+    return Check(recording.name, recording.source, contents(recording), found, recording.warnings)

@@ -47,17 +47,11 @@ def clean(recording: Recording, settings: CleaningConfig = USUAL) -> Recording:
         * identities below -1 and classes without a name: unknown; standard deviations that are none: not given.
     """
     remarks: list[str] = []
-    odometry = _odometry(recording.odometry, settings, remarks)
-    detections = _readings(recording, settings, remarks)
-    frames, detections = _in_time(recording.frames, detections, settings, remarks)
-    frames, odometry = _one_clock(frames, odometry, settings, remarks)
-    odometry = _in_step(replace(recording, frames=frames, odometry=odometry, detections=detections), remarks)
-    frames, detections = _while_driving(frames, detections, odometry, settings, remarks)
-    frames, detections = _fresh(frames, detections, odometry, settings, remarks)
-    if not remarks:
-        return recording
-    warnings = (*recording.warnings, *remarks)
-    return replace(recording, odometry=odometry, frames=frames, detections=detections, warnings=warnings)
+    odometry, detections = _odometry(recording.odometry, settings, remarks), _readings(recording, settings, remarks)
+    cleaned = replace(recording, odometry=odometry, detections=detections)
+    for repaired in (_in_time, _one_clock, _in_step, _while_driving, _fresh):
+        cleaned = repaired(cleaned, settings, remarks)
+    return replace(cleaned, warnings=(*recording.warnings, *remarks)) if remarks else recording
 
 
 def _odometry(odometry: Odometry, settings: CleaningConfig, remarks: list[str]) -> Odometry:
@@ -87,9 +81,8 @@ def spikes(stamp_s: FloatArray, velocity: FloatArray, settings: CleaningConfig) 
     step_s = np.minimum(np.append(step_s, np.inf), np.insert(step_s, 0, np.inf))
     step_s = np.maximum(step_s, np.median(step_s))  # rows that are stamped when they arrive may come in bursts
     usual = np.stack([running_median(column, settings.around) for column in velocity])
-    return np.asarray(
-        np.any(np.abs(velocity - usual) > np.maximum(settings.hardest * step_s, settings.sharpest), axis=0)
-    )
+    most = np.maximum(settings.hardest * step_s, settings.sharpest)
+    return np.asarray(np.any(np.abs(velocity - usual) > most, axis=0))
 
 
 def of_ranges_only(detections: Detections, settings: CleaningConfig) -> bool:
@@ -136,15 +129,14 @@ def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]
     return detections
 
 
-def _in_time(
-    frames: Frames, detections: Detections, settings: CleaningConfig, remarks: list[str]
-) -> tuple[Frames, Detections]:
+def _in_time(recording: Recording, settings: CleaningConfig, remarks: list[str]) -> Recording:
     """Frames at increasing stamps, those with equal stamps united, and detections sorted by frame."""
+    frames, detections = recording.frames, recording.detections
     stamps = _mended("sensor", frames.stamp_s, settings, remarks)
     instants: FloatArray = np.unique(stamps[np.isfinite(stamps)])
     sorted_already = np.all(np.diff(detections.frame) >= 0)
     if len(instants) == len(frames) and np.array_equal(instants, frames.stamp_s) and sorted_already:
-        return frames, detections
+        return recording
     _remark(remarks, "repeated frames merged", int(np.isfinite(stamps).sum()) - len(instants))
     row: IntArray = np.searchsorted(instants, stamps).astype(np.int64)[detections.frame]
     order = np.argsort(row, kind="stable")
@@ -156,13 +148,13 @@ def _in_time(
     _remark(remarks, "repeated readings of a frame dropped", len(same) - len(first))
     if not sorted_already:
         remarks.append("detections sorted by frame")
-    return replace(frames, stamp_s=instants), rows_of(detections, np.sort(first))
+    frames, detections = replace(frames, stamp_s=instants), rows_of(detections, np.sort(first))
+    return replace(recording, frames=frames, detections=detections)
 
 
-def _one_clock(
-    frames: Frames, odometry: Odometry, settings: CleaningConfig, remarks: list[str]
-) -> tuple[Frames, Odometry]:
+def _one_clock(recording: Recording, settings: CleaningConfig, remarks: list[str]) -> Recording:
     """Steps forward that one of the two clocks made alone are taken back, the last one first."""
+    frames, odometry = recording.frames, recording.odometry
     for _ in range(len(frames)):
         step = set_forward(frames.stamp_s, odometry.stamp_s, settings)
         if step is not None:
@@ -172,7 +164,7 @@ def _one_clock(
         if step is None:
             break
         odometry = replace(odometry, stamp_s=_taken_back(odometry.stamp_s, step, "odometry", remarks))
-    return frames, odometry
+    return replace(recording, frames=frames, odometry=odometry)
 
 
 def _taken_back(stamp_s: FloatArray, step: tuple[int, float], what: str, remarks: list[str]) -> FloatArray:
@@ -181,8 +173,8 @@ def _taken_back(stamp_s: FloatArray, step: tuple[int, float], what: str, remarks
     return np.append(stamp_s[:row], stamp_s[row:] - by_s)
 
 
-def _in_step(recording: Recording, remarks: list[str]) -> Odometry:
-    """Return the odometry on the clock of the frames, if sightings show that the two differ.
+def _in_step(recording: Recording, _: CleaningConfig, remarks: list[str]) -> Recording:
+    """Odometry on the clock of the frames, if sightings show that the two differ.
 
     A clock that was set forward leaves a pause in its own stream. One that was set back was taken back already, by
     counting messages, and is off by those that were lost at that moment.
@@ -211,13 +203,13 @@ def _in_step(recording: Recording, remarks: list[str]) -> Odometry:
         del delay_s[shorter], since_s[row]
         row = max(row - 1, 1)
     if len(delay_s) == 1:
-        return odometry
+        return recording
     rows = np.maximum.accumulate([0, *(step(row)[0] for row in range(1, len(since_s)))])
     stamp_s = odometry.stamp_s - np.repeat(delay_s, np.diff([*rows, len(odometry)])) + min(delay_s, key=abs)
     for at_s, by_s in zip(since_s[1:], np.diff(delay_s).tolist(), strict=True):
         remarks.append(f"odometry is later by {by_s:+.1f} s than the detections from {at_s:.1f} s on, undone")
     kept = stamp_s > np.maximum.accumulate(np.append(-np.inf, stamp_s[:-1]))
-    return replace(rows_of(odometry, kept), stamp_s=stamp_s[kept])
+    return replace(recording, odometry=replace(rows_of(odometry, kept), stamp_s=stamp_s[kept]))
 
 
 def _longest_pause(stamp_s: FloatArray, first_s: float, last_s: float) -> tuple[int, float]:
@@ -229,39 +221,32 @@ def _longest_pause(stamp_s: FloatArray, first_s: float, last_s: float) -> tuple[
     return first + longest, float(pauses[longest])
 
 
-def _while_driving(
-    frames: Frames, detections: Detections, odometry: Odometry, settings: CleaningConfig, remarks: list[str]
-) -> tuple[Frames, Detections]:
+def _while_driving(recording: Recording, settings: CleaningConfig, remarks: list[str]) -> Recording:
     """Drop frames far before the first or after the last odometry, where the motion is unknown."""
-    if len(odometry) == 0:
-        return frames, detections
-    near = (frames.stamp_s >= odometry.stamp_s[0] - settings.stray_s) & (
-        frames.stamp_s <= odometry.stamp_s[-1] + settings.stray_s
-    )
-    if near.all():
-        return frames, detections
-    _remark(
-        remarks, f"frames more than {settings.stray_s:g} s before or after the odometry dropped", int(np.sum(~near))
-    )
-    return some_frames(frames, detections, near)
+    if len(odometry := recording.odometry) == 0:
+        return recording
+    stray_s, stamp_s = settings.stray_s, recording.frames.stamp_s
+    near = (stamp_s >= odometry.stamp_s[0] - stray_s) & (stamp_s <= odometry.stamp_s[-1] + stray_s)
+    _remark(remarks, f"frames more than {stray_s:g} s before or after the odometry dropped", int(np.sum(~near)))
+    return recording if near.all() else some_frames(recording, near)
 
 
-def some_frames(frames: Frames, detections: Detections, kept: BoolArray) -> tuple[Frames, Detections]:
-    """Return the `kept` (F,) frames with their detections."""
-    seen = rows_of(detections, kept[detections.frame])
+def some_frames(recording: Recording, kept: BoolArray) -> Recording:
+    """Return the recording with the `kept` (F,) frames and their detections only."""
+    seen = rows_of(recording.detections, kept[recording.detections.frame])
     row: IntArray = (np.cumsum(kept) - 1).astype(np.int64)
-    return replace(frames, stamp_s=frames.stamp_s[kept]), replace(seen, frame=row[seen.frame])
+    frames = replace(recording.frames, stamp_s=recording.frames.stamp_s[kept])
+    return replace(recording, frames=frames, detections=replace(seen, frame=row[seen.frame]))
 
 
-def _fresh(
-    frames: Frames, detections: Detections, odometry: Odometry, settings: CleaningConfig, remarks: list[str]
-) -> tuple[Frames, Detections]:
+def _fresh(recording: Recording, settings: CleaningConfig, remarks: list[str]) -> Recording:
     """Without frames that repeat the one before, number by number, though the robot moved: the sensor hangs.
 
     A single reading may repeat by chance, where a camera counts whole pixels, but not over a metre.
     """
+    frames, detections, odometry = recording.frames, recording.detections, recording.odometry
     if len(frames) < 2 or len(odometry) < 2:
-        return frames, detections
+        return recording
     first = np.searchsorted(detections.frame, np.arange(len(frames) + 1))
     count = np.diff(first)
     before = detections.frame - 1
@@ -272,13 +257,10 @@ def _fresh(
         alike &= column == column[at]
     repeated = (count > 0) & (np.bincount(detections.frame, alike, minlength=len(frames)) == count)
     least = np.where(count > 1, 1.0, SINGLE) * settings.moved
-    repeated &= _moved_since(
-        np.maximum.accumulate(np.where(repeated, 0, np.arange(len(frames)))), frames, odometry, least
-    )
-    if not repeated.any():
-        return frames, detections
+    since = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(frames))))
+    repeated &= _moved_since(since, frames, odometry, least)
     _remark(remarks, "frames dropped that repeat the previous one although the robot moved", int(repeated.sum()))
-    return some_frames(frames, detections, ~repeated)
+    return some_frames(recording, ~repeated) if repeated.any() else recording
 
 
 def _moved_since(row: IntArray, frames: Frames, odometry: Odometry, most: FloatArray) -> BoolArray:
@@ -286,8 +268,7 @@ def _moved_since(row: IntArray, frames: Frames, odometry: Odometry, most: FloatA
     speed = np.stack([np.hypot(odometry.forward_mps, odometry.lateral_mps), np.abs(odometry.angular_radps)])
     way = np.pad(np.cumsum(speed[:, :-1] * np.diff(odometry.stamp_s), axis=1), ((0, 0), (1, 0)))
     at = np.stack([np.interp(frames.stamp_s, odometry.stamp_s, column) for column in way])
-    moved: BoolArray = np.any(at - at[:, row] > most, axis=0)
-    return moved
+    return np.asarray(np.any(at - at[:, row] > most, axis=0))
 
 
 def _mended(what: str, stamp_s: FloatArray, settings: CleaningConfig, remarks: list[str]) -> FloatArray:
@@ -309,11 +290,7 @@ def _remark(remarks: list[str], what: str, count: int) -> None:
 
 
 def restored(stamp_s: FloatArray, settings: CleaningConfig) -> tuple[FloatArray, FloatArray]:
-    """Return the stamps of a clock that is never set back.
-
-    Args:
-        stamp_s: (N,) in the order of arrival, anything.
-        settings: what is a step, and what a stray stamp.
+    """Return the stamps (N,) of a clock that is never set back, of any stamps in the order of arrival.
 
     Returns:
         (N,) stamps, nan where one is none; late ones still stand where they arrived. And (K,) by how much the clock was
@@ -342,20 +319,14 @@ def running_median(values: FloatArray, around: int) -> FloatArray:
     if len(values) == 0:
         return values
     padded = np.pad(values, around // 2, mode="edge")
-    middle: FloatArray = np.median(np.lib.stride_tricks.sliding_window_view(padded, around), axis=1)
-    return middle
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, around), axis=1))
 
 
 def set_forward(stamp_s: FloatArray, other_s: FloatArray, settings: CleaningConfig) -> tuple[int, float] | None:
-    """Return whether a clock was set forward, judged by another stream of the same robot.
+    """Return whether a clock was set forward, judged by another stream of the same robot; both increase.
 
     It was, if this stream seems to end later than the other, and has a pause of just that length in which the other
     goes on.
-
-    Args:
-        stamp_s: (N,) increasing.
-        other_s: (M,) increasing.
-        settings: what is a step.
 
     Returns:
         First row after the step and the step's size [s]; None if it was not.

@@ -61,13 +61,8 @@ class _Eyes(NamedTuple):
 def linearise_encounters(pose: FloatArray, met: Encounters, eyes: Any, values: FloatArray, weight: FloatArray) -> float:
     """Linearise encounters at poses (N, 3); return their negative log likelihood, up to a constant.
 
-    Args:
-        pose: (N, 3) of all robots.
-        met: (S,) the encounters.
-        eyes: calibration, mounts and noise of those who see.
-        values: whitened factors in the layout of `sparse`, by observer, observed and the observer's sensor states;
-            filled in.
-        weight: (S,) inlier weights; filled in.
+    Filled in are `values`, whitened factors in the layout of `sparse`, by observer, observed and the observer's sensor
+    states, and inlier weights (S,).
     """
     cost, at = 0.0, 0
     z, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))

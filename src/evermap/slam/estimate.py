@@ -66,13 +66,7 @@ def solve(
 ) -> Solved:
     """Estimate poses, landmarks, calibration and noise of a recording.
 
-    Args:
-        recording: cleaned, with known identities.
-        settings: of the estimator.
-        prior_map: landmarks to localise in; None maps from scratch.
-        remarks: on the recording.
-        realtime: process at the recording's pace.
-        progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.
+    As `pipeline.run_slam`, of a cleaned recording with known identities; `remarks` on it are the first warnings.
 
     Raises:
         DataError: fewer than two frames with a landmark of known identity.
@@ -90,9 +84,8 @@ def solve(
         settings=settings,
         method=_method(prepared, prior, recording.sensor, settings),
     )
-    step_s, interrupted = fed(
-        prepared.problem.stamp_s, lambda _: slam.step(), least=2, realtime=realtime, progress=progress
-    )
+    stamp_s = prepared.problem.stamp_s
+    step_s, interrupted = fed(stamp_s, lambda _: slam.step(), least=2, realtime=realtime, progress=progress)
     return Solved(recording, prepared, slam.finish(), slam, prior, step_s, interrupted, settings)
 
 
@@ -106,12 +99,7 @@ def fed(
 ) -> tuple[FloatArray, bool]:
     """Process frame after frame, at the recording's pace if wanted, until the end or an interrupt.
 
-    Args:
-        stamp_s: (F,) of the frames.
-        step: processes the frame of a row.
-        least: frames without which an interrupt leaves nothing, and is raised.
-        realtime: wait until each frame is due.
-        progress: told after every frame.
+    `step` processes the frame of a row. An interrupt before `least` of the (F,) frames are done is raised.
 
     Returns:
         (F',) seconds per processed frame, and whether it was interrupted.

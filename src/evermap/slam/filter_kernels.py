@@ -15,14 +15,17 @@ from evermap.compiled import kept
 from evermap.slam.kernels import (
     AT_PLACES,
     N_MOTION,
+    N_NOISE,
     N_SENSOR,
     N_STATES,
     adjoint,
     composed,
     detection_residual,
     inlier_weight,
+    integrate_odometry,
     inverted,
     kernel,
+    odometry_covariance,
     sandwich,
     wrapped,
 )
@@ -114,6 +117,22 @@ def along_turn(x: float, y: float, turn: float) -> tuple[float, float]:
 
 
 @kernel
+def driven(
+    stamp: FloatArray, velocity: FloatArray, unknown: FloatArray, start_s: float, stop_s: float, states: FloatArray,
+    free: Any, sigma: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Return increment, derivatives by free states, and covariance of the motion between two instants: `Motion`."""
+    increment, by_states = np.zeros(3), np.zeros((3, N_MOTION))
+    kinds, covariance = np.zeros((N_NOISE, 3, 3)), np.zeros((3, 3))
+    integrate_odometry(stamp, velocity, unknown, start_s, stop_s, states, increment, by_states, kinds, covariance)
+    odometry_covariance(kinds, covariance, sigma**2, covariance)
+    for k in range(N_MOTION):
+        if not free[N_SENSOR + k]:
+            by_states[:, k] = 0.0
+    return increment, by_states, covariance
+
+
+@kernel
 def drive_on(
     pose: FloatArray, covariance: FloatArray, increment: FloatArray, by_states: FloatArray, noise: FloatArray
 ) -> None:
@@ -143,12 +162,8 @@ def told(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the pose (3,) of the robot's front in metres, and its covariance (3, 3), in its own frame.
 
-    Args:
-        pose: (3,) of the state.
-        covariance: of the state, the pose first.
-        front: (3,) seen from the pose.
-        scale: metres in a unit of the state.
-        in_map: True in the frame of the poses, False in that of the front at the first of them.
+    The pose of the state is the first in its covariance, `front` (3,) is seen from it, `scale` are metres in a unit of
+    the state. The frame is that of the poses in a map, else that of the front at the first of them.
     """
     seen, back = composed(pose, front), inverted(front)
     if not in_map:
@@ -168,19 +183,9 @@ def innovations(
     pose: FloatArray, states: FloatArray, covariance: FloatArray, place: FloatArray, slot: Any, own: FloatArray,
     reading: FloatArray, sigma: FloatArray, mount: FloatArray, free: Any,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
-    """Compare K detections with one place each, each pair separately: `S = H P H' + R`.
+    """Compare K detections, range and bearing, with one place (2,) each, each pair separately: `S = H P H' + R`.
 
-    Args:
-        pose: (3,) of the state.
-        states: (11,) of it.
-        covariance: of it.
-        place: (K, 2).
-        slot: (K,) where the place stands in the covariance, -1 where it does not.
-        own: (K, 2, 2) covariance of places without a slot.
-        reading: (K, 2) range and bearing.
-        sigma: (K, 2) their noise.
-        mount: (3,) pose of the sensor on the robot.
-        free: (11,) which calibration states are estimated.
+    `slot` (K,) says where a place stands in the covariance; where it is -1, `own` (K, 2, 2) is that of the place.
 
     Returns:
         (K,) squared Mahalanobis distance, (K,) `log |S|`, (K, 2) residual and (K, 2, 12) its derivatives by pose,
@@ -256,10 +261,8 @@ def update(
         return nis, weight
     place, where, part = np.empty((count, 2)), np.arange(size), np.empty((size, size))
     for k in range(2 * count):
-        place[k // 2, k % 2], where[AT_PLACES + k] = (
-            position[row[slot[k // 2]], k % 2],
-            AT_PLACES + 2 * slot[k // 2] + k % 2,
-        )
+        place[k // 2, k % 2] = position[row[slot[k // 2]], k % 2]
+        where[AT_PLACES + k] = AT_PLACES + 2 * slot[k // 2] + k % 2
     for k in range(size):
         for other in range(size):
             part[k, other] = covariance[where[k], where[other]]
@@ -362,14 +365,9 @@ def _surprises(
 
 @kernel
 def _weigh_by_the_others(
-    spread: FloatArray,
-    pull: FloatArray,
-    sigma: FloatArray,
-    log_odds: FloatArray,
-    heavy: bool,
-    credible: FloatArray,
+    spread: FloatArray, pull: FloatArray, sigma: FloatArray, log_odds: FloatArray, heavy: bool, credible: FloatArray,
     weight: FloatArray,
-) -> float:
+) -> float:  # fmt: skip
     """Compute weights, at most `credible`, from each detection's innovation given all others; return the largest
     change.
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -34,7 +33,6 @@ class Prepared:
         landmark_id: (L,) ids behind the problem's landmark rows.
         prior_map: the map to localise in, in those rows.
         warnings: what was left out, counted.
-        names: texts behind landmark ids.
     """
 
     problem: Problem
@@ -44,7 +42,6 @@ class Prepared:
     landmark_id: IntArray
     prior_map: PriorMap | None
     warnings: tuple[str, ...]
-    names: Mapping[int, str] = field(default_factory=dict)
 
     def given_map(self) -> GivenMap | None:
         """Return the prior map as the joint search compares with it: landmark by landmark, with covariances."""
@@ -68,33 +65,27 @@ def prepare(
     Raises:
         DataError: fewer than two frames with a landmark of known identity.
     """
-    odometry, detections = recording.odometry, recording.detections
-    if len(odometry) == 0:
-        raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
+    drive, odometry_s, detections = Drive.of(recording, settings), recording.odometry.stamp_s, recording.detections
     stamps = recording.frames.stamp_s
     warnings = list(remarks)
     anonymous = detections.landmark_id == UNKNOWN
     if anonymous.any():
         warnings.append(f"{int(anonymous.sum())} detections without identity not used")
-    moving = (stamps >= odometry.stamp_s[0]) & (stamps <= odometry.stamp_s[-1])
+    moving = (stamps >= odometry_s[0]) & (stamps <= odometry_s[-1])
     outside = ~anonymous & ~moving[detections.frame]
     if outside.any():
         warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
     used = np.flatnonzero(~anonymous & ~outside)
     pose_frame, pose_row = np.unique(detections.frame[used], return_inverse=True)
     if len(pose_frame) < 2:
-        raise DataError(
-            f"{recording.name}: landmarks of known identity were seen in {len(pose_frame)} frames, at least 2 needed",
-            hint=WITHOUT_IDS
-            if anonymous.all()
-            else "check landmark ids, and that detections and odometry share one clock",
-        )
+        seen = f"landmarks of known identity were seen in {len(pose_frame)} frames, at least 2 needed"
+        hint = "check landmark ids, and that detections and odometry share one clock"
+        raise DataError(f"{recording.name}: {seen}", hint=WITHOUT_IDS if anonymous.all() else hint)
     landmark_id, landmark_row = np.unique(detections.landmark_id[used], return_inverse=True)
-    start_s = float(odometry.stamp_s[0])
-    velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
+    start_s = float(odometry_s[0])
     problem = Problem(
         stamp_s=stamps[pose_frame] - start_s,
-        drive=Drive.from_rows(odometry.stamp_s - start_s, velocity, settings),
+        drive=drive,
         pose_row=pose_row.astype(np.int64),
         landmark_row=landmark_row.astype(np.int64),
         reading=np.column_stack([detections.range_m[used], detections.bearing_rad[used]]),
@@ -107,32 +98,23 @@ def prepare(
         landmark_information=sparse.csr_array((2 * len(landmark_id), 2 * len(landmark_id))),
     )
     in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
-    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings), recording.landmark_names)
+    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings))
 
 
 def beliefs(sensor: Sensor, settings: SlamConfig) -> tuple[CalibrationPrior, Noise]:
     """Return the prior of the calibration states and the noise levels before the first frame."""
-    prior = CalibrationPrior.from_settings(
-        settings.calibration, calibrated=settings.sensor_model == "calibrated", sensor=sensor
-    )
+    calibrated = settings.sensor_model == "calibrated"
+    prior = CalibrationPrior.from_settings(settings.calibration, calibrated=calibrated, sensor=sensor)
     start = start_noise(settings.noise, settings.outlier_log_odds)
-    nominal = [sensor.sigma_range_m, sensor.sigma_bearing_rad]
-    detection = np.array(
-        [default if given is None else given for given, default in zip(nominal, start.detection, strict=True)]
-    )
+    nominal = np.array([sensor.sigma_range_m, sensor.sigma_bearing_rad], dtype=np.float64)  # None becomes nan
+    detection = np.where(np.isnan(nominal), start.detection, nominal)
     return prior, replace(start, detection=detection, odometry=start.odometry * settings.odometry_noise_factor)
 
 
 def _in_rows(prior_map: Landmarks, landmark_id: IntArray) -> PriorMap | None:
     """The prior map in the order of this session's landmarks; a sigma of zero means 1 mm."""
-    rows = {int(identity): k for k, identity in enumerate(prior_map.landmark_id)}
-    mean = np.zeros((len(landmark_id), 2))
-    information = np.zeros((len(landmark_id), 2, 2))
-    given = np.zeros(len(landmark_id), dtype=bool)
-    for k, identity in enumerate(landmark_id):
-        if int(identity) in rows:
-            row = rows[int(identity)]
-            given[k] = True
-            mean[k] = prior_map.position_m[row]
-            information[k] = np.linalg.inv(prior_map.covariance_m2[row] + 1e-6 * np.eye(2))
-    return PriorMap(mean, information, given)
+    _, own, row = np.intersect1d(landmark_id, prior_map.landmark_id, return_indices=True)
+    mean, information = np.zeros((len(landmark_id), 2)), np.zeros((len(landmark_id), 2, 2))
+    mean[own] = prior_map.position_m[row]
+    information[own] = np.linalg.inv(prior_map.covariance_m2[row] + 1e-6 * np.eye(2))
+    return PriorMap(mean, information, np.isin(np.arange(len(landmark_id)), own))

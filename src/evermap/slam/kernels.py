@@ -253,18 +253,9 @@ def _of_turn(turn: float) -> tuple[float, float, float, float]:
 
 @kernel
 def _carried(
-    out: FloatArray,
-    xx: float,
-    xy: float,
-    yy: float,
-    xt: float,
-    yt: float,
-    tt: float,
-    c: float,
-    s: float,
-    lever_x: float,
-    lever_y: float,
-) -> None:
+    out: FloatArray, xx: float, xy: float, yy: float, xt: float, yt: float, tt: float, c: float, s: float,
+    lever_x: float, lever_y: float,
+) -> None:  # fmt: skip
     """A covariance of perturbations before a step, as one of perturbations after it."""
     x_x, x_y, x_t = c * xx + s * xy + lever_x * xt, c * xy + s * yy + lever_x * yt, c * xt + s * yt + lever_x * tt
     y_x, y_y, y_t = c * xy - s * xx + lever_y * xt, c * yy - s * xy + lever_y * yt, c * yt - s * xt + lever_y * tt

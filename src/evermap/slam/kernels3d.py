@@ -61,15 +61,9 @@ def odometry_residual(
 
 @kernel
 def point_residual(
-    pose: FloatArray,
-    landmark: FloatArray,
-    mount: FloatArray,
-    measured: FloatArray,
-    residual: FloatArray,
-    j_pose: FloatArray,
-    j_landmark: FloatArray,
-    j_mount: FloatArray,
-) -> None:
+    pose: FloatArray, landmark: FloatArray, mount: FloatArray, measured: FloatArray, residual: FloatArray,
+    j_pose: FloatArray, j_landmark: FloatArray, j_mount: FloatArray,
+) -> None:  # fmt: skip
     """Compute (x, y, z) in the sensor's frame, derivatives by pose (3, 6), point (3, 3) and mount (3, 6)."""
     position_residual(pose, landmark, mount, measured, residual, j_pose, j_mount)
     sensor = _matrix(_times(_quaternion(pose), _quaternion(mount)))
@@ -80,15 +74,9 @@ def point_residual(
 
 @kernel
 def pose_residual(
-    pose: FloatArray,
-    landmark: FloatArray,
-    mount: FloatArray,
-    measured: FloatArray,
-    residual: FloatArray,
-    j_pose: FloatArray,
-    j_landmark: FloatArray,
-    j_mount: FloatArray,
-) -> None:
+    pose: FloatArray, landmark: FloatArray, mount: FloatArray, measured: FloatArray, residual: FloatArray,
+    j_pose: FloatArray, j_landmark: FloatArray, j_mount: FloatArray,
+) -> None:  # fmt: skip
     """Compute the residual (6,) of a landmark's pose (7,) as detected, with (6, 6) derivatives by all three poses.
 
     The first three rows are those of its position. The others are the rotation vector, in the sensor's axes, that turns
@@ -104,16 +92,9 @@ def pose_residual(
 
 @kernel
 def axis_residual(
-    pose: FloatArray,
-    landmark: FloatArray,
-    mount: FloatArray,
-    measured: FloatArray,
-    axis: int,
-    residual: FloatArray,
-    j_pose: FloatArray,
-    j_landmark: FloatArray,
-    j_mount: FloatArray,
-) -> None:
+    pose: FloatArray, landmark: FloatArray, mount: FloatArray, measured: FloatArray, axis: int, residual: FloatArray,
+    j_pose: FloatArray, j_landmark: FloatArray, j_mount: FloatArray,
+) -> None:  # fmt: skip
     """Compute as `pose_residual`, of a landmark of which nobody can see how it is turned about one of its axes.
 
     The last three rows are the shortest rotation vector that turns the predicted axis (0, 1 or 2 of the landmark) into
@@ -229,14 +210,9 @@ def _put(out: FloatArray, x: float, y: float, z: float, a: Quaternion) -> None:
 
 @kernel
 def position_residual(
-    pose: FloatArray,
-    landmark: FloatArray,
-    mount: FloatArray,
-    measured: FloatArray,
-    residual: FloatArray,
-    j_pose: FloatArray,
-    j_mount: FloatArray,
-) -> None:
+    pose: FloatArray, landmark: FloatArray, mount: FloatArray, measured: FloatArray, residual: FloatArray,
+    j_pose: FloatArray, j_mount: FloatArray,
+) -> None:  # fmt: skip
     """Compute the first three rows of a detection, with derivatives by the robot's and the sensor's pose (3, 6)."""
     r_pose, r_mount = matrix_of(pose), matrix_of(mount)
     x, y, z = _turned_back(r_pose, landmark[0] - pose[0], landmark[1] - pose[1], landmark[2] - pose[2])

@@ -53,22 +53,9 @@ def linearise(
 ) -> float:  # fmt: skip
     """Linearise the odometry from poses `begin` to `end - 1`, and the detections from `first` to `last - 1`.
 
-    Args:
-        pose: (N, 3) values of poses.
-        place: (P, 2) of places.
-        states: (11,) of the calibration.
-        driven: odometry between the poses.
-        variance: (5,) of its kinds of noise.
-        seen: all detections.
-        values: factors of odometry, then those of detections; filled in.
-        weight: (M,) inlier weights; filled in.
-        begin: first pose whose odometry to the next one is done.
-        end: pose after the last of these.
-        first: first detection.
-        last: detection after the last.
-
-    Returns:
-        Negative log likelihood, up to a constant.
+    At poses (N, 3), places (P, 2) and calibration states (11,), with the variance (5,) of each kind of noise of the
+    odometry. Filled in are `values`, factors of odometry before those of detections, and inlier weights (M,). Returns
+    the negative log likelihood, up to a constant.
     """
     cost, at = 0.0, ODOMETRY * begin
     information, e, root = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
@@ -129,14 +116,6 @@ def _detection_residuals(
     jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     for m in range(len(pose_row)):
         detection_residual(
-            pose[pose_row[m]],
-            landmark[landmark_row[m]],
-            states,
-            mount,
-            reading[m, 0],
-            reading[m, 1],
-            out[m],
-            jx,
-            jl,
-            jc,
-        )
+            pose[pose_row[m]], landmark[landmark_row[m]], states, mount, reading[m, 0], reading[m, 1], out[m],
+            jx, jl, jc,
+        )  # fmt: skip

@@ -9,7 +9,7 @@ world (compare the compressed filter of Guivant and Nebot 2001, whose far places
 with what ties it to its nearest neighbours; where it comes back it is where these take it. Those that a batch solution
 or a map knows are tied as that says, exactly.
 
-The stream (`session_filter`), the association of detections without identities and the localisation in a fixed map all
+The stream (`SessionFilter`), the association of detections without identities and the localisation in a fixed map all
 drive this filter. In a fixed map places are only considered (Schmidt 1966): they are wrong, by what their covariance
 says, and wrong in the same way in every frame. A filter that takes that for fresh noise of each detection believes
 after a hundred frames in its pose to a tenth of the map's error.
@@ -19,15 +19,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.filter_kernels import BELIEVED, drive_on, innovations, update
+from evermap.slam.filter_kernels import BELIEVED, HEAVY, drive_on, driven, innovations, update
 from evermap.slam.kernels import AT_PLACES, N_STATES
-from evermap.slam.motion import Motion
-from evermap.slam.problem import Estimate, Marginals
-from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.slam.problem import Drive, Estimate, Marginals, Noise, Problem
+from evermap.slam.smoother import Smoother
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 UNKNOWN_VARIANCE = 1e4
 """Of a place before its first sighting, m^2: where nothing is known, but not so wide that digits are lost."""
@@ -40,7 +41,38 @@ FEWEST_SLOTS = 16
 """Places that there is room for at first."""
 NEIGHBOURS = 8
 """Places, the nearest, to which a place is tied while it is not in the covariance."""
+ROOM_SHARE = 0.75
+"""Of the places that there is room for, those that a restart brings in at most."""
 NO_PLACES, NO_GAIN, NO_ODDS, NOWHERE = np.arange(0), np.zeros((2, 0)), np.zeros(0), np.zeros((0, 2, 2))
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Odometry between two poses.
+
+    Attributes:
+        increment: (3,) the second pose seen from the first.
+        by_states: (3, 4) its derivative, at its end, by delay, scales and slip; zero where these are not free.
+        covariance: (3, 3) its noise.
+    """
+
+    increment: FloatArray
+    by_states: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def between(cls, problem: Problem, noise: Noise, row: int, states: FloatArray) -> Motion:
+        """Return from pose `row - 1` to pose `row`."""
+        start_s, stop_s = problem.stamp_s[row - 1 : row + 1]
+        return cls.over(problem.drive, start_s, stop_s, states, problem.prior.free, noise)
+
+    @classmethod
+    def over(
+        cls, drive: Drive, start_s: float, stop_s: float, states: FloatArray, free: BoolArray, noise: Noise
+    ) -> Motion:
+        """Return between two instants, with (11,) calibration states of which some are `free`."""
+        odometry = drive.stamp_s, drive.velocity, drive.unknown
+        return cls(*driven(*odometry, start_s, stop_s, states, free, noise.odometry))
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +94,8 @@ class Ties:
 class LocalFilter:
     """The newest pose, the calibration states and the places around; nothing is known of the pose before `hold`.
 
-    Args:
-        mount: (3,) pose of the sensor on the robot.
-        prior: of the calibration states.
-        most: places in the covariance, unless a single frame sees more.
-        considered: no detection moves a place.
+    At `most` so many places stand in the covariance, unless a single frame sees more. If `considered`, no detection
+    moves a place.
     """
 
     def __init__(
@@ -93,16 +122,12 @@ class LocalFilter:
     @property
     def active(self) -> IntArray:
         """Rows of the places in the covariance."""
-        active: IntArray = self._row[self._row != UNKNOWN]
-        return active
+        return np.asarray(self._row[self._row != UNKNOWN])
 
     def lean_on(self, position: FloatArray, joint: Callable[[IntArray], FloatArray], *, tied: bool = True) -> None:
-        """Take places (L, 2) from a solution or a map; `joint` returns the covariance (2 k, 2 k) of some rows of it.
+        """Take places (L, 2), nan where not known, from a solution or a map.
 
-        Args:
-            position: where they are; nan where they are not known.
-            joint: of their covariance; called as `joint(rows)`.
-            tied: False where all are independent.
+        `joint(rows)` returns the covariance (2 k, 2 k) of some of them; where all are independent they are not `tied`.
         """
         self._given_position, self._given_joint = position, joint
         self._neighbours = NEIGHBOURS if tied else 0
@@ -171,14 +196,9 @@ class LocalFilter:
         given: IntArray = NO_PLACES,
         gain: FloatArray = NO_GAIN,
     ) -> None:
-        """Put a new place at `place` (2,).
+        """Put a new place, of all places `row`, at `place` (2,).
 
-        Args:
-            row: of all places.
-            place: where it is.
-            spread: (2, 2) its covariance, given others.
-            given: (k,) these, in the covariance.
-            gain: (2, 2 k) how it follows them.
+        Its covariance is `spread` (2, 2), `given` others (k,), in the covariance, which it follows by `gain` (2, 2 k).
         """
         self.know_of(row + 1)
         self._make_room(1)
@@ -189,33 +209,18 @@ class LocalFilter:
         """Initialise a place from a sighting at the newest pose, in a map whose places are only considered.
 
         It is as wrong as the pose is now, and stays there: the pose is held by it, but gets no better than it was.
-
-        Args:
-            row: of all places, behind those of the map.
-            place: (2,) where it is.
-            by_pose: (2, 14) its derivatives by the pose and the calibration states.
-            spread: (2, 2) covariance by the reading's own noise.
+        `by_pose` (2, 14) are its derivatives by the pose and the calibration states, `spread` (2, 2) is of the reading.
         """
-        self.know_of(row + 1)
-        self._make_room(1)
-        self._enter(row, NO_PLACES, NO_GAIN, spread)
+        self.meet(row, place, spread)
         own = slice(AT_PLACES + 2 * int(self._slot[row]), AT_PLACES + 2 * int(self._slot[row]) + 2)
         across = by_pose @ self.covariance[:AT_PLACES]
         self.covariance[own], self.covariance[:, own] = across, across.T
         self.covariance[own, own] = across[:, :AT_PLACES] @ by_pose.T + spread
-        self.position[row] = place
 
     def compare(
         self, rows: IntArray, reading: FloatArray, sigma: FloatArray, own: FloatArray = NOWHERE
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Compare detections with a place each, as `filter_kernels.innovations`.
-
-        Args:
-            rows: (k,) the places.
-            reading: (k, 2) range and bearing.
-            sigma: (k, 2) their noise.
-            own: (k, 2, 2) covariance of the places, where some are not in that of the filter.
-        """
+        """Compare detections (k, 2) with a place each, as `filter_kernels.innovations`."""
         return innovations(
             self.pose, self.states, self.covariance, self.position[rows], self._slot[rows], own, reading, sigma,
             self._mount, self._free,
@@ -239,10 +244,8 @@ class LocalFilter:
 
     def know_of(self, count: int) -> None:
         """Make room for so many places in all; nothing is known of new ones."""
-        more = count - len(self.position)
-        if more > 0:
-            self.position = np.pad(self.position, ((0, more), (0, 0)), constant_values=np.nan)
-            self._slot = np.pad(self._slot, (0, more), constant_values=-1)
+        self.position = grown(self.position, count)
+        self._slot = grown(self._slot, count, -1)
 
     def _make_room(self, count: int) -> None:
         """Have so many free slots: new ones as long as there are few, else those that were not used for longest."""
@@ -312,21 +315,17 @@ class LocalFilter:
     def _return(self, row: int, ties: Ties) -> None:
         """Put a known place back where those of its neighbours that are in the covariance take it."""
         there = np.flatnonzero(self._slot[ties.rows] >= 0) if len(ties.rows) else NO_PLACES
-        given, own = ties.rows[there], ties.joint[:2, :2]
+        given, own, gain = ties.rows[there], ties.joint[:2, :2], NO_GAIN
+        at = 2 + (2 * there[:, None] + [0, 1]).ravel()
         if len(there):
-            at = 2 + (2 * there[:, None] + [0, 1]).ravel()
             known = ties.joint[np.ix_(at, at)] + LEAST_VARIANCE * np.eye(len(at))
-            gain: FloatArray = np.linalg.solve(known, ties.joint[at, :2]).T
-            moved = (self.position[given] - ties.neighbours[there]).ravel()
-            self._enter(row, given, gain, own - gain @ ties.joint[at, :2])
-        else:
-            gain, moved = NO_GAIN, NO_ODDS
-            self._enter(row, given, gain, own)
+            gain = np.linalg.solve(known, ties.joint[at, :2]).T
+        self._enter(row, given, gain, own - gain @ ties.joint[at, :2])
         if self._considered:  # whatever its neighbours are held to be
             slot = AT_PLACES + 2 * int(self._slot[row])
             self.covariance[slot : slot + 2, slot : slot + 2] = own
         else:
-            self.position[row] = ties.place + gain @ moved
+            self.position[row] = ties.place + gain @ (self.position[given] - ties.neighbours[there]).ravel()
 
     def _enter(self, row: int, given: IntArray, gain: FloatArray, spread: FloatArray) -> None:
         """Put a place in a free slot."""
@@ -338,13 +337,106 @@ class LocalFilter:
         self._row[slot], self._slot[row], self._used_at[slot] = row, slot, self._now
 
 
+class SessionFilter(LocalFilter):
+    """The filter of a `Problem`: its newest pose, with its places and priors; if `robust`, with the Cauchy's tails.
+
+    Rows of the problem beyond those added are not looked at. It may be exchanged between two steps for one whose coming
+    detections belong to other places, or that has more frames or places at the end; what was added before stays as it
+    was until `restart`.
+    """
+
+    def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True, most: int = MOST_ACTIVE) -> None:
+        super().__init__(problem.mount, problem.prior, most=most)
+        self.problem = problem
+        self._robust, self._noise = robust, noise
+        self.covariance[:3, :3] = np.eye(3) / problem.start_information
+        self.hold(problem.start_pose, self.states, self.covariance, NO_PLACES, self.position)
+        self._old_pose = np.zeros((0, 3))
+        self._new_pose: list[FloatArray] = []
+
+    def restart(self, estimate: Estimate, noise: Noise, problem: Problem, marginals: Marginals | None = None) -> None:
+        """Restart at `estimate`, an optimum of the first poses and all places that they saw.
+
+        From here on with other noise, other places or other priors; `marginals` where they are known already.
+        """
+        self.problem, self._noise, self._free = problem, noise, problem.prior.free
+        n = len(estimate.pose)
+        room = max(int(ROOM_SHARE * self._most), len(np.unique(problem.landmark_row[problem.detections_of(n - 1)])))
+        if marginals is None:
+            marginals = Smoother(problem.until(n), noise, heavy=True, robust=self._robust).marginals(estimate)
+        recent = problem.landmark_row[: np.searchsorted(problem.pose_row, n)][::-1]
+        seen, first = np.unique(recent[: 50 * self._most], return_index=True)
+        rows = seen[np.argsort(first, kind="stable")][:room]
+        if np.count_nonzero(estimate.known) <= room:
+            rows = np.flatnonzero(estimate.known)
+        self.begin(estimate, marginals, n - 1, rows[estimate.known[rows]])
+        self._old_pose, self._new_pose = estimate.pose[:-1], [self.pose.copy()]
+
+    def motion(self, row: int) -> Motion:
+        """Return odometry from the previous pose to pose `row`, with the present states."""
+        return Motion.between(self.problem, self._noise, row, self.states)
+
+    def distances(self, detections: IntArray, places: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Compare detections (k,) of the newest pose, before they are used, with known places (k,).
+
+        Returns:
+            (k,) squared Mahalanobis distances with `S = H P H' + R`, and (k,) `log |S|`.
+        """
+        self.bring(places)
+        return self.compare(places, *self._readings(detections))[:2]
+
+    def add(self, row: int, landmark: FloatArray) -> None:
+        """Add the detections of pose `row`, one more than the last, to which the filter was driven.
+
+        Places that are seen for the first time are at `landmark` (L, 2).
+        """
+        detections = self.problem.detections_of(row)
+        rows = self.problem.landmark_row[detections]
+        self.know_of(len(self.problem.landmark_mean))
+        new = np.isnan(self.position[rows, 0])
+        if np.count_nonzero(new):
+            self.bring(rows[~new])
+            for j in dict.fromkeys(rows[new].tolist()):
+                self._meet(j, landmark)
+        else:
+            self.bring(rows)
+        self.update(rows, *self._readings(detections), weighing=HEAVY if self._robust else BELIEVED)
+        self._new_pose.append(self.pose.copy())
+
+    def estimate(self) -> Estimate:
+        """Return values of everything so far; poses since the last restart as they were when they were added."""
+        landmark = grown(self.position, len(self.problem.landmark_mean)).copy()
+        return Estimate(np.vstack([self._old_pose, *self._new_pose]), landmark, self.states.copy())
+
+    def _readings(self, detections: IntArray) -> tuple[FloatArray, FloatArray]:
+        return self.problem.reading[detections], self._noise.of_detections(self.problem.sigma_given[detections])
+
+    def _meet(self, row: int, landmark: FloatArray) -> None:
+        """Put a place that is seen for the first time at its prior, given those in the covariance, or at `landmark`."""
+        problem, active = self.problem, np.zeros(len(self.problem.landmark_mean), dtype=bool)
+        active[self.active] = True
+        prior = problem.conditional_prior(row, active)
+        if prior.information.any():
+            place = prior.place(self.position, problem.landmark_mean)
+            self.meet(row, place, np.asarray(np.linalg.inv(prior.information)), prior.given, prior.gain)
+        else:
+            self.meet(row, landmark[row])
+
+
 def columns(slots: IntArray) -> IntArray:
     """Return the columns of x and y of places in the covariance."""
     return np.asarray(AT_PLACES + (2 * slots[:, None] + [0, 1]).ravel(), dtype=np.int64)
 
 
+def grown(rows: Any, count: int, missing: float = np.nan) -> Any:
+    """Return rows, so many at least: those that are missing have a value for that; the same array where none is."""
+    more = count - len(rows)
+    if more <= 0:
+        return rows
+    return np.pad(rows, [(0, more), *[(0, 0)] * (rows.ndim - 1)], constant_values=missing)
+
+
 def _nearest(position: FloatArray, to: FloatArray, count: int) -> IntArray:
     """Return rows of the nearest points, the nearest first."""
     away = ((position - to) ** 2).sum(axis=1)
-    near: IntArray = np.argsort(away, kind="stable")[:count]
-    return near
+    return np.asarray(np.argsort(away, kind="stable")[:count])

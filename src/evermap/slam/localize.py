@@ -23,8 +23,7 @@ from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.filter_kernels import BY_OTHERS
 from evermap.slam.kernels import AT_PLACES, N_SENSOR
 from evermap.slam.known_places import KnownPlaces, LocalTrack, Neighbourhood, Placed
-from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
-from evermap.slam.motion import Motion
+from evermap.slam.local_filter import NO_PLACES, LocalFilter, Motion, columns
 from evermap.slam.problem import Drive, Noise
 from evermap.slam.streaming import sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
@@ -182,15 +181,8 @@ class Localizer(Shown):
 
     def over(self, places: KnownPlaces, sensor: Sensor) -> Localizer:
         """Return one that goes on from here in another state of the map."""
-        there = Localizer(
-            places,
-            sensor,
-            self._prior,
-            self.noise,
-            settings=self._settings,
-            looks=self._field.settings,
-            learn=self.learn,
-        )
+        settings, looks = self._settings, self._field.settings
+        there = Localizer(places, sensor, self._prior, self.noise, settings=settings, looks=looks, learn=self.learn)
         local, before = there._filter, self._filter
         local.states[:] = before.states
         local.covariance[3:, 3:] = before.covariance[3:AT_PLACES, 3:AT_PLACES]
@@ -215,11 +207,8 @@ class Localizer(Shown):
         placed = self._track.placed(stamp_s, self.places)
         if placed is None:
             return
-        here, there = self._filter.pose, placed.pose
-        if self._is_placed and (
-            self._track.agreement(there, self.places)
-            < self._settings.better_by * self._track.agreement(here, self.places)
-        ):
+        agreement, places, by = self._track.agreement, self.places, self._settings.better_by
+        if self._is_placed and agreement(placed.pose, places) < by * agreement(self._filter.pose, places):
             self._track = None  # it is the world that differs from the map
             self._agreed.clear()
             return
@@ -293,8 +282,7 @@ class Localizer(Shown):
         nis, log_det, *_ = self._filter.compare(row, reading[of], sigma[of], self.places.covariance_m2[row])
         score = self._believed[row] - 0.5 * nis - 0.5 * log_det
         best = np.maximum.reduceat(score, begin)[of] == score
-        chosen: IntArray = row[best][np.unique(of[best], return_index=True)[1]]
-        return chosen
+        return np.asarray(row[best][np.unique(of[best], return_index=True)[1]])
 
     def _judge(self, stamp_s: float, landmark_id: IntArray, agrees: BoolArray) -> None:
         """Lost where most of the landmarks compared last were not where they should have been."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,14 +13,13 @@ from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.geometry.chunked import JointCovariance
 from evermap.sensing.visibility import NominalField
-from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.estimate import fed
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import FrameSightings, Localizer, Located
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive, Noise
-from evermap.slam.result import described
+from evermap.slam.result import dead_reckoning, described
 from evermap.types import (
     UNKNOWN,
     BoolArray,
@@ -30,6 +28,7 @@ from evermap.types import (
     IntArray,
     Landmarks,
     Misses,
+    Progress,
     Recording,
     Sensor,
     SlamResult,
@@ -48,20 +47,13 @@ def localize(
     *,
     joint_m2: JointCovariance | None = None,
     realtime: bool = False,
-    progress: Callable[[float, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> SlamResult:
-    """Localise a recording in a map that is not changed: causal poses, from an unknown start.
+    """Localise a recording in a map that is not changed, as `pipeline.run_localization`.
 
-    Args:
-        recording: from a reader; its truth is not used.
-        landmarks: the map. Here, other than elsewhere, a landmark may have several rows: one a site where it may stand,
-            with `p_exists` the probability of each; those of probability 0 are not looked at.
-        prior: of the calibration states.
-        noise: standard deviations; they are not estimated.
-        config: settings.
-        joint_m2: covariance of all rows together; None takes `covariance_m2`, and the rows to be independent.
-        realtime: process at the recording's pace.
-        progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.
+    Here, other than elsewhere, a landmark may have several rows: one a site where it may stand, with `p_exists` the
+    probability of each; those of probability 0 are not looked at. `joint_m2` is the covariance of all rows together;
+    None takes `covariance_m2`, and the rows to be independent. Noise levels are not estimated.
 
     Returns:
         Poses from the first frame on at which the robot knew where it was, `trajectory` the same as `online`; the map
@@ -70,33 +62,18 @@ def localize(
     Raises:
         DataError: there is no odometry, or the robot's place in the map could not be found.
     """
-    odometry, stamps = recording.odometry, recording.frames.stamp_s
-    if len(odometry) == 0:
-        raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
-    start_s = float(odometry.stamp_s[0])
-    velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
-    drive = Drive.from_rows(odometry.stamp_s - start_s, velocity, config.slam.odometry)
-    landmarks, places = _existing(landmarks, joint_m2)
-    warm_up()
-    localizer = Localizer(
-        places, recording.sensor, prior.gaussian(), noise, settings=config.slam.localize, looks=config.living.looks
-    )
-    frame = np.flatnonzero((stamps >= start_s) & (stamps <= odometry.stamp_s[-1]))
-    run = _feed(localizer, recording, frame, drive, realtime=realtime, progress=progress)
-    if not run.placed.any():
-        raise DataError(
-            f"{recording.name}: cannot localise in the map: too few of the detected landmarks have the relative "
-            f"positions of the map",
-            hint="check that it is the map of this place",
-        )
-    return _result(recording, run, localizer, prior, drive, landmarks, places)
-
-
-def _existing(landmarks: Landmarks, joint_m2: JointCovariance | None) -> tuple[Landmarks, KnownPlaces]:
-    """Return the landmarks that may exist, and the same as the localiser wants them."""
+    drive = Drive.of(recording, config.slam.odometry)
     covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2
     places = KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists).existing()
-    return landmarks[np.flatnonzero(landmarks.p_exists > 0.0)], places
+    landmarks = landmarks[np.flatnonzero(landmarks.p_exists > 0.0)]
+    warm_up()
+    settings, looks = config.slam.localize, config.living.looks
+    localizer = Localizer(places, recording.sensor, prior.gaussian(), noise, settings=settings, looks=looks)
+    run = _feed(localizer, recording, drive, realtime=realtime, progress=progress)
+    if not run.placed.any():
+        problem = "cannot localise in the map: too few of the detected landmarks have the relative positions of the map"
+        raise DataError(f"{recording.name}: {problem}", hint="check that it is the map of this place")
+    return _result(run, prior, drive, landmarks)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +81,7 @@ class _Run:
     """Results of the frames.
 
     Attributes:
+        recording, localizer: what was fed, and to whom.
         frame: (F,) rows of `Recording.frames` that were processed.
         first: (F,) row of the first detection of each.
         located: one a frame.
@@ -111,6 +89,8 @@ class _Run:
         interrupted: True where the recording goes on.
     """
 
+    recording: Recording
+    localizer: Localizer
     frame: IntArray
     first: IntArray
     located: list[Located]
@@ -132,40 +112,54 @@ class _Run:
         rows = [first + np.arange(len(one.place)) for first, one in zip(self.first, self.located, strict=True)]
         return np.concatenate(rows).astype(np.int64)
 
-    def innovations(self, recording: Recording) -> Innovations:
-        """Return innovations of every detection that was compared with the map."""
-        told = self.all("place") != UNKNOWN
+    @property
+    def innovations(self) -> Innovations:
+        """Innovations of every detection that was compared with the map."""
+        told, seen = self.all("place") != UNKNOWN, self.recording.detections
         rows = self.detection[told]
         return Innovations(
-            stamp_s=recording.frames.stamp_s[recording.detections.frame[rows]],
+            stamp_s=self.recording.frames.stamp_s[seen.frame[rows]],
             detection=rows,
-            landmark_id=recording.detections.landmark_id[rows],
+            landmark_id=seen.landmark_id[rows],
             nis=self.all("nis")[told],
             p_inlier=self.all("p_inlier")[told],
         )
 
-    def misses(self, places: KnownPlaces) -> Misses:
-        """Return landmarks that were well in view and not detected."""
+    @property
+    def misses(self) -> Misses:
+        """Landmarks that were well in view and not detected."""
         missed = self.all("missed")
         count = [int(one.missed.sum()) for one in self.located]
         return Misses(
             frame=np.repeat(self.frame, count),
-            landmark_id=places.landmark_id[self.all("expected")[missed]],
+            landmark_id=self.localizer.places.landmark_id[self.all("expected")[missed]],
             p_detect=self.all("p_detect")[missed],
         )
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was not used, and where the pose was not known."""
+        names = self.recording.detections.landmark_id[self.detection]
+        anonymous = int((names == UNKNOWN).sum())
+        strange = int((~np.isin(names, self.localizer.places.landmark_id)).sum()) - anonymous
+        at = int(np.argmax(self.placed))
+        blind = float(np.ptp(self.recording.frames.stamp_s[self.frame[: at + 1]]))
+        searching = int(sum(one.lost for one in self.located[at:]))
+        said = {
+            f"{anonymous} detections without identity not used": anonymous,
+            f"{strange} detections of landmarks that are not in the map not used": strange,
+            f"the robot was localised in the map after {blind:.1f} s; there are no poses before": at,
+            f"in {searching} frames the map did not fit, and the pose was searched for": searching,
+        }
+        return tuple(text for text, count in said.items() if count)
+
 
 def _feed(
-    localizer: Localizer,
-    recording: Recording,
-    frame: IntArray,
-    drive: Drive,
-    *,
-    realtime: bool,
-    progress: Callable[[float, float], None] | None,
+    localizer: Localizer, recording: Recording, drive: Drive, *, realtime: bool, progress: Progress | None
 ) -> _Run:
-    """Frame after frame through the filter."""
-    seen, stamps = recording.detections, recording.frames.stamp_s
+    """Frame after frame, while there is odometry, through the filter."""
+    seen, stamps, odometry_s = recording.detections, recording.frames.stamp_s, recording.odometry.stamp_s
+    frame = np.flatnonzero((stamps >= odometry_s[0]) & (stamps <= odometry_s[-1]))
     first, last = np.searchsorted(seen.frame, frame), np.searchsorted(seen.frame, frame, side="right")
     located: list[Located] = []
 
@@ -176,43 +170,33 @@ def _feed(
             np.column_stack([seen.range_m[low:high], seen.bearing_rad[low:high]]),
             np.column_stack([seen.sigma_range_m[low:high], seen.sigma_bearing_rad[low:high]]),
         )
-        located.append(localizer.step(stamps[frame[row]] - recording.odometry.stamp_s[0], drive, sightings))
+        located.append(localizer.step(stamps[frame[row]] - odometry_s[0], drive, sightings))
 
     step_s, interrupted = fed(stamps[frame], step, realtime=realtime, progress=progress)
     done = len(step_s)
-    return _Run(frame[:done], first[:done], located[:done], step_s, interrupted)
+    return _Run(recording, localizer, frame[:done], first[:done], located[:done], step_s, interrupted)
 
 
-def _result(
-    recording: Recording,
-    run: _Run,
-    localizer: Localizer,
-    prior: CalibrationPrior,
-    drive: Drive,
-    landmarks: Landmarks,
-    places: KnownPlaces,
-) -> SlamResult:
+def _result(run: _Run, prior: CalibrationPrior, drive: Drive, landmarks: Landmarks) -> SlamResult:
     """Return what the frames said, as plain arrays."""
-    stamps, placed = recording.frames.stamp_s, run.placed
+    recording, localizer, placed, misses = run.recording, run.localizer, run.placed, run.misses
     pose = np.array([one.pose for one in run.located])[placed]
     pose[:, 2] = se2.wrap(pose[:, 2])
     spread = np.array([one.covariance for one in run.located])[placed]
-    trajectory = Trajectory(stamps[run.frame[placed]], pose, spread, frame="prior_map", clock=recording.clock)
-    reported = CalibrationPrior.from_settings(calibrated=False).mean
-    reckoned, spread = dead_reckoned(trajectory.stamp_s - recording.odometry.stamp_s[0], drive, reported, START)
-    misses = run.misses(places)
+    stamp_s = recording.frames.stamp_s[run.frame[placed]]
+    trajectory = Trajectory(stamp_s, pose, spread, frame="prior_map", clock=recording.clock)
     noise = localizer.noise
     fit = NoiseFit(noise, np.zeros_like(noise.detection), np.zeros_like(noise.odometry))
     return SlamResult(
         trajectory=trajectory,
         online=trajectory,
-        landmarks=_with_counts(landmarks, recording, run, places, misses),
+        landmarks=_with_counts(landmarks, run, misses),
         parameters=described(localizer.states, localizer.states_covariance, fit, prior),
-        innovations=run.innovations(recording),
+        innovations=run.innovations,
         misses=misses,
         step_s=run.step_s[placed],
-        dead_reckoning=replace(trajectory, pose_world_robot=se2.compose(pose[0], reckoned), covariance=spread),
-        warnings=tuple(_warnings(recording, run, places)),
+        dead_reckoning=dead_reckoning(trajectory, drive, recording.odometry.stamp_s[0]),
+        warnings=run.warnings,
         interrupted=run.interrupted,
     )
 
@@ -231,30 +215,12 @@ def warm_up() -> None:
     NominalField(sensor).p_detect(np.zeros((1, 3)), at)  # for places that are believed to exist
 
 
-def _with_counts(
-    landmarks: Landmarks, recording: Recording, run: _Run, places: KnownPlaces, misses: Misses
-) -> Landmarks:
+def _with_counts(landmarks: Landmarks, run: _Run, misses: Misses) -> Landmarks:
     """Return one row per landmark, with the hits and misses of this recording."""
-    best = landmarks[np.argsort(landmarks.landmark_id, kind="stable")[places.most_probable()]]
+    best = landmarks[np.argsort(landmarks.landmark_id, kind="stable")[run.localizer.places.most_probable()]]
     names, hit = best.landmark_id, run.detection[run.all("p_inlier") > 0.5]
     n_hits, n_misses = (
         np.bincount(np.searchsorted(names, seen), minlength=len(names)).astype(np.int64)
-        for seen in (recording.detections.landmark_id[hit], misses.landmark_id)
+        for seen in (run.recording.detections.landmark_id[hit], misses.landmark_id)
     )
     return replace(best, n_hits=n_hits, n_misses=n_misses, frame="prior_map")
-
-
-def _warnings(recording: Recording, run: _Run, places: KnownPlaces) -> list[str]:
-    names = recording.detections.landmark_id[run.detection]
-    anonymous = int((names == UNKNOWN).sum())
-    strange = int((~np.isin(names, places.landmark_id)).sum()) - anonymous
-    at = int(np.argmax(run.placed))
-    blind = float(np.ptp(recording.frames.stamp_s[run.frame[: at + 1]]))
-    searching = int(sum(one.lost for one in run.located[at:]))
-    said = {
-        f"{anonymous} detections without identity not used": anonymous,
-        f"{strange} detections of landmarks that are not in the map not used": strange,
-        f"the robot was localised in the map after {blind:.1f} s; there are no poses before": at,
-        f"in {searching} frames the map did not fit, and the pose was searched for": searching,
-    }
-    return [text for text, count in said.items() if count]

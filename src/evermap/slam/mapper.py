@@ -22,12 +22,7 @@ from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Sensor
 
 
 class Growing:
-    """Rows that are added at the end, at a constant cost each on average.
-
-    Args:
-        shape: of a row.
-        kind: type of its numbers.
-    """
+    """Rows of one shape that are added at the end, at a constant cost each on average."""
 
     def __init__(self, *shape: int, kind: Any = np.float64) -> None:
         self._data = np.zeros((64, *shape), dtype=kind)
@@ -51,14 +46,7 @@ class Growing:
 
 
 class Mapper:
-    """Feed frames in order with `step`.
-
-    Args:
-        sensor: its mount.
-        prior: of the calibration states.
-        noise: where the noise levels start.
-        settings: of the estimator.
-    """
+    """Feed frames in order with `step`; `noise` is where the noise levels start."""
 
     def __init__(self, sensor: Sensor, prior: CalibrationPrior, noise: Noise, settings: SlamConfig) -> None:
         self._stamps, self._odometry = Growing(), Growing(5)
@@ -151,6 +139,7 @@ class Mapper:
         return replace(found, covariance_m2=covariance, p_exists=np.full(len(known), p_exists))
 
     def _grow(self, stamp_s: float, seen: FrameSightings, known: IntArray) -> None:
+        """Pass the rows so far and the `known` ones of a frame to the stream."""
         names = seen.landmark_id[known].tolist()
         for name in names:
             self._row.setdefault(name, len(self._row))
@@ -159,10 +148,6 @@ class Mapper:
         self._landmark_row.add([self._row[name] for name in names])
         self._reading.add(seen.reading[known])
         self._sigma.add(seen.sigma_given[known])
-        self._told()
-
-    def _told(self) -> None:
-        """Pass the present rows to the stream."""
         rows, new = self._odometry.rows, len(self._row) - len(self._problem.landmark_mean)
         information = self._problem.landmark_information
         self._problem = replace(

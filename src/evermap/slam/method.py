@@ -63,18 +63,14 @@ class Method(Protocol):
     """Decides for every frame to which places its detections belong, and thinks again at relinearisations."""
 
     def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
-        """Return places (k,) of the detections of pose `row`, before they are used.
+        """Return places (k,) of the detections (k,) of pose `row`, before they are used.
 
-        Args:
-            problem: the measurements, with the places decided so far; `landmark_row[detections]` still says whose
-                detections they are.
-            row: the pose that is about to be added.
-            detections: (k,) rows of the problem's detections.
-            compare: how far each is from a place.
+        The problem has the places decided so far; `landmark_row[detections]` still says whose detections they are.
+        `compare` says how far each is from a place.
 
         Returns:
-            (k,) rows of places. One without position starts where the detection points; rows from the number of
-            places on are new ones, in their order.
+            (k,) rows of places. One without position starts where the detection points; rows from the number of places
+            on are new ones, in their order.
         """
         ...
 
@@ -91,14 +87,10 @@ class Method(Protocol):
         return True
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
-        """Return the best explanation of everything so far.
+        """Return the best explanation of everything so far, from the optimum with the places decided so far.
 
-        Args:
-            problem: the measurements so far, with the places decided so far.
-            estimate: its optimum.
-            noise: the noise levels.
-            heavy: outliers have the Cauchy's tails, as while the estimate may still be far off.
-            final: the session ends here.
+        If `heavy`, outliers have the Cauchy's tails, as while the estimate may still be far off; if `final`, the
+        session ends.
         """
         ...
 

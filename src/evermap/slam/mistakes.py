@@ -51,7 +51,7 @@ class Mistake:
         """Return both, the other one undone first."""
         turned = self.turned
         if other.turned != HONEST.turned:
-            turned = tuple(se3.compose((0.0, 0.0, 0.0, *self.turned), (0.0, 0.0, 0.0, *other.turned))[3:].tolist())
+            turned = tuple(se3.compose(se3.turn(self.turned), se3.turn(other.turned))[3:].tolist())
         return Mistake(
             self.code,
             self.message,
@@ -110,14 +110,13 @@ _ANGLES = (
     *(
         Mistake(
             "bearing-axis",
-            f"bearings seem to be {side} from another axis: they are measured from x ahead (bearing_rad, x_m and y_m, "
-            f"or "
-            "[mount] theta_rad)",
+            "bearings seem to be 90 degrees off, from another axis: they are measured from x ahead (bearing_rad, x_m "
+            "and y_m, or [mount] theta_rad)",
             bearing=sign,
             offset_rad=offset,
         )
         for sign in (1.0, -1.0)
-        for offset, side in ((pi / 2, "90 degrees off,"), (-pi / 2, "90 degrees off,"))
+        for offset in (pi / 2, -pi / 2)
     ),
 )
 _AXES = tuple(
@@ -158,11 +157,7 @@ def _longer(factor: float, why: str) -> Mistake:
 def likeliest(pairs: Pairs, undone: Mistake, told: Container[str], settings: CheckConfig) -> Mistake | None:
     """Return the mistake that explains most of the rest, if it certainly explains anything.
 
-    Args:
-        pairs: of sightings.
-        undone: the mistakes found so far.
-        told: codes of mistakes that are not looked for.
-        settings: what is sure.
+    Those found so far are `undone`; codes in `told` are not looked for.
     """
     before = pairs.residual(undone)[0]
     candidates = [*pairs.units, *pairs.angles, *(_longer(factor, pairs.why_longer) for factor in _FACTORS)]
@@ -172,12 +167,8 @@ def likeliest(pairs: Pairs, undone: Mistake, told: Container[str], settings: Che
     def after(mistakes: list[Mistake]) -> FloatArray:
         return pairs.residual(*(mistake.after(undone) for mistake in mistakes))
 
-    losses = np.concatenate(
-        [
-            _nearer(pairs, before, after(candidates[row : row + AT_ONCE]), settings)
-            for row in range(0, len(candidates), AT_ONCE)
-        ]
-    )
+    parts = [candidates[row : row + AT_ONCE] for row in range(0, len(candidates), AT_ONCE)]
+    losses = np.concatenate([_nearer(pairs, before, after(part), settings) for part in parts])
     best, least = candidates[int(np.argmin(losses))], losses.min()
     if least == inf:
         return None
@@ -247,8 +238,8 @@ def _pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, In
     rows = rows[np.lexsort((stamp_s[rows], detections.landmark_id[rows]))]
     landmark = np.unique(detections.landmark_id[rows], return_inverse=True)[1]
     time_s = stamp_s[rows]
-    spread_s = (np.ptp(time_s) if len(rows) else 0.0) + 4.0 * settings.lags_s[-1]
-    place = landmark * spread_s + time_s - (time_s.min() if len(rows) else 0.0)
+    earliest_s, latest_s = (time_s.min(), time_s.max()) if len(rows) else (0.0, 0.0)
+    place = landmark * (latest_s - earliest_s + 4.0 * settings.lags_s[-1]) + time_s - earliest_s
     chosen = []
     for lag_s in settings.lags_s:
         later = np.searchsorted(place, place + lag_s)
@@ -279,7 +270,9 @@ class PlanarPairs:
     @property
     def still(self) -> bool:
         """Whether the robot never moves, by its odometry."""
-        return not any(np.abs(column).max() >= 1e-9 for column in _velocity(self._odometry))
+        driven = self._odometry
+        columns = (driven.forward_mps, driven.lateral_mps, driven.angular_radps)
+        return not any(np.abs(column).max() >= 1e-9 for column in columns)
 
     @staticmethod
     def difference(after: FloatArray, before: FloatArray) -> FloatArray:
@@ -311,8 +304,7 @@ class PlanarPairs:
             delays_s, which = np.unique(delay_s[mine], return_inverse=True)
             at_s = np.stack(self._stamp_s)[:, None] + delays_s[:, None]
             pose = np.stack([np.interp(at_s, self._odometry.stamp_s, column) for column in track], axis=-1)
-            sensed = se2.between(*se2.compose(pose, self._mount))
-            motion[mine] = sensed[which]
+            motion[mine] = se2.between(*se2.compose(pose, self._mount))[which]
         return motion
 
 
@@ -349,7 +341,7 @@ class SpatialPairs:
         """Return (M, 4, P) second sighting minus what the first and the odometry predict: log range, and direction."""
         motion = self._motions(mistakes)
         motion[..., :3] /= np.array([each.lengths for each in mistakes])[:, None, None]
-        turned = np.array([(0.0, 0.0, 0.0, *each.turned) for each in mistakes])[:, None]
+        turned = se3.turn([each.turned for each in mistakes])[:, None]
         seen, again = (se3.transform(turned, each) for each in self._seen)
         expected = se3.transform(motion, seen)
         far = [np.maximum(np.linalg.norm(each, axis=-1, keepdims=True), 1e-12) for each in (again, expected)]
@@ -372,23 +364,16 @@ class SpatialPairs:
 Pairs: TypeAlias = PlanarPairs | SpatialPairs
 
 
-def _velocity(odometry: Odometry) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps
-
-
-def clock_steps(recording: Recording, settings: CheckConfig = USUAL) -> tuple[FloatArray, FloatArray]:
+def clock_steps(recording: Recording) -> tuple[FloatArray, FloatArray]:
     """Return from when on the odometry's clock is ahead of the detections', and by how much.
 
     Piecewise constant, by dynamic programming (Viterbi 1967): in every second a pair of sightings has a Cauchy loss, on
-    the scale of the usual residual, at each delay, and a step costs `settings.gain`.
-
-    Args:
-        recording: valid; its truth is not looked at.
-        settings: how much readings must gain by a step.
+    the scale of the usual residual, at each delay, and a step costs `CheckConfig.gain`.
 
     Returns:
         (K,) stamps of frames, the first -inf, and (K,) delays that hold from then on [s].
     """
+    settings = USUAL
     first, second = _pairs(recording, settings)
     if len(first) < settings.fewest:
         return np.array([-inf]), np.zeros(1)

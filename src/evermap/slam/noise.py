@@ -26,12 +26,7 @@ from evermap.types import FloatArray
 
 
 def start_noise(settings: NoiseConfig, outlier_log_odds: float = 7.0) -> Noise:
-    """Return the levels that a run starts from; wide: too little noise would lock the first mistake in.
-
-    Args:
-        settings: the levels.
-        outlier_log_odds: see `Noise`.
-    """
+    """Return the levels that a run starts from; wide: too little noise would lock the first mistake in."""
     return Noise(
         detection=np.array([settings.sigma_range_m, settings.sigma_bearing_rad]),
         odometry=np.array(
@@ -69,37 +64,32 @@ class NoiseFit:
 def refine_noise(
     problem: Problem, estimate: Estimate, marginals: Marginals, weights: FloatArray, noise: Noise, start: Noise = START
 ) -> NoiseFit:
-    """Take one step towards the restricted-likelihood noise levels.
+    """Take one step from `noise` towards the restricted-likelihood noise levels.
 
-    Args:
-        problem: the measurements.
-        estimate: the optimum under `noise`.
-        marginals: covariances at `estimate`, made with `noise`.
-        weights: (M,) inlier probabilities.
-        noise: levels so far.
-        start: levels that `start.pseudo_count` imaginary residuals vouch for.
+    `estimate` is the optimum under `noise`, with its covariances and the inlier probabilities (M,); `start` are levels
+    that `start.pseudo_count` imaginary residuals vouch for.
     """
-    free, pseudo = problem.prior.free, start.pseudo_count
-    residual = detection_residuals(problem, estimate)
+    pseudo, residual = start.pseudo_count, detection_residuals(problem, estimate)
     learned = np.where(np.isfinite(problem.sigma_given), 0.0, weights[:, None])
     left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
     squares, counts = (learned * residual**2).sum(axis=0), (learned * np.maximum(left, 0.0)).sum(axis=0)
     detection = np.sqrt((squares + pseudo * start.detection**2) / (counts + pseudo))
+    driven = problem.drive.between(problem.stamp_s, estimate.states)
     pulls, chances, fisher = _odometry_sums(
-        estimate.pose,
-        problem.drive.between(problem.stamp_s, estimate.states),
-        noise.odometry**2,
-        free,
-        marginals.explained_odometry,
+        estimate.pose, driven, noise.odometry**2, problem.prior.free, marginals.explained_odometry
     )
     # tr(W P_k) is a count only after multiplying by the variance
     count = np.maximum(noise.odometry**2 * chances, 0.0)
     squares_odometry = noise.odometry**4 * pulls
     odometry = np.sqrt((squares_odometry + pseudo * start.odometry**2) / (count + pseudo))
+    # a variance is known less well where others act on the same residuals
+    scale = np.sqrt(np.maximum(np.diag(fisher), 1e-300))
+    correlation = fisher / np.outer(scale, scale) + 1e-3 * np.eye(len(fisher))
+    inflation = np.maximum(np.diag(np.linalg.inv(correlation)), 1.0)
     return NoiseFit(
         Noise(detection, odometry, noise.outlier_log_odds),
         1.0 / np.sqrt(2.0 * (counts + pseudo)),
-        np.sqrt(_inflation(fisher) / (2.0 * (count + pseudo))),
+        np.sqrt(inflation / (2.0 * (count + pseudo))),
     )
 
 
@@ -116,8 +106,8 @@ class Extrapolation:
 
     def ahead(self, before: Noise, after: Noise) -> Noise:
         """Return levels to go on from, given those before and after a step."""
-        level = np.log(np.concatenate([before.detection, before.odometry]))
-        step = np.log(np.concatenate([after.detection, after.odometry])) - level
+        level = np.log(before.levels)
+        step = np.log(after.levels) - level
         self._levels, self._steps = [*self._levels, level][-MIXED:], [*self._steps, step][-MIXED:]
         if len(self._steps) > 1:
             by_level, by_step = np.diff(self._levels, axis=0).T, np.diff(self._steps, axis=0).T
@@ -135,21 +125,9 @@ LARGEST_STEP = 0.5
 """Of the logarithm of a level."""
 
 
-def _inflation(fisher: FloatArray) -> FloatArray:
-    """Factor by which each variance is known less well because others act on the same residuals (>= 1)."""
-    scale = np.sqrt(np.maximum(np.diag(fisher), 1e-300))
-    correlation = fisher / np.outer(scale, scale) + 1e-3 * np.eye(len(fisher))
-    inflation: FloatArray = np.maximum(np.diag(np.linalg.inv(correlation)), 1.0)
-    return inflation
-
-
 @kernel
 def _odometry_sums(
-    pose: FloatArray,
-    driven: Intervals,
-    variance: FloatArray,
-    free: Any,
-    explained: FloatArray,
+    pose: FloatArray, driven: Intervals, variance: FloatArray, free: Any, explained: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return for every kind of odometry noise, with `L = W - W V W`: sums of `e' W P_k W e` and of `tr(L P_k)`.
 

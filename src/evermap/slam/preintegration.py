@@ -56,12 +56,9 @@ class Preintegration:
     def between(
         self, stamp_s: FloatArray, states: FloatArray, odometry: tuple[FloatArray, FloatArray, FloatArray]
     ) -> Slices[Intervals]:
-        """Return the intervals between consecutive poses, in slices.
+        """Return the intervals between consecutive poses, of instants (N,), for states (11,), in slices.
 
-        Args:
-            stamp_s: (N,) instants of the poses.
-            states: (11,) calibration states.
-            odometry: stamps (n,), velocities (n, 3) and unknown variance (n,), the same at every call.
+        `odometry`, stamps (n,), velocities (n, 4) and unknown variance (n,), is the same at every call.
         """
         kept = self._intervals
         if kept is not None and np.array_equal(self._motion_states, states[N_SENSOR:]):
@@ -96,17 +93,10 @@ def linearise_interval(
     intervals: Intervals, i: int, pose: FloatArray, variance: FloatArray, free: Any, residual: FloatArray,
     jacobian: FloatArray, information: FloatArray,
 ) -> None:  # fmt: skip
-    """Linearise the odometry of interval `i` at poses `i` and `i + 1`.
+    """Linearise the odometry of interval `i` at poses `i` and `i + 1` of (N, 3), by the `free` (11,) states.
 
-    Args:
-        intervals: the odometry.
-        i: which interval.
-        pose: (N, 3) all poses.
-        variance: (5,) of each kind of noise.
-        free: (11,) which calibration states are.
-        residual: (3,) out, that of `kernels.odometry_residual`.
-        jacobian: (3, 10) out, its derivatives by both poses and by delay, scales and slip.
-        information: (3, 3) out, inverse covariance.
+    Filled in are `residual` (3,) of `kernels.odometry_residual`, its derivatives (3, 10) by both poses and by delay,
+    scales and slip, and the information (3, 3) of noise with a variance (5,) of each kind.
     """
     odometry_covariance(intervals.noise[i], intervals.floor[i], variance, information)
     invert_3x3(information, information)

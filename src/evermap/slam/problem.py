@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from evermap.config import OdometryConfig
+from evermap.errors import DataError
+from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import N_STATES, kernel
 from evermap.slam.preintegration import Intervals, Preintegration
 from evermap.slam.sparse.elimination import Spread
 from evermap.slam.sparse.system import Factorised, Slices, exhausted
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray, Recording
 
 USUAL = OdometryConfig()
 FEWEST_ROWS = 20
@@ -65,6 +67,19 @@ class Drive:
         return self._preintegration.between(stamp_s, states, (self.stamp_s, self.velocity, self.unknown))
 
     @classmethod
+    def of(cls, recording: Recording, settings: OdometryConfig = USUAL) -> Drive:
+        """Return the odometry of a recording, as `from_rows`; stamps count from its first row.
+
+        Raises:
+            DataError: there is none.
+        """
+        odometry = recording.odometry
+        if len(odometry) == 0:
+            raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
+        velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
+        return cls.from_rows(odometry.stamp_s - odometry.stamp_s[0], velocity, settings)
+
+    @classmethod
     def from_rows(cls, stamp_s: FloatArray, velocity: FloatArray, settings: OdometryConfig = USUAL) -> Drive:
         """Return velocities as reported; silences longer than `silence_s` become 'standing still, but who knows'.
 
@@ -93,16 +108,11 @@ class Drive:
 
 
 def beyond_jitter(stamp_s: FloatArray, turn_radps: FloatArray, settings: OdometryConfig = USUAL) -> FloatArray:
-    """Return (n,) turn rates without what may be jitter of their report, each by rows until itself.
+    """Return (n,) turn rates [rad/s] without what may be jitter of their report, each by rows until itself.
 
     A scale that acts on jitter explains it by a scale of zero: where a robot drives straight on, poses do not jitter as
     its gyroscope does, and every row says so (attenuation by errors in variables: Fuller 1987, section 1.1). So a turn
     counts by the share of its square, on average over `turn_s`, that stands out of the jitter.
-
-    Args:
-        stamp_s: (n,) strictly increasing.
-        turn_radps: (n,) as reported [rad/s].
-        settings: `turn_s` and `stands_out`.
     """
     turn = np.ascontiguousarray(turn_radps, dtype=np.float64)
     return _beyond(np.ascontiguousarray(stamp_s, dtype=np.float64), turn, settings.turn_s, settings.stands_out)
@@ -151,8 +161,7 @@ class ConditionalPrior:
 
     def place(self, landmark: FloatArray, landmark_mean: FloatArray) -> FloatArray:
         """Return (2,) where the landmark is expected with the others at `landmark` (L, 2)."""
-        place: FloatArray = self.mean + self.gain @ (landmark[self.given] - landmark_mean[self.given]).ravel()
-        return place
+        return np.asarray(self.mean + self.gain @ (landmark[self.given] - landmark_mean[self.given]).ravel())
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,8 +208,7 @@ class Problem:
     @property
     def mapped(self) -> BoolArray:
         """(L,) landmarks that a prior map holds."""
-        held: BoolArray = self.landmark_information.diagonal()[::2] > 0.0
-        return held
+        return np.asarray(self.landmark_information.diagonal()[::2] > 0.0)
 
     def with_places(self, count: int) -> Problem:
         """Return the problem with room for so many places; new ones have no prior."""
@@ -258,14 +266,13 @@ class Problem:
         With `last_is_blind`, before the detections of the last of them.
         """
         stop = int(np.searchsorted(self.pose_row, n_poses - last_is_blind))
-        return replace(
-            self,
-            stamp_s=self.stamp_s[:n_poses],
-            pose_row=self.pose_row[:stop],
-            landmark_row=self.landmark_row[:stop],
-            reading=self.reading[:stop],
-            sigma_given=self.sigma_given[:stop],
-        )
+        return replace(self.seeing(slice(stop)), stamp_s=self.stamp_s[:n_poses])
+
+    def seeing(self, rows: IntArray | BoolArray | slice) -> Problem:
+        """Return the problem with some of its detections only."""
+        names = ("pose_row", "landmark_row", "reading", "sigma_given")
+        some: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
+        return replace(self, **some)
 
 
 def independent(blocks: FloatArray) -> sparse.csr_array:
@@ -309,11 +316,14 @@ class Estimate:
     landmark: FloatArray
     states: FloatArray
 
+    def moved(self, by: FloatArray) -> Estimate:
+        """Return everything moved together by a motion (3,)."""
+        return Estimate(se2.compose(by, self.pose), se2.transform(by, self.landmark), self.states)
+
     @property
     def known(self) -> BoolArray:
         """(L,) landmarks that have a position."""
-        known: BoolArray = np.isfinite(self.landmark[:, 0])
-        return known
+        return np.asarray(np.isfinite(self.landmark[:, 0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,6 +342,11 @@ class Noise:
     odometry: FloatArray
     outlier_log_odds: float
     pseudo_count: float = 1.0
+
+    @property
+    def levels(self) -> FloatArray:
+        """(7,) of detections, then of odometry."""
+        return np.concatenate([self.detection, self.odometry])
 
     def of_detections(self, sigma_given: FloatArray) -> FloatArray:
         """Return (M, 2) standard deviation of every detection: its own where it came with one."""
@@ -370,13 +385,7 @@ class Marginals:
     """
 
     def __init__(
-        self,
-        solved: Factorised,
-        n_poses: int,
-        n_detections: int,
-        known: BoolArray,
-        *,
-        block: Block | None = None,
+        self, solved: Factorised, n_poses: int, n_detections: int, known: BoolArray, *, block: Block | None = None
     ) -> None:
         self._solved, self._n, self._m, self.known = solved, n_poses, n_detections, known
         n_known = int(known.sum())
@@ -454,21 +463,18 @@ class Marginals:
 
     def joint(self, landmarks: IntArray, *, poses: IntArray | None = None, states: bool = False) -> FloatArray:
         """Return the joint covariance of some poses, some landmarks and, if wanted, the states, in this order."""
-        part = self._block
-        rank = np.cumsum(self.known) - 1
-        rows = np.asarray(landmarks, dtype=np.int64)
-        known = self.known[rows]
-        every = [
-            np.zeros(0, dtype=np.int64) if poses is None else part.first + poses,
-            part.landmarks[rank[rows[known]]],
-        ]
+        part, rows = self._block, np.asarray(landmarks, dtype=np.int64)
+        known, n_poses = self.known[rows], 0 if poses is None else len(poses)
+        every = [self._variables(rows[known])]
+        if poses is not None:
+            every.insert(0, part.first + poses)
         if states:
             every.append(part.border + np.arange(2))
         found = self._solved.joint(np.concatenate(every))
         if known.all():
             return found
-        n_poses = 3 * len(every[0])
-        kept = np.concatenate([np.ones(n_poses, bool), np.repeat(known, 2), np.ones(N_STATES if states else 0, bool)])
+        before, after = np.ones(3 * n_poses, bool), np.ones(N_STATES if states else 0, bool)
+        kept = np.concatenate([before, np.repeat(known, 2), after])
         joint = np.zeros((len(kept), len(kept)))
         joint[np.ix_(kept, kept)] = found
         return joint
@@ -476,19 +482,19 @@ class Marginals:
     def each(self, landmarks: IntArray, poses: IntArray, by: FloatArray) -> FloatArray:
         """Return (V, R, R) the covariances of what each of V matrices makes of some poses, known landmarks and states.
 
-        Args:
-            landmarks: (L,) rows, all known.
-            poses: (P,) rows.
-            by: (V, R, 3 P + 2 L + 11) the matrices.
+        The matrices `by` are (V, R, 3 P + 2 L + 11).
         """
-        part, rank = self._block, np.cumsum(self.known) - 1
-        every = [part.first + poses, part.landmarks[rank[landmarks]], part.border + np.arange(2)]
+        every = [self._block.first + poses, self._variables(landmarks), self._block.border + np.arange(2)]
         return self._solved.each(np.concatenate(every), by)
 
     def product(self, landmarks: IntArray, matrix: FloatArray) -> FloatArray:
         """Return (2 L, K) the joint covariance of known landmarks (L,) times a matrix (2 L, K), without the former."""
+        return self._solved.product(self._variables(landmarks), matrix)
+
+    def _variables(self, landmarks: IntArray) -> IntArray:
+        """Variables of known landmarks (K,)."""
         rank = np.cumsum(self.known) - 1
-        return self._solved.product(self._block.landmarks[rank[np.asarray(landmarks, dtype=np.int64)]], matrix)
+        return np.asarray(self._block.landmarks[rank[np.asarray(landmarks, dtype=np.int64)]])
 
     @cached_property
     def shared(self) -> FloatArray:

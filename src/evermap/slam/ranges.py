@@ -62,18 +62,16 @@ def with_bearings(recording: Recording, settings: SlamConfig) -> tuple[Recording
         return recording, ()
     if settings.unknown_ids or np.any(blind & (seen.landmark_id == UNKNOWN)):
         problem = f"{recording.name}: detections without a bearing need a landmark_id"
-        raise DataError(
-            problem, field="bearing_rad", hint="the number of the beacon; leave out what associates by geometry"
-        )
+        hint = "the number of the beacon; leave out what associates by geometry"
+        raise DataError(problem, field="bearing_rad", hint=hint)
     stamp_s, odometry_s = frames[seen.frame], recording.odometry.stamp_s
     rows = np.flatnonzero(blind & (stamp_s >= odometry_s[0]) & (stamp_s <= odometry_s[-1]))
     eye, way_m = _eyes(recording, stamp_s[rows], settings)
     bearing, sigma = seen.bearing_rad.copy(), seen.sigma_bearing_rad.copy()
     bearing[blind], sigma[blind] = 0.0, ANY_BEARING_RAD
     landmark_id = seen.landmark_id.copy()
-    offset_m = float(
-        CalibrationPrior.from_settings(settings.calibration, calibrated=True, sensor=recording.sensor).sigma[BIAS]
-    )
+    prior = CalibrationPrior.from_settings(settings.calibration, calibrated=True, sensor=recording.sensor)
+    offset_m = float(prior.sigma[BIAS])
     noise_m = recording.sensor.sigma_range_m or settings.noise.sigma_range_m
     for name in np.unique(seen.landmark_id[rows]).tolist():
         mine = np.flatnonzero(seen.landmark_id[rows] == name)
@@ -99,10 +97,7 @@ def with_bearings(recording: Recording, settings: SlamConfig) -> tuple[Recording
 
 def _eyes(recording: Recording, stamp_s: FloatArray, settings: SlamConfig) -> tuple[FloatArray, FloatArray]:
     """Return poses (M, 3) of the sensor at stamps (M,) by odometry alone, and how far it had gone (M,)."""
-    odometry = recording.odometry
-    velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
-    start_s = float(odometry.stamp_s[0])
-    drive = Drive.from_rows(odometry.stamp_s - start_s, velocity, settings.odometry)
+    drive, start_s = Drive.of(recording, settings.odometry), float(recording.odometry.stamp_s[0])
     instants, row = np.unique(np.append(start_s, stamp_s), return_inverse=True)
     mean = CalibrationPrior.from_settings(settings.calibration, calibrated=False).mean
     pose, _ = dead_reckoned(instants - start_s, drive, mean, START)

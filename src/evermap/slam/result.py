@@ -12,10 +12,10 @@ from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import BEARING, FORWARD, OF_ANGLE, OF_SCALE, SLOPE, SPECS, CalibrationPrior, from_front
 from evermap.slam.check import far_off
 from evermap.slam.estimate import Solved
-from evermap.slam.intake import Prepared
 from evermap.slam.kernels import NOISE_NAMES
 from evermap.slam.noise import START, NoiseFit
-from evermap.slam.streaming import Outcome, StreamingSlam
+from evermap.slam.problem import Drive
+from evermap.slam.streaming import Outcome
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,
@@ -42,35 +42,11 @@ LONGEST_PAUSE_S = 60.0
 def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
     """Return trajectory and map, changes, and alternatives; from `scratch` in the frame of that name."""
     prepared, outcome, recording = solved.prepared, solved.outcome, solved.recording
-    frame = "prior_map" if outcome.aligned else scratch
-    found = result(solved, frame, landmarks(prepared, outcome, recording, frame))
-    warnings = list(found.warnings)
-    if prepared.prior_map is not None and not outcome.aligned:
-        warnings.append(
-            "cannot localise in the prior map: too few of the detected landmarks have the relative positions of the "
-            "map; the result is in the frame of the first pose"
-        )
-    return replace(
-        found,
-        warnings=(*warnings, *outcome.revision.warnings),
-        changes=changes(prepared, outcome, outcome.revision.changes),
-        alternatives=alternatives(prepared, outcome, recording, frame),
-    )
-
-
-def result(solved: Solved, frame: str, in_map: Landmarks) -> SlamResult:
-    """Bridge the blind stretches, and return the estimate as plain arrays.
-
-    Args:
-        solved: the recording and its estimate.
-        frame: in which the estimate is: 'first_pose' or 'prior_map'.
-        in_map: landmarks that are told.
-    """
-    recording, prepared, outcome = solved.recording, solved.prepared, solved.outcome
-    path = trajectory(prepared, outcome, recording, frame)
-    values = outcome.estimate.states, outcome.states_covariance
+    frame, revision = "prior_map" if outcome.aligned else scratch, outcome.revision
+    path = trajectory(solved, frame)
     states = described(
-        *values,
+        outcome.estimate.states,
+        outcome.states_covariance,
         outcome.noise,
         outcome.prior,
         askew=outcome.askew,
@@ -81,25 +57,41 @@ def result(solved: Solved, frame: str, in_map: Landmarks) -> SlamResult:
     if solved.interrupted:
         done_s, all_s = (float(np.ptp(s)) for s in (path.stamp_s, recording.frames.stamp_s))
         warnings.append(f"interrupted after {done_s:.0f} of {all_s:.0f} s of the recording")
+    if prepared.prior_map is not None and not outcome.aligned:
+        warnings.append(
+            "cannot localise in the prior map: too few of the detected landmarks have the relative positions of the "
+            "map; the result is in the frame of the first pose"
+        )
+    place, spread = outcome.graph_estimate.landmark[revision.current], outcome.graph_marginals.landmark
     return SlamResult(
         trajectory=path,
-        online=online(prepared, solved.slam, recording, frame),
-        landmarks=in_map,
+        online=online(solved, frame),
+        landmarks=_landmarks(solved, frame, place, spread[revision.current]),
         parameters=states,
-        innovations=innovations(prepared, solved.slam, outcome, recording),
+        innovations=_innovations(solved),
         misses=Misses.empty(),  # the map has their classes
         step_s=solved.step_s,
-        dead_reckoning=dead_reckoning(prepared, path),
-        warnings=tuple(warnings),
+        dead_reckoning=dead_reckoning(path, prepared.problem.drive, prepared.start_s),
+        warnings=(*warnings, *revision.warnings),
         interrupted=solved.interrupted,
+        changes=_changes(solved, revision.changes),
+        alternatives=tuple(
+            Alternative(
+                changes=_changes(solved, rival.changes),
+                probability=rival.probability,
+                landmarks=_landmarks(solved, frame, rival.position, rival.covariance),
+            )
+            for rival in revision.rivals
+        ),
     )
 
 
-def trajectory(prepared: Prepared, outcome: Outcome, recording: Recording, frame: str) -> Trajectory:
+def trajectory(solved: Solved, frame: str) -> Trajectory:
     """Return smoothed poses at all frames, and in between so that no step is longer than `TRAJECTORY_STEP_S`."""
-    stamps = _dense_stamps(recording, outcome, prepared.start_s)
+    outcome, start_s = solved.outcome, solved.prepared.start_s
+    stamps = _dense_stamps(solved.recording.frames.stamp_s, solved.end_s)
     pose, covariance = bridged(
-        stamps - prepared.start_s,
+        stamps - start_s,
         outcome.problem.stamp_s,
         outcome.graph_estimate.pose,
         outcome.graph_marginals.pose,
@@ -109,10 +101,10 @@ def trajectory(prepared: Prepared, outcome: Outcome, recording: Recording, frame
         outcome.noise.noise,
     )
     pose, covariance = _in_metres(pose, covariance, outcome)
-    front = outcome.prior.front(outcome.graph_estimate.states, prepared.problem.mount)
+    front = outcome.prior.front(outcome.graph_estimate.states, solved.prepared.problem.mount)
     pose, covariance = from_front(pose, covariance, front)
     pose[:, 2] = se2.wrap(pose[:, 2])
-    return Trajectory(stamps, pose, covariance, frame=frame, clock=recording.clock)
+    return Trajectory(stamps, pose, covariance, frame=frame, clock=solved.recording.clock)
 
 
 def rows_at(trajectory: Trajectory, recording: Recording, rows: IntArray) -> IntArray:
@@ -121,36 +113,9 @@ def rows_at(trajectory: Trajectory, recording: Recording, rows: IntArray) -> Int
     return np.minimum(found, len(trajectory) - 1)
 
 
-def landmarks(prepared: Prepared, outcome: Outcome, recording: Recording, frame: str) -> Landmarks:
-    """Return the map of a session: positions with covariance, and how often and when each landmark was seen."""
-    current = outcome.revision.current
-    return _records(
-        prepared, outcome, recording, frame, outcome.graph_estimate.landmark[current],
-        outcome.graph_marginals.landmark[current],
-    )  # fmt: skip
-
-
-def alternatives(prepared: Prepared, outcome: Outcome, recording: Recording, frame: str) -> tuple[Alternative, ...]:
-    """Return other explanations of the session, each with its map."""
-    return tuple(
-        Alternative(
-            changes=changes(prepared, outcome, rival.changes),
-            probability=rival.probability,
-            landmarks=_records(prepared, outcome, recording, frame, rival.position, rival.covariance),
-        )
-        for rival in outcome.revision.rivals
-    )
-
-
-def _records(
-    prepared: Prepared,
-    outcome: Outcome,
-    recording: Recording,
-    frame: str,
-    position: FloatArray,
-    covariance: FloatArray,
-) -> Landmarks:
-    """Map records from positions (L, 2) and covariances (L, 2, 2) in the graph's metres."""
+def _landmarks(solved: Solved, frame: str, position: FloatArray, covariance: FloatArray) -> Landmarks:
+    """Map records, with how often and when each was seen, from the graph's positions (L, 2) and covariances."""
+    prepared, outcome, recording = solved.prepared, solved.outcome, solved.recording
     known = np.isfinite(position[:, 0])
     position = position * outcome.scale
     covariance = covariance * outcome.scale**2
@@ -180,41 +145,43 @@ def _records(
     )
 
 
-def changes(prepared: Prepared, outcome: Outcome, moved: tuple[MapChange, ...]) -> tuple[MapChange, ...]:
-    """Return the changes, with the recording's ids and stamps, in metres."""
+def _changes(solved: Solved, moved: tuple[MapChange, ...]) -> tuple[MapChange, ...]:
+    """The changes, with the recording's ids and stamps, in metres."""
+    prepared, scale = solved.prepared, solved.outcome.scale
     return tuple(
         replace(
             change,
             landmark_ids=tuple(sorted(int(prepared.landmark_id[row]) for row in change.landmark_ids)),
             stamp_from_s=change.stamp_from_s + prepared.start_s,
             stamp_to_s=change.stamp_to_s + prepared.start_s,
-            displacement_m=(change.displacement_m[0] * outcome.scale, change.displacement_m[1] * outcome.scale),
-        ).named(prepared.names)
+            displacement_m=(change.displacement_m[0] * scale, change.displacement_m[1] * scale),
+        ).named(solved.recording.landmark_names)
         for change in moved
     )
 
 
-def online(prepared: Prepared, slam: StreamingSlam, recording: Recording, frame: str) -> Trajectory:
+def online(solved: Solved, frame: str) -> Trajectory:
     """Return what the robot knew at the time: the newest pose after every processed frame."""
+    slam, recording = solved.slam, solved.recording
     done = np.isfinite(slam.online_pose[:, 0])
     pose = slam.online_pose[done].copy()
     pose[:, 2] = se2.wrap(pose[:, 2])
-    stamps = recording.frames.stamp_s[prepared.pose_frame[done]]
+    stamps = recording.frames.stamp_s[solved.prepared.pose_frame[done]]
     return Trajectory(stamps, pose, slam.online_covariance[done], frame=frame, clock=recording.clock)
 
 
-def innovations(prepared: Prepared, slam: StreamingSlam, outcome: Outcome, recording: Recording) -> Innovations:
-    """Return consistency of every detection that was predicted."""
-    told = np.flatnonzero(np.isfinite(slam.nis[: len(outcome.inlier)]))
-    detection = prepared.used[told]
-    sigma_rad = recording.detections.sigma_bearing_rad[detection]
-    measured: BoolArray = ~(sigma_rad >= ANY_BEARING_RAD)
+def _innovations(solved: Solved) -> Innovations:
+    """Consistency of every detection that was predicted."""
+    nis, inlier, detections = solved.slam.nis, solved.outcome.inlier, solved.recording.detections
+    told = np.flatnonzero(np.isfinite(nis[: len(inlier)]))
+    detection = solved.prepared.used[told]
+    measured: BoolArray = ~(detections.sigma_bearing_rad[detection] >= ANY_BEARING_RAD)
     return Innovations(
-        stamp_s=recording.frames.stamp_s[recording.detections.frame[detection]],
+        stamp_s=solved.recording.frames.stamp_s[detections.frame[detection]],
         detection=detection,
-        landmark_id=recording.detections.landmark_id[detection],
-        nis=slam.nis[told],
-        p_inlier=outcome.inlier[told],
+        landmark_id=detections.landmark_id[detection],
+        nis=nis[told],
+        p_inlier=inlier[told],
         dof=None if measured.all() else 1 + measured.astype(np.int64),
     )
 
@@ -294,8 +261,7 @@ def _evident(p_needed: float, before: float) -> bool:
 def _levels(fit: NoiseFit) -> list[ParameterEstimate]:
     """Noise levels as records."""
     names = ("sigma_range_m", "sigma_bearing_rad", *NOISE_NAMES)
-    levels = np.concatenate([fit.noise.detection, fit.noise.odometry])
-    started = np.concatenate([START.detection, START.odometry])
+    levels, started = fit.noise.levels, START.levels
     relative = np.concatenate([fit.detection_relative, fit.odometry_relative])
     meanings = (
         "noise of a range",
@@ -313,19 +279,17 @@ def _levels(fit: NoiseFit) -> list[ParameterEstimate]:
     ]
 
 
-def dead_reckoning(prepared: Prepared, trajectory: Trajectory) -> Trajectory:
-    """Return odometry alone, believed as reported, from the first pose on."""
+def dead_reckoning(trajectory: Trajectory, drive: Drive, start_s: float) -> Trajectory:
+    """Return odometry alone, believed as reported, from the first pose on; `drive` counts from `start_s`."""
     plain = CalibrationPrior.from_settings(calibrated=False)
-    pose, covariance = dead_reckoned(trajectory.stamp_s - prepared.start_s, prepared.problem.drive, plain.mean, START)
+    pose, covariance = dead_reckoned(trajectory.stamp_s - start_s, drive, plain.mean, START)
     pose = se2.compose(trajectory.pose_world_robot[0], pose)
-    return Trajectory(trajectory.stamp_s, pose, covariance, frame=trajectory.frame, clock=trajectory.clock)
+    return replace(trajectory, pose_world_robot=pose, covariance=covariance)
 
 
-def _dense_stamps(recording: Recording, outcome: Outcome, start_s: float) -> FloatArray:
+def _dense_stamps(stamps: FloatArray, last_s: float) -> FloatArray:
     """Return the stamps of all frames up to the last processed one, with long steps divided."""
-    last = start_s + outcome.problem.stamp_s[-1]
-    stamps = recording.frames.stamp_s
-    stamps = stamps[stamps <= last + 1e-9]
+    stamps = stamps[stamps <= last_s + 1e-9]
     steps = np.diff(stamps)
     pieces = np.ceil(np.minimum(steps, LONGEST_PAUSE_S) / TRAJECTORY_STEP_S - 1e-9)
     pieces = np.maximum(pieces, 1).astype(np.int64)

@@ -78,11 +78,8 @@ class Equations:
 class Smoother:
     """Optimum and covariances of one `Problem` at given noise.
 
-    Args:
-        problem: the measurements.
-        noise: standard deviations.
-        heavy: outliers have the Cauchy's tails, as while the estimate may still be far off.
-        robust: explain outliers instead of believing every identity.
+    If `heavy`, outliers have the Cauchy's tails, as while the estimate may still be far off; if `robust`, outliers are
+    explained, instead of every identity believed.
     """
 
     def __init__(self, problem: Problem, noise: Noise, *, heavy: bool = False, robust: bool = True) -> None:
@@ -101,35 +98,28 @@ class Smoother:
     def under(self, noise: Noise, *, heavy: bool, problem: Problem | None = None) -> Smoother:
         """Return the smoother at other noise; its structure is kept.
 
-        Args:
-            noise: standard deviations.
-            heavy: as of the class.
-            problem: one that differs only in its start and in the prior of the calibration states; None: the same.
+        Another `problem` may differ only in its start and in the prior of the calibration states.
         """
         other = Smoother(self.problem if problem is None else problem, noise, heavy=heavy, robust=self.robust)
         other._structure = self._structure
         return other
 
-    def optimum(
-        self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6, settled: float = 0.0
-    ) -> Estimate:
-        """Run damped Gauss-Newton from `start`, until steps or what they gain are small.
-
-        Args:
-            start: values to start from.
-            iterations: at most.
-            tolerance: largest move (m or rad) of a step that ends it.
-            settled: gain of a step that ends it, in nats.
+    def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6) -> Estimate:
+        """Return the values at which `solved_in_slices` ends.
 
         Raises:
             NumericalError: no finite optimum.
         """
-        return exhausted(self.solved_in_slices(start, iterations=iterations, tolerance=tolerance, settled=settled))[0]
+        return exhausted(self.solved_in_slices(start, iterations=iterations, tolerance=tolerance))[0]
 
     def solved_in_slices(
         self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6, settled: float = 0.0
     ) -> Slices[tuple[Estimate, Marginals]]:
-        """Return what `optimum` does, in slices, and the covariances that its last step was made with."""
+        """Run damped Gauss-Newton in slices; return the optimum and the covariances that its last step was made with.
+
+        It ends after so many iterations, or with a step that moves nothing by `tolerance` (m or rad) or gains less than
+        `settled` nats.
+        """
         estimate = start
         now = yield from self.linearised_in_slices(estimate)
         damping = 0.0
@@ -345,9 +335,7 @@ class Smoother:
         factors = Factors(
             np.append(0, np.cumsum(np.concatenate(width))).astype(np.int64),
             np.concatenate([part.ravel() for part in tied]).astype(np.int64),
-            np.concatenate(
-                [np.full(n - 1, 3), np.full(len(place), 2), [3], np.array([len(root) for root in roots], dtype=int)]
-            ).astype(np.int64),
+            np.append(np.repeat([3, 2, 3], [n - 1, len(place), 1]), [len(root) for root in roots]).astype(np.int64),
             np.concatenate([leaf_of_pose[steps], leaf_of_pose[problem.pose_row], [0], prior_leaf]).astype(np.int64),
         )
         yield MS * len(place)

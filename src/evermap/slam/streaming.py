@@ -22,11 +22,10 @@ from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior, needed, seated
 from evermap.slam.filter_kernels import told
 from evermap.slam.kernels import N_STATES
+from evermap.slam.local_filter import Motion, SessionFilter, grown
 from evermap.slam.method import Explanation, Method, Static
-from evermap.slam.motion import Motion
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Drive, Estimate, Marginals, Noise, Problem, independent
-from evermap.slam.session_filter import SessionFilter
 from evermap.slam.smoother import COST_SLACK, Smoother
 from evermap.slam.sparse.system import Slices, exhausted
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -215,16 +214,14 @@ class StreamingSlam:
         Args:
             problem: all so far; rows that were there stay, new landmarks come last.
         """
-        poses, detections = (len(rows) for rows in (self.online_pose, self.nis))
+        poses, detections = len(self.online_pose), len(self.nis)
         if len(problem.stamp_s) > poses:  # room for as many again: a frame must not cost what was before it
-            more = max(len(problem.stamp_s), 2 * poses) - poses
-            self.online_pose = np.pad(self.online_pose, ((0, more), (0, 0)), constant_values=np.nan)
-            self.online_covariance = np.pad(self.online_covariance, ((0, more), *[(0, 0)] * 2), constant_values=np.nan)
+            room = max(len(problem.stamp_s), 2 * poses)
+            self.online_pose = grown(self.online_pose, room)
+            self.online_covariance = grown(self.online_covariance, room)
         if len(problem.pose_row) > detections:
-            more = max(len(problem.pose_row), 2 * detections) - detections
-            self.nis = np.pad(self.nis, (0, more), constant_values=np.nan)
-        new = len(problem.landmark_mean) - len(self._landmark)
-        landmark = np.pad(self._landmark, ((0, new), (0, 0)), constant_values=np.nan) if new else self._landmark
+            self.nis = grown(self.nis, max(len(problem.pose_row), 2 * detections))
+        landmark = grown(self._landmark, len(problem.landmark_mean))
         self._adopt(replace(problem, prior=self._problem.prior), landmark)
         self._filter.problem = self._problem
 
@@ -263,9 +260,8 @@ class StreamingSlam:
         self._job = None
         problem, estimate = self._method.unprejudiced(self._problem.until(self._n_poses), self._filter.estimate())
         if self._robust:  # a landmark whose first sighting was misread may be disputed since the last relinearisation
-            estimate = exhausted(
-                _voted(Smoother(problem, self._noise, heavy=True), estimate, self._settings.fewest_sightings)
-            )
+            smoother = Smoother(problem, self._noise, heavy=True)
+            estimate = exhausted(_voted(smoother, estimate, self._settings.fewest_sightings))
         smoother, estimate, fit = self._converged(problem, estimate, self._noise)
         if self._robust:
             better = _readmitted(smoother, _rejoined(smoother, estimate, self._settings), self._settings)
@@ -300,8 +296,7 @@ class StreamingSlam:
         if np.array_equal(start, problem.start_pose):
             return problem, estimate
         turn = se2.compose(start, se2.inverse(problem.start_pose))
-        pose, landmark = se2.compose(turn, estimate.pose), se2.transform(turn, estimate.landmark)
-        return replace(problem, start_pose=start), Estimate(pose, landmark, estimate.states)
+        return replace(problem, start_pose=start), estimate.moved(turn)
 
     def _optimum(
         self, smoother: Smoother, problem: Problem, estimate: Estimate, fit: NoiseFit, *, most: int = 30
@@ -315,13 +310,9 @@ class StreamingSlam:
     def _converged(
         self, problem: Problem, estimate: Estimate, noise: Noise, near: Smoother | None = None
     ) -> tuple[Smoother, Estimate, NoiseFit]:
-        """The optimum and its noise levels, in turns until neither changes.
+        """The optimum and its noise levels from these values, in turns until neither changes.
 
-        Args:
-            problem: the measurements.
-            estimate: where to begin.
-            noise: levels to begin with.
-            near: of the same problem but for its prior, where these were found: it is known what is an outlier.
+        Where the smoother `near`, of the same problem but for its prior, found them, it is known what is an outlier.
         """
         fit, ahead = None, Extrapolation()
         smoother = Smoother(problem, noise, robust=self._robust) if near is None else near
@@ -363,19 +354,16 @@ class StreamingSlam:
         landmark_row = self._problem.landmark_row.copy()
         landmark_row[detections] = places
         count = max(len(self._landmark), int(places.max()) + 1)
-        new = ((0, count - len(self._landmark)), (0, 0))
-        self._adopt(
-            replace(self._problem, landmark_row=landmark_row).with_places(count),
-            np.pad(self._landmark, new, constant_values=np.nan),
-        )
+        problem = replace(self._problem, landmark_row=landmark_row).with_places(count)
+        self._adopt(problem, grown(self._landmark, count))
         self._filter.problem = self._problem
 
     def _adopt(self, problem: Problem, landmark: FloatArray) -> None:
         """Other places from here on, perhaps more of them or fewer; the first are the landmarks as before."""
-        missing = len(landmark) - len(self._n_compared)
+        count = len(landmark)
         self._problem, self._landmark = problem, landmark
-        self._n_compared = np.pad(self._n_compared, (0, max(missing, 0)))[: len(landmark)]
-        self._n_surprising = np.pad(self._n_surprising, (0, max(missing, 0)))[: len(landmark)]
+        self._n_compared = grown(self._n_compared, count, 0)[:count]
+        self._n_surprising = grown(self._n_surprising, count, 0)[:count]
 
     def _compare(self, detections: IntArray) -> None:
         landmark = self._problem.landmark_row[detections]
@@ -461,9 +449,7 @@ class StreamingSlam:
         landmark = estimate.landmark.copy()
         for row in counted(n):
             following.problem = self._problem
-            landmark = np.pad(
-                landmark, ((0, len(self._problem.landmark_mean) - len(landmark)), (0, 0)), constant_values=np.nan
-            )
+            landmark = grown(landmark, len(self._problem.landmark_mean))
             if row == self._n_poses:
                 break
             following.drive(following.motion(row))
@@ -472,10 +458,6 @@ class StreamingSlam:
             following.add(row, landmark)
             yield min(CAUGHT_UP_MS + OF_PAIR_MS * len(detections) ** 2, 0.5 * SLICES_A_FRAME)
         self._filter, self._landmark = following, landmark
-
-    def _restart(self, estimate: Estimate) -> None:
-        self._landmark = estimate.landmark.copy()
-        self._filter.restart(estimate, self._noise, self._problem)
 
     def _can_align(self, *, final: bool = False) -> bool:
         """Return whether most landmarks of the map seen so far have its relative positions; two at the end."""
@@ -504,11 +486,8 @@ class StreamingSlam:
         mean, given = np.pad(prior_map.mean, ((0, new), (0, 0))), np.pad(prior_map.given, (0, new))
         both = given & estimate.known
         pose_map_world, _ = consensus(estimate.landmark[both], mean[both])
-        moved = Estimate(
-            se2.compose(pose_map_world, estimate.pose),
-            np.where(both[:, None], mean, se2.transform(pose_map_world, estimate.landmark)),
-            estimate.states,
-        )
+        moved = estimate.moved(pose_map_world)
+        moved = replace(moved, landmark=np.where(both[:, None], mean, moved.landmark))
         self._aligned, self._scale = True, 1.0
         self._problem = replace(
             self._problem,
@@ -520,7 +499,8 @@ class StreamingSlam:
         )
         done = self._n_poses
         self.online_pose[:done] = se2.compose(pose_map_world, self.online_pose[:done])
-        self._restart(moved)
+        self._landmark = moved.landmark.copy()
+        self._filter.restart(moved, self._noise, self._problem)
         self._job = self._relinearised(learn=True)
         self._owed_ms = self._a_frame_ms()
         self.work()
@@ -538,14 +518,8 @@ def divided(
 ) -> Outcome:
     """Return what a session knows at its optimum, with what only shows together divided as its sensor states it.
 
-    Args:
-        solved: the final optimum, in the graph's metres.
-        prior: of the calibration states as the user means it.
-        p_needed: (11,) probability of each state to be another than stated.
-        noise: levels at which it was solved.
-        revision: the method's last word.
-        aligned: True where lengths and frame are those of a map.
-        others: what other robots say of its lengths (`CalibrationPrior.metre`).
+    `solved` is the final optimum in the graph's metres, `prior` as the user means it, the rest as in `Outcome`;
+    `others` is what other robots say of its lengths (`CalibrationPrior.metre`).
     """
     smoother, estimate, marginals = solved
     believed, worth = prior, smoother.worth(estimate, marginals)
@@ -579,9 +553,7 @@ def divided(
 
 def levels_settled(before: Noise, after: Noise, within: float) -> bool:
     """Return whether no noise level changed by more than this share of itself."""
-    old = np.concatenate([before.detection, before.odometry])
-    new = np.concatenate([after.detection, after.odometry])
-    return bool(np.all(np.abs(new / old - 1.0) < within))
+    return bool(np.all(np.abs(after.levels / before.levels - 1.0) < within))
 
 
 def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount: FloatArray) -> FloatArray:
@@ -618,7 +590,7 @@ def _rejoined(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> E
         piece = (problem.pose_row >= first) & (problem.pose_row < last)
         at = sighted_at(estimate.pose[problem.pose_row], problem.reading, estimate.states, problem.mount)
         mine, theirs = (
-            _middles(problem.landmark_row[some], at[some], len(estimate.landmark)) for some in (piece, ~piece)
+            middles(problem.landmark_row[some], at[some], len(estimate.landmark)) for some in (piece, ~piece)
         )
         both = np.flatnonzero(np.isfinite(mine[:, 0]) & np.isfinite(theirs[:, 0]))
         motion, agree = consensus(mine[both], theirs[both])
@@ -676,8 +648,8 @@ def silent_links(problem: Problem, estimate: Estimate, loose_rad: float) -> Bool
     return np.asarray(floor[:, 2, 2] > loose_rad**2)
 
 
-def _middles(row: IntArray, at: FloatArray, count: int) -> FloatArray:
-    """(L, 2) medians of positions (M, 2) of landmarks (M,); nan of those with none."""
+def middles(row: IntArray, at: FloatArray, count: int) -> FloatArray:
+    """Return (L, 2) medians of positions (M, 2) of landmarks (M,); nan of those with none."""
     middle = np.full((count, 2), np.nan)
     for j in np.unique(row):
         middle[j] = np.median(at[row == j], axis=0)
@@ -688,24 +660,15 @@ def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray, fewest: 
     """Move landmarks to the median of their sightings where most sightings disagree with them.
 
     A landmark whose first sighting carried the wrong identity starts in the wrong place, from where all right
-    sightings look like outliers.
-
-    Args:
-        problem: the measurements so far.
-        estimate: where they put everything.
-        weights: (M,) inlier weights of the detections.
-        fewest: sightings that vote, at least.
+    sightings look like outliers. At least `fewest` vote, by inlier weights (M,).
     """
     sightings = np.bincount(problem.landmark_row, minlength=len(estimate.landmark))
     agreeing = np.bincount(problem.landmark_row, weights=weights > 0.5, minlength=len(estimate.landmark))
     # a vote would only set a landmark of a prior map against that map
-    disputed = (sightings >= fewest) & (agreeing < 0.5 * sightings) & ~problem.mapped
-    lost: IntArray = np.flatnonzero(disputed).astype(np.int64)
-    if len(lost) == 0:
+    disputed: BoolArray = (sightings >= fewest) & (agreeing < 0.5 * sightings) & ~problem.mapped
+    if not disputed.any():
         return estimate
-    landmark = estimate.landmark.copy()
-    for j in lost:
-        mine = np.flatnonzero(problem.landmark_row == j)
-        at = sighted_at(estimate.pose[problem.pose_row[mine]], problem.reading[mine], estimate.states, problem.mount)
-        landmark[j] = np.median(at, axis=0)
-    return Estimate(estimate.pose, landmark, estimate.states)
+    theirs = problem.seeing(disputed[problem.landmark_row])
+    at = sighted_at(estimate.pose[theirs.pose_row], theirs.reading, estimate.states, problem.mount)
+    middle = middles(theirs.landmark_row, at, len(disputed))
+    return replace(estimate, landmark=np.where(disputed[:, None], middle, estimate.landmark))

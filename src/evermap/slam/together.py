@@ -9,7 +9,7 @@ them say (`CalibrationPrior.metre`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
@@ -49,24 +49,6 @@ MOST_TIES = 200
 """Maximum mutual sightings used to align the frames of two robots."""
 
 
-@dataclass(frozen=True, slots=True)
-class Member:
-    """A robot's own solution, and its number.
-
-    Attributes:
-        number: by which others call it.
-        alone: its recording by itself, from scratch.
-    """
-
-    number: int
-    alone: Solved
-
-    @property
-    def start(self) -> Noise:
-        """Noise levels before the first frame."""
-        return beliefs(self.alone.recording.sensor, self.alone.settings)[1]
-
-
 def solve_together(alone: Mapping[int, Solved]) -> tuple[list[Solved], list[Trajectory]]:
     """Return robots solved together, and what each knew at the time, in the frame of the first one's first pose.
 
@@ -78,8 +60,8 @@ def solve_together(alone: Mapping[int, Solved]) -> tuple[list[Solved], list[Traj
         DataError: nothing ties one of them to the others.
         NumericalError: no finite optimum.
     """
-    members = [Member(number, one) for number, one in alone.items()]
-    met, stamps, remarks = _sighted(members)
+    members = list(alone.values())
+    met, stamps, remarks = _sighted(np.array(list(alone)), members)
     own = [_extended(member, stamp_s) for member, stamp_s in zip(members, stamps, strict=True)]
     motion = _placed(members, own, met)
     joint, estimate = _laid_together(members, own, met, motion)
@@ -91,29 +73,27 @@ def solve_together(alone: Mapping[int, Solved]) -> tuple[list[Solved], list[Traj
     outcomes = _divided(members, joint, estimate, marginals, p_needed, fits)
     solved, online = [], []
     frames = ["first_pose", *["first_robot"] * (len(members) - 1)]
-    for member, outcome, by, said, frame in zip(members, outcomes, motion, remarks, frames, strict=True):
-        one = member.alone
+    for one, outcome, by, said, frame in zip(members, outcomes, motion, remarks, frames, strict=True):
         turned = one.outcome.scale / outcome.scale * se2.rotation(by[2])
         changes = outcome.revision.changes
         moved = tuple(replace(change, displacement_m=tuple(turned @ change.displacement_m)) for change in changes)
         revision = replace(outcome.revision, changes=moved)
         prepared = replace(one.prepared, warnings=(*one.prepared.warnings, *said))
         solved.append(replace(one, prepared=prepared, outcome=replace(outcome, revision=revision)))
-        told = told_online(one.prepared, one.slam, one.recording, frame)
+        told = told_online(one, frame)
         online.append(replace(told, pose_world_robot=se2.compose(by, told.pose_world_robot)))
     return solved, online
 
 
-def _sighted(members: Sequence[Member]) -> tuple[Encounters, list[FloatArray], list[tuple[str, ...]]]:
+def _sighted(number: IntArray, members: Sequence[Solved]) -> tuple[Encounters, list[FloatArray], list[tuple[str, ...]]]:
     """Encounters of robots while both have poses; instants of the poses of each, those of the sightings included."""
-    number = np.array([member.number for member in members])
-    start_s = np.array([member.alone.prepared.start_s for member in members])
-    stamps = [member.alone.outcome.problem.stamp_s for member in members]
+    start_s = np.array([member.prepared.start_s for member in members])
+    stamps = [member.outcome.problem.stamp_s for member in members]
     spans = np.array([[own[0], own[-1]] for own in stamps]) + start_s[:, None]
     pairs, instants, readings = [], [], []
     remarks: list[tuple[str, ...]] = []
     for r, member in enumerate(members):
-        seen = member.alone.recording.robot_sightings
+        seen = member.recording.robot_sightings
         remarks.append(())
         if seen is None:
             continue
@@ -152,15 +132,15 @@ def _nearest(own_s: FloatArray, stamp_s: FloatArray) -> IntArray:
     return after - (stamp_s - own_s[after - 1] < own_s[after] - stamp_s)
 
 
-def _extended(member: Member, stamp_s: FloatArray) -> tuple[Problem, Estimate]:
+def _extended(member: Solved, stamp_s: FloatArray) -> tuple[Problem, Estimate]:
     """A robot's problem with poses at more instants, without priors of places, and where it puts everything [m]."""
-    outcome, problem = member.alone.outcome, member.alone.outcome.problem
+    outcome, problem = member.outcome, member.outcome.problem
     graph, spread = outcome.graph_estimate, outcome.graph_marginals
     pose, _ = bridged(
         stamp_s, problem.stamp_s, graph.pose, spread.pose, spread.consecutive, problem.drive, graph.states,
         outcome.noise.noise,
     )  # fmt: skip
-    states, _, scale, _ = member.alone.prior.split_scale(graph.states, np.zeros((N_STATES, N_STATES)))
+    states, _, scale, _ = member.prior.split_scale(graph.states, np.zeros((N_STATES, N_STATES)))
     count = len(graph.landmark)
     extended = replace(
         problem,
@@ -172,7 +152,7 @@ def _extended(member: Member, stamp_s: FloatArray) -> tuple[Problem, Estimate]:
     return extended, Estimate(pose * [scale, scale, 1.0], graph.landmark * scale, states)
 
 
-def _placed(members: Sequence[Member], own: Sequence[tuple[Problem, Estimate]], met: Encounters) -> FloatArray:
+def _placed(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], met: Encounters) -> FloatArray:
     """(R, 3) motions of each robot's frame into that of the first one, by landmarks and sightings that agree.
 
     Raises:
@@ -185,7 +165,7 @@ def _placed(members: Sequence[Member], own: Sequence[tuple[Problem, Estimate]], 
     for r, (problem, estimate) in enumerate(own):
         mine = met.robot == r
         sighted[mine] = sighted_at(pose[met.observer[mine]], met.reading[mine], estimate.states, problem.mount)
-    names = [member.alone.prepared.landmark_id for member in members]
+    names = [member.prepared.landmark_id for member in members]
 
     def ties(a: int, b: int) -> tuple[FloatArray, FloatArray]:
         """Return the same points in the frames of robots a and b."""
@@ -209,19 +189,19 @@ def _placed(members: Sequence[Member], own: Sequence[tuple[Problem, Estimate]], 
             by, agree = consensus(np.concatenate(mine), np.concatenate(there))
             if agree.sum() > best:
                 best, found = int(agree.sum()), (b, by)
-        if found is None or best < members[0].alone.settings.localize.fewest:
-            lost = ", ".join(members[r].alone.recording.name for r in range(len(own)) if r not in placed)
-            what = f"nothing connects {lost} to {members[0].alone.recording.name}"
+        if found is None or best < members[0].settings.localize.fewest:
+            lost = ", ".join(members[r].recording.name for r in range(len(own)) if r not in placed)
+            what = f"nothing connects {lost} to {members[0].recording.name}"
             raise DataError(what, hint="common landmark ids or mutual sightings, and one clock")
         motion[found[0]] = found[1]
         placed.add(found[0])
     return motion
 
 
-def _shared(members: Sequence[Member]) -> list[IntArray]:
+def _shared(members: Sequence[Solved]) -> list[IntArray]:
     """Return the common place of each place of each robot: one per id, except for landmarks that a robot saw moving."""
-    revisions = [member.alone.outcome.revision for member in members]
-    names = [member.alone.prepared.landmark_id for member in members]
+    revisions = [member.outcome.revision for member in members]
+    names = [member.prepared.landmark_id for member in members]
     moved = {
         int(own[k]) for own, said in zip(names, revisions, strict=True) for c in said.changes for k in c.landmark_ids
     }
@@ -237,35 +217,32 @@ def _shared(members: Sequence[Member]) -> list[IntArray]:
 
 
 def _laid_together(
-    members: Sequence[Member], own: Sequence[tuple[Problem, Estimate]], met: Encounters, motion: FloatArray
+    members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], met: Encounters, motion: FloatArray
 ) -> tuple[Together, Estimate]:
     """The problem of all, and where it is when each robot's own solution is moved by (R, 3)."""
     places = _shared(members)
     landmark = np.full((max(int(rows.max()) for rows in places) + 1, 2), np.nan)
     pose, robots = [], []
-    metric = not all(member.alone.prior.shares_scale for member in members)
+    metric = not all(member.prior.shares_scale for member in members)
     for r, (member, (problem, estimate), by) in enumerate(zip(members, own, motion, strict=True)):
-        at, pose_r = se2.transform(by, estimate.landmark), se2.compose(by, estimate.pose)
-        new = np.isfinite(at[:, 0]) & np.isnan(landmark[places[r], 0])
-        landmark[places[r][new]] = at[new]
-        prior, held = member.alone.prior, problem.start_information if r == 0 else ALIGNED_INFORMATION
-        if (
-            not metric
-        ):  # in the scale of the first one's ranges: with all free within their priors a small map is preferred
+        moved = estimate.moved(by)
+        new = moved.known & np.isnan(landmark[places[r], 0])
+        landmark[places[r][new]] = moved.landmark[new]
+        prior, held = member.prior, problem.start_information if r == 0 else ALIGNED_INFORMATION
+        if not metric:  # in the scale of the first one's ranges: of all that the priors allow a small map is preferred
             prior = prior.relative(np.sqrt(2.0) * prior.sigma[SLOPE] if r else 0.0)
-        placed = replace(problem, start_pose=pose_r[0], start_information=held, prior=prior)
-        robots.append(Smoother(placed, member.alone.outcome.noise.noise, robust=member.alone.settings.robust))
-        pose.append(pose_r)
-    start_s = np.array([member.alone.prepared.start_s for member in members])
+        placed = replace(problem, start_pose=moved.pose[0], start_information=held, prior=prior)
+        robots.append(Smoother(placed, member.outcome.noise.noise, robust=member.settings.robust))
+        pose.append(moved.pose)
+    start_s = np.array([member.prepared.start_s for member in members])
     sigma = np.array([robot.noise.detection for robot in robots])
     states = np.concatenate([estimate.states for _, estimate in own])
-    return Together(robots, places, start_s - start_s.min(), met, sigma), Estimate(
-        np.concatenate(pose), landmark, states
-    )
+    joint = Together(robots, places, start_s - start_s.min(), met, sigma)
+    return joint, Estimate(np.concatenate(pose), landmark, states)
 
 
 def _levelled(
-    members: Sequence[Member], joint: Together, estimate: Estimate, *, heavy: bool = False
+    members: Sequence[Solved], joint: Together, estimate: Estimate, *, heavy: bool = False
 ) -> tuple[Together, Estimate, list[NoiseFit]]:
     """The optimum and its noise levels, in turns until neither changes; `heavy` outliers at first, if wanted."""
     ahead, start = [Extrapolation() for _ in members], joint.sigma
@@ -276,13 +253,13 @@ def _levelled(
         estimate, marginals = exhausted(solved)
         own, parts = joint.estimates(estimate), joint.parts(estimate, marginals)
         fits = [
-            refine_noise(robot.problem, one, part, robot.inlier_probability(one), robot.noise, member.start)
+            refine_noise(robot.problem, one, part, robot.inlier_probability(one), robot.noise, _start(member))
             for member, robot, one, part in zip(members, joint.robots, own, parts, strict=True)
         ]
         learning, settled = [], not first
         for member, robot, fit, before in zip(members, joint.robots, fits, ahead, strict=True):
             noise = robot.noise
-            if member.alone.settings.estimate_noise:
+            if member.settings.estimate_noise:
                 settled &= levels_settled(noise, fit.noise, NOISE_CONVERGED)
                 noise = fit.noise if first else before.ahead(noise, fit.noise)
             learning.append(robot.under(noise, heavy=False))
@@ -292,16 +269,21 @@ def _levelled(
     return joint, estimate, [replace(fit, noise=robot.noise) for fit, robot in zip(fits, joint.robots, strict=True)]
 
 
+def _start(member: Solved) -> Noise:
+    """Noise levels before the first frame."""
+    return beliefs(member.recording.sensor, member.settings)[1]
+
+
 def _refined(
-    members: Sequence[Member], joint: Together, estimate: Estimate, marginals: Marginals, start: FloatArray
+    members: Sequence[Solved], joint: Together, estimate: Estimate, marginals: Marginals, start: FloatArray
 ) -> FloatArray:
     """(R, 2) noise of what each robot measures of others, as `refine_noise` has that of landmarks."""
     square, weight = joint.squares(estimate)
     left = weight[:, None] * np.maximum(1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2), 0.0)
     sigma = joint.sigma.copy()
     for r, member in enumerate(members):
-        if member.alone.settings.estimate_noise:
-            mine, pseudo = joint.met.robot == r, member.start.pseudo_count
+        if member.settings.estimate_noise:
+            mine, pseudo = joint.met.robot == r, _start(member).pseudo_count
             counts = left[mine].sum(axis=0) + pseudo
             sigma[r] = np.sqrt((square[mine].sum(axis=0) + pseudo * start[r] ** 2) / counts)
     return sigma
@@ -321,20 +303,19 @@ def _as_needed(joint: Together, estimate: Estimate) -> tuple[Together, Estimate,
     return joint.of(robots, joint.sigma), replace(estimate, states=np.concatenate(states)), p_needed
 
 
-def _ahead(first: Member, joint: Together, estimate: Estimate) -> tuple[Together, Estimate]:
+def _ahead(first: Solved, joint: Together, estimate: Estimate) -> tuple[Together, Estimate]:
     """Return the same, rotated so that the first robot's first pose has its front ahead."""
     problem = joint.robots[0].problem
-    start = se2.inverse(first.alone.prior.front(estimate.states[:N_STATES], problem.mount))
+    start = se2.inverse(first.prior.front(estimate.states[:N_STATES], problem.mount))
     turn, robots = se2.compose(start, se2.inverse(problem.start_pose)), []
     for robot in joint.robots:
         turned = replace(robot.problem, start_pose=se2.compose(turn, robot.problem.start_pose))
         robots.append(Smoother(turned, robot.noise, robust=robot.robust))
-    pose, landmark = se2.compose(turn, estimate.pose), se2.transform(turn, estimate.landmark)
-    return joint.of(robots, joint.sigma), Estimate(pose, landmark, estimate.states)
+    return joint.of(robots, joint.sigma), estimate.moved(turn)
 
 
 def _divided(
-    members: Sequence[Member],
+    members: Sequence[Solved],
     joint: Together,
     estimate: Estimate,
     marginals: Marginals,
@@ -343,14 +324,14 @@ def _divided(
 ) -> list[Outcome]:
     """Return each robot's part of the optimum, in the common scale; changes are those of each alone."""
     own, parts = joint.estimates(estimate), joint.parts(estimate, marginals)
-    priors = [member.alone.prior for member in members]
+    priors = [member.prior for member in members]
     told = [
         prior.metre(one.states, part.states) if all(other.shares_scale for other in priors) else None
         for prior, one, part in zip(priors, own, parts, strict=True)
     ]
     outcomes = []
     for r, (member, robot) in enumerate(zip(members, joint.robots, strict=True)):
-        revision = replace(member.alone.outcome.revision, problem=robot.problem, estimate=own[r], rivals=())
+        revision = replace(member.outcome.revision, problem=robot.problem, estimate=own[r], rivals=())
         others = tuple(said for k, said in enumerate(told) if said is not None and k != r)
         outcome = divided(
             (robot, own[r], parts[r]), priors[r], p_needed[r], fits[r], revision, aligned=True, others=others

@@ -43,10 +43,6 @@ def without_contradicted_ids(recording: AnyRecordingT, settings: SlamConfig) -> 
     """Return the recording without the landmark ids that the seconds around contradict, with a remark on how many.
 
     In space that takes odometry; boxes, which move, and detections without a range keep their ids.
-
-    Args:
-        recording: as read.
-        settings: of the estimator.
     """
     given = recording.detections
     try:

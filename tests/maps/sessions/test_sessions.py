@@ -335,13 +335,11 @@ def test_a_drive_in_pieces_that_nothing_ties_begins_a_map_with_the_largest(
     edges_s = first_s + (last_s - first_s) * np.array([1.0, 2.0]) / 3.0
     silent = (np.abs(whole.odometry.stamp_s[:, None] - edges_s) < 3.0).any(axis=1)
     blind = (np.abs(whole.frames.stamp_s[:, None] - edges_s) < 3.0).any(axis=1)
-    frames, detections = some_frames(whole.frames, whole.detections, ~blind)
+    some = some_frames(whole, ~blind)
     own = own[~blind[whole.detections.frame]]
-    detections = replace(detections, landmark_id=np.where(own, detections.landmark_id, UNKNOWN))
+    detections = replace(some.detections, landmark_id=np.where(own, some.detections.landmark_id, UNKNOWN))
     session = run_session(
-        replace(whole, odometry=rows_of(whole.odometry, ~silent), frames=frames, detections=detections),
-        None,
-        settings(),
+        replace(some, odometry=rows_of(whole.odometry, ~silent), detections=detections), None, settings()
     )
     assert session.found, session.set_aside
     assert any("nothing connects them" in warning for warning in session.recording.warnings)

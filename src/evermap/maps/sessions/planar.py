@@ -120,8 +120,8 @@ class PlanarVisit:
     def watched(self, entry: Extended, config: LivingConfig) -> Watch:
         """Return at which places of the map the session looked, by the nominal field of view."""
         visit = self.solved
-        recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
-        trajectory = of_slam.trajectory(prepared, outcome, recording, "")
+        recording, prepared = visit.recording, visit.prepared
+        trajectory = of_slam.trajectory(visit, "")
         stamps = recording.frames.stamp_s
         frames = np.flatnonzero((stamps >= visit.start_s) & (stamps <= visit.end_s + 1e-9)).astype(np.int64)
         pose = trajectory.pose_world_robot[of_slam.rows_at(trajectory, recording, frames)]
@@ -352,9 +352,9 @@ def without(visit: Solved, untied: BoolArray, wrong: BoolArray) -> Recording | N
     recording, doubt = visit.recording, untied | wrong
     if not doubt.any():
         return recording
-    frames, detections = some_frames(recording.frames, recording.detections, ~doubt)
+    some = some_frames(recording, ~doubt)
     n_tied = np.count_nonzero(~untied[recording.detections.frame])
-    if 2 * len(detections) < n_tied or len(np.unique(detections.frame)) < 2:
+    if 2 * len(some.detections) < n_tied or len(np.unique(some.detections.frame)) < 2:
         return None
     start_s = recording.frames.stamp_s[0]
     spans = np.flatnonzero(np.diff(np.concatenate([[False], doubt, [False]])))
@@ -364,7 +364,7 @@ def without(visit: Solved, untied: BoolArray, wrong: BoolArray) -> Recording | N
         f"{int(doubt.sum())} frames left out ({told}{', ...' if len(spans) > 6 else ''} after the first): most of "
         f"their detections contradict the rest, or the odometry was silent and nothing connects them to it"
     )
-    return replace(recording, frames=frames, detections=detections, warnings=(*recording.warnings, remark))
+    return replace(some, warnings=(*recording.warnings, remark))
 
 
 def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved, near_m: float) -> None:

@@ -26,8 +26,7 @@ from evermap.slam.association.revise import likely_real, reassigned, unseen_nats
 from evermap.slam.association.splitting import weighed_visits
 from evermap.slam.filter_kernels import BY_PLACE, GATED, WIDTH, spread_of_frame
 from evermap.slam.linearise import detection_residuals
-from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
-from evermap.slam.motion import Motion
+from evermap.slam.local_filter import NO_PLACES, LocalFilter, Motion, columns
 from evermap.slam.noise import Extrapolation, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother

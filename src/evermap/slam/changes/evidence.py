@@ -20,7 +20,7 @@ from evermap.slam.calibration import SLOPE, CalibrationPrior
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import sighted_at
+from evermap.slam.streaming import middles, sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
 TINY_INFORMATION = 1e-6
@@ -120,15 +120,11 @@ def landmark_evidence(
 ) -> WindowEvidence:
     """Eliminate poses and calibration of a linearised problem, window by window.
 
-    Args:
-        problem: the measurements; its priors of start and landmarks are left out.
-        estimate: where to linearise; every landmark that was seen has a position.
-        noise: the noise levels.
-        prior: of the calibration, as the user means it.
-        bounds: (W + 1,) first pose of every window, and the number of poses.
-        fewest: sightings that make a copy, at least: one or two may be wrong identities.
-        sized: divide range slope and size by their priors; else positions stay in the metres of the sensor, which is
-            enough where there is no map to compare with.
+    The problem's priors of start and landmarks are left out; every landmark that was seen has a position in the
+    estimate, and `prior` is of the calibration as the user means it. Windows begin at the poses `bounds` (W + 1,), of
+    which the last is the number of poses. A copy takes the `fewest` sightings at least: one or two may be wrong
+    identities. If `sized`, range slope and size are divided by their priors; else positions stay in the metres of the
+    sensor, which is enough where there is no map to compare with.
     """
     estimate = in_sensor_metres(estimate, prior)
     held = prior.without_scale()
@@ -184,13 +180,9 @@ def _joined(pieces: Sequence[_Piece]) -> tuple[FloatArray, FloatArray, int]:
 
 
 def compare(evidence: WindowEvidence, mean: FloatArray, covariance: FloatArray, mapped: BoolArray) -> Comparison:
-    """Set the evidence against a map.
+    """Set the evidence against a map of means (L, 2) with covariances (L, 2, 2).
 
-    Args:
-        evidence: of the copies.
-        mean: (L, 2) the map.
-        covariance: (L, 2, 2) its uncertainty.
-        mapped: (L,) landmarks that it holds; for the others only what happens during the session shows.
+    Of landmarks that it does not hold, not `mapped` (L,), only what happens during the session shows.
     """
     seen = np.unique(evidence.landmark)
     column = np.searchsorted(seen, evidence.landmark)
@@ -252,34 +244,23 @@ def _piece(
     pose_row = problem.pose_row[used]
     count = len(landmark)
     part = replace(
-        problem,
+        problem.seeing(used),
         stamp_s=problem.stamp_s[start:last],
         pose_row=pose_row - start,
         landmark_row=row.astype(np.int64),
-        reading=problem.reading[used],
-        sigma_given=problem.sigma_given[used],
         prior=CalibrationPrior(prior.mean, np.full(N_STATES, np.inf), prior.free),
         start_information=0.0,
         landmark_mean=np.zeros((count, 2)),
         landmark_information=sparse.csr_array((2 * count, 2 * count)),
     )
-    position = _copies(part, estimate, pose_row, landmark)
+    sighted = sighted_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
+    position = middles(part.landmark_row, sighted, count)  # of the landmarks by the poses of this window alone
     local = Estimate(estimate.pose[start:last], position, estimate.states)
     ends = np.unique([0, last - start - 1])
     information, right = Smoother(part, noise).information(local, ends[::-1])
     if len(ends) == 1:  # a window of one pose: it is the first and there is no other
         information, right = np.pad(information, ((3, 0), (3, 0))), np.pad(right, (3, 0))
     return _Piece(landmark, position, information, right)
-
-
-def _copies(part: Problem, estimate: Estimate, pose_row: IntArray, landmark: IntArray) -> FloatArray:
-    """Return the landmarks of a window by its poses alone: the median of their sightings."""
-    if len(landmark) == 0:
-        return np.zeros((0, 2))
-    points = sighted_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
-    order = np.argsort(part.landmark_row, kind="stable")
-    groups = np.split(points[order], np.cumsum(np.bincount(part.landmark_row, minlength=len(landmark)))[:-1])
-    return np.array([np.median(group, axis=0) for group in groups]).reshape(-1, 2)
 
 
 def in_sensor_metres(estimate: Estimate, prior: CalibrationPrior) -> Estimate:

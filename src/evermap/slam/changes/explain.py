@@ -72,10 +72,7 @@ class MovedGroup:
 
     def moved(self, position: FloatArray) -> FloatArray:
         """Return (k, 2) the members' positions after the motion."""
-        own = position[self.members]
-        centre = own.mean(axis=0)
-        moved: FloatArray = centre + self.motion[:2] + (own - centre) @ se2.rotation(float(self.motion[2])).T
-        return moved
+        return se2.move_together(position[self.members], self.motion[:2], float(self.motion[2]))
 
     def motion_prior(self, position: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean (k, 2) and covariance (2 k, 2 k) of the members' displacements, linearised at the angle found."""
@@ -127,10 +124,8 @@ def explained(
             continue
         new = len(places) + np.arange(len(members))
         places.extend(int(j) for j in members)
-        old_rows = se2.xy_rows(members)
-        new_rows = se2.xy_rows(new)
-        tie = np.linalg.inv(motion_covariance + prior.rigid_m**2 * np.eye(len(old_rows)))
-        both = np.concatenate([old_rows, new_rows])
+        tie = np.linalg.inv(motion_covariance + prior.rigid_m**2 * np.eye(2 * len(members)))
+        both = se2.xy_rows(np.append(members, new))
         information = padded(information, len(new))
         parted = embedded(np.kron([[1.0, -1.0], [-1.0, 1.0]], tie), both, 2 * len(places))
         information = sparse.csr_array(information + parted)
@@ -154,13 +149,8 @@ def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArr
 
     Sightings that were given to the wrong places have drawn the poses towards these, and would be right again there.
     """
-    others = ~np.isin(problem.landmark_row, members)
     rest = replace(
-        problem,
-        pose_row=problem.pose_row[others],
-        landmark_row=problem.landmark_row[others],
-        reading=problem.reading[others],
-        sigma_given=problem.sigma_given[others],
+        problem.seeing(~np.isin(problem.landmark_row, members)),
         # the other landmarks stay where they are, or the whole might turn away from the members' places
         landmark_mean=np.nan_to_num(estimate.landmark[: len(problem.landmark_mean)]),
         landmark_information=independent(np.tile(np.eye(2) / HELD_M**2, (len(problem.landmark_mean), 1, 1))),
@@ -182,15 +172,8 @@ def parting_time(
 ) -> tuple[float, tuple[float, float]]:
     """Return the first stamp [s] at the new places, and two stamps between which the change happened.
 
-    Args:
-        problem: the measurements; `landmark_row` says which landmark was seen.
-        estimate: poses and states.
-        noise: the noise levels.
-        members: (k,) landmarks of the group.
-        old: (k, 2) their places before.
-        new: (k, 2) and after.
-        within_s: the change is known to lie between these two stamps.
-        interval: probability that it lies between the stamps returned.
+    Landmarks `members` (k,) of a group changed from `old` (k, 2) to `new` places, between two stamps `within_s`; with
+    probability `interval` it was between the stamps returned.
     """
     stamp_s = problem.stamp_s[problem.pose_row]
     inside = (stamp_s >= within_s[0]) & (stamp_s <= within_s[1])
@@ -202,15 +185,9 @@ def parting_time(
     loss = np.empty((2, len(mine)))
     for k, place in enumerate((old, new)):
         _losses(
-            estimate.pose[problem.pose_row[mine]],
-            place[column],
-            estimate.states,
-            problem.mount,
-            problem.reading[mine],
-            sigma,
-            noise.outlier_log_odds,
-            loss[k],
-        )
+            estimate.pose[problem.pose_row[mine]], place[column], estimate.states, problem.mount,
+            problem.reading[mine], sigma, noise.outlier_log_odds, loss[k],
+        )  # fmt: skip
     stamp_s = stamp_s[mine]
     # log likelihood of the change just before detection k, for k = 1 .. n - 1: both places were seen
     log_likelihood = -np.cumsum(loss[0] - loss[1])[:-1]
@@ -226,15 +203,9 @@ def parting_time(
 
 @kernel
 def _losses(
-    pose: FloatArray,
-    place: FloatArray,
-    states: FloatArray,
-    mount: FloatArray,
-    reading: FloatArray,
-    sigma: FloatArray,
-    log_odds: float,
-    out: Any,
-) -> None:
+    pose: FloatArray, place: FloatArray, states: FloatArray, mount: FloatArray, reading: FloatArray, sigma: FloatArray,
+    log_odds: float, out: Any,
+) -> None:  # fmt: skip
     """Negative log likelihood of every reading of a landmark at `place`, outliers included."""
     e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     for m in range(len(reading)):

@@ -53,11 +53,8 @@ class Tables(NamedTuple):
 def hypothesis_gain(label: IntArray, onset: IntArray, turns: Any, tables: Tables) -> tuple[float, FloatArray]:
     """Return the gain [nats] and the most probable motion (G, 3) of every group: x [m], y [m], angle [rad].
 
-    Args:
-        label: (L,) group of every landmark, 0 = static, groups are 1..G.
-        onset: (G + 1,) window from which on a group has moved; row 0 is not used.
-        turns: (G + 1,) whether a group also turns.
-        tables: what it is computed from.
+    `label` (L,) is the group of every landmark, 0 = static, groups are 1..G; `onset` (G + 1,) the window from which on
+    each has moved, and `turns` (G + 1,) whether it also turns, whose row 0 is not used.
     """
     groups, spread = len(onset) - 1, tables.spread
     width, first, matrix, right, gain = _products(label, onset, turns, tables)
@@ -171,14 +168,9 @@ def _products(
 
 @kernel
 def _columns_of(
-    value: FloatArray,
-    scale: FloatArray,
-    width: IntArray,
-    first: IntArray,
-    start: IntArray,
-    column: FloatArray,
+    value: FloatArray, scale: FloatArray, width: IntArray, first: IntArray, start: IntArray, column: FloatArray,
     tangent: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Columns (C,) at the unknowns (Y,), and their derivatives (C, Y)."""
     tangent[:] = 0.0
     for g in range(1, len(width)):
@@ -236,5 +228,4 @@ def log_onset(n_windows: int) -> FloatArray:
     """Return (W,) log prior of the window from which on a group has moved: before the session as likely as within."""
     if n_windows == 1:
         return np.zeros(1)
-    table: FloatArray = np.log(np.append(0.5, np.full(n_windows - 1, 0.5 / (n_windows - 1))))
-    return table
+    return np.asarray(np.log(np.append(0.5, np.full(n_windows - 1, 0.5 / (n_windows - 1)))))

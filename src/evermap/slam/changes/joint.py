@@ -15,7 +15,6 @@ import numpy as np
 from scipy import sparse
 
 from evermap.config import SlamConfig
-from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, in_sensor_metres, landmark_evidence
@@ -31,10 +30,14 @@ from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
 
 VISIT_MARGIN, MOST_VISITS = 0.5, 8
 """Visits that get windows of their own: this share of the interval around it, and this many."""
+DISAGREES = "the prior map disagrees with the detections, and no change explains it: cannot localise in it"
 ROUNDS = 6
 """Searches at the end of a session, at most."""
 POSES_A_WINDOW, MOST_WINDOWS, MOST_ITEMS = 60, 12, 400
 """Size of a search: poses a window, windows, and landmarks times windows, so that it takes milliseconds."""
+
+
+Groups = tuple[MovedGroup, ...]
 
 
 def may_search(n_frames: int, *, in_map: bool) -> bool:
@@ -45,28 +48,18 @@ def may_search(n_frames: int, *, in_map: bool) -> bool:
 class Joint(Method):
     """Method that finds groups of moved landmarks, before the session or within it.
 
-    Args:
-        n_landmarks: landmarks of the session.
-        calibration: priors of the calibration states as the user means them.
-        given: the map to compare with; None where there is none.
-        settings: how changes are distributed, and what is believed of sightings.
+    `calibration` are the priors of the calibration states as the user means them, `given` is the map to compare with.
     """
 
     def __init__(
-        self,
-        n_landmarks: int,
-        calibration: CalibrationPrior,
-        given: GivenMap | None,
-        settings: SlamConfig,
+        self, n_landmarks: int, calibration: CalibrationPrior, given: GivenMap | None, settings: SlamConfig
     ) -> None:
-        self._count = n_landmarks
-        self._calibration = calibration
-        self._given = given
+        self._count, self._calibration, self._given = n_landmarks, calibration, given
         self._prior, self._robust, self._fewest = settings.changes, settings.robust, settings.fewest_sightings
         self._loosened: _Loosened | None = None
         self._concluded: Explanation | None = None
         self._landmark = np.arange(n_landmarks)
-        self._groups: tuple[MovedGroup, ...] = ()
+        self._groups: Groups = ()
         self._swaps: tuple[tuple[int, int, float], ...] = ()
         self.verdict: Verdict | None = None
 
@@ -104,7 +97,7 @@ class Joint(Method):
         motion, agree = consensus(estimate.landmark[both], self._given.mean[both])
         if np.count_nonzero(agree) < 2:
             return estimate
-        return Estimate(se2.compose(motion, estimate.pose), se2.transform(motion, estimate.landmark), estimate.states)
+        return estimate.moved(motion)
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
         """Search at the present estimate, and at the end of the session again at the resulting one."""
@@ -149,15 +142,12 @@ class Joint(Method):
             self._given = given
         if not heavy:
             estimate = smoother.under(noise, heavy=False).optimum(estimate, iterations=5, tolerance=1e-4)
-        revision = Explanation(
-            problem, estimate, self._current(), self._changes(self._groups, verdict.probability, base)
-        )
+        changes = self._changes(self._groups, verdict.probability, base)
+        revision = Explanation(problem, estimate, self._current(), changes)
         if final:
-            revision = replace(
-                revision,
-                rivals=self._rivals(base, evidence, believed, estimate, noise, bounds),
-                warnings=self._warnings(in_map=in_map),
-            )
+            lost = in_map and not self._groups and verdict.misfit > self._prior.disagreement
+            rivals = self._rivals(base, evidence, believed, estimate, noise, bounds)
+            revision = replace(revision, rivals=rivals, warnings=(DISAGREES,) if lost else ())
             self._concluded = revision
         return revision
 
@@ -170,19 +160,18 @@ class Joint(Method):
 
     def _first_places(self, estimate: Estimate) -> Estimate:
         """Return one place per landmark: the first."""
-        return Estimate(estimate.pose, estimate.landmark[: self._count], estimate.states)
+        return replace(estimate, landmark=estimate.landmark[: self._count])
 
     def _explained(
-        self,
-        base: Problem,
-        estimate: Estimate,
-        evidence: WindowEvidence,
-        believed: GivenMap,
-        groups: tuple[MovedGroup, ...],
+        self, base: Problem, estimate: Estimate, evidence: WindowEvidence, believed: GivenMap, groups: Groups
     ) -> tuple[Problem, Estimate, IntArray]:
         """The problem in a world where these groups moved, a start, and the landmark of every place."""
-        start = _with_copies(self._first_places(estimate), evidence, groups)
-        return explained(base, start, believed, groups, self._prior)
+        landmark = self._first_places(estimate).landmark.copy()
+        first = evidence.first_seen(landmark)
+        for group in groups:
+            if group.window > 0:  # within the session: from where it was first
+                landmark[group.members] = first[group.members]
+        return explained(base, replace(estimate, landmark=landmark), believed, groups, self._prior)
 
     def _rivals(
         self,
@@ -213,12 +202,6 @@ class Joint(Method):
                 )
             )
         return tuple(rivals)
-
-    def _warnings(self, *, in_map: bool) -> tuple[str, ...]:
-        assert self.verdict is not None
-        if in_map and not self._groups and self.verdict.misfit > self._prior.disagreement:
-            return ("the prior map disagrees with the detections, and no change explains it: cannot localise in it",)
-        return ()
 
     def _weighed(
         self, evidence: WindowEvidence, given: GivenMap, n_windows: int, *, thorough: bool
@@ -293,7 +276,7 @@ class Joint(Method):
         )
         return replace(group, since_s=since_s, between_s=between_s)
 
-    def _changes(self, groups: tuple[MovedGroup, ...], probability: float, base: Problem) -> tuple[MapChange, ...]:
+    def _changes(self, groups: Groups, probability: float, base: Problem) -> tuple[MapChange, ...]:
         first_s = float(base.stamp_s[0])
         moved = tuple(_change(group, probability, first_s) for group in groups)
         return (*(self._swap_change(swap, first_s) for swap in self._swaps), *moved)
@@ -346,7 +329,7 @@ def _change(group: MovedGroup, probability: float, first_s: float) -> MapChange:
     )
 
 
-def _same(groups: tuple[MovedGroup, ...], others: tuple[MovedGroup, ...]) -> bool:
+def _same(groups: Groups, others: Groups) -> bool:
     return len(groups) == len(others) and all(a.same_as(b) for a, b in zip(groups, others, strict=True))
 
 
@@ -355,16 +338,6 @@ def _current(landmark: IntArray, count: int) -> IntArray:
     current = np.zeros(count, dtype=np.int64)
     current[landmark] = np.arange(len(landmark))  # later places overwrite earlier ones
     return current
-
-
-def _with_copies(estimate: Estimate, evidence: WindowEvidence, groups: tuple[MovedGroup, ...]) -> Estimate:
-    """Return the first places of members of groups that moved within the session."""
-    landmark = estimate.landmark.copy()
-    first = evidence.first_seen(landmark)
-    for group in groups:
-        if group.window > 0:
-            landmark[group.members] = first[group.members]
-    return Estimate(estimate.pose, landmark, estimate.states)
 
 
 class Swap(NamedTuple):
@@ -378,11 +351,7 @@ class Swap(NamedTuple):
 def likeliest_swap(evidence: WindowEvidence, comparison: Comparison, given: GivenMap, p_swapped: float) -> Swap | None:
     """Return the two landmarks that gain most by taking each other's place; None if that gains less than it costs.
 
-    Args:
-        evidence: of the copies.
-        comparison: the same, seen from the map.
-        given: the map.
-        p_swapped: prior probability that any two landmarks were mixed up.
+    `p_swapped` is the prior probability that any two landmarks were mixed up.
     """
     candidates = np.intersect1d(np.unique(evidence.landmark), np.flatnonzero(given.given))
     count = len(candidates)

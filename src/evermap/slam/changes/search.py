@@ -49,22 +49,14 @@ def find_changes(
 ) -> Hypotheses:
     """Return the most probable sets of changes, and all that were weighed on the way.
 
-    Args:
-        evidence: of the copies.
-        comparison: the same, seen from the map.
-        position: (L, 2) mapped positions; groups turn about the centroid of these.
-        n_windows: windows of the evidence.
-        prior: how changes are distributed.
-        start: hypotheses of which the first is one start of the search.
+    Groups turn about the centroid of mapped positions (L, 2); the first hypothesis of `start` is one start of the
+    search.
     """
     candidates = _candidates(evidence, comparison, len(position), prior, start)
     quadratic, linear = item_columns(evidence, comparison, position, n_windows, candidates)
     count = len(candidates)
-    label, onset, turns = (
-        np.zeros(count, np.int64),
-        np.zeros(prior.most_groups + 1, np.int64),
-        np.zeros(prior.most_groups + 1, bool),
-    )
+    label, onset = np.zeros(count, np.int64), np.zeros(prior.most_groups + 1, np.int64)
+    turns = np.zeros(prior.most_groups + 1, bool)
     if start is not None:
         label[:], onset[:], turns[:] = start.label[0, candidates], start.onset[0], start.turns[0]
     tables = Tables(
@@ -83,10 +75,10 @@ def find_changes(
     ranked = weighed.ranked
     labels = np.zeros((len(ranked), len(position)), np.int64)
     labels[:, candidates] = weighed.label[ranked]
-    motion = np.array(
-        [hypothesis_gain(weighed.label[k], weighed.onset[k], weighed.turns[k], tables)[1] for k in ranked]
-    )
-    return Hypotheses(labels, weighed.onset[ranked], weighed.turns[ranked], motion, weighed.gain[ranked])
+    onsets, turned = weighed.onset[ranked], weighed.turns[ranked]
+    each = zip(weighed.label[ranked], onsets, turned, strict=True)
+    motion = np.array([hypothesis_gain(*one, tables)[1] for one in each])
+    return Hypotheses(labels, onsets, turned, motion, weighed.gain[ranked])
 
 
 def _candidates(
@@ -185,8 +177,7 @@ class Weighed(NamedTuple):
         """Rows that weigh something, the best first."""
         gain = self.gain[: self.used[0]]
         worth = np.flatnonzero(gain > self.best[0] - WORTH_KEEPING)
-        order: IntArray = worth[np.argsort(-gain[worth], kind="stable")]
-        return order
+        return np.asarray(worth[np.argsort(-gain[worth], kind="stable")])
 
 
 @kernel

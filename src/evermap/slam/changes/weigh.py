@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.config import ChangesConfig
+from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap, MovedGroup
 from evermap.slam.changes.search import Hypotheses, find_changes
@@ -59,34 +60,34 @@ def weigh(
 ) -> Verdict:
     """Search for changes, and compute their probabilities.
 
-    Args:
-        evidence: of all copies.
-        given: the map, with its own covariance.
-        prior: how changes are distributed.
-        n_windows: windows of the evidence.
-        before: what was found last time; one start of the search.
-        spared: no copy of this evidence is displaced alone.
-        thorough: try all degrees of belief, else those of `before`.
+    What was found `before` is one start of the search; if not `thorough`, its degree of belief is the only one that is
+    tried. If `spared`, no copy of this evidence is displaced alone.
     """
     factor = 1.0 if before is None else before.map_factor
     usual = prior.softness_m[(len(prior.softness_m) - 1) // 2]
     softness = 0.0 if n_windows == 1 else (usual if before is None else before.softness_m)
     position = np.where(given.given[:, None], given.mean, evidence.first_seen(given.mean))
+
+    def search(
+        evidence: WindowEvidence,
+        start: Hypotheses | None,
+        factor: float = factor,
+        softness: float = prior.usual_softness_m,
+    ) -> tuple[Comparison, Hypotheses]:
+        soft = evidence.softened(softness)
+        comparison = compare(soft, given.mean, given.covariance * factor**2, given.given)
+        return comparison, find_changes(soft, comparison, position, n_windows, prior, start=start)
+
     if n_windows > 1 and not spared:
-
-        def search(evidence: WindowEvidence, start: Hypotheses | None) -> tuple[Comparison, Hypotheses]:
-            soft = evidence.softened(prior.usual_softness_m)
-            comparison = compare(soft, given.mean, given.covariance * factor**2, given.given)
-            return comparison, find_changes(soft, comparison, position, n_windows, prior, start=start)
-
         evidence = without_transients(evidence, position, prior, search)
     trials: dict[tuple[float, float], _Trial] = {}
 
     def tried(factor: float, softness: float) -> float:
         if (factor, softness) not in trials:
             best = max(trials.values(), key=lambda t: t.score, default=None)
-            start = None if best is None else best.hypotheses
-            trials[factor, softness] = _try(evidence, given, position, prior, n_windows, factor, softness, start)
+            comparison, found = search(evidence, None if best is None else best.hypotheses, factor, softness)
+            base = comparison.log_evidence - 0.5 * (np.log(factor) / prior.map_factor_spread) ** 2
+            trials[factor, softness] = _Trial(factor, softness, comparison, found, base)
         return trials[factor, softness].score
 
     tried(factor, softness)
@@ -125,23 +126,6 @@ def _beside(values: tuple[float, ...], value: float) -> tuple[float, ...]:
     """The neighbours of a value."""
     at = values.index(value)
     return values[max(at - 1, 0) : at] + values[at + 1 : at + 2]
-
-
-def _try(
-    evidence: WindowEvidence,
-    given: GivenMap,
-    position: FloatArray,
-    prior: ChangesConfig,
-    n_windows: int,
-    factor: float,
-    softness: float,
-    start: Hypotheses | None,
-) -> _Trial:
-    soft = evidence.softened(softness)
-    comparison = compare(soft, given.mean, given.covariance * factor**2, given.given)
-    hypotheses = find_changes(soft, comparison, position, n_windows, prior, start=start)
-    base = comparison.log_evidence - 0.5 * (np.log(factor) / prior.map_factor_spread) ** 2
-    return _Trial(factor, softness, comparison, hypotheses, base)
 
 
 class _SeenWithin(NamedTuple):
@@ -218,17 +202,11 @@ Search = Callable[[WindowEvidence, Hypotheses | None], tuple[Comparison, Hypothe
 def without_transients(
     evidence: WindowEvidence, position: FloatArray, prior: ChangesConfig, search: Search
 ) -> WindowEvidence:
-    """Return the evidence without copies that are displaced alone.
-
-    Args:
-        evidence: of all copies.
-        position: (L, 2) mapped positions.
-        prior: how changes are distributed.
-        search: how changes are looked for.
-    """
+    """Return the evidence without copies that are displaced alone, from mapped positions (L, 2)."""
     comparison, found = search(evidence, None)
     for _ in range(len(evidence.landmark)):
-        spared = _only_copies(evidence)
+        copy = np.arange(len(evidence.landmark))
+        spared = np.bincount(evidence.landmark)[evidence.landmark] < 2  # their landmarks have no other
         alone = np.where(spared, 0.0, _gains(comparison, prior.move_sigma_m))
         after = _explained_away(evidence, comparison, found, position, prior)
         still = np.where(spared, 0.0, _gains(after, prior.move_sigma_m))
@@ -238,26 +216,14 @@ def without_transients(
             candidates.append((worst, still[worst] - prior.displaced_log_odds))
         worst = int(np.argmax(alone))
         if alone[worst] > prior.displaced_log_odds and all(worst != other for other, _ in candidates):
-            _, others = search(_dropped(evidence, worst), found)
+            _, others = search(evidence.without(copy == worst), found)
             candidates.append((worst, alone[worst] - prior.displaced_log_odds + float(others.gain[0] - found.gain[0])))
         best, gain = max(candidates, key=lambda candidate: candidate[1], default=(0, 0.0))
         if gain <= 0.0:
             break
-        evidence = _dropped(evidence, best)
+        evidence = evidence.without(copy == best)
         comparison, found = search(evidence, found)
     return evidence
-
-
-def _dropped(evidence: WindowEvidence, copy: int) -> WindowEvidence:
-    out = np.zeros(len(evidence.landmark), dtype=bool)
-    out[copy] = True
-    return evidence.without(out)
-
-
-def _only_copies(evidence: WindowEvidence) -> BoolArray:
-    """(R,) copies of landmarks that have no other."""
-    only: BoolArray = np.bincount(evidence.landmark)[evidence.landmark] < 2
-    return only
 
 
 def _gains(comparison: Comparison, sigma_m: float) -> FloatArray:
@@ -268,8 +234,7 @@ def _gains(comparison: Comparison, sigma_m: float) -> FloatArray:
     pull = comparison.pull.reshape(count, 2)
     inner = precision + np.eye(2) / sigma_m**2
     solved = np.linalg.solve(inner, pull[:, :, None])[:, :, 0]
-    gains: FloatArray = 0.5 * (pull * solved).sum(axis=1) - 0.5 * np.linalg.slogdet(sigma_m**2 * inner)[1]
-    return gains
+    return np.asarray(0.5 * (pull * solved).sum(axis=1) - 0.5 * np.linalg.slogdet(sigma_m**2 * inner)[1])
 
 
 def _explained_away(
@@ -284,12 +249,7 @@ def _explained_away(
         moved = np.isin(evidence.landmark, members) & (evidence.window >= found.onset[0, g])
         angle = found.motion[0, g - 1, 2] if found.turns[0, g] else 0.0
         arm = position[evidence.landmark] - position[members].mean(axis=0)
-        turned = np.column_stack(
-            [
-                np.cos(angle) * arm[:, 0] - np.sin(angle) * arm[:, 1],
-                np.sin(angle) * arm[:, 0] + np.cos(angle) * arm[:, 1],
-            ]
-        )
+        turned = se2.transform([0.0, 0.0, angle], arm)
         tangent = np.column_stack([-turned[:, 1], turned[:, 0]])
         shift += moved[:, None] * (turned - arm - angle * tangent)
         parts = [np.tile([1.0, 0.0], (len(moved), 1)), np.tile([0.0, 1.0], (len(moved), 1)), tangent]

@@ -117,16 +117,10 @@ def _passed_on(tree: Tree, node: int, index: Any) -> int:
 def eliminate(
     tree: Tree, factors: Factors, values: FloatArray, extra: FloatArray, state: Elimination, high: int, low: int
 ) -> None:
-    """Eliminate the fronts from `high - 1` down to `low`.
+    """Eliminate the fronts from `high - 1` down to `low`, all later ones being eliminated in `state`.
 
-    Args:
-        tree: the elimination tree.
-        factors: what ties the variables.
-        values: Jacobian and right side of each factor, whitened: the cost is `|A x - b|^2 / 2`.
-        extra: information that is added on the diagonal.
-        state: with all later fronts eliminated; filled in.
-        high: front after the first.
-        low: the last front.
+    `values` are Jacobian and right side of each factor, whitened: the cost is `|A x - b|^2 / 2`; `extra` (numbers,)
+    information is added on the diagonal.
     """
     diagonal = np.zeros(len(state.front))
     for node in range(high - 1, low - 1, -1):
@@ -285,14 +279,7 @@ def back_substitute(
 ) -> None:
     """Solve `L' x = right` for the variables of the fronts from `low` to `high - 1`, those before being done.
 
-    Args:
-        tree: the elimination tree.
-        stored: rows of the Cholesky factor, `L'`.
-        right: (numbers,) its right side.
-        border: (B,) solution of the border.
-        x: (numbers,) filled in.
-        low: the first front.
-        high: front after the last.
+    `stored` are the rows of the Cholesky factor, `border` (B,) the solution of the border; `x` (numbers,) is filled in.
     """
     position, largest = 0, 0
     for v in tree.border:
@@ -322,13 +309,9 @@ def back_substitute(
 
 
 def spread_room(tree: Tree, factors: Factors, border: FloatArray, n_pairs: int) -> Spread:
-    """Return room for covariances, with those of the border in it.
+    """Return room for covariances, with those of the border (B, B) in it.
 
-    Args:
-        tree: the elimination tree.
-        factors: what ties the variables.
-        border: (B, B) covariance of the border.
-        n_pairs: factors, from the first, whose first two variables' covariance is wanted; all of the same two sizes.
+    Of the first `n_pairs` factors, all of the same two sizes, the covariance of the first two variables is wanted.
     """
     own_first = np.append(0, np.cumsum(tree.dim**2))
     of_first = np.append(0, np.cumsum(np.where(factors.rows < LARGE_FACTOR, factors.rows**2, 0)))
@@ -356,15 +339,8 @@ def spread(
 ) -> None:  # fmt: skip
     """Find the covariances that the fronts from `low` to `high - 1` hold, those before being done.
 
-    Args:
-        tree: the elimination tree.
-        factors: what ties the variables.
-        values: as for `eliminate`.
-        stored: rows of the Cholesky factor, `L'`.
-        border: (B, B) covariance of the border.
-        out: filled in, see `spread_room`.
-        low: the first front.
-        high: front after the last.
+    `values` are as for `eliminate`, `stored` the rows of the Cholesky factor, `border` (B, B) the covariance of the
+    border; `out`, of `spread_room`, is filled in.
     """
     own_first, of_first, way, held = out.own_first, out.of_factors_first, tree.way, out.held
     n_pairs, a_dim, b_dim = out.pairs.shape
@@ -460,12 +436,8 @@ def ways_to_border(
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return `L^-1` times a matrix that is zero but for the numbers of some variables, only the rows that it reaches.
 
-    Args:
-        tree: the elimination tree.
-        stored: rows of the Cholesky factor, `L'`.
-        node_of: (V,) front that eliminates each variable, -1 of the border.
-        wanted: (K,) different variables.
-        matrix: (C, numbers of these) its columns, one a row.
+    `stored` are the rows of the Cholesky factor, `node_of` (V,) the fronts that eliminate the variables, -1 of the
+    border; `matrix` (C, numbers) has the columns of different variables `wanted` (K,), one a row.
 
     Returns:
         (C, rows) of the eliminated numbers, (C, B) of the border before it is factorised itself, and (T,) the first

@@ -52,6 +52,8 @@ def exhausted(slices: Slices[_Result]) -> _Result:
 class Factorised:
     """A least-squares problem with all but its border eliminated.
 
+    What needs the border raises `NumericalError` where that is not determined.
+
     Attributes:
         system: its structure.
         values: Jacobians and right sides.
@@ -69,11 +71,7 @@ class Factorised:
     right: FloatArray
 
     def solution(self) -> Slices[FloatArray]:
-        """Return (numbers,) the optimum of all variables, in slices.
-
-        Raises:
-            NumericalError: the border is not determined.
-        """
+        """Return (numbers,) the optimum of all variables, in slices."""
         tree = self.system.tree
         border = cho_solve(self._border, self.right) if len(self.right) else self.right
         x = np.zeros(tree.begin[-1])
@@ -83,22 +81,14 @@ class Factorised:
         return x
 
     def border_covariance(self) -> FloatArray:
-        """Return (B, B) covariance of the border.
-
-        Raises:
-            NumericalError: the border is not determined.
-        """
+        """Return (B, B) covariance of the border."""
         if not len(self.right):
             return self.information
         root = solve_triangular(self._border[0], np.eye(len(self.right)), trans="T")
         return np.asarray(root.T @ root)
 
     def spread(self, n_pairs: int = 0) -> Slices[Spread]:
-        """Return covariances of all variables, with the border, and of what each factor ties, in slices; see `Spread`.
-
-        Raises:
-            NumericalError: the border is not determined.
-        """
+        """Return covariances of all variables, with the border, and of what each factor ties, in slices: `Spread`."""
         tree, factors, border = self.system.tree, self.system.factors, self.border_covariance()
         room = spread_room(tree, factors, border, n_pairs)
         for low, high, share in self.system.cuts(tree.own * tree.size**2 + tree.size**2):
@@ -162,9 +152,8 @@ class Factorised:
         try:
             root, lower = cho_factor(self.information)
         except (LinAlgError, ValueError):
-            raise NumericalError(
-                "the measurements do not determine a solution", hint="check units and stamps"
-            ) from None
+            problem = "the measurements do not determine a solution"
+            raise NumericalError(problem, hint="check units and stamps") from None
         return root, bool(lower)
 
 
@@ -174,14 +163,7 @@ BATCH = 64
 
 
 class System:
-    """Structure of a least-squares problem: the place of every elimination.
-
-    Args:
-        dim: (V,) numbers of each variable.
-        factors: what ties them.
-        coordinate: (leaves, axes), see `tree_of`.
-        border: (B,) variables that are kept to the last, for example what all factors share.
-        tree: of all these, if it is known; see `tree_of`.
+    """Structure of a least-squares problem: the place of every elimination; see `tree_of`.
 
     Raises:
         DataError: a factor that does not fit into memory.

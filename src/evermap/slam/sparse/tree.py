@@ -94,11 +94,8 @@ class Tree(NamedTuple):
 def tree_of(dim: IntArray, factors: Factors, coordinate: FloatArray, border: IntArray) -> Generator[float, None, Tree]:
     """Return the elimination tree of a least-squares problem, in slices of some milliseconds.
 
-    Args:
-        dim: (V,) numbers of each variable.
-        factors: what ties them.
-        coordinate: (leaves, axes) of each leaf, along which leaves may be cut; the first is preferred.
-        border: (B,) variables that are not eliminated.
+    Variables (V,) have `dim` numbers each and are tied by factors, those of the border (B,) are not eliminated. Leaves
+    may be cut along the axes of their coordinates (leaves, axes), of which the first is preferred.
     """
     dim = np.ascontiguousarray(dim, dtype=np.int64)
     border = np.ascontiguousarray(border, dtype=np.int64)

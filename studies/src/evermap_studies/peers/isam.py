@@ -16,7 +16,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from evermap.geometry import se2
 from evermap.slam.kernels import N_STATES
-from evermap.slam.motion import Motion
+from evermap.slam.local_filter import Motion
 from evermap.slam.problem import ConditionalPrior, Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.types import FloatArray, IntArray
@@ -39,7 +39,7 @@ def _landmark_key(row: int) -> int:
 
 
 class IncrementalSmoother:
-    """The incremental solver to compare `session_filter.SessionFilter` with.
+    """The incremental solver to compare `local_filter.SessionFilter` with.
 
     The tree holds the last poses only. What the older ones say about them, about the landmarks and the states is one
     linear factor, so that a step costs what the map costs, whatever the age of the recording.
