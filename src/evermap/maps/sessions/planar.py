@@ -13,26 +13,11 @@ from evermap.geometry import se2
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap, Metres
-from evermap.maps.sessions import believe, gaussian
+from evermap.maps.sessions import believe, gaussian, placing
 from evermap.maps.sessions.extend import Extended, Found, first_and_last
 from evermap.maps.sessions.looks import Sighting, Watch
 from evermap.maps.sessions.overlay import ELSEWHERE
-from evermap.maps.sessions.placing import (
-    ANYWAY,
-    CONTRADICTED,
-    DISTORTED,
-    NOT_FOUND,
-    Held,
-    Laid,
-    Localised,
-    homes,
-    laid_over,
-    places_in,
-    refitted,
-    unbent,
-    widened,
-    with_glimpsed,
-)
+from evermap.maps.sessions.placing import Held, Laid, Localised
 from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.slam import result as of_slam
 from evermap.slam.check import unusable
@@ -108,7 +93,7 @@ class PlanarVisit:
         seen = np.flatnonzero(np.isfinite(last[own.row]))
         row = own.row[seen]
         names = visit.prepared.landmark_id[row]
-        place, probability = places_in(where, names)
+        place, probability = placing.places_in(where, names)
         covariance = own.begun(seen, config.whole_places) if begins else of_places(own.covariance_m2, seen)
         body = np.full(len(names), UNKNOWN, dtype=np.int64)
         _, here, there = np.intersect1d(names, visit.recording.objects[:, 0], return_indices=True)
@@ -152,11 +137,11 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
     (`session.admitted`); and `cut`, without doubtful frames (`doubtful`), if there are any.
     """
     settings, known = config.living, len(living.places) > 0
-    lost = Localised.lost(PlanarVisit(alone), living, CONTRADICTED if known else DISTORTED)
+    lost = Localised.lost(PlanarVisit(alone), living, placing.CONTRADICTED if known else placing.DISTORTED)
     joint = settings.search == "joint"
     wrong = unusable(alone.recording, config.slam.check) if joint and cut else None
     if wrong is not None and not wrong.usable:
-        return Localised.lost(PlanarVisit(alone), living, (wrong.message, ANYWAY))
+        return Localised.lost(PlanarVisit(alone), living, (wrong.message, placing.ANYWAY))
     if wrong is not None and known:
         return lost
     large = len(living.places) > settings.whole_places
@@ -165,7 +150,7 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
     p_site = believe.aged(part, settings, alone.start_s).p_here
     where = where if large else laid(part, p_site, alone, settings)
     if where is None and len(part.places):
-        return Localised.lost(PlanarVisit(alone), living, NOT_FOUND)
+        return Localised.lost(PlanarVisit(alone), living, placing.NOT_FOUND)
     if where is not None:
         in_part = vicinity is not None
         part, where, visit = refit(part, p_site, where, alone, settings, robust=config.slam.robust, part=in_part)
@@ -189,15 +174,15 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingCon
     """Return the alignment of the session with the map; None if no landmarks match."""
     own = gaussian.own_landmarks(alone.outcome, config.fit)
     names = alone.prepared.landmark_id[own.row]
-    log_sigma = np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance))
-    where = laid_over(living, p_site, names, own.position_m, gaussian.of_unknown_size(own, float(log_sigma)), config)
+    log_sigma = float(np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance)))
+    where = placing.laid_over(living, p_site, names, own.position_m, gaussian.of_unknown_size(own, log_sigma), config)
     if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
         return None
     if config.search == "joint":
         together = _seen_together(alone, own.row, config.fit.inlier)
-        where = unbent(living, p_site, where, own.position_m, together, config.fit)
+        where = placing.unbent(living, p_site, where, own.position_m, together, config.fit)
     glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
-    return with_glimpsed(living, where, glimpsed)
+    return placing.with_glimpsed(living, where, glimpsed)
 
 
 def _seen_together(alone: Solved, row: IntArray, least: float) -> sparse.csr_array:
@@ -225,7 +210,7 @@ def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tupl
     if where is None:
         return seen, None
     path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
-    return widened(living, seen.part, named, where, path, alone.recording.sensor, config)
+    return placing.widened(living, seen.part, named, where, path, alone.recording.sensor, config)
 
 
 def refit(
@@ -263,7 +248,7 @@ def refit(
         position = living.places.position_m[where.place[stand]]
         motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
         covariance = gaussian.drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
-        return refitted(
+        return placing.refitted(
             outcome, outcome.prior, motion, size, Held(row, position, covariance), settings=config.fit, robust=robust
         )
 
@@ -276,7 +261,7 @@ def refit(
             where, solved, straightened = as_seen, other, straightened_too
     if straightened:
         # where it lies if nothing has moved
-        at_home = replace(where, place=np.where(where.place >= 0, where.place, homes(living, p_site, where)))
+        at_home = replace(where, place=np.where(where.place >= 0, where.place, placing.homes(living, p_site, where)))
         solved, _ = in_map(at_home)
         landmark = alone.prepared.problem.landmark_row[: len(solved.inlier)]
         n_fit, count = (np.bincount(landmark, w, minlength=len(names)) for w in (solved.inlier, np.ones(len(landmark))))

@@ -402,9 +402,10 @@ def _flaws_of_values(living: LivingMap) -> Iterator[str]:
     if living.lives.chunk_m <= 0.0 or living.sightlines.cell_m <= 0.0 or living.views.cell_m <= 0.0:
         yield "a cell without size"
     covariance = living.covariance_m2
-    read = [covariance]
     if isinstance(covariance, ChunkedCovariance):
         read = [covariance.each_m2, *(part.values for part in covariance.parts if part.is_read)]
+    else:
+        read = [covariance]
     if not all(np.isfinite(values).all() for values in read):
         yield "'covariance_m2' is not finite"
         return
@@ -573,11 +574,11 @@ def _is_column(dtype: Any, shape: Any, lower: Any, names: Any) -> bool:
 def _lives_from_bytes(values: NDArray[Any]) -> tuple[Life, ...]:
     """What `_collect` wrote of `lives.life`."""
     try:
-        listed = json.loads(values.tobytes())
-        lives = tuple(
-            Life(**{name: prior_from_dict(part) if isinstance(part, dict) else part for name, part in life.items()})
-            for life in listed
-        )
+        listed: list[dict[str, Any]] = [
+            {name: prior_from_dict(part) if isinstance(part, dict) else part for name, part in life.items()}
+            for life in json.loads(values.tobytes())
+        ]
+        lives = tuple(Life(**life) for life in listed)
     except (ValueError, TypeError, AttributeError, RecursionError, EvermapError) as error:
         raise DamagedError(f"the learned lifetimes cannot be read: {error}") from None
     for life in lives:
