@@ -68,9 +68,7 @@ class LiveFrame(NamedTuple):
 class Inbox:
     """Readings fed so far. Every method may be called from any thread.
 
-    Args:
-        about: name, sensor, clock and classes of the recording that is made of the readings.
-        config: how late and how many readings may be, and for how long odometry may be silent.
+    `about` has name, sensor, clock and classes of the recording that is made of the readings.
     """
 
     def __init__(self, about: Recording, config: Config) -> None:

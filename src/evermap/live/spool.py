@@ -50,12 +50,8 @@ class Brought:
 class Spool:
     """The folder of a map, held by this process.
 
-    Args:
-        map_file: the map.
-
     Raises:
-        ConfigError: another process feeds the map.
-        InputError: nothing can be written beside it.
+        ConfigError: another process feeds the map. InputError: nothing can be written beside it.
     """
 
     def __init__(self, map_file: Path) -> None:

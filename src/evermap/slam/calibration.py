@@ -164,11 +164,7 @@ class CalibrationPrior:
         readings are worth; that of a Gaussian does where its prior is narrower. So nothing jumps where the evidence is
         in doubt. The optimum is sought from these means: a step to a delay far away would leave what is linear.
 
-        Args:
-            p_needed: (11,) as `needed` returns it.
-            states: (11,) as estimated under this prior.
-            variance: (11,) of them.
-            worth: (11,) variances by the errors as they were found, in those of independent errors.
+        `p_needed` and `worth` (11,) are those of `needed`; states (11,) and their variance are as under this prior.
         """
         asked = self.free & ~np.isnan(p_needed)
         p, before = np.where(asked, np.clip(p_needed, self.settings.p_spare, 1.0), 1.0), 1.0 / self.sigma**2

@@ -84,12 +84,8 @@ class Drive:
         """Return velocities as reported; silences longer than `silence_s` become 'standing still, but who knows'.
 
         What is not known grows over a silence of length T to the way that the last speed would have led, `(v T)^2`, up
-        to that of `longest_silence_s`.
-
-        Args:
-            stamp_s: (n,) strictly increasing.
-            velocity: (n, 3) forward, lateral, turn; (n, 4) with what is known of the turn's jitter.
-            settings: what is believed of odometry.
+        to that of `longest_silence_s`. Stamps (n,) strictly increase; velocities are (n, 3) forward, lateral, turn, or
+        (n, 4) with what is known of the turn's jitter.
         """
         if velocity.shape[1] == 3:
             velocity = np.column_stack([velocity, beyond_jitter(stamp_s, velocity[:, 2], settings)])

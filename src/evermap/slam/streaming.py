@@ -112,13 +112,9 @@ class Outcome:
 class StreamingSlam:
     """Feed poses in order with `step`, then `finish`.
 
-    Args:
-        problem: the measurements; nothing beyond the current row is looked at (but odometry up to the delay).
-        noise: where the noise levels start.
-        prior: calibration priors as the user means them.
-        prior_map: where to localise; None maps from scratch.
-        settings: of the estimator.
-        method: how landmarks that moved are explained; None takes the world to be static.
+    Nothing of the problem beyond the current row is looked at, but odometry up to the delay. `noise` is where the noise
+    levels start, `prior` are calibration priors as the user means them. Without a `prior_map` it maps from scratch,
+    without a `method` it takes the world to be static.
     """
 
     def __init__(

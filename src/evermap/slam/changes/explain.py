@@ -94,12 +94,8 @@ def explained(
 ) -> tuple[Problem, Estimate, IntArray]:
     """Return the problem in a world where `groups` moved.
 
-    Args:
-        problem: the measurements; `landmark_row` says which landmark was seen.
-        estimate: values to start from, one row a landmark.
-        given: the map; its covariance as it shall be believed.
-        groups: what moved.
-        prior: how changes are distributed.
+    Before, `landmark_row` says which landmark was seen, and the estimate has one row a landmark; the covariance of the
+    `given` map is as it shall be believed.
 
     Returns:
         Problem, start values, and (L',) the landmark of every place.
