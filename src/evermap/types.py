@@ -77,12 +77,8 @@ class _Columns(Tabular):
         for name, item in self.__dataclass_fields__.items():
             if item.type not in _KINDS:
                 continue
-            given, owner, kind, rest = (
-                getattr(self, name),
-                type(self).__name__,
-                _KINDS[item.type],
-                _WIDE.get(name, ((),)),
-            )
+            given, owner, kind = getattr(self, name), type(self).__name__, _KINDS[item.type]
+            rest = _WIDE.get(name, ((),))
             array = given if isinstance(given, np.ndarray) else np.asarray(_numbers(given, owner, name))
             if array.dtype != kind:
                 array = _as_kind(array, owner, name, whole=kind is np.int64)
@@ -351,8 +347,7 @@ class Trajectory(_Columns):
 
     def plot(self) -> Figure:
         """Draw the path; returns a matplotlib figure."""
-        figure: Figure = draw("plot_trajectory", self)
-        return figure
+        return draw("plot_trajectory", self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -411,8 +406,7 @@ class Landmarks(_Columns):
 
     def plot(self) -> Figure:
         """Draw the map with 2-sigma ellipses; returns a matplotlib figure."""
-        figure: Figure = draw("plot_landmarks", self)
-        return figure
+        return draw("plot_landmarks", self)
 
     @classmethod
     def at(
@@ -487,8 +481,32 @@ class Landmarks(_Columns):
         )
 
 
+class _Session(Shown):
+    """Mixin of recordings in the plane and in space: how they show themselves."""
+
+    __slots__ = ()
+
+    def _facts(self: Any) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            **span(self.frames.stamp_s),
+            "odometry": 0 if self.odometry is None else len(self.odometry),
+            "frames": len(self.frames),
+            "detections": len(self.detections),
+            "landmarks": self.detections._facts()["landmarks"],
+            "truth": self.truth is not None,
+            "true_landmarks": 0 if self.true_landmarks is None else len(self.true_landmarks),
+            "warnings": len(self.warnings),
+            "source": self.source,
+        }
+
+    def plot(self) -> Figure:
+        """Draw detections over time and range, and the truth where there is one; returns a matplotlib figure."""
+        return draw("plot_recording", self)
+
+
 @dataclass(frozen=True, slots=True)
-class Recording(Shown):
+class Recording(_Session):
     """One robot's session: what a reader returns and the pipeline consumes.
 
     Attributes:
@@ -519,25 +537,6 @@ class Recording(Shown):
     clock: Clock = Clock.RECORDING
     landmark_names: Mapping[int, str] = field(default_factory=dict)
     robot: str = ""
-
-    def _facts(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            **span(self.frames.stamp_s),
-            "odometry": len(self.odometry),
-            "frames": len(self.frames),
-            "detections": len(self.detections),
-            "landmarks": self.detections._facts()["landmarks"],
-            "truth": self.truth is not None,
-            "true_landmarks": 0 if self.true_landmarks is None else len(self.true_landmarks),
-            "warnings": len(self.warnings),
-            "source": self.source,
-        }
-
-    def plot(self) -> Figure:
-        """Draw detections over time and range, and the truth where there is one; returns a matplotlib figure."""
-        figure: Figure = draw("plot_recording", self)
-        return figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -656,7 +655,7 @@ class SpatialSensor(Shown):
 
 
 @dataclass(frozen=True, slots=True)
-class SpatialRecording(Shown):
+class SpatialRecording(_Session):
     """One robot's session in space; as `Recording`, but for poses and landmarks in three dimensions.
 
     Attributes:
@@ -694,25 +693,6 @@ class SpatialRecording(Shown):
     @property
     def robot_sightings(self) -> None:
         """Return None: robots do not see each other in recordings in space."""
-
-    def _facts(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            **span(self.frames.stamp_s),
-            "odometry": 0 if self.odometry is None else len(self.odometry),
-            "frames": len(self.frames),
-            "detections": len(self.detections),
-            "landmarks": self.detections._facts()["landmarks"],
-            "truth": self.truth is not None,
-            "true_landmarks": 0 if self.true_landmarks is None else len(self.true_landmarks),
-            "warnings": len(self.warnings),
-            "source": self.source,
-        }
-
-    def plot(self) -> Figure:
-        """Draw detections over time and range, and the truth where there is one; returns a matplotlib figure."""
-        figure: Figure = draw("plot_recording", self)
-        return figure
 
 
 AnyRecording = Recording | SpatialRecording
@@ -919,8 +899,7 @@ class SlamResult(Shown):
 
     def plot(self, recording: AnyRecording | None = None) -> Figure:
         """Draw path and map; with its recording also the truth and the detections. Returns a matplotlib figure."""
-        figure: Figure = draw("plot_result", self, recording)
-        return figure
+        return draw("plot_result", self, recording)
 
 
 def json_number(value: Any) -> float | None:
