@@ -30,7 +30,7 @@ from evermap.io.table import Table, csv_text, parquet_bytes, parse_csv, parse_pa
 from evermap.io.tag_maps import is_wpilib, map_of_survey, tags_of_fiducials, tags_of_tagslam, tags_of_wpilib
 from evermap.io.text import parse_json
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, rows_of
-from evermap.valid import FEATURES, STAMP_S, X_M, Y_M, Quantity
+from evermap.valid import FEATURES, P_EXISTS, STAMP_S, X_M, Y_M, Quantity
 
 MAP_SCHEMA_VERSION = 1
 
@@ -55,7 +55,6 @@ _MAP_FILES = (
 
 _SIGMA_M = Quantity("sigma_m", 0.0, 1e6, optional=True, hint="standard deviation in metres, empty where unknown")
 _SIGMA_RAD = Quantity("sigma_rad", 0.0, 1e3, optional=True, hint="standard deviation in radians")
-_P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
 _FEATURES = {quantity.name: quantity for quantity in FEATURES}
 _DESCRIPTOR, _NUMBERED = "descriptor_", re.compile(r"descriptor_(0|[1-9]\d{0,4})")
 
@@ -155,7 +154,7 @@ def landmarks_from_table(
         position_m=positions(table) if in_space else np.stack([table.numbers(X_M), table.numbers(Y_M)], axis=1),
         covariance_m2=_covariance(table, sigma_m),
         class_id=class_ids(table, class_names),
-        p_exists=table.numbers(_P_EXISTS) if "p_exists" in table else np.ones(count),
+        p_exists=table.numbers(P_EXISTS) if "p_exists" in table else np.ones(count),
         n_hits=table.ids("n_hits", optional=False) if "n_hits" in table else np.zeros(count, dtype=np.int64),
         n_misses=table.ids("n_misses", optional=False) if "n_misses" in table else np.zeros(count, dtype=np.int64),
         first_seen_s=table.numbers(_seen("first_seen_s")) if "first_seen_s" in table else never,
