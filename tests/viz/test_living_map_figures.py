@@ -96,7 +96,7 @@ def view(**changed: Any) -> MapView:
         names={9: "throne"},
     )
     other = {"other_m": np.array([[1.0, 1.0]]), "other_of": np.array([0])}
-    seen = {"seen_from_m": np.array([[2.0, 1.0], [2.5, 1.0]]), "walls_m": (np.array([[0.0, -1.0], [9.0, -1.0]]),)}
+    seen = {"seen_from_m": np.array([[2.0, 1.0], [2.5, 1.0]])}
     return MapView(
         **({"landmarks": landmarks, "pinned": np.array([False, False, False, True])} | other | seen | changed)
     )
@@ -125,7 +125,7 @@ def test_what_is_gone_is_crossed_out_in_the_look_of_its_class() -> None:
     assert (hollow.get_mec(), hollow.get_xydata().tolist()) == (door.colour, [[4.0, 2.0]])
 
 
-def test_uncertainty_walls_floor_and_other_places_are_drawn() -> None:
+def test_uncertainty_floor_and_other_places_are_drawn() -> None:
     (axes,) = plot_living_map(view(), title="site").axes
     (ellipses,) = [c for c in axes.collections if isinstance(c, EllipseCollection)]
     assert len(ellipses.get_offsets()) == 3
@@ -134,14 +134,13 @@ def test_uncertainty_walls_floor_and_other_places_are_drawn() -> None:
     corners = floor.get_paths()[0].get_extents()
     assert (corners.x0, corners.x1, corners.y0, corners.y1) == (1.75, 2.25, 0.75, 1.25)
     lines = [line.get_xydata().tolist() for line in axes.lines]
-    assert [[0.0, -1.0], [9.0, -1.0]] in lines
     assert [[1.0, 1.0], [0.0, 0.0]] in lines
     assert [[9.0, 1.0]] in lines
 
 
 def test_the_legend_explains_every_mark() -> None:
     assert set(legend_texts(plot_living_map(view(), title="site"))) == {
-        "chair", "door", "class unknown", "sensor positions", "wall", "2σ of its position",
+        "chair", "door", "class unknown", "sensor positions", "2σ of its position",
         "other known place", "gone: P(exists) below 50 %", "pinned",
         "faint: P(exists) from 50 % upwards",
     }  # fmt: skip

@@ -19,10 +19,7 @@ if TYPE_CHECKING:
     from evermap.types import Landmarks
 
 app = typer.Typer(
-    name="map",
-    help="Living maps: history, differences, reasons, edits.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
+    name="map", help="Living maps: history, differences, reasons, edits.", no_args_is_help=True, rich_markup_mode=None
 )
 
 _AtRevision = Annotated[int | None, option("--revision", "Use this revision.", metavar="N", default="newest")]

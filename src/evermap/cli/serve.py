@@ -39,11 +39,7 @@ if TYPE_CHECKING:
     from evermap.server.worker import JobOutcome
 
 app = typer.Typer(
-    name="serve",
-    cls=VerbGroup,
-    help="Serve the maps of a fleet.",
-    rich_markup_mode=None,
-    invoke_without_command=True,
+    name="serve", cls=VerbGroup, help="Serve the maps of a fleet.", rich_markup_mode=None, invoke_without_command=True
 )
 
 Store = Annotated[

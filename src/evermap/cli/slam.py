@@ -471,13 +471,7 @@ def _refuse_unread(given: Sequence[str], config: Config, *, in_map: bool, in_spa
 
 
 def _read(
-    path: Path,
-    *,
-    robot: int | None,
-    topics: Path | None,
-    session: Path | None,
-    force: bool,
-    check: Callable[..., None],
+    path: Path, *, robot: int | None, topics: Path | None, session: Path | None, force: bool, check: Callable[..., None]
 ) -> AnyRecording:
     """Read a recording, and write it condensed to `session`: repaired first, as before it enters a map.
 

@@ -14,14 +14,7 @@ from evermap.survival.hazard_regression import HazardDraws
 from evermap.survival.nonparametric import KaplanMeier, Npmle
 from evermap.survival.parametric_fit import ParametricFit
 from evermap.types import FloatArray
-from evermap.viz.style import (
-    CLASS_COLOURS,
-    INK,
-    MUTED,
-    class_looks,
-    drawing,
-    legend_name,
-)
+from evermap.viz.style import CLASS_COLOURS, INK, MUTED, class_looks, drawing, legend_name
 from evermap.viz.time_axis import TimeUnit, label_ages, unit_for
 
 if TYPE_CHECKING:

@@ -55,7 +55,6 @@ class MapView:
         other_of: (K,) row of the landmark of each.
         seen_from_m: (V, 2) middles of the floor's cells from which the robot looked.
         cell_m: side of a cell.
-        walls_m: lines of (N, 2) points, where walls are known.
     """
 
     landmarks: Landmarks
@@ -64,7 +63,6 @@ class MapView:
     other_of: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     seen_from_m: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     cell_m: float = 0.5
-    walls_m: tuple[FloatArray, ...] = ()
 
 
 def plot_living_map(view: MapView, *, title: str) -> Figure:
@@ -78,9 +76,9 @@ def plot_living_map(view: MapView, *, title: str) -> Figure:
         raise InputError("nothing to draw: the map has no landmark")
     places = np.concatenate([landmarks.position_m, *([view.other_m] if len(view.other_m) else [])])
     low, high = places.min(axis=0), places.max(axis=0)
-    for part in (view.seen_from_m, *view.walls_m):
-        if len(part):
-            low[:2], high[:2] = np.minimum(low[:2], part.min(axis=0)), np.maximum(high[:2], part.max(axis=0))
+    if len(view.seen_from_m):
+        low[:2] = np.minimum(low[:2], view.seen_from_m.min(axis=0))
+        high[:2] = np.maximum(high[:2], view.seen_from_m.max(axis=0))
     size = np.maximum(high - low, 1.0)
     margin = 0.05 * float(size.max())
     with drawing(7.2, float(np.clip(6.4 * height_over_width(size), 2.4, 7.5)) + 1.3) as figure:
@@ -103,22 +101,15 @@ def _draw_panel(axes: Axes, columns: View, view: MapView, reach_m: float) -> lis
 
 
 def _draw_floor(axes: Axes, columns: View, view: MapView) -> list[Any]:
-    """Walls and from where the robot looked, as seen from above, and other known places; returns what to put into a
-    legend.
-    """
+    """From where the robot looked, as seen from above, and other known places; returns what to put into a legend."""
     from matplotlib.collections import PolyCollection
 
     handles: list[Any] = []
-    above = columns == [0, 1]
-    if above and len(view.seen_from_m):
+    if columns == [0, 1] and len(view.seen_from_m):
         corners = 0.5 * view.cell_m * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         squares = view.seen_from_m[:, None, :] + corners
         axes.add_collection(PolyCollection(list(squares), facecolors=SHADE, edgecolors=SHADE, lw=0.4, zorder=0.5))
         handles.append(_mark("s", "sensor positions", color=SHADE, ms=7, mec="none"))
-    for wall in view.walls_m if above else ():
-        axes.plot(*wall.T, color=INK, lw=1.6, solid_capstyle="round", zorder=1)
-    if view.walls_m:
-        handles.append(_mark("", "wall", color=INK, ls="-", lw=1.6))
     if len(view.other_m):
         for place, now in zip(view.other_m, view.landmarks.position_m[view.other_of], strict=True):
             axes.plot(*np.stack([place, now])[:, columns].T, color=MUTED, lw=0.5, alpha=0.5, zorder=1.5)
@@ -164,7 +155,7 @@ def _mark(marker: str, label: str, **style: Any) -> Artist:
     from matplotlib.lines import Line2D
 
     looks: dict[str, Any] = {"ls": "", "ms": 6.0, **style}
-    return Line2D([], [], marker=marker or None, label=label, **looks)
+    return Line2D([], [], marker=marker, label=label, **looks)
 
 
 _FAINT = "faint: P(exists) from 50 % upwards"
