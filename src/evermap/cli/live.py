@@ -82,6 +82,7 @@ def live(
       evermap live --map building.evermap --sensor sensor.toml --zenoh tcp/localhost:7447 --foxglove 8765
       evermap live --replay tuesday --zenoh listen=tcp/localhost:7447
     """
+    from evermap.io import read_recording
     from evermap.live.wires import Mailbox, wires_of
     from evermap.maps.store import is_address
 
@@ -96,7 +97,7 @@ def live(
     elif map_file is None:
         refuse_given("needs a map", "--map FILE", sensor=sensor, topics=topics, **told)
     _check_source(map_file, replay, sensor, connected=connected)
-    recording = None if replay is None else _recording(replay, robot)
+    recording = None if replay is None else read_recording(replay, robot=robot)
     _check_needed(recording, chosen, sensor, topics)
     mailbox = Mailbox() if replay is None else None
     wires = wires_of(zenoh, foxglove, mailbox)
@@ -122,12 +123,6 @@ def _check_source(map_file: str | None, replay: Path | None, sensor: Path | None
         )
     if map_file is not None and replay is None and sensor is None:
         raise ConfigError("the sensor is not described", field="sensor", hint="--sensor sensor.toml")
-
-
-def _recording(path: Path, robot: int | None) -> AnyRecording:
-    from evermap.io import read_recording
-
-    return read_recording(path, robot=robot)
 
 
 def _check_needed(recording: AnyRecording | None, config: Config, sensor: Path | None, topics: Path | None) -> None:

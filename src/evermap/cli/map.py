@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.map_edits import AsJson, MapFile, delete, gc, pin, reenter, revert, undelete, unpin, verify
+from evermap.cli.map_edits import EDITS, AsJson, MapFile, edit, gc, reenter, revert, verify
 from evermap.cli.options import argument, option
 from evermap.cli.terminal import check_picture, echo, print_json, print_table, say, write_picture
 from evermap.errors import ConfigError
@@ -43,14 +43,9 @@ def log(file: MapFile, as_json: AsJson = False) -> None:
         revisions = store.log()
         clock = store.load().clock
     if as_json:
-        print_json(
-            {
-                "map": file,
-                "head": revisions[-1].number if revisions else 0,
-                "clock": clock.value,
-                "revisions": [*map(revision_dict, revisions)],
-            }
-        )
+        newest = revisions[-1].number if revisions else 0
+        told = {"head": newest, "clock": clock.value, "revisions": [*map(revision_dict, revisions)]}
+        print_json({"map": file, **told})
         return
     head = ("revision", "written (UTC)", "kind", "of", "starts", "landmarks", "changes", "took")
     print_table(file, [revision_row(item, clock) for item in revisions], head, numbers=(0, 7))
@@ -341,5 +336,7 @@ def _route_graph(out: Path, graph: Path, clearance_m: float, _: LivingMap, landm
     return {"edges": len(edges), "closed": [edge.number for edge in edges if edge.closed], "doubtful": doubtful}
 
 
-for command in (verify, gc, reenter, revert, pin, unpin, delete, undelete):
+for command in (verify, gc, reenter, revert):
     app.command()(command)
+for name in EDITS:
+    app.command(name)(edit(name))

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -180,59 +181,36 @@ def reenter(
         raise first
 
 
-def pin(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
-    """Keep these landmarks in the map, whatever is missed.
-
-    \b
-    Example:
-      evermap map pin site.evermap 3 4
-    """
-    _edit(file, landmarks, "pinned", note, as_json)
-
-
-def unpin(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
-    """Let the evidence decide about these landmarks again.
-
-    \b
-    Example:
-      evermap map unpin site.evermap 3
-    """
-    _edit(file, landmarks, "unpinned", note, as_json)
+EDITS = {
+    "pin": ("pinned", "Keep these landmarks in the map, whatever is missed.", "3 4"),
+    "unpin": ("unpinned", "Let the evidence decide about these landmarks again.", "3"),
+    "delete": (
+        "deleted",
+        "Leave these landmarks out from now on.\n\nTheir detections are ignored until that is taken back.",
+        '17 --note "a reflection"',
+    ),
+    "undelete": ("undeleted", "Use these landmarks again.", "17"),
+}
+"""What an operator may say of landmarks, by command: the word of the revision, the help, and the example."""
 
 
-def delete(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
-    """Leave these landmarks out from now on.
+def edit(name: str) -> Callable[..., None]:
+    """Return a command by which an operator's word becomes a revision; none where nothing would change."""
+    word, does, example = EDITS[name]
 
-    Their detections are ignored until that is taken back.
+    def command(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
+        from evermap.maps.store import open_store
+        from evermap.runs.sessions import edit_landmarks
 
-    \b
-    Example:
-      evermap map delete site.evermap 17 --note "a reflection"
-    """
-    _edit(file, landmarks, "deleted", note, as_json)
+        with open_store(file) as store:
+            parent = store.head()
+            number, changed, said = edit_landmarks(store, landmarks, word, note=note, command=command_line())
+        if as_json:
+            print_json({"map": file, "revision": number, "parent": parent, word: changed})
+        elif changed:
+            say(f"revision {number}: {said}; undo with: evermap map revert {file} {parent}")
+        else:
+            say(f"nothing to do: {said}")
 
-
-def undelete(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
-    """Use these landmarks again.
-
-    \b
-    Example:
-      evermap map undelete site.evermap 17
-    """
-    _edit(file, landmarks, "undeleted", note, as_json)
-
-
-def _edit(file: str, landmarks: list[str], word: str, note: str, as_json: bool) -> None:
-    """An operator's word as a revision; none where nothing would change."""
-    from evermap.maps.store import open_store
-    from evermap.runs.sessions import edit_landmarks
-
-    with open_store(file) as store:
-        parent = store.head()
-        number, changed, said = edit_landmarks(store, landmarks, word, note=note, command=command_line())
-    if as_json:
-        print_json({"map": file, "revision": number, "parent": parent, word: changed})
-    elif changed:
-        say(f"revision {number}: {said}; undo with: evermap map revert {file} {parent}")
-    else:
-        say(f"nothing to do: {said}")
+    command.__doc__ = f"{does}\n\n\b\nExample:\n  evermap map {name} site.evermap {example}"
+    return command

@@ -28,6 +28,7 @@ from evermap.cli.options import (
     VerbGroup,
     argument,
     configured,
+    database_errors,
     option,
 )
 from evermap.cli.terminal import print_json, print_table, say, warm_up, warn
@@ -366,15 +367,10 @@ def work(
 
 
 def _database(store: str) -> Database:
-    from sqlalchemy.exc import DBAPIError
-
     from evermap.server.database import Database
 
-    try:
+    with database_errors():
         return Database(store)
-    except DBAPIError as error:
-        hint = "check the address, the rights of the user, and that the server runs"
-        raise ConfigError(f"the database cannot be used: {error.orig}", field="store", hint=hint) from None
 
 
 def _uvicorn() -> Any:

@@ -167,9 +167,15 @@ def fit(
     if out is not None:
         _keep(out, groups, found)
     if figure is not None:
-        _draw(figure, groups, found)
-    for remark in [*table.warnings, *_remarks(table, groups)]:
+        from evermap.viz.lifetime_figures import plot_survival
+
+        curves = {group.label: one.fitted for group, one in zip(groups, found, strict=True)}
+        write_picture(figure, plot_survival(curves))
+    for remark in table.warnings:
         warn(remark)
+    for group in groups:
+        if (table.data.right_s[group.rows] == math.inf).all():
+            warn(f"{group.label}: no end was observed, so the estimate never ends")
     if as_json:
         parts = [_content(table, group, one) for group, one in zip(groups, found, strict=True)]
         head = {"source": str(input), "by": list(words), "config": {"survival": chosen.to_dict()}}
@@ -241,20 +247,6 @@ def _keep(out: Path, groups: Sequence[LifetimeGroup], estimates: Sequence[Lifeti
     save_models(ModelOfEach(models, names, np.zeros(0, dtype=np.int64)), per, out)
 
 
-def _draw(path: Path, groups: Sequence[LifetimeGroup], estimates: Sequence[LifetimeEstimate]) -> None:
-    from evermap.viz.lifetime_figures import plot_survival
-
-    write_picture(path, plot_survival({g.label: found.fitted for g, found in zip(groups, estimates, strict=True)}))
-
-
-def _remarks(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> list[str]:
-    """Return remarks on the result."""
-    import numpy as np
-
-    endless = [g.label for g in groups if not np.isfinite(table.data.right_s[g.rows]).any()]
-    return [f"{label}: no end was observed, so the estimate never ends" for label in endless]
-
-
 def _counts(table: LifetimeTable, group: LifetimeGroup) -> dict[str, Any]:
     """Return the number of lifetimes of each sort."""
     import numpy as np
@@ -273,13 +265,9 @@ def _counts(table: LifetimeTable, group: LifetimeGroup) -> dict[str, Any]:
 
 def _content(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) -> dict[str, Any]:
     """Return the content of `--json`."""
-    who: dict[str, Any] = {}
-    if group.class_id is not None:
-        who["class_id"] = group.class_id
-    if group.chunk is not None:
-        who["chunk"] = list(group.chunk)
     return {
-        **who,
+        **({} if group.class_id is None else {"class_id": group.class_id}),
+        **({} if group.chunk is None else {"chunk": list(group.chunk)}),
         "estimator": found.estimator,
         **_counts(table, group),
         **found.numbers,
