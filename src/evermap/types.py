@@ -19,6 +19,7 @@ import math
 import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from datetime import UTC, datetime
 from enum import StrEnum
 from functools import lru_cache
 from hashlib import blake2b
@@ -921,3 +922,34 @@ def rows_of(table: _Table, rows: IntArray | BoolArray) -> _Table:
     columns = {item.name: getattr(table, item.name) for item in fields(table)}
     some: dict[str, Any] = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
     return replace(table, **some)
+
+
+_DAY_S = 86_400
+
+
+def stamp_text(stamp_s: float, clock: Clock) -> str:
+    """Return '2026-11-21 14:20:05', or 'day 3 04:05:06' since the start of a recording's own clock; '-' for no
+    stamp.
+    """
+    if not math.isfinite(stamp_s):
+        return "-"
+    if clock is not Clock.RECORDING:
+        try:
+            return datetime.fromtimestamp(round(stamp_s), UTC).strftime("%Y-%m-%d %H:%M:%S")
+        except (OverflowError, ValueError, OSError):  # no date of the calendar
+            return f"{stamp_s:g} s"
+    days, seconds = divmod(round(stamp_s), _DAY_S)
+    time = f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
+    return f"day {days} {time}" if days else time
+
+
+def between_text(from_s: float, to_s: float, clock: Clock) -> str:
+    """Return 'between A and B'; 'before B' without an earlier look."""
+    late = stamp_text(to_s, clock)
+    early = stamp_text(from_s, clock)
+    if early == "-":
+        return f"before {late}"
+    if early == late:
+        return f"at {late}"
+    same_day = early.rpartition(" ")[0] == late.rpartition(" ")[0] and " " in late
+    return f"between {early} and {late.rpartition(' ')[2] if same_day else late}"

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from evermap.cli.terminal import echo, print_table, write_picture
 from evermap.runs.map_dicts import AXES
-from evermap.stamps import between_text, stamp_text
-from evermap.types import Clock, MapChange, or_nan
+from evermap.types import Clock, MapChange, between_text, or_nan, stamp_text
 
 if TYPE_CHECKING:
     from evermap.maps.store import Revision

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from evermap.metrics.summary import Evaluation
-from evermap.stamps import stamp_text
-from evermap.types import UNKNOWN, AnyRecording, Clock, ParameterEstimate, SlamResult
+from evermap.types import UNKNOWN, AnyRecording, Clock, ParameterEstimate, SlamResult, stamp_text
 from evermap.viz.change_words import explanations, grew, near_alternatives
 from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.run_figures import has_prior, quantity

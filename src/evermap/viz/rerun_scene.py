@@ -102,11 +102,11 @@ def write_scene(
     Raises:
         MissingExtraError: rerun-sdk is not installed.
     """
-    _Scene(recording, result, evaluation or compare_with_truth(recording, result)).write(Path(path))
+    _RunScene(recording, result, evaluation or compare_with_truth(recording, result)).write(Path(path))
     return Path(path)
 
 
-class _Scene:
+class _RunScene:
     """A run in the frame of the picture.
 
     Attributes:

@@ -11,8 +11,7 @@ from evermap.geometry.group import PLANE, group_of
 from evermap.metrics.consistency import chi2_interval, chi2_quantile, comparable_nis, running_mean
 from evermap.metrics.summary import Evaluation
 from evermap.metrics.trajectory import PoseErrors
-from evermap.stamps import stamp_text
-from evermap.types import AnyRecording, Clock, FloatArray, ParameterEstimate, SlamResult
+from evermap.types import AnyRecording, Clock, FloatArray, ParameterEstimate, SlamResult, stamp_text
 from evermap.viz.map_figure import draw_map
 from evermap.viz.panels import BLIND_S, with_breaks
 from evermap.viz.style import (
