@@ -264,7 +264,7 @@ def why(
     Example:
       evermap map why site.evermap 17 --figure why.png
     """
-    from evermap.cli.map_content import draw_why, print_why
+    from evermap.cli.map_content import print_why
     from evermap.maps.store import open_store
     from evermap.maps.why import why as of_landmark
     from evermap.runs.map_dicts import answer_dict
@@ -274,7 +274,9 @@ def why(
     with open_store(file) as store:
         answer = of_landmark(store, landmark, revision)
     if figure is not None:
-        draw_why(figure, answer)
+        from evermap.viz.living_map_figures import plot_why
+
+        write_picture(figure, plot_why(answer))
     if as_json:
         print_json({"map": file, **answer_dict(answer)})
         return

@@ -1,15 +1,14 @@
 """Output of `evermap map` for people: revisions, landmarks and changes.
 
-How `evermap map why` answers: lines, a table of the sessions, a figure.
+How `evermap map why` answers: lines, and a table of the sessions.
 """
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evermap.cli.terminal import echo, print_table, write_picture
+from evermap.cli.terminal import echo, print_table
 from evermap.runs.map_dicts import AXES
 from evermap.types import Clock, MapChange, between_text, or_nan, stamp_text
 
@@ -93,27 +92,3 @@ def print_why(answer: Answer) -> None:
             for visit in answer.visits
         ]
         print_table("what the sessions saw", rows, head, numbers=(0, 4, 5, 6, 7, 8, 9))
-
-
-def draw_why(path: Path, answer: Answer) -> None:
-    """Draw the same as a figure."""
-    import numpy as np
-
-    from evermap.viz.living_map_figures import LandmarkHistory, plot_why
-
-    seen, stays = answer.evidence, answer.stays
-    session = np.repeat([v.revision for v in answer.visits], [v.n_looks for v in answer.visits])
-    names = {site: f"site {k + 1}" for k, site in enumerate(dict.fromkeys(stays.site_id.tolist()))}
-    columns = zip(stays.site_id.tolist(), stays.elsewhere_s, stays.first_s, stays.last_s, stays.gone_s, strict=True)
-    history = LandmarkHistory(
-        seen.stamp_s,
-        seen.p_exists,
-        seen.n_hits,
-        seen.n_misses,
-        seen.log_odds,
-        session.astype(np.int64),
-        [(names[site], *map(float, stamps)) for site, *stamps in columns],  # type: ignore[misc]
-        answer.stamp_s,
-        answer.clock,
-    )
-    write_picture(path, plot_why(history, title=answer.headline))
