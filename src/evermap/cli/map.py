@@ -366,20 +366,9 @@ def verify(file: MapFile, as_json: AsJson = False) -> None:
 
     found = verify_store(file)
     if as_json:
-        print_json(
-            {
-                "map": file,
-                "sound": found.sound,
-                "head": found.head,
-                "intact": list(found.intact),
-                "damaged": {str(number): reason for number, reason in found.damaged.items()},
-                "lost": list(found.lost),
-                "pruned": list(found.pruned),
-                "problems": list(found.problems),
-                "chunks": found.n_chunks,
-                "bytes": found.n_bytes,
-            }
-        )
+        names = ("sound", "head", "intact", "damaged", "lost", "pruned", "problems")
+        told = {name: getattr(found, name) for name in names}
+        print_json({"map": file, **told, "chunks": found.n_chunks, "bytes": found.n_bytes})
     if not found.sound:
         raise found.error(Path(file))
     if not as_json:

@@ -108,9 +108,8 @@ def draw_map(recording: AnyRecording, result: SlamResult, evaluation: Evaluation
     columns = 4 if len(panels) == 1 else 3
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=columns)
     if moved:
-        figure.legend(
-            handles=moved, loc="outside lower left", ncols=1 if len(changed) <= _MOST_LINES else 3, handlelength=3.2
-        )
+        of_changes = 1 if len(changed) <= _MOST_LINES else 3
+        figure.legend(handles=moved, loc="outside lower left", ncols=of_changes, handlelength=3.2)
     return NamedFigure("map", figure, "Trajectory and map", _caption(recording, evaluation, scene))
 
 
@@ -327,16 +326,11 @@ def _frame_caption(recording: AnyRecording, evaluation: Evaluation, size: int) -
         return f"{moved} onto the surveyed landmarks; there is no true path to compare."
     text = f"{moved} so that the estimated path fits the true one best, for display only."
     if odometry is not None:
-        text += (
-            f" Odometry alone, aligned separately, is {odometry.rmse_m:.2f} m off; the estimate {poses.rmse_m:.3f} m."
-        )
-    covered = (poses.stamp_s[-1] - poses.stamp_s[0]) / max(_duration(recording), 1e-9)
-    return text + (f" Truth covers {covered:.0%} of the recording." if covered < 0.98 else "")
-
-
-def _duration(recording: AnyRecording) -> float:
+        off = f"{odometry.rmse_m:.2f} m off; the estimate {poses.rmse_m:.3f} m"
+        text += f" Odometry alone, aligned separately, is {off}."
     stamps = recording.frames.stamp_s
-    return float(stamps[-1] - stamps[0]) if len(stamps) else 0.0
+    covered = np.ptp(poses.stamp_s) / max(np.ptp(stamps) if len(stamps) else 0.0, 1e-9)
+    return text + (f" Truth covers {covered:.0%} of the recording." if covered < 0.98 else "")
 
 
 GROUP_COLOURS = (ALERT, ONLINE, GROUP)
@@ -414,18 +408,11 @@ def draw_moves(axes: Axes, drawn: Sequence[Move]) -> list[Artist]:
         for start, end in zip(move.before_m, move.after_m, strict=True):
             if np.array_equal(start, end):
                 continue
+            way, gap = ("arc3,rad=0.15", 2.0) if move.swapped else ("arc3", 0.0)
             arrow = FancyArrowPatch(
-                (start[0], start[1]),
-                (end[0], end[1]),
-                arrowstyle="-|>",
-                connectionstyle="arc3,rad=0.15" if move.swapped else "arc3",
-                mutation_scale=8.0,
-                shrinkA=2.0,
-                shrinkB=2.0 if move.swapped else 0.0,
-                color=colour,
-                zorder=8 if move.alternative else 9,
-                **line,
-            )
+                (start[0], start[1]), (end[0], end[1]), arrowstyle="-|>", connectionstyle=way, mutation_scale=8.0,
+                shrinkA=2.0, shrinkB=gap, color=colour, zorder=8 if move.alternative else 9, **line,
+            )  # fmt: skip
             axes.add_patch(arrow)
         if move.change.kind in _KIND_MARKS:
             line["ls"] = ""
