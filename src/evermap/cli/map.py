@@ -20,7 +20,7 @@ from evermap.cli.terminal import (
     progress_bar,
     say,
     write_picture,
-)  # fmt: skip
+)
 from evermap.errors import ConfigError, EvermapError
 
 if TYPE_CHECKING:

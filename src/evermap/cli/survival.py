@@ -309,28 +309,29 @@ def _learned_lines(choice: Choice) -> list[tuple[str, str]]:
     return lines
 
 
+_GONE = {
+    "quarter_gone_s": (0.25, "a quarter is gone after"),
+    "half_gone_s": (0.5, "half are gone after"),
+    "three_quarters_gone_s": (0.75, "three quarters after"),
+}
+"""Quartiles of a lifetime: share that is gone, and the line for people."""
+
+
 def lifetime_numbers(prior: LifetimePrior) -> dict[str, float | None]:
     """Return quartiles and mean in seconds, None for what never comes; and the share that never leaves."""
     from evermap.types import json_number
 
-    quartiles = [float(prior.quantile(p)) for p in (0.25, 0.5, 0.75)]
-    values = dict(zip(("quarter_gone_s", "half_gone_s", "three_quarters_gone_s"), quartiles, strict=True))
-    values["mean_stay_s"] = prior.mean()
-    return {k: json_number(v) for k, v in values.items()} | {"p_never_leaves": prior.p_never_leaves}
+    times_s = {key: float(prior.quantile(p)) for key, (p, _) in _GONE.items()} | {"mean_stay_s": prior.mean()}
+    return {key: json_number(value) for key, value in times_s.items()} | {"p_never_leaves": prior.p_never_leaves}
 
 
 def lifetime_lines(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the same in words."""
     from evermap.survival.durations import duration_text
 
-    names = {
-        "quarter_gone_s": "a quarter is gone after",
-        "half_gone_s": "half are gone after",
-        "three_quarters_gone_s": "three quarters after",
-    }
-    lines = [(title, duration_text(math.inf if numbers[key] is None else numbers[key])) for key, title in names.items()]
-    if numbers["mean_stay_s"] is not None:
-        lines.append(("mean stay", duration_text(numbers["mean_stay_s"])))
+    times_s = [(title, math.inf if numbers[key] is None else numbers[key]) for key, (_, title) in _GONE.items()]
+    times_s += [] if numbers["mean_stay_s"] is None else [("mean stay", numbers["mean_stay_s"])]
+    lines = [(title, duration_text(time_s)) for title, time_s in times_s]
     if numbers["p_never_leaves"]:
         lines.append(("never leave", f"{100.0 * numbers['p_never_leaves']:.3g} %"))
     return lines
