@@ -67,6 +67,7 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-cache",
 }  # fmt: skip
+_STATUS: dict[type[Exception], int] = {NoSuchSiteError: 404, StaleRevisionError: 409, DamagedMapError: 500}
 _PAGE = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
 _OPEN = {"/healthz", "/openapi.json", *(f"/{name}" for name in _PAGE)}
 """Paths that need no token."""
@@ -223,8 +224,7 @@ async def _mistake(request: Request, error: Exception) -> Response:
     assert isinstance(error, EvermapError)
     if isinstance(error, StoreUnavailableError):
         return await _outage(request, error)
-    status = 404 if isinstance(error, NoSuchSiteError) or request.method == "GET" else 422
-    status = {StaleRevisionError: 409, DamagedMapError: 500}.get(type(error), status)
+    status = _STATUS.get(type(error), 404 if request.method == "GET" else 422)
     what = f"{error.field}: {error.problem}" if error.field else error.problem
     return PlainJSON({"detail": printable(what, 400)}, status)
 

@@ -80,8 +80,8 @@ def _paint(figure: Figure, axes: Axes, edges: Any, belief: Any) -> None:
     """Blue is there, orange is not, pale is undecided, hatched is no belief."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    colours = LinearSegmentedColormap.from_list("presence", [ALERT, PAPER, ESTIMATE])
-    colours = colours.with_extremes(bad=(0.0, 0.0, 0.0, 0.0))
+    opaque = LinearSegmentedColormap.from_list("presence", [ALERT, PAPER, ESTIMATE])
+    colours = opaque.with_extremes(bad=(0.0, 0.0, 0.0, 0.0))
     rows = np.arange(len(belief) + 1) - 0.5
     shown = np.ma.masked_invalid(belief)
     mesh = axes.pcolormesh(edges, rows, shown, cmap=colours, vmin=0.0, vmax=1.0, rasterized=True, zorder=1)

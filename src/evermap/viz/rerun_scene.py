@@ -154,7 +154,7 @@ class _RunScene:
         recording, positions = self._recording, _flat(self._way)
         centre = positions.mean(axis=0) if len(positions) else np.zeros(3)
         reach = float(np.max(np.ptp(positions, axis=0))) if len(positions) else 10.0
-        ends = {"start": rrb.TimeRangeBoundary.infinite(), "end": rrb.TimeRangeBoundary.cursor_relative()}
+        ends: Any = {"start": rrb.TimeRangeBoundary.infinite(), "end": rrb.TimeRangeBoundary.cursor_relative()}
         scene = rrb.Spatial3DView(
             name=recording.name,
             origin="world",
