@@ -657,23 +657,14 @@ class SpatialSensor(Shown):
 
 @dataclass(frozen=True, slots=True)
 class SpatialRecording(_Session):
-    """One robot's session in space; as `Recording`, but for poses and landmarks in three dimensions.
+    """One robot's session in space: as `Recording`, whose other attributes it has, but with poses and landmarks in
+    three dimensions.
 
     Attributes:
-        name: short label.
         odometry: poses in a drifting frame; None for a sensor that is carried by hand.
-        frames: every instant at which a sensor looked, also when it saw nothing.
-        detections: what it saw.
         sensors: at least one.
-        truth: reference trajectory, for evaluation only; None where unknown.
-        true_landmarks: surveyed landmarks, for evaluation or as a prior map; None where unknown.
-        class_names: what the rows of `class_id` mean.
-        warnings: counted, human-readable remarks of the reader.
-        source: where it was read from.
-        landmark_names: texts behind the ids of landmarks that were given as such (`landmark_id_of`).
         symmetries: turns after which objects look the same, by the names of their classes; as
             `geometry.symmetry.Symmetry.generated` reads them.
-        robot: whose session it is, as of a `Recording`.
     """
 
     name: str

@@ -173,7 +173,7 @@ def _topics(path: Path) -> dict[str, tuple[str, int]]:
 
 
 def _map(path: Path) -> Described:
-    from evermap.cli.map_content import revision_row
+    from evermap.cli.map import revision_row
     from evermap.maps.store import open_store
     from evermap.runs.map_dicts import life_dicts, revision_dict
     from evermap.types import json_number, stamp_text

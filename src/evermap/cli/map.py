@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,9 @@ from evermap.errors import ConfigError, EvermapError
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
-    from evermap.types import Landmarks
+    from evermap.maps.store import Revision
+    from evermap.maps.why import Answer
+    from evermap.types import Clock, Landmarks, MapChange
 
 app = typer.Typer(
     name="map", help="Living maps: history, differences, reasons, edits.", no_args_is_help=True, rich_markup_mode=None
@@ -48,7 +51,6 @@ def log(file: MapFile, as_json: AsJson = False) -> None:
     Example:
       evermap map log site.evermap
     """
-    from evermap.cli.map_content import revision_row
     from evermap.maps.store import open_store
     from evermap.runs.map_dicts import revision_dict
 
@@ -81,12 +83,10 @@ def show(
     Example:
       evermap map show site.evermap --ahead 3d --figure map.png
     """
-    from evermap.cli.map_content import landmark_row
     from evermap.maps.store import open_store
     from evermap.runs.map_dicts import landmark_dicts, life_dicts, prior_dicts
-    from evermap.stamps import stamp_text
     from evermap.survival.durations import parse_duration_s
-    from evermap.types import json_number
+    from evermap.types import json_number, stamp_text
 
     ahead_s = parse_duration_s(ahead)
     if figure is not None:
@@ -107,7 +107,7 @@ def show(
     ]
     head = ("landmark", "class", "P(exists)", f"in {ahead}", "place [m]", "+-", "since", "last seen", "sites", "")
     title = f"{file}, revision {number}, seen until {stamp_text(living.stamp_s, living.clock)}"
-    print_table(title, [landmark_row(item, living.clock) for item in listed], head, numbers=(0, 2, 3, 5, 8))
+    print_table(title, [_landmark_row(item, living.clock) for item in listed], head, numbers=(0, 2, 3, 5, 8))
     for said in prior_dicts(living):
         of = f"of class {said['class']}" if said["class"] else "of all other classes"
         away = f", absences {said['absence']}" if said["absence"] else ""
@@ -131,7 +131,6 @@ def diff(
     Example:
       evermap map diff site.evermap 3 7
     """
-    from evermap.cli.map_content import change_line
     from evermap.maps.diff import diff as between
     from evermap.maps.store import open_store
     from evermap.runs.map_dicts import diff_dict
@@ -143,13 +142,96 @@ def diff(
     if as_json:
         print_json({"map": file, **diff_dict(found)})
         return
-    lines = [change_line(change, new.clock) for change in found.changes]
+    lines = [_change_line(change, new.clock) for change in found.changes]
     lines += grew(len(found.grown), [*map(new.label, found.grown.tolist())])
     lines += [f"landmark {new.label(name)} {word} by an operator" for name, word in found.edits]
     for line in lines:
         echo(line)
     if not lines:
         say(f"no difference between revisions {found.a} and {found.b}")
+
+
+def revision_row(item: Revision, clock: Clock) -> list[str]:
+    """Return a line of the log: the cells of a revision."""
+    from evermap.types import stamp_text
+
+    origin = item.provenance
+    changes = [f"{count} {kind.value}" for kind, count in item.n_changes.items()]
+    changes += [f"grew by {item.n_grown}"] if item.n_grown else []
+    return [
+        str(item.number),
+        item.created_at.replace("T", " ").removesuffix("+00:00"),
+        origin.kind.value,
+        origin.note or origin.recording or "-",
+        stamp_text(origin.stamp_from_s, clock),
+        f"{item.n_existing} of {item.n_landmarks}",
+        ", ".join(changes) or "-",
+        f"{origin.wall_s:.1f} s" if math.isfinite(origin.wall_s) else "-",
+    ]
+
+
+def _change_line(change: MapChange, clock: Clock) -> str:
+    """Return 'landmark 5 moved by (+0.50, 0.00) m between 10:02:00 and 10:20:00, probability 97 % (12 hits, 40
+    misses)'.
+    """
+    from evermap.types import between_text
+    from evermap.viz.change_words import probability, what
+
+    when = between_text(change.stamp_from_s, change.stamp_to_s, clock)
+    return f"{what(change)} {when}, {probability(change.probability)} ({change.n_hits} hits, {change.n_misses} misses)"
+
+
+def _landmark_row(content: dict[str, Any], clock: Clock) -> list[str]:
+    """Return the cells of a landmark."""
+    from evermap.maps.why import probability_text
+    from evermap.runs.map_dicts import AXES
+    from evermap.types import or_nan, stamp_text
+
+    placed = content["x_m"] is not None
+    flags = " ".join(word for word in ("pinned", "deleted") if content[word])
+    ahead = content["p_ahead"]
+    return [
+        content["label"],
+        content["class"] or "-",
+        probability_text(content["p_exists"]),
+        "-" if ahead is None else probability_text(ahead),
+        f"({', '.join(f'{content[axis]:.2f}' for axis in AXES if axis in content)})" if placed else "-",
+        f"{100 * content['sigma_m']:.1f} cm" if placed else "-",
+        stamp_text(or_nan(content["since_s"]), clock),
+        stamp_text(or_nan(content["seen_s"]), clock),
+        str(content["sites"]),
+        flags,
+    ]
+
+
+def _print_why(answer: Answer) -> None:
+    """Print the answer, its reasons, and the evidence of every session."""
+    from evermap.maps.why import probability_text
+    from evermap.types import stamp_text
+
+    echo(answer.headline)
+    for reason in answer.reasons:
+        echo(f"  - {reason}")
+    for revision, change in answer.changes:
+        echo(f"  revision {revision}: {_change_line(change, answer.clock)}")
+    if answer.visits:
+        head = ("revision", "session", "looks from", "to", "frames", "hits", "misses", "expected", "nats", "P(exists)")
+        rows = [
+            [
+                str(visit.revision),
+                " of ".join(filter(None, (visit.recording, visit.robot))) or "-",
+                stamp_text(visit.from_s, answer.clock),
+                stamp_text(visit.to_s, answer.clock),
+                str(visit.n_looks),
+                str(visit.n_hits),
+                str(visit.n_misses),
+                f"{visit.expected:.1f}",
+                f"{visit.log_odds:+.1f}",
+                probability_text(visit.p_exists),
+            ]
+            for visit in answer.visits
+        ]
+        print_table("what the sessions saw", rows, head, numbers=(0, 4, 5, 6, 7, 8, 9))
 
 
 _ExportOut = Annotated[
@@ -264,7 +346,6 @@ def why(
     Example:
       evermap map why site.evermap 17 --figure why.png
     """
-    from evermap.cli.map_content import print_why
     from evermap.maps.store import open_store
     from evermap.maps.why import why as of_landmark
     from evermap.runs.map_dicts import answer_dict
@@ -280,7 +361,7 @@ def why(
     if as_json:
         print_json({"map": file, **answer_dict(answer)})
         return
-    print_why(answer)
+    _print_why(answer)
 
 
 def _writer(

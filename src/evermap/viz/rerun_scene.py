@@ -496,16 +496,15 @@ def log_tracks(
     times = [rr.TimeColumn(TRACKS_TIMELINE, duration=stamp_s)]
     colours = [np.where(rest[:, None], rgb(STATIC), rgb(DYNAMIC)).astype(np.uint8) for rest in static]
     labels = [str(one) for ids in track_id for one in ids.tolist()]
-    for entity, clouds, more, look in (
-        ("world/active", position_m, {"colors": np.concatenate(colours), "labels": labels},
-         rr.Points3D.from_fields(radii=RADIUS_M, show_labels=False)),
-        ("world/working_set", resting_m, {}, rr.Points3D.from_fields(colors=rgb(STATIC), radii=0.4 * RADIUS_M)),
-    ):  # fmt: skip
-        # a cloud for every instant; an empty one too, or the last would stay
+    active = {"colors": np.concatenate(colours), "labels": labels}
+    for entity, clouds, more, look in (  # a cloud for every instant; an empty one too, or the last would stay
+        ("world/active", position_m, active, {"radii": RADIUS_M, "show_labels": False}),
+        ("world/working_set", resting_m, {}, {"colors": rgb(STATIC), "radii": 0.4 * RADIUS_M}),
+    ):
         points = np.concatenate([np.reshape(cloud, (-1, 3)) for cloud in clouds]).astype(np.float32)
         columns = rr.Points3D.columns(positions=points, **more).partition(lengths=np.array([*map(len, clouds)]))
         stream.send_columns(entity, times, columns)
-        stream.log(entity, look, static=True)
+        stream.log(entity, rr.Points3D.from_fields(**look), static=True)
     if sensor_m is not None:
         stream.send_columns("world/sensor", times, rr.Transform3D.columns(translation=sensor_m))
         stream.log("world/sensor", rr.Points3D([[0.0, 0.0, 0.0]], colors=rgb(INK), radii=0.5), static=True)
