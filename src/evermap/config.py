@@ -1159,13 +1159,11 @@ class TrackerConfig(Section):
         if matrix.shape != (n_classes, n_classes):
             raise ConfigError(f"shape {matrix.shape} instead of ({n_classes}, {n_classes})", field="confusion")
         sums = matrix.sum(axis=1)
-        for row in range(n_classes):
-            if not (np.all(matrix[row] >= 0.0) and abs(sums[row] - 1.0) < 1e-6):
-                raise ConfigError(
-                    f"row {row} is not a distribution over detected classes (sum {sums[row]:g})",
-                    field="confusion",
-                    hint="rows are true classes and sum to 1",
-                )
+        fine = (matrix >= 0.0).all(axis=1) & (np.abs(sums - 1.0) < 1e-6)
+        if not fine.all():
+            row = int(np.argmin(fine))
+            problem = f"row {row} is not a distribution over detected classes (sum {sums[row]:g})"
+            raise ConfigError(problem, field="confusion", hint="rows are true classes and sum to 1")
         return matrix
 
     def class_speeds(self, n_classes: int) -> FloatArray:

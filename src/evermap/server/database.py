@@ -207,6 +207,9 @@ class Database:
     def tokens(self) -> list[dict[str, Any]]:
         """Return names and roles of all tokens."""
         question = sa.select(_token.c.name, _token.c.role, _token.c.created_at).order_by(_token.c.name)
+        return self._read(question)
+
+    def _read(self, question: Any) -> list[dict[str, Any]]:
         with self._engine.begin() as connection:
             return [dict(row) for row in connection.execute(question).mappings()]
 
@@ -228,7 +231,7 @@ class Database:
                 if known is not None:
                     return known, False
                 row = sa.insert(_job).values(**told, created_at=now, changed_at=now).returning(*_SHOWN)
-                job = _job_of(connection.execute(row).one())
+                job = _job_of(connection.execute(row).mappings().one())
                 connection.execute(sa.insert(_payload).values(job=job.id, data=data))
                 announce(connection, PREFIX + site)
                 return job, True
@@ -239,8 +242,8 @@ class Database:
             return known, False
 
     def _known(self, connection: sa.Connection, site: str, digest: str) -> Job | None:
-        row = connection.execute(sa.select(*_SHOWN).where(_job.c.site == site, _job.c.digest == digest)).one_or_none()
-        return None if row is None else _job_of(row)
+        known = sa.select(*_SHOWN).where(_job.c.site == site, _job.c.digest == digest)
+        return next(map(_job_of, connection.execute(known).mappings()), None)
 
     def claim(self, worker: str, lease_s: float) -> tuple[Job, bytes] | None:
         """Lease the oldest waiting session of a site without a worker; None if there is none."""
@@ -252,14 +255,14 @@ class Database:
         waiting = sa.or_(_job.c.state == JobState.QUEUED.value, lapsed, _grown())
         oldest = sa.select(*_SHOWN).where(_open_job, waiting, sa.not_(busy)).order_by(_job.c.id).limit(1)
         with self._writer.begin() as connection:
-            row = connection.execute(oldest.with_for_update(skip_locked=True, of=_job)).one_or_none()
+            row = connection.execute(oldest.with_for_update(skip_locked=True, of=_job)).mappings().one_or_none()
             if row is None:
                 return None
             values = {"state": JobState.WORKING.value, "worker": worker, "lease_s": now + lease_s}
-            values |= {"tries": row.tries + 1, "changed_at": now_utc()}
-            connection.execute(sa.update(_job).where(_job.c.id == row.id).values(values))
-            data = connection.execute(sa.select(_payload.c.data).where(_payload.c.job == row.id)).scalar_one()
-            announce(connection, PREFIX + row.site)
+            values |= {"tries": row["tries"] + 1, "changed_at": now_utc()}
+            connection.execute(sa.update(_job).where(_job.c.id == row["id"]).values(values))
+            data = connection.execute(sa.select(_payload.c.data).where(_payload.c.job == row["id"])).scalar_one()
+            announce(connection, PREFIX + row["site"])
         return _job_of(row), data
 
     def renew(self, job: int, worker: str, lease_s: float) -> None:
@@ -269,12 +272,8 @@ class Database:
 
     def finish(self, job: int, worker: str, state: JobState, reason: str = "", revision: int | None = None) -> None:
         """Record the result of a session, unless another worker has its lease by now."""
-        values: dict[str, Any] = {
-            "state": state.value,
-            "reason": printable(reason, 2000),
-            "revision": revision,
-            "worker": "",
-        }
+        values: dict[str, Any] = {"state": state.value, "revision": revision, "worker": ""}
+        values["reason"] = printable(reason, 2000)
         if state is JobState.QUEUED:  # given back: that was no try
             values["tries"] = _job.c.tries - 1
         if state is JobState.ASIDE:
@@ -302,14 +301,11 @@ class Database:
         question = sa.select(*_SHOWN).order_by(_job.c.id.desc()).limit(most)
         question = question if site is None else question.where(_job.c.site == site)
         question = question if state is None else question.where(_job.c.state == state.value)
-        with self._engine.begin() as connection:
-            return [_job_of(row) for row in connection.execute(question)]
+        return [_job_of(row) for row in self._read(question)]
 
     def job(self, number: int) -> Job | None:
         """Return one session that was uploaded; None of an unknown number."""
-        with self._engine.begin() as connection:
-            row = connection.execute(sa.select(*_SHOWN).where(_job.c.id == number)).one_or_none()
-        return None if row is None else _job_of(row)
+        return next(map(_job_of, self._read(sa.select(*_SHOWN).where(_job.c.id == number))), None)
 
     def payload(self, job: int) -> bytes | None:
         """Return the bytes of a session that is not entered; None where they are not kept."""
@@ -325,9 +321,7 @@ class Database:
     def approved(self, site: str) -> dict[str, Any] | None:
         """Return the revision approved last, its operator and time; None if there is none."""
         question = sa.select(_approval.c.revision, _approval.c.who, _approval.c.at).where(_approval.c.site == site)
-        with self._engine.begin() as connection:
-            row = connection.execute(question.order_by(_approval.c.id.desc()).limit(1)).mappings().one_or_none()
-        return None if row is None else dict(row)
+        return next(iter(self._read(question.order_by(_approval.c.id.desc()).limit(1))), None)
 
     def hold(self, robot: str, maps: list[dict[str, str]]) -> bool:
         """Store the maps that a robot reports, in place of its earlier report; returns whether they are others."""
@@ -351,9 +345,8 @@ class Database:
     def robots(self) -> list[dict[str, Any]]:
         """Return the robots that said which maps they hold, and when."""
         question = sa.select(_robot.c.name, _robot.c.maps, _robot.c.at).order_by(_robot.c.name)
-        with self._engine.begin() as connection:
-            rows = connection.execute(question).all()
-        return [{"robot": row.name, "maps": json.loads(row.maps), "at": row.at} for row in rows]
+        told = self._read(question)
+        return [{"robot": row["name"], "maps": json.loads(row["maps"]), "at": row["at"]} for row in told]
 
     def pulse(self, site: str) -> tuple[Any, ...]:
         """Return values of which one differs once anything beside the map of a site has changed: its approval, what
@@ -377,9 +370,7 @@ class Database:
     def audit(self, most: int = 100) -> list[dict[str, Any]]:
         """Return the newest notes."""
         question = sa.select(_audit.c.at, _audit.c.who, _audit.c.what, _audit.c.status)
-        with self._engine.begin() as connection:
-            rows = connection.execute(question.order_by(_audit.c.id.desc()).limit(most)).mappings()
-            return [dict(row) for row in rows]
+        return self._read(question.order_by(_audit.c.id.desc()).limit(most))
 
     def depth(self) -> int:
         """Return how many sessions wait or are worked on; proves that the database answers."""
@@ -449,9 +440,8 @@ def _grown() -> Any:
     return sa.and_(_job.c.state == JobState.ASIDE.value, due)
 
 
-def _job_of(row: sa.Row[Any]) -> Job:
-    values = dict(row._mapping)
-    return Job(**{**values, "state": JobState(values["state"])})
+def _job_of(row: Any) -> Job:
+    return Job(**{**row, "state": JobState(row["state"])})
 
 
 def _digest(token: str) -> bytes:
