@@ -60,7 +60,7 @@ def render_report(
         parts.append(f'<h2>{escape(recording.name)}</h2><p class="lead">{_lead(summary)}</p>')
     parts += [
         cards_html(_cards(summary)),
-        _interrupted(summary),
+        _INTERRUPTED if summary["interrupted"] else "",
         _changes(result, summary),
         warnings_note(summary["warnings"]),
         _figures("Accuracy", figures, ("map", "errors"), _frames(summary)),
@@ -92,10 +92,7 @@ def _lead(summary: Mapping[str, Any]) -> str:
     return f"{text}.<br>Read from <code>{escape(source)}</code>." if source else f"{text}."
 
 
-def _interrupted(summary: Mapping[str, Any]) -> str:
-    if not summary["interrupted"]:
-        return ""
-    return '<p class="note">Stopped before the end of the recording: all results are for the part until then.</p>'
+_INTERRUPTED = '<p class="note">Stopped before the end of the recording: all results are for the part until then.</p>'
 
 
 def _changes(result: SlamResult, summary: Mapping[str, Any]) -> str:
