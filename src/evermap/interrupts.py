@@ -188,7 +188,7 @@ def _leave(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 (the p
     """No exception and no taking apart of the interpreter: neither is safe in the middle of everything."""
     for known in _SIGNALS:
         signal.signal(known, signal.SIG_IGN)
-    for clean in (_stop_workers, *reversed(_cleanups), lambda: sys.stdout.flush()):
+    for clean in (_stop_workers, *reversed(_cleanups), _flush):
         try:  # noqa: SIM105 (as above)
             clean()
         except Exception:  # nosec  # B110: what comes next matters more
@@ -214,3 +214,7 @@ def _stop_workers() -> None:
         child.kill()
     if children:
         util._exit_function()  # type: ignore[attr-defined]
+
+
+def _flush() -> None:
+    sys.stdout.flush()
