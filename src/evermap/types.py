@@ -482,7 +482,7 @@ class Landmarks(_Columns):
         )
 
 
-class _Session(Shown):
+class _ShownRecording(Shown):
     """Mixin of recordings in the plane and in space: how they show themselves."""
 
     __slots__ = ()
@@ -507,7 +507,7 @@ class _Session(Shown):
 
 
 @dataclass(frozen=True, slots=True)
-class Recording(_Session):
+class Recording(_ShownRecording):
     """One robot's session: what a reader returns and the pipeline consumes.
 
     Attributes:
@@ -656,7 +656,7 @@ class SpatialSensor(Shown):
 
 
 @dataclass(frozen=True, slots=True)
-class SpatialRecording(_Session):
+class SpatialRecording(_ShownRecording):
     """One robot's session in space: as `Recording`, whose other attributes it has, but with poses and landmarks in
     three dimensions.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.geometry.group import Group, group_of
+from evermap.geometry.group import group_of
 from evermap.metrics.summary import Evaluation
 from evermap.types import AnyRecording, BoolArray, ChangeKind, FloatArray, Landmarks, MapChange, SlamResult
 from evermap.viz.change_words import near_alternatives, probability, what
@@ -116,14 +116,15 @@ def draw_map(recording: AnyRecording, result: SlamResult, evaluation: Evaluation
 def _scene(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) -> _Scene:
     group = group_of(result.trajectory.pose_world_robot)
     size = group.point_dim
-    pose_truth_map = _alignment(evaluation, group)
+    tie = evaluation.landmarks_own if evaluation.poses is None else evaluation.poses
+    pose_truth_map = group.identity() if tie is None else tie.pose_truth_estimate
     path = group.compose(pose_truth_map, result.trajectory.pose_world_robot)[:, :size]
     truth = recording.truth
     way = None if truth is None else with_breaks(truth.stamp_s, truth.pose_world_robot[:, :size])[1]
     known = Landmarks.at([], np.zeros((0, 2))) if recording.true_landmarks is None else recording.true_landmarks
     survey = None if recording.true_landmarks is None else known.position_m
-    if evaluation.poses is None and evaluation.landmarks_own is None:
-        way = survey = None  # nothing ties the frames together
+    if tie is None:  # nothing ties the frames together
+        way = survey = None
     odometry = evaluation.dead_reckoning
     pose_truth_odometry = pose_truth_map if odometry is None else odometry.pose_truth_estimate
     drifted = result.dead_reckoning.pose_world_robot
@@ -170,14 +171,6 @@ def _draw_panel(axes: Axes, view: View, scene: _Scene, low: FloatArray, high: Fl
     return draw_moves(axes, [
         replace(move, before_m=move.before_m[:, view], after_m=move.after_m[:, view]) for move in scene.changed
     ])  # fmt: skip
-
-
-def _alignment(evaluation: Evaluation, group: Group) -> FloatArray:
-    if evaluation.poses is not None:
-        return evaluation.poses.pose_truth_estimate
-    if evaluation.landmarks_own is not None:
-        return evaluation.landmarks_own.pose_truth_estimate
-    return group.identity()
 
 
 def _thin(points: FloatArray) -> FloatArray:

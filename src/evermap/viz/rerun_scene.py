@@ -127,11 +127,7 @@ class _RunScene:
         self.scale = float(np.clip(np.max(high - low) / _ROOM_M, 0.1, 1.0))
 
     def write(self, path: Path) -> None:
-        """Write all of it.
-
-        Raises:
-            MissingExtraError: rerun-sdk is not installed.
-        """
+        """Write all of it; errors as of `write_scene`."""
         require_rerun()
         self._rr, self._stream = _opened(self._recording.name or "run", path, self._blueprint())
         self._stream.send_recording_name(self._recording.name)
