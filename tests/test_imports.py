@@ -23,7 +23,6 @@ RULES = {
     "types": "errors show",
     "config": "errors types",
     "geometry": "types",
-    "stamps": "types",
     "survival": "errors show types",
     "valid": "errors types",
     "io": "errors compiled interrupts types geometry valid",
@@ -31,18 +30,17 @@ RULES = {
     "sensing": "errors compiled types config geometry",
     "existence": "errors compiled show types survival io sensing",
     "tracking": "errors compiled show types config geometry survival valid io sensing existence",
-    "viz": "errors types geometry stamps survival metrics existence",
+    "viz": "errors types geometry survival metrics existence",
     "slam": "errors interrupts compiled plugins show types config geometry valid sensing tracking",
-    "maps": "errors show types config geometry stamps survival valid sensing existence tracking slam",
+    "maps": "errors show types config geometry survival valid sensing existence tracking slam",
     "pipeline": "errors compiled types config slam maps",
     "runs": (
-        "errors interrupts show types config geometry stamps survival valid io metrics existence tracking viz maps "
-        "pipeline"
+        "errors interrupts show types config geometry survival valid io metrics existence tracking viz maps pipeline"
     ),
     "live": "errors compiled types config geometry valid io maps runs slam",
     "server": "errors types config io maps runs",
     "cli": (
-        "errors interrupts compiled plugins types config geometry stamps survival valid io existence tracking viz slam "
+        "errors interrupts compiled plugins types config geometry survival valid io existence tracking viz slam "
         "maps pipeline runs live server"
     ),
 }

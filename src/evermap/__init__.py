@@ -65,16 +65,9 @@ _HOME = {
     "evermap.survival.text": ("parse_prior",),
     "evermap.tracking.tracker": ("Tracker",),
     "evermap.types": (
-        "Detections",
-        "Frames",
-        "Landmarks",
-        "Odometry",
-        "Recording",
-        "Sensor",
-        "SlamResult",
-        "Trajectory",
+        "Detections", "Frames", "Landmarks", "Odometry", "Recording", "Sensor", "SlamResult", "Trajectory",
     ),
-}
+}  # fmt: skip
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [

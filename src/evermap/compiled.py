@@ -26,6 +26,9 @@ from evermap.interrupts import held, raises
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
+THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Variables that limit the threads of libraries for linear algebra, read when these are loaded."""
+
 _LOCK, _INSIDE = threading.Lock(), list[list[tuple[Any, int]]]()
 """Who is within `single_threaded`, with the numbers of threads before the first of them."""
 

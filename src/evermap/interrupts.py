@@ -21,7 +21,7 @@ import time
 TYPE_CHECKING = False  # as in typing, which takes longer to load than all of this: the first instants count
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import FrameType, TracebackType
+    from types import FrameType
     from typing import Any, Self
 
 _SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
@@ -50,9 +50,7 @@ class _Block:
             _open[self.kind] += 1
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._counts:
             _open[self.kind] -= 1
             _deliver()
@@ -79,11 +77,9 @@ class watched(_Block):  # noqa: N801 (used as a function)
         _stops.update(self._also)
         return super().__enter__()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         _stops.difference_update(self._also)
-        super().__exit__(kind, error, traceback)
+        super().__exit__(*error)
 
     def stop_if_asked(self) -> None:
         """Raise `KeyboardInterrupt` if Ctrl-C came: here nothing is half done."""
@@ -145,9 +141,7 @@ class temporary:  # noqa: N801 (used as a function)
         _cleanups.append(self._remove)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         try:
             self._remove()
         finally:

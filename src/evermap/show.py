@@ -6,11 +6,14 @@ from collections.abc import Mapping
 from html import escape
 from importlib import import_module
 from numbers import Integral, Real
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 
 from evermap.errors import MissingExtraError, printable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LONGEST = 900
 """Maximum characters of a text; the rest is omitted."""
@@ -111,9 +114,9 @@ def data_frame(columns: Mapping[str, Any]) -> Any:
     return pandas.DataFrame(dict(columns))
 
 
-def draw(function: str, *given: Any, **options: Any) -> Any:
+def draw(function: str, *given: Any, **options: Any) -> Figure:
     """Draw with a function of `evermap.viz.plots`, which is loaded now: nothing that it draws may import it."""
-    return getattr(import_module("evermap.viz.plots"), function)(*given, **options)
+    return cast("Figure", getattr(import_module("evermap.viz.plots"), function)(*given, **options))
 
 
 def short(value: Any) -> str:

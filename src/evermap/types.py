@@ -19,6 +19,7 @@ import math
 import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from datetime import UTC, datetime
 from enum import StrEnum
 from functools import lru_cache
 from hashlib import blake2b
@@ -77,12 +78,8 @@ class _Columns(Tabular):
         for name, item in self.__dataclass_fields__.items():
             if item.type not in _KINDS:
                 continue
-            given, owner, kind, rest = (
-                getattr(self, name),
-                type(self).__name__,
-                _KINDS[item.type],
-                _WIDE.get(name, ((),)),
-            )
+            given, owner, kind = getattr(self, name), type(self).__name__, _KINDS[item.type]
+            rest = _WIDE.get(name, ((),))
             array = given if isinstance(given, np.ndarray) else np.asarray(_numbers(given, owner, name))
             if array.dtype != kind:
                 array = _as_kind(array, owner, name, whole=kind is np.int64)
@@ -351,8 +348,7 @@ class Trajectory(_Columns):
 
     def plot(self) -> Figure:
         """Draw the path; returns a matplotlib figure."""
-        figure: Figure = draw("plot_trajectory", self)
-        return figure
+        return draw("plot_trajectory", self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -411,8 +407,7 @@ class Landmarks(_Columns):
 
     def plot(self) -> Figure:
         """Draw the map with 2-sigma ellipses; returns a matplotlib figure."""
-        figure: Figure = draw("plot_landmarks", self)
-        return figure
+        return draw("plot_landmarks", self)
 
     @classmethod
     def at(
@@ -487,8 +482,32 @@ class Landmarks(_Columns):
         )
 
 
+class _ShownRecording(Shown):
+    """Mixin of recordings in the plane and in space: how they show themselves."""
+
+    __slots__ = ()
+
+    def _facts(self: Any) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            **span(self.frames.stamp_s),
+            "odometry": 0 if self.odometry is None else len(self.odometry),
+            "frames": len(self.frames),
+            "detections": len(self.detections),
+            "landmarks": self.detections._facts()["landmarks"],
+            "truth": self.truth is not None,
+            "true_landmarks": 0 if self.true_landmarks is None else len(self.true_landmarks),
+            "warnings": len(self.warnings),
+            "source": self.source,
+        }
+
+    def plot(self) -> Figure:
+        """Draw detections over time and range, and the truth where there is one; returns a matplotlib figure."""
+        return draw("plot_recording", self)
+
+
 @dataclass(frozen=True, slots=True)
-class Recording(Shown):
+class Recording(_ShownRecording):
     """One robot's session: what a reader returns and the pipeline consumes.
 
     Attributes:
@@ -519,25 +538,6 @@ class Recording(Shown):
     clock: Clock = Clock.RECORDING
     landmark_names: Mapping[int, str] = field(default_factory=dict)
     robot: str = ""
-
-    def _facts(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            **span(self.frames.stamp_s),
-            "odometry": len(self.odometry),
-            "frames": len(self.frames),
-            "detections": len(self.detections),
-            "landmarks": self.detections._facts()["landmarks"],
-            "truth": self.truth is not None,
-            "true_landmarks": 0 if self.true_landmarks is None else len(self.true_landmarks),
-            "warnings": len(self.warnings),
-            "source": self.source,
-        }
-
-    def plot(self) -> Figure:
-        """Draw detections over time and range, and the truth where there is one; returns a matplotlib figure."""
-        figure: Figure = draw("plot_recording", self)
-        return figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -656,24 +656,15 @@ class SpatialSensor(Shown):
 
 
 @dataclass(frozen=True, slots=True)
-class SpatialRecording(Shown):
-    """One robot's session in space; as `Recording`, but for poses and landmarks in three dimensions.
+class SpatialRecording(_ShownRecording):
+    """One robot's session in space: as `Recording`, whose other attributes it has, but with poses and landmarks in
+    three dimensions.
 
     Attributes:
-        name: short label.
         odometry: poses in a drifting frame; None for a sensor that is carried by hand.
-        frames: every instant at which a sensor looked, also when it saw nothing.
-        detections: what it saw.
         sensors: at least one.
-        truth: reference trajectory, for evaluation only; None where unknown.
-        true_landmarks: surveyed landmarks, for evaluation or as a prior map; None where unknown.
-        class_names: what the rows of `class_id` mean.
-        warnings: counted, human-readable remarks of the reader.
-        source: where it was read from.
-        landmark_names: texts behind the ids of landmarks that were given as such (`landmark_id_of`).
         symmetries: turns after which objects look the same, by the names of their classes; as
             `geometry.symmetry.Symmetry.generated` reads them.
-        robot: whose session it is, as of a `Recording`.
     """
 
     name: str
@@ -694,25 +685,6 @@ class SpatialRecording(Shown):
     @property
     def robot_sightings(self) -> None:
         """Return None: robots do not see each other in recordings in space."""
-
-    def _facts(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            **span(self.frames.stamp_s),
-            "odometry": 0 if self.odometry is None else len(self.odometry),
-            "frames": len(self.frames),
-            "detections": len(self.detections),
-            "landmarks": self.detections._facts()["landmarks"],
-            "truth": self.truth is not None,
-            "true_landmarks": 0 if self.true_landmarks is None else len(self.true_landmarks),
-            "warnings": len(self.warnings),
-            "source": self.source,
-        }
-
-    def plot(self) -> Figure:
-        """Draw detections over time and range, and the truth where there is one; returns a matplotlib figure."""
-        figure: Figure = draw("plot_recording", self)
-        return figure
 
 
 AnyRecording = Recording | SpatialRecording
@@ -919,8 +891,7 @@ class SlamResult(Shown):
 
     def plot(self, recording: AnyRecording | None = None) -> Figure:
         """Draw path and map; with its recording also the truth and the detections. Returns a matplotlib figure."""
-        figure: Figure = draw("plot_result", self, recording)
-        return figure
+        return draw("plot_result", self, recording)
 
 
 def json_number(value: Any) -> float | None:
@@ -942,3 +913,34 @@ def rows_of(table: _Table, rows: IntArray | BoolArray) -> _Table:
     columns = {item.name: getattr(table, item.name) for item in fields(table)}
     some: dict[str, Any] = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
     return replace(table, **some)
+
+
+_DAY_S = 86_400
+
+
+def stamp_text(stamp_s: float, clock: Clock) -> str:
+    """Return '2026-11-21 14:20:05', or 'day 3 04:05:06' since the start of a recording's own clock; '-' for no
+    stamp.
+    """
+    if not math.isfinite(stamp_s):
+        return "-"
+    if clock is not Clock.RECORDING:
+        try:
+            return datetime.fromtimestamp(round(stamp_s), UTC).strftime("%Y-%m-%d %H:%M:%S")
+        except (OverflowError, ValueError, OSError):  # no date of the calendar
+            return f"{stamp_s:g} s"
+    days, seconds = divmod(round(stamp_s), _DAY_S)
+    time = f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
+    return f"day {days} {time}" if days else time
+
+
+def between_text(from_s: float, to_s: float, clock: Clock) -> str:
+    """Return 'between A and B'; 'before B' without an earlier look."""
+    late = stamp_text(to_s, clock)
+    early = stamp_text(from_s, clock)
+    if early == "-":
+        return f"before {late}"
+    if early == late:
+        return f"at {late}"
+    same_day = early.rpartition(" ")[0] == late.rpartition(" ")[0] and " " in late
+    return f"between {early} and {late.rpartition(' ')[2] if same_day else late}"

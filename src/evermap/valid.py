@@ -6,6 +6,7 @@ are far beyond any robot. They catch wrong units (degrees, milliseconds, millime
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import inf, pi
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 from evermap.errors import DataError, InputError
 from evermap.types import (
     UNKNOWN,
+    AnyRecording,
     BoolArray,
     Detections,
     FloatArray,
@@ -131,12 +133,8 @@ def validate(recording: Any) -> None:
         DataError: fewer than two rows of odometry, or no detection.
     """
     check_type(recording, (Recording,))
+    _check_content(recording)
     odometry, frames, detections = recording.odometry, recording.frames, recording.detections
-    if len(odometry) < 2:
-        raise DataError("the odometry needs at least two rows", path=recording.source or None, field="odometry")
-    if len(frames) == 0 or len(detections) == 0:
-        problem = "no landmark was seen in the whole recording"
-        raise DataError(problem, path=recording.source or None, hint="look at the detections")
     _check_stamps(odometry.stamp_s, "odometry.stamp_s")
     for quantity in (FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS):
         quantity.check_array(getattr(odometry, quantity.name), f"odometry.{quantity.name}")
@@ -163,13 +161,9 @@ def validate_spatial(recording: Any) -> None:
     """
     if not isinstance(recording, SpatialRecording):
         raise InputError(f"a SpatialRecording is needed, not {type(recording).__name__}", field="recording")
-    source = recording.source or None
-    if len(recording.frames) == 0 or len(recording.detections) == 0:
-        raise DataError("no landmark was seen in the whole recording", path=source, hint="look at the detections")
+    _check_content(recording)
     _check_stamps(recording.frames.stamp_s, "frames.stamp_s")
     if recording.odometry is not None:
-        if len(recording.odometry) < 2:
-            raise DataError("the odometry needs at least two rows", path=source, field="odometry")
         _check_stamps(recording.odometry.stamp_s, "odometry.stamp_s")
         _check_poses(recording.odometry.pose_world_robot, "odometry.pose_world_robot")
         variance = recording.odometry.variance
@@ -178,10 +172,17 @@ def validate_spatial(recording: Any) -> None:
     for sensor in recording.sensors:
         _check_spatial_sensor(sensor)
     if recording.truth is not None:
-        _check_stamps(recording.truth.stamp_s, "truth.stamp_s")
-        _check_poses(recording.truth.pose_world_robot, "truth.pose_world_robot")
+        _check_trajectory(recording.truth, "truth")
     if recording.true_landmarks is not None:
         check_landmarks(recording.true_landmarks, "true_landmarks")
+
+
+def _check_content(recording: AnyRecording) -> None:
+    source = recording.source or None
+    if recording.odometry is not None and len(recording.odometry) < 2:
+        raise DataError("the odometry needs at least two rows", path=source, field="odometry")
+    if len(recording.frames) == 0 or len(recording.detections) == 0:
+        raise DataError("no landmark was seen in the whole recording", path=source, hint="look at the detections")
 
 
 def _check_spatial_detections(detections: SpatialDetections, frames: int, sensors: int) -> None:
@@ -239,23 +240,27 @@ def _check_spatial_sensor(sensor: SpatialSensor) -> None:
         wanted = " or ".join(map(str, counts))
         problem = f"{where}: {sensor.distortion_model} needs {wanted} coefficients, not {len(sensor.distortion)}"
         raise InputError(problem, field="sensors.distortion")
-    for name in ("p_detect", "p_false"):
-        if not 0.0 <= getattr(sensor, name) <= 1.0:
-            problem = f"{where}: {getattr(sensor, name)} is not a probability"
-            raise InputError(problem, field=f"sensors.{name}", hint="0 to 1")
     if not sensor.range_min_m < sensor.range_max_m:
         problem = f"{where}: {sensor.range_min_m} is not below range_max_m = {sensor.range_max_m}"
         raise InputError(problem, field="sensors.range_min_m")
-    for name in ("sigma_scale", "sigma_angle_rad", "sigma_position_m", "sigma_odometer_scale"):
+    _check_chances(sensor, "sensors", ("sigma_m", "sigma_rad", "sigma_px"), f"{where}: ")
+    known = ("sigma_scale", "sigma_angle_rad", "sigma_position_m", "sigma_odometer_scale")
+    _check_chances(sensor, "sensors", known, f"{where}: ", zero=True)
+
+
+def _check_chances(
+    sensor: Sensor | SpatialSensor, field: str, sigmas: Iterable[str], whose: str = "", *, zero: bool = False
+) -> None:
+    """Raise InputError for a probability, or a stated standard deviation, that cannot be; `zero`: it may be 0."""
+    for name in ("p_detect", "p_false"):
+        if not 0.0 <= getattr(sensor, name) <= 1.0:
+            problem = f"{whose}{getattr(sensor, name)} is not a probability"
+            raise InputError(problem, field=f"{field}.{name}", hint="0 to 1")
+    for name in sigmas:
         sigma = getattr(sensor, name)
-        if sigma is not None and not 0.0 <= sigma < inf:
-            problem = f"{where}: {sigma} is not a standard deviation"
-            raise InputError(problem, field=f"sensors.{name}", hint="None where unknown")
-    for name in ("sigma_m", "sigma_rad", "sigma_px"):
-        sigma = getattr(sensor, name)
-        if sigma is not None and not 0.0 < sigma < inf:
-            problem = f"{where}: {sigma} is not a standard deviation"
-            raise InputError(problem, field=f"sensors.{name}", hint="None where unknown")
+        if sigma is not None and not (0.0 < sigma < inf or (zero and sigma == 0.0)):
+            problem = f"{whose}{sigma} is not a standard deviation"
+            raise InputError(problem, field=f"{field}.{name}", hint="None where unknown")
 
 
 def is_covariance(covariance: FloatArray) -> Any:
@@ -276,9 +281,11 @@ def _is_unit(quaternion: FloatArray) -> BoolArray:
 
 
 def _check_poses(pose: FloatArray, field: str) -> None:
-    for quantity, column in zip((X_M, Y_M, Z_M), pose.T, strict=False):
+    plane = pose.shape[1] == 3
+    for quantity, column in zip((X_M, Y_M, THETA_RAD if plane else Z_M), pose.T, strict=False):
         quantity.check_array(column, field)
-    _require(_is_unit(pose[:, 3:]), pose, field, "does not end in a unit quaternion", "x, y, z, qx, qy, qz, qw")
+    if not plane:
+        _require(_is_unit(pose[:, 3:]), pose, field, "does not end in a unit quaternion", "x, y, z, qx, qy, qz, qw")
 
 
 def check_type(recording: Any, kinds: tuple[type, ...] = (Recording, SpatialRecording)) -> None:
@@ -300,19 +307,13 @@ def check_landmarks(landmarks: Any, field: str) -> None:
     again = np.ones(len(ids), dtype=bool)
     again[np.unique(ids, return_index=True)[1]] = False
     _require(~again, ids, f"{field}.landmark_id", "is listed twice", "one row per landmark")
-    _require(
-        is_covariance(covariance),
-        ids,
-        f"{field}.covariance_m2",
-        "is not a covariance: not positive semidefinite",
-        "square metres",
-    )
+    problem = "is not a covariance: not positive semidefinite"
+    _require(is_covariance(covariance), ids, f"{field}.covariance_m2", problem, "square metres")
 
 
 def _check_trajectory(trajectory: Trajectory, field: str) -> None:
     _check_stamps(trajectory.stamp_s, f"{field}.stamp_s")
-    for quantity, column in zip((X_M, Y_M, THETA_RAD), trajectory.pose_world_robot.T, strict=True):
-        quantity.check_array(column, f"{field}.pose_world_robot")
+    _check_poses(trajectory.pose_world_robot, f"{field}.pose_world_robot")
 
 
 def check_sensor(sensor: Sensor) -> None:
@@ -321,13 +322,7 @@ def check_sensor(sensor: Sensor) -> None:
         if not getattr(sensor, low) < getattr(sensor, high):
             problem = f"{getattr(sensor, low)} is not below {high} = {getattr(sensor, high)}"
             raise InputError(problem, field=f"sensor.{low}", hint="metres, and radians counter-clockwise")
-    for name in ("p_detect", "p_false"):
-        if not 0.0 <= getattr(sensor, name) <= 1.0:
-            raise InputError(f"{getattr(sensor, name)} is not a probability", field=f"sensor.{name}", hint="0 to 1")
-    for name in ("sigma_range_m", "sigma_bearing_rad"):
-        sigma = getattr(sensor, name)
-        if sigma is not None and not 0.0 < sigma < inf:
-            raise InputError(f"{sigma} is not a standard deviation", field=f"sensor.{name}", hint="None where unknown")
+    _check_chances(sensor, "sensor", ("sigma_range_m", "sigma_bearing_rad"))
     mount = np.asarray(sensor.mount_robot_sensor, dtype=np.float64)
     if mount.shape != (3,) or not np.isfinite(mount).all():
         raise InputError(
@@ -351,9 +346,8 @@ def _check_stamps(stamp_s: FloatArray, field: str) -> None:
     step_s = np.diff(stamp_s)
     if np.any(step_s <= 0.0):
         row = int(np.argmax(step_s <= 0.0)) + 1
-        problem = (
-            "repeats the previous one" if step_s[row - 1] == 0.0 else f"time runs backwards by {-step_s[row - 1]:.6g} s"
-        )
+        back_s = -step_s[row - 1]
+        problem = f"time runs backwards by {back_s:.6g} s" if back_s else "repeats the previous one"
         raise InputError(f"row {row}: {problem}", field=field, hint="sort by time, one row per stamp")
 
 

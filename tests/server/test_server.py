@@ -27,7 +27,7 @@ from evermap.errors import ConfigError, InputError
 from evermap.io import read_native
 from evermap.maps.store import Provenance, open_store, verify_store
 from evermap.runs.sessions import enter_session
-from evermap.server.app import _lines
+from evermap.server.app import _since
 from evermap.server.database import Database, Role
 from evermap.server.sites import SiteStores
 
@@ -367,8 +367,7 @@ def test_revisions_are_short_paged_and_compressed(fleet: Fleet, zips: list[bytes
 
 
 def _lines_of(fleet: Fleet) -> list[tuple[int, Any]]:
-    with fleet.server.sites.store("ward") as store:
-        return [(number, json.loads(line)) for number, line in _lines(store, 0)]
+    return [(number, json.loads(line)) for number, line in _since(fleet.server, "ward", 0)]
 
 
 @SQLITE_ONLY

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from evermap.tracking.record import StaticSpells
-from evermap.types import Clock
-from evermap.viz.plots import MOST_SPELLS, plot_objects
+from evermap.viz.plots import MOST_SPELLS, plot_track_run
 from evermap.viz.style import ALERT, class_looks
 
 HOUR_S = 3600.0
@@ -24,8 +26,22 @@ def rests(n: int) -> StaticSpells:
     )
 
 
+def figure_of(spells: StaticSpells, *, end_s: float, start_s: float = 0.0, names: tuple[str, ...] = ("a", "b")) -> Any:
+    """The figure of a run with these spells, in which an object of the first class moves from (0, 0) to (1, 1)."""
+    stamp_s = np.array([start_s, start_s + 1.0, end_s])
+    tracks = SimpleNamespace(
+        track_id=np.zeros(2, int),
+        stamp_s=stamp_s[:2],
+        static=np.zeros(2, bool),
+        position_m=np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]),
+    )
+    table = SimpleNamespace(class_names=names, stamp_s=stamp_s, sensor_m=None)
+    run = SimpleNamespace(table=table, spells=spells, objects=lambda: tracks, class_of_track=lambda: np.zeros(1, int))
+    return plot_track_run(run)
+
+
 def test_a_bar_for_each_spell_thin_where_it_can_have_come_and_gone() -> None:
-    figure = plot_objects(("a", "b"), [], rests(3), start_s=0.0, end_s=8 * HOUR_S)
+    figure = figure_of(rests(3), end_s=8 * HOUR_S)
     _, bars = figure.axes
     lines = [line for line in bars.lines if line.get_linestyle() == "-" and np.size(line.get_xdata()) == 2]
     spans = sorted(
@@ -44,7 +60,7 @@ def test_a_bar_for_each_spell_thin_where_it_can_have_come_and_gone() -> None:
 
 
 def test_of_too_many_the_longest() -> None:
-    figure = plot_objects(("a", "b"), [], rests(MOST_SPELLS + 5), start_s=0.0, end_s=400 * HOUR_S)
+    figure = figure_of(rests(MOST_SPELLS + 5), end_s=400 * HOUR_S)
     _, bars = figure.axes
     thick = [line for line in bars.lines if line.get_linewidth() == 3.0 and np.size(line.get_xdata())]
     assert len(thick) == MOST_SPELLS
@@ -52,9 +68,7 @@ def test_of_too_many_the_longest() -> None:
 
 
 def test_classes_have_their_look_and_what_left_is_crossed_out() -> None:
-    figure = plot_objects(
-        ("b", "a"), [(0, np.array([[0.0, 0.0], [1.0, 1.0]]))], rests(3), start_s=0.0, end_s=8 * HOUR_S
-    )
+    figure = figure_of(rests(3), end_s=8 * HOUR_S, names=("b", "a"))
     above, bars = figure.axes
     looks = class_looks(("a", "b"))
     marks = {(str(line.get_marker()), str(line.get_mec()), str(line.get_mfc())): np.asarray(line.get_xydata()).tolist()
@@ -79,5 +93,5 @@ def test_classes_have_their_look_and_what_left_is_crossed_out() -> None:
 
 
 def test_clocks_give_dates() -> None:
-    figure = plot_objects(("a", "b"), [], rests(2), start_s=1.7e9, end_s=1.7e9 + HOUR_S, clock=Clock.UNIX)
+    figure = figure_of(rests(2), start_s=1.7e9, end_s=1.7e9 + HOUR_S)
     assert figure.axes[1].get_xlabel() == "time [UTC]"

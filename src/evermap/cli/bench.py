@@ -40,12 +40,14 @@ def bench(
       evermap bench --only persistence
       evermap bench --only scale --sizes 400,1000,4000 --out out/scale
     """
+    from evermap.compiled import THREAD_LIMITS
+
     landmarks = None if sizes is None else _numbers(sizes)
     if landmarks is not None and only not in (None, "scale"):
         raise InputError("--sizes belongs to 'scale'", field="--only", hint="--only scale")
     if out is not None and only not in (None, "scale", "kitti", "space"):
         raise InputError("--out belongs to one part", field="--only", hint="--only scale, --only kitti or --only space")
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    for name in (*THREAD_LIMITS, "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # read when the libraries are loaded, below
     runner = load_benchmarks()
     measured = runner.run(update_baseline=update_baseline, only=only, sizes=landmarks)

@@ -6,7 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-from evermap.cli.options import Topics, argument, option
+from evermap.cli.options import Robot, Topics, argument, option
 from evermap.cli.terminal import print_json, say, warn
 
 
@@ -20,7 +20,7 @@ class TableFormat(StrEnum):
 def convert(
     recording_path: Annotated[Path, argument("Recording in any format that can be read.", metavar="INPUT")],
     out: Annotated[Path, argument("Folder to write.", metavar="OUT")],
-    robot: Annotated[int | None, option("Robot of a recording that has several.", default=False)] = None,
+    robot: Robot = None,
     topics: Topics = None,
     table_format: Annotated[TableFormat, option("--format", "Format of the tables.")] = TableFormat.CSV,
     as_json: Annotated[bool, option("--json", "Print the result as JSON.")] = False,
@@ -41,20 +41,10 @@ def convert(
         write_native(recording, folder.path("."), table_format.value)
     for remark in recording.warnings:
         warn(remark)
-    odometry = 0 if recording.odometry is None else len(recording.odometry)
+    odometry, frames, detections = recording.odometry or (), recording.frames, recording.detections
+    counts = {"odometry": len(odometry), "frames": len(frames), "detections": len(detections)}
     if as_json:
-        print_json(
-            {
-                "name": recording.name,
-                "out": str(out),
-                "odometry": odometry,
-                "frames": len(recording.frames),
-                "detections": len(recording.detections),
-                "warnings": list(recording.warnings),
-            }
-        )
+        warnings = list(recording.warnings)
+        print_json({"name": recording.name, "out": str(out), **counts, "warnings": warnings})
     else:
-        say(
-            f"wrote {out}: {odometry} odometry rows, {len(recording.frames)} frames, "
-            f"{len(recording.detections)} detections"
-        )
+        say(f"wrote {out}: {len(odometry)} odometry rows, {len(frames)} frames, {len(detections)} detections")

@@ -173,11 +173,10 @@ def _topics(path: Path) -> dict[str, tuple[str, int]]:
 
 
 def _map(path: Path) -> Described:
-    from evermap.cli.map_content import revision_row
+    from evermap.cli.map import revision_row
     from evermap.maps.store import open_store
     from evermap.runs.map_dicts import life_dicts, revision_dict
-    from evermap.stamps import stamp_text
-    from evermap.types import json_number
+    from evermap.types import json_number, stamp_text
 
     with open_store(path) as store:
         revisions, living = store.log(), store.load()

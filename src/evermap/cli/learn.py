@@ -19,6 +19,7 @@ from evermap.cli.options import (
     Workers,
     argument,
     configured,
+    database_errors,
     one_of,
     option,
 )
@@ -124,31 +125,26 @@ def sites_of(maps: list[str], store: str | None, cluster: str | None = None) -> 
 
 
 def _stored(store: str) -> list[tuple[str, str]]:
-    from sqlalchemy.exc import ArgumentError, DBAPIError
+    from sqlalchemy.exc import ArgumentError
 
     from evermap.server.sites import SiteStores
 
     stores = SiteStores(store)
     try:
-        return [(name, stores.address(name)) for name in stores.names()]
+        with database_errors():
+            return [(name, stores.address(name)) for name in stores.names()]
     except (ArgumentError, ValueError):
-        raise ConfigError(
-            "is not the address of a database", field="store", hint="postgresql://user@host/base"
-        ) from None
-    except DBAPIError as error:
-        hint = "check the address, the rights of the user, and that the server runs"
-        raise ConfigError(f"the database cannot be used: {error.orig}", field="store", hint=hint) from None
-
-
-def _half_gone_s(lifetimes: Lifetimes) -> float | None:
-    from evermap.types import json_number
-
-    return json_number(lifetimes.stay.quantile(0.5))
+        hint = "postgresql://user@host/base"
+        raise ConfigError("is not the address of a database", field="store", hint=hint) from None
 
 
 def _written(folder: RunFolder, company: Company, names: list[str]) -> dict[str, Any]:
     """Write the files of a company and its sites; return the results for the summary."""
     from evermap.existence.models import save_lifetimes
+    from evermap.types import json_number
+
+    def half_gone_s(lifetimes: Lifetimes) -> float | None:
+        return json_number(lifetimes.stay.quantile(0.5))
 
     general = company.lifetimes()
     save_lifetimes(general, folder.path("company.json"))
@@ -161,7 +157,7 @@ def _written(folder: RunFolder, company: Company, names: list[str]) -> dict[str,
                 progress(number + 1, len(names))
     sites = {
         site: {
-            name: {"stays": n_stays, "stays_that_ended": n_ended, "half_gone_s": _half_gone_s(lifetimes[name])}
+            name: {"stays": n_stays, "stays_that_ended": n_ended, "half_gone_s": half_gone_s(lifetimes[name])}
             for name, n_stays, n_ended in zip(of.class_names, of.n_stays.tolist(), of.n_ended.tolist(), strict=True)
         }
         for of, (site, lifetimes) in zip(company.sites, own.items(), strict=True)
@@ -170,7 +166,7 @@ def _written(folder: RunFolder, company: Company, names: list[str]) -> dict[str,
     for name, lifetimes in general.items():
         seen = [of[name] for of in sites.values() if name in of]
         counts = {key: sum(one[key] for one in seen) for key in ("stays", "stays_that_ended")}
-        classes[name] = {"sites": len(seen), **counts, "half_gone_s": _half_gone_s(lifetimes)}
+        classes[name] = {"sites": len(seen), **counts, "half_gone_s": half_gone_s(lifetimes)}
     differ = float(math.exp(company.stay.p_pair @ company.stay.spreads[:, 0]))
     return {"classes": classes, "sites": sites, "factor_between_sites": differ}
 

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -81,6 +82,7 @@ def live(
       evermap live --map building.evermap --sensor sensor.toml --zenoh tcp/localhost:7447 --foxglove 8765
       evermap live --replay tuesday --zenoh listen=tcp/localhost:7447
     """
+    from evermap.io import read_recording
     from evermap.live.wires import Mailbox, wires_of
     from evermap.maps.store import is_address
 
@@ -95,7 +97,7 @@ def live(
     elif map_file is None:
         refuse_given("needs a map", "--map FILE", sensor=sensor, topics=topics, **told)
     _check_source(map_file, replay, sensor, connected=connected)
-    recording = None if replay is None else _recording(replay, robot)
+    recording = None if replay is None else read_recording(replay, robot=robot)
     _check_needed(recording, chosen, sensor, topics)
     mailbox = Mailbox() if replay is None else None
     wires = wires_of(zenoh, foxglove, mailbox)
@@ -121,12 +123,6 @@ def _check_source(map_file: str | None, replay: Path | None, sensor: Path | None
         )
     if map_file is not None and replay is None and sensor is None:
         raise ConfigError("the sensor is not described", field="sensor", hint="--sensor sensor.toml")
-
-
-def _recording(path: Path, robot: int | None) -> AnyRecording:
-    from evermap.io import read_recording
-
-    return read_recording(path, robot=robot)
 
 
 def _check_needed(recording: AnyRecording | None, config: Config, sensor: Path | None, topics: Path | None) -> None:
@@ -169,21 +165,17 @@ def _give_memory_back() -> None:
         ctypes.CDLL(None).mallopt(MMAP_THRESHOLD, LARGE)
 
 
+@dataclass(slots=True)
 class _Drive:
     """A drive: an engine, its readings, and its outputs to connections and terminal."""
 
-    def __init__(
-        self,
-        map_file: Path,
-        config: Config,
-        sensor: Path | None,
-        topics: Path | None,
-        mailbox: Mailbox | None,
-        recording: AnyRecording | None,
-    ) -> None:
-        self._map_file, self._config, self._sensor, self._topics = map_file, config, sensor, topics
-        self._mailbox, self._recording = mailbox, recording
-        self._listener: Listener | None = None
+    map_file: Path
+    config: Config
+    sensor: Path | None
+    topics: Path | None
+    mailbox: Mailbox | None
+    recording: AnyRecording | None
+    listener: Listener | None = None
 
     def run(self, wires: Sequence[Wire], *, localize: bool, realtime: bool, as_json: bool) -> None:
         """Drive until the recording ends, or until it is stopped."""
@@ -191,15 +183,15 @@ class _Drive:
 
         _give_memory_back()
         # a replay faster than real time cannot wait for parallel work
-        engine = self._engine(mapping=not localize, beside=realtime or self._recording is None)
-        shown = _Shown(as_json=as_json, mailbox=self._mailbox)
+        engine = self._engine(mapping=not localize, beside=realtime or self.recording is None)
+        shown = _Shown(as_json=as_json, mailbox=self.mailbox)
         with engine:
             readings = self._readings(engine, shown, realtime=realtime)
             warm_up(engine.warm_up)
             gc.collect()
             gc.freeze()  # objects loaded so far are kept: collecting them again would take a tenth of a second
             gc.set_threshold(OBJECTS)
-            kept(self._map_file, f"the drive enters {self._map_file} at the next start")
+            kept(self.map_file, f"the drive enters {self.map_file} at the next start")
             with self._teller(engine, wires) as tell:
 
                 def told(now: Now) -> None:
@@ -214,35 +206,35 @@ class _Drive:
                 if not localize:
                     engine.save()
                 told(engine.step())
-        shown.finish(self._map_file)
+        shown.finish(self.map_file)
 
     def _engine(self, *, mapping: bool, beside: bool) -> Engine:
         from evermap.live.engine import Engine
         from evermap.types import Recording
 
-        recording = self._recording
+        recording = self.recording
         about: dict[str, Any] = {"name": datetime.now(UTC).strftime("live %Y-%m-%d %H:%M:%S")}
-        sensor: Sensor | Path | None = self._sensor
+        sensor: Sensor | Path | None = self.sensor
         if isinstance(recording, Recording):
             about = {"clock": recording.clock, "class_names": recording.class_names, "name": recording.name}
             sensor = recording.sensor
         elif sensor is None:
             problem = "is in space; sessions in space are solved when they end"
             raise ConfigError(problem, field="replay", hint="evermap slam --map; in the plane with --sensor FILE")
-        return Engine(self._map_file, sensor, self._config, mapping=mapping, beside=beside, **about)
+        return Engine(self.map_file, sensor, self.config, mapping=mapping, beside=beside, **about)
 
     def _readings(self, engine: Engine, shown: _Shown, *, realtime: bool) -> Iterator[Reading | None]:
         from evermap.live.feed import replayed
         from evermap.live.ros import Listener, heard, spoken
         from evermap.types import Recording
 
-        if isinstance(self._recording, Recording):
-            return replayed(self._recording, paced=realtime)
-        self._listener = Listener(engine.sensor, self._topics, say)
-        if self._recording is not None:
-            return spoken(self._recording, self._listener, shown.refused, paced=realtime)
-        assert self._mailbox is not None
-        return heard(self._mailbox, self._listener, shown.refused)
+        if isinstance(self.recording, Recording):
+            return replayed(self.recording, paced=realtime)
+        self.listener = Listener(engine.sensor, self.topics, say)
+        if self.recording is not None:
+            return spoken(self.recording, self.listener, shown.refused, paced=realtime)
+        assert self.mailbox is not None
+        return heard(self.mailbox, self.listener, shown.refused)
 
     @contextmanager
     def _teller(self, engine: Engine, wires: Sequence[Wire]) -> Iterator[Callable[[Now], None]]:
@@ -257,7 +249,7 @@ class _Drive:
                 say(wire.about)
         teller = Teller(engine, wires)
         try:
-            yield lambda now: teller.tell(now, self._listener)
+            yield lambda now: teller.tell(now, self.listener)
         finally:
             teller.close()
 

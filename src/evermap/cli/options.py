@@ -163,6 +163,18 @@ def duration_s(text: str | None, field: str) -> float | None:
         raise ConfigError(error.problem, field=field, hint=error.hint) from None
 
 
+@contextmanager
+def database_errors() -> Iterator[None]:
+    """Make an error of a database that cannot be used one of `--store`."""
+    from sqlalchemy.exc import DBAPIError
+
+    try:
+        yield
+    except DBAPIError as error:
+        hint = "check the address, the rights of the user, and that the server runs"
+        raise ConfigError(f"the database cannot be used: {error.orig}", field="store", hint=hint) from None
+
+
 def default_out(name: str) -> Path:
     """Return `evermap-out/mrclam_dataset6-robot-1` for 'MRCLAM_Dataset6 robot 1', and `evermap-out/looks` for
     'looks.csv.gz'.
@@ -171,40 +183,28 @@ def default_out(name: str) -> Path:
     return Path("evermap-out") / (re.sub(r"[^a-z0-9_.]+", "-", name).strip("-.") or "run")
 
 
-class Verb(TyperCommand):
-    """A command whose errors and remarks name options instead of the core's arguments."""
+class _SpeaksOfOptions:
+    """Mixin of commands and groups whose errors and remarks name options instead of the core's arguments."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command."""
+        """Run the command, or the group or one of its commands."""
         remark_as.set(lambda text: with_options(text, ctx))
-        with _speaking_of_options(ctx):
-            return super().invoke(ctx)
+        try:
+            return super().invoke(ctx)  # type: ignore[misc]
+        except EvermapError as error:
+            error.problem = with_options(error.problem, ctx)
+            error.hint = error.hint and with_options(error.hint, ctx)
+            if error.line is None:  # in a line of a file it is a column or a key
+                error.field = error.field and (_option(error.field, ctx) or error.field)
+            raise
 
 
-class VerbGroup(TyperGroup):
-    """A group that is a command itself, whose errors name options as those of a `Verb` do."""
-
-    def invoke(self, ctx: Any) -> Any:
-        """Run the group, or one of its commands."""
-        with _speaking_of_options(ctx):
-            return super().invoke(ctx)
+class Verb(_SpeaksOfOptions, TyperCommand):
+    """A command whose errors and remarks name options."""
 
 
-@contextmanager
-def _speaking_of_options(ctx: Any) -> Iterator[None]:
-    try:
-        yield
-    except EvermapError as error:
-        speak_of_options(error, ctx)
-        raise
-
-
-def speak_of_options(error: EvermapError, ctx: Any) -> None:
-    """Name the options of a command instead of the core's arguments, in an error's field and in its `backquotes`."""
-    error.problem = with_options(error.problem, ctx)
-    error.hint = error.hint and with_options(error.hint, ctx)
-    if error.line is None:  # in a line of a file it is a column or a key
-        error.field = error.field and (_option(error.field, ctx) or error.field)
+class VerbGroup(_SpeaksOfOptions, TyperGroup):
+    """A group that is a command itself."""
 
 
 def with_options(text: str, ctx: Any) -> str:

@@ -28,6 +28,7 @@ from evermap.cli.options import (
     VerbGroup,
     argument,
     configured,
+    database_errors,
     option,
 )
 from evermap.cli.terminal import print_json, print_table, say, warm_up, warn
@@ -39,11 +40,7 @@ if TYPE_CHECKING:
     from evermap.server.worker import JobOutcome
 
 app = typer.Typer(
-    name="serve",
-    cls=VerbGroup,
-    help="Serve the maps of a fleet.",
-    rich_markup_mode=None,
-    invoke_without_command=True,
+    name="serve", cls=VerbGroup, help="Serve the maps of a fleet.", rich_markup_mode=None, invoke_without_command=True
 )
 
 Store = Annotated[
@@ -370,15 +367,10 @@ def work(
 
 
 def _database(store: str) -> Database:
-    from sqlalchemy.exc import DBAPIError
-
     from evermap.server.database import Database
 
-    try:
+    with database_errors():
         return Database(store)
-    except DBAPIError as error:
-        hint = "check the address, the rights of the user, and that the server runs"
-        raise ConfigError(f"the database cannot be used: {error.orig}", field="store", hint=hint) from None
 
 
 def _uvicorn() -> Any:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypedDict, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     from evermap.config import Config
     from evermap.maps.store import MapStore
     from evermap.runs.sessions import Entered
-    from evermap.runs.summary import RunInfo
     from evermap.types import AnyRecording, Landmarks, SlamResult
 
 # (section, key, label, format); a number that the run does not have is left out
@@ -214,32 +212,56 @@ def slam(
     of_prior_map = {"shift": shift, "prior_sigma": prior_sigma}
     set_here = [*(settings or []), *(f"slam.{name}=" for name, value in given.items() if value is not None)]
     paths = _recordings(input, one=offline_session is not None)
+    inputs = [*paths, config, topics, None if prior_map == "truth" else prior_map, map_file]
+    asked = _Asked(chosen, set_here, inputs, as_json, force, realtime, robot, topics, offline_session)
     if together:
         single = {"realtime": realtime or None, "topics": topics, "offline_session": offline_session, "robot": robot}
         in_a_map = {"map_file": map_file, "prior": prior, "localize": localize or None, "prior_map": prior_map}
         refuse_given("is for one robot at a time", "omit it or --together", **single, **in_a_map, **of_prior_map)
-        _refuse_unread(set_here, chosen, in_map=False, in_space=False)
-        _each_together(paths, out, chosen, {"as_json": as_json, "force": force, "inputs": [*paths, config]})
+        _refuse_unread(asked, in_space=False)
+        _each_together(paths, out, asked)
         return
     if prior_map is None:
         refuse_given("there is no prior map", "--prior-map truth, or --prior-map FILE", **of_prior_map)
     _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method, prior=prior, inputs=paths)
     from evermap.io import parse_shift
 
-    check = partial(_refuse_unread, set_here, chosen, in_map=map_file is not None)
-    read = partial(_read, robot=robot, topics=topics, session=offline_session, force=force, check=check)
-    known = partial(_known, prior_map, prior_sigma or SURVEY_SIGMA_M, [parse_shift(text) for text in shift or []])
-    options = None if map_file is None else MapOptions(map_file, prior or [], localize, realtime)
-    inputs = [*paths, config, topics, None if prior_map == "truth" else prior_map, map_file]
-    how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
-    work = partial(_estimate, read=read, config=chosen, known=known, options=options, realtime=realtime, how=how)
+    shifts = [parse_shift(text) for text in shift or []]
+    asked = asked._replace(prior_map=prior_map, prior_sigma_m=prior_sigma or SURVEY_SIGMA_M, shifts=shifts)
+    asked = asked._replace(map_file=map_file, priors=prior or [], localize=localize)
     if len(paths) > 1:
-        _each(paths, out, work)
+        _each(paths, out, asked)
     else:
-        work(paths[0], out)
+        _estimate(paths[0], out, asked)
 
 
-def _each(paths: Sequence[Path], out: Path | None, work: Callable[..., None]) -> None:
+class _Asked(NamedTuple):
+    """What the command line asks for, of every recording; the arguments of `slam`.
+
+    Attributes:
+        set_here: keys that were set on the command line, as `slam.seed=3`.
+        inputs: what is read, and therefore not overwritten.
+        shifts: of landmarks of the prior map.
+    """
+
+    config: Config
+    set_here: Sequence[str]
+    inputs: Sequence[str | Path | None]
+    as_json: bool
+    force: bool
+    realtime: bool
+    robot: int | None
+    topics: Path | None
+    offline_session: Path | None
+    prior_map: str | None = None
+    prior_sigma_m: float = SURVEY_SIGMA_M
+    shifts: Sequence[Any] = ()
+    map_file: str | None = None
+    priors: Sequence[str] = ()
+    localize: bool = False
+
+
+def _each(paths: Sequence[Path], out: Path | None, asked: _Asked) -> None:
     """Work on several recordings; one that is refused stops none of the others.
 
     Raises:
@@ -248,8 +270,9 @@ def _each(paths: Sequence[Path], out: Path | None, work: Callable[..., None]) ->
     refused = []
     for number, path in enumerate(paths):
         say(f"session {number + 1} of {len(paths)}: {path}")
+        folder = None if out is None else out / default_out(path.resolve().name).name
         try:
-            work(path, None if out is None else out / default_out(path.resolve().name).name, later=number > 0)
+            _estimate(path, folder, asked, later=number > 0)
         except EvermapError as error:
             refused.append(str(path))
             fail(error.one_line())
@@ -257,69 +280,56 @@ def _each(paths: Sequence[Path], out: Path | None, work: Callable[..., None]) ->
         raise DataError(f"{len(refused)} of {len(paths)} sessions were refused: {', '.join(refused)}")
 
 
-def _estimate(
-    path: Path,
-    out: Path | None,
-    *,
-    read: Callable[[Path], AnyRecording],
-    config: Config,
-    known: Callable[[AnyRecording], Landmarks | None],
-    options: MapOptions | None,
-    realtime: bool,
-    how: _How,
-    later: bool = False,
-) -> None:
-    """Read a recording, run, and write the folder; `later` as in `MapOptions`."""
+def _estimate(path: Path, out: Path | None, asked: _Asked, *, later: bool = False) -> None:
+    """Read a recording, run, and write the folder.
+
+    `later`: of several sessions it is not the first, and needs the survey only if none before it began the map.
+    """
+    from evermap.io import shifted
     from evermap.runs.folder import check_replaceable
 
     if out is not None:  # better now than after the run
-        check_replaceable(out, force=how["force"], inputs=how["inputs"])
-    recording = read(path)
+        check_replaceable(out, force=asked.force, inputs=asked.inputs)
+    recording = _read(path, asked)
     if out is None:
         out = default_out(recording.name)
-        check_replaceable(out, force=how["force"], inputs=how["inputs"])
-    landmarks = known(recording)
-    if options is not None:
-        run_in_map(recording, config, options._replace(survey=landmarks, later=later), out, **how)
+        check_replaceable(out, force=asked.force, inputs=asked.inputs)
+    survey = None if asked.prior_map is None else _prior_landmarks(asked.prior_map, asked.prior_sigma_m, recording)
+    landmarks = None if survey is None else shifted(survey, asked.shifts)
+    if asked.map_file is None:
+        _run_alone(recording, landmarks, out, asked)
     else:
-        run_and_write(recording, config, out, prior=landmarks, realtime=realtime, **how)
+        _run_in_map(recording, landmarks, out, asked, asked.map_file, later=later)
 
 
-def run_and_write(
-    recording: AnyRecording,
-    config: Config,
-    out: Path,
-    *,
-    prior: Landmarks | None = None,
-    realtime: bool = False,
-    **how: Unpack[_How],
-) -> None:
+def _run_alone(recording: AnyRecording, prior: Landmarks | None, out: Path, asked: _Asked) -> None:
     """Run, write the folder, show the results. A run interrupted by Ctrl-C is written as far as it got."""
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.pipeline import run_slam
     from evermap.slam.changes.joint import may_search
     from evermap.types import SpatialRecording
 
+    unknown_ids = asked.config.slam.unknown_ids
     if isinstance(recording, SpatialRecording):
         from evermap.slam.space.moving import has_traffic
 
-        if realtime:
+        if asked.realtime:
             problem = "all frames of a recording in space are solved together"
             raise ConfigError(problem, field="realtime", hint="leave it out")
         traffic = has_traffic(recording)
-        warm_up(lambda: compile_kernels(in_space=True, traffic=traffic, unknown_ids=config.slam.unknown_ids))
+        warm_up(lambda: compile_kernels(in_space=True, traffic=traffic, unknown_ids=unknown_ids))
     else:
         search = may_search(len(recording.frames.stamp_s), in_map=prior is not None)
-        warm_up(lambda: compile_kernels(search=search, unknown_ids=config.slam.unknown_ids))
+        warm_up(lambda: compile_kernels(search=search, unknown_ids=unknown_ids))
     start = time.perf_counter()
     with progress_bar(recording.name) as progress:
-        result = run_slam(recording, config, prior_map=prior, realtime=realtime, progress=progress)
-    _write(out, recording, result, config, _info(config, time.perf_counter() - start, realtime=realtime), **how)
+        result = run_slam(recording, asked.config, prior_map=prior, realtime=asked.realtime, progress=progress)
+    _write(out, recording, result, asked, time.perf_counter() - start)
     if result.interrupted:
         raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}")
 
 
-def _each_together(paths: Sequence[Path], out: Path | None, config: Config, how: _How) -> None:
+def _each_together(paths: Sequence[Path], out: Path | None, asked: _Asked) -> None:
     """Read several robots, run them as one problem, and write a folder for each.
 
     Raises:
@@ -342,49 +352,41 @@ def _each_together(paths: Sequence[Path], out: Path | None, config: Config, how:
     if out is not None:
         folders = {number: out / folder.name for number, folder in folders.items()}
     for folder in folders.values():  # better now than after the run
-        check_replaceable(folder, force=how["force"], inputs=how["inputs"])
+        check_replaceable(folder, force=asked.force, inputs=asked.inputs)
     warm_up(lambda: compile_kernels(search=True))
     start = time.perf_counter()
     with progress_bar(f"{len(recordings)} robots") as progress:
-        results = run_together(recordings, config, progress=progress)
+        results = run_together(recordings, asked.config, progress=progress)
     elapsed_s = time.perf_counter() - start
     for number, result in results.items():
-        _write(folders[number], recordings[number], result, config, _info(config, elapsed_s, realtime=False), **how)
+        _write(folders[number], recordings[number], result, asked, elapsed_s)
 
 
-class _How(TypedDict):
-    """How a run is written: see `write_run`; `as_json` prints its summary as JSON."""
-
-    as_json: bool
-    force: bool
-    inputs: Sequence[str | Path | None]
-
-
-def _info(config: Config, elapsed_s: float, *, realtime: bool, entered: Entered | None = None) -> RunInfo:
-    """Return the facts on a run that its result lacks."""
+def _write(
+    out: Path,
+    recording: AnyRecording,
+    result: SlamResult,
+    asked: _Asked,
+    elapsed_s: float,
+    entered: Entered | None = None,
+) -> None:
+    """Write the folder; print its summary as JSON, or the main numbers, the main files and the changes."""
+    from evermap.runs.folder import write_run
     from evermap.runs.summary import RunInfo
+    from evermap.viz.change_words import explanations, grew
 
-    return RunInfo(
+    info = RunInfo(
         command=command_line(),
-        seeds={"slam": config.slam.seed},
-        processing_s=None if realtime else elapsed_s,  # at the recording's pace most of it is waiting
+        seeds={"slam": asked.config.slam.seed},
+        processing_s=None if asked.realtime else elapsed_s,  # at the recording's pace most of it is waiting
         total_s=elapsed_s,
         grown=None if entered is None else len(entered.grown),
         accepted=None if entered is None else entered.session.found,
     )
-
-
-def _write(
-    out: Path, recording: AnyRecording, result: SlamResult, config: Config, info: RunInfo, **how: Unpack[_How]
-) -> None:
-    """Write the folder; print its summary as JSON, or the main numbers, the main files and the changes."""
-    from evermap.runs.folder import write_run
-    from evermap.viz.change_words import explanations, grew
-
-    summary = write_run(out, recording, result, config, info=info, force=how["force"], inputs=how["inputs"])
+    summary = write_run(out, recording, result, asked.config, info=info, force=asked.force, inputs=asked.inputs)
     for remark in summary["warnings"]:
         warn(remark)
-    if how["as_json"]:
+    if asked.as_json:
         print_json(summary)
         return
     rows = main_numbers(summary)
@@ -398,13 +400,11 @@ def _write(
 
 def main_numbers(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the main numbers of a run's summary, with their names."""
-    twice = (
-        {"orientation_rmse_deg"} if summary["metrics"].get("heading_rmse_deg") is not None else set()
-    )  # in the plane
+    plane = summary["metrics"].get("heading_rmse_deg") is not None
     return [
         (label, form.format(summary[section][key]))
         for section, key, label, form in _ROWS
-        if summary[section].get(key) is not None and key not in twice
+        if summary[section].get(key) is not None and not (plane and key == "orientation_rmse_deg")
     ]
 
 
@@ -446,51 +446,36 @@ def _recordings(given: list[Path] | None, *, one: bool) -> list[Path]:
     return given
 
 
-def _refuse_unread(given: Sequence[str], config: Config, *, in_map: bool, in_space: bool, boxes: bool = False) -> None:
+def _refuse_unread(asked: _Asked, *, in_space: bool, boxes: bool = False) -> None:
     """Refuse settings that such a recording would silently ignore.
 
     Raises:
         ConfigError: names the first one.
     """
-    from evermap.config import (
-        UNREAD_IN_SPACE,
-        UNREAD_IN_THE_PLANE,
-        UNREAD_WITHOUT_BOXES,
-        UNREAD_WITHOUT_MAP,
-        refuse_unread,
-    )
+    from evermap import config
 
+    in_map = asked.map_file is not None
     unread = {
-        "for a recording in space": UNREAD_IN_SPACE if in_space else (),
-        "for a recording in the plane": () if in_space else UNREAD_IN_THE_PLANE,
-        "for a recording without boxes without identity": () if boxes or not in_space else UNREAD_WITHOUT_BOXES,
-        "without --map": () if in_map else UNREAD_WITHOUT_MAP,
-        "without --unknown-ids": () if in_map or config.slam.unknown_ids else ("slam.association",),
+        "for a recording in space": config.UNREAD_IN_SPACE if in_space else (),
+        "for a recording in the plane": () if in_space else config.UNREAD_IN_THE_PLANE,
+        "for a recording without boxes without identity": () if boxes or not in_space else config.UNREAD_WITHOUT_BOXES,
+        "without --map": () if in_map else config.UNREAD_WITHOUT_MAP,
+        "without --unknown-ids": () if in_map or asked.config.slam.unknown_ids else ("slam.association",),
     }
-    refuse_unread(given, unread, within="slam")
+    config.refuse_unread(asked.set_here, unread, within="slam")
 
 
-def _read(
-    path: Path,
-    *,
-    robot: int | None,
-    topics: Path | None,
-    session: Path | None,
-    force: bool,
-    check: Callable[..., None],
-) -> AnyRecording:
-    """Read a recording, and write it condensed to `session`: repaired first, as before it enters a map.
-
-    `check` refuses settings that such a recording does not read.
-    """
+def _read(path: Path, asked: _Asked) -> AnyRecording:
+    """Read a recording, and write it condensed where that is asked for: repaired first, as before it enters a map."""
     from evermap.io import read_recording
     from evermap.slam.space.moving import has_traffic
     from evermap.types import Recording
 
-    if session is not None and session.exists() and not force:
+    session = asked.offline_session
+    if session is not None and session.exists() and not asked.force:
         raise ConfigError(f"{session} is there already", field="offline_session", hint="another name, or --force")
-    recording = read_recording(path, robot=robot, topics=topics)
-    check(in_space=not isinstance(recording, Recording), boxes=has_traffic(recording))
+    recording = read_recording(path, robot=asked.robot, topics=asked.topics)
+    _refuse_unread(asked, in_space=not isinstance(recording, Recording), boxes=has_traffic(recording))
     if session is not None:
         from evermap.io.native_write import write_session
         from evermap.maps.sessions.session import repaired
@@ -530,13 +515,6 @@ def _write_bag_settings(bag: Path) -> None:
     say(f"wrote this to {path}; correct it where needed, then: evermap slam {bag}")
 
 
-def _known(prior_map: str | None, sigma_m: float, shifts: Sequence[Any], recording: AnyRecording) -> Landmarks | None:
-    """Return the prior map with the shifts of experiments."""
-    from evermap.io import shifted
-
-    return None if prior_map is None else shifted(_prior_landmarks(prior_map, sigma_m, recording), shifts)
-
-
 def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) -> Landmarks:
     from evermap.io import read_prior_map
     from evermap.types import Landmarks
@@ -559,27 +537,9 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) ->
     )
 
 
-class MapOptions(NamedTuple):
-    """Options of a living map.
-
-    Attributes:
-        map_file: the map.
-        priors: lifetimes, `[CLASS=]PRIOR`.
-        localize: only localise; the map is not changed.
-        realtime: at the recording's pace.
-        survey: landmarks that a new map begins with.
-        later: of several sessions this is not the first: it needs the survey only if none before it began the map.
-    """
-
-    map_file: str | Path
-    priors: Sequence[str]
-    localize: bool
-    realtime: bool
-    survey: Landmarks | None = None
-    later: bool = False
-
-
-def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out: Path, **how: Unpack[_How]) -> None:
+def _run_in_map(
+    recording: AnyRecording, survey: Landmarks | None, out: Path, asked: _Asked, map_file: str, *, later: bool
+) -> None:
     """Run, write the folder, then commit the map, so that every session in the map has its folder."""
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.existence.models import priors_of
@@ -588,13 +548,13 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
     from evermap.runs.sessions import at_time, begin_map, enter_session
     from evermap.types import SpatialRecording
 
-    map_file, priors, localize, realtime, *_ = options
+    config, localize = asked.config, asked.localize
     in_space = isinstance(recording, SpatialRecording)
-    if realtime and (in_space or not localize):
+    if asked.realtime and (in_space or not localize):
         raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
-    common, by_class = priors_by_class(priors)
+    common, by_class = priors_by_class(asked.priors)
     said = priors_of(common, by_class)
-    later = [name for name in said if name not in (by_class or {})]  # a file tells of classes of other sites, too
+    others = [name for name in said if name not in (by_class or {})]  # a file tells of classes of other sites, too
     unknown = config.slam.unknown_ids
     warm_up(lambda: compile_kernels(unknown_ids=unknown, sessions=not localize, localize=localize, in_space=in_space))
     with held():  # a map without its tables is none
@@ -603,25 +563,25 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
     with opened as store:
         start = time.perf_counter()
         entered: Entered | None = None
-        if options.survey is not None and not (options.later and len(store.load().places)):
-            begin_map(store, options.survey, recording, command_line())
+        if survey is not None and not (later and len(store.load().places)):
+            begin_map(store, survey, recording, command_line())
         with progress_bar(recording.name) as progress:
             if localize:
                 stamps = recording.frames.stamp_s
                 living = at_time(store, float(stamps[0]) if len(stamps) else 0.0)
-                result = run_localization(recording, living, config, realtime=realtime, progress=progress)
+                result = run_localization(recording, living, config, realtime=asked.realtime, progress=progress)
             else:
-                entered = enter_session(store, recording, config, priors=said, later=later, progress=progress)
+                entered = enter_session(store, recording, config, priors=said, later=others, progress=progress)
                 result, recording = replace(entered.session.slam, changes=entered.changes), entered.session.recording
         elapsed_s = time.perf_counter() - start
-        _write(out, recording, result, config, _info(config, elapsed_s, realtime=realtime, entered=entered), **how)
+        _write(out, recording, result, asked, elapsed_s, entered)
         if result.interrupted:
             raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}; the map is unchanged")
         if entered is not None:
             _commit(entered, store, map_file, config, elapsed_s)
 
 
-def _commit(entered: Entered, store: MapStore, map_file: str | Path, config: Config, elapsed_s: float) -> None:
+def _commit(entered: Entered, store: MapStore, map_file: str, config: Config, elapsed_s: float) -> None:
     """Make a session the newest revision of a map."""
     if not entered.session.found:
         problem, hint = entered.session.set_aside

@@ -167,9 +167,15 @@ def fit(
     if out is not None:
         _keep(out, groups, found)
     if figure is not None:
-        _draw(figure, groups, found)
-    for remark in [*table.warnings, *_remarks(table, groups)]:
+        from evermap.viz.lifetime_figures import plot_survival
+
+        curves = {group.label: one.fitted for group, one in zip(groups, found, strict=True)}
+        write_picture(figure, plot_survival(curves))
+    for remark in table.warnings:
         warn(remark)
+    for group in groups:
+        if (table.data.right_s[group.rows] == math.inf).all():
+            warn(f"{group.label}: no end was observed, so the estimate never ends")
     if as_json:
         parts = [_content(table, group, one) for group, one in zip(groups, found, strict=True)]
         head = {"source": str(input), "by": list(words), "config": {"survival": chosen.to_dict()}}
@@ -241,20 +247,6 @@ def _keep(out: Path, groups: Sequence[LifetimeGroup], estimates: Sequence[Lifeti
     save_models(ModelOfEach(models, names, np.zeros(0, dtype=np.int64)), per, out)
 
 
-def _draw(path: Path, groups: Sequence[LifetimeGroup], estimates: Sequence[LifetimeEstimate]) -> None:
-    from evermap.viz.lifetime_figures import plot_survival
-
-    write_picture(path, plot_survival({g.label: found.fitted for g, found in zip(groups, estimates, strict=True)}))
-
-
-def _remarks(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> list[str]:
-    """Return remarks on the result."""
-    import numpy as np
-
-    endless = [g.label for g in groups if not np.isfinite(table.data.right_s[g.rows]).any()]
-    return [f"{label}: no end was observed, so the estimate never ends" for label in endless]
-
-
 def _counts(table: LifetimeTable, group: LifetimeGroup) -> dict[str, Any]:
     """Return the number of lifetimes of each sort."""
     import numpy as np
@@ -273,13 +265,9 @@ def _counts(table: LifetimeTable, group: LifetimeGroup) -> dict[str, Any]:
 
 def _content(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) -> dict[str, Any]:
     """Return the content of `--json`."""
-    who: dict[str, Any] = {}
-    if group.class_id is not None:
-        who["class_id"] = group.class_id
-    if group.chunk is not None:
-        who["chunk"] = list(group.chunk)
     return {
-        **who,
+        **({} if group.class_id is None else {"class_id": group.class_id}),
+        **({} if group.chunk is None else {"chunk": list(group.chunk)}),
         "estimator": found.estimator,
         **_counts(table, group),
         **found.numbers,
@@ -321,28 +309,29 @@ def _learned_lines(choice: Choice) -> list[tuple[str, str]]:
     return lines
 
 
+_GONE = {
+    "quarter_gone_s": (0.25, "a quarter is gone after"),
+    "half_gone_s": (0.5, "half are gone after"),
+    "three_quarters_gone_s": (0.75, "three quarters after"),
+}
+"""Quartiles of a lifetime: share that is gone, and the line for people."""
+
+
 def lifetime_numbers(prior: LifetimePrior) -> dict[str, float | None]:
     """Return quartiles and mean in seconds, None for what never comes; and the share that never leaves."""
     from evermap.types import json_number
 
-    quartiles = [float(prior.quantile(p)) for p in (0.25, 0.5, 0.75)]
-    values = dict(zip(("quarter_gone_s", "half_gone_s", "three_quarters_gone_s"), quartiles, strict=True))
-    values["mean_stay_s"] = prior.mean()
-    return {k: json_number(v) for k, v in values.items()} | {"p_never_leaves": prior.p_never_leaves}
+    times_s = {key: float(prior.quantile(p)) for key, (p, _) in _GONE.items()} | {"mean_stay_s": prior.mean()}
+    return {key: json_number(value) for key, value in times_s.items()} | {"p_never_leaves": prior.p_never_leaves}
 
 
 def lifetime_lines(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the same in words."""
     from evermap.survival.durations import duration_text
 
-    names = {
-        "quarter_gone_s": "a quarter is gone after",
-        "half_gone_s": "half are gone after",
-        "three_quarters_gone_s": "three quarters after",
-    }
-    lines = [(title, duration_text(math.inf if numbers[key] is None else numbers[key])) for key, title in names.items()]
-    if numbers["mean_stay_s"] is not None:
-        lines.append(("mean stay", duration_text(numbers["mean_stay_s"])))
+    times_s = [(title, math.inf if numbers[key] is None else numbers[key]) for key, (_, title) in _GONE.items()]
+    times_s += [] if numbers["mean_stay_s"] is None else [("mean stay", numbers["mean_stay_s"])]
+    lines = [(title, duration_text(time_s)) for title, time_s in times_s]
     if numbers["p_never_leaves"]:
         lines.append(("never leave", f"{100.0 * numbers['p_never_leaves']:.3g} %"))
     return lines

@@ -107,23 +107,12 @@ def _drive(start_s: float) -> Recording:
     seen = (place < len(PLACES) - 1) | (frame % 2 == 0)
     frame, place = frame[seen], place[seen]
     away = PLACES[place] - np.column_stack([0.1 * frame, np.zeros(len(frame))])
-    unsaid = np.full(len(frame), np.nan)
-    return Recording(
-        "warm-up",
-        Odometry(stamp_s, np.ones(FRAMES), np.zeros(FRAMES), np.zeros(FRAMES)),
-        Frames(stamp_s),
-        Detections(
-            frame,
-            place,
-            np.hypot(*away.T),
-            np.arctan2(away[:, 1], away[:, 0]),
-            np.full(len(frame), UNKNOWN),
-            unsaid,
-            unsaid,
-            np.zeros(len(frame), dtype=np.int64),
-        ),
-        Sensor(range_max_m=8.0, sigma_range_m=0.05, sigma_bearing_rad=0.02),
-    )
+    unsaid, none = np.full(len(frame), np.nan), np.full(len(frame), UNKNOWN)
+    distance, bearing = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
+    detections = Detections(frame, place, distance, bearing, none, unsaid, unsaid, np.zeros(len(frame), dtype=np.int64))
+    odometry = Odometry(stamp_s, np.ones(FRAMES), np.zeros(FRAMES), np.zeros(FRAMES))
+    sensor = Sensor(range_max_m=8.0, sigma_range_m=0.05, sigma_bearing_rad=0.02)
+    return Recording("warm-up", odometry, Frames(stamp_s), detections, sensor)
 
 
 def _flight(start_s: float, n_places: int = len(PLACES)) -> SpatialRecording:

@@ -367,8 +367,7 @@ class LivingMap(Shown):
         Raises:
             InputError: there is nothing to draw.
         """
-        figure: Figure = draw("plot_map", self, title=title)
-        return figure
+        return draw("plot_map", self, title=title)
 
     @property
     def landmark_names(self) -> dict[int, str]:

@@ -13,9 +13,8 @@ from evermap.maps.diff import edits
 from evermap.maps.living import EXISTS, LivingMap, Stays
 from evermap.maps.store.protocol import MapStore, Revision, RevisionKind
 from evermap.show import Shown
-from evermap.stamps import stamp_text
 from evermap.survival.durations import duration_text
-from evermap.types import Clock, MapChange
+from evermap.types import Clock, MapChange, stamp_text
 
 
 @dataclass(frozen=True, slots=True)

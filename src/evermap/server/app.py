@@ -67,6 +67,7 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-cache",
 }  # fmt: skip
+_STATUS: dict[type[Exception], int] = {NoSuchSiteError: 404, StaleRevisionError: 409, DamagedMapError: 500}
 _PAGE = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
 _OPEN = {"/healthz", "/openapi.json", *(f"/{name}" for name in _PAGE)}
 """Paths that need no token."""
@@ -221,13 +222,9 @@ def _holder(request: Request) -> tuple[str, Role] | None:
 async def _mistake(request: Request, error: Exception) -> Response:
     """Return one line, without paths of this machine."""
     assert isinstance(error, EvermapError)
-    status = 404 if isinstance(error, NoSuchSiteError) or request.method == "GET" else 422
-    if isinstance(error, StaleRevisionError):
-        status = 409
-    if isinstance(error, DamagedMapError):
-        status = 500
     if isinstance(error, StoreUnavailableError):
         return await _outage(request, error)
+    status = _STATUS.get(type(error), 404 if request.method == "GET" else 422)
     what = f"{error.field}: {error.problem}" if error.field else error.problem
     return PlainJSON({"detail": printable(what, 400)}, status)
 
@@ -292,6 +289,8 @@ Site = Annotated[str, Path(json_schema_extra={"pattern": f"^{SITE.pattern}$"})]
 OfSite = Annotated[str | None, Query(pattern=f"^{SITE.pattern}$")]
 AtRevision = Annotated[int | None, Query(ge=0, le=2**31 - 1)]
 Number = Annotated[float | None, Query(allow_inf_nan=False)]
+JobNumber = Annotated[int, Field(ge=0, le=2**31 - 1)]
+Most = Annotated[int, Query(ge=1, le=1000)]
 
 
 class Detail(BaseModel):
@@ -373,9 +372,8 @@ def list_sites(server: Answering, _: Reader) -> list[str]:
 
 @router.get("/maps")
 def list_maps(
-    server: Answering, _: Reader, site: OfSite = None, after: OfSite = None,
-    most: Annotated[int, Query(ge=1, le=1000)] = 100,
-) -> list[dict[str, Any]]:  # fmt: skip
+    server: Answering, _: Reader, site: OfSite = None, after: OfSite = None, most: Most = 100
+) -> list[dict[str, Any]]:
     """List one site, or the first `most` of those after a name, with the newest revision and the approved one."""
     names = [site] if site is not None else [name for name in server.sites.names() if name > (after or "")]
     told = []
@@ -399,21 +397,20 @@ async def upload(request: Request, response: Response, site: Site, server: Answe
 
 @router.get("/jobs")
 def list_jobs(
-    server: Answering, _: Reader, site: OfSite = None, state: JobState | None = None,
-    most: Annotated[int, Query(ge=1, le=1000)] = 100,
-) -> list[dict[str, Any]]:  # fmt: skip
+    server: Answering, _: Reader, site: OfSite = None, state: JobState | None = None, most: Most = 100
+) -> list[dict[str, Any]]:
     """List uploaded sessions, the newest first."""
     return [asdict(job) for job in server.database.jobs(site, state, most)]
 
 
 @router.get("/jobs/{number}")
-def show_job(number: Annotated[int, Field(ge=0, le=2**31 - 1)], server: Answering, _: Reader) -> dict[str, Any]:
+def show_job(number: JobNumber, server: Answering, _: Reader) -> dict[str, Any]:
     """Return the state of an uploaded session."""
     return asdict(_job(server, number))
 
 
 @router.get("/jobs/{number}/payload", **_as("application/octet-stream"))
-def show_payload(number: Annotated[int, Field(ge=0, le=2**31 - 1)], server: Answering, _: Approver) -> Response:
+def show_payload(number: JobNumber, server: Answering, _: Approver) -> Response:
     """Return the uploaded bytes of a waiting or refused session."""
     data = server.database.payload(_job(server, number).id)
     if data is None:
@@ -422,7 +419,7 @@ def show_payload(number: Annotated[int, Field(ge=0, le=2**31 - 1)], server: Answ
 
 
 @router.post("/jobs/{number}/retry")
-def retry(number: Annotated[int, Field(ge=0, le=2**31 - 1)], server: Answering, _: Approver) -> dict[str, Any]:
+def retry(number: JobNumber, server: Answering, _: Approver) -> dict[str, Any]:
     """Queue a refused session once more."""
     if not server.database.retry(_job(server, number).id):
         raise HTTPException(409, "only a refused session can be queued again")
@@ -515,9 +512,7 @@ def why(request: Request, site: Site, landmark: str, _: Reader, revision: AtRevi
 
 
 @router.get("/maps/{site}/poses")
-def poses(
-    request: Request, site: Site, _: Reader, revision: AtRevision = None, at_s: Number = None,
-) -> Response:  # fmt: skip
+def poses(request: Request, site: Site, _: Reader, revision: AtRevision = None, at_s: Number = None) -> Response:
     """Return where each robot was in its newest session up to `at_s`, and its path in it."""
     until_s = math.inf if at_s is None else at_s
     return _told(request, site, lambda store: {"robots": map_dicts.pose_dicts(store, revision, until_s)})
@@ -641,9 +636,7 @@ for _action, _said in zip(("pin", "unpin", "delete", "undelete"), WORDS, strict=
 
 
 @router.get("/audit")
-def audit(
-    server: Answering, _: Administrator, most: Annotated[int, Query(ge=1, le=1000)] = 100
-) -> list[dict[str, Any]]:
+def audit(server: Answering, _: Administrator, most: Most = 100) -> list[dict[str, Any]]:
     """List who asked for changes, the newest first."""
     return server.database.audit(most)
 
@@ -722,10 +715,7 @@ def _since(server: Server, site: str, told: int) -> list[tuple[int, str]]:
     """Revisions after one, as events; none while the database does not answer."""
     try:
         with server.sites.store(site) as store:
-            return _lines(store, told) if store.head() > told else []
+            new = store.log() if store.head() > told else ()
+            return [(item.number, json.dumps(_revision(item))) for item in new if item.number > told]
     except (InputError, *AWAY):
         return []
-
-
-def _lines(store: SqlStore, told: int) -> list[tuple[int, str]]:
-    return [(item.number, json.dumps(_revision(item))) for item in store.log() if item.number > told]

@@ -18,30 +18,7 @@ from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import (
-    Column,
-    Connection,
-    Float,
-    Index,
-    Integer,
-    LargeBinary,
-    MetaData,
-    Row,
-    Table,
-    Text,
-    UniqueConstraint,
-    and_,
-    case,
-    delete,
-    exists,
-    func,
-    insert,
-    inspect,
-    not_,
-    or_,
-    select,
-    update,
-)
+import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError, InterfaceError, OperationalError
 from sqlalchemy.schema import CreateIndex, CreateSchema
 
@@ -66,66 +43,51 @@ SHOWN = 20
 _GROWTH = 4
 """Growth of the map between retries, so that their number is logarithmic in its revisions."""
 
-metadata = MetaData()
-_server = Table("server", metadata, Column("version", Integer, nullable=False))
-_token = Table(
+metadata = sa.MetaData()
+
+
+def _given(**kinds: Any) -> list[sa.Column[Any]]:
+    """Return columns that no row may leave empty."""
+    return [sa.Column(name, kind, nullable=False) for name, kind in kinds.items()]
+
+
+def _numbered() -> sa.Column[int]:
+    return sa.Column("id", sa.Integer, primary_key=True)
+
+
+_server = sa.Table("server", metadata, *_given(version=sa.Integer))
+_token = sa.Table(
     "token",
     metadata,
-    Column("digest", LargeBinary, primary_key=True),
-    Column("name", Text, nullable=False, unique=True),
-    Column("role", Text, nullable=False),
-    Column("created_at", Text, nullable=False),
+    sa.Column("digest", sa.LargeBinary, primary_key=True),
+    sa.Column("name", sa.Text, nullable=False, unique=True),
+    *_given(role=sa.Text, created_at=sa.Text),
 )
-_job = Table(
+_job = sa.Table(
     "job",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("site", Text, nullable=False),
-    Column("digest", Text, nullable=False),
-    Column("n_bytes", Integer, nullable=False),
-    Column("robot", Text, nullable=False),
-    Column("state", Text, nullable=False, index=True),
-    Column("reason", Text, nullable=False, default=""),
-    Column("revision", Integer),
-    Column("tries", Integer, nullable=False, default=0),
-    Column("worker", Text, nullable=False, default=""),
-    Column("lease_s", Float, nullable=False, default=0.0),
-    Column("created_at", Text, nullable=False),
-    Column("changed_at", Text, nullable=False),
-    UniqueConstraint("site", "digest"),
+    _numbered(),
+    *_given(site=sa.Text, digest=sa.Text, n_bytes=sa.Integer, robot=sa.Text),
+    sa.Column("state", sa.Text, nullable=False, index=True),
+    sa.Column("reason", sa.Text, nullable=False, default=""),
+    sa.Column("revision", sa.Integer),
+    sa.Column("tries", sa.Integer, nullable=False, default=0),
+    sa.Column("worker", sa.Text, nullable=False, default=""),
+    sa.Column("lease_s", sa.Float, nullable=False, default=0.0),
+    *_given(created_at=sa.Text, changed_at=sa.Text),
+    sa.UniqueConstraint("site", "digest"),
 )
 _open_job = _job.c.state.in_(["queued", "working", "aside"])
-_open_jobs = Index("ix_job_open", _job.c.id, postgresql_where=_open_job, sqlite_where=_open_job)
+_open_jobs = sa.Index("ix_job_open", _job.c.id, postgresql_where=_open_job, sqlite_where=_open_job)
 """Those that may be leased: of a million sessions that are entered, no lease looks at one."""
-_payload = Table(
-    "payload", metadata, Column("job", Integer, primary_key=True), Column("data", LargeBinary, nullable=False)
+_payload = sa.Table("payload", metadata, sa.Column("job", sa.Integer, primary_key=True), *_given(data=sa.LargeBinary))
+_approval = sa.Table(
+    "approval", metadata, _numbered(), *_given(site=sa.Text, revision=sa.Integer, who=sa.Text, at=sa.Text)
 )
-_approval = Table(
-    "approval",
-    metadata,
-    Column("id", Integer, primary_key=True),
-    Column("site", Text, nullable=False),
-    Column("revision", Integer, nullable=False),
-    Column("who", Text, nullable=False),
-    Column("at", Text, nullable=False),
+_robot = sa.Table(
+    "robot", metadata, sa.Column("name", sa.Text, primary_key=True), *_given(maps=sa.Text, told=sa.Integer, at=sa.Text)
 )
-_robot = Table(
-    "robot",
-    metadata,
-    Column("name", Text, primary_key=True),
-    Column("maps", Text, nullable=False),
-    Column("told", Integer, nullable=False),
-    Column("at", Text, nullable=False),
-)
-_audit = Table(
-    "audit",
-    metadata,
-    Column("id", Integer, primary_key=True),
-    Column("at", Text, nullable=False),
-    Column("who", Text, nullable=False),
-    Column("what", Text, nullable=False),
-    Column("status", Integer, nullable=False),
-)
+_audit = sa.Table("audit", metadata, _numbered(), *_given(at=sa.Text, who=sa.Text, what=sa.Text, status=sa.Integer))
 
 
 class Role(IntEnum):
@@ -208,12 +170,12 @@ class Database:
         with self._engine.execution_options(writes=True).begin() as connection:
             if on_server:
                 connection.execute(CreateSchema(SCHEMA, if_not_exists=True))
-            begun = inspect(connection).has_table("server")
+            begun = sa.inspect(connection).has_table("server")
             metadata.create_all(connection)  # an older evermap does without the tables that it does not know
             connection.execute(CreateIndex(_open_jobs, if_not_exists=True))
             if not begun:
-                connection.execute(insert(_server).values(version=VERSION))
-            version = connection.execute(select(_server.c.version)).scalar()
+                connection.execute(sa.insert(_server).values(version=VERSION))
+            version = connection.execute(sa.select(_server.c.version)).scalar()
         if version != VERSION:
             problem = f"the server's tables are of version {version}, this evermap has {VERSION}"
             raise InputError(problem, hint="the evermap version that wrote them, or an empty store")
@@ -231,7 +193,7 @@ class Database:
         row = {"digest": _digest(text), "name": name, "role": role.name.lower(), "created_at": now_utc()}
         try:
             with self._writer.begin() as connection:
-                connection.execute(insert(_token).values(row))
+                connection.execute(sa.insert(_token).values(row))
         except IntegrityError:
             hint = "another name, or revoke that one first"
             raise ConfigError(f"a token named '{name}' exists", field="name", hint=hint) from None
@@ -240,11 +202,14 @@ class Database:
     def revoke_token(self, name: str) -> bool:
         """Delete a token; returns whether there was one."""
         with self._writer.begin() as connection:
-            return connection.execute(delete(_token).where(_token.c.name == name)).rowcount > 0
+            return connection.execute(sa.delete(_token).where(_token.c.name == name)).rowcount > 0
 
     def tokens(self) -> list[dict[str, Any]]:
         """Return names and roles of all tokens."""
-        question = select(_token.c.name, _token.c.role, _token.c.created_at).order_by(_token.c.name)
+        question = sa.select(_token.c.name, _token.c.role, _token.c.created_at).order_by(_token.c.name)
+        return self._read(question)
+
+    def _read(self, question: Any) -> list[dict[str, Any]]:
         with self._engine.begin() as connection:
             return [dict(row) for row in connection.execute(question).mappings()]
 
@@ -252,7 +217,7 @@ class Database:
         """Return the name and role of a token; None for an unknown one."""
         with self._engine.begin() as connection:
             row = connection.execute(
-                select(_token.c.name, _token.c.role).where(_token.c.digest == _digest(text))
+                sa.select(_token.c.name, _token.c.role).where(_token.c.digest == _digest(text))
             ).one_or_none()
         return None if row is None else (row.name, Role[row.role.upper()])
 
@@ -265,9 +230,9 @@ class Database:
                 known = self._known(connection, site, digest)
                 if known is not None:
                     return known, False
-                row = insert(_job).values(**told, created_at=now, changed_at=now).returning(*_SHOWN)
-                job = _job_of(connection.execute(row).one())
-                connection.execute(insert(_payload).values(job=job.id, data=data))
+                row = sa.insert(_job).values(**told, created_at=now, changed_at=now).returning(*_SHOWN)
+                job = _job_of(connection.execute(row).mappings().one())
+                connection.execute(sa.insert(_payload).values(job=job.id, data=data))
                 announce(connection, PREFIX + site)
                 return job, True
         except IntegrityError:  # sent twice at the same time
@@ -276,108 +241,101 @@ class Database:
             assert known is not None
             return known, False
 
-    def _known(self, connection: Connection, site: str, digest: str) -> Job | None:
-        row = connection.execute(select(*_SHOWN).where(_job.c.site == site, _job.c.digest == digest)).one_or_none()
-        return None if row is None else _job_of(row)
+    def _known(self, connection: sa.Connection, site: str, digest: str) -> Job | None:
+        known = sa.select(*_SHOWN).where(_job.c.site == site, _job.c.digest == digest)
+        return next(map(_job_of, connection.execute(known).mappings()), None)
 
     def claim(self, worker: str, lease_s: float) -> tuple[Job, bytes] | None:
         """Lease the oldest waiting session of a site without a worker; None if there is none."""
         now, other = time.time(), _job.alias()
-        busy = exists().where(
+        busy = sa.exists().where(
             other.c.site == _job.c.site, other.c.state == JobState.WORKING.value, other.c.lease_s >= now
         )
-        lapsed = and_(_job.c.state == JobState.WORKING.value, _job.c.lease_s < now)
-        waiting = or_(_job.c.state == JobState.QUEUED.value, lapsed, _grown())
-        oldest = select(*_SHOWN).where(_open_job, waiting, not_(busy)).order_by(_job.c.id).limit(1)
+        lapsed = sa.and_(_job.c.state == JobState.WORKING.value, _job.c.lease_s < now)
+        waiting = sa.or_(_job.c.state == JobState.QUEUED.value, lapsed, _grown())
+        oldest = sa.select(*_SHOWN).where(_open_job, waiting, sa.not_(busy)).order_by(_job.c.id).limit(1)
         with self._writer.begin() as connection:
-            row = connection.execute(oldest.with_for_update(skip_locked=True, of=_job)).one_or_none()
+            row = connection.execute(oldest.with_for_update(skip_locked=True, of=_job)).mappings().one_or_none()
             if row is None:
                 return None
             values = {"state": JobState.WORKING.value, "worker": worker, "lease_s": now + lease_s}
-            values |= {"tries": row.tries + 1, "changed_at": now_utc()}
-            connection.execute(update(_job).where(_job.c.id == row.id).values(values))
-            data = connection.execute(select(_payload.c.data).where(_payload.c.job == row.id)).scalar_one()
-            announce(connection, PREFIX + row.site)
+            values |= {"tries": row["tries"] + 1, "changed_at": now_utc()}
+            connection.execute(sa.update(_job).where(_job.c.id == row["id"]).values(values))
+            data = connection.execute(sa.select(_payload.c.data).where(_payload.c.job == row["id"])).scalar_one()
+            announce(connection, PREFIX + row["site"])
         return _job_of(row), data
 
     def renew(self, job: int, worker: str, lease_s: float) -> None:
         """Keep a session for another while."""
         with self._writer.begin() as connection:
-            connection.execute(update(_job).where(_mine(job, worker)).values(lease_s=time.time() + lease_s))
+            connection.execute(sa.update(_job).where(_mine(job, worker)).values(lease_s=time.time() + lease_s))
 
     def finish(self, job: int, worker: str, state: JobState, reason: str = "", revision: int | None = None) -> None:
         """Record the result of a session, unless another worker has its lease by now."""
-        values: dict[str, Any] = {
-            "state": state.value,
-            "reason": printable(reason, 2000),
-            "revision": revision,
-            "worker": "",
-        }
+        values: dict[str, Any] = {"state": state.value, "revision": revision, "worker": ""}
+        values["reason"] = printable(reason, 2000)
         if state is JobState.QUEUED:  # given back: that was no try
             values["tries"] = _job.c.tries - 1
         if state is JobState.ASIDE:
             values["tries"] = 0
         with self._writer.begin() as connection:
-            mine = update(_job).where(_mine(job, worker)).values(**values, lease_s=0.0, changed_at=now_utc())
+            mine = sa.update(_job).where(_mine(job, worker)).values(**values, lease_s=0.0, changed_at=now_utc())
             site = connection.execute(mine.returning(_job.c.site)).scalar()
             if site is not None:
                 announce(connection, PREFIX + site)
             if site is not None and state in (JobState.ENTERED, JobState.REPEAT):  # the map keeps the recording
-                connection.execute(delete(_payload).where(_payload.c.job == job))
+                connection.execute(sa.delete(_payload).where(_payload.c.job == job))
 
     def retry(self, job: int) -> bool:
         """Queue a session once more that was refused or set aside; returns whether it was one."""
-        refused = and_(_job.c.id == job, _job.c.state.in_([JobState.REJECTED.value, JobState.ASIDE.value]))
+        refused = sa.and_(_job.c.id == job, _job.c.state.in_([JobState.REJECTED.value, JobState.ASIDE.value]))
         values = {"state": JobState.QUEUED.value, "reason": "", "tries": 0, "changed_at": now_utc()}
         with self._writer.begin() as connection:
-            site = connection.execute(update(_job).where(refused).values(values).returning(_job.c.site)).scalar()
+            site = connection.execute(sa.update(_job).where(refused).values(values).returning(_job.c.site)).scalar()
             if site is not None:
                 announce(connection, PREFIX + site)
         return site is not None
 
     def jobs(self, site: str | None = None, state: JobState | None = None, most: int = 100) -> list[Job]:
         """Return the newest sessions that were uploaded."""
-        question = select(*_SHOWN).order_by(_job.c.id.desc()).limit(most)
+        question = sa.select(*_SHOWN).order_by(_job.c.id.desc()).limit(most)
         question = question if site is None else question.where(_job.c.site == site)
         question = question if state is None else question.where(_job.c.state == state.value)
-        with self._engine.begin() as connection:
-            return [_job_of(row) for row in connection.execute(question)]
+        return [_job_of(row) for row in self._read(question)]
 
     def job(self, number: int) -> Job | None:
         """Return one session that was uploaded; None of an unknown number."""
-        with self._engine.begin() as connection:
-            row = connection.execute(select(*_SHOWN).where(_job.c.id == number)).one_or_none()
-        return None if row is None else _job_of(row)
+        return next(map(_job_of, self._read(sa.select(*_SHOWN).where(_job.c.id == number))), None)
 
     def payload(self, job: int) -> bytes | None:
         """Return the bytes of a session that is not entered; None where they are not kept."""
         with self._engine.begin() as connection:
-            return connection.execute(select(_payload.c.data).where(_payload.c.job == job)).scalar()
+            return connection.execute(sa.select(_payload.c.data).where(_payload.c.job == job)).scalar()
 
     def approve(self, site: str, revision: int, who: str) -> None:
         """Make a revision the one that robots are to use."""
         with self._writer.begin() as connection:
-            connection.execute(insert(_approval).values(site=site, revision=revision, who=who, at=now_utc()))
+            connection.execute(sa.insert(_approval).values(site=site, revision=revision, who=who, at=now_utc()))
             announce(connection, PREFIX + site)
 
     def approved(self, site: str) -> dict[str, Any] | None:
         """Return the revision approved last, its operator and time; None if there is none."""
-        question = select(_approval.c.revision, _approval.c.who, _approval.c.at).where(_approval.c.site == site)
-        with self._engine.begin() as connection:
-            row = connection.execute(question.order_by(_approval.c.id.desc()).limit(1)).mappings().one_or_none()
-        return None if row is None else dict(row)
+        question = sa.select(_approval.c.revision, _approval.c.who, _approval.c.at).where(_approval.c.site == site)
+        return next(iter(self._read(question.order_by(_approval.c.id.desc()).limit(1))), None)
 
     def hold(self, robot: str, maps: list[dict[str, str]]) -> bool:
         """Store the maps that a robot reports, in place of its earlier report; returns whether they are others."""
         values = {"maps": json.dumps(maps), "at": now_utc()}
-        news = case((_robot.c.maps == values["maps"], 0), else_=1)
+        news = sa.case((_robot.c.maps == values["maps"], 0), else_=1)
         for _ in range(2):  # again where it says so the first time, and twice at once
             try:
                 with self._writer.begin() as connection:
-                    before = connection.execute(select(_robot.c.maps).where(_robot.c.name == robot)).scalar()
-                    changed = update(_robot).where(_robot.c.name == robot).values(**values, told=_robot.c.told + news)
+                    before = connection.execute(sa.select(_robot.c.maps).where(_robot.c.name == robot)).scalar()
+                    changed = (
+                        sa.update(_robot).where(_robot.c.name == robot).values(**values, told=_robot.c.told + news)
+                    )
                     if not connection.execute(changed).rowcount:
-                        connection.execute(insert(_robot).values(name=robot, **values, told=1))
+                        connection.execute(sa.insert(_robot).values(name=robot, **values, told=1))
                     announce(connection, "")
                 return before != values["maps"]
             except IntegrityError:
@@ -386,19 +344,20 @@ class Database:
 
     def robots(self) -> list[dict[str, Any]]:
         """Return the robots that said which maps they hold, and when."""
-        question = select(_robot.c.name, _robot.c.maps, _robot.c.at).order_by(_robot.c.name)
-        with self._engine.begin() as connection:
-            rows = connection.execute(question).all()
-        return [{"robot": row.name, "maps": json.loads(row.maps), "at": row.at} for row in rows]
+        question = sa.select(_robot.c.name, _robot.c.maps, _robot.c.at).order_by(_robot.c.name)
+        told = self._read(question)
+        return [{"robot": row["name"], "maps": json.loads(row["maps"]), "at": row["at"]} for row in told]
 
     def pulse(self, site: str) -> tuple[Any, ...]:
         """Return values of which one differs once anything beside the map of a site has changed: its approval, what
         robots hold, or one of the newest sessions.
         """
-        newest = select(_job.c.id, _job.c.state, _job.c.tries).where(_job.c.site == site)
+        newest = sa.select(_job.c.id, _job.c.state, _job.c.tries).where(_job.c.site == site)
         with self._engine.begin() as connection:
-            approved = connection.execute(select(func.max(_approval.c.id)).where(_approval.c.site == site)).scalar()
-            told = connection.execute(select(func.count(), func.sum(_robot.c.told))).one()
+            approved = connection.execute(
+                sa.select(sa.func.max(_approval.c.id)).where(_approval.c.site == site)
+            ).scalar()
+            told = connection.execute(sa.select(sa.func.count(), sa.func.sum(_robot.c.told))).one()
             jobs = connection.execute(newest.order_by(_job.c.id.desc()).limit(SHOWN)).all()
         return approved, *told, *map(tuple, jobs)
 
@@ -406,30 +365,28 @@ class Database:
         """Note who requested a change, and its result."""
         with self._writer.begin() as connection:
             row = {"at": now_utc(), "who": who, "what": printable(what, 500), "status": status}
-            connection.execute(insert(_audit).values(row))
+            connection.execute(sa.insert(_audit).values(row))
 
     def audit(self, most: int = 100) -> list[dict[str, Any]]:
         """Return the newest notes."""
-        question = select(_audit.c.at, _audit.c.who, _audit.c.what, _audit.c.status)
-        with self._engine.begin() as connection:
-            rows = connection.execute(question.order_by(_audit.c.id.desc()).limit(most)).mappings()
-            return [dict(row) for row in rows]
+        question = sa.select(_audit.c.at, _audit.c.who, _audit.c.what, _audit.c.status)
+        return self._read(question.order_by(_audit.c.id.desc()).limit(most))
 
     def depth(self) -> int:
         """Return how many sessions wait or are worked on; proves that the database answers."""
-        waiting = or_(_job.c.state.in_([JobState.QUEUED.value, JobState.WORKING.value]), _grown())
+        waiting = sa.or_(_job.c.state.in_([JobState.QUEUED.value, JobState.WORKING.value]), _grown())
         with self._engine.begin() as connection:
-            return connection.execute(select(func.count()).select_from(_job).where(waiting)).scalar_one()
+            return connection.execute(sa.select(sa.func.count()).select_from(_job).where(waiting)).scalar_one()
 
     def queue(self) -> tuple[dict[str, int], float, int]:
         """Return sessions by state, the longest waiting time [s], and the number in work."""
-        counts = select(_job.c.state, func.count()).group_by(_job.c.state)
-        oldest = select(func.min(_job.c.changed_at)).where(_job.c.state == JobState.QUEUED.value)
-        leased = and_(_job.c.state == JobState.WORKING.value, _job.c.lease_s >= time.time())
+        counts = sa.select(_job.c.state, sa.func.count()).group_by(_job.c.state)
+        oldest = sa.select(sa.func.min(_job.c.changed_at)).where(_job.c.state == JobState.QUEUED.value)
+        leased = sa.and_(_job.c.state == JobState.WORKING.value, _job.c.lease_s >= time.time())
         with self._engine.begin() as connection:
             by_state = {str(state): int(count) for state, count in connection.execute(counts)}
             since = connection.execute(oldest).scalar()
-            working = connection.execute(select(func.count()).select_from(_job).where(leased)).scalar_one()
+            working = connection.execute(sa.select(sa.func.count()).select_from(_job).where(leased)).scalar_one()
         waits_s = 0.0 if since is None else (datetime.now(UTC) - datetime.fromisoformat(since)).total_seconds()
         return by_state, waits_s, working
 
@@ -438,7 +395,7 @@ class Database:
         if self._engine.dialect.name != "postgresql":
             return None
         with self._engine.begin() as connection:
-            return int(connection.execute(select(func.pg_database_size(func.current_database()))).scalar_one())
+            return int(connection.execute(sa.select(sa.func.pg_database_size(sa.func.current_database()))).scalar_one())
 
     def close(self) -> None:
         """Let go of all connections."""
@@ -455,7 +412,7 @@ def approved_of(where: str | Path) -> int | None:
         url, site = split_address(str(where))
         home = url.render_as_string(hide_password=False)
         with postgres_engine(home, "public").connect() as connection:
-            served = inspect(connection).has_schema(SCHEMA)
+            served = sa.inspect(connection).has_schema(SCHEMA)
     else:
         home, site = str(Path(where).parent), Path(where).stem
         served = Path(home, "server.db").is_file()
@@ -470,22 +427,21 @@ def approved_of(where: str | Path) -> int | None:
 
 
 def _mine(job: int, worker: str) -> Any:
-    return and_(_job.c.id == job, _job.c.worker == worker, _job.c.state == JobState.WORKING.value)
+    return sa.and_(_job.c.id == job, _job.c.worker == worker, _job.c.state == JobState.WORKING.value)
 
 
 def _grown() -> Any:
     """Sessions set aside whose map has a quarter more revisions than when they were tried last."""
     other = _job.alias()
-    newest = select(func.max(other.c.revision)).where(
+    newest = sa.select(sa.func.max(other.c.revision)).where(
         other.c.site == _job.c.site, other.c.state == JobState.ENTERED.value
     )
     due = newest.correlate(_job).scalar_subquery() > _job.c.revision + _job.c.revision // _GROWTH
-    return and_(_job.c.state == JobState.ASIDE.value, due)
+    return sa.and_(_job.c.state == JobState.ASIDE.value, due)
 
 
-def _job_of(row: Row[Any]) -> Job:
-    values = dict(row._mapping)
-    return Job(**{**values, "state": JobState(values["state"])})
+def _job_of(row: Any) -> Job:
+    return Job(**{**row, "state": JobState(row["state"])})
 
 
 def _digest(token: str) -> bytes:

@@ -155,8 +155,7 @@ class Lifetime(Shown, ABC):
 
     def plot(self, **options: Any) -> Figure:
         """Draw hazard, survival and density, with the options of `viz.lifetime_figures.plot_lifetimes`."""
-        figure: Figure = draw("plot_lifetime", self, **options)
-        return figure
+        return draw("plot_lifetimes", self, **options)
 
     def _time_of_log_hazard(self, log_target: FloatArray) -> FloatArray:
         """Return the smallest `t` with `log H(t) >= log_target`; by bisection in log t unless overridden."""
@@ -191,8 +190,7 @@ class SurvivalEstimate(Shown):
 
     def plot(self, **options: Any) -> Figure:
         """Draw the survival function and its band, with the options of `viz.lifetime_figures.plot_survival`."""
-        figure: Figure = draw("plot_estimate", self, **options)
-        return figure
+        return draw("plot_survival", {type(self).__name__: self}, **options)
 
 
 def _plain(values: FloatArray) -> FloatArray:

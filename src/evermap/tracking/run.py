@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.config import TrackConfig
-from evermap.config.tables import DEFAULT_PRIOR
+from evermap.config import DEFAULT_PRIOR, TrackConfig
 from evermap.errors import ConfigError, DataError
 from evermap.existence.models import priors_of
 from evermap.io.text import counted, quote
@@ -76,8 +75,7 @@ class TrackResult(Shown):
 
     def plot(self) -> Figure:
         """Draw paths and places of rest from above, and when objects rested."""
-        figure: Figure = draw("plot_track_run", self)
-        return figure
+        return draw("plot_track_run", self)
 
     def _facts(self) -> dict[str, Any]:
         return {

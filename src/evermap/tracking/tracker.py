@@ -220,8 +220,7 @@ class Tracker(Shown):
     def plot(self) -> Figure:
         """Draw the tracks, and objects at rest out of view, from above."""
         resting = self.working_set.stored.position[self.working_set.rows]
-        figure: Figure = draw("plot_followed", self.followed(), resting)
-        return figure
+        return draw("plot_followed", self.followed(), resting)
 
     def _facts(self) -> dict[str, Any]:
         states = self._tracklets.state[: self._n]

@@ -14,14 +14,7 @@ from evermap.survival.hazard_regression import HazardDraws
 from evermap.survival.nonparametric import KaplanMeier, Npmle
 from evermap.survival.parametric_fit import ParametricFit
 from evermap.types import FloatArray
-from evermap.viz.style import (
-    CLASS_COLOURS,
-    INK,
-    MUTED,
-    class_looks,
-    drawing,
-    legend_name,
-)
+from evermap.viz.style import CLASS_COLOURS, INK, MUTED, class_looks, drawing, legend_name
 from evermap.viz.time_axis import TimeUnit, label_ages, unit_for
 
 if TYPE_CHECKING:
@@ -129,9 +122,7 @@ def _limit(axes: Axes, logarithmic: bool) -> None:
 
 def _legend(name: str, prior: LifetimePrior) -> str:
     stay = prior.p_never_leaves
-    if stay == 0.0:
-        return name
-    return f"{name} ({100.0 * stay:.3g} % never leave)"
+    return f"{name} ({100.0 * stay:.3g} % never leave)" if stay else name
 
 
 def _times(priors: Iterable[LifetimePrior], until_s: float | None, log_time: bool | None) -> tuple[FloatArray, bool]:
@@ -205,11 +196,11 @@ def plot_survival(
         axes = figure.subplots()
         for name, one in estimates.items():
             _draw_estimate(axes, one, legend_name(name), time_s, unit, styles[name])
-        _name_boxes_once(axes)
+        for again in [box for box in axes.collections if box.get_label() == _BOX][1:]:
+            again.set_label("")
         if truth is not None:
-            axes.plot(
-                time_s / unit.seconds, np.exp(truth.log_survival(time_s)), color=INK, lw=1.0, ls="--", label="truth"
-            )
+            true = np.exp(truth.log_survival(time_s))
+            axes.plot(time_s / unit.seconds, true, color=INK, lw=1.0, ls="--", label="truth")
         axes.set(ylim=(0.0, 1.03), ylabel="P(T > t) [1]")
         label_ages(axes, time_s, unit, logarithmic=logarithmic)
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
@@ -246,12 +237,6 @@ def _curve(one: Estimate, time_s: FloatArray) -> tuple[FloatArray, tuple[FloatAr
             return mean, (lower, upper)
         case _:
             return np.exp(one.log_survival(time_s)), None  # type: ignore[union-attr]
-
-
-def _name_boxes_once(axes: Axes) -> None:
-    boxes = [drawn for drawn in axes.collections if drawn.get_label() == _BOX]
-    for drawn in boxes[1:]:
-        drawn.set_label("")
 
 
 def _corners(one: Npmle, time_s: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.errors import InputError, printable
-from evermap.types import BoolArray, Clock, FloatArray, IntArray, Landmarks, rows_of
+from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, rows_of
 from evermap.viz.map_figure import GONE, LABELS_UP_TO, class_names_of, draw_ellipses, draw_gone, magnification
 from evermap.viz.panels import (
     View,
@@ -64,7 +64,6 @@ class MapView:
         other_of: (K,) row of the landmark of each.
         seen_from_m: (V, 2) middles of the floor's cells from which the robot looked.
         cell_m: side of a cell.
-        walls_m: lines of (N, 2) points, where walls are known.
     """
 
     landmarks: Landmarks
@@ -73,7 +72,6 @@ class MapView:
     other_of: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     seen_from_m: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     cell_m: float = 0.5
-    walls_m: tuple[FloatArray, ...] = ()
 
 
 def plot_living_map(view: MapView, *, title: str) -> Figure:
@@ -87,9 +85,9 @@ def plot_living_map(view: MapView, *, title: str) -> Figure:
         raise InputError("nothing to draw: the map has no landmark")
     places = np.concatenate([landmarks.position_m, *([view.other_m] if len(view.other_m) else [])])
     low, high = places.min(axis=0), places.max(axis=0)
-    for part in (view.seen_from_m, *view.walls_m):
-        if len(part):
-            low[:2], high[:2] = np.minimum(low[:2], part.min(axis=0)), np.maximum(high[:2], part.max(axis=0))
+    if len(view.seen_from_m):
+        low[:2] = np.minimum(low[:2], view.seen_from_m.min(axis=0))
+        high[:2] = np.maximum(high[:2], view.seen_from_m.max(axis=0))
     if mostly_boxes(landmarks):
         low, high = low[:2], high[:2]
     size = np.maximum(high - low, 1.0)
@@ -114,22 +112,15 @@ def _draw_panel(axes: Axes, columns: View, view: MapView, reach_m: float) -> lis
 
 
 def _draw_floor(axes: Axes, columns: View, view: MapView) -> list[Any]:
-    """Walls and from where the robot looked, as seen from above, and other known places; returns what to put into a
-    legend.
-    """
+    """From where the robot looked, as seen from above, and other known places; returns what to put into a legend."""
     from matplotlib.collections import PolyCollection
 
     handles: list[Any] = []
-    above = columns == [0, 1]
-    if above and len(view.seen_from_m):
+    if columns == [0, 1] and len(view.seen_from_m):
         corners = 0.5 * view.cell_m * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         squares = view.seen_from_m[:, None, :] + corners
         axes.add_collection(PolyCollection(list(squares), facecolors=SHADE, edgecolors=SHADE, lw=0.4, zorder=0.5))
         handles.append(_mark("s", "sensor positions", color=SHADE, ms=7, mec="none"))
-    for wall in view.walls_m if above else ():
-        axes.plot(*wall.T, color=INK, lw=1.6, solid_capstyle="round", zorder=1)
-    if view.walls_m:
-        handles.append(_mark("", "wall", color=INK, ls="-", lw=1.6))
     if len(view.other_m):
         for place, now in zip(view.other_m, view.landmarks.position_m[view.other_of], strict=True):
             axes.plot(*np.stack([place, now])[:, columns].T, color=MUTED, lw=0.5, alpha=0.5, zorder=1.5)
@@ -178,7 +169,7 @@ def _mark(marker: str, label: str, **style: Any) -> Artist:
     from matplotlib.lines import Line2D
 
     looks: dict[str, Any] = {"ls": "", "ms": 6.0, **style}
-    return Line2D([], [], marker=marker or None, label=label, **looks)
+    return Line2D([], [], marker=marker, label=label, **looks)
 
 
 _FAINT = "faint: P(exists) from 50 % upwards"
@@ -198,89 +189,67 @@ def _legend(figure: Figure, handles: Sequence[Any]) -> None:
     )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class LandmarkHistory:
-    """History of one landmark in a map.
-
-    Attributes:
-        stamp_s: (N,) of the looks, never decreasing.
-        p_exists: (N,) after each.
-        n_hits: (N,) detections.
-        n_misses: (N,) expected detections that did not come.
-        log_odds: (N,) what each said for 'it stands there' [nats].
-        session: (N,) number of the session of each look.
-        stays: name of the site, last look before, first and last sighting, first look after, as in `maps.Stays`.
-        now_s: end of the axis.
-        clock: of the stamps.
-    """
-
-    stamp_s: FloatArray
-    p_exists: FloatArray
-    n_hits: IntArray
-    n_misses: IntArray
-    log_odds: FloatArray
-    session: IntArray
-    stays: Sequence[tuple[str, float, float, float, float]]
-    now_s: float
-    clock: Clock = Clock.RECORDING
-
-    def sessions(self) -> list[Any]:
-        """Return the rows of each session, in order."""
-        return [np.flatnonzero(self.session == number) for number in dict.fromkeys(self.session.tolist())]
+_Stay = tuple[str, float, float, float, float]
+"""Name of the site, last look before, first and last sighting, first look after."""
 
 
-def plot_why(history: LandmarkHistory, *, title: str) -> Figure:
-    """Draw three rows over one axis of time: belief, evidence of every session, stays.
+def plot_why(answer: Any) -> Figure:
+    """Draw the `Answer` of `evermap.why` in three rows over one axis of time: belief, evidence of every session, stays.
 
     Raises:
         InputError: nothing was looked at and it never stood anywhere.
     """
-    edges = [value for stay in history.stays for value in (*stay[1:], history.now_s) if np.isfinite(value)]
-    known = np.concatenate([history.stamp_s, edges])
+    looks, now_s = answer.evidence, answer.stamp_s
+    ends = np.cumsum([visit.n_looks for visit in answer.visits], dtype=np.int64)[:-1]
+    sessions = [rows for rows in np.split(np.arange(len(looks.stamp_s)), ends) if len(rows)]
+    site_id, columns = answer.stays.site_id.tolist(), ("elsewhere_s", "first_s", "last_s", "gone_s")
+    names = {site: f"site {k + 1}" for k, site in enumerate(dict.fromkeys(site_id))}
+    stamps = zip(*(getattr(answer.stays, column).tolist() for column in columns), strict=True)
+    stays: list[_Stay] = [(names[site], *four) for site, four in zip(site_id, stamps, strict=True)]
+    edges = [value for stay in stays for value in (*stay[1:], now_s) if np.isfinite(value)]
+    known = np.concatenate([looks.stamp_s, edges])
     if not len(known):
         raise InputError("nothing to draw: no session looked at it")
     first, last = float(known.min()), float(known.max())
     margin = 0.02 * max(last - first, 1.0)
-    axis = TimeAxis.over(first, last + margin, history.clock)
-    sites = list(dict.fromkeys(name for name, *_ in history.stays))
-    with drawing(7.2, 3.9 + 0.22 * len(sites)) as figure:
-        rows = figure.subplots(3, 1, sharex=True, height_ratios=[2.0, 1.6, 0.5 + 0.35 * max(len(sites), 1)])
-        _draw_belief(rows[0], axis, history)
-        _draw_evidence(rows[1], axis, history)
-        _draw_stays(rows[2], axis, history.stays, sites, last)
-        rows[0].set_title(printable(title))
+    axis = TimeAxis.over(first, last + margin, answer.clock)
+    with drawing(7.2, 3.9 + 0.22 * len(names)) as figure:
+        rows = figure.subplots(3, 1, sharex=True, height_ratios=[2.0, 1.6, 0.5 + 0.35 * max(len(names), 1)])
+        _draw_belief(rows[0], axis, looks, sessions, now_s)
+        _draw_evidence(rows[1], axis, looks, sessions)
+        _draw_stays(rows[2], axis, stays, list(names.values()), last)
+        rows[0].set_title(printable(answer.headline))
         rows[2].set_xlim(axis.coordinates(first - margin), axis.coordinates(last + margin))
         axis.label(rows[2])
         figure.legend(*legend_of(*rows), loc="outside lower center", ncols=3)
     return figure
 
 
-def _draw_belief(axes: Axes, axis: TimeAxis, history: LandmarkHistory) -> None:
+def _draw_belief(axes: Axes, axis: TimeAxis, looks: Any, sessions: Sequence[IntArray], now_s: float) -> None:
     """A line within every session, a thin one between sessions, where there was no look; log odds as probabilities."""
-    at, belief = axis.coordinates(history.stamp_s), np.clip(history.p_exists, _P_CLIP, 1.0 - _P_CLIP)
+    at, belief = axis.coordinates(looks.stamp_s), np.clip(looks.p_exists, _P_CLIP, 1.0 - _P_CLIP)
     axes.set_yscale("logit")
     edge = f", cut at {100 * _P_CLIP:g} % and {100 - 100 * _P_CLIP:g} %"
-    label = "P(exists)" + (edge if np.any(belief != history.p_exists) else "")
-    for k, rows in enumerate(history.sessions()):
+    label = "P(exists)" + (edge if np.any(belief != looks.p_exists) else "")
+    for k, rows in enumerate(sessions):
         axes.plot(at[rows], belief[rows], color=ESTIMATE, lw=1.8, zorder=4, label="" if k else label)
     if len(at):
         axes.plot(at, belief, color=ESTIMATE, lw=0.7, alpha=0.6, zorder=3, label="between sessions")
         axes.plot(at[-1:], belief[-1:], "o", color=ESTIMATE, ms=4.0, zorder=5)
     axes.axhline(0.5, color=MUTED, lw=0.8, ls=(0, (3, 2)), zorder=2)
-    if np.isfinite(history.now_s):
-        axes.axvline(axis.coordinates(history.now_s), color=INK, lw=0.9, ls=(0, (4, 2)), zorder=2, label="now")
+    if np.isfinite(now_s):
+        axes.axvline(axis.coordinates(now_s), color=INK, lw=0.9, ls=(0, (4, 2)), zorder=2, label="now")
     axes.minorticks_off()
     ticks = (0.01, 0.1, 0.5, 0.9, 0.99)
     axes.set_yticks(ticks, [f"{100 * p:g} %" for p in ticks])
     axes.set(ylim=(0.6 * _P_CLIP, 1.0 - 0.6 * _P_CLIP), ylabel="P(exists)")
 
 
-def _draw_evidence(axes: Axes, axis: TimeAxis, history: LandmarkHistory) -> None:
+def _draw_evidence(axes: Axes, axis: TimeAxis, looks: Any, sessions: Sequence[IntArray]) -> None:
     """Draw the evidence of every session, upwards for and downwards against, with its hits and misses."""
-    groups = history.sessions()
-    said = np.array([float(history.log_odds[rows].sum()) for rows in groups])
+    said = np.array([float(looks.log_odds[rows].sum()) for rows in sessions])
     drawn = np.clip(said, -_NATS_CLIP, _NATS_CLIP)
-    at = axis.coordinates([history.stamp_s[rows].mean() for rows in groups])
+    at = axis.coordinates([looks.stamp_s[rows].mean() for rows in sessions])
     for side, colour, label in ((said >= 0.0, LANDMARK, "for it"), (said < 0.0, ALERT, "against it")):
         axes.vlines(at[side], 0.0, drawn[side], color=colour, lw=3.0, zorder=3)
         axes.plot([], [], "-", color=colour, lw=3.0, label=f"evidence of a session {label}")
@@ -289,8 +258,8 @@ def _draw_evidence(axes: Axes, axis: TimeAxis, history: LandmarkHistory) -> None
         axes.plot(at[beyond & side], drawn[beyond & side], marker, color=colour, ms=6.0, zorder=4)
     if beyond.any():
         axes.plot([], [], "^", color=MUTED, ms=6.0, label=f"more than {_NATS_CLIP:g} nats")
-    if len(groups) <= _MAX_WORDS:
-        hits, misses = ([int(column[rows].sum()) for rows in groups] for column in (history.n_hits, history.n_misses))
+    if len(sessions) <= _MAX_WORDS:
+        hits, misses = ([int(column[rows].sum()) for rows in sessions] for column in (looks.n_hits, looks.n_misses))
         words = [f"{hit} hits, {miss} misses" for hit, miss in zip(hits, misses, strict=True)]
         label_points(axes, list(zip(at, drawn, strict=True)), words)
     axes.axhline(0.0, color=MUTED, lw=0.7, zorder=2)
@@ -299,13 +268,7 @@ def _draw_evidence(axes: Axes, axis: TimeAxis, history: LandmarkHistory) -> None
     axes.set_ylabel("evidence [nats]")
 
 
-def _draw_stays(
-    axes: Axes,
-    axis: TimeAxis,
-    stays: Sequence[tuple[str, float, float, float, float]],
-    sites: Sequence[str],
-    last_s: float,
-) -> None:
+def _draw_stays(axes: Axes, axis: TimeAxis, stays: Sequence[_Stay], sites: Sequence[str], last_s: float) -> None:
     """A bar from the first to the last sighting; thin lines for when it may have come and gone; an arrow goes on."""
     for k, (name, elsewhere, first, until, gone) in enumerate(stays):
         y = sites.index(name)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.geometry.group import Group, group_of
+from evermap.geometry.group import group_of
 from evermap.metrics.summary import Evaluation
 from evermap.types import AnyRecording, BoolArray, ChangeKind, FloatArray, Landmarks, MapChange, SlamResult
 from evermap.viz.change_words import near_alternatives, probability, what
@@ -109,23 +109,23 @@ def draw_map(recording: AnyRecording, result: SlamResult, evaluation: Evaluation
     columns = 4 if len(panels) == 1 else 3
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=columns)
     if moved:
-        figure.legend(
-            handles=moved, loc="outside lower left", ncols=1 if len(changed) <= _MOST_LINES else 3, handlelength=3.2
-        )
+        of_changes = 1 if len(changed) <= _MOST_LINES else 3
+        figure.legend(handles=moved, loc="outside lower left", ncols=of_changes, handlelength=3.2)
     return NamedFigure("map", figure, "Trajectory and map", _caption(recording, evaluation, scene))
 
 
 def _scene(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) -> _Scene:
     group = group_of(result.trajectory.pose_world_robot)
     size = group.point_dim
-    pose_truth_map = _alignment(evaluation, group)
+    tie = evaluation.landmarks_own if evaluation.poses is None else evaluation.poses
+    pose_truth_map = group.identity() if tie is None else tie.pose_truth_estimate
     path = group.compose(pose_truth_map, result.trajectory.pose_world_robot)[:, :size]
     truth = recording.truth
     way = None if truth is None else with_breaks(truth.stamp_s, truth.pose_world_robot[:, :size])[1]
     known = Landmarks.at([], np.zeros((0, 2))) if recording.true_landmarks is None else recording.true_landmarks
     survey = None if recording.true_landmarks is None else known.position_m
-    if evaluation.poses is None and evaluation.landmarks_own is None:
-        way = survey = None  # nothing ties the frames together
+    if tie is None:  # nothing ties the frames together
+        way = survey = None
     odometry = evaluation.dead_reckoning
     pose_truth_odometry = pose_truth_map if odometry is None else odometry.pose_truth_estimate
     drifted = result.dead_reckoning.pose_world_robot
@@ -172,14 +172,6 @@ def _draw_panel(axes: Axes, view: View, scene: _Scene, low: FloatArray, high: Fl
     return draw_moves(axes, [
         replace(move, before_m=move.before_m[:, view], after_m=move.after_m[:, view]) for move in scene.changed
     ])  # fmt: skip
-
-
-def _alignment(evaluation: Evaluation, group: Group) -> FloatArray:
-    if evaluation.poses is not None:
-        return evaluation.poses.pose_truth_estimate
-    if evaluation.landmarks_own is not None:
-        return evaluation.landmarks_own.pose_truth_estimate
-    return group.identity()
 
 
 def _thin(points: FloatArray) -> FloatArray:
@@ -315,16 +307,11 @@ def _frame_caption(recording: AnyRecording, evaluation: Evaluation, size: int) -
         return f"{moved} onto the surveyed landmarks; there is no true path to compare."
     text = f"{moved} so that the estimated path fits the true one best, for display only."
     if odometry is not None:
-        text += (
-            f" Odometry alone, aligned separately, is {odometry.rmse_m:.2f} m off; the estimate {poses.rmse_m:.3f} m."
-        )
-    covered = (poses.stamp_s[-1] - poses.stamp_s[0]) / max(_duration(recording), 1e-9)
-    return text + (f" Truth covers {covered:.0%} of the recording." if covered < 0.98 else "")
-
-
-def _duration(recording: AnyRecording) -> float:
+        off = f"{odometry.rmse_m:.2f} m off; the estimate {poses.rmse_m:.3f} m"
+        text += f" Odometry alone, aligned separately, is {off}."
     stamps = recording.frames.stamp_s
-    return float(stamps[-1] - stamps[0]) if len(stamps) else 0.0
+    covered = np.ptp(poses.stamp_s) / max(np.ptp(stamps) if len(stamps) else 0.0, 1e-9)
+    return text + (f" Truth covers {covered:.0%} of the recording." if covered < 0.98 else "")
 
 
 GROUP_COLOURS = (ALERT, ONLINE, GROUP)
@@ -402,18 +389,11 @@ def draw_moves(axes: Axes, drawn: Sequence[Move]) -> list[Artist]:
         for start, end in zip(move.before_m, move.after_m, strict=True):
             if np.array_equal(start, end):
                 continue
+            way, gap = ("arc3,rad=0.15", 2.0) if move.swapped else ("arc3", 0.0)
             arrow = FancyArrowPatch(
-                (start[0], start[1]),
-                (end[0], end[1]),
-                arrowstyle="-|>",
-                connectionstyle="arc3,rad=0.15" if move.swapped else "arc3",
-                mutation_scale=8.0,
-                shrinkA=2.0,
-                shrinkB=2.0 if move.swapped else 0.0,
-                color=colour,
-                zorder=8 if move.alternative else 9,
-                **line,
-            )
+                (start[0], start[1]), (end[0], end[1]), arrowstyle="-|>", connectionstyle=way, mutation_scale=8.0,
+                shrinkA=2.0, shrinkB=gap, color=colour, zorder=8 if move.alternative else 9, **line,
+            )  # fmt: skip
             axes.add_patch(arrow)
         if move.change.kind in _KIND_MARKS:
             line["ls"] = ""

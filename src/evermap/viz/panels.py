@@ -119,12 +119,7 @@ def seen(landmarks: Landmarks, view: View) -> Landmarks:
 
 
 def draw_shapes(
-    axes: Axes,
-    landmarks: Landmarks,
-    view: View,
-    colours: Any,
-    reach_m: float,
-    path_m: FloatArray | None = None,
+    axes: Axes, landmarks: Landmarks, view: View, colours: Any, reach_m: float, path_m: FloatArray | None = None
 ) -> None:
     """Draw boxes by their edges, and where the other landmarks that have an orientation face: along their z.
 

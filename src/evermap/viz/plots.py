@@ -10,11 +10,9 @@ import numpy as np
 from evermap.geometry import se3
 from evermap.geometry.group import group_of
 from evermap.metrics.summary import compare_with_truth
-from evermap.survival.base import LifetimePrior
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
-    Clock,
     Detections,
     FloatArray,
     Frames,
@@ -24,7 +22,7 @@ from evermap.types import (
     SlamResult,
     Trajectory,
 )
-from evermap.viz.lifetime_figures import plot_lifetimes, plot_survival
+from evermap.viz.lifetime_figures import plot_lifetimes, plot_survival  # noqa: F401 (taken by their names)
 from evermap.viz.living_map_figures import MapView, plot_living_map
 from evermap.viz.map_figure import draw_map, moving_paths
 from evermap.viz.panels import corners_of, height_over_width, lay_out
@@ -111,20 +109,6 @@ def plot_landmarks(landmarks: Landmarks) -> Figure:
     return plot_living_map(MapView(landmarks, np.zeros(len(landmarks), dtype=np.bool_)), title="")
 
 
-def plot_track_run(result: Any) -> Figure:
-    """Draw a `TrackResult`: paths and places of rest from above, and when objects rested."""
-    table = result.table
-    return plot_objects(
-        table.class_names,
-        [(kind, way[:, :2]) for kind, way in moving_paths(result)],
-        result.spells,
-        start_s=float(table.stamp_s[0]),
-        end_s=float(table.stamp_s[-1]),
-        sensor_m=None if table.sensor_m is None else table.sensor_m[:, :2],
-        clock=guess_clock(table.stamp_s),
-    )
-
-
 def plot_trajectory(trajectory: Trajectory) -> Figure:
     """Draw a path and its first pose, in space from above and from the side."""
     place = _places(trajectory)
@@ -200,16 +184,6 @@ def _driven_rows(recording: AnyRecording) -> _Rows:
     return {"speed [m/s]": (stamps[1:], speed), "turn [rad/s]": (stamps[1:], turned)}
 
 
-def plot_lifetime(prior: LifetimePrior, **options: Any) -> Figure:
-    """Draw hazard, survival and density of a lifetime prior; options as of `plot_lifetimes`."""
-    return plot_lifetimes(prior, **options)
-
-
-def plot_estimate(estimate: Any, **options: Any) -> Figure:
-    """Draw the survival function of an estimate; options as of `plot_survival`."""
-    return plot_survival({type(estimate).__name__: estimate}, **options)
-
-
 def _nothing_but_frames(result: SlamResult) -> Recording:
     nothing = np.zeros(0)
     whole = nothing.astype(np.int64)
@@ -221,40 +195,25 @@ MOST_SPELLS = 80
 """Maximum rows of the right half: the longest spells."""
 
 
-def plot_objects(
-    class_names: Sequence[str],
-    paths: Sequence[tuple[int, FloatArray]],
-    rests: Any,
-    *,
-    start_s: float,
-    end_s: float,
-    sensor_m: FloatArray | None = None,
-    clock: Clock = Clock.RECORDING,
-) -> Figure:
-    """Draw paths and places of rest from above; beside it, a bar for each spell at rest.
+def plot_track_run(result: Any) -> Figure:
+    """Draw a `TrackResult`: paths and places of rest from above; beside it, a bar for each spell at rest.
 
     A bar is from the first sighting to the last. The thin line before it begins at the last look at which the object
     was not there, that behind it ends at the first; an arrow instead of an end: nobody knows. Objects that left their
     place of rest are crossed out.
-
-    Args:
-        class_names: C classes, '' for one without a name.
-        paths: class and (K, 2) positions of each stretch in which an object moved.
-        rests: the spells, `tracking.record.StaticSpells`.
-        start_s: first frame.
-        end_s: last frame.
-        sensor_m: (F, 2) where the sensor was, in order; None where unknown.
-        clock: `RECORDING` for an axis of seconds, minutes, hours or days; else dates.
     """
-    looks = [class_looks(class_names)[name] for name in class_names]
+    table, rests, paths = result.table, result.spells, moving_paths(result)
+    start_s, end_s = float(table.stamp_s[0]), float(table.stamp_s[-1])
+    looks = class_looks(table.class_names)
     left = np.isfinite(rests.gone_s)
     with drawing(9.0, 4.8) as figure:
         above, bars = figure.subplots(1, 2, width_ratios=(1.1, 1.0))
-        if sensor_m is not None:
-            above.plot(*sensor_m.T, color=MUTED, lw=0.8, ls=":", zorder=1, label="path of the sensor")
-        for k, (name, look) in enumerate(zip(class_names, looks, strict=True)):
+        if table.sensor_m is not None:
+            above.plot(*table.sensor_m[:, :2].T, color=MUTED, lw=0.8, ls=":", zorder=1, label="path of the sensor")
+        for k, name in enumerate(table.class_names):
+            look = looks[name]
             for _, path in (one for one in paths if one[0] == k):
-                above.plot(*path.T, color=look.colour, lw=0.9, alpha=0.7, zorder=2)
+                above.plot(*path[:, :2].T, color=look.colour, lw=0.9, alpha=0.7, zorder=2)
             mark: Any = {"ls": "none", "marker": look.marker, "ms": 6.0, "mec": look.colour}
             here = rests.class_id == k
             above.plot(*rests.position_m[here & left, :2].T, mfc="none", alpha=0.6, zorder=3, **mark)
@@ -268,7 +227,8 @@ def plot_objects(
         above.set(xlabel="x [m]", ylabel="y [m]")
         above.set_aspect("equal", adjustable="datalim")
         above.set_title("paths, and places of rest")
-        _draw_bars(bars, rests, [look.colour for look in looks], TimeAxis.over(start_s, end_s, clock), end_s)
+        axis = TimeAxis.over(start_s, end_s, guess_clock(table.stamp_s))
+        _draw_bars(bars, rests, [looks[name].colour for name in table.class_names], axis, end_s)
         figure.legend(*legend_of(above, bars), loc="outside lower center", ncols=5)
     return figure
 
@@ -294,9 +254,8 @@ def _draw_bars(axes: Axes, rests: Any, colours: Sequence[str], axis: TimeAxis, e
         axes.plot([], [], color=MUTED, lw=0.8, label="arrived or left in between")
     if unbounded:
         axes.plot([], [], color=MUTED, marker=">", ls="", ms=3.5, label="beginning or end unknown")
-    which = (
-        f"the {len(order)} longest of {len(rests.first_s):,} spells" if len(order) < len(rests.first_s) else "spells"
-    )
+    all_of_them = len(order) == len(rests.first_s)
+    which = "spells" if all_of_them else f"the {len(order)} longest of {len(rests.first_s):,} spells"
     axes.set(yticks=[], ylim=(len(order), -1.0))
     axes.axvline(at(end_s), color=INK, lw=0.6, ls=":", label="last frame")
     axis.label(axes)

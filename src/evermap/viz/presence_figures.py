@@ -16,18 +16,7 @@ from evermap.existence.protocol import Instants, Looks, PresenceModel
 from evermap.existence.rhythm import MONDAY_S
 from evermap.metrics.belief import BeliefScores, Reliability
 from evermap.types import Clock, FloatArray
-from evermap.viz.style import (
-    ALERT,
-    ESTIMATE,
-    ESTIMATE_BAND,
-    GRID,
-    INK,
-    LANDMARK,
-    MUTED,
-    PAPER,
-    SHADE,
-    drawing,
-)
+from evermap.viz.style import ALERT, ESTIMATE, ESTIMATE_BAND, GRID, INK, LANDMARK, MUTED, PAPER, SHADE, drawing
 from evermap.viz.time_axis import DURATIONS, TimeAxis
 
 if TYPE_CHECKING:
@@ -74,18 +63,16 @@ def plot_raster(
         _paint(figure, axes, axis.coordinates(edge), belief)
         _mark(axes, axis, changes, row_in)
         if forecast_from_s is not None and edge[0] < forecast_from_s < edge[-1]:
-            axes.axvline(
-                axis.coordinates(forecast_from_s), color=INK, lw=0.9, ls=(0, (3, 2)), label="forecast from here"
-            )
+            begin = axis.coordinates(forecast_from_s)
+            axes.axvline(begin, color=INK, lw=0.9, ls=(0, (3, 2)), label="forecast from here")
         _label_rows(axes, names)
         axis.label(axes)
         if title:
             axes.set_title(title)
         handles, labels = axes.get_legend_handles_labels()
         if handles:
-            figure.legend(
-                handles, labels, loc="outside lower center", ncols=4, markerscale=5.5 / _mark_size(row_in, changes)
-            )
+            scale = 5.5 / _mark_size(row_in, changes)
+            figure.legend(handles, labels, loc="outside lower center", ncols=4, markerscale=scale)
     return figure
 
 
@@ -93,9 +80,8 @@ def _paint(figure: Figure, axes: Axes, edges: Any, belief: Any) -> None:
     """Blue is there, orange is not, pale is undecided, hatched is no belief."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    colours = LinearSegmentedColormap.from_list("presence", [ALERT, PAPER, ESTIMATE]).with_extremes(
-        bad=(0.0, 0.0, 0.0, 0.0)
-    )
+    opaque = LinearSegmentedColormap.from_list("presence", [ALERT, PAPER, ESTIMATE])
+    colours = opaque.with_extremes(bad=(0.0, 0.0, 0.0, 0.0))
     rows = np.arange(len(belief) + 1) - 0.5
     shown = np.ma.masked_invalid(belief)
     mesh = axes.pcolormesh(edges, rows, shown, cmap=colours, vmin=0.0, vmax=1.0, rasterized=True, zorder=1)
@@ -147,10 +133,7 @@ def plot_presence_models(models: Mapping[str, PresenceModel]) -> Figure:
     """Draw a figure of forecasts, one row a model: presence after it was certainly seen there, or gone, and over the
     week.
 
-    Looks are taken on a Monday at noon. The first eight models are drawn.
-
-    Args:
-        models: by name; '' for a model without one.
+    Looks are taken on a Monday at noon. The first eight models are drawn, by name; '' for one without.
     """
     drawn = dict(list(models.items())[:MOST_ROWS])
     rhythm = any(map(has_rhythm, drawn.values()))
@@ -165,14 +148,7 @@ def plot_presence_models(models: Mapping[str, PresenceModel]) -> Figure:
 
 
 def week_of_presence(model: PresenceModel) -> tuple[FloatArray, FloatArray]:
-    """Return presence over a week that nobody looks at, long after the last look.
-
-    Args:
-        model: any model of presence.
-
-    Returns:
-        Times since Monday 00:00 in seconds, and the probabilities.
-    """
+    """Return times of a week, since Monday 00:00 [s], and presence then, long after the last look."""
     time_s = np.arange(0.0, 7.0 * 86400.0 + 1.0, _WEEK_STEP_S)
     nothing = np.zeros(0)
     unseen = Looks(np.zeros(2, dtype=np.int64), nothing, nothing, nothing, nothing)
@@ -214,9 +190,8 @@ def _after_a_look(axes: Axes, model: PresenceModel, name: str, *, last: bool, le
 def _week(axes: Axes, time_s: Any, presence: Any, *, last: bool) -> None:
     """Presence through the week, nights shaded."""
     day = time_s / 86400.0
-    for k in range(7):
-        axes.axvspan(k - 0.25, k + 0.25, color=SHADE, lw=0, zorder=0)
-    axes.axvspan(6.75, 7.0, color=SHADE, lw=0, zorder=0)
+    for k in range(8):
+        axes.axvspan(k - 0.25, min(k + 0.25, 7.0), color=SHADE, lw=0, zorder=0)
     axes.fill_between(day, 0.0, presence, color=ESTIMATE, alpha=0.25, lw=0)
     axes.plot(day, presence, color=ESTIMATE, lw=1.0)
     axes.set(xlim=(0.0, 7.0), ylim=(-0.03, 1.03))
@@ -239,26 +214,14 @@ def plot_reliability(bins: Reliability, scores: BeliefScores, *, title: str | No
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1.0))
         filled = bins.count > 0
         above.plot([0.0, 1.0], [0.0, 1.0], color=MUTED, lw=0.9, ls="--", zorder=2, label="calibrated")
+        belief, present = bins.belief[filled], bins.present[filled]
         size = 20.0 + 100.0 * np.sqrt(bins.count[filled] / bins.count.max())
-        above.plot(bins.belief[filled], bins.present[filled], color=ESTIMATE, lw=1.2, zorder=3)
-        above.scatter(
-            bins.belief[filled], bins.present[filled], s=size, color=ESTIMATE, zorder=4, label="bin of beliefs"
-        )
+        above.plot(belief, present, color=ESTIMATE, lw=1.2, zorder=3)
+        above.scatter(belief, present, s=size, color=ESTIMATE, zorder=4, label="bin of beliefs")
         above.set(xlim=(-0.03, 1.03), ylim=(-0.06, 1.06), ylabel="truly there [1]")
-        numbers = {
-            "Brier": scores.brier,
-            "log loss": scores.log_loss,
-            "calibration error": scores.calibration_error,
-        }
-        above.text(
-            0.97,
-            0.05,
-            "\n".join(f"{name} {value:.4f}" for name, value in numbers.items()),
-            transform=above.transAxes,
-            ha="right",
-            va="bottom",
-            size=8,
-        )
+        numbers = {"Brier": scores.brier, "log loss": scores.log_loss, "calibration error": scores.calibration_error}
+        told = "\n".join(f"{name} {value:.4f}" for name, value in numbers.items())
+        above.text(0.97, 0.05, told, transform=above.transAxes, ha="right", va="bottom", size=8)
         above.legend(loc="upper left", markerscale=0.6)
         if title:
             above.set_title(title)

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from evermap.metrics.summary import Evaluation
-from evermap.stamps import stamp_text
-from evermap.types import UNKNOWN, AnyRecording, Clock, ParameterEstimate, SlamResult
+from evermap.types import UNKNOWN, AnyRecording, Clock, ParameterEstimate, SlamResult, stamp_text
 from evermap.viz.change_words import explanations, grew, near_alternatives
 from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.run_figures import has_prior, quantity
-from evermap.viz.style import NamedFigure, house_style
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from evermap.viz.style import NamedFigure
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,12 +26,12 @@ class ReportSection:
     Attributes:
         title: plain text.
         html: trusted markup (paragraphs, tables); may use the page's classes `cards`, `card`, `note`, `n`.
-        figures: drawn after the text; a `NamedFigure`, or (PNG bytes or matplotlib figure, plain-text caption).
+        figures: drawn after the text.
     """
 
     title: str
     html: str = ""
-    figures: tuple[NamedFigure | tuple[Figure | bytes, str], ...] = ()
+    figures: tuple[NamedFigure, ...] = ()
 
 
 def render_report(
@@ -58,12 +52,15 @@ def render_report(
         figures: `draw_figures(...)`, may be empty.
         sections: what the caller adds.
     """
-    parts = [_section(section, number) for number, section in enumerate(sections)]
+    parts = [  # the first one has the heading of the page
+        "\n".join([f"<h2>{escape(one.title)}</h2>" if k else "", one.html, *map(figure_html, one.figures)])
+        for k, one in enumerate(sections)
+    ]
     if sections:  # the page is about more than this recording
         parts.append(f'<h2>{escape(recording.name)}</h2><p class="lead">{_lead(summary)}</p>')
     parts += [
         cards_html(_cards(summary)),
-        _interrupted(summary),
+        _INTERRUPTED if summary["interrupted"] else "",
         _changes(result, summary),
         warnings_note(summary["warnings"]),
         _figures("Accuracy", figures, ("map", "errors"), _frames(summary)),
@@ -95,10 +92,7 @@ def _lead(summary: Mapping[str, Any]) -> str:
     return f"{text}.<br>Read from <code>{escape(source)}</code>." if source else f"{text}."
 
 
-def _interrupted(summary: Mapping[str, Any]) -> str:
-    if not summary["interrupted"]:
-        return ""
-    return '<p class="note">Stopped before the end of the recording: all results are for the part until then.</p>'
+_INTERRUPTED = '<p class="note">Stopped before the end of the recording: all results are for the part until then.</p>'
 
 
 def _changes(result: SlamResult, summary: Mapping[str, Any]) -> str:
@@ -121,29 +115,6 @@ def _figures(title: str, figures: Sequence[NamedFigure], names: tuple[str, ...],
     if not shown and not html:
         return ""
     return "\n".join([f"<h2>{escape(title)}</h2>", *map(figure_html, shown), html])
-
-
-def _section(section: ReportSection, number: int) -> str:
-    # the first one has the heading of the page
-    parts = [f"<h2>{escape(section.title)}</h2>" if number else "", section.html]
-    for index, item in enumerate(section.figures):
-        if isinstance(item, NamedFigure):
-            parts.append(figure_html(item))
-            continue
-        picture, caption = item
-        data = base64.b64encode(picture if isinstance(picture, bytes) else _png(picture)).decode("ascii")
-        parts.append(
-            f'<figure id="section-{number}-{index}"><img alt="{escape(caption, quote=True)}"'
-            f' src="data:image/png;base64,{data}"><figcaption>{escape(caption)}</figcaption></figure>'
-        )
-    return "\n".join(parts)
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    with house_style():
-        figure.savefig(buffer, format="png", dpi=160, facecolor="white")
-    return buffer.getvalue()
 
 
 def _frames(summary: Mapping[str, Any]) -> str:
@@ -248,14 +219,9 @@ def _cards(summary: Mapping[str, Any]) -> list[str | None]:
         _landmark_card(metrics),
         card("Speed", timing["real_time_factor"], "{:.0f}", "× real time", _latency(timing)),
         card("Innovations", metrics["nis_mean"], "{:.2f}", "mean NIS", _nis(metrics)),
-        card(
-            "Online position error",
-            metrics["online_pose_rmse_m"],
-            "{:.3f}",
-            "m RMSE",
-            "Causal poses, without later detections, while landmarks were in view.",
-        ),
-    ]
+        card("Online position error", metrics["online_pose_rmse_m"], "{:.3f}", "m RMSE",
+             "Causal poses, without later detections, while landmarks were in view."),
+    ]  # fmt: skip
 
 
 def _gain(value: float | None, odometry: float | None, form: str) -> str:
@@ -271,11 +237,11 @@ def _gain(value: float | None, odometry: float | None, form: str) -> str:
 def _landmark_card(metrics: Mapping[str, Any]) -> str | None:
     after_path, own = metrics["landmark_rmse_m"], metrics["landmark_rmse_own_alignment_m"]
     scored, least = metrics["landmarks_scored"], metrics["landmark_min_sightings"]
-    if after_path is not None:
-        meaning = f"{scored} landmarks with at least {least} sightings, after the alignment of the path."
-        return card("Landmark error", after_path, "{:.3f}", "m RMSE", meaning)
-    meaning = f"{scored} landmarks with at least {least} sightings, aligned by themselves: there is no true path."
-    return card("Landmark error", own, "{:.3f}", "m RMSE", meaning)
+    how = (
+        "after the alignment of the path" if after_path is not None else "aligned by themselves: there is no true path"
+    )
+    meaning = f"{scored} landmarks with at least {least} sightings, {how}."
+    return card("Landmark error", own if after_path is None else after_path, "{:.3f}", "m RMSE", meaning)
 
 
 def _latency(timing: Mapping[str, Any]) -> str:
@@ -289,12 +255,9 @@ def _nis(metrics: Mapping[str, Any]) -> str:
     mean = metrics["nis_mean"]
     if mean is None:
         return "No detection was judged an inlier: the readings do not fit the estimate."
-    if mean > 2.6:
-        verdict = "errors are larger than estimated"
-    elif mean < 1.4:
-        verdict = "errors are smaller than estimated"
-    else:
-        verdict = "the uncertainties are about right"
+    verdict = "the uncertainties are about right"
+    if not 1.4 <= mean <= 2.6:
+        verdict = f"errors are {'larger' if mean > 2.6 else 'smaller'} than estimated"
     return f"2 is expected: {verdict}. {metrics['nis_in_band_share']:.0%} lie below the 95% bound."
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,8 +11,7 @@ from evermap.geometry.group import PLANE, group_of
 from evermap.metrics.consistency import chi2_interval, chi2_quantile, comparable_nis, running_mean
 from evermap.metrics.summary import Evaluation
 from evermap.metrics.trajectory import PoseErrors
-from evermap.stamps import stamp_text
-from evermap.types import AnyRecording, Clock, FloatArray, ParameterEstimate, SlamResult
+from evermap.types import AnyRecording, Clock, FloatArray, ParameterEstimate, SlamResult, stamp_text
 from evermap.viz.map_figure import draw_map
 from evermap.viz.panels import BLIND_S, with_breaks
 from evermap.viz.style import (
@@ -76,11 +75,8 @@ def draw_errors(recording: AnyRecording, result: SlamResult, evaluation: Evaluat
     above, below = figure.subplots(2, 1, sharex=True)
     start_s = _start(recording)
     poses = evaluation.poses
-    if poses is None:
-        stamps, covariance = result.trajectory.stamp_s, result.trajectory.covariance
-    else:
-        stamps, covariance = poses.stamp_s, poses.covariance
-    time = stamps - start_s
+    known = result.trajectory if poses is None else poses
+    time, covariance = known.stamp_s - start_s, known.covariance
     group = group_of(result.trajectory.pose_world_robot)
     size, turn = group.point_dim, "heading" if group is PLANE else "orientation"
     position_band = 2.0 * np.sqrt(np.trace(covariance[:, :size, :size], axis1=1, axis2=2))
@@ -93,27 +89,25 @@ def draw_errors(recording: AnyRecording, result: SlamResult, evaluation: Evaluat
     lowest = -1.0 if group is PLANE else 0.0  # headings have a sign, angles in space have none
     above.fill_between(time, 0, position_band, color=ESTIMATE_BAND, lw=0, zorder=1, label="2σ expected")
     below.fill_between(time, lowest * turn_band, turn_band, color=ESTIMATE_BAND, lw=0, zorder=1)
-    top, side = _limit(position_band), _limit(turn_band)
+    top, side = (1.12 * float(np.max(band, initial=0.0)) for band in (position_band, turn_band))
     if poses is not None:
         online = evaluation.online
         if online is not None:
-            causal = with_breaks(online.stamp_s, online.position_error_m)
-            above.plot(
-                causal[0] - start_s, causal[1], color=ONLINE, lw=0.8, label=f"online (RMSE {online.rmse_m:.3f} m)"
-            )
-            causal = with_breaks(online.stamp_s, _turn_deg(online))
-            below.plot(causal[0] - start_s, causal[1], color=ONLINE, lw=0.8)
+            errors = np.column_stack([online.position_error_m, _turn_deg(online)])
+            stamps, causal = with_breaks(online.stamp_s, errors)
+            label = f"online (RMSE {online.rmse_m:.3f} m)"
+            above.plot(stamps - start_s, causal[:, 0], color=ONLINE, lw=0.8, label=label)
+            below.plot(stamps - start_s, causal[:, 1], color=ONLINE, lw=0.8)
         turned = _turn_deg(poses)
         above.plot(time, poses.position_error_m, color=ESTIMATE, lw=1.1, label=f"smoothed (RMSE {poses.rmse_m:.3f} m)")
         below.plot(time, turned, color=ESTIMATE, lw=1.1)
         below.axhline(0, color=MUTED, lw=0.7)
         top = max(1.12 * poses.max_m, min(top, 3.0 * poses.max_m))
-        side = max(1.12 * float(np.max(np.abs(turned))), min(side, 3.0 * float(np.max(np.abs(turned)))))
+        most = float(np.max(np.abs(turned)))
+        side = max(1.12 * most, min(side, 3.0 * most))
     above.set(ylim=(0, top or None), ylabel="position error [m]" if poses else "2σ of position [m]")
-    below.set(
-        ylim=(lowest * side, side) if side else None, ylabel=f"{turn} error [°]" if poses else f"2σ of {turn} [°]"
-    )
-    below.set(xlabel=_since_start(recording))
+    ylabel = f"{turn} error [°]" if poses else f"2σ of {turn} [°]"
+    below.set(ylim=(lowest * side, side) if side else None, ylabel=ylabel, xlabel=_since_start(recording))
     _span(below, recording)
     figure.legend(*above.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     title = "Error over time" if poses else "Uncertainty over time"
@@ -189,16 +183,8 @@ def draw_latency(recording: AnyRecording, result: SlamResult, real_time_factor: 
     p50, p99 = np.percentile(step_ms, [50, 99])
     figure = new_figure(7.2, 2.7)
     axes = figure.add_subplot()
-    axes.plot(
-        stamps - _start(recording),
-        step_ms,
-        "o",
-        color=ESTIMATE,
-        ms=2,
-        mec="none",
-        alpha=0.4,
-        rasterized=count > _RASTER_FROM,
-    )
+    look: Any = {"color": ESTIMATE, "ms": 2, "mec": "none", "alpha": 0.4, "rasterized": count > _RASTER_FROM}
+    axes.plot(stamps - _start(recording), step_ms, "o", **look)
     axes.set_yscale("log")
     lines = [(p50, INK, f"median {p50:.2g} ms"), (p99, ALERT, f"99% {p99:.2g} ms")]
     if count > 1:
@@ -231,10 +217,6 @@ def _span(axes: Axes, recording: AnyRecording) -> None:
     stamps = recording.frames.stamp_s
     if len(stamps) > 1:
         axes.set_xlim(0, float(stamps[-1] - stamps[0]))
-
-
-def _limit(band: FloatArray) -> float:
-    return 1.12 * float(np.max(band, initial=0.0))
 
 
 def _error_caption(evaluation: Evaluation, blind: int) -> str:
@@ -277,27 +259,18 @@ def draw_calibration(result: SlamResult) -> NamedFigure | None:
     spread = np.array([p.sigma / p.prior_sigma for p in shown])
     axes.barh(rows, 4.0, left=-2.0, height=0.62, color=GRID, alpha=0.6, lw=0, label="prior, 2σ", zorder=1)
     axes.axvline(0, color=MUTED, lw=0.8, zorder=2)
-    axes.errorbar(
-        shift, rows, xerr=2 * spread, fmt="o", color=ESTIMATE, ms=4.5, capsize=3, lw=1.6, label="estimate, 2σ", zorder=3
-    )
+    look: Any = {"color": ESTIMATE, "ms": 4.5, "capsize": 3, "lw": 1.6, "label": "estimate, 2σ", "zorder": 3}
+    axes.errorbar(shift, rows, xerr=2 * spread, fmt="o", **look)
     reach = max(2.6, 1.1 * float(np.max(np.abs(shift) + 2 * spread)))
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-0.6, len(shown) - 0.4)
+    axes.set(xlim=(-reach, reach), ylim=(-0.6, len(shown) - 0.4))
     axes.set_yticks(rows, [p.name for p in shown])
     axes.tick_params(axis="y", length=0)
     axes.grid(visible=False, axis="y")
     axes.spines["left"].set_visible(False)
     axes.set_xlabel("distance from the prior mean [prior standard deviations]")
     for row, parameter in zip(rows, shown, strict=True):
-        axes.text(
-            1.02,
-            row,
-            quantity(parameter.value, parameter.sigma, parameter.unit),
-            transform=axes.get_yaxis_transform(),
-            va="center",
-            size=8,
-            color=INK,
-        )
+        text = quantity(parameter.value, parameter.sigma, parameter.unit)
+        axes.text(1.02, row, text, transform=axes.get_yaxis_transform(), va="center", size=8, color=INK)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     caption = (
         "Estimated calibration states in units of their prior standard deviations: a bar much shorter than the grey "

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 from weakref import WeakKeyDictionary
@@ -85,45 +86,26 @@ def class_looks(names: Iterable[str]) -> dict[str, ClassLook]:
     are distinguished by readers with every common kind of colour blindness; as their number and that of the markers
     have no common divisor, 56 classes look different.
     """
-    known = enumerate(sorted({name for name in names if name}))
-    looks = {
-        name: ClassLook(CLASS_COLOURS[k % len(CLASS_COLOURS)], CLASS_MARKERS[k % len(CLASS_MARKERS)])
-        for k, name in known
-    }
-    return {"": NO_CLASS, **looks}
+    looks = zip(cycle(CLASS_COLOURS), cycle(CLASS_MARKERS), strict=False)
+    known = sorted({name for name in names if name})
+    return {"": NO_CLASS, **{name: ClassLook(*look) for name, look in zip(known, looks, strict=False)}}
 
 
 _RC: Any = {
     "font.family": "DejaVu Sans",
-    "font.size": 9.0,
-    "axes.labelsize": 9.0,
-    "axes.titlesize": 9.0,
+    **dict.fromkeys(("font.size", "axes.labelsize", "axes.titlesize"), 9.0),
+    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), 8.0),
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "legend.fontsize": 8.0,
-    "legend.frameon": False,
     "legend.handlelength": 1.8,
-    "figure.facecolor": "none",
-    "figure.autolayout": False,
-    "figure.constrained_layout.use": False,
-    "axes.facecolor": "none",
-    "savefig.facecolor": "none",
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": MUTED,
-    "axes.titlecolor": INK,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"),
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.titlecolor", "xtick.labelcolor", "ytick.labelcolor"), INK),
+    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), MUTED),
     "grid.color": GRID,
+    **dict.fromkeys(("legend.frameon", "axes.spines.top", "axes.spines.right"), False),
+    **dict.fromkeys(("figure.autolayout", "figure.constrained_layout.use"), False),
+    **dict.fromkeys(("axes.grid", "axes.axisbelow"), True),
+    "axes.linewidth": 0.7,
     "grid.linewidth": 0.6,
     "lines.linewidth": 1.2,
     "lines.solid_joinstyle": "round",

@@ -117,7 +117,9 @@ def _benchmark(name: str) -> Any:
 
 def _limit_threads() -> None:
     """Limit libraries to one thread: they read it when they are loaded, which they are not yet."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    from evermap.compiled import THREAD_LIMITS
+
+    for name in THREAD_LIMITS:
         os.environ.setdefault(name, "1")
 
 

@@ -11,14 +11,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evermap import __version__
+from evermap import __version__, compiled
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
     from matplotlib.figure import Figure
 
-THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+THREAD_LIMITS = (*compiled.THREAD_LIMITS, "NUMBA_NUM_THREADS")
 """Environment variables that must be 1 before numpy is loaded for timings on one core; the command sets them."""
 
 

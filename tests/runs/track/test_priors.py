@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from evermap.config import TrackConfig
-from evermap.config.tables import DEFAULT_PRIOR
+from evermap.config import DEFAULT_PRIOR, TrackConfig
 from evermap.errors import ConfigError, InputError
 from evermap.existence.models import NamedModels, save_models
 from evermap.existence.one_stay import OneStay

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.config import PersistConfig
-from evermap.config.tables import NO_RECURRENCE
+from evermap.config import NO_RECURRENCE, PersistConfig
 from evermap.errors import ConfigError, DataError, EvermapError, InputError, NumericalError
 from evermap.existence import models as storage
 from evermap.existence.models import KINDS, Choice, choose

@@ -12,9 +12,8 @@ import numpy as np
 
 from evermap.existence.protocol import Instants
 from evermap.runs.persist.run import PersistResult
-from evermap.stamps import stamp_text
 from evermap.survival.durations import duration_text
-from evermap.types import Clock, FloatArray, IntArray
+from evermap.types import Clock, FloatArray, IntArray, stamp_text
 from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.style import NamedFigure
 

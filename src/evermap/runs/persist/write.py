@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.config import PersistConfig
-from evermap.config.tables import NO_RECURRENCE
+from evermap.config import NO_RECURRENCE, PersistConfig
 from evermap.errors import ConfigError, EvermapError
 from evermap.io.columns import csv_bytes, named, needs_quotes
 from evermap.io.table import arrow_cells

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.session import Session
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
 
 @dataclass(frozen=True, slots=True)
 class Visit:
@@ -245,11 +243,11 @@ def _workers(processes: int) -> Iterator[Callable[[_Day], Future[tuple[_Evening,
     import multiprocessing
     import os
 
-    from evermap.compiled import find_place
+    from evermap.compiled import THREAD_LIMITS, find_place
 
     # one thread each: the linear algebra of two processes would fight over two cores. Read when a worker starts.
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    before = {name: os.environ.get(name) for name in THREAD_LIMITS}
+    os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
     find_place()
     context = multiprocessing.get_context("spawn")  # a fork would copy locks of threads that it does not copy
     with ProcessPoolExecutor(processes, mp_context=context) as executor:

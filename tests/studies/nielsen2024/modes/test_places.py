@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from problems import make_world
 
 from evermap.slam.problem import Estimate
-from evermap_studies.nielsen2024.modes.places import FREE, Modes, grown, intervals_s
+from evermap_studies.nielsen2024.modes.places import FREE, Modes, grown
 
 
 @st.composite
@@ -57,12 +55,3 @@ def test_grown_problems_keep_their_priors():
     )
     assert estimate.known.tolist() == [True] * 5 + [False] * 3
     assert grown(problem, estimate, 8) == (problem, estimate)
-
-
-def test_intervals_are_first_and_last_sightings():
-    world = make_world(1)
-    problem = replace(world.problem, landmark_row=np.where(world.problem.landmark_row == 4, 0, 1))
-    found = intervals_s(problem)
-    for place in range(5):
-        seen = problem.stamp_s[problem.pose_row[problem.landmark_row == place]]
-        np.testing.assert_array_equal(found[place], [seen.min(), seen.max()] if len(seen) else [np.nan] * 2)

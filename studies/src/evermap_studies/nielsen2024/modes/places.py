@@ -107,14 +107,3 @@ def moved_to(problem: Problem, places: IntArray, others: IntArray) -> Problem:
     to = np.arange(len(problem.landmark_mean))
     to[places] = others
     return replace(problem, landmark_row=to[problem.landmark_row])
-
-
-def intervals_s(problem: Problem) -> FloatArray:
-    """(P, 2) first and last stamp at which each place was seen: when its mode certainly held; nan where never."""
-    stamps = problem.stamp_s[problem.pose_row]
-    first = np.full(len(problem.landmark_mean), np.inf)
-    last = np.full(len(problem.landmark_mean), -np.inf)
-    np.minimum.at(first, problem.landmark_row, stamps)
-    np.maximum.at(last, problem.landmark_row, stamps)
-    both = np.column_stack([first, last])
-    return np.where(np.isfinite(both), both, np.nan)
