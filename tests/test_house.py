@@ -75,14 +75,15 @@ OF_THE_CODE = frozenset(
     maps.sessions.believe.MOST_P runs.persist.changes._SHORTEST_GAP_S sensing.kernels.FAR_OUT
     slam.association.associator.LEAST_LEFT slam.association.associator.SAME_NATS slam.association.consensus.IMPLIED_M2
     slam.association.consensus.LEAST_M2 slam.association.in_space.FAR_M
-    slam.association.particles.FEWEST_PARTICLES slam.association.particles.GATE slam.association.splitting.LEAST_M2
-    slam.association.splitting.LEAST_SHARE slam.calibration.LEAST_SIGMA slam.changes.explain.HELD_M
+    slam.association.particles.FEWEST_PARTICLES slam.association.particles.GATE
+    slam.association.wrong_associations.LEAST_M2
+    slam.association.wrong_associations.LEAST_SHARE slam.calibration.LEAST_SIGMA slam.changes.explain.HELD_M
     slam.changes.search.NEAR slam.known_places.LEAST_VARIANCE slam.known_places.RETRY_S slam.known_places.SIGMA_M
     slam.problem.FEWEST_ROWS slam.space.against_map.LEAST_INFORMATION slam.space.drift.FEWEST
     slam.space.drift.FEWEST_BINS slam.space.drift.FEWEST_OF_BOTH slam.space.drift.FEWEST_PAIRS
     slam.space.drift.LEAST_OF_SQUARE slam.space.drift.PERSIST_S slam.space.drift.SEEN_TOGETHER
     slam.space.problem.LEAST_WEIGHT slam.space.problem.NO_JUMP_LOG_ODDS slam.space.solve.GROSS_M
-    slam.space.start.SLACK_M slam.space.start.SLACK_RAD slam.space.start.STILL_M slam.space.start.STILL_RAD
+    slam.space.solve.SLACK_M slam.space.solve.SLACK_RAD slam.space.solve.STILL_M slam.space.solve.STILL_RAD
     slam.streaming.NEAR slam.streaming.NEAR_NOISE slam.streaming.NEAR_NOISE_GAIN slam.votes.FEWEST_PAIRS
     slam.votes.LEAST_SHARE tracking.frame._NEAR_S tracking.grid.FAR tracking.life.LEAST tracking.standing.STRIDE_S
     """.split()  # noqa: SIM905

@@ -16,6 +16,7 @@ from evermap.maps.sessions.nameless import numbered_in
 from evermap.slam.association import with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator, compared, correlated, fit_sighting_noise
+from evermap.slam.association.features import Traits
 from evermap.slam.association.merging import propose_merges
 from evermap.slam.association.revise import (
     HIDDEN,
@@ -124,7 +125,9 @@ def test_merging_and_forgetting_keep_the_detections_together() -> None:
     split[(rows == 2) & (made.problem.pose_row > 30)] = 8
     landmark = np.vstack([made.truth.landmark, made.truth.landmark[2]])
     estimate = Estimate(made.truth.pose, landmark, made.truth.states)
-    broken = Assignment(made.problem, split, estimate, np.zeros((len(split), 2), dtype=np.int64))
+    broken = Assignment(
+        made.problem, split, estimate, np.zeros((len(split), 2), dtype=np.int64), Traits.none(len(split))
+    )
     np.testing.assert_array_equal(broken.merged([(8, 2)]).landmark_row, rows)
     less = broken.without(np.arange(9) == 0)
     assert less.n_landmarks == 8
@@ -141,7 +144,9 @@ def test_noise_that_grows_with_range_is_found() -> None:
     )
     truth = replace(made.truth, states=made.problem.prior.mean)
     noisy = replace(made.problem, reading=reading)
-    found = fit_sighting_noise(noisy, truth, np.array([0.02, 0.01])).of_detections(noisy)
+    found = fit_sighting_noise(
+        noisy, truth, np.array([0.02, 0.01]), np.ones((len(reach), 2)), NAMELESS.association
+    ).of_detections(noisy)
     np.testing.assert_allclose(found[:, 0], np.hypot(0.01, 2e-4 * reach**2), rtol=0.1)
     np.testing.assert_allclose(found[:, 1], 0.005, rtol=0.05)
 
@@ -242,7 +247,7 @@ def test_residuals_that_hang_together_count_as_fewer() -> None:
     )
     alone = correlated(found)
     assert alone < 2.0
-    visit, rng = found.visits(20.0), np.random.default_rng(0)
+    visit, rng = found.of_visits()[0], np.random.default_rng(0)
     common = rng.normal(0.0, 0.05, visit.max() + 1)[visit]
     reading = found.measured.reading + np.column_stack([common, np.zeros(len(common))])
     assert correlated(replace(found, measured=replace(found.measured, reading=reading))) > 2.0 * alone
@@ -252,7 +257,7 @@ def settled(made: World, row: np.ndarray) -> Assignment:
     """Assigned as told, at the true values; landmarks whose detections go astray keep their places."""
     sigma = np.tile(made.noise.detection, (len(row), 1))
     measured = replace(made.problem, sigma_given=sigma)
-    return Assignment(measured, row, made.truth, np.full((len(row), 2), UNKNOWN))
+    return Assignment(measured, row, made.truth, np.full((len(row), 2), UNKNOWN), Traits.none(len(row)))
 
 
 def test_detections_of_others_go_back_and_what_was_overlooked_is_a_landmark() -> None:

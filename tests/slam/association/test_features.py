@@ -17,7 +17,7 @@ from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator
 from evermap.slam.association.features import Likeness, Traits, Variances, learned, medians
 from evermap.slam.association.particles import drawn as drawn_anew
-from evermap.slam.association.splitting import traits_against_others
+from evermap.slam.association.wrong_associations import traits_against_others
 from evermap.slam.calibration import CalibrationPrior
 from evermap.types import UNKNOWN
 

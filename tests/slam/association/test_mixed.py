@@ -16,6 +16,7 @@ from evermap.maps.sessions.nameless import numbered_in
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.association import with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment, alike, names_of
+from evermap.slam.association.features import Traits
 from evermap.slam.association.identify import numbered
 from evermap.slam.association.merging import _without_contradictions
 from evermap.slam.calibration import CalibrationPrior
@@ -73,7 +74,7 @@ def test_visits_are_landmarks_of_their_own_but_for_names() -> None:
     row, name = np.array([1, 1, NOBODY, 1, 1, 0, 0, 0, 1]), np.full(9, UNKNOWN)
     name[[3, 5]] = 4
     estimate = Estimate(made.truth.pose[:9], np.zeros((2, 2)), made.truth.states)
-    visits = Assignment(seen, row, estimate, np.column_stack([np.full(9, UNKNOWN), name])).in_visits(20.0)
+    visits = Assignment(seen, row, estimate, np.column_stack([np.full(9, UNKNOWN), name]), Traits.none(9)).in_visits()
     assert visits.tolist() == [0, 0, NOBODY, 1, 1, 1, 1, 2, 3]
 
 

@@ -14,6 +14,7 @@ from evermap.config import Config
 from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator
+from evermap.slam.association.features import Traits
 from evermap.slam.association.identify import searched
 from evermap.slam.association.particles import drawn
 from evermap.slam.calibration import CalibrationPrior
@@ -56,7 +57,7 @@ def test_evidence_is_that_of_the_joint_gaussian() -> None:
     problem = replace(problem, sigma_given=np.tile(noise.detection, (len(problem.pose_row), 1)))
     at = replace(made.truth, pose=np.array(pose))
     kind = np.full((len(problem.pose_row), 2), -1)
-    given = Assignment(problem, problem.landmark_row, at, kind, settings=settings)
+    given = Assignment(problem, problem.landmark_row, at, kind, Traits.none(len(kind)), settings)
     _, evidence = drawn(given, noise.odometry, seed=0, wider=1.0)
 
     def residuals(change: np.ndarray) -> np.ndarray:

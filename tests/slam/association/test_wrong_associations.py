@@ -12,8 +12,8 @@ from evermap.config import Config
 from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import BEFORE
-from evermap.slam.association.relaying import displaced_stretches, laid
-from evermap.slam.association.splitting import Visits, weighed_visits
+from evermap.slam.association.features import Traits
+from evermap.slam.association.wrong_associations import Visits, displaced_stretches, laid, weighed_visits
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
 from evermap.slam.noise import START
@@ -52,14 +52,14 @@ def two_visits(seed: int, off_m: float = 0.0) -> tuple[World, Assignment, np.nda
     sigma = np.tile(made.noise.detection, (len(row), 1))
     measured = replace(problem, reading=reading, sigma_given=sigma)
     kind = np.full((len(row), 2), UNKNOWN)
-    return made, Assignment(measured, row, made.truth, kind, settings=SETTINGS), np.flatnonzero(late)
+    return made, Assignment(measured, row, made.truth, kind, Traits.none(len(row)), SETTINGS), np.flatnonzero(late)
 
 
 def weighed(made: World, assignment: Assignment) -> Visits:
     found, marginals, smoother = solved(made, assignment)
-    return weighed_visits(
-        found, marginals, smoother.detections(found.estimate), among=np.arange(8) == TWICE, density=0.1
-    )
+    every = weighed_visits(found, marginals, smoother.detections(found.estimate), density=0.1)
+    mine = np.flatnonzero(every.landmark == TWICE)
+    return Visits([every.rows[k] for k in mine], *(each[mine] for each in every[1:]))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -83,9 +83,7 @@ def test_where_nothing_is_a_landmark_there_are_no_visits() -> None:
     made, assignment, _ = two_visits(0)
     nothing = assignment.without(np.ones(8, dtype=bool))
     _, marginals, smoother = solved(made, assignment)
-    visits = weighed_visits(
-        nothing, marginals, smoother.detections(assignment.estimate), among=np.ones(0, dtype=bool), density=0.1
-    )
+    visits = weighed_visits(nothing, marginals, smoother.detections(assignment.estimate), density=0.1)
     assert len(visits.rows) == len(visits.evidence) == 0
 
 
@@ -124,6 +122,7 @@ def kicked(seed: int) -> tuple[World, Assignment, np.ndarray]:
         row,
         Estimate(pose, np.zeros((len(names), 2)), KNOWN_SENSORS.mean),
         np.full((len(tree), 2), UNKNOWN),
+        Traits.none(len(tree)),
     )
     points = guess.points()
     place = np.array([np.median(points[row == k], axis=0) for k in range(len(names))])

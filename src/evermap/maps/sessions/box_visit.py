@@ -53,7 +53,7 @@ class SeenBoxes:
 
 def seen_boxes(taken: TrafficIntake, solved: SpatialSolved, settings: BoxesConfig) -> SeenBoxes:
     """Return the static boxes of a session at their estimated places."""
-    optimum, stands = solved.optimum, taken.traffic.standing
+    optimum, stands = solved.optimum, taken.stays
     problem, estimate, count = optimum.smoother.problem, optimum.estimate, len(optimum.estimate.place)
     row = taken.used[taken.intake.used]
     given, stay_of = taken.recording.detections, np.full(len(taken.recording.detections), UNKNOWN)
@@ -207,7 +207,7 @@ class BoxVisit(SpatialVisit):
         row_of[self.intake.pose_frame] = np.arange(len(problem.stamp_s))
         rows = boxes_of(recording)
         rows = rows[row_of[recording.detections.frame[rows]] >= 0]
-        seen = self.taken.traffic.gauge.range_scale * recording.detections.position_sensor_m[rows]
+        seen = self.taken.gauge.range_scale * recording.detections.position_sensor_m[rows]
         eye = se3.compose(
             self.optimum.estimate.pose[row_of[recording.detections.frame[rows]]], mounts_of(recording)[rows]
         )
@@ -219,7 +219,7 @@ class BoxVisit(SpatialVisit):
         """Looks, by frame and place, at boxes of the map that a detection shows which no stay has."""
         living, recording = entry.living, self.taken.recording
         box = np.flatnonzero(np.isin(living.places.landmark_id, living.boxes.landmark_id))
-        stands = self.taken.traffic.standing
+        stands = self.taken.stays
         spare = np.isin(rows, boxes_of(recording)[(stands.stay == UNKNOWN) & ~(stands.p_static < 0.5)])
         rows, at = rows[spare], at[spare]
         if not len(box) or not len(rows):

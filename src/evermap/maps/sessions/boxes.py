@@ -207,7 +207,7 @@ def _placed(
         motion, agree = consensus(own[:, :2], there[:, :2])
         if agree.sum() > 1:
             return in_space(motion, own[agree], there[agree]), 1.0
-    metre = taken.known > 0 or taken.traffic.gauge.stated is not None
+    metre = taken.known > 0 or taken.gauge.stated is not None
     return placed(seen_boxes(taken, solved, known.settings), known, metre=metre)
 
 

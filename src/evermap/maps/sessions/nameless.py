@@ -32,12 +32,11 @@ from evermap.maps.sessions.gaussian import drifted
 from evermap.maps.sessions.placing import SMALLEST_P, one_to_one
 from evermap.maps.sessions.session import admitted
 from evermap.slam.association import associate
-from evermap.slam.association.assignment import alike, landmarks_of_visits, visits_of, with_ids
+from evermap.slam.association.assignment import alike, visits_of, with_ids
 from evermap.slam.association.consensus import Candidates, consensus
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
 from evermap.slam.association.features import Likeness, Traits, column_medians, learned
 from evermap.slam.association.identify import ALL_TRIED, Associated, numbered
-from evermap.slam.association.in_space import AssociatedInSpace
 from evermap.slam.association.jcbb import gates
 from evermap.slam.association.merging import in_reach
 from evermap.slam.association.place_index import PlaceIndex
@@ -148,9 +147,7 @@ def numbered_in(recording: AnyRecordingT, prior_map: Landmarks, config: Config) 
     return with_ids(given, found.landmark_row, name, numbered(landmark_id, taken))
 
 
-def _met(
-    recording: AnyRecording, living: LivingMap, config: Config
-) -> tuple[Associated | AssociatedInSpace, IntArray, IntArray]:
+def _met(recording: AnyRecording, living: LivingMap, config: Config) -> tuple[Associated, IntArray, IntArray]:
     """The association of a recording, (M,) ids of its detections, given or of glimpsed landmarks of a map, and (L,) ids
     of its landmarks, `UNKNOWN` for new ones.
     """
@@ -242,15 +239,12 @@ class _Traits(NamedTuple):
     theirs: Likeness
 
     @classmethod
-    def of(
-        cls, found: Associated | AssociatedInSpace, recording: AnyRecording, living: LivingMap, settings: SlamConfig
-    ) -> Self | None:
+    def of(cls, found: Associated, recording: AnyRecording, living: LivingMap, settings: SlamConfig) -> Self | None:
         """Return what the columns of a recording say; None if that is nothing, or the map does not know them."""
         seen, row = recording.detections, found.landmark_row
         if seen.features is None or not len(living.traits):
             return None
-        visit = visits_of(recording.frames.stamp_s[seen.frame], row, settings.association.forget_s)
-        landmark = landmarks_of_visits(visit, row)
+        visit, landmark = visits_of(recording.frames.stamp_s[seen.frame], row, settings.association.forget_s)
         traits = learned(seen.features, visit, landmark, settings=settings)
         if traits is None:
             return None
@@ -287,7 +281,7 @@ class _Assigned:
 
     def __init__(
         self,
-        found: Associated | AssociatedInSpace,
+        found: Associated,
         living: LivingMap,
         stood: _Stood,
         traits: _Traits | None,

@@ -10,10 +10,9 @@ from evermap.types import AnyRecording, SpatialRecording
 
 if TYPE_CHECKING:
     from evermap.slam.association.identify import Associated
-    from evermap.slam.association.in_space import AssociatedInSpace
 
 
-def associate(recording: AnyRecording, settings: SlamConfig, *, keep_ids: bool) -> Associated | AssociatedInSpace:
+def associate(recording: AnyRecording, settings: SlamConfig, *, keep_ids: bool) -> Associated:
     """Associate the detections of a recording by geometry.
 
     Args:

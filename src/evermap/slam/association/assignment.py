@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from evermap.config import SlamConfig
+from evermap.config import AssociationConfig, SlamConfig
 from evermap.slam.association.features import Likeness, Traits
 from evermap.slam.problem import Estimate, Problem
 from evermap.slam.streaming import USUAL, sighted_at
@@ -36,14 +36,12 @@ class LooseDetections(NamedTuple):
 
 def alike(one: IntArray, other: IntArray) -> BoolArray:
     """Return which labels (..., P) are compatible: equal in every column, such as class and name, or unknown."""
-    same: BoolArray = ((one == other) | (one == UNKNOWN) | (other == UNKNOWN)).all(axis=-1)
-    return same
+    return np.asarray(((one == other) | (one == UNKNOWN) | (other == UNKNOWN)).all(axis=-1))
 
 
 def same_name(one: IntArray, other: IntArray) -> BoolArray:
     """Return which labels (..., P) have the same known name, the last column."""
-    same: BoolArray = (one[..., -1] == other[..., -1]) & (one[..., -1] != UNKNOWN)
-    return same
+    return np.asarray((one[..., -1] == other[..., -1]) & (one[..., -1] != UNKNOWN))
 
 
 def labels_of(kind: IntArray, landmark_row: IntArray, n_landmarks: int) -> IntArray:
@@ -87,19 +85,43 @@ def with_ids(recording: AnyRecordingT, landmark_row: IntArray, name: IntArray, l
     return replace(recording, detections=detections)
 
 
-def visits_of(stamp_s: FloatArray, landmark_row: IntArray, pause_s: float) -> IntArray:
-    """Return (M,) visits of detections with stamps and landmarks (M,); see `Assignment.visits`."""
+def visits_of(stamp_s: FloatArray, landmark_row: IntArray, pause_s: float) -> tuple[IntArray, IntArray]:
+    """Return (M,) the visit of each detection, numbered by landmark and then by time, `NOBODY` if unassigned; and (V,)
+    the landmark of each visit.
+
+    Args:
+        stamp_s: (M,) of detections.
+        landmark_row: (M,) their landmarks, `NOBODY` for none.
+        pause_s: time without a detection that ends a visit.
+    """
     found, order = np.full_like(landmark_row, NOBODY), np.lexsort((stamp_s, landmark_row))
     order = order[landmark_row[order] >= 0]
     again = (np.diff(landmark_row[order]) == 0) & (np.diff(stamp_s[order]) <= pause_s)
-    found[order] = np.cumsum(np.append(0, ~again)[: len(order)])
-    return found
+    first = np.append(True, ~again)[: len(order)]
+    found[order] = np.cumsum(first) - 1
+    return found, landmark_row[order[first]]
 
 
-def landmarks_of_visits(visit: IntArray, landmark_row: IntArray) -> IntArray:
-    """Return (V,) the landmark of each visit."""
-    first = np.flatnonzero(visit >= 0)
-    return landmark_row[first[np.unique(visit[first], return_index=True)[1]]]
+def shared_variance(
+    wide: FloatArray, landmark_row: IntArray, n_landmarks: int, settings: AssociationConfig
+) -> FloatArray:
+    """Return (L,) variance [m^2] of the error that all sightings of a landmark have in common.
+
+    A robot at rest repeats the same error a hundred times, which the smoother takes for independent errors.
+
+    Args:
+        wide: (M,) standard deviations of detections [m].
+        landmark_row: (M,) their landmarks, `NOBODY` for none.
+        n_landmarks: number of landmarks.
+        settings: of the association.
+    """
+    seen = np.flatnonzero(landmark_row >= 0)
+    order = seen[np.lexsort((wide[seen], landmark_row[seen]))]
+    count = np.bincount(landmark_row[seen], minlength=n_landmarks)
+    middle, met = np.cumsum(count) - count + count // 2, count > 0
+    variance = np.full(n_landmarks, settings.shared_m**2)
+    variance[met] += (settings.shared_share * wide[order[middle[met]]]) ** 2
+    return variance
 
 
 def seen_together(
@@ -131,6 +153,14 @@ def _seen_in(frame: IntArray, landmark_row: IntArray, shape: tuple[int, int]) ->
     return found
 
 
+def merged_rows(pairs: list[tuple[int, int]], n_landmarks: int) -> IntArray:
+    """Return (L,) the landmark that each becomes if pairs (younger, older) are merged."""
+    becomes = np.arange(n_landmarks)
+    for younger, older in sorted(pairs, key=lambda pair: pair[0]):
+        becomes[younger] = becomes[older]  # the older one may itself be merged with a still older one
+    return becomes
+
+
 @dataclass(frozen=True, slots=True)
 class Assignment:
     """Detections, each of at most one landmark, and an estimate of poses, landmarks and calibration states.
@@ -140,7 +170,7 @@ class Assignment:
         landmark_row: (M,) landmark of every detection, `NOBODY` for none; landmarks by first detection.
         estimate: of everything; every landmark has a position.
         kind: (M, 2) class and name of every detection, `UNKNOWN` for none; different ones exclude each other.
-        traits: readings of the landmarks themselves; None if they give no evidence.
+        traits: readings of the landmarks themselves; `Traits.none` if they give no evidence.
         settings: of the estimator.
     """
 
@@ -148,7 +178,7 @@ class Assignment:
     landmark_row: IntArray
     estimate: Estimate
     kind: IntArray
-    traits: Traits | None = None
+    traits: Traits
     settings: SlamConfig = USUAL
 
     @property
@@ -164,18 +194,17 @@ class Assignment:
     @property
     def last_seen_s(self) -> FloatArray:
         """(L,) stamp of the last detection; -inf for none."""
-        last = np.full(self.n_landmarks, -np.inf)
-        seen = self.landmark_row >= 0
-        np.maximum.at(last, self.landmark_row[seen], self.measured.stamp_s[self.measured.pose_row[seen]])
-        return last
+        return self._stamp_s(np.maximum, -np.inf)
 
     @property
     def first_seen_s(self) -> FloatArray:
         """(L,) stamp of the first detection; inf for none."""
-        first = np.full(self.n_landmarks, np.inf)
-        seen = self.landmark_row >= 0
-        np.minimum.at(first, self.landmark_row[seen], self.measured.stamp_s[self.measured.pose_row[seen]])
-        return first
+        return self._stamp_s(np.minimum, np.inf)
+
+    def _stamp_s(self, choose: np.ufunc, none_s: float) -> FloatArray:
+        found, seen = np.full(self.n_landmarks, none_s), self.landmark_row >= 0
+        choose.at(found, self.landmark_row[seen], self.measured.stamp_s[self.measured.pose_row[seen]])
+        return found
 
     @property
     def of_kind(self) -> IntArray:
@@ -196,37 +225,16 @@ class Assignment:
         return np.bincount(self.landmark_row[named], minlength=self.n_landmarks)
 
     @property
-    def name(self) -> IntArray:
-        """(L,) name of each landmark, `UNKNOWN` for none; no two have the same."""
-        return names_of(self.kind[:, -1], self.landmark_row, self.n_landmarks)
-
-    def seen_together(self) -> tuple[sparse.csr_array, sparse.csr_array]:
-        """Return `seen_together` of these landmarks."""
-        around = self.settings.association.around_frames
-        n_frames = len(self.measured.stamp_s)
-        return seen_together(self.measured.pose_row, self.landmark_row, n_frames, self.n_landmarks, around)
-
-    @property
     def shared_variance(self) -> FloatArray:
-        """(L,) variance [m^2] of the error that all sightings of a landmark have in common.
-
-        A robot at rest repeats the same error a hundred times, which the smoother takes for independent errors.
-        """
-        seen = np.flatnonzero(self.landmark_row >= 0)
-        order = seen[np.lexsort((self.measured.sigma_given[seen, 0], self.landmark_row[seen]))]
-        count = self.sightings
-        middle = np.cumsum(count) - count + count // 2
-        settings = self.settings.association
-        variance = np.full(self.n_landmarks, settings.shared_m**2)
-        met = count > 0
-        variance[met] += (settings.shared_share * self.measured.sigma_given[order[middle[met]], 0]) ** 2
-        return variance
+        """(L,) `shared_variance` of these landmarks."""
+        return shared_variance(
+            self.measured.sigma_given[:, 0], self.landmark_row, self.n_landmarks, self.settings.association
+        )
 
     def with_shared_errors(self, joint: FloatArray) -> FloatArray:
-        """Return the covariance (G, G) of all landmarks and states with the shared errors of sightings."""
-        out = joint.copy()
-        rows = np.arange(2 * self.n_landmarks)
-        out[rows, rows] += np.repeat(self.shared_variance, 2)
+        """Return the covariance (2 L, 2 L) of landmarks, the first of `joint`, with the shared errors of sightings."""
+        out = joint[: 2 * self.n_landmarks, : 2 * self.n_landmarks].copy()
+        out[np.diag_indices(len(out))] += np.repeat(self.shared_variance, 2)
         return out
 
     def points(self) -> FloatArray:
@@ -270,36 +278,24 @@ class Assignment:
 
     def merged(self, pairs: list[tuple[int, int]]) -> Assignment:
         """Return the assignment with pairs (younger, older) merged: the place of the older, the detections of both."""
-        becomes = np.arange(self.n_landmarks)
-        for younger, older in sorted(pairs, key=lambda pair: pair[0]):
-            becomes[younger] = becomes[older]  # the older one may itself be merged with a still older one
+        becomes = merged_rows(pairs, self.n_landmarks)
         kept = becomes == np.arange(self.n_landmarks)
         rank = np.cumsum(kept) - 1
         return self._renumbered(rank[becomes], kept)
 
-    def visits(self, pause_s: float) -> IntArray:
-        """Return (M,) the visit of each detection, numbered by landmark and then by time, `NOBODY` if unassigned.
-
-        Args:
-            pause_s: time without a detection that ends a visit.
-        """
-        return visits_of(self.measured.stamp_s[self.measured.pose_row], self.landmark_row, pause_s)
-
     def of_visits(self) -> tuple[IntArray, IntArray]:
-        """Return `visits` with the gap of the settings, and (V,) the landmark of each."""
-        visit = self.visits(self.settings.association.forget_s)
-        return visit, landmarks_of_visits(visit, self.landmark_row)
+        """Return `visits_of` these landmarks."""
+        stamp_s = self.measured.stamp_s[self.measured.pose_row]
+        return visits_of(stamp_s, self.landmark_row, self.settings.association.forget_s)
 
-    def like(self) -> Likeness | None:
-        """Return the traits of each landmark (L,); None if they give no evidence."""
-        if self.traits is None:
-            return None
+    def like(self) -> Likeness:
+        """Return the traits of each landmark (L,)."""
         visit, landmark = self.of_visits()
         return self.traits.of_landmarks(self.traits.of_visits(visit, len(landmark)), landmark, self.n_landmarks)
 
-    def in_visits(self, pause_s: float) -> IntArray:
-        """Return (M,) landmarks with a new one per visit, except that those with a name stay one; see `visits`."""
-        found = self.visits(pause_s)
+    def in_visits(self) -> IntArray:
+        """Return (M,) landmarks with a new one per visit, except that those with a name stay one; see `visits_of`."""
+        found = self.of_visits()[0]
         name = labels_of(self.kind, found, int(found.max(initial=NOBODY)) + 1)[:, -1]
         named = name != UNKNOWN
         one = np.arange(len(name))

@@ -16,14 +16,13 @@ import numpy as np
 
 from evermap.config import AssociationConfig, SlamConfig
 from evermap.geometry import se2
-from evermap.slam.association.assignment import NOBODY, Assignment, alike, same_name
-from evermap.slam.association.constellation import MOST_LAID, LoosePart, overlays, propose_constellation
-from evermap.slam.association.features import Likeness, Traits
+from evermap.slam.association.assignment import NOBODY, Assignment, alike, same_name, seen_together
+from evermap.slam.association.constellation import LoosePart, agreed_pairs, overlays
+from evermap.slam.association.features import Traits
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
-from evermap.slam.association.merging import Differences, Solution, propose_merges
-from evermap.slam.association.relaying import displaced_stretches, laid
+from evermap.slam.association.merging import Differences, Solution, accepted_rise, propose_merges, tried_by_halves
 from evermap.slam.association.revise import likely_real, reassigned, unseen_nats, with_overlooked
-from evermap.slam.association.splitting import weighed_visits
+from evermap.slam.association.wrong_associations import displaced_stretches, laid, weighed_visits
 from evermap.slam.filter_kernels import BY_PLACE, GATED, WIDTH, spread_of_frame
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, Motion, columns
@@ -107,8 +106,8 @@ class Associator:
         rules = self._rules = settings.association
         self._kind = np.full((len(problem.pose_row), 2), UNKNOWN) if kind is None else kind
         self._of_kind: IntArray = np.zeros((0, 2), dtype=np.int64)
-        self._traits = traits
-        self._like = None if traits is None else traits.nothing(0)
+        self._traits = Traits.none(len(problem.pose_row), settings) if traits is None else traits
+        self._like = self._traits.nothing(0)
         self._seen_s = np.zeros(0)
         self._start_noise = noise
         if odometry is None:
@@ -119,16 +118,16 @@ class Associator:
         self._first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
         self._pose = np.zeros((len(problem.stamp_s), 3))
         self._row: IntArray = np.full(len(problem.pose_row), NOBODY, dtype=np.int64)
-        self._sigma = rules.noise_caution * SightingNoise.constant(noise.detection).of_detections(problem)
+        self._sigma = rules.noise_caution * noise.of_detections(problem.sigma_given)
         self._filter = LocalFilter(problem.mount, problem.prior, most=MOST_COMPARED)
         self._done, self._doubted = 0, 0
         self.worth = 1.0
         """Detections whose residuals count as one; learned by the first `finish`."""
         self._next_batch = FIRST_BATCH
-        self._density_m2 = landmark_density(np.zeros((0, 2)), np.zeros(0, dtype=np.int64), settings)
+        self._density_m2 = density_of_unmet(np.zeros((0, 2)), settings)
 
     def step(self) -> None:
-        """Associate the next frame."""
+        """Associate the next frame; at intervals solve everything so far, merge duplicates, and continue from there."""
         row, local = self._done, self._filter
         detections = np.arange(self._first[row], self._first[row + 1])
         if row == 0:
@@ -142,7 +141,7 @@ class Associator:
         self._pose[row] = local.pose
         self._done += 1
         if self._done == self._next_batch:
-            self._relinearise()
+            self._go_on_from(self._settled(self._without_chance(self._assignment()), RECENT))
             self._next_batch = self._done + max(FIRST_BATCH, int(BATCH_SHARE * self._done))
 
     def _after_driving(self, row: int, detections: IntArray) -> _Frame:
@@ -189,7 +188,7 @@ class Associator:
         if not len(_twice(now)):
             return
         begun = replace(now, estimate=replace(now.estimate, pose=pose()))
-        row, points = begun.in_visits(self._rules.forget_s), begun.points()
+        row, points = begun.in_visits(), begun.points()
         seen = row >= 0
         each = np.bincount(row[seen])
         place: FloatArray = np.column_stack([np.bincount(row[seen], x) / each for x in points[seen].T])
@@ -282,20 +281,18 @@ class Associator:
     def _match(self, detections: IntArray) -> _Frame:
         """Weigh the detections of the frame against the landmarks so far."""
         kind = self._kind[detections], self._of_kind
-        pairings = pairings_of_frame(
+        pairings, followed = pairings_of_frame(
             self._filter, self._problem, self._sigma, detections,
             density=self._density_m2, kind=kind, settings=self._rules,
         )  # fmt: skip
-        if self._traits is not None and self._like is not None:
-            read = self._traits.singly(detections[pairings.source])
-            by_traits = self._traits.same(read, self._like.part(pairings.target))
-            pairings = replace(pairings, log_density_new=pairings.log_density_new - by_traits)
-        probability, evidence, _ = pairing_probability(pairings, confidence=self._rules.gate_confidence)
+        read = self._traits.singly(detections[pairings.source])
+        by_traits = self._traits.same(read, self._like.part(pairings.target))
+        pairings = replace(pairings, log_density_new=pairings.log_density_new - by_traits)
+        probability, evidence = pairing_probability(pairings, confidence=self._rules.gate_confidence)
         known = np.zeros(len(detections))
         np.add.at(known, pairings.source, probability)
-        assert pairings.followed is not None
         away = self._problem.stamp_s[self._done] - self._seen_s[pairings.target] > self._rules.forget_s
-        least = np.where(away & ~pairings.followed, self._rules.p_return, self._rules.p_match)
+        least = np.where(away & ~followed, self._rules.p_return, self._rules.p_match)
         taken = np.flatnonzero((probability >= least) | self._harmless(pairings, probability, known, least))
         return _Frame(pairings, taken, 1.0 - known, evidence)
 
@@ -339,24 +336,17 @@ class Associator:
         self._doubted += len(detections) - len(known) - len(new)
         self._of_kind[target] = np.maximum(self._of_kind[target], self._kind[known])
         self._seen_s[target] = problem.stamp_s[self._done]
-        if self._traits is not None and self._like is not None:
-            self._like = self._traits.followed(self._like, target, known)
+        self._row[new] = len(local.position) + np.arange(len(new))
+        seen = np.append(known, new)
+        self._like = self._traits.followed(self._like, self._row[seen], seen)
         if not len(new):
             return
-        self._row[new] = len(local.position) + np.arange(len(new))
         self._of_kind = np.vstack([self._of_kind, self._kind[new]])
-        if self._traits is not None and self._like is not None:
-            more = Likeness(*map(np.concatenate, zip(self._like, self._traits.nothing(len(new)), strict=True)))
-            self._like = self._traits.followed(more, self._row[new], new)
         self._seen_s = np.append(self._seen_s, np.full(len(new), problem.stamp_s[self._done]))
         at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
         for row, place in zip(self._row[new].tolist(), at, strict=True):
             local.meet(row, place)
         local.update(self._row[new], problem.reading[new], self._sigma[new], weighing=GATED)
-
-    def _relinearise(self) -> None:
-        """Solve everything so far, merge duplicates, and continue from there."""
-        self._go_on_from(self._settled(self._without_chance(self._assignment()), RECENT))
 
     def _go_on_from(self, solved: _Solved) -> None:
         assignment = solved.assignment
@@ -371,9 +361,8 @@ class Associator:
         measured = self._problem.until(self._done)
         estimate = Estimate(self._pose[: self._done].copy(), self._filter.position.copy(), self._filter.states.copy())
         count = len(measured.pose_row)
-        traits = None if self._traits is None else self._traits.until(count)
         row, kind = self._row[:count].copy(), self._kind[:count]
-        return Assignment(measured, row, estimate, kind, traits, self._settings)
+        return Assignment(measured, row, estimate, kind, self._traits.until(count), self._settings)
 
     def _with_sigma(self, measured: Problem) -> Problem:
         """The measurements with the learned noise of sightings."""
@@ -402,6 +391,11 @@ class Associator:
         """
         settings, p_merge = self._settings, self._rules.p_merge
         refused: set[tuple[int, int]] = set()
+
+        def merge(pairs: list[tuple[int, int]]) -> _Solved | None:
+            trial = self._solved(now.merged(pairs))
+            return trial if trial.cost - solved.cost <= accepted_rise(pairs, now.sightings, 2, self._rules) else None
+
         for _ in range(MERGE_ROUNDS):
             now = solved.assignment
             self._density_m2 = density = landmark_density(now.estimate.landmark, now.sightings, settings)
@@ -413,24 +407,19 @@ class Associator:
                 compared(now, solved.marginals, density), probability=p_merge,
                 among=among, known=known, last=recent is None, refused=refused,
             )  # fmt: skip
-            part = self._loose(solved, refused) if not pairs and within is None else None
+            part = LoosePart.of(now, solved.marginals, refused) if not pairs and within is None else None
             if part is not None:
-                pairs = propose_constellation(part, density=density, probability=p_merge, settings=settings)
+                sure = agreed_pairs(
+                    part.source, part.target, part.allowed, density=density, probability=p_merge, settings=settings
+                )
+                pairs = part.rows(sure)
             if not pairs:
                 break
-            merged = self._merged(solved, pairs, refused)
+            merged = tried_by_halves(pairs, merge, refused.add)
             if merged is not None:
                 refused.clear()
                 solved = merged
         return solved
-
-    def _loose(self, solved: _Solved, refused: set[tuple[int, int]]) -> LoosePart | None:
-        """The loose part of a map that is small enough to be aligned with the rest by all its pairs."""
-        now = solved.assignment
-        if now.n_landmarks > MOST_LAID:
-            return None
-        honest = now.with_shared_errors(solved.marginals.shared)[: 2 * now.n_landmarks, : 2 * now.n_landmarks]
-        return LoosePart.of(now, honest, refused)
 
     def _attached(self, solved: _Solved) -> _Solved:
         """Align a loose part with the rest in the best of its ways, if that explains detections of removed ghosts.
@@ -438,7 +427,7 @@ class Associator:
         No way is certain. But copies of landmarks, removed as ghosts, leave detections that this alignment explains;
         fewer landmarks alone are no reason.
         """
-        part = self._loose(solved, set())
+        part = LoosePart.of(solved.assignment, solved.marginals)
         if part is None or not len(part.root):
             return solved
         rules, best = self._rules, solved
@@ -457,42 +446,32 @@ class Associator:
         real = without_ghosts(solved.assignment)
         return solved if real.n_landmarks == solved.assignment.n_landmarks else self._solved(real)
 
-    def _contradictions_split(
-        self, solved: _Solved, refused: set[tuple[int, int]], recent: int | None = None
-    ) -> _Solved:
+    def _contradictions_split(self, solved: _Solved, refused: set[tuple[int, int]]) -> _Solved:
         """Split contradictory visits from their landmarks, and merge again, if the result is better.
 
         Visits that were tried without gain are in `refused`, by first detection and number.
         """
         rules = self._rules
+
+        def split(parts: list[IntArray]) -> _Solved | None:
+            trial = self._all_merged(self._solved(now.split(parts)))
+            return trial if _is_better(trial, solved) else None
+
         for _ in range(SPLIT_ROUNDS):
             now = solved.assignment
             linear = solved.smoother.detections(now.estimate)
-            visits = weighed_visits(now, solved.marginals, linear, density=self._density_m2, among=_latest(now, recent))
+            visits = weighed_visits(now, solved.marginals, linear, density=self._density_m2)
             doubtful = visits.evidence < math.log(rules.p_merge / (1.0 - rules.p_merge))
             by_traits = visits.by_traits < -rules.readings.misread_nats
             doubtful &= (visits.squared > gates(1, rules.contradiction)[1]) | by_traits
             order = np.flatnonzero(doubtful)[np.argsort(visits.evidence[doubtful], kind="stable")]
             _, first = np.unique(visits.landmark[order], return_index=True)  # one of each landmark
             parts = [visits.rows[k] for k in order[np.sort(first)] if _key(visits.rows[k]) not in refused]
-            better = self._better_split(solved, parts, refused, recent)
+            better = tried_by_halves(parts, split, lambda part: refused.add(_key(part)))
             if better is None:
                 break
             solved = better
         return solved
-
-    def _better_split(
-        self, solved: _Solved, parts: list[IntArray], refused: set[tuple[int, int]], recent: int | None
-    ) -> _Solved | None:
-        """Split all parts, or half of them, and so on, until the result is better; None if it never is."""
-        while parts:
-            trial = self._all_merged(self._solved(solved.assignment.split(parts)), recent)
-            if _is_better(trial, solved):
-                return trial
-            if len(parts) == 1:
-                refused.add(_key(parts[0]))
-            parts = parts[: len(parts) // 2]
-        return None
 
     def _realigned(self, solved: _Solved) -> _Solved:
         """Realign displaced stretches, if the result is better."""
@@ -510,21 +489,6 @@ class Associator:
             solved = self._contradictions_split(better, set())
         return solved
 
-    def _merged(self, solved: _Solved, pairs: list[tuple[int, int]], refused: set[tuple[int, int]]) -> _Solved | None:
-        """Merge all pairs, or half of them, and so on, until the cost permits; a single one may be refused."""
-        rules = self._rules
-        sightings = solved.assignment.sightings
-        while pairs:
-            trial = self._solved(solved.assignment.merged(pairs))
-            lesser = np.array([min(sightings[u], sightings[o]) for u, o in pairs])
-            rise = np.minimum(rules.rise_nats + rules.rise_per_sighting * lesser, rules.most_rise_nats)
-            if trial.cost - solved.cost <= rise.sum():
-                return trial
-            if len(pairs) == 1:
-                refused.update(pairs)
-            pairs = pairs[: len(pairs) // 2]
-        return None
-
     def _solved(self, assignment: Assignment, noise: Noise | None = None) -> _Solved:
         """Optimum, covariances and cost; also learns the noise of sightings, even if the solution is rejected later."""
         problem = assignment.problem()
@@ -539,9 +503,7 @@ class Associator:
         start = self._rules.noise_floor * self._start_noise.detection
         noise_of = fit_sighting_noise(unknown, estimate, start, left, self._rules)
         self._sigma = self._rules.noise_caution * noise_of.of_detections(self._problem)
-        cost = smoother.under(noise, heavy=False).cost(estimate)
-        if assignment.traits is not None:
-            cost -= assignment.traits.evidence(*assignment.of_visits())
+        cost = smoother.under(noise, heavy=False).cost(estimate) - assignment.traits.evidence(*assignment.of_visits())
         return _Solved(replace(assignment, estimate=estimate), marginals, cost, smoother)
 
 
@@ -566,13 +528,14 @@ def compared(assignment: Assignment, marginals: Marginals, density: float) -> So
 
         readings = np.minimum(named[younger], named[older])
         new = math.log(density) - by_name(kind[younger], kind[older], readings, settings)
-        if assignment.traits is not None and like is not None:
-            new -= assignment.traits.same(like.part(younger), like.part(older))
+        new -= assignment.traits.same(like.part(younger), like.part(older))
         return Differences(place[younger] - place[older], own, new, together)
 
+    frame, row = assignment.measured.pose_row, assignment.landmark_row
+    n_frames, around = len(assignment.measured.stamp_s), settings.around_frames
     return Solution(
         place, marginals.landmark, differences, assignment.sightings, assignment.last_seen_s,
-        *assignment.seen_together(), kind, settings,
+        *seen_together(frame, row, n_frames, len(place), around), kind, settings,
     )  # fmt: skip
 
 
@@ -600,7 +563,7 @@ def correlated(assignment: Assignment) -> float:
     seen = assignment.landmark_row >= 0
     sigma = assignment.measured.sigma_given[seen]
     residual = np.clip(detection_residuals(assignment.problem(), assignment.estimate) / sigma, -3.0, 3.0)
-    visit = assignment.visits(assignment.settings.association.forget_s)[seen]
+    visit = assignment.of_visits()[0][seen]
     if not len(visit):
         return 1.0
     together = np.column_stack([np.bincount(visit, of) for of in residual.T])
@@ -656,8 +619,9 @@ def pairings_of_frame(
     density: float,
     kind: tuple[IntArray, IntArray],
     settings: AssociationConfig,
-) -> Pairings:
-    """Return detections of a frame paired with the landmarks whose gates they pass.
+) -> tuple[Pairings, BoolArray]:
+    """Return detections of a frame paired with the landmarks whose gates they pass, K of them; and (K,) whether these
+    are tracked: known relative to the robot as well as they are measured.
 
     Args:
         local: the pose of the frame, with the landmarks that are compared.
@@ -688,31 +652,40 @@ def pairings_of_frame(
     # area element r dr db
     new = np.log(np.where(followed, settings.unmet_share, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))
     new -= settings.name_nats * same_name(kind[0][source], kind[1][target])
-    return Pairings(source, target, innovation[inside], joint, new, len(detections), followed)
+    return Pairings(source, target, innovation[inside], joint, new, len(detections)), followed
 
 
 def density_of_unmet(place: FloatArray, settings: SlamConfig = USUAL) -> float:
-    """Return the density of unmapped landmarks [1/m^2] in the area that those at `place` (L, 2) span."""
-    return settings.association.least_landmarks / _area_m2(place, settings)
-
-
-def _area_m2(place: FloatArray, settings: SlamConfig) -> float:
-    area_m2 = float(np.prod(np.ptp(place, axis=0))) if len(place) else 0.0
-    return max(area_m2, settings.association.least_area_m2)
+    """Return the density of unmapped landmarks in what those at `place` span; units as of `landmark_density`."""
+    return settings.association.least_landmarks / _extent(place, settings)
 
 
 def landmark_density(place: FloatArray, sightings: IntArray, settings: SlamConfig = USUAL) -> float:
-    """Return the density of landmarks [1/m^2] in the area that those at `place` (L, 2) span; see `effective_number`."""
-    return effective_number(sightings, settings) / _area_m2(place, settings)
+    """Return the density of landmarks: their effective number over the area, in space the volume, that they span.
 
+    The effective number is `(sum s)^2 / sum s^2`, so that a duplicate with few sightings counts little; landmarks with
+    equal sightings count one each.
 
-def effective_number(sightings: IntArray, settings: SlamConfig = USUAL) -> float:
-    """Return the effective number of landmarks from their sightings (L,): `(sum s)^2 / sum s^2`.
+    Args:
+        place: (L, 2), or (L, 3) in space.
+        sightings: (L,) numbers `s` of detections.
+        settings: of the estimator.
 
-    A duplicate with few sightings counts little; landmarks with equal sightings count one each.
+    Returns:
+        [1/m^2], in space [1/m^3].
     """
     squares = float((sightings.astype(float) ** 2).sum())
-    return max(float(sightings.sum()) ** 2 / max(squares, 1.0), settings.association.least_landmarks)
+    number = float(sightings.sum()) ** 2 / max(squares, 1.0)
+    return max(number, settings.association.least_landmarks) / _extent(place, settings)
+
+
+def _extent(place: FloatArray, settings: SlamConfig) -> float:
+    """Area [m^2], in space volume [m^3], of the box around places; those on a wall span none, hence a least extent."""
+    rules = settings.association
+    side_m, least = 0.0, rules.least_area_m2
+    if place.shape[1] == 3:
+        side_m, least = rules.space.least_extent_m, rules.space.least_volume_m3
+    return max(float(np.prod(np.maximum(np.ptp(place, axis=0), side_m))) if len(place) else 0.0, least)
 
 
 LEAST_LEFT = 0.1
@@ -729,11 +702,6 @@ class SightingNoise:
     range_growth: float
     bearing_variance: float
 
-    @classmethod
-    def constant(cls, sigma: FloatArray) -> SightingNoise:
-        """Return noise independent of range: sigma (2,) of range [m] and bearing [rad]."""
-        return cls(float(sigma[0] ** 2), 0.0, float(sigma[1] ** 2))
-
     def of_detections(self, problem: Problem) -> FloatArray:
         """Return (M, 2) standard deviation of every detection: its own if it states one."""
         fourth = problem.reading[:, 0] ** 4
@@ -744,11 +712,7 @@ class SightingNoise:
 
 
 def fit_sighting_noise(
-    problem: Problem,
-    estimate: Estimate,
-    start: FloatArray,
-    left: FloatArray | None = None,
-    settings: AssociationConfig = USUAL.association,
+    problem: Problem, estimate: Estimate, start: FloatArray, left: FloatArray, settings: AssociationConfig
 ) -> SightingNoise:
     """Estimate noise from the residuals of assigned detections that state none.
 
@@ -757,12 +721,12 @@ def fit_sighting_noise(
         estimate: the optimum.
         start: (2,) standard deviations of the prior.
         left: (M, 2) share of the variance that the fit leaves in the residuals (restricted likelihood, see
-            `slam.noise`); None for all of it.
+            `slam.noise`).
         settings: of the association.
     """
     pseudo, clipped_at = settings.pseudo_sightings, settings.clipped_at
     free = ~np.isfinite(problem.sigma_given)
-    left = np.ones(free.shape) if left is None else np.maximum(left, LEAST_LEFT)
+    left = np.maximum(left, LEAST_LEFT)
     squared = detection_residuals(problem, estimate) ** 2 / left
     fourth = problem.reading[free[:, 0], 0] ** 4
     middle = float(np.median(fourth)) if len(fourth) else 1.0

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,7 @@ FREE = 2
 """Number of pairs that determine a motion in the plane."""
 
 
-@dataclass(frozen=True, slots=True)
-class Candidates:
+class Candidates(NamedTuple):
     """P candidate pairs.
 
     Attributes:
@@ -74,19 +73,13 @@ def consensus(candidates: Candidates, *, gate: float, loose: float) -> Consensus
         loose: the same for the first `FREE` pairs, which determine the motion.
     """
     count = len(candidates.difference)
-    ends = np.arange(2 * count).reshape(count, 2) if candidates.ends is None else candidates.ends
-    every = (
-        np.ascontiguousarray(candidates.difference),
-        np.ascontiguousarray(candidates.covariance),
-        candidates.log_density,
-        np.ascontiguousarray(candidates.conflict),
-        np.ascontiguousarray(ends),
-    )
     if not count:
         return Consensus(np.zeros(0, dtype=np.int64), 0.0, np.zeros(0))
-    alone = np.array([_grown(np.array([k]), -1, 1, gate, loose, *every)[1] for k in range(count)])
+    ends = np.arange(2 * count).reshape(count, 2) if candidates.ends is None else candidates.ends
+    every = Candidates(*map(np.ascontiguousarray, candidates._replace(ends=ends)))
+    alone = np.array([_grown(np.array([k]), -1, 1, gate, loose, every)[1] for k in range(count)])
     seeds = np.argsort(-alone, kind="stable")[:MOST_SEEDS]
-    sets, evidence, label = _all_grown(seeds, gate, loose, *every)
+    sets, evidence, label = _all_grown(seeds, gate, loose, every)
     if evidence.max() <= 0.0:
         return Consensus(np.zeros(0, dtype=np.int64), 0.0, np.zeros(0))
     top = int(np.argmax(evidence))
@@ -94,7 +87,7 @@ def consensus(candidates: Candidates, *, gate: float, loose: float) -> Consensus
     margin = np.full(len(best), evidence[top])  # over no pairs
     for m, pair in enumerate(best.tolist()):
         without = evidence[label[:, ends[pair, 0]] != label[:, ends[pair, 1]]]
-        _, rest, _ = _grown(np.delete(best, m), pair, LARGEST_SET, gate, loose, *every)
+        _, rest, _ = _grown(np.delete(best, m), pair, LARGEST_SET, gate, loose, every)
         margin[m] = evidence[top] - max(0.0, rest, without.max(initial=0.0))
     return Consensus(best, float(evidence[top]), margin)
 
@@ -107,45 +100,26 @@ def warm_up() -> None:
 
 
 @kernel
-def _all_grown(
-    seeds: IntArray,
-    gate: float,
-    loose: float,
-    difference: FloatArray,
-    covariance: FloatArray,
-    log_density: FloatArray,
-    conflict: Any,
-    ends: IntArray,
-) -> tuple[IntArray, FloatArray, IntArray]:
+def _all_grown(seeds: IntArray, gate: float, loose: float, pairs: Any) -> tuple[IntArray, FloatArray, IntArray]:
     """Sets (K, LARGEST_SET) grown from seeds (K,), padded by -1, the evidence (K,) of each, and labels (K, L) of
     landmarks: those with one label are the same.
     """
     sets, evidence = np.full((len(seeds), LARGEST_SET), -1), np.zeros(len(seeds))
-    label = np.empty((len(seeds), ends.max() + 1), dtype=np.int64)
+    label = np.empty((len(seeds), pairs.ends.max() + 1), dtype=np.int64)
     for k in range(len(seeds)):
-        found, evidence[k], label[k] = _grown(
-            seeds[k : k + 1], -1, LARGEST_SET, gate, loose, difference, covariance, log_density, conflict, ends
-        )
+        found, evidence[k], label[k] = _grown(seeds[k : k + 1], -1, LARGEST_SET, gate, loose, pairs)
         sets[k, : len(found)] = found
     return sets, evidence, label
 
 
 @kernel
 def _grown(
-    start: IntArray,
-    forbidden: int,
-    most: int,
-    gate: float,
-    loose: float,
-    difference: FloatArray,
-    covariance: FloatArray,
-    log_density: FloatArray,
-    conflict: Any,
-    ends: IntArray,
+    start: IntArray, forbidden: int, most: int, gate: float, loose: float, pairs: Any
 ) -> tuple[IntArray, float, IntArray]:
     """Grow a set from pairs `start` to at most `most`, without the `forbidden` one; return it, its evidence, and the
     labels of landmarks.
     """
+    difference, covariance, log_density, ends = pairs.difference, pairs.covariance, pairs.log_density, pairs.ends
     count = len(difference)
     room = max(min(most, LARGEST_SET), len(start))
     chosen, evidence = np.empty(room, dtype=np.int64), 0.0
@@ -181,7 +155,7 @@ def _grown(
         label[label == other] = one
         for k in range(count):
             one, other = label[ends[k, 0]], label[ends[k, 1]]
-            if conflict[best, k] or one == other:
+            if pairs.conflict[best, k] or one == other:
                 open_[k] = False
             elif forbidden >= 0:
                 a, b = label[ends[forbidden, 0]], label[ends[forbidden, 1]]

@@ -23,6 +23,7 @@ from evermap.geometry.group import group_of
 from evermap.geometry.rigid import rigid
 from evermap.slam.association.assignment import Assignment, alike, same_name
 from evermap.slam.association.jcbb import Pairings, most_pairings
+from evermap.slam.problem import Marginals
 from evermap.slam.streaming import USUAL
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -71,17 +72,17 @@ class LocalMap:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """A motion and the pairs that it explains.
+    """The pairs that a motion explains.
 
     Attributes:
-        motion: (3,), in space (7,), from the frame of the source to that of the target.
         pairs: (source, target) of landmarks that agree.
         log_evidence: of the pairs over no pairs [nats].
+        pairings: all that are near each other under the motion.
     """
 
-    motion: FloatArray
     pairs: tuple[tuple[int, int], ...]
     log_evidence: float
+    pairings: Pairings
 
 
 def overlays(
@@ -103,12 +104,15 @@ def overlays(
         motions: candidates; None tries all pairs, in the plane.
         settings: of the estimator.
     """
-    found: dict[tuple[tuple[int, int], ...], Alignment] = {}
-    for motion in _motions(source, target, allowed, settings.association.constellation) if motions is None else motions:
-        overlay = _weighed(motion, source, target, allowed, density, settings.association)
-        known = found.get(overlay.pairs)
-        if known is None or known.log_evidence < overlay.log_evidence:
-            found[overlay.pairs] = overlay
+    rules, found = settings.association, dict[tuple[tuple[int, int], ...], Alignment]()
+    for motion in _motions(source, target, allowed, rules.constellation) if motions is None else motions:
+        pairings = _pairings(motion, source, target, allowed, density, rules)
+        chosen = most_pairings(pairings, confidence=rules.gate_confidence)
+        rows = chosen[chosen >= 0]
+        pairs = tuple(zip(pairings.source[rows].tolist(), pairings.target[rows].tolist(), strict=True))
+        log_evidence = _evidence(pairings, rows.tolist(), density)
+        if pairs not in found or found[pairs].log_evidence < log_evidence:
+            found[pairs] = Alignment(pairs, log_evidence, pairings)
     return sorted(found.values(), key=lambda overlay: -overlay.log_evidence)
 
 
@@ -125,18 +129,9 @@ def agreed_pairs(
 ) -> list[tuple[int, int]]:
     """Return pairs (source, target) that are certain: of an alignment far better than any other, and certain in it.
 
-    Empty if there are several good alignments, or none.
-
-    Args:
-        source: the local map, its best known landmarks first.
-        target: the map.
-        allowed: (n, m) pairs that may be the same.
-        density: expected landmarks per square metre, in space per cubic metre, if they are not the same.
-        probability: least probability of a pair, against all alignments that differ in this pair only.
-        motions: candidates; None tries all pairs, in the plane.
-        margins_nats: evidence that an alignment needs over no alignment, and over its best rival; None for the default
-            (`slam.association.constellation.certain_nats`).
-        settings: of the estimator.
+    Empty if there are several good alignments, or none. Of an alignment, `margins_nats` are the evidence that it needs
+    over no alignment, and over its best rival; None for `slam.association.constellation.certain_nats`. Of a pair,
+    `probability` is the least one, against all alignments that differ in this pair only. The rest is as of `overlays`.
     """
     certain = settings.association.constellation.certain_nats
     least_nats, lead_nats = margins_nats or (certain, certain)
@@ -148,13 +143,13 @@ def agreed_pairs(
     rivals = [other for other in found[1:] if not set(other.pairs) & set(best.pairs)]
     if rivals and best.log_evidence - rivals[0].log_evidence < lead_nats:
         return []
-    pairings = _pairings(best.motion, source, target, allowed, density, settings.association)
-    sure = _certain(best, pairings, density, math.log(probability / (1.0 - probability)))
+    sure = _certain(best, density, math.log(probability / (1.0 - probability)))
     return sure if len(sure) > 1 else []
 
 
-def _certain(best: Alignment, pairings: Pairings, density: float, margin: float) -> list[tuple[int, int]]:
+def _certain(best: Alignment, density: float, margin: float) -> list[tuple[int, int]]:
     """Pairs that exceed any change of the alignment in one pair by `margin` nats: removed, replaced, or exchanged."""
+    pairings = best.pairings
     row_of = {(int(a), int(b)): k for k, (a, b) in enumerate(zip(pairings.source, pairings.target, strict=True))}
     chosen = dict(best.pairs)
     whole = _evidence(pairings, [row_of[pair] for pair in chosen.items()], density)
@@ -220,32 +215,10 @@ def _sigma_of_span(source: LocalMap, i: int, j: int) -> float:
     return math.sqrt(max(float(row @ source.covariance @ row), 0.0))
 
 
-def _weighed(
-    motion: FloatArray,
-    source: LocalMap,
-    target: LocalMap,
-    allowed: BoolArray,
-    density: float,
-    settings: AssociationConfig,
-) -> Alignment:
-    """The largest jointly compatible set of pairs around a motion, and its evidence."""
-    pairings = _pairings(motion, source, target, allowed, density, settings)
-    found = most_pairings(pairings, confidence=settings.gate_confidence)
-    rows = found.pairing[found.pairing >= 0]
-    if len(rows) == 0:
-        return Alignment(motion, (), 0.0)
-    pairs = tuple((int(pairings.source[k]), int(pairings.target[k])) for k in rows)
-    return Alignment(motion, pairs, _evidence(pairings, rows.tolist(), density))
-
-
 def _pairings(
-    motion: FloatArray,
-    source: LocalMap,
-    target: LocalMap,
-    allowed: BoolArray,
-    density: float,
+    motion: FloatArray, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float,
     settings: AssociationConfig,
-) -> Pairings:
+) -> Pairings:  # fmt: skip
     """Pairs near each other under the motion, with the covariance of their differences around it."""
     rules, group = settings.constellation, group_of(motion)
     place, dim = group.transform(motion, source.place), source.dim
@@ -287,59 +260,39 @@ class LoosePart(NamedTuple):
 
     @classmethod
     def of(
-        cls, assignment: Assignment, joint: FloatArray, refused: Collection[tuple[int, int]] = ()
+        cls, assignment: Assignment, marginals: Marginals, refused: Collection[tuple[int, int]] = ()
     ) -> LoosePart | None:
-        """Return the loose part of a map with covariance `joint`; None if it has no two landmarks."""
-        rules = assignment.settings.association
-        place, sightings = assignment.estimate.landmark, assignment.sightings
-        apart = assignment.together.toarray() > 0.0
-        root, loose = stiff_and_loose(sightings, joint, rules)
+        """Return the loose part of a map at its optimum: landmarks that are not connected with the oldest, each well
+        known relative to the next. None if it has no two landmarks, or the map more than `MOST_LAID`.
+        """
+        rules, sightings = assignment.settings.association, assignment.sightings
+        seen = np.flatnonzero(sightings >= rules.fewest_to_pair)
+        if not len(seen) or assignment.n_landmarks > MOST_LAID:
+            return None
+        place, joint = assignment.estimate.landmark, assignment.with_shared_errors(marginals.shared)
+        within = np.linalg.eigvalsh(_spreads(joint, seen, seen))[..., 1] < rules.constellation.stiff_m**2
+        _, group = connected_components(within, directed=False)
+        root, loose = seen[group == group[0]], seen[group != group[0]]
         if len(loose) < 2:
             return None
         loose = loose[np.argsort(-sightings[loose], kind="stable")]
-        allowed = ~apart[np.ix_(loose, root)]
+        allowed = assignment.together.toarray()[np.ix_(loose, root)] == 0.0
         gap = place[loose][:, None] - place[root][None]
         spread = _spreads(joint, loose, root)
         near = np.einsum("ijk,ijk->ij", gap, np.linalg.solve(spread, gap[..., None])[..., 0]) < rules.loose_gate
         one, other = assignment.of_kind[loose][:, None], assignment.of_kind[root][None]
         allowed &= (near | same_name(one, other)) & alike(one, other)
-        like, traits = assignment.like(), assignment.traits
-        if traits is not None and like is not None:
-            k, m = np.nonzero(allowed)
-            allowed[k, m] = traits.same(like.part(loose[k]), like.part(root[m])) >= -rules.readings.misread_nats
+        (k, m), like = np.nonzero(allowed), assignment.like()
+        by_traits = assignment.traits.same(like.part(loose[k]), like.part(root[m]))
+        allowed[k, m] = by_traits >= -rules.readings.misread_nats
         for k, m in np.argwhere(allowed):
             allowed[k, m] = _ordered(loose[k], root[m]) not in refused
-        return cls(loose, root, _local(place, joint, loose), _local(place, joint, root), allowed)
+        whole = LocalMap(place, joint)
+        return cls(loose, root, whole.part(loose), whole.part(root), allowed)
 
     def rows(self, pairs: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
         """Return pairs (younger, older) of the map, from those of `source` and `target`."""
         return [_ordered(self.loose[k], self.root[m]) for k, m in pairs]
-
-
-def propose_constellation(
-    part: LoosePart, *, density: float, probability: float, settings: SlamConfig
-) -> list[tuple[int, int]]:
-    """Return pairs (younger, older) of a loose part of the map that has one alignment with the rest."""
-    pairs = agreed_pairs(
-        part.source, part.target, part.allowed, density=density, probability=probability, settings=settings
-    )
-    return part.rows(pairs)
-
-
-def stiff_and_loose(sightings: IntArray, joint: FloatArray, settings: AssociationConfig) -> tuple[IntArray, IntArray]:
-    """Return landmarks connected with the oldest, each well known relative to the next; and all others.
-
-    Args:
-        sightings: (L,) number of detections of each.
-        joint: (G, G) covariance, that of the landmarks first.
-        settings: of the association.
-    """
-    seen = np.flatnonzero(sightings >= settings.fewest_to_pair)
-    if not len(seen):
-        return seen, seen
-    within = np.linalg.eigvalsh(_spreads(joint, seen, seen))[..., 1] < settings.constellation.stiff_m**2
-    _, part = connected_components(within, directed=False)
-    return seen[part == part[0]], seen[part != part[0]]
 
 
 def _ordered(u: int, o: int) -> tuple[int, int]:
@@ -347,17 +300,10 @@ def _ordered(u: int, o: int) -> tuple[int, int]:
     return int(max(u, o)), int(min(u, o))
 
 
-def _local(place: FloatArray, joint: FloatArray, rows: IntArray) -> LocalMap:
-    columns = np.column_stack([2 * rows, 2 * rows + 1]).ravel()
-    return LocalMap(place[rows], joint[np.ix_(columns, columns)])
-
-
 def _spreads(joint: FloatArray, some: IntArray, others: IntArray) -> FloatArray:
     """(n, m, 2, 2) covariances of the differences of landmarks."""
     count = len(joint) // 2
-    blocks = joint[: 2 * count, : 2 * count].reshape(count, 2, count, 2).transpose(0, 2, 1, 3)
+    blocks = joint.reshape(count, 2, count, 2).transpose(0, 2, 1, 3)
     cross = blocks[np.ix_(some, others)]
-    spread: FloatArray = (
-        blocks[some, some][:, None] + blocks[others, others][None] - cross - cross.transpose(0, 1, 3, 2)
-    )
-    return spread
+    own = blocks[some, some][:, None] + blocks[others, others][None]
+    return np.asarray(own - cross - cross.transpose(0, 1, 3, 2))

@@ -10,8 +10,9 @@ evidence is not used.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -20,6 +21,8 @@ from evermap.config import ReadingsConfig, SlamConfig
 from evermap.slam.kernels import kernel
 from evermap.slam.streaming import USUAL
 from evermap.types import FloatArray, IntArray
+
+_Found = TypeVar("_Found")
 
 MOST_COLUMNS = 16
 """Number of columns that are used, those with most evidence: bounds the work."""
@@ -148,8 +151,12 @@ class Traits:
         return Likeness(nothing, nothing.copy(), np.zeros(count))
 
     def followed(self, known: Likeness, landmark: IntArray, rows: IntArray) -> Likeness:
-        """Return landmarks with further readings, each of a different one: a running mean, until medians are taken."""
-        value, variance, readings = (each.copy() for each in known)
+        """Return landmarks with further readings, each of a different one: a running mean, until medians are taken.
+
+        Rows of landmarks behind the known ones are of new ones.
+        """
+        new = self.nothing(max(int(landmark.max(initial=-1)) + 1 - len(known.value), 0))
+        value, variance, readings = (np.concatenate(each) for each in zip(known, new, strict=True))
         old, now = value[landmark], self.value[rows]
         gain = 1.0 / (1.0 + readings[landmark, None])
         mean = np.where(np.isnan(old), now, old + gain * np.where(np.isnan(now), 0.0, now - old))
@@ -253,6 +260,39 @@ def learned(
         return None
     spread = Variances(reading[used], error[used], between[used], alone, rules.misread_nats)
     return Traits(np.ascontiguousarray(value[:, used]), spread, settings, used, mean[used])
+
+
+def best_with_traits(
+    first: _Found,
+    traits: Traits | None,
+    explain: Callable[[_Found, _Found], tuple[float, Traits | None]],
+    again: Callable[[_Found, Traits], _Found],
+) -> _Found:
+    """Return the association that explains all detections and their traits best.
+
+    The variances of the traits are learned from the association without them, which may be wrong: first from readings
+    within visits, then from revisits. Each result is a proposal; the one with most evidence, by its own variances, is
+    kept.
+
+    Args:
+        first: the association without traits.
+        traits: learned from it without revisits; None without evidence.
+        explain: returns the negative log likelihood [nats] of the second one, as the first one is judged, and the
+            traits learned from it.
+        again: returns another association with given traits, from the best one so far.
+    """
+    if traits is None:
+        return first
+    best, (cost, known) = first, explain(first, first)
+    for _ in range(MOST_LEARNED):
+        trial = again(best, traits)
+        against, own = explain(best, trial)
+        if against < cost:
+            best, cost, known = trial, against, own
+        if known is None or known.close_to(traits):
+            break
+        traits = known
+    return best
 
 
 def _within(

@@ -10,15 +10,16 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from operator import itemgetter
+from typing import TypeAlias
 
 import numpy as np
 from scipy import sparse
 
 from evermap.config import SlamConfig
-from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetections
+from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetections, names_of
 from evermap.slam.association.associator import Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap
-from evermap.slam.association.features import MOST_LEARNED, Traits, learned
+from evermap.slam.association.features import Traits, best_with_traits, learned
 from evermap.slam.association.particles import drawn
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
@@ -27,6 +28,8 @@ from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import USUAL, StreamingSlam
 from evermap.types import UNKNOWN, FloatArray, IntArray, Recording
+
+_Found: TypeAlias = tuple[Associator, Assignment]
 
 ALL_TRIED = 100
 """Number of landmarks of a prior map up to which every pair is tried; above, an index of constellations is used."""
@@ -40,92 +43,52 @@ LITTLE = 200.0
 
 @dataclass(frozen=True)
 class Associated:
-    """A recording whose detections were associated by geometry.
+    """A recording, in the plane or in space, whose detections were associated by geometry.
 
     Attributes:
         landmark_row: (M,) landmark of every detection of the recording, by first detection; `NOBODY` if it is of no
             landmark with enough sightings.
         name: (M,) given identity of every detection, `UNKNOWN` if there is none or it was ignored.
-        used: rows of the recording's detections that are used.
-        assignment: of these.
-        noise: of its solution.
-        prior: of the calibration states.
+        of_kind: (L, 2) class and name of each landmark, `UNKNOWN` for none.
+        together: (L, L) number of frames, in space of views, that show both of two landmarks.
+        loose: detections of no landmark, without a name.
+        settings: of the estimator.
+        locate: returns `in_metres`.
     """
 
     landmark_row: IntArray
     name: IntArray
-    used: IntArray
-    assignment: Assignment
-    noise: Noise
-    prior: CalibrationPrior
+    of_kind: IntArray
+    together: sparse.csr_array
+    loose: LooseDetections
+    settings: SlamConfig
+    locate: Callable[[], LocalMap]
 
     @property
     def names(self) -> IntArray:
         """(L,) name of each landmark, `UNKNOWN` for none; no two have the same."""
-        return self.assignment.name
-
-    @property
-    def of_kind(self) -> IntArray:
-        """(L, 2) class and name of each landmark, `UNKNOWN` for none."""
-        return self.assignment.of_kind
+        return names_of(self.name, self.landmark_row, len(self.of_kind))
 
     @property
     def sightings(self) -> IntArray:
         """(L,) number of detections of each landmark."""
-        return self.assignment.sightings
-
-    @property
-    def together(self) -> sparse.csr_array:
-        """(L, L) number of frames that show both of two landmarks."""
-        return self.assignment.together
-
-    @property
-    def density_of_unmet(self) -> float:
-        """Density of unmapped landmarks [1/m^2] in the area of the session."""
-        return density_of_unmet(self.in_metres.place, self.assignment.settings)
+        return np.bincount(self.landmark_row[self.landmark_row >= 0], minlength=len(self.of_kind))
 
     @functools.cached_property
     def in_metres(self) -> LocalMap:
-        """Return the landmarks in the frame of the first pose, with the scale divided by the priors and its uncertainty
-        in the covariance.
-        """
-        assignment, prior = self.assignment, self.prior
-        marginals = Smoother(assignment.problem(), self.noise, heavy=True).marginals(assignment.estimate)
-        _, _, scale, log_sigma = prior.split_scale(assignment.estimate.states, marginals.states)
-        place = assignment.estimate.landmark * scale
-        covariance: FloatArray = assignment.with_shared_errors(marginals.shared)[:-N_STATES, :-N_STATES] * scale**2
-        return LocalMap(place, covariance + log_sigma**2 * np.outer(place.ravel(), place.ravel()))
+        """The landmarks in the frame of the first pose."""
+        return self.locate()
 
     @property
-    def loose(self) -> LooseDetections:
-        """Detections of no landmark, without a name."""
-        assignment = self.assignment
-        some = np.flatnonzero((assignment.landmark_row == NOBODY) & (self.name[self.used] == UNKNOWN))
-        scale = self.prior.split_scale(assignment.estimate.states, np.eye(N_STATES))[2]
-        at = assignment.points()[some] * scale
-        return LooseDetections(self.used[some], at, assignment.wide_m[some], assignment.kind[some, 0])
+    def density_of_unmet(self) -> float:
+        """Density of unmapped landmarks in the area [1/m^2], in space in the volume [1/m^3], of the session."""
+        return density_of_unmet(self.in_metres.place, self.settings)
 
 
 def associated(
-    recording: Recording,
-    prior: CalibrationPrior,
-    noise: Noise,
-    *,
-    keep_ids: bool = False,
-    settings: SlamConfig = USUAL,
+    recording: Recording, prior: CalibrationPrior, noise: Noise, *, keep_ids: bool = False, settings: SlamConfig = USUAL
 ) -> Associated:
-    """Associate the detections of a recording by geometry.
-
-    Args:
-        recording: as read.
-        prior: of the calibration states.
-        noise: initial noise levels.
-        keep_ids: detections with an id keep it, those without may be of the same landmarks; else ids are ignored.
-        settings: of the estimator.
-
-    Raises:
-        DataError: too few frames with detections, or too many for the memory.
-    """
+    """Associate a recording in the plane; as `associate`, by priors of calibration states and initial noise levels."""
     given = recording.detections
     nameless = replace(recording, detections=replace(given, landmark_id=np.zeros_like(given.landmark_id)))
     prepared = prepare(nameless, settings=settings.odometry)
@@ -141,67 +104,57 @@ def associated(
             associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior, settings))
         return associator.finish()
 
-    def found(traits: Traits | None) -> tuple[Associator, Assignment]:
+    def found(traits: Traits | None) -> _Found:
         first = Associator(problem, noise, kind, traits=traits, settings=settings)
         assignment = finished(first)
         if first.doubtful > settings.association.doubtful_share:
-            again = lambda odometry: finished(  # noqa: E731
-                Associator(problem, noise, kind, odometry, traits, settings)
-            )
-            assignment = searched(first, assignment, again)
+            again = functools.partial(Associator, problem, noise, kind, traits=traits, settings=settings)
+            assignment = searched(first, assignment, lambda odometry: finished(again(odometry=odometry)))
         return first, assignment
 
-    cautious, assignment = found(None)
+    best = found(None)
     if given.features is not None:
-        assignment, cautious = _with_traits(assignment, cautious, given.features[prepared.used], found)
+        best = _with_traits(best, given.features[prepared.used], settings, found)
+    associator, assignment = best
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
-    return Associated(row, name, prepared.used, assignment, cautious.noise, prior)
+    scale = prior.split_scale(assignment.estimate.states, np.eye(N_STATES))[2]
+    some = np.flatnonzero((assignment.landmark_row == NOBODY) & (kind[:, 1] == UNKNOWN))
+    at, wide = assignment.points()[some] * scale, assignment.wide_m[some]
+    loose = LooseDetections(prepared.used[some], at, wide, kind[some, 0])
+    locate = functools.partial(_in_metres, assignment, associator.noise, prior)
+    return Associated(row, name, assignment.of_kind, assignment.together, loose, settings, locate)
 
 
 def _with_traits(
-    plain: Assignment,
-    associator: Associator,
-    features: FloatArray,
-    found: Callable[[Traits], tuple[Associator, Assignment]],
-) -> tuple[Assignment, Associator]:
-    """Return the assignment that explains all detections and their traits best, and its associator.
+    first: _Found, features: FloatArray, settings: SlamConfig, found: Callable[[Traits], _Found]
+) -> _Found:
+    """`best_with_traits` of detections with features (M, D); `found` returns another result with given traits."""
+    nothing = first[1].traits
 
-    The variances of the traits are learned from the assignment without them, which may be wrong: first from readings
-    within visits, then from revisits. Each result is a proposal; the one with most evidence, by its own variances, is
-    kept.
+    def explain(best: _Found, trial: _Found) -> tuple[float, Traits | None]:
+        own = learned(features, *trial[1].of_visits(), settings=settings)
+        return best[0].against(replace(trial[1], traits=own or nothing)), own
 
-    Args:
-        plain: the assignment without traits.
-        associator: of this assignment.
-        features: (M, D) of the detections.
-        found: returns another associator and its assignment, with given traits.
-    """
-
-    def explained(assignment: Assignment) -> tuple[float, Assignment]:
-        own = replace(assignment, traits=learned(features, *assignment.of_visits(), settings=plain.settings))
-        return associator.against(own), own
-
-    traits = learned(features, *plain.of_visits(), revisits=False, settings=plain.settings)
-    if traits is None:
-        return plain, associator
-    cost, best = explained(plain)
-    for _ in range(MOST_LEARNED):
-        known = replace(best, traits=traits)
+    def again(best: _Found, traits: Traits) -> _Found:
+        known = replace(best[1], traits=traits)
         if traits.evidence(*known.of_visits()) > 0.0:
-            cautious = associator.having(traits)
-            trial = cautious.finish(known)
-        else:  # most of it is wrong
-            cautious, trial = found(traits)
-        against, trial = explained(trial)
-        if against >= cost and best.traits is None:
-            break
-        if against < cost:
-            cost, best, associator = against, trial, cautious
-        if best.traits is None or best.traits.close_to(traits):
-            break
-        traits = best.traits
-    return replace(best, traits=None), associator
+            other = best[0].having(traits)
+            return other, other.finish(known)
+        return found(traits)  # most of it is wrong
+
+    return best_with_traits(
+        first, learned(features, *first[1].of_visits(), revisits=False, settings=settings), explain, again
+    )
+
+
+def _in_metres(assignment: Assignment, noise: Noise, prior: CalibrationPrior) -> LocalMap:
+    """The landmarks with the scale divided by the priors, and its uncertainty in the covariance."""
+    marginals = Smoother(assignment.problem(), noise, heavy=True).marginals(assignment.estimate)
+    _, _, scale, log_sigma = prior.split_scale(assignment.estimate.states, marginals.states)
+    place = assignment.estimate.landmark * scale
+    covariance: FloatArray = assignment.with_shared_errors(marginals.shared) * scale**2
+    return LocalMap(place, covariance + log_sigma**2 * np.outer(place.ravel(), place.ravel()))
 
 
 def searched(associator: Associator, assignment: Assignment, again: Callable[[FloatArray], Assignment]) -> Assignment:
@@ -253,7 +206,7 @@ def _by_names(
     landmark = np.full(len(name), NOBODY)
     landmark[named] = row
     start = Estimate(np.zeros((len(problem.stamp_s), 3)), np.zeros((len(names), 2)), prior.mean)
-    some = Assignment(problem, landmark, start, name[:, None]).problem()
+    some = Assignment(problem, landmark, start, name[:, None], Traits.none(len(name))).problem()
     slam = StreamingSlam(some, noise, prior.without_scale(), settings=settings)
     for _ in some.stamp_s:
         slam.step()

@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -26,23 +26,32 @@ from evermap.slam.association.assignment import (
     LooseDetections,
     alike,
     labels_of,
-    landmarks_of_visits,
-    names_of,
+    merged_rows,
     same_name,
     seen_together,
+    shared_variance,
     visits_of,
 )
-from evermap.slam.association.associator import LAST_ROUNDS, MERGE_ROUNDS, effective_number
+from evermap.slam.association.associator import LAST_ROUNDS, MERGE_ROUNDS, density_of_unmet, landmark_density
 from evermap.slam.association.constellation import LocalMap
-from evermap.slam.association.features import MOST_LEARNED, Likeness, Traits, learned
+from evermap.slam.association.features import Traits, best_with_traits, learned
+from evermap.slam.association.identify import Associated
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
-from evermap.slam.association.merging import Differences, Solution, in_reach, propose_merges
+from evermap.slam.association.merging import (
+    Differences,
+    Solution,
+    accepted_rise,
+    in_reach,
+    propose_merges,
+    tried_by_halves,
+)
 from evermap.slam.association.revise import lying_together, may_be_of, most_probable
 from evermap.slam.space.estimate import as_seen, converged, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, prepare_space, without_range
 from evermap.slam.space.linearise import POINT, POSE
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
+from evermap.slam.sparse.system import Factorised
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
 
 SLIPS = 3
@@ -58,20 +67,10 @@ OF_DETECTIONS = (
 """Columns of `SpatialProblem` with one row per detection."""
 
 
-def associated_in_space(
-    recording: SpatialRecording, settings: SlamConfig, *, keep_ids: bool = False
-) -> AssociatedInSpace:
-    """Associate the detections of a recording in space by geometry.
+def associated_in_space(recording: SpatialRecording, settings: SlamConfig, *, keep_ids: bool = False) -> Associated:
+    """Associate a recording in space; as `associate`.
 
     Boxes (of a detector of movable objects) and detections without a range are of no landmark.
-
-    Args:
-        recording: as read, with odometry.
-        settings: of the estimator.
-        keep_ids: detections with an id keep it, those without may be of the same landmarks; else ids are ignored.
-
-    Raises:
-        DataError: no odometry, or too few frames.
     """
     if recording.odometry is None or len(recording.odometry) < 2:
         problem = f"{recording.name}: landmarks without identity need odometry"
@@ -79,8 +78,11 @@ def associated_in_space(
     given = recording.detections
     asked = ~np.isfinite(given.size_m).all(axis=1) & ~without_range(recording)
     name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
-    if not asked.any():
-        return AssociatedInSpace.of_none(name, settings)
+    row = np.full(len(given), NOBODY)
+    if not asked.any():  # a recording of boxes alone
+        none, local = np.zeros(0, dtype=np.int64), LocalMap(np.zeros((0, 3)), np.zeros((0, 0)))
+        loose = LooseDetections(none, local.place, np.zeros(0), none)
+        return Associated(row, name, none.reshape(0, 2), sparse.csr_array((0, 0)), loose, settings, lambda: local)
     # symmetries are those of classes, so each class is one landmark until landmarks are known
     by_class = np.where(asked, given.class_id - UNKNOWN, UNKNOWN)
     intake = prepare_space(replace(recording, detections=replace(given, landmark_id=by_class)), settings.space)
@@ -89,57 +91,10 @@ def associated_in_space(
     solved = associator.finish()
     if given.features is not None:
         solved = _with_traits(associator, solved, given.features[intake.used])
-    row = np.full(len(given), NOBODY)
     row[intake.used], local, together, loose = associator.concluded(solved)
     of_kind = labels_of(kind, row[intake.used], len(local.place))
     loose = loose._replace(row=intake.used[loose.row])
-    return AssociatedInSpace(row, name, of_kind, local, together, loose, settings)
-
-
-@dataclass(frozen=True, slots=True)
-class AssociatedInSpace:
-    """A recording in space whose detections were associated by geometry: what `identify.Associated` is in the plane.
-
-    Attributes:
-        landmark_row: (M,) landmark of every detection of the recording, by first detection; `NOBODY` for none.
-        name: (M,) given identity of every detection, `UNKNOWN` if there is none or it was ignored.
-        of_kind: (L, 2) class and name of each landmark, `UNKNOWN` for none.
-        in_metres: the landmarks in the frame of the first pose.
-        together: (L, L) number of views that show both of two landmarks.
-        loose: detections of no landmark, without a name.
-        settings: of the estimator.
-    """
-
-    landmark_row: IntArray
-    name: IntArray
-    of_kind: IntArray
-    in_metres: LocalMap
-    together: sparse.csr_array
-    loose: LooseDetections
-    settings: SlamConfig
-
-    @classmethod
-    def of_none(cls, name: IntArray, settings: SlamConfig) -> Self:
-        """Return the association of a recording without landmarks, such as one of boxes alone."""
-        none, place = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        local, loose = LocalMap(place, np.zeros((0, 0))), LooseDetections(none, place, np.zeros(0), none)
-        nobody, of_kind = np.full(len(name), NOBODY), np.zeros((0, 2), dtype=np.int64)
-        return cls(nobody, name, of_kind, local, sparse.csr_array((0, 0)), loose, settings)
-
-    @property
-    def sightings(self) -> IntArray:
-        """(L,) number of detections of each landmark."""
-        return np.bincount(self.landmark_row[self.landmark_row >= 0], minlength=len(self.of_kind))
-
-    @property
-    def names(self) -> IntArray:
-        """(L,) name of each landmark, `UNKNOWN` for none; no two have the same."""
-        return names_of(self.name, self.landmark_row, len(self.in_metres.place))
-
-    @property
-    def density_of_unmet(self) -> float:
-        """Density of unmapped landmarks [1/m^3] in the volume of the session."""
-        return self.settings.association.least_landmarks / _volume_m3(self.in_metres.place, self.settings)
+    return Associated(row, name, of_kind, together, loose, settings, lambda: local)
 
 
 class _Nearby:
@@ -250,7 +205,7 @@ class SpatialAssociator:
         self._view = np.unique(problem.pose_row * len(problem.mount) + problem.sensor, return_inverse=True)[1]
         self._row: IntArray = np.full(len(self._view), NOBODY)
         self._of = np.zeros((0, 2), dtype=np.int64)  # class and name of each landmark
-        self._density = _density(np.zeros((0, 3)), np.zeros(0, dtype=np.int64), settings)
+        self._density = density_of_unmet(np.zeros((0, 3)), settings)
 
     def having(self, traits: Traits) -> SpatialAssociator:
         """Return an associator of the same detections that also uses traits."""
@@ -260,9 +215,8 @@ class SpatialAssociator:
         return other
 
     def of_visits(self, solved: _Solved) -> tuple[IntArray, IntArray]:
-        """Return (M,) the visit of every detection, and (V,) the landmark of each; see `Assignment.of_visits`."""
-        visit = visits_of(self._problem.stamp_s[self._problem.pose_row], solved.row, self._rules.forget_s)
-        return visit, landmarks_of_visits(visit, solved.row)
+        """Return `visits_of` these landmarks."""
+        return visits_of(self._problem.stamp_s[self._problem.pose_row], solved.row, self._rules.forget_s)
 
     def against(self, solved: _Solved, traits: Traits | None) -> float:
         """Return the negative log likelihood [nats] of all detections, and of their traits, up to a constant.
@@ -320,7 +274,7 @@ class SpatialAssociator:
         width = np.where(turned, 6, 3)
         own = block_diag(*np.where(turned[:, None, None], se3.rotation_of(place), np.eye(3)))
         at = ((np.cumsum(width) - width)[:, None] + np.arange(3)).ravel()
-        covariance = own @ joint[np.ix_(at, at)] @ own.T + np.diag(np.repeat(self._shared_m2(solved.row)[rows], 3))
+        covariance = own @ joint[np.ix_(at, at)] @ own.T + np.diag(np.repeat(self._shared_m2(solved)[rows], 3))
         told = turned & (problem.symmetries.of[rows] == 0)  # what looks the same in several has none
         return LocalMap(place[:, :3], covariance, np.where(told[:, None], place[:, 3:], np.nan))
 
@@ -376,9 +330,9 @@ class SpatialAssociator:
         new -= rules.name_nats * same_name(self._kind[view[source]], self._of[near.row[target]])
         new -= self._traits.same(self._traits.singly(view[source]), self._like.part(near.row[target]))
         pairs = Pairings(
-            source, target, innovation, joint.reshape(3 * len(source), 3 * len(source)), new, len(view), None, least
+            source, target, innovation, joint.reshape(3 * len(source), 3 * len(source)), new, len(view), least
         )
-        probability, evidence, _ = pairing_probability(pairs, confidence=rules.gate_confidence)
+        probability, evidence = pairing_probability(pairs, confidence=rules.gate_confidence)
         known = np.zeros(len(view))
         np.add.at(known, source, probability)
         best = np.zeros(len(source), dtype=np.bool_)
@@ -412,9 +366,8 @@ class SpatialAssociator:
         new = view[match.p_new >= self._rules.p_new]
         self._row[new] = len(self._of) + np.arange(len(new))
         self._of = np.vstack([self._of, self._kind[new]])
-        like = Likeness(*map(np.concatenate, zip(self._like, self._traits.nothing(len(new)), strict=True)))
         seen = np.append(known, new)
-        self._like = self._traits.followed(like, self._row[seen], seen)
+        self._like = self._traits.followed(self._like, self._row[seen], seen)
         near.meet(self._row[new])
         at = np.append(match.target, len(near.row) - len(new) + np.arange(len(new)))
         near.update(at, self._at[seen], self._covariance(seen))
@@ -455,51 +408,31 @@ class SpatialAssociator:
             smoother = SpatialSmoother(problem, pose)
             estimate, _ = smoother.optimum(estimate, self._noise, heavy=True)
             estimate, now = smoother.optimum(estimate, self._noise, heavy=False)
-        self._density = _density(estimate.place[:, :3], np.bincount(problem.place), self.settings)
+        self._density = landmark_density(estimate.place[:, :3], np.bincount(problem.place), self.settings)
         solved = _Solved(row, estimate, smoother, now, now.cost)
         return replace(solved, cost=now.cost - self._traits.evidence(*self.of_visits(solved)))
-
-    def _like_of(self, solved: _Solved) -> Likeness:
-        """Return the traits of each landmark."""
-        visit, landmark = self.of_visits(solved)
-        visits = self._traits.of_visits(visit, len(landmark))
-        return self._traits.of_landmarks(visits, landmark, len(solved.estimate.place))
 
     def _merged(self, solved: _Solved) -> _Solved:
         """Merge duplicates while there are any."""
         refused: set[tuple[int, int]] = set()
+
+        def merge(pairs: list[tuple[int, int]]) -> _Solved | None:
+            row = np.where(solved.row >= 0, merged_rows(pairs, len(among))[solved.row], NOBODY)
+            trial = self._solved(_without(row, ~among), solved.estimate.pose)
+            numbers = np.where(solved.smoother.problem.oriented[[u for u, _ in pairs]], 6, 3)
+            rise = accepted_rise(pairs, solution.sightings, numbers, self._rules)
+            return trial if trial.cost - solved.cost <= rise else None
+
         for _ in range(MERGE_ROUNDS):
             among = np.ones(len(solved.estimate.place), dtype=np.bool_)
             solution = self._compared(solved)
             pairs = propose_merges(solution, probability=self._rules.p_merge, among=among, last=True, refused=refused)
-            following = self._trial(solved, solution.sightings, pairs, refused)
+            following = tried_by_halves(pairs, merge, refused.add)
             if following is None:
                 break
             solved = following
             refused.clear()
         return solved
-
-    def _trial(
-        self, solved: _Solved, sightings: IntArray, pairs: list[tuple[int, int]], refused: set[tuple[int, int]]
-    ) -> _Solved | None:
-        """Merge all pairs, or half of them, and so on, until the cost permits; a single one may be refused."""
-        rules = self._rules
-        while pairs:
-            becomes = np.arange(len(sightings))
-            for younger, older in pairs:  # in the order of the younger ones
-                becomes[younger] = becomes[older]
-            row = np.where(solved.row >= 0, becomes[solved.row], NOBODY)
-            trial = self._solved(_without(row, np.zeros(len(sightings), dtype=np.bool_)), solved.estimate.pose)
-            lesser = np.array([min(sightings[u], sightings[o]) for u, o in pairs])
-            numbers = np.where(solved.smoother.problem.oriented[[u for u, _ in pairs]], 6, 3)
-            rise = np.minimum(rules.rise_nats + rules.rise_per_sighting * lesser, rules.most_rise_nats)
-            rise = 0.5 * numbers * rise  # stated for two numbers
-            if trial.cost - solved.cost <= rise.sum():
-                return trial
-            if len(pairs) == 1:
-                refused.update(pairs)
-            pairs = pairs[: len(pairs) // 2]
-        return None
 
     def _compared(self, solved: _Solved) -> Solution:
         """The landmarks for `propose_merges`."""
@@ -513,23 +446,17 @@ class SpatialAssociator:
         np.maximum.at(last_s, row, self._problem.stamp_s[self._problem.pose_row[used]])
         like = np.array([alike(each, of).mean() for each in of])
         log_density = np.log(self._density * like)
-        traits = self._traits, self._like_of(solved)
-        differences = _Differing(solved, self._shared_m2(solved.row), log_density, of, traits, rules)
+        factorised = solved.smoother.factorised(solved.now)
+        differences = _Differing(solved, factorised, self._shared_m2(solved), log_density, of, rules)
         n_views = int(self._view.max()) + 1
         return Solution(
             solved.estimate.place[:, :3], own, differences, sightings, last_s,
             *seen_together(self._view[used], row, n_views, count, rules.around_frames), of, rules,
         )  # fmt: skip
 
-    def _shared_m2(self, row: IntArray) -> FloatArray:
-        """(L,) variance [m^2] of the error that all sightings of a landmark have in common; landmarks (M,) of
-        detections.
-        """
-        used = np.flatnonzero(row >= 0)
-        wide, count = self._wide_m()[used], np.bincount(row[used])
-        order = np.lexsort((wide, row[used]))
-        middle = wide[order[np.cumsum(count) - count + count // 2]]
-        return np.asarray(self._rules.shared_m**2 + (self._rules.shared_share * middle) ** 2)
+    def _shared_m2(self, solved: _Solved) -> FloatArray:
+        """(L,) `shared_variance` of the landmarks."""
+        return shared_variance(self._wide_m(), solved.row, len(solved.estimate.place), self._rules)
 
     def _covariance(self, rows: IntArray | BoolArray | slice) -> FloatArray:
         """(K, 3, 3) covariances of positions in the frame of the robot, at the current noise levels."""
@@ -561,7 +488,10 @@ class SpatialAssociator:
         score = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(self._density)
         tail = math.log(tail_share) - 3.0 * math.log(tail_by) - 0.5 * squared / tail_by**2
         score += np.logaddexp(math.log(1.0 - tail_share) - 0.5 * squared, tail)
-        score += self._traits.same(self._traits.singly(seen), self._like_of(solved).part(row))
+        visit, landmark = self.of_visits(solved)
+        visits = self._traits.of_visits(visit, len(landmark))
+        like = self._traits.of_landmarks(visits, landmark, len(place))
+        score += self._traits.same(self._traits.singly(seen), like.part(row))
         inside = (squared < tail_by**2 * gate) & (score > 0.0)
         return most_probable(seen[inside], row[inside], score[inside], self._view, len(place), rules.p_own)
 
@@ -577,56 +507,48 @@ class SpatialAssociator:
         return after
 
 
+@dataclass(frozen=True, slots=True)
 class _Differing:
     """Differences of pairs of landmarks: of points in three numbers, of poses in six.
 
-    Args:
-        solved: the landmarks.
+    Attributes:
+        solved: the landmarks; factorised: at their optimum.
         shared: (L,) variance [m^2] of the shared errors of sightings.
         log_density: (L,) of landmarks with compatible labels [1/m^3].
         kind: (L, 2) class and name of each.
-        traits: of detections, and of the landmarks.
         settings: of the association.
     """
 
-    def __init__(
-        self,
-        solved: _Solved,
-        shared: FloatArray,
-        log_density: FloatArray,
-        kind: IntArray,
-        traits: tuple[Traits, Likeness],
-        settings: AssociationConfig,
-    ) -> None:
-        problem, self._kind, self._rules = solved.smoother.problem, kind, settings
-        self._place, self._turned = solved.estimate.place, problem.oriented
-        self._symmetries, self._first = problem.symmetries, len(problem.stamp_s)
-        self._shared, self._log_density = shared, log_density
-        self._traits, self._like = traits
-        self._factorised = solved.smoother.factorised(solved.now)
+    solved: _Solved
+    factorised: Factorised
+    shared: FloatArray
+    log_density: FloatArray
+    kind: IntArray
+    settings: AssociationConfig
 
     def __call__(self, younger: IntArray, older: IntArray) -> Differences:
         """Return the differences of pairs."""
-        both = self._turned[younger] & self._turned[older]
+        problem = self.solved.smoother.problem
+        both = problem.oriented[younger] & problem.oriented[older]
         dim = 6 if both.any() else 3
         gap, by = self._linearised(younger, older, both)
         rows, at = np.unique(np.concatenate([younger, older]), return_inverse=True)
-        width = np.where(self._turned[rows], 6, 3)
+        width = np.where(problem.oriented[rows], 6, 3)
         first = np.cumsum(width) - width
         joint = np.zeros((int(width.sum()) + 1, int(width.sum()) + 1))  # the last row: no orientation
-        joint[:-1, :-1] = self._factorised.joint(self._first + rows)
+        joint[:-1, :-1] = self.factorised.joint(len(problem.stamp_s) + rows)
         position = (first[:, None] + np.arange(3)).ravel()
-        joint[position, position] += np.repeat(self._shared[rows], 3)
+        joint[position, position] += np.repeat(self.shared[rows], 3)
         turn = (first[width == 6, None] + np.arange(3, 6)).ravel()
-        joint[turn, turn] += self._rules.space.shared_rad**2
+        joint[turn, turn] += self.settings.space.shared_rad**2
         columns = np.where(np.arange(6) < width[:, None], first[:, None] + np.arange(6), len(joint) - 1)
         at = columns[at.reshape(2, -1)].transpose(1, 0, 2).reshape(len(younger), 12)
         own = by @ joint[at[:, :, None], at[:, None, :]] @ by.transpose(0, 2, 1)
         # a pair without orientations: three differences that are 0
         idle = np.where(both[:, None], 0.0, np.arange(6) >= 3)
         own += idle[:, :, None] * np.eye(6)
-        new = self._log_density[younger]
-        new = new - self._rules.name_nats * same_name(self._kind[younger], self._kind[older])
+        names = same_name(self.kind[younger], self.kind[older])
+        new = self.log_density[younger] - self.settings.name_nats * names
         new += np.where(both, self._turns(younger, older), -1.5 * math.log(2.0 * math.pi))
 
         def together(some: IntArray) -> FloatArray:
@@ -642,55 +564,42 @@ class _Differing:
     def _linearised(self, younger: IntArray, older: IntArray, both: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Gaps (K, 6), and their derivatives (K, 6, 12) by the two."""
         gap, by = np.zeros((len(younger), 6)), np.zeros((len(younger), 6, 12))
-        one, other = self._place[younger], self._place[older]
-        one = self._symmetries[younger].nearest(one, other)
+        problem, place = self.solved.smoother.problem, self.solved.estimate.place
+        one, other = place[younger], place[older]
+        one = problem.symmetries[younger].nearest(one, other)
         gap[both] = se3.local(other[both], one[both])
         by[both, :, :6] = se3.right_jacobian_inverse(gap[both])
         by[both, :, 6:] = -se3.right_jacobian_inverse(-gap[both])
         gap[~both, :3] = one[~both, :3] - other[~both, :3]
         for some, columns, sign in ((younger, slice(0, 3), 1.0), (older, slice(6, 9), -1.0)):
-            axes = np.where(self._turned[some, None, None], se3.rotation_of(self._place[some]), np.eye(3))
+            axes = np.where(problem.oriented[some, None, None], se3.rotation_of(place[some]), np.eye(3))
             by[~both, :3, columns] = sign * axes[~both]
         return gap, by
 
     def _turns(self, younger: IntArray, older: IntArray) -> FloatArray:
         """(K,) log density of the orientation of another landmark [1/rad^3]: uniform, or similar to one of the map."""
-        alike_rad = self._rules.space.alike_rad
-        count, found = len(self._place), np.zeros(len(younger))
-        names, row = np.unique(younger, return_inverse=True)
-        angle = np.stack([self._symmetries.angle_between(self._place[k], self._place) for k in names])
-        like = np.where(self._turned, np.exp(-0.5 * (angle / alike_rad) ** 2), 0.0)
+        problem, place = self.solved.smoother.problem, self.solved.estimate.place
+        alike_rad, (names, row) = self.settings.space.alike_rad, np.unique(younger, return_inverse=True)
+        angle = np.stack([problem.symmetries.angle_between(place[k], place) for k in names])
+        like = np.where(problem.oriented, np.exp(-0.5 * (angle / alike_rad) ** 2), 0.0)
         like /= (2.0 * math.pi) ** 1.5 * alike_rad**3
         found = like.sum(axis=1)[row] - like[row, younger] - like[row, older]
-        return np.asarray(np.log(0.5 / (8.0 * math.pi**2) + 0.5 * np.maximum(found, 0.0) / max(count, 1)))
+        return np.asarray(np.log(0.5 / (8.0 * math.pi**2) + 0.5 * np.maximum(found, 0.0) / max(len(place), 1)))
 
 
 def _with_traits(plain: SpatialAssociator, first: _Solved, features: FloatArray) -> _Solved:
-    """Return the landmarks of all detections that explain these and their traits (M, D) best.
+    """`best_with_traits` of detections with features (M, D)."""
 
-    As in the plane (`identify`): variances are learned from the association without traits, first from readings within
-    visits, then from revisits.
-    """
+    def explain(_: _Solved, trial: _Solved) -> tuple[float, Traits | None]:
+        own = learned(features, *plain.of_visits(trial), settings=plain.settings)
+        return plain.against(trial, own), own
 
-    def explained(solved: _Solved) -> tuple[float, Traits | None]:
-        own = learned(features, *plain.of_visits(solved), settings=plain.settings)
-        return plain.against(solved, own), own
-
-    traits = learned(features, *plain.of_visits(first), revisits=False, settings=plain.settings)
-    best, (cost, known) = first, explained(first)
-    for _ in range(MOST_LEARNED):
-        if traits is None:
-            break
+    def again(best: _Solved, traits: Traits) -> _Solved:
         right = traits.evidence(*plain.of_visits(best)) > 0.0  # else most of it is wrong
-        trial = plain.having(traits).finish(best if right else None)
-        against, own = explained(trial)
-        better = against < cost
-        if better:
-            best, cost, known = trial, against, own
-        if known is None or known.close_to(traits):
-            break
-        traits = known
-    return best
+        return plain.having(traits).finish(best if right else None)
+
+    within_visits = learned(features, *plain.of_visits(first), revisits=False, settings=plain.settings)
+    return best_with_traits(first, within_visits, explain, again)
 
 
 def _one_way(
@@ -723,17 +632,6 @@ def _driven(problem: SpatialProblem) -> FloatArray:
     for k, motion in enumerate(problem.increment):
         pose[k + 1] = se3.compose(pose[k], motion)
     return pose
-
-
-def _density(place: FloatArray, sightings: IntArray, settings: SlamConfig) -> float:
-    """Density of landmarks [1/m^3]; see `effective_number`. Those on a wall span no volume, hence a least extent."""
-    return effective_number(sightings, settings) / _volume_m3(place, settings)
-
-
-def _volume_m3(place: FloatArray, settings: SlamConfig) -> float:
-    rules = settings.association.space
-    volume = float(np.prod(np.maximum(np.ptp(place, axis=0), rules.least_extent_m))) if len(place) else 0.0
-    return max(volume, rules.least_volume_m3)
 
 
 def _without(row: IntArray, gone: BoolArray) -> IntArray:

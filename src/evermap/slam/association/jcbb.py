@@ -20,12 +20,12 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from evermap.slam.kernels import kernel
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import FloatArray, IntArray
 
 NEGLIGIBLE = 25.0
 """Log weight below the best set [nats] from which a set is ignored: rounding is larger than its weight."""
 MAX_NODES = 200_000
-"""Maximum number of visited nodes; a tenth of a second."""
+"""Maximum number of visited nodes, behind which the search is cut; a tenth of a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,6 @@ class Pairings:
         covariance: (D K, D K) of all innovations together.
         log_density_new: (K,) of the innovation if the landmark is new.
         n_sources: number of sources, with pairings or not.
-        followed: (K,) whether the landmark is tracked: known relative to the robot as well as it is measured; None if
-            unused.
         log_det_least: (K,) lower bound of that of the covariance of an innovation given all others, to cut sets of no
             weight; None if unknown.
     """
@@ -51,23 +49,7 @@ class Pairings:
     covariance: FloatArray
     log_density_new: FloatArray
     n_sources: int
-    followed: BoolArray | None = None
     log_det_least: FloatArray | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Matching:
-    """The result of the search.
-
-    Attributes:
-        pairing: (n_sources,) the row of `Pairings` of every source in the best set, -1 for none.
-        distance: squared Mahalanobis distance of the best set.
-        complete: False if the search was cut short.
-    """
-
-    pairing: IntArray
-    distance: float
-    complete: bool
 
 
 @functools.cache
@@ -78,23 +60,23 @@ def gates(n: int, confidence: float, dim: int = 2) -> FloatArray:
     return bounds
 
 
-def most_pairings(pairings: Pairings, *, confidence: float = 0.99, max_nodes: int = MAX_NODES) -> Matching:
-    """Return the jointly compatible set with most pairings and, among those, the smallest distance."""
-    found, distance, _, _, complete = _search(*_arguments(pairings, confidence), False, max_nodes)
-    return Matching(found, distance, complete)
-
-
-def pairing_probability(
-    pairings: Pairings, *, confidence: float = 0.99, max_nodes: int = MAX_NODES
-) -> tuple[FloatArray, float, bool]:
-    """Return posterior probabilities of the pairings over all jointly compatible sets.
+def most_pairings(pairings: Pairings, *, confidence: float = 0.99) -> IntArray:
+    """Return the jointly compatible set with most pairings and, among those, the smallest distance.
 
     Returns:
-        (K,) probability of every pairing; evidence of all sets together over only new sources [nats]; and whether the
-        search was complete.
+        (n_sources,) the row of `Pairings` of every source, -1 for none.
     """
-    _, _, probability, evidence, complete = _search(*_arguments(pairings, confidence), True, max_nodes)
-    return probability, evidence, complete
+    return np.asarray(_search(*_arguments(pairings, confidence), False)[0])
+
+
+def pairing_probability(pairings: Pairings, *, confidence: float = 0.99) -> tuple[FloatArray, float]:
+    """Return (K,) posterior probabilities of the pairings over all jointly compatible sets.
+
+    Returns:
+        These, and the evidence of all sets together over only new sources [nats].
+    """
+    _, probability, evidence = _search(*_arguments(pairings, confidence), True)
+    return probability, evidence
 
 
 def _arguments(
@@ -156,8 +138,7 @@ def _search(
     gate: FloatArray,
     rest: FloatArray,
     weigh_all: bool,
-    max_nodes: int,
-) -> tuple[Any, float, FloatArray, float, bool]:
+) -> tuple[IntArray, FloatArray, float]:
     """Search depth first; a level of the tree is a source, its branches are the pairings of the source, and none.
 
     With `weigh_all` every compatible set adds its weight to its pairings, except sets of no weight: `rest`
@@ -197,7 +178,7 @@ def _search(
             continue
         k = cursor[level]
         cursor[level] += 1
-        if k > first[level + 1] or nodes >= max_nodes:
+        if k > first[level + 1] or nodes >= MAX_NODES:
             picked[level] = -1
             level -= 1
             continue
@@ -234,4 +215,4 @@ def _search(
     if total > 0.0:
         weight /= total
         evidence = top + np.log(total)
-    return best, best_distance, weight, evidence, nodes < max_nodes
+    return best, weight, evidence

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -22,6 +22,9 @@ from evermap.slam.association.consensus import FREE, Candidates, Consensus, cons
 from evermap.slam.association.jcbb import gates
 from evermap.slam.streaming import USUAL
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+
+_Part = TypeVar("_Part")
+_Result = TypeVar("_Result")
 
 GROUP = 24
 """Number of consecutive landmarks that are weighed jointly with the rest of the map: bounds the work."""
@@ -124,6 +127,35 @@ def propose_merges(
             part = found.part(begin, begin + len(mine))
             merges += _agreed(solution, younger[mine], older[mine], part, probability, last=last)
     return _without_contradictions(sorted(set(merges)), solution.kind)
+
+
+def accepted_rise(
+    pairs: list[tuple[int, int]], sightings: IntArray, numbers: int | IntArray, settings: AssociationConfig
+) -> float:
+    """Return the rise of the cost that merging pairs may cause [nats].
+
+    Args:
+        pairs: (younger, older), P of them.
+        sightings: (L,) number of detections of each landmark.
+        numbers: of the difference of a pair, or (P,) of each; the settings are for two.
+        settings: of the association.
+    """
+    lesser = np.array([min(sightings[u], sightings[o]) for u, o in pairs])
+    rise = np.minimum(settings.rise_nats + settings.rise_per_sighting * lesser, settings.most_rise_nats)
+    return float((0.5 * numbers * rise).sum())
+
+
+def tried_by_halves(
+    parts: list[_Part], attempt: Callable[[list[_Part]], _Result | None], refuse: Callable[[_Part], object]
+) -> _Result | None:
+    """Try all parts, or half of them, and so on, until the attempt gives a result; a single part may be refused."""
+    while parts:
+        if (found := attempt(parts)) is not None:
+            return found
+        if len(parts) == 1:
+            refuse(parts[0])
+        parts = parts[: len(parts) // 2]
+    return None
 
 
 def _batches(groups: list[IntArray], younger: IntArray, older: IntArray) -> Iterator[list[IntArray]]:

@@ -138,13 +138,12 @@ def drawn(
     noise = np.concatenate([np.eye(3)[None] / problem.start_information, spread])
     steps = np.vstack([problem.start_pose, motion.increment])
     first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
-    traits = assignment.traits or Traits.none(len(problem.reading), settings)
     variance = (wider * problem.sigma_given) ** 2
+    traits, like = assignment.traits, assignment.like()
     seen = _Seen(
         first, problem.reading, variance, assignment.kind, problem.stamp_s, traits.value, traits.errors, traits.spread,
         _Rules.of(settings),
     )  # fmt: skip
-    like = assignment.like() or traits.nothing(assignment.n_landmarks)
     cloud = _begun(assignment.estimate.landmark, assignment.of_kind, like, int(count), settings)
     row, pose, evidence = _run(seen, _Sensor(seated(problem.mount, states), states), steps, noise, cloud, seed)
     met, row[row >= 0] = np.unique(row[row >= 0], return_inverse=True)
@@ -305,14 +304,8 @@ def _weigh(
         score = math.log(sightings / (sightings + 1.0)) - 0.5 * (distance + math.log(det))
         if seen.like.shape[1] > 0:
             read = min(int(cloud.read[i, k]), seen.rules.most_readings)
-            score += same_nats(
-                seen.like[d],
-                seen.errors[1],
-                cloud.like[i, k],
-                seen.errors[read],
-                min(1.0, cloud.read[i, k]),
-                seen.spread,
-            )
+            known_by = min(1.0, cloud.read[i, k])
+            score += same_nats(seen.like[d], seen.errors[1], cloud.like[i, k], seen.errors[read], known_by, seen.spread)
         options.slot[n], options.score[n] = k, score + (seen.rules.name_nats if named else 0.0)
         options.innovation[n, 0], options.innovation[n, 1] = e0, e1
         options.covariance[n, 0], options.covariance[n, 1], options.covariance[n, 2] = v00, v01, v11

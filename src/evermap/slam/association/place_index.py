@@ -210,8 +210,7 @@ def _triangles(place: FloatArray, tree: KDTree, neighbours: int, rules: Constell
     longest = length.max(axis=1)
     good = (longest < rules.longest_side_m) & (length.min(axis=1) > rules.least_span_m)
     good &= area > FLATTEST * longest**2
-    kept: IntArray = corners[good]
-    return kept
+    return np.asarray(corners[good])
 
 
 def _sides(at: FloatArray) -> tuple[FloatArray, IntArray]:
@@ -225,5 +224,4 @@ def _patch(place: FloatArray, start: FloatArray, done: BoolArray) -> IntArray:
     """Rows of the landmarks nearest to a point that are not done."""
     away = np.where(done, np.inf, np.hypot(*(place - start).T))
     near = np.argsort(away, kind="stable")[:PATCH]
-    rows: IntArray = near[np.isfinite(away[near])]
-    return rows
+    return np.asarray(near[np.isfinite(away[near])])

@@ -61,9 +61,7 @@ def reassigned(assignment: Assignment, explained: FloatArray, *, density: float)
     # area element r dr db
     new = np.log(density * np.maximum(problem.reading[seen, 0], 0.1))
     score = -0.5 * (squared + np.log(variance).sum(axis=1)) - np.log(2.0 * np.pi) - new
-    like = assignment.like()
-    if assignment.traits is not None and like is not None:
-        score += assignment.traits.same(assignment.traits.singly(seen), like.part(row))
+    score += assignment.traits.same(assignment.traits.singly(seen), assignment.like().part(row))
     inside = (squared < gate) & (score > 0.0)
     seen, row, score = seen[inside], row[inside], score[inside]
     found = most_probable(seen, row, score, problem.pose_row, assignment.n_landmarks, settings.p_own)
@@ -74,8 +72,7 @@ def reassigned(assignment: Assignment, explained: FloatArray, *, density: float)
 def may_be_of(detection: IntArray, landmark: IntArray) -> BoolArray:
     """Return which pairs are compatible by labels (K, P) of both; a detection with a name needs a landmark with it."""
     named = detection[:, -1] != UNKNOWN
-    found: BoolArray = alike(detection, landmark) & (~named | same_name(detection, landmark))
-    return found
+    return np.asarray(alike(detection, landmark) & (~named | same_name(detection, landmark)))
 
 
 def most_probable(
@@ -180,10 +177,9 @@ def likely_real(assignment: Assignment) -> BoolArray:
     with its place in view, times the usual rate of sightings at that range. It is no landmark if its share is probably
     below `slam.association.least_seen` (posterior with a flat prior; the usual rate is that of the landmarks only).
     """
-    real, least = np.ones(assignment.n_landmarks, dtype=bool), assignment.settings.association.least_seen
     if not (assignment.landmark_row >= 0).any():
-        return real
-    return _looked_at(assignment, least).real
+        return np.ones(assignment.n_landmarks, dtype=bool)
+    return _looked_at(assignment).real
 
 
 def unseen_nats(assignment: Assignment) -> float:
@@ -198,7 +194,7 @@ def unseen_nats(assignment: Assignment) -> float:
     if not used.any():
         return 0.0
     rules, measured, estimate = assignment.settings.association, assignment.measured, assignment.estimate
-    look = _looked_at(assignment, rules.least_seen)
+    look = _looked_at(assignment)
     when = ((measured.stamp_s - measured.stamp_s[0]) // rules.forget_s).astype(np.int64)
     expected = _expected(estimate.pose, estimate.landmark, look.edges, look.view, look.rate, when)
     seen = np.zeros(expected.shape, dtype=np.bool_)
@@ -217,10 +213,10 @@ class _Visible(NamedTuple):
     view: FloatArray
 
 
-def _looked_at(assignment: Assignment, least: float) -> _Visible:
+def _looked_at(assignment: Assignment) -> _Visible:
     """Which landmarks are seen often enough in view, and how often these are."""
     real, used = np.ones(assignment.n_landmarks, dtype=bool), assignment.landmark_row >= 0
-    measured, estimate = assignment.measured, assignment.estimate
+    measured, estimate, least = assignment.measured, assignment.estimate, assignment.settings.association.least_seen
     reach, bearing = measured.reading[used].T
     edges = np.quantile(reach, np.linspace(0.0, 1.0, LOOK_BINS + 1))
     view = np.array([bearing.min(), bearing.max()])

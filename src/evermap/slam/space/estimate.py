@@ -150,7 +150,7 @@ def oriented(problem: SpatialProblem, estimate: SpatialEstimate, weight: FloatAr
         candidate = np.vstack([first[some], other[some][has_other[some]]])
         symmetry = problem.symmetries.kinds[problem.symmetries.of[place]]
         far = [
-            _likeness(symmetry.angle_between(candidate[:, None], seen[mine]), sigma[mine])
+            np.exp(-0.5 * (symmetry.angle_between(candidate[:, None], seen[mine]) / sigma[mine]) ** 2)
             for seen in (first, np.where(has_other[:, None], other, first))
         ]
         mixed = first_share[mine] * far[0] + (1.0 - first_share[mine]) * far[1]
@@ -158,11 +158,6 @@ def oriented(problem: SpatialProblem, estimate: SpatialEstimate, weight: FloatAr
         best = candidate[int(np.argmax(score))]
         found[place, 3:] = symmetry.nearest(best, estimate.place[place])[3:]
     return found
-
-
-def _likeness(angle: FloatArray, sigma: FloatArray) -> FloatArray:
-    """(C, D) likelihood ratios of orientations seen, by their angles from candidates."""
-    return np.asarray(np.exp(-0.5 * (angle / sigma) ** 2))
 
 
 def first_places(problem: SpatialProblem, pose: FloatArray) -> SpatialEstimate:

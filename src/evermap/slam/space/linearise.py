@@ -41,25 +41,20 @@ kernel = kept(effort=1, error_model="numpy")
 
 
 class SpatialSightings(NamedTuple):
-    """M detections as the kernel reads them.
+    """M detections as the kernel reads them; see `SpatialProblem` for those of its attributes.
 
     Attributes:
-        pose_row, place, sensor, kind: (M,) what saw which place how.
         oriented: (M,) 1 where the place has an orientation, 0 of points.
-        measured: (M, 7) the place in the sensor's frame.
         root: (M, 3, 3) whitens the position but for the noise levels: rows across the line of sight, then along it.
-        sigma_rad: (M,) of the orientation, but for the noise level.
         corner: (M, 4, 2) corners at depth 1.
         corner_root: (M, 4, 2, 2) pixels by these.
         half_m: (M,) half of the tag's edge.
         first: (M + 1,) where the values of each begin, counted from the first detection.
-        share: (M,) of the information of each that is new: errors of consecutive detections are alike.
         log_odds: (3,) of each kind, beyond which half of the squared residual makes an outlier.
         symmetry: (M,) row of the turns after which the place looks the same; 0 without any.
         axis: (K,) axes about which any turn does, of these; -1 without.
         first_turn: (K + 1,) rows of `turns` of each.
         turns: (T, 4) quaternions.
-        ray: (M,) detections of a direction alone.
     """
 
     pose_row: IntArray

@@ -19,9 +19,9 @@ from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
 from evermap.slam.space.drift import Gauge, gauge_of
 from evermap.slam.space.estimate import converged
-from evermap.slam.space.intake import SpatialIntake, prepare_space, scale_between
-from evermap.slam.space.result import concluded_in_space, numbered
-from evermap.slam.space.solve import SpatialSolved, solve_space
+from evermap.slam.space.intake import SpatialIntake, most_of, prepare_space, scale_between
+from evermap.slam.space.result import concluded_in_space, distinguished
+from evermap.slam.space.solve import SpatialSolved, solve_space, times_of
 from evermap.tracking.frame import DetectionTable, Poses, heading_of, in_world, with_empty_frames
 from evermap.tracking.run import TrackResult, run_track
 from evermap.tracking.standing import Stood, long_enough, standing
@@ -38,7 +38,6 @@ from evermap.types import (
     Progress,
     SlamResult,
     SpatialRecording,
-    landmark_id_of,
     rows_of,
 )
 
@@ -47,21 +46,6 @@ SETTLED = 0.2
 """Standard deviations by which the gauge changes in the last round, at most."""
 WANDERS = 0.03, 0.003
 """From where the noise of an odometry that wanders is sought [m/sqrt(s), rad/sqrt(s)]."""
-
-
-@dataclass(frozen=True, slots=True)
-class Traffic:
-    """Objects around the robot.
-
-    Attributes:
-        followed: the tracker's answer; None where nothing was seen often enough.
-        standing: static stays, one row per box.
-        gauge: systematic errors.
-    """
-
-    followed: TrackResult | None
-    standing: Stood
-    gauge: Gauge
 
 
 def has_traffic(recording: AnyRecording) -> TypeGuard[SpatialRecording]:
@@ -107,7 +91,8 @@ class TrafficIntake:
         recording: with a frame for every pose; its other detections are left out.
         rows: (M,) of these in the recording that was given.
         driven: (F, 7) poses by the odometry, from the first frame.
-        traffic: what stands, and what moves.
+        stays: of static objects, one row per box.
+        gauge: systematic errors.
         known: the first identity that is no landmark of the recording: stay `k` has `known + k`.
         used: (K,) rows of the detections that have an identity for the solver.
         standing: the recording with these only, without errors that repeat themselves.
@@ -117,7 +102,8 @@ class TrafficIntake:
     recording: SpatialRecording
     rows: IntArray
     driven: FloatArray
-    traffic: Traffic
+    stays: Stood
+    gauge: Gauge
     known: int
     used: IntArray
     standing: SpatialRecording
@@ -127,45 +113,56 @@ class TrafficIntake:
 def take_in_traffic(recording: SpatialRecording, space: SpaceConfig, track: TrackConfig) -> TrafficIntake:
     """Return the static objects of a recording with systematic errors removed; arguments as of `run_in_traffic`."""
     recording, rows = _whole(recording)
-    driven, space = _driven(recording), _by_sheet(recording, space)
-    return _taken(recording, rows, driven, _settled(recording, driven, space, track), space)
+    assert recording.odometry is not None
+    driven_s, pose = recording.odometry.stamp_s, recording.odometry.pose_world_robot
+    driven = se3.interpolate(driven_s, pose, recording.frames.stamp_s)
+    driven = se3.between(driven[0], driven)
+    # the prior of the ranges' scale is what kind and data sheet of the sensors state
+    sigma = max(scale_between(recording.sensors, space, space.traffic.sigma_scale)[0], 1e-6)
+    space = space.model_copy(update={"traffic": space.traffic.model_copy(update={"sigma_scale": sigma})})
+    return _taken(recording, rows, driven, *_settled(recording, driven, space, track), space)
 
 
 def _taken(
-    recording: SpatialRecording, rows: IntArray, driven: FloatArray, traffic: Traffic, space: SpaceConfig
+    recording: SpatialRecording, rows: IntArray, driven: FloatArray, stays: Stood, gauge: Gauge, space: SpaceConfig
 ) -> TrafficIntake:
     """The recording as the solver takes it, with the errors taken off that repeat themselves."""
-    identity = _identity(recording, traffic.standing)
-    standing_only = _standing_only(recording, driven, traffic, identity)
+    identity = recording.detections.landmark_id.copy()
+    known = int(identity.max(initial=UNKNOWN)) + 1
+    identity[boxes_of(recording)] = np.where(stays.stay == UNKNOWN, UNKNOWN, known + stays.stay)
+    standing_only = _standing_only(recording, driven, gauge, identity)
     intake = prepare_space(standing_only, space, fewest=0)
     # the scale between ranges and odometry was taken off
     intake = replace(intake, problem=replace(intake.problem, steady=True, scale_sigma=0.0, ranges_share=0.0))
     used = np.flatnonzero(identity != UNKNOWN)
-    return TrafficIntake(recording, rows, driven, traffic, _known(recording), used, standing_only, intake)
+    return TrafficIntake(recording, rows, driven, stays, gauge, known, used, standing_only, intake)
 
 
 def rescaled(taken: TrafficIntake, factor: float) -> TrafficIntake:
     """Return the same with all lengths scaled to a map: odometry and ranges alike."""
-    gauge = taken.traffic.gauge
-    ranges, driven = factor * gauge.range_scale, factor * gauge.odometry_scale
-    gauge = gauge._replace(stated=ranges, scale=1.0 / driven - 1.0)
-    traffic, space = replace(taken.traffic, gauge=gauge), taken.intake.problem.settings
-    return _taken(taken.recording, taken.rows, taken.driven, traffic, space)
-
-
-def _by_sheet(recording: SpatialRecording, space: SpaceConfig) -> SpaceConfig:
-    """Return the settings with the prior of the ranges' scale that kind and data sheet of the sensors state."""
-    sigma = max(scale_between(recording.sensors, space, space.traffic.sigma_scale)[0], 1e-6)
-    return space.model_copy(update={"traffic": space.traffic.model_copy(update={"sigma_scale": sigma})})
+    ranges, driven = factor * taken.gauge.range_scale, factor * taken.gauge.odometry_scale
+    gauge = taken.gauge._replace(stated=ranges, scale=1.0 / driven - 1.0)
+    space = taken.intake.problem.settings
+    return _taken(taken.recording, taken.rows, taken.driven, taken.stays, gauge, space)
 
 
 def solve_in_traffic(taken: TrafficIntake, progress: Progress | None = None) -> SpatialSolved:
-    """Return the solution of the static objects alone.
+    """Return the solution of the static objects alone, with drifting odometry if that explains them far better.
+
+    The errors of boxes are alike for seconds, and things that creep are taken for such that stand: both look like an
+    odometry that wanders a little. So good odometry is believed, until things agree that it is not.
 
     Raises:
         NumericalError: no finite optimum.
     """
-    return _wandering(solve_space(taken.intake, None, progress=progress))
+    solved = solve_space(taken.intake, None, progress=progress)
+    optimum, problem = solved.optimum, solved.optimum.smoother.problem
+    if len(np.unique(problem.place)) < problem.settings.traffic.witnesses:
+        return solved
+    noise = replace(optimum.noise, translation=WANDERS[0], rotation=WANDERS[1])
+    other = converged(replace(problem, steady=False), optimum.estimate, noise, heavy_rounds=0)
+    better = optimum.noise.position > problem.settings.traffic.better_by * other.noise.position
+    return replace(solved, optimum=other) if better else solved
 
 
 def conclude_in_traffic(
@@ -173,7 +170,7 @@ def conclude_in_traffic(
 ) -> tuple[SlamResult, TrackResult | None]:
     """Return poses and static objects, with rows of detections of `taken.recording`; and tracks along these poses."""
     result = concluded_in_space(taken.standing, intake, solved)
-    followed = _followed(taken.recording, result.trajectory.pose_world_robot, taken.traffic.gauge, track)
+    followed = _followed(taken.recording, result.trajectory.pose_world_robot, taken.gauge, track)
     if followed is not None:
         p_still = _stands(taken.recording, followed, track.still).p_still
         of_row = [p_still.get(one, np.nan) for one in followed.tracks.track_id.tolist()]
@@ -183,7 +180,7 @@ def conclude_in_traffic(
         result,
         innovations=replace(result.innovations, detection=taken.used[result.innovations.detection]),
         dead_reckoning=replace(result.dead_reckoning, pose_world_robot=alone),
-        parameters=(*result.parameters, *_parameters(taken.traffic.gauge, intake.problem.settings.traffic)),
+        parameters=(*result.parameters, *_parameters(taken.gauge, intake.problem.settings.traffic)),
         followed=followed,
     ), followed
 
@@ -192,11 +189,6 @@ def boxes_of(recording: SpatialRecording) -> IntArray:
     """Return rows of boxes without identity."""
     given = recording.detections
     return np.flatnonzero((given.landmark_id == UNKNOWN) & np.isfinite(given.size_m).all(axis=1))
-
-
-def _known(recording: SpatialRecording) -> int:
-    """Return the first id that no landmark of the recording has."""
-    return int(recording.detections.landmark_id.max(initial=UNKNOWN)) + 1
 
 
 def _whole(recording: SpatialRecording) -> tuple[SpatialRecording, IntArray]:
@@ -214,19 +206,13 @@ def _whole(recording: SpatialRecording) -> tuple[SpatialRecording, IntArray]:
     return whole, np.flatnonzero(kept)
 
 
-def _driven(recording: SpatialRecording) -> FloatArray:
-    """(F, 7) poses by the odometry."""
-    assert recording.odometry is not None
-    found = se3.interpolate(recording.odometry.stamp_s, recording.odometry.pose_world_robot, recording.frames.stamp_s)
-    return se3.between(found[0], found)
-
-
-def _settled(recording: SpatialRecording, driven: FloatArray, space: SpaceConfig, track: TrackConfig) -> Traffic:
-    """Return identities, static objects, and systematic errors, alternated until the errors no longer change."""
+def _settled(
+    recording: SpatialRecording, driven: FloatArray, space: SpaceConfig, track: TrackConfig
+) -> tuple[Stood, Gauge]:
+    """Return static objects and systematic errors, alternated until the errors no longer change."""
     rows, stamps, gauge = boxes_of(recording), recording.frames.stamp_s, Gauge.before(space)
     mount, frame = mounts_of(recording)[rows], recording.detections.frame[rows]
     seen = se3.transform(mount, recording.detections.position_sensor_m[rows])
-    followed, stands = None, _stands(recording, None, track.still)
     for _ in range(ROUNDS):
         followed = _followed(recording, gauge.applied(driven), gauge, track)
         stands = _stands(recording, followed, track.still)
@@ -240,7 +226,7 @@ def _settled(recording: SpatialRecording, driven: FloatArray, space: SpaceConfig
         gauge = found
         if change < SETTLED:
             break
-    return Traffic(followed, stands, gauge)
+    return stands, gauge
 
 
 def mounts_of(recording: SpatialRecording) -> FloatArray:
@@ -291,46 +277,23 @@ def _stands(recording: SpatialRecording, followed: TrackResult | None, settings:
     return standing(stamp_s, followed.table.position_m, range_m, followed.track_of_detection, limit, settings)
 
 
-def _identity(recording: SpatialRecording, stands: Stood) -> IntArray:
-    """Return (M,) identities of the solver: for static boxes their stay."""
-    identity = recording.detections.landmark_id.copy()
-    identity[boxes_of(recording)] = np.where(stands.stay == UNKNOWN, UNKNOWN, _known(recording) + stands.stay)
-    return identity
-
-
 def _standing_only(
-    recording: SpatialRecording, driven: FloatArray, traffic: Traffic, identity: IntArray
+    recording: SpatialRecording, driven: FloatArray, gauge: Gauge, identity: IntArray
 ) -> SpatialRecording:
     """Return the input of the solver: detections with an identity (M,), without systematic errors."""
     assert recording.odometry is not None
     rows, given = boxes_of(recording), recording.detections
     rotation, position = given.rotation.copy(), given.position_sensor_m.copy()
     rotation[rows] = np.nan  # the heading of a box is no better than a few degrees, and the wrong way now and then
-    position[rows] *= traffic.gauge.range_scale
+    position[rows] *= gauge.range_scale
     told = replace(given, landmark_id=identity, rotation=rotation, position_sensor_m=position)
     path = replace(
         recording.odometry,
         stamp_s=recording.frames.stamp_s,
-        pose_world_robot=traffic.gauge.applied(driven),
+        pose_world_robot=gauge.applied(driven),
         variance=np.full((len(driven), 6), np.nan),
     )
     return replace(recording, odometry=path, detections=rows_of(told, identity != UNKNOWN), warnings=())
-
-
-def _wandering(solved: SpatialSolved) -> SpatialSolved:
-    """Return the solution with drifting odometry if that explains the detections far better; else the given one.
-
-    The errors of boxes are alike for seconds, and things that creep are taken for such that stand: both look like an
-    odometry that wanders a little. So good odometry is believed, until things agree that it is not.
-    """
-    optimum = solved.optimum
-    problem, begun = optimum.smoother.problem, optimum.noise
-    if len(np.unique(problem.place)) < problem.settings.traffic.witnesses:
-        return solved
-    noise = replace(begun, translation=WANDERS[0], rotation=WANDERS[1])
-    other = converged(replace(problem, steady=False), optimum.estimate, noise, heavy_rounds=0)
-    better = begun.position > problem.settings.traffic.better_by * other.noise.position
-    return replace(solved, optimum=other) if better else solved
 
 
 def with_stays(
@@ -344,15 +307,18 @@ def with_stays(
         followed: the tracks along the estimated poses.
         track: settings of the tracker.
     """
-    traffic, known, tilt_rad = taken.traffic, taken.known, taken.intake.problem.settings.traffic.tilt_rad
-    landmarks, of = result.landmarks, _tracks(traffic.standing, followed)
-    identities, names = _identities(of, known)
+    stays, known, tilt_rad = taken.stays, taken.known, taken.intake.problem.settings.traffic.tilt_rad
+    landmarks, of = result.landmarks, stays.track
+    if followed is not None:  # the track that most boxes of each stay are of
+        most = most_of(stays.stay, followed.track_of_detection, len(of))
+        of = np.where(most == UNKNOWN, of, most)
+    identities, names = distinguished(known + of, times_of(of), {})
     stay = landmarks.landmark_id - known
     ours = np.flatnonzero((stay >= 0) & (stay < len(identities)))
     stay, new = stay[ours], landmarks.landmark_id.copy()
     new[ours] = identities[stay]
     p_exists = landmarks.p_exists.copy()
-    p_exists[ours] = traffic.standing.p_stay[stay]
+    p_exists[ours] = stays.p_stay[stay]
     told = replace(landmarks, landmark_id=new, p_exists=p_exists, names={**landmarks.names, **names})
     if followed is not None and len(ours):
         told = _headed(told, ours, of[stay], followed, tilt_rad)
@@ -362,32 +328,8 @@ def with_stays(
         result,
         landmarks=rows_of(told, np.argsort(new, kind="stable")),
         innovations=replace(result.innovations, landmark_id=asked, detection=taken.rows[result.innovations.detection]),
-        changes=(*result.changes, *_changes(traffic.standing, identities, names, track.still.when_s)),
+        changes=(*result.changes, *_changes(stays, identities, names, track.still.when_s)),
     )
-
-
-def _tracks(standing: Stood, followed: TrackResult | None) -> IntArray:
-    """(S,) the track that most boxes of each stay are of."""
-    found = standing.track.copy()
-    if followed is None:
-        return found
-    for stay in range(len(found)):
-        of = followed.track_of_detection[standing.stay == stay]
-        of = of[of != UNKNOWN]
-        found[stay] = np.bincount(of).argmax() if len(of) else found[stay]
-    return found
-
-
-def _identities(track: IntArray, known: int) -> tuple[IntArray, dict[int, str]]:
-    """Ids (S,) of stays, and names: the second stay of one track is called '7#2'."""
-    found, names, times = known + track, dict[int, str](), dict[int, int]()
-    for stay, one in enumerate(track.tolist()):
-        times[one] = times.get(one, 0) + 1
-        if times[one] > 1:
-            name = numbered(known + one, times[one])
-            found[stay] = landmark_id_of(name)
-            names[int(found[stay])] = name
-    return found, names
 
 
 def _headed(landmarks: Landmarks, ours: IntArray, track: IntArray, followed: TrackResult, tilt_rad: float) -> Landmarks:

@@ -57,6 +57,7 @@ class _Told:
     recording: SpatialRecording
     intake: SpatialIntake
     solved: SpatialSolved
+    problem: SpatialProblem
     spread: Spread
     frame: str
     stamp_s: FloatArray
@@ -65,38 +66,28 @@ class _Told:
 
 def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solved: SpatialSolved) -> SlamResult:
     """Return trajectory and map, and differences to a given map."""
-    frame = "prior_map" if len(solved.optimum.smoother.problem.prior.place) else "first_pose"
-    optimum = solved.optimum
-    found, placed = located(optimum.smoother.problem, optimum.now)
-    told = _Told(
-        recording, intake, solved, optimum.smoother.spread(optimum.now), frame,
-        intake.start_s + optimum.smoother.problem.stamp_s, placed,
-    )  # fmt: skip
+    optimum, problem = solved.optimum, solved.optimum.smoother.problem
+    frame = "prior_map" if len(problem.prior.place) else "first_pose"
+    found, placed = located(problem, optimum.now)
+    spread = optimum.smoother.spread(optimum.now)
+    told = _Told(recording, intake, solved, problem, spread, frame, intake.start_s + problem.stamp_s, placed)
     identities, names = identities_of(intake, solved)
-    warnings = list(intake.warnings)
-    inlier = optimum.smoother.problem.settings.inlier
-    left_out = [
-        names.get(int(identities[k]), str(identities[k]))
-        for k in np.setdiff1d(optimum.smoother.problem.place[optimum.now.weight > inlier], np.flatnonzero(placed))
-    ]
+    called = [names.get(one, str(one)) for one in identities.tolist()]
+    warnings, inlier = list(intake.warnings), problem.settings.inlier
+    used = problem.place[optimum.now.weight > inlier]
+    left_out = [called[k] for k in np.setdiff1d(used, np.flatnonzero(placed))]
     if left_out:
         warnings.append(f"landmarks left out, since nothing connects them to the others: {', '.join(left_out)}")
     if not found.all():
         warnings.append(f"{int((~found).sum())} frames in which the robot could not be located left out")
-    seen = np.bincount(optimum.smoother.problem.place, optimum.now.weight, minlength=len(identities)) > inlier
-    twice = [_called(names, int(identities[k])) for k in np.flatnonzero((solved.number > 1) & seen & placed)]
+    seen = np.bincount(problem.place, optimum.now.weight, minlength=len(identities)) > inlier
+    twice = [called[k] for k in np.flatnonzero((solved.number > 1) & seen & placed)]
     if twice:
         warnings.append(f"identities on several landmarks, distinguished by their places: {', '.join(twice)}")
     rough = np.repeat(solved.online_spread**2, 3, axis=1)[:, :, None] * np.eye(6)
     return SlamResult(
-        trajectory=Trajectory(
-            told.stamp_s[found],
-            optimum.estimate.pose[found],
-            _of_poses(told)[found],
-            frame=frame,
-            clock=recording.clock,
-        ),
-        online=Trajectory(told.stamp_s, solved.online_pose, rough, frame=frame, clock=recording.clock),
+        trajectory=_path(told, optimum.estimate.pose[found], _of_poses(told)[found], found),
+        online=_path(told, solved.online_pose, rough),
         landmarks=_landmarks(told, identities, names),
         parameters=_parameters(told),
         innovations=_innovations(told, identities),
@@ -111,9 +102,9 @@ def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solve
 
 def _of_poses(told: _Told) -> FloatArray:
     """Return (N, 6, 6) covariances of poses, with what is not known of the metre."""
-    optimum = told.solved.optimum
-    covariance = optimum.smoother.covariance_of_poses(told.spread).copy()
-    away = np.einsum("nji,nj->ni", se3.rotation_of(optimum.estimate.pose), optimum.estimate.pose[:, :3])
+    pose = told.solved.optimum.estimate.pose
+    covariance = told.spread.own[: 36 * len(pose)].reshape(-1, 6, 6).copy()
+    away = np.einsum("nji,nj->ni", se3.rotation_of(pose), pose[:, :3])
     covariance[:, :3, :3] += _undivided(told) ** 2 * away[:, :, None] * away[:, None, :]
     return covariance
 
@@ -124,18 +115,25 @@ def numbered(name: str | int, number: int) -> str:
 
 
 def identities_of(intake: SpatialIntake, solved: SpatialSolved) -> tuple[IntArray, dict[int, str]]:
-    """Return ids (P,) of places, and names: a second landmark with the identity 7 is called '7#2'."""
-    names, identities = dict(intake.names), intake.landmark_id[solved.identity].copy()
-    for row in np.flatnonzero(solved.number > 1).tolist():
-        own = int(identities[row])
-        name = numbered(names.get(own, own), int(solved.number[row]))
-        identities[row] = landmark_id_of(name)
-        names[int(identities[row])] = name
-    return identities, names
+    """Return `distinguished` ids (P,) of places, and the names of all."""
+    return distinguished(intake.landmark_id[solved.identity], solved.number, intake.names)
 
 
-def _called(names: Mapping[int, str], identity: int) -> str:
-    return names.get(identity, str(identity))
+def distinguished(landmark_id: IntArray, number: IntArray, names: Mapping[int, str]) -> tuple[IntArray, dict[int, str]]:
+    """Return ids of which none is there twice, and names with those of the new ones.
+
+    Args:
+        landmark_id: (P,) the second of two with the id 7 is called '7#2'.
+        number: (P,) which of those with its id each is, from 1.
+        names: texts behind ids.
+    """
+    found, names = landmark_id.copy(), dict(names)
+    for row in np.flatnonzero(number > 1).tolist():
+        own = int(found[row])
+        name = numbered(names.get(own, own), int(number[row]))
+        found[row] = landmark_id_of(name)
+        names[int(found[row])] = name
+    return found, names
 
 
 def located(problem: SpatialProblem, now: SpatialLinear) -> tuple[BoolArray, BoolArray]:
@@ -161,8 +159,8 @@ def located(problem: SpatialProblem, now: SpatialLinear) -> tuple[BoolArray, Boo
 
 
 def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> Landmarks:
-    optimum, recording = told.solved.optimum, told.recording
-    problem, place = optimum.smoother.problem, optimum.estimate.place
+    optimum, recording, problem = told.solved.optimum, told.recording, told.problem
+    place = optimum.estimate.place
     count, n = len(place), len(problem.stamp_s)
     used = optimum.now.weight > problem.settings.inlier
     hits = np.bincount(problem.place[used], minlength=count)
@@ -206,7 +204,7 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
 
 def _sizes(told: _Told, count: int) -> FloatArray:
     """(P, 3) median sizes of boxes."""
-    size, place = told.recording.detections.size_m[told.intake.used], told.solved.optimum.smoother.problem.place
+    size, place = told.recording.detections.size_m[told.intake.used], told.problem.place
     found = np.full((count, 3), np.nan)
     for row in range(count):
         own = size[(place == row) & np.isfinite(size[:, 0])]
@@ -216,7 +214,7 @@ def _sizes(told: _Told, count: int) -> FloatArray:
 
 
 def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
-    problem, levels = told.solved.optimum.smoother.problem, told.solved.optimum.noise.levels
+    optimum, problem, levels = told.solved.optimum, told.problem, told.solved.optimum.noise.levels
     has = {
         TRANSLATION: problem.driven,
         ROTATION: problem.driven,
@@ -230,7 +228,7 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
         for row, (name, unit, meaning) in _LEVELS.items()
         if has[row]
     ]
-    border = told.solved.optimum.smoother.factorised(told.solved.optimum.now).border_covariance()
+    border = optimum.smoother.factorised(optimum.now).border_covariance()
     *of_sensors, of_scale = np.sqrt(np.diag(border))
     sigma = np.reshape(of_sensors, (-1, 6))
     parts = [*((f"mount_{axis}_m", "m") for axis in "xyz"), *((f"mount_r{axis}_rad", "rad") for axis in "xyz")]
@@ -238,7 +236,7 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
         for column, (part, unit) in enumerate(parts):
             prior = float(problem.mount_sigma[row, column])
             if prior > 0.0:
-                value = float(told.solved.optimum.estimate.state[row, column])
+                value = float(optimum.estimate.state[row, column])
                 name, spread = f"{sensor.name}_{part}", float(sigma[row, column])
                 found.append(ParameterEstimate(name, value, spread, 0.0, prior, unit, meaning=MOUNT))
         if np.isfinite(told.solved.delay_sigma_s[row]):
@@ -252,19 +250,18 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
 
 def _undivided(told: _Told) -> float:
     """Return the standard deviation of all lengths that remains where only ranges and odometer say what a metre is."""
-    problem, before = told.solved.optimum.smoother.problem, told.intake.problem.scale_sigma
+    problem, before = told.problem, told.intake.problem.scale_sigma
     share = 0.0 if len(problem.prior.place) else problem.ranges_share
     return float(before * np.sqrt(share * (1.0 - share)))
 
 
 def _scales(told: _Told, sigma: float) -> list[ParameterEstimate]:
     """Return the scales of odometry and ranges; `sigma` is of the logarithm of what they show together."""
-    optimum = told.solved.optimum
-    problem, share = optimum.smoother.problem, optimum.smoother.problem.ranges_share
+    problem, share = told.problem, told.problem.ranges_share
     before = told.intake.problem.scale_sigma  # it was averaged since
     odometer, ranges = before * np.sqrt(1.0 - share), before * np.sqrt(share)
     undivided = _undivided(told)
-    scale = float(np.exp(problem.odometry_log + optimum.estimate.log_scale))
+    scale = float(np.exp(problem.odometry_log + told.solved.optimum.estimate.log_scale))
     if share == 0.0:
         return [ParameterEstimate("odometry_scale", scale, scale * sigma, 1.0, odometer, "", meaning=SCALE)]
     of_odometer = float(scale * np.hypot((1.0 - share) * sigma, undivided))
@@ -287,8 +284,8 @@ def _innovations(told: _Told, identities: IntArray) -> Innovations:
 
     With H = J S J' of whitened Jacobians and the covariance S, and the weight w: r' (1 - w H)^-1 (1 - w H + H)^-1 r.
     """
-    smoother, now = told.solved.optimum.smoother, told.solved.optimum.now
-    problem, first = smoother.problem, told.spread.of_factors_first[len(smoother.problem.increment) :]
+    problem, now = told.problem, told.solved.optimum.now
+    first = told.spread.of_factors_first[len(problem.increment) :]
     nis = np.zeros(len(problem.kind))
     for kind in range(3):
         some, rows = np.flatnonzero(problem.kind == kind), int(ROWS[kind])
@@ -312,10 +309,14 @@ def _innovations(told: _Told, identities: IntArray) -> Innovations:
 
 def _dead_reckoning(told: _Told) -> Trajectory:
     """Odometry alone from the first pose; nothing without."""
-    problem, pose = told.solved.optimum.smoother.problem, told.solved.optimum.estimate.pose
-    count = len(pose) if problem.driven else 0
-    path = se3.compose(pose[:1], told.intake.driven_pose[:count])
-    return Trajectory(told.stamp_s[:count], path, np.zeros((count, 6, 6)), frame=told.frame, clock=told.recording.clock)
+    pose = told.solved.optimum.estimate.pose
+    count = len(pose) if told.problem.driven else 0
+    return _path(told, se3.compose(pose[:1], told.intake.driven_pose[:count]), np.zeros((count, 6, 6)), slice(count))
+
+
+def _path(told: _Told, pose: FloatArray, covariance: FloatArray, of: BoolArray | slice = slice(None)) -> Trajectory:
+    """Poses at some of the stamps."""
+    return Trajectory(told.stamp_s[of], pose, covariance, frame=told.frame, clock=told.recording.clock)
 
 
 def _changes(told: _Told, identities: IntArray, names: Mapping[int, str]) -> tuple[MapChange, ...]:
@@ -323,7 +324,7 @@ def _changes(told: _Told, identities: IntArray, names: Mapping[int, str]) -> tup
     found = told.solved.from_map
     if found is None:
         return ()
-    problem, optimum = told.solved.optimum.smoother.problem, told.solved.optimum
+    problem, optimum = told.problem, told.solved.optimum
     used = optimum.now.weight > problem.settings.inlier
     changes = []
     for k in np.argsort(found.p_stands, kind="stable"):

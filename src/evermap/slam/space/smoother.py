@@ -57,7 +57,8 @@ class SpatialSmoother:
     def __init__(self, problem: SpatialProblem, around: FloatArray) -> None:
         self.problem = problem
         self._seen, self._back = problem.sightings, problem.earlier()
-        self._states = _information(np.append(problem.mount_sigma, problem.scale_sigma))
+        sigma = np.append(problem.mount_sigma, problem.scale_sigma)
+        self._states = np.where(sigma > 0.0, 1.0 / np.maximum(sigma, 1e-12) ** 2, FIXED)
         self._start = np.array(around[0])
         self.system = self._structured(around)
         axis = problem.symmetries.axis
@@ -144,11 +145,6 @@ class SpatialSmoother:
         """Return covariances of all variables and of what each factor ties."""
         return exhausted(self.factorised(now).spread(len(self.problem.increment)))
 
-    def covariance_of_poses(self, spread: Spread) -> FloatArray:
-        """Return (N, 6, 6)."""
-        n = len(self.problem.stamp_s)
-        return spread.own[: 36 * n].reshape(n, 6, 6)
-
     def scale_by_stretches(self, now: SpatialLinear) -> tuple[float, float]:
         """Return the variance of the odometry's scale, and what one with correlated residuals has over it, at least 1.
 
@@ -162,21 +158,21 @@ class SpatialSmoother:
         stretch = np.minimum((STRETCHES * share).astype(np.int64), STRETCHES - 1)
         pose, scale = with_scale[: 6 * n].reshape(n, 6), with_scale[-1:]
         by = np.hstack([pose[:-1], pose[1:], np.tile(scale, (n - 1, 1))])
-        rows = now.values[:odometry].reshape(n - 1, 6, 14)
-        told = np.einsum("nra,na->nr", rows[..., :-1], by)
-        pull, independent = np.bincount(stretch[:-1], (told * rows[..., -1]).sum(axis=1), STRETCHES), (told**2).sum()
-        for kind, rows_of_kind in enumerate(ROWS.tolist()):
+        parts = [(stretch[:-1], now.values[:odometry].reshape(n - 1, 6, 14), by)]
+        for kind, n_rows in enumerate(ROWS.tolist()):
             for dim in (3, 6):
                 some = np.flatnonzero((seen.kind == kind) & (seen.oriented == (dim == 6)))
-                width = 13 + dim
-                at = odometry + seen.first[some][:, None] + np.arange(rows_of_kind * width)
-                rows = now.values[at].reshape(len(some), rows_of_kind, width)
+                at = odometry + seen.first[some][:, None] + np.arange(n_rows * (13 + dim))
                 place = begin[n + seen.place[some]][:, None] + np.arange(dim)
                 sensor = begin[n + len(problem.oriented) + seen.sensor[some]][:, None] + np.arange(STATES)
                 by = np.hstack([pose[seen.pose_row[some]], with_scale[place], with_scale[sensor]])
-                told = np.einsum("mra,ma->mr", rows[..., :-1], by)
-                independent += (told**2).sum()
-                pull += np.bincount(stretch[seen.pose_row[some]], (told * rows[..., -1]).sum(axis=1), STRETCHES)
+                rows = now.values[at].reshape(len(some), n_rows, 13 + dim)
+                parts.append((stretch[seen.pose_row[some]], rows, by))
+        pull, independent = np.zeros(STRETCHES), 0.0
+        for of, rows, by in parts:
+            told = np.einsum("mra,ma->mr", rows[..., :-1], by)
+            pull += np.bincount(of, (told * rows[..., -1]).sum(axis=1), STRETCHES)
+            independent += float((told**2).sum())
         found = (pull**2).sum() * STRETCHES / (STRETCHES - 1.0)
         return float(scale[0]), max(float(found / max(independent, 1e-300)), 1.0)
 
@@ -255,7 +251,3 @@ def _odometry_sigma(problem: SpatialProblem, noise: SpatialNoise) -> FloatArray:
     """Return (N - 1, 6) standard deviations of the odometry between consecutive poses."""
     root = np.sqrt(np.maximum(problem.lasted_s, 1e-3))
     return np.repeat(np.column_stack([noise.translation * root, noise.rotation * root]), 3, axis=1)
-
-
-def _information(sigma: FloatArray) -> FloatArray:
-    return np.where(sigma > 0.0, 1.0 / np.maximum(sigma, 1e-12) ** 2, FIXED)
