@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from evermap.compiled import single_threaded
 from evermap.config import Config
 from evermap.errors import ConfigError, DataError
@@ -70,8 +68,7 @@ def run_together(
 
     Args:
         recordings: by the numbers by which robots call each other; in the plane, their stamps on one clock.
-        config: settings; None for the defaults.
-        progress: told after every frame of each.
+        config, progress: as of `run_slam`.
 
     Raises:
         InputError: no `Recording`, or one with invalid values.
@@ -111,8 +108,7 @@ def run_session(
     Args:
         recording: the session; its truth is not looked at. One that is earlier than the map is for `enter_session`.
         living: the map; None begins one, in the frame of the first pose.
-        config: settings; None for the defaults.
-        progress: told after every frame.
+        config, progress: as of `run_slam`.
 
     Raises:
         InputError: no `Recording`.
@@ -127,8 +123,7 @@ def run_session(
     if not isinstance(recording, SpatialRecording):
         entered = bring_in(solve_alone(recording, living, config, progress=progress), living, config)
         return session.begun_with(entered, whole)
-    recording = nameless.without_ids(recording) if config.slam.unknown_ids is True else recording
-    recording, remarks = check.screened(recording, config)
+    recording, remarks = check.screened(nameless.without_ids(recording, config), config)
     recording, living = session.admitted(recording, living)
     if config.slam.unknown_ids:
         recording, living = session.admitted(nameless.named_in(recording, living, config), living)
@@ -145,8 +140,7 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     from evermap.maps.sessions import nameless, planar, session
     from evermap.slam import check
 
-    recording = nameless.without_ids(recording) if config.slam.unknown_ids is True else recording
-    recording, remarks = check.screened(recording, config, repair=True)
+    recording, remarks = check.screened(nameless.without_ids(recording, config), config, repair=True)
     recording, _ = session.admitted(recording, living)
     if config.slam.unknown_ids:
         recording, _ = session.admitted(nameless.named_in(recording, living, config), living)
@@ -173,12 +167,7 @@ def run_localization(
 ) -> SlamResult:
     """Localise in a living map that stays as it is: causal, from an unknown pose, at a fixed cost per frame.
 
-    Args:
-        recording: what a reader returned; its truth is not looked at.
-        living: the map.
-        config: settings; None for the defaults.
-        realtime: process at the recording's pace; in space all frames are solved together.
-        progress: told after every frame.
+    Arguments are those of `run_slam`, with the map.
 
     Raises:
         ConfigError: `slam.unknown_ids`: that is not causal.
@@ -188,7 +177,6 @@ def run_localization(
     from evermap.maps.sessions import believe, session, spatial
     from evermap.slam import check, intake
     from evermap.slam.localize_recording import localize
-    from evermap.slam.ranges import RANGE_ONLY
 
     config = config or Config()
     if config.slam.unknown_ids:
@@ -201,8 +189,6 @@ def run_localization(
         p_site = believe.aged(living, config.living, float(recording.frames.stamp_s[0])).p_here
         return run_slam(recording, config, prior_map=spatial.standing(living, p_site), progress=progress)
     recording = check.valid(recording, config.sensor)
-    if np.isnan(recording.detections.bearing_rad).any():
-        raise DataError(RANGE_ONLY, field="bearing_rad", hint="enter the session, or use the map as `prior_map`")
     remarks = check.odd(recording, settings=config.slam.check)
     recording, living = session.admitted(recording, living)
     named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])

@@ -19,6 +19,7 @@ from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import FrameSightings, Localizer, Located
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive, Noise
+from evermap.slam.ranges import RANGE_ONLY
 from evermap.slam.result import dead_reckoning, described
 from evermap.types import (
     UNKNOWN,
@@ -60,8 +61,11 @@ def localize(
         with one row a landmark, its most probable one, and the hits and misses of this recording.
 
     Raises:
-        DataError: there is no odometry, or the robot's place in the map could not be found.
+        DataError: there is no odometry, ranges come without bearings, or the robot's place in the map could not be
+            found.
     """
+    if np.isnan(recording.detections.bearing_rad).any():
+        raise DataError(RANGE_ONLY, field="bearing_rad", hint="enter the session, or use the map as `prior_map`")
     drive = Drive.of(recording, config.slam.odometry)
     covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2
     places = KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists).existing()

@@ -105,7 +105,7 @@ def test_the_map_is_as_large_as_that_of_named_landmarks(lived: tuple[BuildingSim
 
 def test_ids_of_the_recording_are_not_looked_at(lived: tuple[BuildingSimulation, list[Session]]) -> None:
     one, sessions = lived
-    again = lived_through([without_ids(recording) for recording in one.sessions[:2]], NAMELESS)
+    again = lived_through([without_ids(recording, NAMELESS) for recording in one.sessions[:2]], NAMELESS)
     assert again[1].living.landmark_texts == sessions[1].living.landmark_texts
     np.testing.assert_array_equal(again[1].living.places.position_m, sessions[1].living.places.position_m)
 

@@ -99,8 +99,10 @@ class _Stood:
         return cls(row, member, places.position_m, covariance, places.rotation, members.class_id[member], p, p_away)
 
 
-def without_ids(recording: AnyRecordingT) -> AnyRecordingT:
-    """Return a recording without the ids of its detections."""
+def without_ids(recording: AnyRecordingT, config: Config) -> AnyRecordingT:
+    """Return a recording without the ids of its detections, where `slam.unknown_ids` says that they do not count."""
+    if config.slam.unknown_ids is not True:
+        return recording
     nobody = np.full(len(recording.detections), UNKNOWN)
     return replace(with_ids(recording, nobody, nobody, nobody[:0]), landmark_names={})
 
@@ -140,7 +142,7 @@ def numbered_in(recording: AnyRecordingT, prior_map: Landmarks, config: Config) 
         DataError: as of `named_in`.
     """
     living = replace(LivingMap.begun(prior_map, config.living.whole_places), clock=recording.clock)
-    given = recording if config.slam.unknown_ids == "empty" else without_ids(recording)
+    given = without_ids(recording, config)
     of_map, living = admitted(given, living.from_now_on(float(recording.frames.stamp_s[0])))
     found, name, landmark_id = _met(of_map, living, config)
     taken = np.concatenate([prior_map.landmark_id, given.detections.landmark_id])

@@ -79,8 +79,7 @@ def prepare_space(
     seen_in = np.unique(detections.frame[usable])
     if len(seen_in) < fewest:
         raise _too_little(recording, len(seen_in), fewest)
-    pose_frame = seen_in if recording.odometry is None else np.flatnonzero(moving)
-    used = np.flatnonzero(usable)
+    pose_frame, used = seen_in if recording.odometry is None else np.flatnonzero(moving), np.flatnonzero(usable)
     landmark_id, place = np.unique(detections.landmark_id[used], return_inverse=True)
     some = rows_of(where, used)
     symmetries = _symmetries(recording, place, used, some.kind)
