@@ -147,7 +147,7 @@ def test_a_failure_in_the_middle_leaves_the_old_run_untouched(run, tmp_path, mon
     def fail(*_):
         raise RuntimeError("power cut")
 
-    monkeypatch.setattr(runfolder, "_write_innovations", fail)
+    monkeypatch.setattr(runfolder, "changes_text", fail)
     with pytest.raises(RuntimeError, match="power cut"):
         quick(out, run)
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
@@ -231,7 +231,7 @@ def test_a_full_disk_is_one_line(run, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(runfolder, "_write_innovations", full)
+    monkeypatch.setattr(runfolder, "changes_text", full)
     with pytest.raises(ConfigError, match="No space left"):
         quick(tmp_path / "run", run)
     assert list(tmp_path.iterdir()) == []

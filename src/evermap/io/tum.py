@@ -24,16 +24,14 @@ def write_tum(trajectory: Trajectory, path: str | Path) -> Path:
 
     Numbers are written in the shortest form that reads back the same.
     """
-    pose = trajectory.pose_world_robot
-    if pose.shape[1] == 7:
-        lines = [
-            " ".join(map(repr, (stamp, *row))) + "\n"
-            for stamp, row in zip(trajectory.stamp_s.tolist(), pose.tolist(), strict=True)
-        ]
-        return write_atomic(path, "".join(lines))
-    columns = (trajectory.stamp_s, *se3.from_plane(pose)[:, [0, 1, 5, 6]].T)
-    rows = zip(*(column.tolist() for column in columns), strict=True)
-    lines = [f"{stamp!r} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}\n" for stamp, x, y, qz, qw in rows]
+    pose, lines = trajectory.pose_world_robot, []
+    in_plane = pose.shape[1] == 3
+    poses = (se3.from_plane(pose) if in_plane else pose).tolist()
+    for stamp, row in zip(trajectory.stamp_s.tolist(), poses, strict=True):
+        words = [*map(repr, (stamp, *row))]
+        if in_plane:
+            words[3:6] = "0", "0", "0"
+        lines.append(" ".join(words) + "\n")
     return write_atomic(path, "".join(lines))
 
 
