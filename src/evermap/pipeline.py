@@ -66,9 +66,8 @@ def run_together(
     Robots that saw each other (`Recording.robot_sightings`) tie each other's poses. Each is solved alone first. The
     results are in the frame of the first robot's first pose.
 
-    Args:
-        recordings: by the numbers by which robots call each other; in the plane, their stamps on one clock.
-        config, progress: as of `run_slam`.
+    `recordings` are by the numbers by which robots call each other; in the plane, their stamps on one clock. The other
+    arguments are those of `run_slam`.
 
     Raises:
         InputError: no `Recording`, or one with invalid values.
@@ -105,10 +104,8 @@ def run_session(
 ) -> Session:
     """Enter one session into a living map: localise from an unknown pose, find what changed, extend it (MATH.md 5).
 
-    Args:
-        recording: the session; its truth is not looked at. One that is earlier than the map is for `enter_session`.
-        living: the map; None begins one, in the frame of the first pose.
-        config, progress: as of `run_slam`.
+    A session that is earlier than the map is for `enter_session`. Without a map (`living`) it begins one, in the frame
+    of its first pose. The other arguments are those of `run_slam`.
 
     Raises:
         InputError: no `Recording`.
