@@ -350,7 +350,7 @@ def _said_by(frames: CliqueFrames, looks: SiteLooks, chains: CliqueChains, senso
     site, key = looks.site[frames.order], looks.key[frames.order]
     n_lines = max(len(lines.hits), 1)
     pair, slot = np.unique(site * n_lines + key, return_inverse=True)  # lines of sight to each site learn by themselves
-    columns = (np.asarray(column, dtype=np.float64)[pair % n_lines] for column in lines[:3])
+    p_free, hits, misses = (np.asarray(column, dtype=np.float64)[pair % n_lines] for column in lines[:3])
     shape = len(frames), chains.width
     n_hits, n_misses = np.zeros((2, *shape), dtype=np.int64)
     said = FrameEvidence(np.zeros(shape), n_hits, n_misses, np.zeros(shape))
@@ -363,7 +363,7 @@ def _said_by(frames: CliqueFrames, looks: SiteLooks, chains: CliqueChains, senso
         np.asarray(looks.hit, dtype=np.bool_)[frames.order],
     )
     numbers = float(p_false), float(p_occluded), float(occluded_s), bool(use_misses)
-    frame_evidence(rows, Lines(*columns, float(lines.p_blocked)), numbers, said)
+    frame_evidence(rows, Lines(p_free, hits, misses, float(lines.p_blocked)), numbers, said)
     return said
 
 

@@ -68,8 +68,7 @@ class NominalField:
             seen: (H,) rows of poses and (H,) rows of landmarks: the detections.
         """
         least = self.settings.worth_a_look * self.sensor.p_detect
-        reach_m = self.sensor.range_max_m + 3.0 * self.settings.range_margin_m  # nothing is detected any more
-        return self._listed(pose, position_m, seen, least, float(reach_m))
+        return self._listed(pose, position_m, seen, least, float(self.reach_m))
 
     def _listed(
         self, pose: FloatArray, position_m: FloatArray, seen: tuple[IntArray, IntArray], least: float, reach_m: float
@@ -82,6 +81,11 @@ class NominalField:
         first = np.searchsorted(seen[0][by_pose], np.arange(len(eye) + 1))
         position = np.asarray(position_m, dtype=np.float64)
         return LooksAt(*looks(eye, position, self.limits, (least, reach_m, AT_ONCE), first, seen[1][by_pose]))
+
+    @property
+    def reach_m(self) -> float:
+        """Return how far away nothing is detected any more."""
+        return self.sensor.range_max_m + 3.0 * self.settings.range_margin_m
 
     @property
     def limits(self) -> tuple[float, ...]:
