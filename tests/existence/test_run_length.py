@@ -290,7 +290,10 @@ def test_a_long_recording_is_smoothed_as_a_hidden_markov_chain(name: str) -> Non
 
     grid = lattice(looks, STEP_S)
     gap, middle = np.diff(grid.stamp_s), 0.5 * (grid.stamp_s[1:] + grid.stamp_s[:-1])
-    factors = [np.ones(n - 1) if one is None else one.at(middle) for one in (model.absence_rhythm, model.stay_rhythm)]
+    factors = [
+        np.ones(n - 1) if one is None else one.factor[bin_of_week(middle)]
+        for one in (model.absence_rhythm, model.stay_rhythm)
+    ]
     x = np.stack([0.04 * factors[0] * gap, 0.06 * factors[1] * gap], axis=1)
     stays_so, ends = np.exp(-x), -np.expm1(-x)
     likelihood = np.stack([grid.gone, grid.there], axis=1)

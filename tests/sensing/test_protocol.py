@@ -17,7 +17,7 @@ from evermap.sensing import learned
 from evermap.sensing.kernels import OUT_OF_FIELD
 from evermap.sensing.profile import Assumed
 from evermap.sensing.sightlines import SightLines
-from evermap.sensing.visibility import USUAL, DetectionModel, NominalField, looks_at
+from evermap.sensing.visibility import USUAL, DetectionModel, NominalField
 from evermap.tracking.views import View
 from evermap.types import FloatArray, IntArray, Sensor
 from evermap_studies.worlds.sensors import CAMERA, LIDAR, Fading, InField, SpatialModel, ViewingAngle
@@ -242,7 +242,7 @@ def test_looks_are_what_is_in_view_and_what_is_detected(seed: int, sensor: Senso
     pose = np.column_stack([rng.uniform(-4.0, 4.0, (11, 2)), rng.uniform(-9.0, 9.0, 11)])
     position = rng.uniform(-9.0, 9.0, (13, 2))
     pairs = np.argwhere(rng.random((11, 13)) < 0.3 * share)
-    looks = looks_at(sensor, pose, position, (pairs[:, 0], pairs[:, 1]))
+    looks = NominalField(sensor).looks(pose, position, (pairs[:, 0], pairs[:, 1]))
     p = NominalField(sensor).p_detect(pose, position)
     hits = set(map(tuple, pairs.tolist()))
     told = list(zip(looks.pose.tolist(), looks.landmark.tolist(), strict=True))

@@ -12,7 +12,6 @@ from evermap.sensing import visibility
 from evermap.sensing.visibility import (
     USUAL,
     NominalField,
-    looks_at,
 )
 from evermap.types import Sensor
 
@@ -82,7 +81,7 @@ def tiny_scene():
 
 def looked_at(sensor, pose, position, seen):
     """Hits and misses as pairs, of detections (frame, landmark)."""
-    looks = looks_at(sensor, pose, position, tuple(np.array(seen, dtype=np.int64).reshape(-1, 2).T))
+    looks = NominalField(sensor).looks(pose, position, tuple(np.array(seen, dtype=np.int64).reshape(-1, 2).T))
     pairs = list(zip(looks.pose.tolist(), looks.landmark.tolist(), strict=True))
     hits, misses = ([pair for pair, hit in zip(pairs, looks.hit, strict=True) if hit == kind] for kind in (True, False))
     return hits, misses, looks

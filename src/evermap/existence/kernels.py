@@ -1,6 +1,6 @@
 """The recursion compiled: streams of looks, and one look at each of many rows with a lifetime in closed form.
 
-A kernel writes into arrays it is given and returns whether any row was refused; which one and why is for `checks` to
+A kernel writes into arrays it is given and returns whether any row was refused; which one and why is for `batch` to
 find out, off the fast path. Refused are times running back, probabilities outside [0, 1], parameters out of range and
 looks that are impossible under both states.
 """

@@ -2,7 +2,7 @@
 
 Nothing but the looks is used: no truth, no guess of when a feature came or went. The E-step is exact for looks at any
 times (`phase_kernels`); the M-step divides expected changes by expected time, or fits a smooth rhythm of the week to
-the two (`smooth_rates`).
+the two (`rhythm.fit`).
 Between structures, and between rhythm and none, the Bayesian information criterion decides: log evidence minus half
 the number of parameters times the logarithm of the number of looks.
 """
@@ -66,11 +66,7 @@ class Limits(NamedTuple):
 
     @classmethod
     def of(cls, looks: Looks) -> Limits:
-        """Return from the times of the looks.
-
-        Raises:
-            DataError: no feature has looks at two instants.
-        """
+        """Return them from the times of the looks; DataError if no feature has looks at two instants."""
         gap, span = looks.median_gap_s(), float(np.ptp(looks.stamp_s))
         return cls(FASTEST / gap, 0.5 * float(np.sqrt(gap * span)))
 
@@ -123,7 +119,7 @@ class LearnedPhases(Shown):
         at_s = max(self.statistics.at_s, float(looks.stamp_s.max()))
         fade = 2.0 ** (-(at_s - self.statistics.at_s) / self.half_life_s)
         old = Statistics(self.statistics.events * fade, self.statistics.exposure_s * fade, at_s)
-        data = _Data.of(looks, at_s, self.half_life_s)._replace(begin_s=self.stamp_s)
+        data = _Data.of(looks, at_s, self.half_life_s, self.limits)._replace(begin_s=self.stamp_s)
         model, total = self.model, old
         for _ in range(rounds):
             new = _expect(data, model, self.belief).statistics
@@ -170,20 +166,20 @@ def learn(
     structures = _structures(phases)
     _check_settings(structures, rhythm, half_life_s, restarts)
     end_s = float(looks.stamp_s.max())
-    data = _Data.of(looks, end_s, np.inf if half_life_s is None else half_life_s)
-    span_s, limits = end_s - float(looks.stamp_s.min()), Limits.of(looks)
+    data = _Data.of(looks, end_s, np.inf if half_life_s is None else half_life_s, Limits.of(looks))
+    span_s = end_s - float(looks.stamp_s.min())
     with_rhythm = rhythm is True or (rhythm == "auto" and span_s >= SHORTEST_RHYTHM_S)
     found: list[tuple[Candidate, _Fit, Structure]] = []
     random = np.random.default_rng(seed)
     for structure in structures:
         if progress:
             progress(structure.name)
-        fit = _best_of(data, structure, restarts, random, span_s, limits)
+        fit = _best_of(data, structure, restarts, random, span_s)
         fits = [] if rhythm is True else [fit]
         if with_rhythm:
             if progress:
                 progress(f"{structure.name} + rhythm")
-            fits.append(_with_rhythm(data, structure, fit, limits))
+            fits.append(_with_rhythm(data, structure, fit))
         found += [(_candidate(looks, structure, fit), fit, structure) for fit in fits]
     found.sort(key=lambda one: -one[0].score)
     best, fit, structure = found[0]
@@ -197,7 +193,7 @@ def learn(
         belief=final.last,
         stamp_s=looks.ends_s(end_s)[1],
         half_life_s=data.half_life_s,
-        limits=limits,
+        limits=data.limits,
     )
 
 
@@ -227,10 +223,11 @@ class _Data(NamedTuple):
     begin_s: FloatArray
     end_s: float
     half_life_s: float
+    limits: Limits
 
     @classmethod
-    def of(cls, looks: Looks, end_s: float, half_life_s: float) -> _Data:
-        return cls(looks, looks.columns(), looks.ends_s(end_s)[0], end_s, half_life_s)
+    def of(cls, looks: Looks, end_s: float, half_life_s: float, limits: Limits) -> _Data:
+        return cls(looks, looks.columns(), looks.ends_s(end_s)[0], end_s, half_life_s, limits)
 
 
 class _Expected(NamedTuple):
@@ -295,28 +292,27 @@ def _maximise(structure: Structure, statistics: Statistics, rhythm: bool, limits
 
 
 def _round(
-    data: _Data, structure: Structure, model: PhaseType, start: FloatArray, limits: Limits
+    data: _Data, structure: Structure, model: PhaseType, start: FloatArray
 ) -> tuple[float, PhaseType, FloatArray]:
     """Objective at a model without rhythm, and the next model and start."""
     expected = _expect(data, model, start)
     rates = model.rates_hz[structure.changes]
     # of the log rates and of the start, up to a constant, as in the M-step
-    log_prior = HALF_AN_EVENT * float(np.log(rates).sum() + np.log(start).sum()) - limits.prior_s * float(rates.sum())
+    log_prior = HALF_AN_EVENT * float(np.log(rates).sum() + np.log(start).sum())
+    log_prior -= data.limits.prior_s * float(rates.sum())
     counts = expected.smoothed.sum(0) + HALF_AN_EVENT
-    following, _ = _maximise(structure, expected.statistics, False, limits)
+    following, _ = _maximise(structure, expected.statistics, False, data.limits)
     return expected.log_evidence + log_prior, following, counts / counts.sum()
 
 
-def _search(
-    data: _Data, structure: Structure, model: PhaseType, start: FloatArray, limits: Limits, rounds: int
-) -> _Fit:
+def _search(data: _Data, structure: Structure, model: PhaseType, start: FloatArray, rounds: int) -> _Fit:
     """EM until it settles, three rounds at a time extrapolated (SQUAREM, Varadhan and Roland 2008) where that helps."""
     changes = structure.changes
     history: list[float] = []
     while len(history) < rounds:
-        objective, once, start_once = _round(data, structure, model, start, limits)
+        objective, once, start_once = _round(data, structure, model, start)
         history.append(objective)
-        objective_once, twice, start_twice = _round(data, structure, once, start_once, limits)
+        objective_once, twice, start_twice = _round(data, structure, once, start_once)
         history.append(objective_once)
         here, there = np.log(model.rates_hz[changes]), np.log(once.rates_hz[changes])
         first, second = there - here, np.log(twice.rates_hz[changes]) - there
@@ -328,36 +324,32 @@ def _search(
         if stretch > 1.0:
             rates = np.zeros(changes.shape)
             bold = here + 2.0 * stretch * first + stretch**2 * (second - first)
-            rates[changes] = np.minimum(np.exp(np.clip(bold, -700.0, 700.0)), limits.fastest_hz)
+            rates[changes] = np.minimum(np.exp(np.clip(bold, -700.0, 700.0)), data.limits.fastest_hz)
             candidate = PhaseType(structure.present, rates)
-            objective_bold, following, start_bold = _round(data, structure, candidate, start_twice, limits)
+            objective_bold, following, start_bold = _round(data, structure, candidate, start_twice)
             if objective_bold >= objective_once:
                 history.append(objective_bold)
                 model, start = following, start_bold
     return _Fit(model, start, float(changes.sum()), tuple(history))
 
 
-def _best_of(
-    data: _Data, structure: Structure, restarts: int, random: np.random.Generator, span_s: float, limits: Limits
-) -> _Fit:
+def _best_of(data: _Data, structure: Structure, restarts: int, random: np.random.Generator, span_s: float) -> _Fit:
     """The best of several searches, each from rates of its own; only the most promising is led to its end."""
     n = len(structure.present)
-    low, high = np.log(2.0 / span_s), np.log(0.2 * limits.fastest_hz)
+    low, high = np.log(2.0 / span_s), np.log(0.2 * data.limits.fastest_hz)
     trials = []
     for _ in range(restarts):
         pace = np.exp(random.uniform(low, high, n))  # how soon each phase is left
         share = np.where(structure.changes, random.uniform(0.1, 1.0, (n, n)), 0.0)
         rates = pace[:, None] * share / np.maximum(share.sum(1, keepdims=True), 1e-300)
-        trial = _search(
-            data, structure, PhaseType(structure.present, rates), np.full(n, 1.0 / n), limits, _TRIAL_ROUNDS
-        )
-        trials.append(trial)
+        model = PhaseType(structure.present, rates)
+        trials.append(_search(data, structure, model, np.full(n, 1.0 / n), _TRIAL_ROUNDS))
     best = max(trials, key=lambda trial: trial.history[-1])
-    final = _search(data, structure, best.model, best.start, limits, _MOST_ROUNDS)
+    final = _search(data, structure, best.model, best.start, _MOST_ROUNDS)
     return final._replace(history=best.history + final.history)
 
 
-def _with_rhythm(data: _Data, structure: Structure, flat: _Fit, limits: Limits) -> _Fit:
+def _with_rhythm(data: _Data, structure: Structure, flat: _Fit) -> _Fit:
     """EM with smooth rhythms, from the rates found without."""
     which = np.where(structure.changes, 0, -1)
     model = PhaseType(structure.present, flat.model.rates_hz, None, (Rhythm(np.zeros(BINS)),), which)
@@ -368,7 +360,7 @@ def _with_rhythm(data: _Data, structure: Structure, flat: _Fit, limits: Limits) 
         if expected.log_evidence - before < _RHYTHM_SETTLED:
             break
         before = expected.log_evidence
-        model, parameters = _maximise(structure, expected.statistics, True, limits)
+        model, parameters = _maximise(structure, expected.statistics, True, data.limits)
         counts = expected.smoothed.sum(0) + HALF_AN_EVENT
         start = counts / counts.sum()
     return _Fit(model, start, parameters, ())

@@ -3,7 +3,7 @@
 No truth is needed and no list of changes: the expectation step runs the run-length filter forward and backward and
 counts, with probabilities, at which ages stays and absences ended; the maximisation step fits lifetimes to the counts.
 Where there is a rhythm of the week the calendar matters too: from week to week the level of each hazard may drift. It
-is a random walk whose steps are as large as the counts want them (smoothness by marginal likelihood, `smooth_rates`);
+is a random walk whose steps are as large as the counts want them (smoothness by marginal likelihood, `rhythm.fit`);
 the model that comes out has the level of the last week.
 """
 
@@ -59,12 +59,8 @@ class Expected(Shown):
         if n == 1:
             return np.ones((2, 1))
         basis = steady_level(n)
-        logs = np.array(
-            [
-                fit(events[:, None], expected[:, None], basis, None).log_age
-                for events, expected in zip(self.of_period, self.expected_of_period, strict=True)
-            ]
-        )
+        pairs = zip(self.of_period[..., None], self.expected_of_period[..., None], strict=True)
+        logs = np.array([fit(events, expected, basis, None).log_age for events, expected in pairs])
         return np.asarray(np.exp(logs - logs[:, -1:]), dtype=np.float64)
 
 
@@ -94,11 +90,7 @@ class Data(Shown):
 
     @classmethod
     def of(cls, looks: Looks, step_s: float, half_life_s: float, *, rhythm: bool) -> Data:
-        """Lay out looks.
-
-        Raises:
-            DataError: no feature with two looks at different times.
-        """
+        """Lay out looks; DataError if no feature has two at different times."""
         # as the filter's: never longer than a rhythm is constant
         step = min(step_s, BIN_S) if rhythm else step_s
         pieces = [lattice(one, step) for one in map(looks.of, range(looks.n_features)) if len(one.stamp_s)]

@@ -223,11 +223,7 @@ def priors_of(common: str | None, by_class: Mapping[str, str] | None = None) -> 
 
 
 def read_model_file(path: str | Path) -> dict[str, Any]:
-    """Return the content of a model file of a version that we know.
-
-    Raises:
-        InputError: no such file, no JSON, or a newer schema.
-    """
+    """Return the content of a model file; InputError for no such file, no JSON, or a version that we do not know."""
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -252,12 +248,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
 
 
 def model_of(data: Any) -> PresenceModel:
-    """Return the model of which `to_dict` gave these plain numbers and words.
-
-    Raises:
-        InputError: an unknown kind, or a field that is missing or malformed.
-        ConfigError: numbers that cannot be.
-    """
+    """Return the model that `to_dict` wrote; InputError for an unknown kind or field, ConfigError for bad numbers."""
     kind = data.get("kind") if isinstance(data, dict) else None
     if not isinstance(kind, str) or kind not in CLASSES:
         raise InputError(f"unknown kind of model {kind!r}", field="kind", hint=", ".join(sorted(CLASSES)))

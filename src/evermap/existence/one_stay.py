@@ -162,11 +162,7 @@ class OneStay(Shown):
 
     @classmethod
     def of_text(cls, text: str) -> Self:
-        """Return the model of a prior as people write it.
-
-        Raises:
-            ConfigError: no prior is written like this.
-        """
+        """Return the model of a prior as people write it; ConfigError for other text."""
         return cls(parse_prior(text), text)
 
     @property

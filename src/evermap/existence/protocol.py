@@ -38,11 +38,7 @@ def as_prior(prior: LifetimePrior | str) -> LifetimePrior:
 
 
 def as_rows(values: Any, n: int, field: str) -> FloatArray:
-    """Return `values` as float64 of shape (n,): a scalar serves all rows.
-
-    Raises:
-        InputError: not numbers, or a shape that does not fit.
-    """
+    """Return `values` as float64 of shape (n,), a scalar for all rows; InputError for others."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -55,11 +51,7 @@ def as_rows(values: Any, n: int, field: str) -> FloatArray:
 
 
 def as_instants(stamp_s: Any, last_s: float = -np.inf) -> FloatArray:
-    """Return (T,) instants, finite, in order, and none before `last_s`.
-
-    Raises:
-        InputError: others.
-    """
+    """Return (T,) instants, finite, in order, and none before `last_s`; InputError for others."""
     time = np.array(stamp_s, dtype=np.float64).reshape(-1)
     if (np.diff(time) < 0.0).any():
         raise InputError("the instants asked for are not in order of time", field="stamp_s", hint="sort them")
@@ -149,12 +141,7 @@ def impossible(who: str, row: int | None = None) -> NumericalError:
 
 
 def check_rows(rows: Any, n: int, *, twice: bool = False, field: str = "rows") -> IntArray:
-    """Return row numbers as int64, each in range and, unless `twice` is allowed, at most once.
-
-    Raises:
-        InputError: a row that does not exist.
-        DataError: a row twice in one update.
-    """
+    """Return row numbers as int64; InputError for a row that does not exist, DataError for one `twice` if forbidden."""
     index = np.asarray(rows)
     if index.ndim != 1 or (index.size and index.dtype.kind not in "iu"):
         raise InputError("row numbers are a list of whole numbers", field=field)
@@ -221,11 +208,7 @@ class Looks(Shown):
         return feature_of(self.first)
 
     def median_gap_s(self) -> float:
-        """Return the median time above 0 between successive looks at a feature.
-
-        Raises:
-            DataError: no feature has looks at two instants.
-        """
+        """Return the median time above 0 between successive looks at a feature; DataError if there is none."""
         gaps = np.diff(self.stamp_s)[np.diff(self.feature) == 0]
         if not (gaps > 0.0).any():
             raise DataError("no feature has looks at two instants", hint="there is nothing to learn from")

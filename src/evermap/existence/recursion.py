@@ -1,6 +1,6 @@
 """The persistence recursion: every formula of MATH.md section 2 once, for floats, compiled loops and tensors alike.
 
-Plain Python on one number at a time. `one` calls it directly, `kernels` compiles it into loops over rows, `tensors`
+Plain Python on one number at a time. `one_stay` calls it directly, `kernels` compiles it into loops over rows, `batch`
 reads its conditional expressions as selections between whole tensors. A belief is its inverse odds `r = (1 - p) / p`:
 a gap of conditional survival `q` gives `r + (1 + r) (1 - q) / q`, a look multiplies by its likelihood when gone over
 its likelihood when there.

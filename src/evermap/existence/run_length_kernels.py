@@ -36,7 +36,7 @@ class Law(NamedTuple):
         share: (K,) of the kinds of day.
         factor: (K, 2, 1008) by what the hazards of absences (0) and stays (1) are multiplied at each ten minutes of the
             week on each kind of day; (1, 2, 1) ones where there is no rhythm.
-        offset: of the bins of age (`hazard_table`).
+        offset: of the bins of age (`lifetimes.HazardTable`).
         hazard_hz: (2, B) hazard in each bin.
         intercept: (2, B) the hazard integrated up to an age `a` in bin `i` is `intercept[i] + hazard_hz[i] a`.
     """

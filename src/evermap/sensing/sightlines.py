@@ -122,10 +122,7 @@ class SightLines:
         """
         from evermap.sensing.kernels import cells
 
-        sensor, place = (
-            np.ascontiguousarray(sensor_m, dtype=np.float64),
-            np.ascontiguousarray(place_m, dtype=np.float64),
-        )
+        sensor, place = (np.ascontiguousarray(one, dtype=np.float64) for one in (sensor_m, place_m))
         one, other = (np.arange(len(sensor)),) * 2 if pairs is None else pairs
         cell, row = cells(sensor, one, place, other, self.cell_m, _REACH)
         if row >= 0:
@@ -180,8 +177,8 @@ class SightLines:
             weight: (N,) probability that it was there.
             rate: of the session, see `session_rate`: with half the detections, a look is worth half.
         """
-        mine = self._rows(places)
-        kept = mine >= 0
+        mine = pair_rows(places, (self.site_id, self.landmark_id))
+        kept = mine >= 0  # of others the map has the place no more
         key = np.append(mine[kept] * _SPAN + self.cell[kept], place * _SPAN + cell)
         every, row = np.unique(key, return_inverse=True)
         n_old, n = int(kept.sum()), len(every)
@@ -195,16 +192,12 @@ class SightLines:
         rows = places[0][at], places[1][at], every % _SPAN
         return SightLines(*rows, hits * scale, looks * scale, self.hidden, self.shown, self.cell_m, self.rules)
 
-    def _rows(self, places: tuple[IntArray, IntArray]) -> IntArray:
-        """(K,) row of the place of each line, -1 where the map has it no more."""
-        return pair_rows(places, (self.site_id, self.landmark_id))
-
     def _around(
         self, places: tuple[IntArray, IntArray], place: IntArray, cell: IntArray
     ) -> tuple[FloatArray, FloatArray]:
         """(N,) hits and looks along lines, and along those from the cells around as far as they count."""
         hits, looks = np.zeros(len(cell)), np.zeros(len(cell))
-        mine = self._rows(places)
+        mine = pair_rows(places, (self.site_id, self.landmark_id))
         order = np.argsort(mine * _SPAN + self.cell, kind="stable")
         order = order[mine[order] >= 0]
         if not len(order):

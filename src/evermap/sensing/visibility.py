@@ -56,12 +56,24 @@ class NominalField:
     def p_detect(self, pose: FloatArray, position_m: FloatArray) -> FloatArray:
         """Return (F, L) probabilities of landmarks (L, 2) from robot poses (F, 3) in the same frame."""
         none = np.zeros(0, dtype=np.int64)
-        return self.looks(pose, position_m, (none, none), -1.0, math.inf).p_detect.reshape(len(pose), len(position_m))
+        listed = self._listed(pose, position_m, (none, none), -1.0, math.inf)
+        return listed.p_detect.reshape(len(pose), len(position_m))
 
-    def looks(
+    def looks(self, pose: FloatArray, position_m: FloatArray, seen: tuple[IntArray, IntArray]) -> LooksAt:
+        """List the looks at landmarks, hits and misses.
+
+        Args:
+            pose: (F, 3) of the robot.
+            position_m: (L, 2) landmarks in the same frame, taken to be there.
+            seen: (H,) rows of poses and (H,) rows of landmarks: the detections.
+        """
+        least = self.settings.worth_a_look * self.sensor.p_detect
+        return self._listed(pose, position_m, seen, least, float(self.reach_m))
+
+    def _listed(
         self, pose: FloatArray, position_m: FloatArray, seen: tuple[IntArray, IntArray], least: float, reach_m: float
     ) -> LooksAt:
-        """Return what was `seen` (see `looks_at`), and what is in reach and detected with some probability at least."""
+        """Return what was seen, and what is in reach and detected with some probability at least."""
         from evermap.sensing.kernels import looks
 
         eye = se2.compose(pose, np.asarray(self.sensor.mount_robot_sensor)).reshape(-1, 3)
@@ -105,23 +117,3 @@ class LooksAt(NamedTuple):
     def rows(self, some: IntArray | BoolArray) -> LooksAt:
         """Return some looks, by number, in that order, or by a mask."""
         return LooksAt(self.pose[some], self.landmark[some], self.p_detect[some], self.hit[some])
-
-
-def looks_at(
-    sensor: Sensor,
-    pose: FloatArray,
-    position_m: FloatArray,
-    seen: tuple[IntArray, IntArray],
-    settings: LooksConfig = USUAL,
-) -> LooksAt:
-    """List the looks at landmarks, hits and misses.
-
-    Args:
-        sensor: its nominal field of view.
-        pose: (F, 3) of the robot.
-        position_m: (L, 2) landmarks in the same frame, taken to be there.
-        seen: (H,) rows of poses and (H,) rows of landmarks: the detections.
-        settings: of the field's edges, and what is worth a look.
-    """
-    field, least = NominalField(sensor, settings), settings.worth_a_look * sensor.p_detect
-    return field.looks(pose, position_m, seen, least, float(field.reach_m))

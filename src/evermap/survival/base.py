@@ -1,9 +1,9 @@
 """The protocol of a lifetime prior, the checks of its arguments, and the base class that all models share.
 
-A model supplies mathematics only (see `weibull`): the hazard and the logarithm of its integral between two times,
-`log H(a, b)`. From it, `log q = -H(a, b)` and `log(1 - q) = log(1 - exp(-H(a, b)))` lose no digit, however close `a`
-and `b` are and however small `S(a)` is. The logarithm matters: `1 - q` may be 1e-800, whose logarithm is an ordinary
-number.
+A model supplies mathematics only (see `families.Weibull`): the hazard and the logarithm of its integral between two
+times, `log H(a, b)`. From it, `log q = -H(a, b)` and `log(1 - q) = log(1 - exp(-H(a, b)))` lose no digit, however close
+`a` and `b` are and however small `S(a)` is. The logarithm matters: `1 - q` may be 1e-800, whose logarithm is an
+ordinary number.
 """
 
 from __future__ import annotations

@@ -240,19 +240,15 @@ def stay_log_likelihood(seen: Sightings) -> FloatArray:
             each = (share[:, part] / pairs)[:, None, None]
             leave = np.maximum((last - first) * each, _LEAST)
             come = back * leave + (rate * watched_s)[:, None, None] * each
-            log_seen += pairs[:, None, None] * _log_there_again(leave, come)
+            both = leave + come
+            log_there_again = np.log(np.maximum((come + leave * np.exp(-both)) / both, _LEAST))
+            log_seen += pairs[:, None, None] * log_there_again
         leave = np.maximum((gone - last)[ended], _LEAST)
         change = (1.0 + back[ended]) * leave + (rate[ended] * left_s)[:, None, None]
         log_seen[ended] += np.log(leave / change * -np.expm1(-change))
         # given presence at the first look, relative to which both instants are taken
         result[:, :, a] = _log_sum(log_seen) - _log_sum(-first)
     return result
-
-
-def _log_there_again(leave: FloatArray, come: FloatArray) -> FloatArray:
-    """Return the log probability of presence after a gap, by the mean numbers of departures and returns in it."""
-    both = leave + come
-    return np.asarray(np.log(np.maximum((come + leave * np.exp(-both)) / both, _LEAST)))
 
 
 def _log_sum(log_values: FloatArray) -> FloatArray:

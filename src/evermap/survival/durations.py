@@ -42,11 +42,7 @@ def parse_positive(text: str) -> float:
 
 
 def parse_duration_s(text: str) -> float:
-    """Read `90s`, `10min`, `2h`, `3d`, `4w`, `1y` (of 365.25 days) or `20ms` in seconds. A unit is needed.
-
-    Raises:
-        ConfigError: not a number with a unit, or not positive.
-    """
+    """Read `90s`, `10min`, `2h`, `3d`, `4w`, `1y` (of 365.25 days) or `20ms` in seconds, or raise a ConfigError."""
     found = _DURATION.fullmatch(text.strip())
     if found is None:
         raise ConfigError(f"'{text}' is not a duration", hint="a number and a unit, as 90s, 10min, 2h, 3d, 4w or 1y")
@@ -60,11 +56,7 @@ def parse_duration_s(text: str) -> float:
 
 
 def parse_rate_hz(text: str) -> float:
-    """Read a hazard, `0.5/d`, `2/h`, `1e-3/s`, in 1/s; it may be 0.
-
-    Raises:
-        ConfigError: not a number per unit of time, or negative.
-    """
+    """Read a hazard, `0.5/d`, `2/h`, `1e-3/s`, in 1/s, which may be 0, or raise a ConfigError."""
     found = _RATE.fullmatch(text.strip())
     if found is None:
         raise ConfigError(f"'{text}' is not a rate", hint="a number per unit of time, as 0.5/d, 2/h or 1e-3/s")

@@ -214,11 +214,7 @@ class Exposures:
 
 
 def learn(samples: Exposures, terms: Sequence[Term]) -> Posterior:
-    """Learn the most probable terms and scales, and the covariance of the terms.
-
-    Raises:
-        NumericalError: no maximum is found.
-    """
+    """Learn the most probable terms and scales, and the covariance; NumericalError if no maximum is found."""
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1, user_api="blas"):  # matrices of some hundreds are faster on one thread

@@ -253,11 +253,7 @@ FORMS: Mapping[str, Form] = {
 
 
 def prior_text(prior: LifetimePrior) -> str:
-    """Write a prior as text, in seconds and with all digits, for `parse_prior`.
-
-    Raises:
-        ConfigError: it has no form, as a hazard that is a function.
-    """
+    """Write a prior as text, in seconds and with all digits, for `parse_prior`; ConfigError if it has no form."""
     match prior:
         case Exponential():
             return f"exponential:rate={prior.rate!r}/s"
@@ -315,11 +311,7 @@ def prior_to_dict(prior: LifetimePrior) -> dict[str, Any]:
 
 
 def prior_from_dict(content: Mapping[str, Any]) -> LifetimePrior:
-    """Read a prior that `prior_to_dict` wrote.
-
-    Raises:
-        ConfigError: an unknown name, unknown or missing fields, or invalid values.
-    """
+    """Read a prior that `prior_to_dict` wrote; ConfigError for unknown or missing fields, or invalid values."""
     kind = CLASSES.get(str(content.get("lifetime")))
     if kind is None:
         raise ConfigError(f"unknown lifetime {content.get('lifetime')!r}", field="lifetime", hint=", ".join(CLASSES))

@@ -10,7 +10,6 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.geometry import se3
-from evermap.io.text import counted
 from evermap.types import UNKNOWN, FloatArray, IntArray
 from evermap.valid import STAMP_S
 
@@ -56,11 +55,7 @@ def p_real_of(score: FloatArray, midpoint: float, scale: float) -> FloatArray:
 
 
 def positions(values: Any) -> FloatArray:
-    """Return (M, 3) finite positions.
-
-    Raises:
-        InputError: another shape, or a number that is not finite.
-    """
+    """Return (M, 3) finite positions; InputError for another shape, or a number that is not finite."""
     try:
         array = np.ascontiguousarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -81,11 +76,7 @@ def _check_shape(array: Any, shape: tuple[int, ...], field: str, hint: str | Non
 
 
 def boxes(values: Any, m: int) -> FloatArray:
-    """Return (M, 4) sizes and headings.
-
-    Raises:
-        InputError: another shape, a size that is not positive, or a heading that is not finite.
-    """
+    """Return (M, 4) sizes and headings; InputError for another shape, a size not positive, a heading not finite."""
     array = np.ascontiguousarray(values, dtype=np.float64) if m else np.empty((0, 4))
     _check_shape(array, (m, 4), "box", hint="length, width, height, heading")
     wrong = np.flatnonzero(~(np.isfinite(array).all(axis=1) & (array[:, :3] > 0.0).all(axis=1)))
@@ -96,11 +87,7 @@ def boxes(values: Any, m: int) -> FloatArray:
 
 
 def probabilities(values: Any, m: int) -> FloatArray:
-    """Return (M,) probabilities, nan where none is given.
-
-    Raises:
-        InputError: another shape, or a number that is not a probability.
-    """
+    """Return (M,) probabilities, nan where none is given; InputError for another shape, or no probability."""
     if values is None:
         return np.full(m, np.nan)
     array = np.asarray(values, dtype=np.float64)
@@ -112,11 +99,7 @@ def probabilities(values: Any, m: int) -> FloatArray:
 
 
 def classes(values: Any, m: int, n_classes: int) -> IntArray:
-    """Return (M,) classes, `UNKNOWN` where none is given.
-
-    Raises:
-        InputError: another number of them, no whole numbers, or a class that does not exist.
-    """
+    """Return (M,) classes, `UNKNOWN` where none is given; InputError for another shape, or a class that is none."""
     if values is None:
         return np.full(m, UNKNOWN)
     array = np.asarray(values)
@@ -135,11 +118,7 @@ def classes(values: Any, m: int, n_classes: int) -> IntArray:
 
 
 def covariances(values: Any, m: int, default: FloatArray) -> FloatArray:
-    """Return (M, 3, 3) covariances, or `default` (1, 3, 3) where none are given.
-
-    Raises:
-        InputError: another shape, or a matrix that is not symmetric and positive definite.
-    """
+    """Return (M, 3, 3) covariances, or `default` (1, 3, 3); InputError unless symmetric and positive definite."""
     if values is None or m == 0:
         return default
     array = np.ascontiguousarray(values, dtype=np.float64)
@@ -155,11 +134,7 @@ def covariances(values: Any, m: int, default: FloatArray) -> FloatArray:
 
 
 def appearances(values: Any, m: int, n_appearance: int) -> FloatArray:
-    """Return (M, A) unit vectors; a row of zeros, or without a finite length, has no appearance.
-
-    Raises:
-        InputError: another shape than the tracker was made for.
-    """
+    """Return (M, A) unit vectors, or zeros for a row without a finite length; InputError for another shape."""
     if values is None:
         return np.zeros((m, n_appearance))
     array = np.asarray(values, dtype=np.float64)
@@ -224,12 +199,6 @@ class DetectionTable:
         return len(self.position_m)
 
 
-def said_of(table: DetectionTable) -> list[str]:
-    """Return remarks on the table: its own, and on ignored detections."""
-    weak = [f"{counted(table.n_weak, 'detection')} with a low score dropped"] if table.n_weak else []
-    return [*table.warnings, *weak]
-
-
 @dataclass(frozen=True, slots=True)
 class Poses:
     """Poses of a sensor.
@@ -245,11 +214,7 @@ class Poses:
     path: Path
 
     def at(self, stamp_s: FloatArray) -> FloatArray:
-        """Return (F, 7) poses, interpolated along the shortest screw.
-
-        Raises:
-            InputError: a stamp before the first or after the last pose.
-        """
+        """Return (F, 7) poses, along the shortest screw; InputError for a stamp before the first or after the last."""
         outside = (stamp_s < self.stamp_s[0] - _NEAR_S) | (stamp_s > self.stamp_s[-1] + _NEAR_S)
         if outside.any():
             problem = f"has no pose at {stamp_s[np.argmax(outside)]:g} s, where there are detections"

@@ -113,11 +113,8 @@ def rows_near(
             for y in range(low_y, high_y + 1):
                 row = head[x] if everywhere else head[bucket_of(x, y, 0, n_buckets - 1)]
                 while row != END:
-                    dx, dy, dz = (
-                        position[row, 0] - centre[k, 0],
-                        position[row, 1] - centre[k, 1],
-                        position[row, 2] - centre[k, 2],
-                    )
+                    dx, dy = position[row, 0] - centre[k, 0], position[row, 1] - centre[k, 1]
+                    dz = position[row, 2] - centre[k, 2]
                     mine = everywhere or (
                         cell_of(position[row, 0], chunk_m) == x and cell_of(position[row, 1], chunk_m) == y
                     )

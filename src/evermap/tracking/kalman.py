@@ -153,13 +153,8 @@ def update(mean: FloatArray, covariance: FloatArray, position: FloatArray, noise
         mean[r] += gain[r, 0] * innovation[0] + gain[r, 1] * innovation[1] + gain[r, 2] * innovation[2]
     for r in range(d - 1, -1, -1):  # from the last row, so that the first three are still the old ones
         for c in range(r, -1, -1):
-            lowered = (
-                covariance[r, c]
-                - gain[r, 0] * covariance[c, 0]
-                - gain[r, 1] * covariance[c, 1]
-                - gain[r, 2] * covariance[c, 2]
-            )
-            covariance[r, c] = lowered
+            lowered = covariance[r, c] - gain[r, 0] * covariance[c, 0] - gain[r, 1] * covariance[c, 1]
+            covariance[r, c] = lowered - gain[r, 2] * covariance[c, 2]
     for r in range(d):
         for c in range(r):
             covariance[c, r] = covariance[r, c]

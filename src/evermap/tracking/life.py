@@ -389,13 +389,8 @@ def match(targets: Targets, frame: Frame, likelihood: Likelihood) -> tuple[IntAr
     detection = pairs.column[pair]
     moved = np.empty(found.shape[0], dtype=np.bool_)
     for k in range(found.shape[0]):
-        squared = displacement(
-            frame.position[detection[k]],
-            noise_of(frame, detection[k]),
-            targets.mean[found[k]],
-            targets.covariance[found[k]],
-            0.0,
-        )
+        i, j = found[k], detection[k]
+        squared = displacement(frame.position[j], noise_of(frame, j), targets.mean[i], targets.covariance[i], 0.0)
         moved[k] = squared > likelihood.displaced
     return found, detection, pairs.log_ratio[pair], moved
 

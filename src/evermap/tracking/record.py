@@ -125,10 +125,8 @@ class Recorder:
     def tracks(self) -> Tracks:
         """Return everything about tracklets that were confirmed sooner or later, their first frames too.
 
-        Rows after the last detection before a tracklet was given up are left out: they were guesses.
-
-        Raises:
-            DataError: no frame was recorded.
+        Rows after the last detection before a tracklet was given up are left out: they were guesses. DataError if no
+        frame was recorded.
         """
         frame, columns = self._rows()
         ids = columns["track_id"]
@@ -139,17 +137,13 @@ class Recorder:
         return self._of(keep, frame, columns)
 
     def at_once(self, least_p: float) -> Tracks:
-        """Return the causal output, frame by frame: every tracklet with a belief of at least `least_p`.
-
-        Raises:
-            DataError: no frame was recorded.
-        """
+        """Return the output frame by frame: tracklets with a belief of at least `least_p`; DataError without frames."""
         frame, columns = self._rows()
         order = np.lexsort((frame, columns["track_id"]))
         return self._of(order[columns["p_exists"][order] >= least_p], frame, columns)
 
     def _rows(self) -> tuple[IntArray, dict[str, Any]]:
-        """(R,) frame of each row, and all columns."""
+        """(R,) frame of each row, and all columns; DataError if no frame was recorded."""
         frames = self._frames
         if not frames:
             raise DataError("no frame was tracked")

@@ -17,7 +17,7 @@ from evermap.show import Shown, draw
 from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.text import parse_prior
-from evermap.tracking.frame import DetectionTable, p_real_of, said_of
+from evermap.tracking.frame import DetectionTable, p_real_of
 from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import TrackState
@@ -109,11 +109,7 @@ class TrackResult(Shown):
 
 
 def check_choices(config: TrackConfig, table: DetectionTable) -> None:
-    """Refuse choices that need what the table does not have, before anything takes long.
-
-    Raises:
-        ConfigError: the position or the heading of the sensor is not known.
-    """
+    """Raise a ConfigError, before anything takes long, for choices that need a sensor's pose where it is unknown."""
     if config.range_m is not None and table.sensor_m is None:
         hint = "columns sensor_x_m, sensor_y_m, sensor_z_m in the table"
         raise ConfigError("the position of the sensor is unknown", field="range_m", hint=hint)
@@ -183,12 +179,7 @@ def run_track(
 
 
 def _priors(config: TrackConfig, class_names: Sequence[str]) -> tuple[LifetimePrior, ...]:
-    """Return how long objects of every class rest, from texts or files of models.
-
-    Raises:
-        ConfigError: text that is not a prior, or a class that no detection has.
-        InputError: a file that cannot be read, or that has no lifetime of its class.
-    """
+    """Return how long objects of every class rest, from texts or files of models; errors as `priors_of`."""
     _check_classes(config.class_priors, class_names, "class_priors")
     found = {name: lives.stay for name, lives in priors_of(config.prior, config.class_priors).items()}
     rest = found.get("") or parse_prior(DEFAULT_PRIOR)  # a file may name some of the classes only
@@ -213,7 +204,9 @@ def _follow(
     tracker: Tracker, table: DetectionTable, config: TrackConfig, progress: Callable[[float, float], None] | None
 ) -> tuple[Recorder, IntArray, int]:
     """Frame after frame; between them, where there was no look for long, blind ones."""
-    noise = _noise(table, config.sigma_position_m)
+    noise = table.covariance_m2
+    if noise is not None:
+        noise = np.where(np.isnan(noise), config.sigma_position_m**2 * np.eye(3), noise)
     step_s = _usual_step_s(table)
     gap_s = config.gap_s or config.gap_steps * step_s
     recorder, found, n_gaps = Recorder(), np.full(len(table), UNKNOWN), 0
@@ -265,13 +258,6 @@ def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s:
     return events
 
 
-def _noise(table: DetectionTable, sigma_m: float) -> FloatArray | None:
-    """(M, 3, 3), the settings' noise where a detection brings none."""
-    if table.covariance_m2 is None:
-        return None
-    return np.where(np.isnan(table.covariance_m2), sigma_m**2 * np.eye(3), table.covariance_m2)
-
-
 def _lifetimes(spells: StaticSpells, rest_for_s: float) -> tuple[CensoredLifetimes | None, IntArray]:
     if not np.isfinite(spells.elsewhere_s).any():  # it is known of none when it can have begun
         return None, np.zeros(0, dtype=np.int64)
@@ -286,7 +272,9 @@ def _usual_step_s(table: DetectionTable) -> float:
 
 
 def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -> list[str]:
-    remarks = said_of(table)
+    remarks = list(table.warnings)
+    if table.n_weak:
+        remarks.append(f"{counted(table.n_weak, 'detection')} with a low score dropped")
     step_s = _usual_step_s(table)
     if step_s > config.slow_step_s:
         remarks.append(f"frames are {step_s:.3g} s apart: moving objects are hardly tracked at that rate")

@@ -58,11 +58,7 @@ class View:
         return cls(centre_m, reach_m, within)
 
     def probability(self, position_m: FloatArray) -> FloatArray:
-        """Return (N,) `p_detect`, checked.
-
-        Raises:
-            InputError: not one probability a position.
-        """
+        """Return (N,) `p_detect`, or raise an InputError unless that is one probability a position."""
         if len(position_m) == 0:
             return np.empty(0)
         p = np.ascontiguousarray(self.p_detect(position_m), dtype=np.float64)

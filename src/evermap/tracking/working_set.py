@@ -157,12 +157,8 @@ class WorkingSet:
 
     def near(self, centre_m: FloatArray, reach_m: FloatArray) -> IntArray:
         """Return rows within `reach_m` (K,) of any of the points `centre_m` (K, 3), each once, in order."""
-        return np.asarray(
-            self._chunks.rows_near(
-                centre_m, reach_m, self.stored.position, self._chunk_m, self._head, self.stored.following
-            ),
-            dtype=np.int64,
-        )
+        s = self.stored
+        return self._chunks.rows_near(centre_m, reach_m, s.position, self._chunk_m, self._head, s.following)
 
     def inverse_odds(self, rows: IntArray, stamp_s: float) -> FloatArray:
         """Return (K,) inverse odds that objects are there still at `stamp_s`: less what lifetimes took."""

@@ -26,7 +26,7 @@ from evermap.geometry import se2
 from evermap.maps.living import LivingMap, class_of, clique_rows, site_middles
 from evermap.maps.sessions.extend import first_and_last
 from evermap.sensing.sightlines import HEADINGS, Lines, SightLines, Views, nominal_lines, offsets, session_rate
-from evermap.sensing.visibility import LooksAt, NominalField, looks_at
+from evermap.sensing.visibility import LooksAt, NominalField
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 USUAL = LooksConfig()
@@ -66,7 +66,8 @@ class Watch(NamedTuple):
     @classmethod
     def of(cls, sighting: Sighting, position_m: FloatArray, sensor: Sensor, settings: LooksConfig = USUAL) -> Watch:
         """Return what a sensor in the plane looked at, by its nominal field of view, of places (P, 2)."""
-        listed = looks_at(sensor, sighting.pose_map_robot, position_m, (sighting.frame, sighting.place), settings)
+        seen = sighting.frame, sighting.place
+        listed = NominalField(sensor, settings).looks(sighting.pose_map_robot, position_m, seen)
         return cls(sighting.stamp_s, listed, sensor_poses(sighting, sensor))
 
 
