@@ -21,8 +21,8 @@ def tree_of(name: str) -> ast.Module:
     return ast.parse(MODULES[name].read_text(encoding="utf-8"))
 
 
-MOST_MODULES = 297
-MOST_LINES = 80_173
+MOST_MODULES = 277
+MOST_LINES = 76_103
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8
