@@ -82,7 +82,6 @@ OF_THE_CODE = frozenset(
     slam.problem.FEWEST_ROWS slam.space.against_map.LEAST_INFORMATION slam.space.drift.FEWEST
     slam.space.drift.FEWEST_BINS slam.space.drift.FEWEST_OF_BOTH slam.space.drift.FEWEST_PAIRS
     slam.space.drift.LEAST_OF_SQUARE slam.space.drift.PERSIST_S slam.space.drift.SEEN_TOGETHER
-    slam.space.intake.LED_BY_S slam.space.solve.STRIDE_S
     slam.space.problem.LEAST_WEIGHT slam.space.problem.NO_JUMP_LOG_ODDS slam.space.solve.GROSS_M
     slam.space.solve.SLACK_M slam.space.solve.SLACK_RAD slam.space.solve.STILL_M slam.space.solve.STILL_RAD
     slam.streaming.NEAR slam.streaming.NEAR_NOISE slam.streaming.NEAR_NOISE_GAIN slam.votes.FEWEST_PAIRS

@@ -27,8 +27,6 @@ from evermap.types import (
 )
 from evermap.valid import WITHOUT_IDS
 
-MOST_DELAYED, LED_BY_S = 4.0, 0.3
-"""Standard deviations that a delay is at most, and seconds whose motion leads on beyond the ends of the odometry."""
 HARDLY = 1.0
 """Standard deviation with which it counts, as a share of the range: as good as nothing."""
 
@@ -400,15 +398,18 @@ def _scale_sigma(sensor: SpatialSensor, settings: SpaceConfig) -> float:
 
 
 def _path(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -> OdometryPath | None:
-    """Return the odometry, led on at both ends as it went there, so that delays of all sizes are compared alike."""
+    """Return the odometry, led on at both ends for four standard deviations of a delay, at the speed over one there: so
+    delays of all sizes are compared alike.
+    """
     odometry = recording.odometry
     if odometry is None or len(odometry) < 2:
         return None
     stamp_s, pose = odometry.stamp_s - start_s, odometry.pose_world_robot
-    further_s = MOST_DELAYED * delay_sigma_s
-    for end, inside_s in ((0, stamp_s[0] + LED_BY_S), (-1, stamp_s[-1] - LED_BY_S)) if further_s > 0.0 else ():
+    further_s = 4.0 * delay_sigma_s
+    ends = ((0, stamp_s[0] + delay_sigma_s), (-1, stamp_s[-1] - delay_sigma_s)) if delay_sigma_s > 0.0 else ()
+    for end, inside_s in ends:
         near = se3.interpolate(stamp_s, pose, np.clip([inside_s], *stamp_s[[0, -1]]))[0]
-        ahead = further_s / LED_BY_S * se3.local(near, pose[end])
+        ahead = 4.0 * se3.local(near, pose[end])
         beyond = se3.retract(pose[end], ahead)
         at = 0 if end == 0 else len(pose)
         pose = np.insert(pose, at, beyond, axis=0)

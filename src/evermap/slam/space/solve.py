@@ -33,8 +33,6 @@ MOST_TRIED = 200
 GROSS_M = 1.0
 SPLITS = 2
 """Poses tried for a start, the scale of its loss [m], and times that landmarks are split."""
-STRIDE_S, FINE, DELAYS = 0.05, 4.0, 2
-"""Delays are tried so far apart at first, at last by no more than the square root of so many deviations; and rounds."""
 SLACK_M, SLACK_RAD = 0.15, 0.15
 """What places of a map in the making are off by."""
 STILL_M, STILL_RAD = 0.03, 0.03
@@ -136,7 +134,7 @@ def _with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, FloatArray]:
     sigma_s = np.full(len(problem.mount), np.nan)
     if problem.path is None or problem.settings.delay_sigma_s == 0.0:
         return optimum, sigma_s
-    for row in [*range(len(sigma_s))] * DELAYS:
+    for row in [*range(len(sigma_s))] * 2:  # the noise levels of the first round are those without a delay
         delay_s, sigma_s[row] = _delay_of(optimum, row)
         problem = optimum.smoother.problem
         late = np.where(np.arange(len(sigma_s)) == row, delay_s, problem.delay_s)
@@ -153,7 +151,8 @@ def _delay_of(optimum: SpatialOptimum, row: int) -> tuple[float, float]:
     problem, estimate = optimum.smoother.problem, optimum.estimate
     assert problem.path is not None
     step_s, begun_s = float(np.median(np.diff(problem.path.stamp_s))), float(problem.delay_s[row])
-    stride, before, found = max(1, round(STRIDE_S / step_s)), problem.settings.delay_sigma_s, dict[int, float]()
+    before, found = problem.settings.delay_sigma_s, dict[int, float]()
+    stride = max(1, round(before / (6.0 * step_s)))  # coarse at first, at last two standard deviations or one step
     eye = se3.retract(estimate.pose, problem.earlier()[row])
 
     def cost(steps: int) -> float:
@@ -173,7 +172,7 @@ def _delay_of(optimum: SpatialOptimum, row: int) -> tuple[float, float]:
             best += stride if above < below else -stride
             continue
         information = max((below - 2.0 * cost(best) + above) / (stride * step_s) ** 2, before**-2)
-        if stride == 1 or information * (stride * step_s) ** 2 < FINE:
+        if stride == 1 or information * (stride * step_s) ** 2 < 4.0:
             break
         stride = max(1, stride // 2)
     off_s = 0.5 * (below - above) / (information * stride * step_s)
