@@ -34,7 +34,7 @@ from evermap.slam.association.assignment import (
 )
 from evermap.slam.association.associator import LAST_ROUNDS, MERGE_ROUNDS, density_of_unmet, landmark_density
 from evermap.slam.association.constellation import LocalMap
-from evermap.slam.association.features import Traits, best_with_traits, learned
+from evermap.slam.association.features import Likeness, Traits, best_with_traits, learned
 from evermap.slam.association.identify import Associated
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.association.merging import (
@@ -447,7 +447,8 @@ class SpatialAssociator:
         like = np.array([alike(each, of).mean() for each in of])
         log_density = np.log(self._density * like)
         factorised = solved.smoother.factorised(solved.now)
-        differences = _Differing(solved, factorised, self._shared_m2(solved), log_density, of, rules)
+        known = self._traits, self._likeness(solved)
+        differences = _Differing(solved, factorised, self._shared_m2(solved), log_density, of, *known, rules)
         n_views = int(self._view.max()) + 1
         return Solution(
             solved.estimate.place[:, :3], own, differences, sightings, last_s,
@@ -488,12 +489,15 @@ class SpatialAssociator:
         score = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(self._density)
         tail = math.log(tail_share) - 3.0 * math.log(tail_by) - 0.5 * squared / tail_by**2
         score += np.logaddexp(math.log(1.0 - tail_share) - 0.5 * squared, tail)
-        visit, landmark = self.of_visits(solved)
-        visits = self._traits.of_visits(visit, len(landmark))
-        like = self._traits.of_landmarks(visits, landmark, len(place))
-        score += self._traits.same(self._traits.singly(seen), like.part(row))
+        score += self._traits.same(self._traits.singly(seen), self._likeness(solved).part(row))
         inside = (squared < tail_by**2 * gate) & (score > 0.0)
         return most_probable(seen[inside], row[inside], score[inside], self._view, len(place), rules.p_own)
+
+    def _likeness(self, solved: _Solved) -> Likeness:
+        """What each landmark is like, by its visits."""
+        visit, landmark = self.of_visits(solved)
+        visits = self._traits.of_visits(visit, len(landmark))
+        return self._traits.of_landmarks(visits, landmark, len(solved.estimate.place))
 
     def _with_overlooked(self, row: IntArray, pose: FloatArray) -> IntArray:
         """(M,) landmarks, with a new one per cluster of unassigned detections from enough views."""
@@ -516,6 +520,7 @@ class _Differing:
         shared: (L,) variance [m^2] of the shared errors of sightings.
         log_density: (L,) of landmarks with compatible labels [1/m^3].
         kind: (L, 2) class and name of each.
+        traits, like: what else readings tell, and what it tells of each.
         settings: of the association.
     """
 
@@ -524,6 +529,8 @@ class _Differing:
     shared: FloatArray
     log_density: FloatArray
     kind: IntArray
+    traits: Traits
+    like: Likeness
     settings: AssociationConfig
 
     def __call__(self, younger: IntArray, older: IntArray) -> Differences:
@@ -549,6 +556,7 @@ class _Differing:
         own += idle[:, :, None] * np.eye(6)
         names = same_name(self.kind[younger], self.kind[older])
         new = self.log_density[younger] - self.settings.name_nats * names
+        new -= self.traits.same(self.like.part(younger), self.like.part(older))
         new += np.where(both, self._turns(younger, older), -1.5 * math.log(2.0 * math.pi))
 
         def together(some: IntArray) -> FloatArray:
