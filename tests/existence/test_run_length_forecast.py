@@ -9,7 +9,7 @@ from scipy import integrate
 from evermap.errors import InputError, NumericalError
 from evermap.existence.lifetimes import tabulate
 from evermap.existence.protocol import Looks
-from evermap.existence.rhythm import BIN_S, BINS, WEEK_S, Rhythm
+from evermap.existence.rhythm import BIN_S, BINS, WEEK_S, Rhythm, bin_of_week
 from evermap.existence.run_length import RunLength, RunLengthBelief, residual_life
 from evermap.survival import (
     Exponential,
@@ -171,15 +171,15 @@ def test_with_a_rhythm_time_passes_as_fast_as_the_hours_tell() -> None:
         state = RunLengthBelief.first(model, [begin_s]).update(begin_s + 50.0, 1, 0.1, 0.1)
         grid = begin_s + 50.0 + 60.0 * np.arange(40 * 7 * 1440)
         for one, found, factor in (
-            (rate, state.time_to_leave()[0], HOURS.at(grid + 30.0)),
-            (rate / 20.0, state.time_to_return()[0], HOURS.at(grid + 30.0)),
+            (rate, state.time_to_leave()[0], HOURS.factor[bin_of_week(grid + 30.0)]),
+            (rate / 20.0, state.time_to_return()[0], HOURS.factor[bin_of_week(grid + 30.0)]),
         ):
             x = one * factor * 60.0
             before = np.exp(-np.concatenate([[0.0], np.cumsum(x)[:-1]]))
             assert found == pytest.approx((before * 60.0 * -np.expm1(-x) / x).sum(), rel=2e-3)
         asked = begin_s + np.array([3600.0, 40000.0, 90000.0])
         k = np.round((asked - begin_s - 50.0) / 60.0).astype(int)
-        expected = np.exp(-np.concatenate([[0.0], np.cumsum(rate * HOURS.at(grid + 30.0) * 60.0)]))[k]
+        expected = np.exp(-np.concatenate([[0.0], np.cumsum(rate * HOURS.factor[bin_of_week(grid + 30.0)] * 60.0)]))[k]
         np.testing.assert_allclose(state.p_lasts(asked)[0], expected, rtol=5e-3)
 
 
