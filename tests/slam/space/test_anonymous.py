@@ -90,7 +90,7 @@ def test_identities_of_the_recording_are_not_looked_at():
 
 def test_two_at_one_place_are_told_apart_by_a_column():
     """Places alone exchange them; a colour that says nothing changes no identity."""
-    recording = hall(1, n_points=40, n_frames=250, sigma_m=0.05, beside_m=0.06)
+    recording = hall(1, n_points=20, n_frames=125, step_s=0.8, sigma_m=0.05, beside_m=0.06)
     seen, random = recording.detections, np.random.default_rng(0)
     real = seen.landmark_id != UNKNOWN
 
@@ -100,7 +100,7 @@ def test_two_at_one_place_are_told_apart_by_a_column():
 
     alone = found()
     assert identity_scores(alone[real], seen.landmark_id[real]).purity < 0.7
-    radius = random.uniform(0.0, 1.0, 40)[seen.landmark_id] + random.normal(0.0, 0.02, len(seen))
+    radius = random.uniform(0.0, 1.0, 20)[seen.landmark_id] + random.normal(0.0, 0.02, len(seen))
     told = identity_scores(found(features=radius[:, None], feature_names=("radius_m",))[real], seen.landmark_id[real])
     assert told.purity > 0.85
     assert told.completeness > 0.8
