@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -72,7 +73,8 @@ def part_of(path: Path) -> str:
     return path.relative_to(SOURCE).parts[0].removesuffix(".py")
 
 
-def imported_parts(path: Path) -> set[str]:
+@functools.cache
+def imported_parts(path: Path) -> frozenset[str]:
     """Parts of evermap that a module imports anywhere, inside functions and for type checking too."""
     package = ["evermap", *path.relative_to(SOURCE).parts[:-1]]
     names: set[str] = set()
@@ -83,7 +85,7 @@ def imported_parts(path: Path) -> set[str]:
             base = package[: len(package) - node.level + 1] if node.level else []
             module = ".".join([*base, *([node.module] if node.module else [])])
             names |= {f"{module}.{alias.name}" for alias in node.names} if module == "evermap" else {module}
-    return {name.split(".")[1] for name in names if name.startswith("evermap.")} - {"__version__"}
+    return frozenset(name.split(".")[1] for name in names if name.startswith("evermap.")) - {"__version__"}
 
 
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or not path.name.startswith("__"))

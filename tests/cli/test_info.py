@@ -15,6 +15,8 @@ from evermap.cli.main import app
 from evermap.io import read_landmarks, read_recording, write_template
 from evermap.maps.store import open_store
 
+QUICK = ["--set", "output.figures=false", "--set", "output.report=false"]
+
 
 def run(*arguments: str | Path) -> Any:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
@@ -28,7 +30,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_template(folder / "flight", in_space=True)
     for arguments in (
         ("slam", folder / "rec", "--map", folder / "site.evermap", "--out", folder / "run"),
-        ("slam", folder / "flight", "--out", folder / "flown", "--set", "output.mcap=true"),
+        ("slam", folder / "flight", "--out", folder / "flown", "--set", "output.mcap=true", *QUICK),
         ("map", "export", folder / "site.evermap", "--out", folder / "map.geojson", "--lifetimes", folder / "l.json"),
         ("persist", "--init", folder / "looks.csv"),
         ("track", "--init", folder / "detections.csv"),

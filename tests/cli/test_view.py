@@ -15,6 +15,9 @@ from evermap.cli.main import app
 from evermap.io import read_landmarks, read_tum, write_template
 from evermap.maps.store import open_store
 
+QUICK = ["--set", "output.figures=false", "--set", "output.report=false"]
+"""What is shown is made of the other files of a run."""
+
 
 def run(*arguments: str | Path) -> Any:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
@@ -25,7 +28,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("view")
     for name, in_space in (("rec", False), ("flight", True)):
         write_template(folder / name, in_space=in_space)
-        made = run("slam", folder / name, "--map", folder / f"{name}.evermap", "--out", folder / f"run-{name}")
+        files = ("--map", folder / f"{name}.evermap", "--out", folder / f"run-{name}")
+        made = run("slam", folder / name, *files, *QUICK)
         assert made.exit_code == 0, made.output
     return folder
 

@@ -148,15 +148,15 @@ def test_a_late_session_that_was_overtaken_is_entered_again(tmp_path: Path) -> N
 
 
 def test_nor_in_a_database(site_address: str, in_order: LivingMap) -> None:
-    assert_same(built(site_address, (1, 3, 0, 2)), in_order)
+    assert_same(built(site_address, (0, 2, 3, 1)), in_order)
 
 
 def test_nor_whose_sessions_they_are(tmp_path: Path) -> None:
     """Three robots, one of which reads ranges too long: a session that is replayed is that of its robot."""
-    whose = [replace(session, robot=f"robot {k % 3}") for k, session in enumerate(SESSIONS)]
+    whose = [replace(session, robot=f"robot {k}") for k, session in enumerate(SESSIONS[:3])]
     told = whose[1].detections
     whose[1] = replace(whose[1], detections=replace(told, range_m=1.05 * told.range_m))
-    late, wanted = (built(tmp_path / f"{order}.evermap", order, whose) for order in ((0, 3, 2, 1), (0, 1, 2, 3)))
+    late, wanted = (built(tmp_path / f"{order}.evermap", order, whose) for order in ((0, 2, 1), (0, 1, 2)))
     assert_same(late, wanted)
     np.testing.assert_array_equal(late.metres.log_metre, wanted.metres.log_metre)
     assert late.metres.log_metre.tolist()[1] > 0.03

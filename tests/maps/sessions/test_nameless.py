@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -148,10 +149,17 @@ def test_landmarks_without_a_name_keep_company_with_those_that_have_one() -> Non
 
 
 def test_a_large_map_that_shows_no_constellation_of_the_session_refuses_it() -> None:
-    """The index has no motion to offer then."""
-    recording = simulate_warehouse(WarehouseConfig(n_landmarks=120, rate_hz=2.0))
-    begun = LivingMap.begun(Landmarks.at(np.arange(150), np.column_stack([7.0 * np.arange(150), np.zeros(150)])))
-    assert not lived_through([recording], NAMELESS, begun)[0].found
+    """The index has no motion to offer then; in a map of the same size that has its landmarks, the session is found."""
+    recording = simulate_warehouse(WarehouseConfig(n_landmarks=40, rate_hz=1.0))
+    assert recording.true_landmarks is not None
+    row = np.column_stack([7.0 * np.arange(150), np.zeros(150)])
+    there = np.vstack([recording.true_landmarks.position_m, row[40:] + 300.0])
+    refused, found = (
+        lived_through([recording], NAMELESS, LivingMap.begun(Landmarks.at(np.arange(150), place)))[0].found
+        for place in (row, there)
+    )
+    assert not refused
+    assert found
 
 
 def test_a_session_of_another_building_is_refused(lived: tuple[BuildingSimulation, list[Session]]) -> None:
@@ -189,12 +197,29 @@ def with_descriptors(recording: Recording, true: IntArray, session: int, shift: 
     return replace(recording, detections=replace(recording.detections, features=value, feature_names=names))
 
 
+@pytest.fixture(scope="module")
+def described(
+    lived: tuple[BuildingSimulation, list[Session]], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Session]:
+    """The file of a map of the first session with descriptors, to be copied; and that session."""
+    one, _ = lived
+    path = tmp_path_factory.mktemp("described") / "map.evermap"
+    with open_store(path, create=True) as store:
+        first = with_descriptors(one.sessions[0], one.truths[0].detection_landmark_id, 0)
+        entered = enter_session(store, first, NAMELESS)
+        entered.commit(store, NAMELESS)
+    return path, entered.session
+
+
 @pytest.mark.parametrize("shift", [0.0, 1.0])
 def test_exchanged_landmarks_are_recognised_by_what_they_are_like(
-    lived: tuple[BuildingSimulation, list[Session]], shift: float, tmp_path: Path
+    lived: tuple[BuildingSimulation, list[Session]], described: tuple[Path, Session], shift: float, tmp_path: Path
 ) -> None:
-    """Two chairs or pallets of the second session stand where the other one stood; without columns nothing tells."""
-    one, plain = lived
+    """Two chairs or pallets of the second session stand where the other one stood; without columns nothing tells.
+
+    What they are like is read from the file of the map, and kept there.
+    """
+    (one, plain), (file, begun) = lived, described
     first, second = (truth.detection_landmark_id.copy() for truth in one.truths[:2])
     assert len(plain[1].recording.detections) == len(second)
     both = names(one, plain, 0).keys() & names(one, plain, 1).keys()
@@ -204,10 +229,12 @@ def test_exchanged_landmarks_are_recognised_by_what_they_are_like(
     a, b = next((a, b) for k, a in enumerate(known) for b in known[k + 1 :] if kind[a] == kind[b])
     changed = second.copy()
     changed[second == a], changed[second == b] = b, a
-    begun = lived_through([with_descriptors(one.sessions[0], first, 0)], NAMELESS)[0]
     named = {real: name for name, real in names(one, [begun], 0).items()}
-    seen = with_descriptors(one.sessions[1], changed, 1, shift)
-    session = lived_through([seen], NAMELESS, begun.living)[0]
+    with open_store(shutil.copy(file, tmp_path / "map.evermap")) as store:
+        entered = enter_session(store, with_descriptors(one.sessions[1], changed, 1, shift), NAMELESS)
+        entered.commit(store, NAMELESS)
+        kept = store.load().traits
+    session = entered.session
     name = session.recording.detections.landmark_id
     for real in (a, b):
         assert np.bincount(changed[name == named[real]]).argmax() == real
@@ -215,10 +242,7 @@ def test_exchanged_landmarks_are_recognised_by_what_they_are_like(
             for i in change.landmark_ids}  # fmt: skip
     assert {named[a], named[b]} <= told
     assert not {change.kind for change in plain[1].changes if {named[a], named[b]} & set(change.landmark_ids)}
-    with open_store(tmp_path / "map.evermap", create=True) as store:
-        for recording in (with_descriptors(one.sessions[0], first, 0), seen):
-            enter_session(store, recording, NAMELESS).commit(store, NAMELESS)
-        kept = store.load().traits
+    assert session.living.traits.sessions.max() == 2
     for column in ("landmark_id", "column_id", "value", "sessions"):
         np.testing.assert_array_equal(getattr(kept, column), getattr(session.living.traits, column))
 

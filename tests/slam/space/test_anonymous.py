@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from evermap.config import Config, SlamConfig
 from evermap.errors import DataError
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.nameless import numbered_in
+from evermap.maps.sessions.session import Session
 from evermap.slam.association import with_identities
 from evermap.types import UNKNOWN, ChangeKind, Landmarks, SpatialRecording, rows_of
 
@@ -90,7 +92,7 @@ def test_identities_of_the_recording_are_not_looked_at():
 
 def test_two_at_one_place_are_told_apart_by_a_column():
     """Places alone exchange them; a colour that says nothing changes no identity."""
-    recording = hall(1, n_points=40, n_frames=250, sigma_m=0.05, beside_m=0.06)
+    recording = hall(1, n_points=20, n_frames=125, step_s=0.8, sigma_m=0.05, beside_m=0.06)
     seen, random = recording.detections, np.random.default_rng(0)
     real = seen.landmark_id != UNKNOWN
 
@@ -100,7 +102,7 @@ def test_two_at_one_place_are_told_apart_by_a_column():
 
     alone = found()
     assert identity_scores(alone[real], seen.landmark_id[real]).purity < 0.7
-    radius = random.uniform(0.0, 1.0, 40)[seen.landmark_id] + random.normal(0.0, 0.02, len(seen))
+    radius = random.uniform(0.0, 1.0, 20)[seen.landmark_id] + random.normal(0.0, 0.02, len(seen))
     told = identity_scores(found(features=radius[:, None], feature_names=("radius_m",))[real], seen.landmark_id[real])
     assert told.purity > 0.85
     assert told.completeness > 0.8
@@ -150,8 +152,8 @@ def named_as(recording: SpatialRecording, found: SpatialRecording) -> dict[int, 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_points_are_found_in_a_fixed_map_from_anywhere_and_new_ones_get_numbers_of_their_own(seed):
     """The odometry of the drive starts in a frame that is turned about all axes."""
-    drive = part_of_hall(hall(seed, n_points=60, n_frames=600, drift=0.05), 300, 600, tilt(seed))
-    true = hall(seed, n_points=60, n_frames=600, drift=0.05).true_landmarks
+    drive = part_of_hall(hall(seed, n_points=60, n_frames=400, step_s=0.6, drift=0.05), 200, 400, tilt(seed))
+    true = hall(seed, n_points=60, n_frames=400, step_s=0.6, drift=0.05).true_landmarks
     assert true is not None
     survey = replace(rows_of(true, np.arange(60) >= 6), landmark_id=true.landmark_id[6:] + 100)
     found = numbered_in(drive, survey, NAMELESS)
@@ -167,12 +169,18 @@ def test_points_are_found_in_a_fixed_map_from_anywhere_and_new_ones_get_numbers_
     assert np.median(np.linalg.norm(at - there, axis=1)) < 0.05
 
 
+@functools.cache
+def first_session(seed: int) -> tuple[SpatialRecording, Session]:
+    """The first half of a drive through a hall, and its map."""
+    first = part_of_hall(hall(seed, n_points=60, n_frames=400, step_s=0.6, drift=0.05), 0, 200)
+    return first, run_session(first, None, NAMELESS)
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_points_keep_their_names_over_sessions_and_those_that_left_are_told(seed):
-    whole, gone = hall(seed, n_points=60, n_frames=600, drift=0.05), [3, 20, 41]
-    first = part_of_hall(whole, 0, 300)
-    begun = run_session(first, None, NAMELESS)
-    second = part_of_hall(whole, 300, 600, tilt(seed), without=gone, later_s=86_400.0)
+    whole, gone = hall(seed, n_points=60, n_frames=400, step_s=0.6, drift=0.05), [3, 20, 41]
+    first, begun = first_session(seed)
+    second = part_of_hall(whole, 200, 400, tilt(seed), without=gone, later_s=86_400.0)
     session = run_session(second, begun.living, NAMELESS)
     assert session.found
     before, now = named_as(first, begun.recording), named_as(second, session.recording)
@@ -185,15 +193,15 @@ def test_points_keep_their_names_over_sessions_and_those_that_left_are_told(seed
 
 
 def test_another_hall_is_refused():
-    begun = run_session(part_of_hall(hall(1, n_points=60, n_frames=600), 0, 300), None, NAMELESS)
-    other = part_of_hall(hall(7, n_points=60, n_frames=600), 0, 300, later_s=86_400.0)
+    _, begun = first_session(1)
+    other = part_of_hall(hall(7, n_points=60, n_frames=400, step_s=0.6), 0, 200, later_s=86_400.0)
     session = run_session(other, begun.living, NAMELESS)
     assert not session.found
     assert len(session.living.places) == len(begun.living.places)
 
 
 def test_points_that_were_exchanged_are_recognised_by_what_they_are_like():
-    whole = hall(1, n_points=60, n_frames=600, drift=0.05)
+    whole = hall(1, n_points=60, n_frames=400, step_s=0.6, drift=0.05)
     own, random = np.random.default_rng(5).normal(size=(61, 8)), np.random.default_rng(6)
 
     def like(recording: SpatialRecording, true: np.ndarray) -> SpatialRecording:
@@ -201,7 +209,7 @@ def test_points_that_were_exchanged_are_recognised_by_what_they_are_like():
         names = tuple(f"descriptor_{k}" for k in range(8))
         return replace(recording, detections=replace(recording.detections, features=value, feature_names=names))
 
-    first, second = part_of_hall(whole, 0, 300), part_of_hall(whole, 300, 600, tilt(1), later_s=86_400.0)
+    first, second = part_of_hall(whole, 0, 200), part_of_hall(whole, 200, 400, tilt(1), later_s=86_400.0)
     begun = run_session(like(first, first.detections.landmark_id), None, NAMELESS)
     name = named_as(first, begun.recording)
     a, b = (int(one) for one in np.argsort(-np.bincount(second.detections.landmark_id + 1)[1:], kind="stable")[:2])
@@ -229,8 +237,8 @@ def test_objects_that_look_the_same_however_they_are_turned_keep_their_names_ove
 @pytest.mark.slow
 def test_points_are_found_in_a_large_survey():
     """A thousand others lie beside the hall, so that the map is in chunks."""
-    whole = hall(1, n_points=60, n_frames=600, drift=0.05)
-    drive = part_of_hall(whole, 300, 600, tilt(1))
+    whole = hall(1, n_points=60, n_frames=400, step_s=0.6, drift=0.05)
+    drive = part_of_hall(whole, 200, 400, tilt(1))
     assert whole.true_landmarks is not None
     beside = np.random.default_rng(0).uniform([30.0, 0.0, 0.0], [110.0, 80.0, 3.0], (1000, 3))
     place = np.vstack([whole.true_landmarks.position_m, beside])
@@ -243,9 +251,9 @@ def test_points_are_found_in_a_large_survey():
 
 @pytest.mark.parametrize("share", [0.05, 0.5])
 def test_points_of_which_some_have_names_keep_them_over_sessions(share):
-    whole, gone = hall(1, n_points=60, n_frames=600, drift=0.05), [3, 20, 41]
+    whole, gone = hall(1, n_points=60, n_frames=400, step_s=0.6, drift=0.05), [3, 20, 41]
     named = np.random.default_rng(0).permutation(60)[: int(60 * share)]
-    days = part_of_hall(whole, 0, 300), part_of_hall(whole, 300, 600, tilt(1), without=gone, later_s=86_400.0)
+    days = part_of_hall(whole, 0, 200), part_of_hall(whole, 200, 400, tilt(1), without=gone, later_s=86_400.0)
     living, called = None, []
     for day in days:
         true = day.detections.landmark_id
