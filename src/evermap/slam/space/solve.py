@@ -323,7 +323,7 @@ def incremental(
         if progress is not None:
             progress(float(problem.stamp_s[row]), float(problem.stamp_s[-1]))
     place[~problem.oriented, 3:] = se3.NO_TURN
-    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), 7))), spread, step_s
+    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), 6))), spread, step_s
 
 
 def _sigma_m(root: FloatArray) -> FloatArray:
