@@ -520,7 +520,7 @@ class _Differing:
         shared: (L,) variance [m^2] of the shared errors of sightings.
         log_density: (L,) of landmarks with compatible labels [1/m^3].
         kind: (L, 2) class and name of each.
-        traits, like: what else readings tell, and what it tells of each.
+        traits, like: of columns beside the position, and what each landmark is like by them.
         settings: of the association.
     """
 
