@@ -188,6 +188,7 @@ def _leave(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 (the p
     """No exception and no taking apart of the interpreter: neither is safe in the middle of everything."""
     for known in _SIGNALS:
         signal.signal(known, signal.SIG_IGN)
+    threading.excepthook = lambda *_: None  # threads that wait for workers report that these are gone
     for clean in (_stop_workers, *reversed(_cleanups), _flush):
         try:  # noqa: SIM105 (as above)
             clean()
