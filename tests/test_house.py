@@ -22,7 +22,7 @@ def tree_of(name: str) -> ast.Module:
 
 
 MOST_MODULES = 277
-MOST_LINES = 76_112
+MOST_LINES = 76_114
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8

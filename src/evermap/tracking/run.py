@@ -22,7 +22,7 @@ from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import TrackState
 from evermap.tracking.views import View
-from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,8 +90,13 @@ class TrackResult(Shown):
 
     def objects(self) -> Tracks:
         """Return the rows of `tracks` that are of objects that were confirmed, sooner or later."""
+        return self.tracks[self.confirmed]
+
+    @property
+    def confirmed(self) -> BoolArray:
+        """Return (R,) which rows of `tracks` those are."""
         t = self.tracks
-        return t[np.isin(t.track_id, t.track_id[t.state != TrackState.BIRTH])]
+        return np.isin(t.track_id, t.track_id[t.state != TrackState.BIRTH])
 
     def speeds_mps(self) -> FloatArray:
         """Return (C,) the speed of each class above which it moves."""

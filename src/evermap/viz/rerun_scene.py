@@ -294,8 +294,7 @@ class _RunScene:
         followed = self._result.followed
         tracks, p_static, stamps = followed.tracks, followed.p_static, followed.table.stamp_s
         stood = np.zeros(len(tracks), dtype=np.bool_) if p_static is None else p_static >= 0.5
-        confirmed = np.isin(tracks.track_id, followed.objects().track_id)
-        rows = np.flatnonzero(confirmed & ~tracks.static & ~stood & (tracks.p_exists >= 0.5))
+        rows = np.flatnonzero(followed.confirmed & ~tracks.static & ~stood & (tracks.p_exists >= 0.5))
         rows = rows[np.argsort(tracks.stamp_s[rows], kind="stable")]
         names, of = followed.table.class_names, tracks.class_p[rows].argmax(axis=1)
         looks = class_looks(names)

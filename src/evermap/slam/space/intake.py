@@ -405,16 +405,14 @@ def _path(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -> 
     if odometry is None or len(odometry) < 2:
         return None
     stamp_s, pose = odometry.stamp_s - start_s, odometry.pose_world_robot
-    further_s = 4.0 * delay_sigma_s
-    ends = ((0, stamp_s[0] + delay_sigma_s), (-1, stamp_s[-1] - delay_sigma_s)) if delay_sigma_s > 0.0 else ()
-    for end, inside_s in ends:
-        near = se3.interpolate(stamp_s, pose, np.clip([inside_s], *stamp_s[[0, -1]]))[0]
-        ahead = 4.0 * se3.local(near, pose[end])
-        beyond = se3.retract(pose[end], ahead)
-        at = 0 if end == 0 else len(pose)
-        pose = np.insert(pose, at, beyond, axis=0)
-        stamp_s = np.insert(stamp_s, at, stamp_s[end] + (further_s if end else -further_s))
-    return OdometryPath(stamp_s, pose)
+    if delay_sigma_s == 0.0:
+        return OdometryPath(stamp_s, pose)
+    first_s, last_s = stamp_s[[0, -1]].tolist()
+    inside_s = np.clip([first_s + delay_sigma_s, last_s - delay_sigma_s], first_s, last_s)
+    end, inside = pose[[0, -1]], se3.interpolate(stamp_s, pose, inside_s)
+    before, after = se3.retract(end, 4.0 * se3.local(inside, end))
+    stamp_s = np.concatenate([[first_s - 4.0 * delay_sigma_s], stamp_s, [last_s + 4.0 * delay_sigma_s]])
+    return OdometryPath(stamp_s, np.vstack([before, pose, after]))
 
 
 def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
