@@ -32,8 +32,9 @@ RULES = {
     "existence": "errors compiled show types survival io sensing",
     "tracking": "errors compiled show types config geometry survival valid io sensing existence",
     "viz": "errors types geometry survival metrics existence",
-    "slam": "errors interrupts compiled plugins show types config geometry valid sensing tracking",
-    "maps": "errors show types config geometry survival valid sensing existence tracking slam",
+    "estimate": "errors compiled types",
+    "slam": "errors interrupts compiled plugins show types config geometry valid sensing tracking estimate",
+    "maps": "errors show types config geometry survival valid sensing existence tracking estimate slam",
     "pipeline": "errors compiled types config slam maps",
     "runs": (
         "errors interrupts show types config geometry survival valid io metrics existence tracking viz maps pipeline"

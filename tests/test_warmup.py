@@ -118,7 +118,7 @@ def test_all_kernels_of_a_job_are_ready_when_it_begins(folder: Path, tmp_path: P
 
 
 LARGE = """
-from evermap.slam.sparse import elimination, system
+from evermap.estimate.sparse import elimination, system
 from evermap.slam.warmup import warm_up
 import evermap as em
 from evermap_studies.sim import simulate_warehouse

@@ -25,11 +25,9 @@ from evermap.slam.kernels import (
     FLOOR_VARIANCE,
     NOISE_NAMES,
     detection_residual,
-    inlier_weight,
     invert_3x3,
     multiply,
     odometry_residual,
-    outlier_loss,
     sandwich,
 )
 from evermap.slam.problem import USUAL, Drive
@@ -291,34 +289,6 @@ def test_noise_counts_reported_distance_angle_and_time():
     out = integrated(turning, 0.5, 2.5, default_prior().mean)
     assert np.trace(out.noise[1]) == pytest.approx(3.0, rel=1e-2)
     assert out.noise[4] == pytest.approx(np.diag([0.0, 0.0, 3.0]), abs=1e-12)
-
-
-@few
-@given(
-    st.floats(0.0, 300.0),
-    st.one_of(st.floats(0.5, 50.0), st.just(7.0)),
-    st.booleans(),
-)
-def test_weight_is_twice_the_derivative_of_the_loss(squared, log_odds, heavy):
-    h = 1e-4 * (1.0 + squared)
-    low = max(squared - h, 0.0)
-    slope = (outlier_loss(squared + h, log_odds, heavy) - outlier_loss(low, log_odds, heavy)) / (squared + h - low)
-    middle = 0.5 * (squared + h + low)
-    assert inlier_weight(middle, log_odds, heavy) == pytest.approx(2 * slope, rel=1e-3, abs=1e-6)
-
-
-def test_loss_is_minus_log_of_a_mixture_of_inlier_and_outlier():
-    for squared in (0.0, 1.0, 13.9, 14.1, 80.0, 1e4):
-        density = np.logaddexp(-squared / 2, -7.0) - np.logaddexp(0.0, -7.0)
-        assert outlier_loss(squared, 7.0, False) == pytest.approx(-density, abs=1e-12)
-        weight = np.exp(-squared / 2 - np.logaddexp(-squared / 2, -7.0))
-        assert inlier_weight(squared, 7.0, False) == pytest.approx(weight, rel=1e-12)
-
-
-def test_without_outliers_the_loss_is_quadratic():
-    for squared in (0.0, 3.0, 1e6):
-        assert outlier_loss(squared, np.inf, False) == pytest.approx(squared / 2)
-        assert inlier_weight(squared, np.inf, False) == 1.0
 
 
 def test_silences_become_standing_still_without_knowing():

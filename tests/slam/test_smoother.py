@@ -11,10 +11,10 @@ from dense import DensePosterior
 from problems import World, default_prior, make_world
 
 from evermap.errors import DataError
+from evermap.estimate.sparse import system
 from evermap.geometry import se2
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
-from evermap.slam.sparse import system
 
 SMALL = 1e-4
 """Parts of a standard deviation."""

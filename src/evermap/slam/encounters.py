@@ -1,30 +1,32 @@
 """Several robots that share landmarks and see each other, as one least-squares problem.
 
-Each keeps its own poses, calibration and noise; an unmoved landmark is one place for all that saw it. A robot that sees
-another measures range and bearing from its own pose to that of the other at the same instant: both have a pose there,
-tied to their others by odometry, so nothing is interpolated.
+It is the concatenation of their blocks. Each robot keeps its own poses, calibration and noise; an unmoved landmark is
+one place for all that saw it. A robot that sees another measures range and bearing from its own pose to that of the
+other at the same instant: both have a pose there, tied to their others by odometry, so nothing is interpolated.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES, detection_residual, inlier_weight, kernel, outlier_loss
-from evermap.slam.linearise import DETECTION, ODOMETRY
+from evermap.estimate.gauss_newton import Steps
+from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Part, Room, Structure, build_structure, grouped
+from evermap.estimate.robust import weigh
+from evermap.estimate.solver import Solver
+from evermap.estimate.sparse.system import Factorised, Slices, exhausted
+from evermap.slam.kernels import HEAVY_TAIL, N_MOTION, N_SENSOR, N_STATES, detection_residual, kernel
 from evermap.slam.problem import Block, Estimate, Marginals
-from evermap.slam.smoother import POSES_A_LEAF, Equations, Linearised, Smoother
-from evermap.slam.sparse.system import Factorised, Slices, System
-from evermap.slam.sparse.tree import Factors
+from evermap.slam.smoother import COST_SLACK, DETECTIONS, HELD, ODOMETRY, POSES_A_LEAF, Smoother, retract
 from evermap.types import BoolArray, FloatArray, IntArray
 
 OF_ENCOUNTER = 3 + 3 + N_SENSOR + 1
-ENCOUNTER = 2 * OF_ENCOUNTER
-"""Numbers of a row, by two poses and the states of the sensor, and the right side; and of an encounter, of two rows."""
+"""Numbers of a row, by two poses and the states of the sensor, and the right side."""
 
 
 class Encounters(NamedTuple):
@@ -42,24 +44,28 @@ class Encounters(NamedTuple):
     reading: FloatArray
 
 
-class _Eyes(NamedTuple):
-    """Sensor data for the encounters.
+class Eyes(NamedTuple):
+    """What robots measure others with.
 
-    Of each robot (R, 11) states and which are free, (R, 3) mounts, (R, 2) standard deviations, and (R,) as for
-    `kernels.inlier_weight`.
+    Attributes:
+        free: (R, 11) calibration states that are estimated.
+        mount: (R, 3) poses of the sensors.
+        sigma: (R, 2) standard deviations of range [m] and bearing [rad].
+        log_odds, tail: (R,) as for `robust.weigh`.
     """
 
-    states: FloatArray
     free: BoolArray
     mount: FloatArray
     sigma: FloatArray
     log_odds: FloatArray
-    heavy: BoolArray
+    tail: FloatArray
 
 
 @kernel
-def linearise_encounters(pose: FloatArray, met: Encounters, eyes: Any, values: FloatArray, weight: FloatArray) -> float:
-    """Linearise encounters at poses (N, 3); return their negative log likelihood, up to a constant.
+def linearise_encounters(
+    pose: FloatArray, states: FloatArray, met: Encounters, eyes: Eyes, values: FloatArray, weight: FloatArray
+) -> float:
+    """Linearise encounters at poses (N, 3) and states (R, 11); return their negative log likelihood, up to a constant.
 
     Filled in are `values`, whitened factors in the layout of `sparse`, by observer, observed and the observer's sensor
     states, and inlier weights (S,).
@@ -69,12 +75,12 @@ def linearise_encounters(pose: FloatArray, met: Encounters, eyes: Any, values: F
     for m in range(len(met.observer)):
         r, other = met.robot[m], pose[met.observed[m]]
         detection_residual(
-            pose[met.observer[m]], other[:2], eyes.states[r], eyes.mount[r], met.reading[m, 0], met.reading[m, 1],
+            pose[met.observer[m]], other[:2], states[r], eyes.mount[r], met.reading[m, 0], met.reading[m, 1],
             z, jx, jl, jc,
         )  # fmt: skip
         squared = (z[0] / eyes.sigma[r, 0]) ** 2 + (z[1] / eyes.sigma[r, 1]) ** 2
-        weight[m] = inlier_weight(squared, eyes.log_odds[r], eyes.heavy[r])
-        cost += outlier_loss(squared, eyes.log_odds[r], eyes.heavy[r])
+        weight[m], loss = weigh(squared, eyes.log_odds[r], eyes.tail[r], 0.0)
+        cost += loss
         c, s = math.cos(other[2]), math.sin(other[2])
         for row in range(2):
             scale = math.sqrt(weight[m]) / eyes.sigma[r, row]
@@ -91,7 +97,42 @@ def linearise_encounters(pose: FloatArray, met: Encounters, eyes: Any, values: F
     return cost
 
 
-class Together(Smoother):
+class EncounterFactors(NamedTuple):
+    """Robots that see each other.
+
+    Attributes:
+        met: who saw whom, with poses numbered through all robots.
+        eyes: what they measured it with.
+        sensor: (R,) variables of the sensor states of each robot.
+    """
+
+    met: Encounters
+    eyes: Eyes
+    sensor: IntArray
+
+    @property
+    def ties(self) -> IntArray:
+        """Return (S, 3) two poses and the sensor states of the observer."""
+        return np.column_stack([self.met.observer, self.met.observed, self.sensor[self.met.robot]])
+
+    @property
+    def rows(self) -> IntArray:
+        """Return (S,) twos."""
+        return np.full(len(self.met.robot), 2)
+
+    @property
+    def pose(self) -> IntArray:
+        """Return (S,) the observing poses."""
+        return self.met.observer
+
+    def linearise(self, state: Estimate, out: Room) -> Slices[float]:
+        """Fill in `linearise_encounters`."""
+        states = state.states.reshape(-1, N_STATES)
+        yield from ()
+        return float(linearise_encounters(state.pose, states, self.met, self.eyes, out.values, out.weights))
+
+
+class Together(Solver[Estimate]):
     """Optimum and covariances of several problems that share places, and of encounters.
 
     Its estimates are those of all robots: (N, 3) poses one robot after the other, (P, 2) places, (11 R,) states. What
@@ -113,22 +154,17 @@ class Together(Smoother):
         met: Encounters,
         sigma: FloatArray,
     ) -> None:
-        super().__init__(robots[0].problem, robots[0].noise)
+        super().__init__()
         self.robots, self.places, self.start_s, self.met, self.sigma = tuple(robots), places, start_s, met, sigma
         self.first = np.cumsum([0, *(len(robot.problem.stamp_s) for robot in robots)])
-        self._blocks: tuple[Block, ...] = ()
+        self._structure: tuple[BoolArray, Structure] | None = None
         self._own: tuple[Estimate, list[Estimate]] | None = None
 
     def of(self, robots: Sequence[Smoother], sigma: FloatArray) -> Together:
         """Return the same for robots with other noise or priors; its structure is kept."""
         other = Together(robots, self.places, self.start_s, self.met, sigma)
-        other._structure, other._blocks = self._structure, self._blocks
+        other._structure = self._structure
         return other
-
-    @property
-    def states_sigma(self) -> FloatArray:
-        """(11 R,) standard deviations of the priors of all calibration states."""
-        return np.concatenate([robot.states_sigma for robot in self.robots])
 
     def estimates(self, estimate: Estimate) -> list[Estimate]:
         """Return the estimate of each robot."""
@@ -139,91 +175,95 @@ class Together(Smoother):
             self._own = (estimate, own)
         return self._own[1]
 
+    def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6) -> Estimate:
+        """Return the values at which `solved_in_slices` ends.
+
+        Raises:
+            NumericalError: no finite optimum.
+        """
+        return exhausted(self.minimised_in_slices(start, Steps(iterations, tolerance, 0.0, COST_SLACK))).state
+
+    def solved(self, start: Estimate, steps: Steps) -> tuple[Estimate, Marginals]:
+        """Return the optimum, and the covariances that its last step was made with."""
+        solution = exhausted(self.minimised_in_slices(start, steps))
+        return solution.state, self.marginals(solution.state, solution.factorised)
+
+    def marginals(self, estimate: Estimate, solved: Factorised | None = None) -> Marginals:
+        """Return covariances of the Gaussian approximation at `estimate`; those of detections are of the encounters.
+
+        `solved` are the normal equations, where they are known.
+        """
+        known = estimate.known
+        if solved is None:
+            solved = exhausted(self.factorised_in_slices(estimate))
+        n, places, first = len(estimate.pose), int(known.sum()), self.graph(estimate).structure.first
+        block = Block(0, n + np.arange(places), n + places, 0, first[2 * len(self.robots)], n - len(self.robots))
+        return Marginals(solved, n, len(self.met.robot), known, block=block)
+
     def parts(self, estimate: Estimate, marginals: Marginals) -> list[Marginals]:
         """Return the marginals of each robot, for those of all."""
-        return [
-            marginals.of(block, len(own.pose), len(robot.problem.pose_row), own.known)
-            for block, robot, own in zip(self._blocks, self.robots, self.estimates(estimate), strict=True)
-        ]
-
-    def linearised_in_slices(self, estimate: Estimate) -> Slices[Linearised]:
-        """Return the factors of all robots, by kind, then the encounters, in slices; weights are of the latter."""
-        if self._last is not None and self._last[0] is estimate:
-            return self._last[1]
-        alone, kinds = [], []
-        for robot, own in zip(self.robots, self.estimates(estimate), strict=True):
-            part = yield from robot.linearised_in_slices(own)
-            driven = ODOMETRY * (len(own.pose) - 1)
-            kinds.append(np.split(part.values, [driven, driven + DETECTION * len(robot.problem.pose_row)]))
-            alone.append(part)
-        eyes = _Eyes(
-            estimate.states.reshape(-1, N_STATES),
-            np.array([robot.problem.prior.free for robot in self.robots]),
-            np.array([robot.problem.mount for robot in self.robots]),
-            self.sigma,
-            np.array([robot.noise.outlier_log_odds if robot.robust else np.inf for robot in self.robots]),
-            np.array([robot.heavy and robot.robust for robot in self.robots]),
-        )
-        values, weights = np.empty(ENCOUNTER * len(self.met.robot)), np.empty(len(self.met.robot))
-        cost = linearise_encounters(estimate.pose, self.met, eyes, values, weights)
-        now = Linearised(
-            np.concatenate([*(part for kind in zip(*kinds, strict=True) for part in kind), values]),
-            weights,
-            sum(part.cost for part in alone) + cost,
-            np.concatenate([part.states_right for part in alone]),
-        )
-        self._last = (estimate, now)
-        return now
+        n, rank, count = len(estimate.pose), np.cumsum(estimate.known) - 1, len(self.robots)
+        first, border, found = self.graph(estimate).structure.first, n + int(estimate.known.sum()), []
+        for r, (robot, own) in enumerate(zip(self.robots, self.estimates(estimate), strict=True)):
+            places = n + rank[self.places[r][own.known]]
+            block = Block(int(self.first[r]), places, border + 2 * r, first[r], first[count + r], n - count)
+            found.append(marginals.of(block, len(own.pose), len(robot.problem.pose_row), own.known))
+        return found
 
     def squares(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
         """Return squared residuals (S, 2) of encounters, times their inlier probability, and the latter (S,)."""
-        now, count = self.linearised(estimate), len(self.met.robot)
-        right = now.values[len(now.values) - ENCOUNTER * count :].reshape(-1, 2, OF_ENCOUNTER)[..., -1]
-        return (right * self.sigma[self.met.robot]) ** 2, now.weights
+        now, k = self.linearised(estimate), 2 * len(self.robots)
+        right = now.values[self.graph(estimate).structure.values_of(k)].reshape(-1, 2, OF_ENCOUNTER)[..., -1]
+        return (right * self.sigma[self.met.robot]) ** 2, now.weights[k]
 
-    def _marginals(self, estimate: Estimate, solved: Factorised) -> Marginals:
-        n, places, met = len(estimate.pose), int(estimate.known.sum()), len(self.met.robot)
-        first = len(solved.system.factors.rows) - met
-        block = Block(0, n + np.arange(places), n + places, 0, first, n - len(self.robots))
-        return Marginals(solved, n, met, estimate.known, block=block)
-
-    def _structured(self, estimate: Estimate) -> Slices[Equations]:
-        """The equations of all robots: variables and leaves one robot after the other, factors by kind."""
-        known, n, n_robots = estimate.known, len(estimate.pose), len(self.robots)
-        if self._structure is not None and np.array_equal(self._structure.known, known):
-            return self._structure
+    def graph_in_slices(self, state: Estimate) -> Slices[Graph[Estimate]]:
+        """Return all robots as one graph: odometry of each, detections of each, encounters, starts and priors."""
+        known, n = state.known, len(state.pose)
         rank, border = np.cumsum(known) - 1, n + int(known.sum())
-        kinds: list[list[Factors]] = [[], [], []]
-        blocks, coordinates, leaves, seen = [], [], [0], n - n_robots
-        for r, (robot, own) in enumerate(zip(self.robots, self.estimates(estimate), strict=True)):
-            alone = yield from robot._structured(own)
-            places, driven, count = n + rank[self.places[r][own.known]], len(own.pose) - 1, len(robot.problem.pose_row)
-            blocks.append(Block(int(self.first[r]), places, border + 2 * r, int(self.first[r]) - r, seen, n - n_robots))
-            seen += count
-            states = border + 2 * r + np.arange(2)
-            variable = np.concatenate([np.arange(self.first[r], self.first[r + 1]), places, states])
-            factors = alone.system.factors
-            cuts = pairwise([0, driven, driven + count, len(factors.rows)])
-            for kind, (low, high) in zip(kinds, cuts, strict=True):
-                first = factors.first[low : high + 1]
-                tied = variable[factors.variable[first[0] : first[-1]]]
-                kind.append(Factors(np.diff(first), tied, factors.rows[low:high], factors.leaf[low:high] + leaves[-1]))
-            coordinates.append(self._laid_out(r, alone.coordinate))
-            leaves.append(leaves[-1] + len(alone.coordinate))
-        tied = np.column_stack([self.met.observer, self.met.observed, border + 2 * self.met.robot]).ravel()
-        row, last = self.met.observer - self.first[self.met.robot], np.diff(self.first)[self.met.robot] - 2
-        leaf = np.array(leaves)[self.met.robot] + np.minimum(row, last) // POSES_A_LEAF
-        met = Factors(np.full(len(row), 3), tied, np.full(len(row), 2), leaf)
-        width, *rest = (np.concatenate(column) for column in zip(*kinds[0], *kinds[1], *kinds[2], met, strict=True))
-        dim = np.concatenate([np.full(n, 3), np.full(border - n, 2), np.tile([N_SENSOR, N_MOTION], n_robots)])
-        coordinate = np.concatenate(coordinates)
-        factors = Factors(np.append(0, np.cumsum(width)), *rest)
-        system = System(dim, factors, coordinate, border + np.arange(2 * n_robots))
-        self._blocks, self._structure = tuple(blocks), Equations(known, rank, system, coordinate, (), ())
-        return self._structure
+        kinds: list[list[FactorBlock[Estimate]]] = []
+        for r, (robot, own) in enumerate(zip(self.robots, self.estimates(state), strict=True)):
+            poses, states = np.arange(self.first[r], self.first[r + 1]), border + 2 * r + np.arange(2)
+            variable = np.concatenate([poses, n + rank[self.places[r][own.known]], states])
+            select = partial(self._own_part, robot=r)
+            kinds.append([Part(block, variable, int(self.first[r]), select) for block in robot.blocks(own.known)])
+        met = EncounterFactors(self.met, self._eyes(), border + 2 * np.arange(len(self.robots)))
+        measured = [blocks[kind] for kind in (ODOMETRY, DETECTIONS) for blocks in kinds]
+        blocks = (*measured, met, *(block for own in kinds for block in own[DETECTIONS + 1 :]))
+        if self._structure is None or not np.array_equal(self._structure[0], known):
+            structure = yield from build_structure(self._layout(state), blocks)
+            self._structure = known, structure
+        structure = self._structure[1]
+        held = np.zeros(structure.system.tree.begin[-1])
+        held[3 * n : -N_STATES * len(self.robots)] = HELD
+        information = 1.0 / np.concatenate([robot.states_sigma for robot in self.robots]) ** 2
+        return Graph(blocks, structure, Border(information, self._off_mean), held, retract)
 
-    def _laid_out(self, r: int, coordinate: FloatArray) -> FloatArray:
-        """Coordinates of a robot's leaves among all: time on their clock, position, robot."""
-        stamp = self.robots[r].problem.stamp_s + self.start_s[r]
-        when = np.interp(coordinate[:, 0] * POSES_A_LEAF, np.arange(len(stamp)), stamp)
-        return np.column_stack([when, coordinate[:, 1:], np.full(len(when), float(r))])
+    def _own_part(self, state: Estimate, robot: int) -> Estimate:
+        return self.estimates(state)[robot]
+
+    def _off_mean(self, state: Estimate) -> FloatArray:
+        own = zip(self.robots, self.estimates(state), strict=True)
+        return np.concatenate([robot.off_mean(estimate) for robot, estimate in own])
+
+    def _eyes(self) -> Eyes:
+        robots = self.robots
+        return Eyes(
+            np.array([robot.problem.prior.free for robot in robots]),
+            np.array([robot.problem.mount for robot in robots]),
+            self.sigma,
+            np.array([robot.noise.outlier_log_odds if robot.robust else np.inf for robot in robots]),
+            np.array([HEAVY_TAIL if robot.heavy and robot.robust else 0.0 for robot in robots]),
+        )
+
+    def _layout(self, state: Estimate) -> Layout:
+        """Variables of all; poses by time on the clock of all, position, robot."""
+        n, count, n_robots = len(state.pose), int(state.known.sum()), len(self.robots)
+        leaves, coordinates, n_leaves = [], [], 0
+        for r, (robot, own) in enumerate(zip(self.robots, self.estimates(state), strict=True)):
+            leaves.append(n_leaves + grouped(len(own.pose), POSES_A_LEAF))
+            n_leaves = int(leaves[-1][-1]) + 1
+            when = robot.problem.stamp_s + self.start_s[r]
+            coordinates.append(np.column_stack([when, own.pose[:, :2], np.full(len(when), float(r))]))
+        dim = np.concatenate([np.full(n, 3), np.full(count, 2), np.tile([N_SENSOR, N_MOTION], n_robots)])
+        border = n + count + np.arange(2 * n_robots)
+        return Layout(dim, border, np.concatenate(leaves), np.concatenate(coordinates))

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from evermap.compiled import kept
+from evermap.estimate.robust import weigh
 from evermap.slam.kernels import (
     AT_PLACES,
+    HEAVY_TAIL,
     N_MOTION,
     N_NOISE,
     N_SENSOR,
@@ -21,7 +23,6 @@ from evermap.slam.kernels import (
     adjoint,
     composed,
     detection_residual,
-    inlier_weight,
     integrate_odometry,
     inverted,
     kernel,
@@ -280,7 +281,7 @@ def update(
         if weighing == BY_OTHERS and iteration == 0:
             unsure = _surprises(part, jacobian, root, innovation, sigma, nis)
             for m in range(count):
-                weight[m] = credible[m] = max(inlier_weight(nis[m], log_odds[m], False), LEAST_WEIGHT)
+                weight[m] = credible[m] = max(weigh(nis[m], log_odds[m], 0.0, 0.0)[0], LEAST_WEIGHT)
         for m in range(count if weighing == HEAVY else 0):
             # before anything is known of this frame: as surprising as its innovation is
             unknown = 1.0 if iteration == 0 else 0.0
@@ -289,7 +290,7 @@ def update(
                 a + sigma[m, 0] ** 2, unknown * root[2 * m, 2 * m + 1], d + sigma[m, 1] ** 2,
                 innovation[2 * m], innovation[2 * m + 1],
             )  # fmt: skip
-            weight[m] = inlier_weight(squared, 0.0, True)
+            weight[m] = weigh(squared, 0.0, HEAVY_TAIL, 0.0)[0]
         for each in range(2 * count):
             root[each, each] += sigma[each // 2, each % 2] ** 2 / weight[each // 2]
             # innovation at the step so far, expressed at the start
@@ -383,7 +384,8 @@ def _weigh_by_the_others(
         x, y = aa * pull[2 * m] + bb * pull[2 * m + 1], bb * pull[2 * m] + dd * pull[2 * m + 1]
         more = 1.0 / weight[m] - 1.0  # noise by which it was held to be an outlier
         squared = _squared(aa - more * sigma[m, 0] ** 2, bb, dd - more * sigma[m, 1] ** 2, x, y)
-        now = min(max(inlier_weight(max(squared, 0.0), log_odds[m], heavy), LEAST_WEIGHT), credible[m])
+        now, _ = weigh(max(squared, 0.0), log_odds[m], HEAVY_TAIL if heavy else 0.0, 0.0)
+        now = min(max(now, LEAST_WEIGHT), credible[m])
         changed = max(changed, abs(now - weight[m]))
         weight[m] = now
     return changed

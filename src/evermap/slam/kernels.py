@@ -33,6 +33,8 @@ MAX_STEP_S = 0.1
 N_SENSOR, N_MOTION = 7, 4
 """Calibration states of the sensor and, behind them, of the odometry (`calibration.SPECS`)."""
 N_STATES = N_SENSOR + N_MOTION
+HEAVY_TAIL = 9.0
+"""Square of a detection's residual at which the Cauchy begins, while the estimate may be far off: `robust.weigh`."""
 AT_PLACES = 3 + N_STATES
 """Where places begin in a joint covariance: behind the newest pose and the calibration states."""
 
@@ -333,26 +335,3 @@ def detection_residual(
     # where the sensor sits moves it as the robot does, along the robot's axes
     for row in range(2):
         j_states[row, 5], j_states[row, 6] = j_pose[row, 0], j_pose[row, 1]
-
-
-@kernel
-def inlier_weight(squared: float, log_odds: float, heavy: bool) -> float:
-    """Return the weight of a detection with squared normalised residual `squared`.
-
-    `heavy`: Cauchy with scale 3, which never lets go while the estimate is still far away. Otherwise the posterior
-    probability of 'no outlier' when an outlier is as likely as an inlier at `squared = 2 log_odds`.
-    """
-    if heavy:
-        return 1.0 / (1.0 + squared / 9.0)
-    return 1.0 / (1.0 + math.exp(min(0.5 * squared - log_odds, 700.0)))
-
-
-@kernel
-def outlier_loss(squared: float, log_odds: float, heavy: bool) -> float:
-    """Return the negative log likelihood, 0 at 0; `inlier_weight` is twice its derivative by `squared`."""
-    if heavy:
-        return 4.5 * math.log1p(squared / 9.0)
-    # -log(exp(-s/2) + exp(-log_odds)) without overflow, 0 at s = 0
-    d = 0.5 * squared - log_odds
-    log_sum = math.log1p(math.exp(d)) if d < 0 else d + math.log1p(math.exp(-d))
-    return 0.5 * squared - log_sum + math.log1p(math.exp(-log_odds))

@@ -1,4 +1,4 @@
-"""A problem as whitened linear factors: Jacobians and right sides, in the layout of `sparse`."""
+"""Odometry, detections and priors in the plane as blocks of factors."""
 
 from __future__ import annotations
 
@@ -6,10 +6,16 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
-from evermap.slam.kernels import N_MOTION, N_SENSOR, detection_residual, inlier_weight, kernel, outlier_loss
+from evermap.estimate.graph import Room
+from evermap.estimate.robust import weigh
+from evermap.estimate.sparse.system import Slices
+from evermap.geometry import se2
+from evermap.slam.kernels import N_MOTION, N_SENSOR, detection_residual, kernel
 from evermap.slam.preintegration import Intervals, linearise_interval
-from evermap.slam.problem import Estimate, Problem
+from evermap.slam.problem import Estimate, Problem, between_rows
 from evermap.types import BoolArray, FloatArray, IntArray
 
 OF_INTERVAL, OF_DETECTION = 3 + 3 + N_MOTION + 1, 3 + 2 + N_SENSOR + 1
@@ -17,12 +23,14 @@ OF_INTERVAL, OF_DETECTION = 3 + 3 + N_MOTION + 1, 3 + 2 + N_SENSOR + 1
 right side."""
 ODOMETRY, DETECTION = 3 * OF_INTERVAL, 2 * OF_DETECTION
 """Numbers of one factor, of three rows and of two."""
+INTERVALS_A_SLICE, DETECTIONS_A_SLICE = 1000, 2000
+"""Factors that are linearised in about a millisecond."""
 
 
 class Readings(NamedTuple):
     """Detections as the kernel reads them: (M,) rows of pose and place, (M, 2) readings and sigmas; (3,) mount.
 
-    `free` (11,) are the calibration states that are estimated; `log_odds` and `heavy` as for `kernels.inlier_weight`.
+    `free` (11,) are the calibration states that are estimated; `log_odds` and `tail` as for `robust.weigh`.
     """
 
     pose_row: IntArray
@@ -32,7 +40,7 @@ class Readings(NamedTuple):
     mount: FloatArray
     free: BoolArray
     log_odds: float
-    heavy: bool
+    tail: float
 
 
 @kernel
@@ -47,21 +55,19 @@ def root_of(information: FloatArray, root: FloatArray) -> None:
 
 
 @kernel
-def linearise(
-    pose: FloatArray, place: FloatArray, states: FloatArray, driven: Intervals, variance: FloatArray, seen: Readings,
-    values: FloatArray, weight: FloatArray, begin: int, end: int, first: int, last: int,
-) -> float:  # fmt: skip
-    """Linearise the odometry from poses `begin` to `end - 1`, and the detections from `first` to `last - 1`.
+def linearise_odometry(
+    pose: FloatArray, driven: Intervals, variance: FloatArray, free: Any, values: FloatArray, begin: int, end: int
+) -> float:
+    """Linearise the odometry from poses `begin` to `end - 1` of (N, 3), by the `free` (11,) calibration states.
 
-    At poses (N, 3), places (P, 2) and calibration states (11,), with the variance (5,) of each kind of noise of the
-    odometry. Filled in are `values`, factors of odometry before those of detections, and inlier weights (M,). Returns
+    `variance` (5,) is that of each kind of noise. Filled in are `values`, those of a factor for each interval. Returns
     the negative log likelihood, up to a constant.
     """
     cost, at = 0.0, ODOMETRY * begin
     information, e, root = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
     j = np.zeros((3, OF_INTERVAL - 1))
     for i in range(begin, end):
-        linearise_interval(driven, i, pose, variance, seen.free, e, j, information)
+        linearise_interval(driven, i, pose, variance, free, e, j, information)
         root_of(information, root)
         for a in range(3):
             for b in range(OF_INTERVAL - 1):
@@ -75,7 +81,20 @@ def linearise(
             values[at + OF_INTERVAL - 1] = -total
             cost += 0.5 * total * total
             at += OF_INTERVAL
-    at = ODOMETRY * (len(pose) - 1) + DETECTION * first
+    return cost
+
+
+@kernel
+def linearise_detections(
+    pose: FloatArray, place: FloatArray, states: FloatArray, seen: Readings, values: FloatArray, weight: FloatArray,
+    first: int, last: int,
+) -> float:  # fmt: skip
+    """Linearise the detections from `first` to `last - 1` at poses (N, 3), places (P, 2) and states (11,).
+
+    Filled in are `values`, those of a factor for each detection, and inlier weights (M,). Returns the negative log
+    likelihood, up to a constant.
+    """
+    cost, at = 0.0, DETECTION * first
     z, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     for m in range(first, last):
         detection_residual(
@@ -83,8 +102,8 @@ def linearise(
             z, jx, jl, jc,
         )  # fmt: skip
         squared = (z[0] / seen.sigma[m, 0]) ** 2 + (z[1] / seen.sigma[m, 1]) ** 2
-        weight[m] = inlier_weight(squared, seen.log_odds, seen.heavy)
-        cost += outlier_loss(squared, seen.log_odds, seen.heavy)
+        weight[m], loss = weigh(squared, seen.log_odds, seen.tail, 0.0)
+        cost += loss
         for row in range(2):
             scale = math.sqrt(weight[m]) / seen.sigma[m, row]
             for a in range(3):
@@ -96,6 +115,190 @@ def linearise(
             values[at + OF_DETECTION - 1] = -scale * z[row]
             at += OF_DETECTION
     return cost
+
+
+class OdometryFactors(NamedTuple):
+    """Odometry between consecutive poses, with its calibration states.
+
+    Attributes:
+        problem: the drive, and which states are free.
+        variance: (5,) of each kind of noise.
+        states: the variable of the motion states.
+    """
+
+    problem: Problem
+    variance: FloatArray
+    states: int
+
+    @property
+    def ties(self) -> IntArray:
+        """Return (N - 1, 3) two poses and the motion states."""
+        step = self.pose
+        return np.column_stack([step, step + 1, np.full(len(step), self.states)])
+
+    @property
+    def rows(self) -> IntArray:
+        """Return (N - 1,) threes."""
+        return np.full(len(self.problem.stamp_s) - 1, 3)
+
+    @property
+    def pose(self) -> IntArray:
+        """Return (N - 1,) the first pose of each interval."""
+        return np.arange(len(self.problem.stamp_s) - 1)
+
+    def linearise(self, state: Estimate, out: Room) -> Slices[float]:
+        """Fill in `linearise_odometry`; no interval is an outlier."""
+        problem, cost, count = self.problem, 0.0, len(out.weights)
+        driven = yield from problem.drive.in_slices(problem.stamp_s, state.states)
+        for begin in range(0, count, INTERVALS_A_SLICE):
+            end = min(begin + INTERVALS_A_SLICE, count)
+            cost += linearise_odometry(state.pose, driven, self.variance, problem.prior.free, out.values, begin, end)
+            yield (end - begin) / INTERVALS_A_SLICE
+        return cost
+
+
+class DetectionFactors(NamedTuple):
+    """Ranges and bearings of places, with the calibration states of the sensor.
+
+    Attributes:
+        seen: the readings, by known places.
+        known: (L,) places that have a position; these are the variables.
+        places: the variable of the first of them.
+        states: the variable of the sensor states.
+    """
+
+    seen: Readings
+    known: BoolArray
+    places: int
+    states: int
+
+    @property
+    def ties(self) -> IntArray:
+        """Return (M, 3) pose, place and sensor states."""
+        return np.column_stack([self.pose, self.places + self.seen.place, np.full(len(self.pose), self.states)])
+
+    @property
+    def rows(self) -> IntArray:
+        """Return (M,) twos."""
+        return np.full(len(self.pose), 2)
+
+    @property
+    def pose(self) -> IntArray:
+        """Return (M,) the poses that saw them."""
+        return self.seen.pose_row
+
+    def linearise(self, state: Estimate, out: Room) -> Slices[float]:
+        """Fill in `linearise_detections`."""
+        place, cost, count = state.landmark[self.known], 0.0, len(out.weights)
+        for first in range(0, count, DETECTIONS_A_SLICE):
+            last = min(first + DETECTIONS_A_SLICE, count)
+            cost += linearise_detections(
+                state.pose, place, state.states, self.seen, out.values, out.weights, first, last
+            )
+            yield (last - first) / DETECTIONS_A_SLICE
+        return cost
+
+
+class StartFactor(NamedTuple):
+    """The first pose, held where it is.
+
+    Attributes:
+        mean: (3,) where.
+        information: how firmly, [1/m^2] and [1/rad^2].
+    """
+
+    mean: FloatArray
+    information: float
+
+    @property
+    def ties(self) -> IntArray:
+        """Return (1, 1) the first variable."""
+        return np.zeros((1, 1), dtype=np.int64)
+
+    @property
+    def rows(self) -> IntArray:
+        """Return (1,) 3."""
+        return np.full(1, 3)
+
+    @property
+    def pose(self) -> IntArray:
+        """Return (1,) the first pose."""
+        return np.zeros(1, dtype=np.int64)
+
+    def linearise(self, state: Estimate, out: Room) -> Slices[float]:
+        """Fill in one factor of three rows."""
+        root, first = np.sqrt(self.information), state.pose[0]
+        off = np.array(se2.between(self.mean, first))
+        off[:2] = se2.rotation(-first[2]) @ (first[:2] - self.mean[:2])
+        block = root * np.eye(3, 4)
+        block[:, 3] = -root * off
+        out.values[:] = block.ravel()
+        yield from ()
+        return 0.5 * float(block[:, 3] @ block[:, 3])
+
+
+class PlacePriors(NamedTuple):
+    """What a map says about places, so many of them together in each factor.
+
+    Attributes:
+        ties: (F, k) variables of the places.
+        pose: (F,) the pose that saw each first; -1 of several places.
+        place: (F, k) their rows.
+        root: (F, r, 2 k) square roots of the information.
+        mean: (F, 2 k) prior positions.
+    """
+
+    ties: IntArray
+    pose: IntArray
+    place: IntArray
+    root: FloatArray
+    mean: FloatArray
+
+    @property
+    def rows(self) -> IntArray:
+        """Return (F,) the rank of what is known."""
+        return np.full(len(self.root), self.root.shape[1])
+
+    def linearise(self, state: Estimate, out: Room) -> Slices[float]:
+        """Fill in linear factors."""
+        off = state.landmark[self.place].reshape(self.mean.shape) - self.mean
+        pull = -np.einsum("frk,fk->fr", self.root, off)
+        out.values[:] = np.concatenate([self.root, pull[..., None]], axis=2).ravel()
+        yield from ()
+        return 0.5 * float(np.sum(pull**2))
+
+
+def build_place_priors(problem: Problem, known: BoolArray, places: int) -> tuple[PlacePriors, ...]:
+    """Return what the prior says about `known` landmarks, whose variables begin at `places`.
+
+    Landmarks that it ties to each other are one factor; those of as many landmarks and the same rank are one block.
+    """
+    information = problem.prior_information(known)
+    row: IntArray = np.flatnonzero(known)
+    at, to = information.nonzero()
+    given = np.unique(at // 2)
+    if not len(given):
+        return ()
+    ties = sparse.csr_array((np.ones(len(at)), (at // 2, to // 2)), shape=(len(row), len(row)))
+    _, group = connected_components(ties, directed=False)
+    given = given[np.argsort(group[given], kind="stable")]
+    first_seen = np.full(len(known), -1)
+    first_seen[problem.landmark_row[::-1]] = problem.pose_row[::-1]
+    found: dict[tuple[int, int], list[tuple[IntArray, FloatArray]]] = {}
+    for part in np.split(given, 1 + np.flatnonzero(np.diff(group[given]))):
+        mine = part.astype(np.int64)
+        size, direction = np.linalg.eigh(between_rows(information, se2.xy_rows(mine)).toarray())
+        kept = size > 1e-12 * size[-1]
+        root = np.sqrt(size[kept])[:, None] * direction[:, kept].T
+        found.setdefault((len(mine), len(root)), []).append((mine, root))
+    blocks = []
+    for (width, _), factors in found.items():
+        members = np.array([mine for mine, _ in factors])
+        pose = first_seen[row[members[:, 0]]] if width == 1 else np.full(len(members), -1)
+        root = np.array([own for _, own in factors])
+        mean = problem.landmark_mean[row[members]].reshape(len(members), -1)
+        blocks.append(PlacePriors(places + members, pose, row[members], root, mean))
+    return tuple(blocks)
 
 
 def detection_residuals(problem: Problem, estimate: Estimate) -> FloatArray:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from evermap.estimate.sparse.system import Slices
 from evermap.slam.kernels import (
     N_MOTION,
     N_NOISE,
@@ -22,7 +23,6 @@ from evermap.slam.kernels import (
     odometry_residual,
     residual_by_states,
 )
-from evermap.slam.sparse.system import Slices
 from evermap.types import FloatArray
 
 A_SLICE = 500

@@ -12,12 +12,12 @@ from scipy.sparse.csgraph import connected_components
 
 from evermap.config import OdometryConfig
 from evermap.errors import DataError
+from evermap.estimate.sparse.elimination import Spread
+from evermap.estimate.sparse.system import Factorised, Slices, exhausted
 from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import N_STATES, kernel
 from evermap.slam.preintegration import Intervals, Preintegration
-from evermap.slam.sparse.elimination import Spread
-from evermap.slam.sparse.system import Factorised, Slices, exhausted
 from evermap.types import BoolArray, FloatArray, IntArray, Recording
 
 USUAL = OdometryConfig()

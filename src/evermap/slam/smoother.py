@@ -1,81 +1,45 @@
-"""Batch smoothing: damped Gauss-Newton on the sparse normal equations of poses, places and calibration.
+"""Batch smoothing in the plane: a `Problem` as a graph of poses, places and calibration, and its covariances.
 
-Calibration states, which all measurements share, are the border of the elimination tree; the rest is `slam.sparse`.
+Calibration states, which all measurements share, are the border of the elimination tree; the rest is `estimate`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
-
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
-from evermap.errors import NumericalError
-from evermap.geometry import se2
+from evermap.estimate.gauss_newton import Steps
+from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Structure, build_structure, grouped
+from evermap.estimate.solver import Solver
+from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
 from evermap.slam.calibration import DELAY
-from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES
-from evermap.slam.linearise import DETECTION, ODOMETRY, OF_DETECTION, OF_INTERVAL, Readings, linearise
-from evermap.slam.problem import Estimate, Marginals, Noise, Problem, between_rows
-from evermap.slam.sparse.elimination import curvature
-from evermap.slam.sparse.system import Factorised, Slices, System, exhausted
-from evermap.slam.sparse.tree import MS, Factors, tree_of
+from evermap.slam.kernels import HEAVY_TAIL, N_MOTION, N_SENSOR, N_STATES
+from evermap.slam.linearise import (
+    OF_DETECTION,
+    OF_INTERVAL,
+    DetectionFactors,
+    OdometryFactors,
+    Readings,
+    StartFactor,
+    build_place_priors,
+)
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.types import BoolArray, FloatArray, IntArray
 
 COST_SLACK = 0.5
 """Nats by which the cost may rise in a step: weights change with calibration states and residuals, which is no harm."""
 HELD = 1e-9
 """Information that keeps a landmark whose every sighting is an outlier from going anywhere."""
-POSES_A_SLICE = 500
-"""Poses that are linearised, with their detections, in about a millisecond."""
 STRETCHES = 40
 """Stretches of a recording, which are taken to err independently of each other."""
 LEAST_CHANGE = 1e-3
 """Share of the changes of velocity that is no jitter, at least."""
 POSES_A_LEAF = 8
 """Consecutive poses that are eliminated in one front: fewer make more fronts, more make larger ones."""
+ODOMETRY, DETECTIONS = 0, 1
+"""Blocks of a robot; behind them are the start and what a map says."""
 
 
-@dataclass(frozen=True, slots=True)
-class Linearised:
-    """A problem at some values.
-
-    Attributes:
-        values: Jacobians and right sides of all factors.
-        weights: (M,) inlier probability of every detection.
-        cost: negative log posterior up to a constant.
-        states_right: (11,) pull of the prior of the calibration.
-    """
-
-    values: FloatArray
-    weights: FloatArray
-    cost: float
-    states_right: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class Equations:
-    """The structure of the equations, which is independent of values and noise for the same known landmarks.
-
-    Attributes:
-        known: (L,) landmarks with a position.
-        rank: (L,) their numbers.
-        system: poses, then known landmarks, then sensor and motion states.
-        coordinate: of its leaves.
-        prior_roots: square roots (r, 2 k) of the information of landmarks that the prior ties.
-        prior_rows: (k,) these landmarks.
-    """
-
-    known: BoolArray
-    rank: IntArray
-    system: System
-    coordinate: FloatArray
-    prior_roots: tuple[FloatArray, ...]
-    prior_rows: tuple[IntArray, ...]
-
-
-class Smoother:
+class Smoother(Solver[Estimate]):
     """Optimum and covariances of one `Problem` at given noise.
 
     If `heavy`, outliers have the Cauchy's tails, as while the estimate may still be far off; if `robust`, outliers are
@@ -83,12 +47,12 @@ class Smoother:
     """
 
     def __init__(self, problem: Problem, noise: Noise, *, heavy: bool = False, robust: bool = True) -> None:
+        super().__init__()
         self.problem = problem
         self.noise = noise
         self.heavy = heavy
         self.robust = robust
-        self._structure: Equations | None = None
-        self._last: tuple[Estimate, Linearised] | None = None
+        self._structure: tuple[BoolArray, Structure] | None = None
 
     @property
     def states_sigma(self) -> FloatArray:
@@ -120,43 +84,16 @@ class Smoother:
         It ends after so many iterations, or with a step that moves nothing by `tolerance` (m or rad) or gains less than
         `settled` nats.
         """
-        estimate = start
-        now = yield from self.linearised_in_slices(estimate)
-        damping = 0.0
-        undamped: Factorised | None = None
-        for _ in range(iterations):
-            solved = yield from self._eliminated(estimate, now, damping)
-            step = yield from solved.solution()
-            trial = self._moved(estimate, step)
-            following = yield from self.linearised_in_slices(trial)
-            if damping == 0.0:
-                undamped = solved
-            if np.isfinite(following.cost) and following.cost <= now.cost + COST_SLACK:
-                gain = now.cost - following.cost
-                estimate, now = trial, following
-                if damping > 0.0:
-                    undamped = None
-                if np.abs(step).max() < tolerance or (damping == 0.0 and abs(gain) < settled):
-                    break
-                damping = 0.0 if damping < 1e-6 else damping / 10.0
-            else:
-                damping = max(1e-6, 10.0 * damping)
-                if damping > 1e6:
-                    break
-        if not np.isfinite(now.cost):
-            raise NumericalError("the smoother found no finite optimum", hint="check units and time stamps")
-        self._last = (estimate, now)  # the last trial need not be the best
-        if undamped is None:
-            undamped = yield from self._eliminated(estimate, now, 0.0)
-        return estimate, self._marginals(estimate, undamped)
-
-    def cost(self, estimate: Estimate) -> float:
-        """Return the negative log posterior up to a constant."""
-        return self.linearised(estimate).cost
+        steps = Steps(iterations, tolerance, settled, COST_SLACK)
+        solution = yield from self.minimised_in_slices(start, steps)
+        estimate, solved = solution.state, solution.factorised
+        if solved is None:
+            solved = yield from self.factorised_in_slices(estimate)
+        return estimate, self._marginals(estimate, solved)
 
     def inlier_probability(self, estimate: Estimate) -> FloatArray:
         """Return (M,) probability of every detection to be no outlier, given the estimate."""
-        return self.linearised(estimate).weights
+        return self.linearised(estimate).weights[DETECTIONS]
 
     def marginals(self, estimate: Estimate) -> Marginals:
         """Return covariances of the Gaussian approximation at `estimate`; rows of unknown landmarks are zero.
@@ -168,8 +105,7 @@ class Smoother:
 
     def marginals_in_slices(self, estimate: Estimate) -> Slices[Marginals]:
         """Return what `marginals` does, in slices."""
-        now = yield from self.linearised_in_slices(estimate)
-        solved = yield from self._eliminated(estimate, now, 0.0)
+        solved = yield from self.factorised_in_slices(estimate)
         return self._marginals(estimate, solved)
 
     def _marginals(self, estimate: Estimate, solved: Factorised) -> Marginals:
@@ -185,10 +121,11 @@ class Smoother:
         problem, n = self.problem, len(estimate.pose)
         if not problem.prior.free.any():
             return np.ones(N_STATES)
-        now, structure, with_states = self.linearised(estimate), self._structure_of(estimate), marginals.with_states
+        now, structure, with_states = self.linearised(estimate), self.graph(estimate).structure, marginals.with_states
         pose, states = with_states[: 3 * n].reshape(n, 3, N_STATES), with_states[-N_STATES:]
         place = with_states[3 * n : -N_STATES].reshape(-1, 2, N_STATES)
-        driven, seen = now.values[: ODOMETRY * (n - 1)].reshape(-1, 3, OF_INTERVAL), self.detections(estimate)
+        driven = now.values[structure.values_of(ODOMETRY)].reshape(-1, 3, OF_INTERVAL)
+        seen, rank = self.detections(estimate), np.cumsum(estimate.known) - 1
         of_driven = (
             np.einsum("nra,nas->nrs", driven[..., :3], pose[:-1])
             + np.einsum("nra,nas->nrs", driven[..., 3:6], pose[1:])
@@ -196,7 +133,7 @@ class Smoother:
         )
         of_seen = (
             np.einsum("nra,nas->nrs", seen[..., :3], pose[problem.pose_row])
-            + np.einsum("nra,nas->nrs", seen[..., 3:5], place[structure.rank[problem.landmark_row]])
+            + np.einsum("nra,nas->nrs", seen[..., 3:5], place[rank[problem.landmark_row]])
             + seen[..., 5:-1] @ states[:N_SENSOR]
         )
         stamp = problem.stamp_s - problem.stamp_s[0]
@@ -216,9 +153,8 @@ class Smoother:
 
     def detections(self, estimate: Estimate) -> FloatArray:
         """Return (M, 2, 13) detections, linearised and whitened: by pose, place, sensor states; and the right side."""
-        begin = ODOMETRY * (len(estimate.pose) - 1)
-        values = self.linearised(estimate).values[begin : begin + DETECTION * len(self.problem.pose_row)]
-        return values.reshape(-1, 2, OF_DETECTION)
+        where = self.graph(estimate).structure.values_of(DETECTIONS)
+        return self.linearised(estimate).values[where].reshape(-1, 2, OF_DETECTION)
 
     def information(self, estimate: Estimate, poses: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the information on some poses, the known landmarks and the states, with all other poses marginalised.
@@ -226,165 +162,69 @@ class Smoother:
         Returns:
             (n, n) and (n,), n = 3 poses + 2 known landmarks + 11: information and right side of a step from `estimate`.
         """
-        now, structure = self.linearised(estimate), self._structure_of(estimate)
-        system, n = structure.system, len(estimate.pose)
-        kept = np.concatenate([poses, np.arange(n, len(system.tree.dim))])
-        above = System(system.tree.dim, system.factors, structure.coordinate, kept)
-        solved = exhausted(above.factorised(now.values, extra=self._extra(above, n)))
+        now, graph = self.linearised(estimate), self.graph(estimate)
+        structure, tree, n = graph.structure, graph.structure.system.tree, len(estimate.pose)
+        kept = np.concatenate([poses, np.arange(n, len(tree.dim))])
+        above = System(tree.dim, structure.system.factors, structure.coordinate, kept)
+        solved = exhausted(above.factorised(now.values, extra=graph.held))
         information, right = solved.information, solved.right
-        information[-N_STATES:, -N_STATES:] += np.diag(1.0 / self.problem.prior.sigma**2)
-        right[-N_STATES:] += now.states_right
+        information[-N_STATES:, -N_STATES:] += np.diag(graph.border.information)
+        right[-N_STATES:] += now.border_right
         return information, right
 
-    def linearised(self, estimate: Estimate) -> Linearised:
-        """Return the problem linearised at `estimate`; landmarks without position are left out."""
-        return exhausted(self.linearised_in_slices(estimate))
+    def graph_in_slices(self, state: Estimate) -> Slices[Graph[Estimate]]:
+        """Return the problem as a graph: poses, landmarks that have a position, sensor and motion states."""
+        blocks = self.blocks(state.known)
+        if self._structure is None or not np.array_equal(self._structure[0], state.known):
+            structure = yield from build_structure(self._layout(state), blocks)
+            self._structure = state.known, structure
+        structure = self._structure[1]
+        held = np.zeros(structure.system.tree.begin[-1])
+        held[3 * len(state.pose) : -N_STATES] = HELD
+        return Graph(blocks, structure, Border(1.0 / self.states_sigma**2, self.off_mean), held, retract)
 
-    def linearised_in_slices(self, estimate: Estimate) -> Slices[Linearised]:
-        """Return what `linearised` does, in slices."""
-        if self._last is not None and self._last[0] is estimate:
-            return self._last[1]
-        problem, noise, structure = self.problem, self.noise, (yield from self._structured(estimate))
-        values, weights = np.zeros(structure.system.tree.value_first[-1]), np.zeros(len(problem.pose_row))
-        driven = yield from problem.drive.in_slices(problem.stamp_s, estimate.states)
-        place, variance, cost = estimate.landmark[structure.known], noise.odometry**2, 0.0
+    def blocks(self, known: BoolArray) -> tuple[FactorBlock[Estimate], ...]:
+        """Return the factors: `ODOMETRY`, `DETECTIONS`, the start, and priors of the `known` (L,) landmarks."""
+        problem, noise, n = self.problem, self.noise, len(self.problem.stamp_s)
+        rank, sensor = np.cumsum(known) - 1, n + int(known.sum())
         seen = Readings(
             problem.pose_row,
-            structure.rank[problem.landmark_row],
+            rank[problem.landmark_row],
             problem.reading,
             noise.of_detections(problem.sigma_given),
             problem.mount,
             problem.prior.free,
             noise.outlier_log_odds if self.robust else np.inf,
-            self.heavy and self.robust,
+            HEAVY_TAIL if self.heavy and self.robust else 0.0,
         )
-        bounds = [*range(0, len(estimate.pose), POSES_A_SLICE), len(estimate.pose)]
-        rows = np.searchsorted(problem.pose_row, bounds).tolist()
-        for (begin, end), (first, last) in zip(pairwise(bounds), pairwise(rows), strict=True):
-            cost += linearise(
-                estimate.pose, place, estimate.states, driven, variance, seen, values, weights,
-                begin, min(end, len(estimate.pose) - 1), first, last,
-            )  # fmt: skip
-            yield (end - begin) / POSES_A_SLICE
-        at = ODOMETRY * (len(estimate.pose) - 1) + DETECTION * len(problem.pose_row)
-        held = np.sqrt(problem.start_information) * np.eye(3, 4)
-        off = np.array(se2.between(problem.start_pose, estimate.pose[0]))
-        off[:2] = se2.rotation(-estimate.pose[0, 2]) @ (estimate.pose[0, :2] - problem.start_pose[:2])
-        held[:, 3] = -np.sqrt(problem.start_information) * off
-        values[at : at + 12] = held.ravel()
-        at += 12
-        cost += 0.5 * float(held[:, 3] @ held[:, 3])
-        for rows, root in zip(structure.prior_rows, structure.prior_roots, strict=True):
-            pull = -root @ (estimate.landmark[rows] - problem.landmark_mean[rows]).ravel()
-            values[at : at + root.size + len(root)] = np.column_stack([root, pull]).ravel()
-            at += root.size + len(root)
-            cost += 0.5 * float(pull @ pull)
-        off_mean = estimate.states - problem.prior.mean
-        states_right = -off_mean / problem.prior.sigma**2
-        cost -= 0.5 * float(off_mean @ states_right)
-        now = Linearised(values, weights, float(cost), states_right)
-        self._last = (estimate, now)
-        return now
-
-    def _eliminated(self, estimate: Estimate, now: Linearised, damping: float) -> Slices[Factorised]:
-        system, n = self._structure_of(estimate).system, len(estimate.pose)
-        extra, states = self._extra(system, n), 1.0 / self.states_sigma**2
-        if damping > 0.0:
-            own = extra + curvature(system.tree, system.factors, now.values)
-            own[-len(states) :] += states
-            extra = extra + damping * own
-        return system.factorised(
-            now.values, extra=extra, border_information=np.diag(states), border_right=now.states_right
+        return (
+            OdometryFactors(problem, noise.odometry**2, sensor + 1),
+            DetectionFactors(seen, known, n, sensor),
+            StartFactor(problem.start_pose, problem.start_information),
+            *build_place_priors(problem, known, n),
         )
 
-    def _extra(self, system: System, n_poses: int) -> FloatArray:
-        extra = np.zeros(system.tree.begin[-1])
-        extra[3 * n_poses : -len(self.states_sigma)] = HELD
-        return extra
+    def off_mean(self, state: Estimate) -> FloatArray:
+        """Return (11,) calibration states less the means of their prior."""
+        return state.states - self.problem.prior.mean
 
-    def _structure_of(self, estimate: Estimate) -> Equations:
-        return exhausted(self._structured(estimate))
-
-    def _structured(self, estimate: Estimate) -> Slices[Equations]:
-        known, kept = estimate.known, self._structure
-        if kept is not None and np.array_equal(kept.known, known):
-            return kept
-        problem, n = self.problem, len(estimate.pose)
-        rank, count = np.cumsum(known) - 1, int(known.sum())
-        sensor, motion = n + count, n + count + 1
-        roots, rows = _roots(problem.prior_information(known), np.flatnonzero(known))
-        place = rank[problem.landmark_row]
-        steps, detections = np.arange(n - 1), np.arange(len(place))
-        tied = [
-            np.column_stack([steps, steps + 1, np.full(n - 1, motion)]),
-            np.column_stack([problem.pose_row, n + place, np.full(len(detections), sensor)]),
-            np.zeros((1, 1), dtype=np.int64),
-            *(n + rank[row][None] for row in rows),
-        ]
-        yield MS * len(place)
-        leaf_of_pose = np.minimum(np.arange(n), max(n - 2, 0)) // POSES_A_LEAF
-        first_seen = np.full(count, -1)
-        first_seen[place[::-1]] = leaf_of_pose[problem.pose_row[::-1]]
-        n_leaves = int(leaf_of_pose[-1]) + 1
-        prior_leaf = []
-        for row in rows:
-            seen = first_seen[rank[row[0]]] if len(row) == 1 else -1
-            prior_leaf.append(seen if seen >= 0 else n_leaves)
-            n_leaves += seen < 0
-        width = [np.full(len(part), part.shape[1]) for part in tied]
-        factors = Factors(
-            np.append(0, np.cumsum(np.concatenate(width))).astype(np.int64),
-            np.concatenate([part.ravel() for part in tied]).astype(np.int64),
-            np.append(np.repeat([3, 2, 3], [n - 1, len(place), 1]), [len(root) for root in roots]).astype(np.int64),
-            np.concatenate([leaf_of_pose[steps], leaf_of_pose[problem.pose_row], [0], prior_leaf]).astype(np.int64),
-        )
-        yield MS * len(place)
+    def _layout(self, state: Estimate) -> Layout:
+        n, count = len(state.pose), int(state.known.sum())
+        leaf = grouped(n, POSES_A_LEAF)
         dim = np.concatenate([np.full(n, 3), np.full(count, 2), [N_SENSOR, N_MOTION]])
-        at = np.zeros((n_leaves, 3))
-        at[:, 0] = np.arange(n_leaves)
-        weight = np.bincount(leaf_of_pose, minlength=n_leaves)
-        for axis in range(2):
-            total = np.bincount(leaf_of_pose, estimate.pose[:, axis], minlength=n_leaves)
-            at[:, 1 + axis] = total / np.maximum(weight, 1)
-        for leaf, row in zip(prior_leaf, rows, strict=True):
-            if weight[leaf] == 0:
-                at[leaf, 0] = 0.5 * n_leaves
-                at[leaf, 1:] = estimate.landmark[row].mean(axis=0)
-        yield MS * n
-        border = np.array([sensor, motion])
-        tree = yield from tree_of(dim, factors, at, border)
-        self._structure = Equations(known, rank, System(dim, factors, at, border, tree), at, roots, rows)
-        return self._structure
-
-    def _moved(self, estimate: Estimate, step: FloatArray) -> Estimate:
-        """The estimate after a step: poses on the right, the rest added."""
-        n = len(estimate.pose)
-        by = step[: 3 * n].reshape(n, 3)
-        c, s = np.cos(estimate.pose[:, 2]), np.sin(estimate.pose[:, 2])
-        pose = estimate.pose.copy()
-        pose[:, 0] += c * by[:, 0] - s * by[:, 1]
-        pose[:, 1] += s * by[:, 0] + c * by[:, 1]
-        pose[:, 2] += by[:, 2]
-        landmark = estimate.landmark.copy()
-        states = len(estimate.states)
-        landmark[estimate.known] += step[3 * n : -states].reshape(-1, 2)
-        return Estimate(pose, landmark, estimate.states + step[-states:])
+        return Layout(dim, n + count + np.arange(2), leaf, np.column_stack([leaf, state.pose[:, :2]]))
 
 
-def _roots(information: sparse.csr_array, rows: IntArray) -> tuple[tuple[FloatArray, ...], tuple[IntArray, ...]]:
-    """Square roots of a joint prior (2 K, 2 K) of landmarks `rows`, one for those that it ties, and these."""
-    at, to = information.nonzero()
-    given = np.unique(at // 2)
-    if not len(given):
-        return (), ()
-    ties = sparse.csr_array((np.ones(len(at)), (at // 2, to // 2)), shape=(len(rows), len(rows)))
-    _, group = connected_components(ties, directed=False)
-    given = given[np.argsort(group[given], kind="stable")]
-    roots, members = [], []
-    for mine in np.split(given, 1 + np.flatnonzero(np.diff(group[given]))):
-        own = se2.xy_rows(mine)
-        size, direction = np.linalg.eigh(between_rows(information, own).toarray())
-        kept = size > 1e-12 * size[-1]
-        roots.append(np.sqrt(size[kept])[:, None] * direction[:, kept].T)
-        members.append(rows[mine])
-    return tuple(roots), tuple(members)
+def retract(state: Estimate, step: FloatArray) -> tuple[Estimate, float]:
+    """Return values after a step, poses on the right, the rest added; and the largest number of it."""
+    n, known = len(state.pose), state.known
+    by = step[: 3 * n].reshape(n, 3)
+    c, s = np.cos(state.pose[:, 2]), np.sin(state.pose[:, 2])
+    pose = state.pose.copy()
+    pose[:, 0] += c * by[:, 0] - s * by[:, 1]
+    pose[:, 1] += s * by[:, 0] + c * by[:, 1]
+    pose[:, 2] += by[:, 2]
+    landmark = state.landmark.copy()
+    states = len(state.states)
+    landmark[known] += step[3 * n : -states].reshape(-1, 2)
+    return Estimate(pose, landmark, state.states + step[-states:]), float(np.abs(step).max())

@@ -17,6 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from evermap.config import SlamConfig
 from evermap.errors import NumericalError
+from evermap.estimate.sparse.system import Slices, exhausted
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior, needed, seated
@@ -26,8 +27,7 @@ from evermap.slam.local_filter import Motion, SessionFilter, grown
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Drive, Estimate, Marginals, Noise, Problem, independent
-from evermap.slam.smoother import COST_SLACK, Smoother
-from evermap.slam.sparse.system import Slices, exhausted
+from evermap.slam.smoother import COST_SLACK, DETECTIONS, Smoother
 from evermap.types import BoolArray, FloatArray, IntArray
 
 USUAL = SlamConfig()
@@ -567,7 +567,7 @@ def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount:
 def _voted(smoother: Smoother, estimate: Estimate, fewest: int) -> Slices[Estimate]:
     """Return what `outvoted` does, by the weights that the detections have there."""
     now = yield from smoother.linearised_in_slices(estimate)
-    return outvoted(smoother.problem, estimate, now.weights, fewest)
+    return outvoted(smoother.problem, estimate, now.weights[DETECTIONS], fewest)
 
 
 def _rejoined(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> Estimate:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from evermap.errors import DataError
+from evermap.estimate.gauss_newton import Steps
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.bridge import bridged
@@ -27,7 +28,6 @@ from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.result import online as told_online
 from evermap.slam.smoother import Smoother
-from evermap.slam.sparse.system import exhausted
 from evermap.slam.streaming import (
     ALIGNED_INFORMATION,
     FINAL_GAIN,
@@ -69,7 +69,7 @@ def solve_together(alone: Mapping[int, Solved]) -> tuple[list[Solved], list[Traj
     joint, estimate, p_needed = _as_needed(joint, estimate)
     joint, estimate, fits = _levelled(members, joint, estimate)
     joint, estimate = _ahead(members[0], joint, estimate)
-    estimate, marginals = exhausted(joint.solved_in_slices(estimate, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN))
+    estimate, marginals = joint.solved(estimate, Steps(tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN))
     outcomes = _divided(members, joint, estimate, marginals, p_needed, fits)
     solved, online = [], []
     frames = ["first_pose", *["first_robot"] * (len(members) - 1)]
@@ -249,8 +249,7 @@ def _levelled(
     for round_ in range(FINAL_ROUNDS):
         first = heavy and round_ == 0
         joint = joint.of([robot.under(robot.noise, heavy=first) for robot in joint.robots], joint.sigma)
-        solved = joint.solved_in_slices(estimate, iterations=STEPS_A_ROUND, tolerance=NEAR_NOISE)
-        estimate, marginals = exhausted(solved)
+        estimate, marginals = joint.solved(estimate, Steps(STEPS_A_ROUND, NEAR_NOISE))
         own, parts = joint.estimates(estimate), joint.parts(estimate, marginals)
         fits = [
             refine_noise(robot.problem, one, part, robot.inlier_probability(one), robot.noise, _start(member))
@@ -291,7 +290,7 @@ def _refined(
 
 def _as_needed(joint: Together, estimate: Estimate) -> tuple[Together, Estimate, list[FloatArray]]:
     """Return the same under priors of the needed calibration states, with their probabilities."""
-    marginals = exhausted(joint.marginals_in_slices(estimate))
+    marginals = joint.marginals(estimate)
     robots, states, p_needed = [], [], []
     parts = zip(joint.robots, joint.estimates(estimate), joint.parts(estimate, marginals), strict=True)
     for robot, own, part in parts:

@@ -8,6 +8,9 @@ import numpy as np
 from scipy import sparse
 
 from evermap.config import ChangesConfig
+from evermap.estimate.sparse.elimination import Elimination, curvature, eliminate_large
+from evermap.estimate.sparse.system import System, exhausted
+from evermap.estimate.sparse.tree import Factors
 from evermap.sensing.visibility import NominalField
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
@@ -16,9 +19,6 @@ from evermap.slam.changes.search import find_changes
 from evermap.slam.noise import START, refine_noise
 from evermap.slam.problem import Drive, Estimate, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.sparse.elimination import Elimination, curvature, eliminate_large
-from evermap.slam.sparse.system import System, exhausted
-from evermap.slam.sparse.tree import Factors
 from evermap.slam.streaming import FIRST_RELINEARISATION, StreamingSlam
 from evermap.types import Sensor
 

@@ -9,6 +9,7 @@ import pytest
 from problems import World, make_world
 
 from evermap.config import Config
+from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import BEFORE
@@ -19,7 +20,6 @@ from evermap.slam.intake import prepare
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Marginals
 from evermap.slam.smoother import Smoother
-from evermap.slam.sparse.system import exhausted
 from evermap.types import UNKNOWN
 from evermap_studies.sim.park import ParkConfig, simulate_park
 

@@ -16,7 +16,6 @@ from evermap.slam.space.linearise import (
     SpatialSightings,
     linearise_odometry,
     linearise_sightings,
-    weighed,
 )
 
 LEVEL = np.array([0.1, 0.05, 0.7, 2.1, 1.3, 0.4])
@@ -150,14 +149,3 @@ def test_jacobians_of_odometry_are_those_of_differences():
                 moved[row] = se3.retract(pose[row], by)
                 ends.append(-at(moved)[:, 13])
             assert block[:, 6 * row + k] == pytest.approx((ends[0] - ends[1]) / (2.0 * STEP), abs=1e-4)
-
-
-@pytest.mark.parametrize("share", [0.0, 1e-4, 0.1])
-@pytest.mark.parametrize("squared", [0.0, 3.0, 20.0, 60.0, 5000.0])
-def test_weights_are_twice_the_slope_of_the_loss(squared, share):
-    log_odds, step = 14.0, 1e-4
-    weight, loss = weighed(squared, log_odds, 6, share, False)
-    mixture = -np.logaddexp(-0.5 * squared, -log_odds - 0.5 * share * squared)
-    assert loss == pytest.approx(mixture, rel=1e-9, abs=1e-9)
-    after, before = (weighed(squared + sign * step, log_odds, 6, share, False)[1] for sign in (1.0, -1.0))
-    assert weight == pytest.approx((after - before) / step, abs=1e-5)

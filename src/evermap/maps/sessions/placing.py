@@ -9,6 +9,7 @@ import numpy as np
 from scipy import sparse
 
 from evermap.config import FitConfig, LivingConfig, OverlayConfig
+from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import consensus, rigid
@@ -21,7 +22,6 @@ from evermap.slam.calibration import FORWARD, SLOPE, CalibrationPrior
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.sparse.system import exhausted
 from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_GAIN, FINAL_TOLERANCE, Outcome, divided, sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
 

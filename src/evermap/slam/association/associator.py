@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.config import AssociationConfig, SlamConfig
+from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment, alike, same_name, seen_together
 from evermap.slam.association.constellation import LoosePart, agreed_pairs, overlays
@@ -29,7 +30,6 @@ from evermap.slam.local_filter import NO_PLACES, LocalFilter, Motion, columns
 from evermap.slam.noise import Extrapolation, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.sparse.system import exhausted
 from evermap.slam.streaming import USUAL, sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 

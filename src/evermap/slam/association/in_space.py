@@ -20,6 +20,7 @@ from scipy.linalg import block_diag
 
 from evermap.config import AssociationConfig, SlamConfig
 from evermap.errors import DataError
+from evermap.estimate.sparse.system import Factorised
 from evermap.geometry import se2, se3
 from evermap.slam.association.assignment import (
     NOBODY,
@@ -51,7 +52,6 @@ from evermap.slam.space.intake import SpatialIntake, prepare_space, without_rang
 from evermap.slam.space.linearise import POINT, POSE
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
-from evermap.slam.sparse.system import Factorised
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
 
 SLIPS = 3

@@ -14,8 +14,9 @@ import numpy as np
 from scipy import sparse
 
 from evermap.config import ChangesConfig
+from evermap.estimate.robust import weigh
 from evermap.geometry import se2
-from evermap.slam.kernels import N_SENSOR, detection_residual, kernel, outlier_loss
+from evermap.slam.kernels import N_SENSOR, detection_residual, kernel
 from evermap.slam.problem import Estimate, Noise, Problem, between_rows, embedded, independent, padded
 from evermap.slam.smoother import Smoother
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -207,4 +208,4 @@ def _losses(
     for m in range(len(reading)):
         detection_residual(pose[m], place[m], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
         squared = (e[0] / sigma[m, 0]) ** 2 + (e[1] / sigma[m, 1]) ** 2
-        out[m] = outlier_loss(squared, log_odds, False)
+        out[m] = weigh(squared, log_odds, 0.0, 0.0)[1]

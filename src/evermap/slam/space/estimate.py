@@ -11,7 +11,7 @@ from evermap.slam.space.linearise import (
     ACROSS,
     ALONG,
     CORNERS,
-    ODOMETRY,
+    OF_STEP,
     ORIENTATION,
     PIXEL,
     POSE,
@@ -73,7 +73,7 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
     trace = _traces(smoother, spread.of_factors, spread.of_factors_first)
     levels, before, start = noise.levels.copy(), noise.levels, begun.levels
     # odometry: its whitened residuals are in the right sides of its rows, with the root of their weights
-    block = now.values[: ODOMETRY * n_steps].reshape(n_steps, 6, 14)
+    block = now.values[: 6 * OF_STEP * n_steps].reshape(n_steps, 6, OF_STEP)
     weight = now.odometry_weight
     if problem.driven and not problem.steady:  # how fast a robot may move is no noise that shows in how it did
         for level, rows in ((TRANSLATION, slice(0, 3)), (ROTATION, slice(3, 6))):

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.calibration import OF_SCALE
 from evermap.slam.space.intake import SpatialIntake, most_of
@@ -17,7 +18,6 @@ from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PI
 from evermap.slam.space.problem import SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear
 from evermap.slam.space.solve import SpatialSolved
-from evermap.slam.sparse.elimination import Spread
 from evermap.types import (
     BoolArray,
     ChangeKind,

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from evermap.estimate.robust import weigh
 from evermap.slam.kernels import (
+    HEAVY_TAIL,
     N_SENSOR,
     detection_residual,
-    inlier_weight,
     integrate_odometry,
     kernel,
     odometry_residual,
@@ -71,7 +72,7 @@ def whitened_detections(
     for m in range(len(reading)):
         detection_residual(pose, points[column[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
         squared = (e[0] / sigma[m, 0]) ** 2 + (e[1] / sigma[m, 1]) ** 2
-        root = np.sqrt(inlier_weight(squared, 0.0, True)) if heavy else 1.0
+        root = np.sqrt(weigh(squared, 0.0, HEAVY_TAIL, 0.0)[0]) if heavy else 1.0
         for k in range(2):
             row = 2 * m + k
             scale = root / sigma[m, k]

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evermap.errors import DataError, NumericalError
-from evermap.slam.sparse import system as sparse_system
-from evermap.slam.sparse.system import Factorised, System, exhausted
-from evermap.slam.sparse.tree import Factors
+from evermap.estimate.sparse import system as sparse_system
+from evermap.estimate.sparse.system import Factorised, System, exhausted
+from evermap.estimate.sparse.tree import Factors
 
 PLANE, SPACE = (3, 2, 9), (6, 3, 12)
 """Numbers of a pose, of a place, and of the calibration."""

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from groups import SPACE_CASE
 
+from evermap.estimate.sparse.system import System, exhausted
+from evermap.estimate.sparse.tree import Factors
 from evermap.geometry import se3
 from evermap.slam.kernels3d import odometry_residual, point_residual
-from evermap.slam.sparse.system import System, exhausted
-from evermap.slam.sparse.tree import Factors
 
 N, K = 16, 6
 """Poses on a loop, and points."""

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
 from evermap.compiled import kept
-from evermap.slam.sparse.tree import Factors, Tree
+from evermap.estimate.sparse.tree import Factors, Tree
 from evermap.types import FloatArray, IntArray
 
 TINY = 1e-12

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 
 from evermap.errors import DataError, NumericalError
-from evermap.slam.sparse.elimination import (
+from evermap.estimate.sparse.elimination import (
     Elimination,
     Spread,
     back_substitute,
@@ -25,7 +25,7 @@ from evermap.slam.sparse.elimination import (
     spread_room,
     ways_to_border,
 )
-from evermap.slam.sparse.tree import Factors, Tree, tree_of
+from evermap.estimate.sparse.tree import Factors, Tree, tree_of
 from evermap.types import FloatArray, IntArray
 
 _Result = TypeVar("_Result")
