@@ -507,6 +507,29 @@ class _ShownRecording(Shown):
 
 
 @dataclass(frozen=True, slots=True)
+class Measurements(Shown):
+    """Measurements of one kind beside odometry and detections, one row each.
+
+    Attributes:
+        kind: its name, one of `evermap.estimate.measurements`, such as 'gnss'.
+        stamp_s: (K,) instants.
+        columns: (K,) numbers by the names of that kind's columns; nan where a row does not measure one.
+        landmark_id: (K,) what was measured; `UNKNOWN` where the kind is not of a landmark.
+    """
+
+    kind: str
+    stamp_s: FloatArray
+    columns: Mapping[str, FloatArray]
+    landmark_id: IntArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+    def _facts(self) -> dict[str, Any]:
+        return {"kind": self.kind, "rows": len(self), **span(self.stamp_s)}
+
+
+@dataclass(frozen=True, slots=True)
 class Recording(_ShownRecording):
     """One robot's session: what a reader returns and the pipeline consumes.
 
@@ -521,6 +544,7 @@ class Recording(_ShownRecording):
         source: where it was read from.
         landmark_names: texts behind the ids of landmarks that were given as such (`landmark_id_of`).
         robot: whose session it is; '' where nobody said. A map keeps it with the revision, not with what was measured.
+        measurements: of other kinds, each kind once.
     """
 
     name: str
@@ -538,6 +562,7 @@ class Recording(_ShownRecording):
     clock: Clock = Clock.RECORDING
     landmark_names: Mapping[int, str] = field(default_factory=dict)
     robot: str = ""
+    measurements: tuple[Measurements, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -681,6 +706,7 @@ class SpatialRecording(_ShownRecording):
     landmark_names: Mapping[int, str] = field(default_factory=dict)
     symmetries: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     robot: str = ""
+    measurements: tuple[Measurements, ...] = ()
 
     @property
     def robot_sightings(self) -> None:

@@ -35,10 +35,11 @@ def from_plane(pose: ArrayLike) -> FloatArray:
 
 
 def from_angles(roll_pitch_yaw: ArrayLike) -> FloatArray:
-    """Return the pose (7,) at the origin rotated about the fixed axes x, then y, then z [rad]."""
-    pose = identity()
+    """Return poses (..., 7) at the origin rotated about the fixed axes x, then y, then z by angles (..., 3) [rad]."""
+    angle = np.asarray(roll_pitch_yaw, dtype=np.float64)
+    pose = identity(*angle.shape[:-1])
     for axis in (2, 1, 0):
-        pose = compose(pose, exp(np.eye(6)[3 + axis] * np.asarray(roll_pitch_yaw)[axis]))
+        pose = compose(pose, exp(np.eye(6)[3 + axis] * angle[..., axis, None]))
     return pose
 
 

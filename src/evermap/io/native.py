@@ -14,6 +14,7 @@ from evermap.geometry import se2
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal, wrap_far
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, survey_of
+from evermap.io.measurements import measurement_names, read_measurements
 from evermap.io.native_space import in_space, spatial_recording, truth_of
 from evermap.io.rig_toml import CAMERA_FILE, SENSOR_FILE, read_rig
 from evermap.io.sensor_toml import Settings, parse_sensor_toml
@@ -62,7 +63,7 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
         raise InputError(problem, path=path, hint="omit the robot")
     warnings: list[str] = []
     _warn_of_similar_names(files, warnings)
-    tables = {name: _read_table(files, name, warnings) for name in TABLES}
+    tables = {name: _read_table(files, name, warnings) for name in (*TABLES, *measurement_names())}
     seen = _needed("detections", tables, files)
     if in_space(tables, files):
         rig = read_rig(files, warnings)
@@ -94,6 +95,7 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
         clock=clock,
         robot=settings.robot,
         landmark_names=names,
+        measurements=read_measurements(tables, names),
     )
     return finish_recording(recording, warnings=warnings)
 
@@ -224,7 +226,10 @@ def _objects(table: Table | None, names: dict[int, str]) -> IntArray:
 
 def _warn_of_similar_names(files: FileSet, warnings: list[str]) -> None:
     """A misspelt optional file would be missed in silence."""
-    known = [f"{name}{ending}" for name in TABLES for ending in ENDINGS] + [SENSOR_FILE, CAMERA_FILE]
+    known = [f"{name}{ending}" for name in (*TABLES, *measurement_names()) for ending in ENDINGS] + [
+        SENSOR_FILE,
+        CAMERA_FILE,
+    ]
     for name in files.members:
         meant = similar(name, known, cutoff=0.85)
         if name not in known and meant:

@@ -14,6 +14,7 @@ from evermap.geometry.camera import unproject
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal
 from evermap.io.files import FileSet
 from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, survey_of
+from evermap.io.measurements import read_measurements
 from evermap.io.rig_toml import CAMERA_FILE, Rig
 from evermap.io.spatial import (
     AT,
@@ -119,6 +120,7 @@ def spatial_recording(
         robot=settings.robot,
         landmark_names=names,
         symmetries=rig.symmetries,
+        measurements=read_measurements(tables, names),
     )
     unknown = [name for name in rig.symmetries if name not in class_names]
     if unknown:

@@ -15,6 +15,7 @@ from evermap.errors import ConfigError
 from evermap.geometry import se2
 from evermap.io.files import staged_folder, write_atomic
 from evermap.io.landmarks import labels_of, survey_columns
+from evermap.io.measurements import measurement_columns, measurement_names
 from evermap.io.native_space import CORNERS, VARIANCES
 from evermap.io.rig_toml import SENSOR_FILE, rig_toml
 from evermap.io.sensor_toml import Settings, sensor_toml
@@ -85,7 +86,9 @@ def write_session(recording: Recording | SpatialRecording, file: str | Path) -> 
         for name, text in texts.items():
             archive.writestr(zipfile.ZipInfo(name), text)
         for name, columns in tables.items():
-            archive.writestr(zipfile.ZipInfo(f"{name}.parquet"), parquet_bytes(_single(columns)))
+            # fixes are far from an origin: single precision would be decimetres
+            some = columns if name in measurement_names() else _single(columns)
+            archive.writestr(zipfile.ZipInfo(f"{name}.parquet"), parquet_bytes(some))
     return write_atomic(file, buffer.getvalue())
 
 
@@ -168,6 +171,10 @@ def native_tables(recording: Recording | SpatialRecording) -> dict[str, dict[str
     if isinstance(recording, Recording) and len(recording.objects):
         landmark_id = _called(recording.objects[:, 0], called)
         tables["objects"] = {"landmark_id": landmark_id, "object_id": recording.objects[:, 1]}
+    for table in recording.measurements:
+        columns = measurement_columns(table)
+        place = {"landmark_id": _called(table.landmark_id, called)} if "landmark_id" in columns else {}
+        tables[table.kind] = _given({**columns, **place})
     return tables
 
 

@@ -26,6 +26,7 @@ _FRAME_MEANING = {
     "first_pose": "the robot's first pose: origin at its position, {axes}; metres",
     "first_robot": "the first robot's first pose: origin at its position, {axes}; metres",
     "prior_map": "the frame of the given map; metres",
+    "gnss": "the frame of the GNSS fixes; metres",
     "truth": "the frame of the recording's own reference; metres",
 }
 _AXES = {3: "x ahead of it, y to its left", 7: "axes as at that pose"}

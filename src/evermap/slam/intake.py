@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy import sparse
 
 from evermap.config import OdometryConfig, SlamConfig
 from evermap.errors import DataError
+from evermap.estimate.tie import tie_measurements
+from evermap.geometry import se3
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.noise import start_noise
 from evermap.slam.problem import USUAL, Drive, Noise, Problem
 from evermap.slam.streaming import PriorMap
-from evermap.types import UNKNOWN, IntArray, Landmarks, Recording, Sensor
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Landmarks, Recording, Sensor
 from evermap.valid import WITHOUT_IDS
 
 FIRST_POSE_INFORMATION = 1e8
@@ -76,18 +79,24 @@ def prepare(
     if outside.any():
         warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
     used = np.flatnonzero(~anonymous & ~outside)
-    pose_frame, pose_row = np.unique(detections.frame[used], return_inverse=True)
-    if len(pose_frame) < 2:
-        seen = f"landmarks of known identity were seen in {len(pose_frame)} frames, at least 2 needed"
+    seen_in = np.unique(detections.frame[used])
+    if len(seen_in) < 2:
+        seen = f"landmarks of known identity were seen in {len(seen_in)} frames, at least 2 needed"
         hint = "check landmark ids, and that detections and odometry share one clock"
         raise DataError(f"{recording.name}: {seen}", hint=WITHOUT_IDS if anonymous.all() else hint)
-    landmark_id, landmark_row = np.unique(detections.landmark_id[used], return_inverse=True)
+    pose_frame = _frames_with_pose(recording, seen_in, moving)
+    measured_id = [table.landmark_id[table.landmark_id != UNKNOWN] for table in recording.measurements]
+    landmark_id = np.unique(np.concatenate([detections.landmark_id[used], *measured_id]))
     start_s = float(odometry_s[0])
+    tied, left_out = tie_measurements(
+        recording.measurements, stamps[pose_frame], partial(_driven, drive, start_s), landmark_id
+    )
+    warnings.extend(left_out)
     problem = Problem(
         stamp_s=stamps[pose_frame] - start_s,
         drive=drive,
-        pose_row=pose_row.astype(np.int64),
-        landmark_row=landmark_row.astype(np.int64),
+        pose_row=np.searchsorted(pose_frame, detections.frame[used]),
+        landmark_row=np.searchsorted(landmark_id, detections.landmark_id[used]),
         reading=np.column_stack([detections.range_m[used], detections.bearing_rad[used]]),
         sigma_given=np.column_stack([detections.sigma_range_m[used], detections.sigma_bearing_rad[used]]),
         mount=np.array(recording.sensor.mount_robot_sensor, dtype=np.float64),
@@ -96,9 +105,28 @@ def prepare(
         start_information=FIRST_POSE_INFORMATION,
         landmark_mean=np.zeros((len(landmark_id), 2)),
         landmark_information=sparse.csr_array((2 * len(landmark_id), 2 * len(landmark_id))),
+        measurements=tied,
     )
     in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
     return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings))
+
+
+def _frames_with_pose(recording: Recording, seen_in: IntArray, moving: BoolArray) -> IntArray:
+    """Return rows of the frames that get a pose: those `seen_in`, and the last before each other measurement."""
+    stamps, instants = recording.frames.stamp_s, [np.zeros(0)]
+    for table in recording.measurements:
+        instants += [table.stamp_s, table.columns.get("to_stamp_s", table.stamp_s)]
+    before = np.searchsorted(stamps, np.concatenate(instants), side="right") - 1
+    return np.union1d(seen_in, before[(before >= 0) & moving[before]])
+
+
+def _driven(drive: Drive, start_s: float, from_s: FloatArray, to_s: FloatArray) -> FloatArray:
+    """Return (K, 7) motions by the odometry between instants (K,), as it was reported."""
+    states, found = CalibrationPrior.from_settings(calibrated=False).mean, se3.identity(len(from_s))
+    for k, (begin, end) in enumerate(zip(from_s - start_s, to_s - start_s, strict=True)):
+        if end > begin:
+            found[k] = se3.from_plane(drive.between(np.array([begin, end]), states).increment[0])
+    return found
 
 
 def beliefs(sensor: Sensor, settings: SlamConfig) -> tuple[CalibrationPrior, Noise]:

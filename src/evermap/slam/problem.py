@@ -12,9 +12,10 @@ from scipy.sparse.csgraph import connected_components
 
 from evermap.config import OdometryConfig
 from evermap.errors import DataError
+from evermap.estimate.measurement import Tied
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, Slices, exhausted
-from evermap.geometry import se2
+from evermap.geometry import se2, se3
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import N_STATES, kernel
 from evermap.slam.preintegration import Intervals, Preintegration
@@ -178,6 +179,7 @@ class Problem:
         landmark_information: (2 L, 2 L) sparse inverse of their joint prior covariance, empty where there is none.
             Blocks off the diagonal tie landmarks to each other, for example those that may have moved together. A dense
             array is taken, too.
+        measurements: of other kinds than odometry and detections; what they say about height and tilt has no effect.
     """
 
     stamp_s: FloatArray
@@ -192,6 +194,7 @@ class Problem:
     start_information: float
     landmark_mean: FloatArray
     landmark_information: sparse.csr_array
+    measurements: tuple[Tied, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "landmark_information", sparse.csr_array(self.landmark_information))
@@ -262,7 +265,8 @@ class Problem:
         With `last_is_blind`, before the detections of the last of them.
         """
         stop = int(np.searchsorted(self.pose_row, n_poses - last_is_blind))
-        return replace(self.seeing(slice(stop)), stamp_s=self.stamp_s[:n_poses])
+        measurements = tuple(tied.until(n_poses) for tied in self.measurements)
+        return replace(self.seeing(slice(stop)), stamp_s=self.stamp_s[:n_poses], measurements=measurements)
 
     def seeing(self, rows: IntArray | BoolArray | slice) -> Problem:
         """Return the problem with some of its detections only."""
@@ -320,6 +324,26 @@ class Estimate:
     def known(self) -> BoolArray:
         """(L,) landmarks that have a position."""
         return np.asarray(np.isfinite(self.landmark[:, 0]))
+
+
+class PlanarView:
+    """The variables of a problem in the plane, as measurements see them: on the floor, which is level."""
+
+    def poses(self, state: Estimate) -> FloatArray:
+        """Return (N, 7) poses."""
+        return se3.from_plane(state.pose)
+
+    def places(self, state: Estimate) -> FloatArray:
+        """Return (L, 3) positions of landmarks."""
+        return np.column_stack([state.landmark, np.zeros(len(state.landmark))])
+
+    def by_pose(self, by_twist: FloatArray) -> FloatArray:
+        """Return derivatives (K, r, 3) by steps forward and left, and by turns."""
+        return by_twist[..., [0, 1, 5]]
+
+    def by_place(self, state: Estimate, place: IntArray, by_position: FloatArray) -> list[FloatArray]:  # noqa: ARG002
+        """Return derivatives (r, 2) by positions on the floor."""
+        return list(by_position[..., :2])
 
 
 @dataclass(frozen=True, slots=True)

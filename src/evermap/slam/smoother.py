@@ -9,6 +9,7 @@ import numpy as np
 
 from evermap.estimate.gauss_newton import Steps
 from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Structure, build_structure, grouped
+from evermap.estimate.measurement import MeasurementFactors, Tied
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
 from evermap.slam.calibration import DELAY
@@ -22,7 +23,7 @@ from evermap.slam.linearise import (
     StartFactor,
     build_place_priors,
 )
-from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.slam.problem import Estimate, Marginals, Noise, PlanarView, Problem
 from evermap.types import BoolArray, FloatArray, IntArray
 
 COST_SLACK = 0.5
@@ -202,7 +203,17 @@ class Smoother(Solver[Estimate]):
             DetectionFactors(seen, known, n, sensor),
             StartFactor(problem.start_pose, problem.start_information),
             *build_place_priors(problem, known, n),
+            *(self._measured(tied, known, n + rank) for tied in problem.measurements),
         )
+
+    def _measured(self, tied: Tied, known: BoolArray, variable: IntArray) -> MeasurementFactors[Estimate]:
+        """Return measurements of known landmarks, and all others; of landmarks (L,) the variables."""
+        other = tied.other.reshape(len(tied.row), -1)
+        if tied.kind.ties == "pose_place":
+            tied = tied[known[tied.other]]
+            other = variable[tied.other][:, None]
+        log_odds = self.noise.outlier_log_odds if self.robust else np.inf
+        return MeasurementFactors(tied, PlanarView(), other, log_odds, self.heavy and self.robust)
 
     def off_mean(self, state: Estimate) -> FloatArray:
         """Return (11,) calibration states less the means of their prior."""

@@ -252,6 +252,7 @@ def _piece(
         start_information=0.0,
         landmark_mean=np.zeros((count, 2)),
         landmark_information=sparse.csr_array((2 * count, 2 * count)),
+        measurements=tuple(tied.among(start, last) for tied in problem.measurements if tied.kind.ties != "pose_place"),
     )
     sighted = sighted_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
     position = middles(part.landmark_row, sighted, count)  # of the landmarks by the poses of this window alone

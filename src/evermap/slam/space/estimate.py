@@ -171,4 +171,8 @@ def first_places(problem: SpatialProblem, pose: FloatArray) -> SpatialEstimate:
         away = np.linalg.norm(at[mine, :3] - np.median(at[mine, :3], axis=0), axis=1)
         place[row] = at[mine[int(np.argmin(away))]]
     place[~problem.oriented, 3:] = se3.NO_TURN
+    unseen = np.setdiff1d(np.arange(len(place)), problem.place)
+    for tied in problem.measurements:
+        for row, at in tied.locate(pose, unseen).items():
+            place[row, :3] = at
     return replace(estimate, place=place)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from evermap.config import SpaceConfig
 from evermap.errors import DataError
+from evermap.estimate.tie import tie_measurements
 from evermap.geometry import se3
 from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
@@ -21,6 +23,7 @@ from evermap.types import (
     BoolArray,
     FloatArray,
     IntArray,
+    SpatialOdometry,
     SpatialRecording,
     SpatialSensor,
     rows_of,
@@ -78,13 +81,19 @@ def prepare_space(
     if len(seen_in) < fewest:
         raise _too_little(recording, len(seen_in), fewest)
     pose_frame, used = seen_in if recording.odometry is None else np.flatnonzero(moving), np.flatnonzero(usable)
-    landmark_id, place = np.unique(detections.landmark_id[used], return_inverse=True)
+    measured_id = [table.landmark_id[table.landmark_id != UNKNOWN] for table in recording.measurements]
+    landmark_id = np.unique(np.concatenate([detections.landmark_id[used], *measured_id]))
+    place = np.searchsorted(landmark_id, detections.landmark_id[used])
     some = rows_of(where, used)
-    symmetries = _symmetries(recording, place, used, some.kind)
+    symmetries = _symmetries(recording, place, used, some.kind, len(landmark_id))
     oriented = np.bincount(place, some.kind != POINT, minlength=len(landmark_id)) > 0.0
     driven, by_corners = recording.odometry is not None, 2 * np.count_nonzero(some.kind == CORNERS) > len(some.kind)
     driven_pose, increment = _driven(recording, stamps[pose_frame])
     scale = scale_between(recording.sensors, settings, settings.scale_sigma if by_corners else 0.0)
+    tied, left_out = tie_measurements(
+        recording.measurements, stamps[pose_frame], partial(_moved, recording.odometry), landmark_id
+    )
+    warnings.extend(left_out)
     problem = SpatialProblem(
         stamp_s=stamps[pose_frame] - stamps[pose_frame[0]],
         increment=increment,
@@ -112,12 +121,23 @@ def prepare_space(
         scale_sigma=scale[0] if driven else 0.0,
         ranges_share=scale[1],
         path=_path(recording, stamps[pose_frame[0]], settings.delay_sigma_s),
+        measurements=tied,
+        start_sigma=np.max([[1e-4] * 6, *(of.kind.first_sigma for of in tied)], axis=0),
         settings=settings,
     )
     return SpatialIntake(
         problem, float(stamps[pose_frame[0]]), pose_frame, used, landmark_id, driven_pose, tuple(warnings),
-        recording.landmark_names, np.bincount(place, np.isfinite(detections.size_m[used]).all(axis=1)) > 0.0,
+        recording.landmark_names,
+        np.bincount(place, np.isfinite(detections.size_m[used]).all(axis=1), len(landmark_id)) > 0.0,
     )  # fmt: skip
+
+
+def _moved(odometry: SpatialOdometry | None, from_s: FloatArray, to_s: FloatArray) -> FloatArray:
+    """Return (K, 7) motions by the odometry between instants (K,); none without odometry."""
+    if odometry is None:
+        return se3.identity(len(from_s))
+    then, now = (se3.interpolate(odometry.stamp_s, odometry.pose_world_robot, at_s) for at_s in (from_s, to_s))
+    return se3.between(then, now)
 
 
 def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
@@ -130,12 +150,11 @@ def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
     return found
 
 
-def _symmetries(recording: SpatialRecording, place: IntArray, used: IntArray, kind: IntArray) -> Symmetries:
-    """Return the symmetries of places by their classes; none for tags, which have a pattern.
+def _symmetries(recording: SpatialRecording, place: IntArray, used: IntArray, kind: IntArray, count: int) -> Symmetries:
+    """Return the symmetries of so many places by their classes; none for tags, which have a pattern.
 
     What has no orientation becomes a point: `kind` (M,) is written to.
     """
-    count = int(place.max(initial=-1)) + 1
     class_id = most_of(place, recording.detections.class_id[used], count)
     names = dict(enumerate(recording.class_names))
     try:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.config import SpaceConfig
+from evermap.estimate.measurement import Tied
 from evermap.geometry import se3
 from evermap.geometry.symmetry import Symmetries
 from evermap.slam.space.linearise import POINT, POSE, ROWS, SpatialSightings
@@ -114,6 +115,7 @@ class SpatialProblem:
         prior: on places.
         start_sigma: (6,) how firmly the first pose is held where it is.
         path: the odometry, in the time of the poses, from which delays are estimated; None without.
+        measurements: of other kinds than odometry and detections.
         settings: what is believed of sensors and of a map.
     """
 
@@ -148,6 +150,7 @@ class SpatialProblem:
     odometry_log: float = 0.0
     start_sigma: FloatArray = field(default_factory=lambda: np.full(6, 1e-4))
     path: OdometryPath | None = None
+    measurements: tuple[Tied, ...] = ()
     settings: SpaceConfig = USUAL
 
     def earlier(self) -> FloatArray:
@@ -262,3 +265,30 @@ class SpatialEstimate:
         back = problem.earlier()[problem.sensor, problem.pose_row]
         pose = self.pose[problem.pose_row]
         return se3.retract(pose, back) if back.any() else pose, back
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialView:
+    """The variables of a problem in space, as measurements see them; `oriented` (P,) are places with an orientation."""
+
+    oriented: BoolArray
+
+    def poses(self, state: SpatialEstimate) -> FloatArray:
+        """Return (N, 7) poses."""
+        return state.pose
+
+    def places(self, state: SpatialEstimate) -> FloatArray:
+        """Return (P, 3) positions of places."""
+        return state.place[:, :3]
+
+    def by_pose(self, by_twist: FloatArray) -> FloatArray:
+        """Return (K, r, 6) the same: a step of a pose is a twist."""
+        return by_twist
+
+    def by_place(self, state: SpatialEstimate, place: IntArray, by_position: FloatArray) -> list[FloatArray]:
+        """Return derivatives (r, 3) by points, (r, 6) by twists of places with an orientation."""
+        turned = by_position @ se3.rotation_of(state.place[place])
+        return [
+            np.hstack([own, np.zeros_like(own)]) if self.oriented[row] else by_position[k]
+            for k, (row, own) in enumerate(zip(place, turned, strict=True))
+        ]

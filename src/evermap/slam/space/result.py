@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from evermap.estimate.measurement import frame_of
 from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.calibration import OF_SCALE
@@ -67,7 +68,7 @@ class _Told:
 def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solved: SpatialSolved) -> SlamResult:
     """Return trajectory and map, and differences to a given map."""
     optimum, problem = solved.optimum, solved.optimum.smoother.problem
-    frame = "prior_map" if len(problem.prior.place) else "first_pose"
+    frame = "prior_map" if len(problem.prior.place) else frame_of(problem.measurements)
     found, placed = located(problem, optimum.now)
     spread = optimum.smoother.spread(optimum.now)
     told = _Told(recording, intake, solved, problem, spread, frame, intake.start_s + problem.stamp_s, placed)
@@ -164,6 +165,8 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
     count, n = len(place), len(problem.stamp_s)
     used = optimum.now.weight > problem.settings.inlier
     hits = np.bincount(problem.place[used], minlength=count)
+    for tied in (tied for tied in problem.measurements if tied.kind.ties == "pose_place"):
+        hits += np.bincount(tied.other, minlength=count)
     covariance, turned = np.zeros((count, 3, 3)), np.full((count, 3, 3), np.nan)
     for k in range(count):
         dim, at = (6 if problem.oriented[k] else 3), told.spread.own_first[n + k]
@@ -178,6 +181,9 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
     stamp_s = told.stamp_s[problem.pose_row]
     np.fmin.at(first, problem.place[used], stamp_s[used])
     np.fmax.at(last, problem.place[used], stamp_s[used])
+    for tied in (tied for tied in problem.measurements if tied.kind.ties == "pose_place"):
+        np.fmin.at(first, tied.other, told.stamp_s[tied.row])
+        np.fmax.at(last, tied.other, told.stamp_s[tied.row])
     order = np.argsort(identities, kind="stable")
     order = order[(hits[order] > 0) & told.placed[order]]
     oriented = bool(problem.oriented.any())
@@ -251,7 +257,7 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
 def _undivided(told: _Told) -> float:
     """Return the standard deviation of all lengths that remains where only ranges and odometer say what a metre is."""
     problem, before = told.problem, told.intake.problem.scale_sigma
-    share = 0.0 if len(problem.prior.place) else problem.ranges_share
+    share = 0.0 if len(problem.prior.place) or problem.measurements else problem.ranges_share
     return float(before * np.sqrt(share * (1.0 - share)))
 
 

@@ -11,12 +11,14 @@ import numpy as np
 
 from evermap.estimate.gauss_newton import Steps, minimised
 from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, build_structure, grouped
+from evermap.estimate.measurement import MeasurementFactors, Tied
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.geometry import se3
 from evermap.slam.space.drift import STRETCHES
 from evermap.slam.space.linearise import (
     OF_STEP,
+    POINT,
     ROWS,
     STATES,
     MapFactors,
@@ -24,7 +26,7 @@ from evermap.slam.space.linearise import (
     SpatialOdometryFactors,
     StartFactor,
 )
-from evermap.slam.space.problem import NO_JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.problem import NO_JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem, SpatialView
 from evermap.types import FloatArray
 
 POSES_A_LEAF = 4
@@ -199,7 +201,15 @@ class SpatialSmoother:
             SightingFactors(problem, self._seen, self._back, noise.levels, heavy, n, sensor),
             StartFactor(self._start, problem.start_sigma),
             MapFactors(problem, n + prior, first_seen[prior]),
+            *(self._measured(tied, heavy) for tied in problem.measurements),
         )
+
+    def _measured(self, tied: Tied, heavy: bool) -> MeasurementFactors[SpatialEstimate]:
+        problem, other = self.problem, tied.other.reshape(len(tied.row), -1)
+        if tied.kind.ties == "pose_place":
+            other = len(problem.stamp_s) + other
+        log_odds = problem.settings.outlier_log_odds[POINT]
+        return MeasurementFactors(tied, SpatialView(problem.oriented), other, log_odds, heavy)
 
     def _retract(self, estimate: SpatialEstimate, step: FloatArray) -> tuple[SpatialEstimate, float]:
         """The estimate after a step, and how far it went."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evermap.estimate.measurement import Tied
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
@@ -80,6 +81,7 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
         NumericalError: no finite optimum.
     """
     problem, stated = _with_map(intake, prior_map)
+    problem, framed = _without_frames(problem)
     identity = np.arange(len(intake.landmark_id))
     settings = problem.settings
     goes = (settings.drift_m, settings.drift_rad) if problem.driven else (settings.hand_mps, settings.hand_radps)
@@ -103,12 +105,14 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)
+    problem, estimate = _in_measured_frame(problem, estimate, framed)
     optimum, delay_sigma_s = _with_delays(converged(problem, estimate, noise))
     optimum = repaired(optimum)
     problem = optimum.smoother.problem
     if problem.scale_sigma > 0.0:
         optimum = _with_averaged_scale(optimum)
-        if problem.ranges_share > 0.0 and not len(problem.prior.place):
+        metric = len(problem.prior.place) or problem.measurements
+        if problem.ranges_share > 0.0 and not metric:
             optimum = _in_shared_metre(optimum)
         problem = optimum.smoother.problem
     if problem.driven and len(problem.prior.place):
@@ -126,6 +130,34 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     if len(stated):
         optimum, from_map = compared(optimum, stated)
     return SpatialSolved(optimum, identity, times_of(identity), from_map, delay_sigma_s, stepwise.pose, spread, step_s)
+
+
+def _without_frames(problem: SpatialProblem) -> tuple[SpatialProblem, tuple[Tied, ...]]:
+    """Return the problem without measurements that have a frame of their own, such as GNSS fixes, and these.
+
+    Where there is a map, which has another frame, they are left out.
+    """
+    framed = tuple(tied for tied in problem.measurements if tied.kind.frame is not None)
+    if not framed:
+        return problem, ()
+    rest = tuple(tied for tied in problem.measurements if tied.kind.frame is None)
+    alone = replace(problem, measurements=rest, start_sigma=np.full(6, 1e-4))
+    return (replace(problem, measurements=rest), ()) if len(problem.prior.place) else (alone, framed)
+
+
+def _in_measured_frame(
+    problem: SpatialProblem, estimate: SpatialEstimate, framed: tuple[Tied, ...]
+) -> tuple[SpatialProblem, SpatialEstimate]:
+    """Return problem and values in the frame of measurements that have one."""
+    for tied in framed:
+        motion = tied.find_frame(estimate.pose)
+        assert motion is not None
+        pose, place = (se3.compose(motion, part) for part in (estimate.pose, estimate.place))
+        place[~problem.oriented, 3:] = se3.NO_TURN
+        estimate = replace(estimate, pose=pose, place=place)
+        loose = np.maximum(problem.start_sigma, tied.kind.first_sigma)
+        problem = replace(problem, measurements=(*problem.measurements, tied), start_sigma=loose)
+    return problem, estimate
 
 
 def _with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, FloatArray]:

@@ -1,0 +1,73 @@
+"""What a kind of measurement is: the columns of its table and a residual, in one file of `measurements`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.types import FloatArray
+
+Columns = Mapping[str, FloatArray]
+"""Numbers (K,) of a table by the names of its columns."""
+
+
+class Linearised(NamedTuple):
+    """Residuals of a kind of measurement, in the units of its columns.
+
+    Attributes:
+        residual: (K, r) measured less predicted.
+        by_pose: (K, r, 6) derivatives by a twist of the pose in its own frame, translation first.
+        by_other: (K, r, 6) those by the other pose, (K, r, 3) those by the position of a landmark in the world, or None
+            where the measurement ties a pose alone.
+    """
+
+    residual: FloatArray
+    by_pose: FloatArray
+    by_other: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of measurement.
+
+    Attributes:
+        name: of the table, without its ending.
+        meaning: one line for the documentation.
+        columns: that every row must have, beside `stamp_s`.
+        optional: columns that may be left out, with what they are then; nan: not measured.
+        sigma: for each number of the residual the column that has its standard deviation.
+        ties: 'pose' alone, 'pose_pose' (columns `stamp_s` and `to_stamp_s`), or 'pose_place' (column `landmark_id`).
+        linearise: residuals of poses (K, 7) and of other poses (K, 7) or places (K, 3), for the columns of a table.
+        first_sigma: (6,) how firmly the first pose may be held beside it: along and about x, y, z [m, rad]. Small where
+            the measurement does not say where that is, large where its frame is that of the measurement.
+        place: of a kind that sees landmarks, where (3,) one of them may be, for poses (K, 7) and columns; None where
+            these do not tell.
+        frame: of a kind that has a frame of its own, the motion (7,) that brings poses (K, 7) into it, by its columns.
+    """
+
+    name: str
+    meaning: str
+    columns: tuple[str, ...]
+    sigma: tuple[str, ...]
+    ties: str
+    linearise: Callable[[FloatArray, FloatArray, Columns], Linearised]
+    optional: Mapping[str, float] = field(default_factory=dict)
+    first_sigma: tuple[float, ...] = (1e-4,) * 6
+    place: Callable[[FloatArray, Columns], FloatArray | None] | None = None
+    frame: Callable[[FloatArray, Columns], FloatArray] | None = None
+
+
+def stacked(columns: Columns, *names: str) -> FloatArray:
+    """Return (K, n) some columns beside each other."""
+    return np.column_stack([columns[name] for name in names])
+
+
+def crossing(vector: FloatArray) -> FloatArray:
+    """Return (K, 3, 3) the matrices by which vectors (K, 3) are multiplied from the left in a cross product."""
+    x, y, z = np.moveaxis(vector, -1, 0)
+    nothing = np.zeros_like(x)
+    rows = [[nothing, -z, y], [z, nothing, -x], [-y, x, nothing]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
