@@ -63,6 +63,11 @@ class Tied:
     other: IntArray
     other_after: FloatArray
 
+    @property
+    def others(self) -> IntArray:
+        """Return (K, 1) other poses or places; (K, 0) of measurements of a pose alone."""
+        return self.other[:, None] if self.kind.ties != "pose" else np.zeros((len(self.row), 0), dtype=np.int64)
+
     def until(self, n_poses: int) -> Tied:
         """Return those that tie none but the first so many poses."""
         return self.among(0, n_poses)

@@ -208,10 +208,10 @@ class Smoother(Solver[Estimate]):
 
     def _measured(self, tied: Tied, known: BoolArray, variable: IntArray) -> MeasurementFactors[Estimate]:
         """Return measurements of known landmarks, and all others; of landmarks (L,) the variables."""
-        other = tied.other.reshape(len(tied.row), -1)
+        other = tied.others
         if tied.kind.ties == "pose_place":
             tied = tied[known[tied.other]]
-            other = variable[tied.other][:, None]
+            other = variable[tied.others]
         log_odds = self.noise.outlier_log_odds if self.robust else np.inf
         return MeasurementFactors(tied, PlanarView(), other, log_odds, self.heavy and self.robust)
 

@@ -205,7 +205,7 @@ class SpatialSmoother:
         )
 
     def _measured(self, tied: Tied, heavy: bool) -> MeasurementFactors[SpatialEstimate]:
-        problem, other = self.problem, tied.other.reshape(len(tied.row), -1)
+        problem, other = self.problem, tied.others
         if tied.kind.ties == "pose_place":
             other = len(problem.stamp_s) + other
         log_odds = problem.settings.outlier_log_odds[POINT]
