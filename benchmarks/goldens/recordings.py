@@ -59,6 +59,14 @@ def present(path: Path) -> Path:
     return path
 
 
+def as_map(survey: Landmarks | None, sigma_m: float = SIGMA_SURVEY_M) -> Landmarks:
+    """Return surveyed landmarks as a map to localise in."""
+    assert survey is not None
+    if survey.position_m.shape[1] == 3:
+        return survey.as_prior(sigma_m)
+    return Landmarks.at(survey.landmark_id, survey.position_m, sigma_m=sigma_m, frame="prior_map")
+
+
 def mrclam(data: Path, dataset: int, robot: int) -> Any:
     """Read a robot."""
     return em.read_recording(present(data / "mrclam" / MRCLAM.format(dataset)), robot=robot)
@@ -93,9 +101,7 @@ def mrclam3_shifted(data: Path) -> Iterator[Named]:
     shift = parse_shift(SHIFT)
     for robot in (1, 2):
         recording = mrclam(data, 3, robot)
-        survey = recording.true_landmarks
-        assert survey is not None
-        prior = shifted(survey.as_prior(SIGMA_SURVEY_M), [shift])
+        prior = shifted(as_map(recording.true_landmarks), [shift])
         result = em.run_slam(recording, prior_map=prior)
         true = [shift.undone(float(recording.frames.stamp_s[0]))]
         yield from ((f"robot{robot}/{name}", value) for name, value in scores(recording, result))
@@ -151,7 +157,7 @@ def tags(name: str, *, mapped: bool, data: Path) -> Iterator[Named]:
 
     recording = em.read_recording(present(data / "tagslam" / name))
     survey = recording.true_landmarks
-    prior = survey.as_prior(space.SIGMA_SURVEY) if mapped and survey is not None else None
+    prior = as_map(survey) if mapped else None
     with measured() as spent:
         result = em.run_slam(recording, prior_map=prior)
     yield from scores(recording, result, rate_hz=RATE_HZ)
@@ -187,9 +193,7 @@ def starloc(session: str, *, data: Path) -> Iterator[Named]:
         command = [sys.executable, script, folder, session, temporary, "--truth"]
         subprocess.run(list(map(str, command)), check=True)
         recording = em.read_recording(temporary)
-    survey = recording.true_landmarks
-    assert survey is not None
-    for name, prior in (("unknown", None), ("survey", survey.as_prior(SIGMA_SURVEY_M))):
+    for name, prior in (("unknown", None), ("survey", as_map(recording.true_landmarks))):
         try:
             with measured() as spent:
                 result = em.run_slam(recording, prior_map=prior)
@@ -281,8 +285,7 @@ def case(name: str, *, data: Path) -> AnyRecording:
 def field_case(name: str, move: tuple[int, tuple[float, float, float]] | None = None, *, data: Path) -> Iterator[Named]:
     """Tags of a competition field, with its layout as exact map."""
     recording = case(name, data=data)
-    assert recording.true_landmarks is not None
-    result = em.run_slam(recording, prior_map=recording.true_landmarks.as_prior(0.0))
+    result = em.run_slam(recording, prior_map=as_map(recording.true_landmarks, 0.0))
     yield from scores(recording, result)
     yield from changes(result.changes, [] if move is None else [moved(*move)])
 
@@ -300,10 +303,7 @@ def orchard(data: Path) -> Iterator[Named]:
 def anchors_left_behind(data: Path) -> Iterator[Named]:
     """A drive that leaves its anchors behind, in their map: nothing moved."""
     recording = case("f_uwb_moved_far", data=data)
-    survey = recording.true_landmarks
-    assert survey is not None
-    plane = Landmarks.at(survey.landmark_id, survey.position_m[:, :2], sigma_m=SIGMA_SURVEY_M)
-    result = em.run_slam(recording, prior_map=plane)
+    result = em.run_slam(recording, prior_map=as_map(recording.true_landmarks))
     yield from scores(recording, result)
     yield from changes(result.changes, [])
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 
+from evermap.metrics.consistency import chi2_quantile
 from evermap.metrics.summary import compare_with_truth, metrics_dict
-from evermap.types import AnyRecording, ChangeKind, MapChange, SlamResult
+from evermap.types import AnyRecording, ChangeKind, FloatArray, MapChange, SlamResult
 
 Named = tuple[str, float | None]
 """A figure's name without its part, and its value."""
@@ -20,26 +20,26 @@ class MissingDataError(Exception):
     """A recording that is not here; its text says which."""
 
 
-def scores(recording: AnyRecording, result: SlamResult, *, rate_hz: float = 2.0, mean: str = "") -> Iterator[Named]:
-    """Yield the errors of poses and landmarks, and NEES and NIS over their expectations, of one run.
+def scores(recording: AnyRecording, result: SlamResult, *, rate_hz: float = 2.0) -> Iterator[Named]:
+    """Yield the errors of poses and landmarks, and NEES and NIS over what is expected of them, of one run.
 
     Poses are aligned, unless the run is in the frame of a map; landmarks are aligned by the poses, and without true
-    poses by themselves. NEES of unaligned poses are those in the frame of the first pose.
+    poses by themselves. NEES are medians over the median of a chi-square: near the first pose of a map from an unknown
+    start, covariances vanish, and a mean is of those few poses.
     """
-    found = metrics_dict(compare_with_truth(recording, result, rate_hz=rate_hz))
-    dof = found["nees_dof"] or 2
-    where = f"{mean}/" if mean else ""
+    compared = compare_with_truth(recording, result, rate_hz=rate_hz)
+    found, poses, places = metrics_dict(compared), compared.poses, compared.landmarks
     turn = found["heading_rmse_deg"] if found["heading_rmse_deg"] is not None else found["orientation_rmse_deg"]
     at = "landmark_rmse_m" if found["landmark_rmse_m"] is not None else "landmark_rmse_own_alignment_m"
     figures = {
         "position_m": found["pose_rmse_m"],
         "turn_deg": turn,
         "landmarks_m": found[at],
-        "poses/nees": _over(found["pose_nees_mean"], dof),
-        "landmarks/nees": _over(found["landmark_nees_mean"], dof),
-        "nis": _over(found["nis_mean"], 2),
+        "poses/nees": None if poses is None else _typical(poses.nees, poses.dof),
+        "landmarks/nees": None if places is None else _typical(places.nees[places.scored], places.dof),
+        "nis": None if found["nis_mean"] is None else found["nis_mean"] / 2.0,
     }
-    yield from ((where + name, value) for name, value in figures.items() if value is not None)
+    yield from ((name, value) for name, value in figures.items() if value is not None)
 
 
 def mean_of(rows: Sequence[Sequence[Named]]) -> Iterator[Named]:
@@ -56,8 +56,9 @@ def mean_of(rows: Sequence[Sequence[Named]]) -> Iterator[Named]:
             yield name, float(np.mean(values))
 
 
-def _over(value: float | None, expected: float) -> float | None:
-    return None if value is None else value / expected
+def _typical(nees: FloatArray, dof: int) -> float | None:
+    known = nees[np.isfinite(nees)]
+    return float(np.median(known)) / chi2_quantile(0.5, dof) if len(known) else None
 
 
 def levels(result: SlamResult, names: Sequence[str]) -> Iterator[Named]:
@@ -98,8 +99,3 @@ def measured() -> Iterator[Spent]:
     spent, began = Spent(), time.process_time()
     yield spent
     spent.cpu_s = time.process_time() - began
-
-
-def arrays_of(result: SlamResult) -> dict[str, Any]:
-    """Return poses and landmarks of a run, to compare two bit by bit."""
-    return {"pose": result.trajectory.pose_world_robot, "landmark": result.landmarks.position_m}

@@ -149,6 +149,7 @@ def test_one_part_that_fails_leaves_the_others(
         return run
 
     errors = {"bad": ValueError("no such thing\nat all"), "good": None, "away": MissingDataError("x is not here")}
+    monkeypatch.setattr(program, "warm_up", lambda: None)
     monkeypatch.setattr(program, "all_parts", lambda: {name: part(name, error) for name, error in errors.items()})
     out = tmp_path / "found.json"
     assert program.main(["--out", str(out)]) == 1
@@ -165,8 +166,11 @@ def test_one_part_that_fails_leaves_the_others(
     assert goldens.Figures.read(out).parts.keys() == {"good"}
 
 
-def test_the_same_commit_gives_the_same_figures(goldens: ModuleType, program: ModuleType, tmp_path: Path) -> None:
+def test_the_same_commit_gives_the_same_figures(
+    goldens: ModuleType, program: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """But for costs. The parts are those that need no recording and take least."""
+    monkeypatch.setattr(program, "warm_up", lambda: None)
     found = [
         program.compute(tmp_path / f"{run}.json", tmp_path / "no-data", ["template", "objects"]) for run in range(2)
     ]
