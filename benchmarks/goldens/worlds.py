@@ -56,20 +56,22 @@ def warehouse(n_landmarks: int) -> Part:
         scale.warm_up()
         drive = scale.warehouse_drive(n_landmarks)
         ticks = scale.Ticks()
-        with measured() as spent:
+        with measured() as first:
             result = em.run_slam(drive.recording, progress=ticks)
         yield from scores(drive.recording, result)
         yield from levels(result, ("sigma_range_m", "sigma_bearing_rad"))
-        yield "plain/objective", scale.by_evermap_plain(drive)["objective"] / scale.best_objective(drive)
-        yield "cpu_s", spent.cpu_s
-        yield "longest/frame_ms", 1e3 * float(ticks.frame_s[scale.STREAM_FROM :].max())
-        peer = levenberg_marquardt(drive.factors, drive.starts["near"], marginals=False)
-        yield "lm/over_peer", spent.cpu_s / peer.solve.cpu_s
-        yield "session/cpu_s", scale.by_evermap_mapped(drive)["cpu_s"]
-        with counting_factorisations() as sizes:
+        with counting_factorisations() as sizes, measured() as second:
             em.run_slam(drive.recording)
         if sizes:  # those that are at least half as large as the largest
             yield "factorisations", sum(2 * size >= max(sizes) for size in sizes)
+        cpu_s = min(first.cpu_s, second.cpu_s)
+        yield "cpu_s", cpu_s
+        yield "longest/frame_ms", 1e3 * float(ticks.frame_s[scale.STREAM_FROM :].max())
+        peers = (levenberg_marquardt(drive.factors, drive.starts["near"], marginals=False) for _ in range(3))
+        yield "lm/over_peer", cpu_s / min(peer.solve.cpu_s for peer in peers)
+        yield "session/cpu_s", scale.by_evermap_mapped(drive)["cpu_s"]
+        if n_landmarks == SIZES[0]:  # the peer's optimum to many digits takes it long
+            yield "plain/objective", scale.by_evermap_plain(drive)["objective"] / scale.best_objective(drive)
 
     return run
 
