@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evermap.estimate.kind import Kind
+from evermap.estimate.kind import MeasurementKind
 from evermap.estimate.measurements import find_kinds
 from evermap.geometry import se3
 
@@ -21,7 +21,7 @@ MEASURED = {
 KINDS = sorted(find_kinds())
 
 
-def columns_of(kind: Kind, count: int, **given) -> dict[str, np.ndarray]:
+def columns_of(kind: MeasurementKind, count: int, **given) -> dict[str, np.ndarray]:
     return {name: np.full(count, value, dtype=float) for name, value in {**kind.optional, **given}.items()}
 
 
@@ -29,7 +29,7 @@ def poses(seed: int, count: int) -> np.ndarray:
     return se3.exp(np.random.default_rng(seed).normal(0.0, [2.0, 2.0, 2.0, 0.6, 0.6, 0.6], (count, 6)))
 
 
-def others(kind: Kind, seed: int, count: int) -> np.ndarray:
+def others(kind: MeasurementKind, seed: int, count: int) -> np.ndarray:
     other = poses(100 + seed, count)
     return {"pose": np.zeros((count, 0)), "pose_pose": other, "pose_place": 3.0 * other[:, :3]}[kind.ties]
 

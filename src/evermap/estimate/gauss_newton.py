@@ -36,7 +36,7 @@ class Steps(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Solution(Generic[State]):
+class Minimum(Generic[State]):
     """The end of an iteration.
 
     Attributes:
@@ -50,7 +50,7 @@ class Solution(Generic[State]):
     factorised: Factorised | None
 
 
-def minimised(graph: Graph[State], start: State, steps: Steps, now: Linear | None = None) -> Slices[Solution[State]]:
+def minimised(graph: Graph[State], start: State, steps: Steps, now: Linear | None = None) -> Slices[Minimum[State]]:
     """Run damped Gauss-Newton from `start`, in slices.
 
     Args:
@@ -88,4 +88,4 @@ def minimised(graph: Graph[State], start: State, steps: Steps, now: Linear | Non
                 break
     if not np.isfinite(now.cost):
         raise NumericalError("the smoother found no finite optimum", hint="check units and time stamps")
-    return Solution(state, now, undamped)
+    return Minimum(state, now, undamped)

@@ -3,7 +3,7 @@
 Variables are poses, then whatever else there is (places, bodies), then the border: calibration states, which many
 factors share. A block holds all factors of one kind, as arrays: which variables each of them ties, and how to fill in
 their whitened Jacobians at given values. Nothing else of the estimator depends on what is measured, so several problems
-together are a concatenation of their blocks (`Part`), and a new measurement is a new block.
+together are a concatenation of their blocks (`SharedBlock`), and a new measurement is a new block.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Layout:
 
 
 @dataclass(frozen=True, slots=True)
-class Structure:
+class GraphStructure:
     """The order of elimination of a graph, which does not depend on values, noise or weights.
 
     Attributes:
@@ -128,7 +128,7 @@ class Graph(Generic[State]):
     """
 
     blocks: tuple[FactorBlock[State], ...]
-    structure: Structure
+    structure: GraphStructure
     border: Border[State]
     held: FloatArray
     retract: Callable[[State, FloatArray], tuple[State, float]]
@@ -179,7 +179,7 @@ class Linear:
 
 
 @dataclass(frozen=True, slots=True)
-class Part(Generic[State]):
+class SharedBlock(Generic[State]):
     """A block of one problem among several that are solved together.
 
     Attributes:
@@ -219,7 +219,7 @@ def grouped(n_poses: int, a_leaf: int) -> IntArray:
     return np.minimum(np.arange(n_poses), max(n_poses - 2, 0)) // a_leaf
 
 
-def build_structure(layout: Layout, blocks: Sequence[FactorBlock[State]]) -> Slices[Structure]:
+def build_structure(layout: Layout, blocks: Sequence[FactorBlock[State]]) -> Slices[GraphStructure]:
     """Find the order of elimination, in slices: nested dissection of the leaves, those of factors without a pose too.
 
     Args:
@@ -243,7 +243,7 @@ def build_structure(layout: Layout, blocks: Sequence[FactorBlock[State]]) -> Sli
     yield MS * len(leaf)
     tree = yield from tree_of(layout.dim, factors, coordinate, layout.border)
     system = System(layout.dim, factors, coordinate, layout.border, tree)
-    return Structure(layout, system, coordinate, tuple(np.append(0, np.cumsum(counts)).tolist()))
+    return GraphStructure(layout, system, coordinate, tuple(np.append(0, np.cumsum(counts)).tolist()))
 
 
 def _coordinates(layout: Layout, factors: Factors, pose: IntArray) -> FloatArray:

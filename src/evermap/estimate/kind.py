@@ -30,7 +30,7 @@ class Linearised(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class MeasurementKind:
     """A kind of measurement.
 
     Attributes:

@@ -1,7 +1,7 @@
 """Measurements beside odometry and detections as factors, in the plane and in space.
 
-The residual of a `Kind` is written once, on poses in space. In the plane it is seen through a `View`: of a twist in
-space only three numbers are free there.
+The residual of a `MeasurementKind` is written once, on poses in space. In the plane it is seen through a `PoseView`: of
+a twist in space only three numbers are free there.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Generic, Protocol
 import numpy as np
 
 from evermap.estimate.graph import Room, State, State_contra
-from evermap.estimate.kind import Columns, Kind, stacked
+from evermap.estimate.kind import Columns, MeasurementKind, stacked
 from evermap.estimate.robust import weigh
 from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se3
@@ -23,7 +23,7 @@ HEAVY_TAIL = 9.0
 """Square of a residual, a number, at which the Cauchy begins, while the estimate may be far off: `robust.weigh`."""
 
 
-class View(Protocol[State_contra]):
+class PoseView(Protocol[State_contra]):
     """How the variables of a problem are seen as poses and places in space."""
 
     def poses(self, state: State_contra) -> FloatArray:
@@ -56,7 +56,7 @@ class Tied:
         other_after: (K, 7) as `after`, of other poses.
     """
 
-    kind: Kind
+    kind: MeasurementKind
     columns: Columns
     row: IntArray
     after: FloatArray
@@ -118,7 +118,7 @@ class MeasurementFactors(Generic[State]):
     """
 
     tied: Tied
-    view: View[State]
+    view: PoseView[State]
     other_variable: IntArray
     log_odds: float
     heavy: bool

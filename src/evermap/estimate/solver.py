@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Generic
 
-from evermap.estimate.gauss_newton import Solution, Steps, minimised
+from evermap.estimate.gauss_newton import Minimum, Steps, minimised
 from evermap.estimate.graph import Graph, Linear, State
 from evermap.estimate.sparse.system import Factorised, Slices, exhausted
 
@@ -37,7 +37,7 @@ class Solver(ABC, Generic[State]):
         """Return what `linearised_in_slices` does."""
         return exhausted(self.linearised_in_slices(state))
 
-    def minimised_in_slices(self, start: State, steps: Steps) -> Slices[Solution[State]]:
+    def minimised_in_slices(self, start: State, steps: Steps) -> Slices[Minimum[State]]:
         """Run damped Gauss-Newton from `start`, in slices: `gauss_newton.minimised`.
 
         Raises:

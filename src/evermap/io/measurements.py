@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.estimate.kind import Kind
+from evermap.estimate.kind import MeasurementKind
 from evermap.estimate.measurements import find_kinds
 from evermap.io.table import Table
 from evermap.types import UNKNOWN, FloatArray, Measurements
@@ -43,7 +43,7 @@ def read_measurements(tables: Mapping[str, Table | None], names: dict[int, str])
     return tuple(found)
 
 
-def _read_column(table: Table, kind: Kind, column: str) -> FloatArray:
+def _read_column(table: Table, kind: MeasurementKind, column: str) -> FloatArray:
     """Return a column, with what is meant where it is left out or, of an optional one, empty."""
     if column == "to_stamp_s":
         return table.numbers(Quantity(column, STAMP_S.low, STAMP_S.high, hint=STAMP_S.hint, dates=True))

@@ -16,7 +16,17 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.estimate.gauss_newton import Steps
-from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Part, Room, Structure, build_structure, grouped
+from evermap.estimate.graph import (
+    Border,
+    FactorBlock,
+    Graph,
+    GraphStructure,
+    Layout,
+    Room,
+    SharedBlock,
+    build_structure,
+    grouped,
+)
 from evermap.estimate.robust import weigh
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, exhausted
@@ -157,7 +167,7 @@ class Together(Solver[Estimate]):
         super().__init__()
         self.robots, self.places, self.start_s, self.met, self.sigma = tuple(robots), places, start_s, met, sigma
         self.first = np.cumsum([0, *(len(robot.problem.stamp_s) for robot in robots)])
-        self._structure: tuple[BoolArray, Structure] | None = None
+        self._structure: tuple[BoolArray, GraphStructure] | None = None
         self._own: tuple[Estimate, list[Estimate]] | None = None
 
     def of(self, robots: Sequence[Smoother], sigma: FloatArray) -> Together:
@@ -225,7 +235,9 @@ class Together(Solver[Estimate]):
             poses, states = np.arange(self.first[r], self.first[r + 1]), border + 2 * r + np.arange(2)
             variable = np.concatenate([poses, n + rank[self.places[r][own.known]], states])
             select = partial(self._own_part, robot=r)
-            kinds.append([Part(block, variable, int(self.first[r]), select) for block in robot.blocks(own.known)])
+            kinds.append(
+                [SharedBlock(block, variable, int(self.first[r]), select) for block in robot.blocks(own.known)]
+            )
         met = EncounterFactors(self.met, self._eyes(), border + 2 * np.arange(len(self.robots)))
         measured = [blocks[kind] for kind in (ODOMETRY, DETECTIONS) for blocks in kinds]
         blocks = (*measured, met, *(block for own in kinds for block in own[DETECTIONS + 1 :]))

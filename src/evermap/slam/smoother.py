@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from evermap.estimate.gauss_newton import Steps
-from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Structure, build_structure, grouped
+from evermap.estimate.graph import Border, FactorBlock, Graph, GraphStructure, Layout, build_structure, grouped
 from evermap.estimate.measurement import MeasurementFactors, Tied
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
@@ -53,7 +53,7 @@ class Smoother(Solver[Estimate]):
         self.noise = noise
         self.heavy = heavy
         self.robust = robust
-        self._structure: tuple[BoolArray, Structure] | None = None
+        self._structure: tuple[BoolArray, GraphStructure] | None = None
 
     @property
     def states_sigma(self) -> FloatArray:

@@ -12,18 +12,18 @@ from collections.abc import Mapping
 from importlib.metadata import entry_points
 
 from evermap.errors import InputError
-from evermap.estimate.kind import Kind
+from evermap.estimate.kind import MeasurementKind
 
-_ADDED: dict[str, Kind] = {}
+_ADDED: dict[str, MeasurementKind] = {}
 """Kinds of this process, by `add_kind`."""
 
 
-def find_kinds() -> Mapping[str, Kind]:
+def find_kinds() -> Mapping[str, MeasurementKind]:
     """Return all kinds of measurements by their names."""
     return {**_installed_kinds(), **_ADDED}
 
 
-def add_kind(kind: Kind) -> None:
+def add_kind(kind: MeasurementKind) -> None:
     """Make a kind known to this process, by its name: that of its table.
 
     Raises:
@@ -35,7 +35,7 @@ def add_kind(kind: Kind) -> None:
 
 
 @functools.cache
-def _installed_kinds() -> Mapping[str, Kind]:
+def _installed_kinds() -> Mapping[str, MeasurementKind]:
     names = sorted(module.name for module in pkgutil.iter_modules(__path__))
     kinds = [importlib.import_module(f"{__name__}.{name}").KIND for name in names]
     kinds += [point.load() for point in entry_points(group="evermap.measurements")]

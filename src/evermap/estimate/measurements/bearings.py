@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.estimate.kind import Columns, Kind, Linearised, crossing, stacked
+from evermap.estimate.kind import Columns, Linearised, MeasurementKind, crossing, stacked
 from evermap.geometry import se3
 from evermap.types import FloatArray
 
@@ -41,7 +41,7 @@ def locate(pose: FloatArray, columns: Columns) -> FloatArray | None:
     return np.asarray(np.linalg.solve(total, np.einsum("kab,kb->a", across, pose[:, :3])))
 
 
-KIND = Kind(
+KIND = MeasurementKind(
     name="bearings",
     meaning="the direction of a landmark from the robot: to the left of its front, and above its plane",
     columns=("azimuth_rad",),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.estimate.kind import Columns, Kind, Linearised, stacked
+from evermap.estimate.kind import Columns, Linearised, MeasurementKind, stacked
 from evermap.geometry import se3
 from evermap.types import FloatArray
 
@@ -21,7 +21,7 @@ def linearise(pose: FloatArray, other: FloatArray, columns: Columns) -> Linearis
     return Linearised(np.where(np.isfinite(given), -off, np.nan), by_pose, jacobian)
 
 
-KIND = Kind(
+KIND = MeasurementKind(
     name="closures",
     meaning="the robot's pose at `to_stamp_s`, seen from that at `stamp_s`",
     columns=("to_stamp_s", "x_m", "y_m", "yaw_rad"),

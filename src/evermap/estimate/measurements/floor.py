@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.estimate.kind import Columns, Kind, Linearised, crossing, stacked
+from evermap.estimate.kind import Columns, Linearised, MeasurementKind, crossing, stacked
 from evermap.geometry import se3
 from evermap.types import FloatArray
 
@@ -20,7 +20,7 @@ def linearise(pose: FloatArray, _: FloatArray, columns: Columns) -> Linearised:
     return Linearised(stacked(columns, "z_m", "up_x", "up_y") - predicted, by_pose)
 
 
-KIND = Kind(
+KIND = MeasurementKind(
     name="floor",
     meaning="the robot's height, and where the vertical points in its frame",
     columns=("z_m",),

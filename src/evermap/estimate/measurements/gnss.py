@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.estimate.kind import Columns, Kind, Linearised, crossing, stacked
+from evermap.estimate.kind import Columns, Linearised, MeasurementKind, crossing, stacked
 from evermap.geometry import se2, se3
 from evermap.geometry.rigid import rigid
 from evermap.types import FloatArray
@@ -31,7 +31,7 @@ def find_frame(pose: FloatArray, columns: Columns) -> FloatArray:
     return found
 
 
-KIND = Kind(
+KIND = MeasurementKind(
     name="gnss",
     meaning="where an antenna is: east, north (and up) of an origin",
     columns=("x_m", "y_m"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.estimate.kind import Columns, Kind, Linearised, crossing, stacked
+from evermap.estimate.kind import Columns, Linearised, MeasurementKind, crossing, stacked
 from evermap.geometry import se3
 from evermap.types import FloatArray
 
@@ -17,7 +17,7 @@ def linearise(pose: FloatArray, _: FloatArray, columns: Columns) -> Linearised:
     return Linearised(reads / np.linalg.norm(reads, axis=1, keepdims=True) - up, by_pose)
 
 
-KIND = Kind(
+KIND = MeasurementKind(
     name="gravity",
     meaning="specific force in the robot's frame while it does not accelerate",
     columns=("ax_mps2", "ay_mps2", "az_mps2"),

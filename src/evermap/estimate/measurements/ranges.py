@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.estimate.kind import Columns, Kind, Linearised, crossing, stacked
+from evermap.estimate.kind import Columns, Linearised, MeasurementKind, crossing, stacked
 from evermap.geometry import se3
 from evermap.types import FloatArray
 
@@ -39,7 +39,7 @@ def locate(pose: FloatArray, columns: Columns) -> FloatArray | None:
     return np.asarray(middle + here @ axes)
 
 
-KIND = Kind(
+KIND = MeasurementKind(
     name="ranges",
     meaning="the distance of a landmark from a radio on the robot",
     columns=("range_m",),

@@ -16,16 +16,8 @@ from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.geometry import se3
 from evermap.slam.space.drift import STRETCHES
-from evermap.slam.space.linearise import (
-    OF_STEP,
-    POINT,
-    ROWS,
-    STATES,
-    MapFactors,
-    SightingFactors,
-    SpatialOdometryFactors,
-    StartFactor,
-)
+from evermap.slam.space.factors import MapFactors, SightingFactors, SpatialOdometryFactors, SpatialStartFactor
+from evermap.slam.space.linearise import OF_STEP, POINT, ROWS, STATES
 from evermap.slam.space.problem import NO_JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem, SpatialView
 from evermap.types import FloatArray
 
@@ -199,7 +191,7 @@ class SpatialSmoother:
         return (
             SpatialOdometryFactors(problem.increment, sigma, jump, heavy, sensor + len(problem.mount)),
             SightingFactors(problem, self._seen, self._back, noise.levels, heavy, n, sensor),
-            StartFactor(self._start, problem.start_sigma),
+            SpatialStartFactor(self._start, problem.start_sigma),
             MapFactors(problem, n + prior, first_seen[prior]),
             *(self._measured(tied, heavy) for tied in problem.measurements),
         )
