@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from evermap.compiled import single_threaded
 from evermap.config import Config
-from evermap.errors import ConfigError, DataError
+from evermap.errors import ConfigError, DataError, InputError
 from evermap.types import AnyRecording, Landmarks, Progress, Recording, SlamResult, SpatialRecording
 
 if TYPE_CHECKING:
@@ -59,35 +59,46 @@ def run_slam(
 
 @single_threaded()
 def run_together(
-    recordings: Mapping[int, Recording], config: Config | None = None, *, progress: Progress | None = None
+    recordings: Mapping[int, AnyRecording], config: Config | None = None, *, progress: Progress | None = None
 ) -> dict[int, SlamResult]:
     """Estimate several robots that drove at the same time as one problem: landmarks are one where their ids are.
 
-    Robots that saw each other (`Recording.robot_sightings`) tie each other's poses. Each is solved alone first. The
-    results are in the frame of the first robot's first pose.
+    Robots in the plane that saw each other (`Recording.robot_sightings`) tie each other's poses. Each is solved alone
+    first. The results are in the frame of the first robot's first pose.
 
-    `recordings` are by the numbers by which robots call each other; in the plane, their stamps on one clock. The other
-    arguments are those of `run_slam`.
+    `recordings` are by the numbers by which robots call each other, all in the plane or all in space, their stamps on
+    one clock. The other arguments are those of `run_slam`.
 
     Raises:
-        InputError: no `Recording`, or one with invalid values.
+        InputError: no recordings, some with invalid values, or some in the plane and some in space.
         DataError: nothing can be estimated from one, or nothing ties one to the others.
         ConfigError: landmarks without identities are those of one robot (`slam.unknown_ids`).
         NumericalError: no finite optimum.
     """
-    from evermap.maps.sessions import planar, session
+    from evermap.maps.sessions import planar, session, spatial
     from evermap.slam import check, estimate, together
 
     config = config or Config()
+    if len({isinstance(recording, SpatialRecording) for recording in recordings.values()}) > 1:
+        problem = "some of the recordings are in the plane, some in space"
+        raise InputError(problem, field="recordings", hint="robots that drove together in one or the other")
     if config.slam.unknown_ids:
         problem, hint = "landmarks that several robots see are known by their ids", "run the robots one by one"
         raise ConfigError(problem, field="slam.unknown_ids", hint=hint)
-    alone, results = {}, {}
+    alone, visits, results = {}, list[spatial.SpatialVisit](), {}
     for number, given in recordings.items():
         recording, remarks = check.screened(given, config)
+        if isinstance(recording, SpatialRecording):
+            visits.append(spatial.solve_visit(recording, config, None, remarks, progress=progress))
+            continue
         alone[number] = estimate.solve(recording, config.slam, remarks=remarks, progress=progress)
         if alone[number].interrupted:
             raise KeyboardInterrupt
+    if visits:
+        frames = ["first_pose", *["first_robot"] * (len(visits) - 1)]
+        for number, one, frame in zip(recordings, spatial.solve_visits_together(visits), frames, strict=True):
+            results[number] = session.existing(one, one.concluded(frame), config.living)
+        return results
     for number, solved, online in zip(alone, *together.solve_together(alone), strict=True):
         visit = planar.PlanarVisit(solved)
         results[number] = session.existing(visit, replace(visit.concluded(online.frame), online=online), config.living)

@@ -336,14 +336,14 @@ def _each_together(paths: Sequence[Path], out: Path | None, asked: _Asked) -> No
         ConfigError: there is one robot.
     """
     from evermap.cli.warmup import warm_up as compile_kernels
-    from evermap.io import list_robots, read_planar
+    from evermap.io import list_robots, read_recording
     from evermap.pipeline import run_together
     from evermap.runs.folder import check_replaceable
 
     if len(paths) > 1:
-        recordings = {number: read_planar(path) for number, path in enumerate(paths, start=1)}
+        recordings = {number: read_recording(path) for number, path in enumerate(paths, start=1)}
     else:
-        recordings = {number: read_planar(paths[0], robot=number) for number in list_robots(paths[0])}
+        recordings = {number: read_recording(paths[0], robot=number) for number in list_robots(paths[0])}
     if len(recordings) < 2:
         raise ConfigError("there is one robot", field="together", hint="give the recordings of the other robots, too")
     folders = {number: default_out(recording.name) for number, recording in recordings.items()}

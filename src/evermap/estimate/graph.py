@@ -21,6 +21,8 @@ from evermap.types import FloatArray, IntArray
 
 State = TypeVar("State")
 """Values of all variables."""
+Own = TypeVar("Own")
+"""Values of the variables of one problem among several."""
 State_contra = TypeVar("State_contra", contravariant=True)
 
 
@@ -179,7 +181,7 @@ class Linear:
 
 
 @dataclass(frozen=True, slots=True)
-class SharedBlock(Generic[State]):
+class SharedBlock(Generic[State, Own]):
     """A block of one problem among several that are solved together.
 
     Attributes:
@@ -189,10 +191,10 @@ class SharedBlock(Generic[State]):
         select: its values among those of all.
     """
 
-    block: FactorBlock[State]
+    block: FactorBlock[Own]
     variable: IntArray
     first_pose: int
-    select: Callable[[State], State]
+    select: Callable[[State], Own]
 
     @property
     def ties(self) -> IntArray:

@@ -174,6 +174,6 @@ class MeasurementFactors(Generic[State]):
         return cost
 
 
-def frame_of(measured: Sequence[Tied]) -> str:
-    """Return what the frame of a solution is: that of measurements that have one, or the robot's first pose."""
-    return next((tied.kind.name for tied in measured if tied.kind.frame is not None), "first_pose")
+def frame_of(measured: Sequence[Tied], scratch: str = "first_pose") -> str:
+    """Return what the frame of a solution is: that of measurements that have one, or `scratch`."""
+    return next((tied.kind.name for tied in measured if tied.kind.frame is not None), scratch)

@@ -140,7 +140,7 @@ class BoxVisit(SpatialVisit):
         both = both[np.argsort(both.landmark_id, kind="stable")]
         return replace(living, boxes=both, landmark_texts=tuple(sorted({*living.landmark_texts, *texts})))
 
-    def concluded(self) -> SlamResult:
+    def concluded(self, scratch: str = "first_pose") -> SlamResult:  # noqa: ARG002
         """Return the solved session, with the tracks of moving objects."""
         return conclude_in_traffic(self.taken, self.intake, self.solved, self.track)[0]
 

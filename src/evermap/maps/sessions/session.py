@@ -19,14 +19,12 @@ from evermap.maps.sessions.extend import Extended, Found, extended
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Sighting, Watch, arrivals, looked_at
 from evermap.maps.sessions.placing import Laid, Localised
 from evermap.maps.sessions.planar import PlanarVisit
-from evermap.maps.sessions.spatial import SpatialVisit
+from evermap.maps.sessions.spatial import SpatialVisit, solve_visit
 from evermap.maps.vicinity import in_chunks
 from evermap.show import Shown
 from evermap.slam.association.features import medians
 from evermap.slam.cleaning import clean
 from evermap.slam.estimate import solve
-from evermap.slam.space.intake import prepare_space
-from evermap.slam.space.solve import solve_space
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -319,8 +317,7 @@ def solved(
 ) -> Visit:
     """Return a recording with identities solved, by itself or in a map that is given; arguments as of `run_slam`."""
     if isinstance(recording, SpatialRecording):
-        intake = prepare_space(recording, config.slam.space, remarks)
-        return SpatialVisit(recording, intake, solve_space(intake, prior_map, progress=progress))
+        return solve_visit(recording, config, prior_map, remarks, progress=progress)
     alone = solve(recording, config.slam, prior_map=prior_map, remarks=remarks, realtime=realtime, progress=progress)
     return PlanarVisit(alone)
 

@@ -9,6 +9,7 @@ laid over the map as any other session, and solved once more with what stands.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,6 +33,7 @@ from evermap.slam.space.intake import SpatialIntake, most_of, prepare_space
 from evermap.slam.space.problem import ANY_RAD, PlacePrior
 from evermap.slam.space.result import concluded_in_space, identities_of, located, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved, solve_space
+from evermap.slam.space.together import Alone, solve_space_together
 from evermap.types import (
     UNKNOWN,
     BoolArray,
@@ -74,9 +76,9 @@ class SpatialVisit:
         """The recording of which `concluded` names rows."""
         return self.recording
 
-    def concluded(self) -> SlamResult:
-        """Return the session as the estimator has it."""
-        return concluded_in_space(self.recording, self.intake, self.solved)
+    def concluded(self, scratch: str = "first_pose") -> SlamResult:
+        """Return the session as the estimator has it; `scratch` is what its frame is where there is no map."""
+        return concluded_in_space(self.recording, self.intake, self.solved, scratch)
 
     def begun(self, living: LivingMap) -> LivingMap:
         """Return an empty map: in space the scale is that of the sensors."""
@@ -285,6 +287,30 @@ class SpatialVisit:
         )
         model = learned.init(position_m, np.arange(len(position_m)), assumed)
         return replace(model, outward=np.sign(middle) * outward if faced else 0.0 * outward)
+
+
+def solve_visit(
+    recording: SpatialRecording,
+    config: Config,
+    prior_map: Landmarks | None,
+    remarks: tuple[str, ...],
+    *,
+    progress: Progress | None = None,
+) -> SpatialVisit:
+    """Return a recording with identities solved, by itself or in a map that is given; arguments as of `run_slam`."""
+    intake = prepare_space(recording, config.slam.space, remarks)
+    return SpatialVisit(recording, intake, solve_space(intake, prior_map, progress=progress))
+
+
+def solve_visits_together(visits: Sequence[SpatialVisit]) -> list[SpatialVisit]:
+    """Return robots that were solved alone solved as one problem: `slam.space.together`.
+
+    Raises:
+        DataError: nothing ties one of them to the others.
+    """
+    members = [Alone(visit.intake, visit.solved) for visit in visits]
+    solved = solve_space_together(members, [visit.recording.name for visit in visits])
+    return [replace(visit, solved=own) for visit, own in zip(visits, solved, strict=True)]
 
 
 def _near_hits(stamp_s: FloatArray, detected: BoolArray, within_s: float) -> BoolArray:

@@ -65,10 +65,12 @@ class _Told:
     placed: BoolArray
 
 
-def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solved: SpatialSolved) -> SlamResult:
-    """Return trajectory and map, and differences to a given map."""
+def concluded_in_space(
+    recording: SpatialRecording, intake: SpatialIntake, solved: SpatialSolved, scratch: str = "first_pose"
+) -> SlamResult:
+    """Return trajectory and map, and differences to a given map; without one, `scratch` is what the frame is."""
     optimum, problem = solved.optimum, solved.optimum.smoother.problem
-    frame = "prior_map" if len(problem.prior.place) else frame_of(problem.measurements)
+    frame = "prior_map" if len(problem.prior.place) else frame_of(problem.measurements, scratch)
     found, placed = located(problem, optimum.now)
     spread = optimum.smoother.spread(optimum.now)
     told = _Told(recording, intake, solved, problem, spread, frame, intake.start_s + problem.stamp_s, placed)

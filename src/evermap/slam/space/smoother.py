@@ -19,7 +19,7 @@ from evermap.slam.space.drift import STRETCHES
 from evermap.slam.space.factors import MapFactors, SightingFactors, SpatialOdometryFactors, SpatialStartFactor
 from evermap.slam.space.linearise import OF_STEP, POINT, ROWS, STATES
 from evermap.slam.space.problem import NO_JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem, SpatialView
-from evermap.types import FloatArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
 POSES_A_LEAF = 4
 HELD = 1e-9
@@ -95,11 +95,21 @@ class SpatialSmoother:
             dim, n + count + np.arange(len(problem.mount) + 1), leaf, np.column_stack([leaf, around[:, :3]])
         )
         self.structure = exhausted(build_structure(layout, self._blocks(SpatialNoise(), heavy=False)))
-        axis, begin = problem.symmetries.axis, self.structure.system.tree.begin
-        about = np.flatnonzero(problem.oriented & (axis >= 0))
+        begin = self.structure.system.tree.begin
         self._held = np.zeros(begin[-1])
         self._held[6 * n : -len(sigma)] = HELD
-        self._held[begin[n + about] + 3 + axis[about]] = ANY_TURN
+        self.hold(self._held, begin)
+
+    @property
+    def states_information(self) -> FloatArray:
+        """(6 S + 1,) information of the priors of mounts and scale."""
+        return self._border.information
+
+    def hold(self, held: FloatArray, begin: IntArray) -> None:
+        """Write what holds turns that no detection shows to the numbers of all variables, which begin there (V,)."""
+        axis = self.problem.symmetries.axis
+        about = np.flatnonzero(self.problem.oriented & (axis >= 0))
+        held[begin[len(self.problem.stamp_s) + about] + 3 + axis[about]] = ANY_TURN
 
     def graph(self, noise: SpatialNoise, *, heavy: bool) -> Graph[SpatialEstimate]:
         """Return the problem as a graph at some noise levels; `heavy` as for `optimum`."""
@@ -207,15 +217,7 @@ class SpatialSmoother:
         """The estimate after a step, and how far it went."""
         problem, tree = self.problem, self.structure.system.tree
         n, count = len(problem.stamp_s), len(problem.oriented)
-        by = step[: 6 * n].reshape(n, 6)
-        begin = tree.begin[n : n + count]
-        turned = np.zeros((count, 6))
-        for k in range(6):
-            some = problem.oriented if k >= 3 else np.ones(count, dtype=np.bool_)
-            turned[some, k] = step[begin[some] + k]
-        size = float(max(np.abs(by).max(), np.abs(turned).max(initial=0.0)))
-        most = max(np.abs(by[:, 3:]).max(), np.abs(turned[:, 3:]).max(initial=0.0))
-        share = min(1.0, LARGEST_TURN / max(float(most), 1e-12))
+        by, turned, share, size = limit_turns(step, n, problem.oriented, tree.begin[n : n + count])
         place = estimate.place.copy()
         on = problem.oriented
         place[on] = se3.retract(place[on], share * turned[on])
@@ -223,6 +225,26 @@ class SpatialSmoother:
         state = estimate.state + share * step[tree.begin[n + count] : -1].reshape(-1, STATES)
         log_scale = estimate.log_scale + share * float(step[-1])
         return SpatialEstimate(se3.retract(estimate.pose, share * by), place, state, log_scale), size
+
+
+def limit_turns(
+    step: FloatArray, n_poses: int, oriented: BoolArray, begin: IntArray
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Return the parts of a step: of poses (N, 6), of places (P, 6); the share of it that turns none too far; its size.
+
+    Args:
+        step: numbers of all variables.
+        n_poses: N, which are the first.
+        oriented: (P,) places with an orientation.
+        begin: (P,) where their numbers begin.
+    """
+    by, turned = step[: 6 * n_poses].reshape(n_poses, 6), np.zeros((len(begin), 6))
+    for k in range(6):
+        some = oriented if k >= 3 else np.ones(len(begin), dtype=np.bool_)
+        turned[some, k] = step[begin[some] + k]
+    size = float(max(np.abs(by).max(), np.abs(turned).max(initial=0.0)))
+    most = max(np.abs(by[:, 3:]).max(), np.abs(turned[:, 3:]).max(initial=0.0))
+    return by, turned, min(1.0, LARGEST_TURN / max(float(most), 1e-12)), size
 
 
 def _states(estimate: SpatialEstimate) -> FloatArray:

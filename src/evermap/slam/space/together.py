@@ -1,0 +1,338 @@
+"""Several robots in space that drove at the same time, as one problem: a concatenation of their blocks.
+
+Each is solved alone first; their frames are aligned by landmarks with the same id. Then all is solved at once, a
+landmark that several saw being one place, with the calibration and the noise levels of each robot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.errors import DataError
+from evermap.estimate.gauss_newton import Minimum, Steps, minimised
+from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, SharedBlock, build_structure, grouped
+from evermap.estimate.sparse.elimination import Spread
+from evermap.estimate.sparse.system import Factorised, exhausted
+from evermap.geometry import se3
+from evermap.geometry.rigid import rigid
+from evermap.slam.space.estimate import CONVERGED, ROUNDS, SpatialOptimum, refined
+from evermap.slam.space.intake import SpatialIntake
+from evermap.slam.space.linearise import STATES
+from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.smoother import (
+    COST_SLACK,
+    FIRST_DAMPING,
+    HELD,
+    ODOMETRY,
+    POSES_A_LEAF,
+    SETTLED,
+    SIGHTINGS,
+    SpatialLinear,
+    SpatialSmoother,
+    limit_turns,
+)
+from evermap.slam.space.solve import FREE, SpatialSolved
+from evermap.types import BoolArray, FloatArray, IntArray
+
+AGREE_M = 0.5
+"""Landmarks of two robots agree where they come to lie this close."""
+FEWEST = 3
+"""Points that align two robots; of landmarks with an orientation one does."""
+
+
+class JointEstimate(NamedTuple):
+    """Values of all variables of several robots: their poses (N, 7), one robot after the other; the places (P, 7) of
+    all; the mounts (S, 6) of all their sensors; and the scale (R,) of the odometry of each.
+    """
+
+    pose: FloatArray
+    place: FloatArray
+    state: FloatArray
+    log_scale: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Alone:
+    """A robot that was solved by itself."""
+
+    intake: SpatialIntake
+    solved: SpatialSolved
+
+    @property
+    def problem(self) -> SpatialProblem:
+        """Its last problem."""
+        return self.solved.optimum.smoother.problem
+
+    @property
+    def identity(self) -> IntArray:
+        """(P,) ids of its places; -1 of a second one with the same id, which is its own."""
+        return np.where(self.solved.number == 1, self.intake.landmark_id[self.solved.identity], -1)
+
+
+def solve_space_together(members: Sequence[Alone], names: Sequence[str]) -> list[SpatialSolved]:
+    """Return robots solved together, in the frame of the first one's first pose.
+
+    Args:
+        members: each by itself.
+        names: what they are called in messages.
+
+    Raises:
+        DataError: nothing ties one of them to the others.
+        NumericalError: no finite optimum.
+    """
+    motion = align_robots(members, names)
+    joint, start = _lay_together(members, motion)
+    noise = [member.solved.optimum.noise for member in members]
+    begun = list(noise)
+    for round_ in range(ROUNDS):
+        solution = joint.minimise(start, noise, most=15 if round_ == 0 else 2)
+        start = solution.state
+        parts = joint.parts(solution, noise)
+        following = [
+            refined(part.smoother, part.now, own, first) for part, own, first in zip(parts, noise, begun, strict=True)
+        ]
+        before, noise = noise, following
+        changes = [np.abs(np.log(new.levels / old.levels)).max() for new, old in zip(noise, before, strict=True)]
+        if max(changes) < CONVERGED:
+            break
+    optima = joint.parts(joint.minimise(start, noise, most=6), noise)
+    found = []
+    for member, by, optimum in zip(members, motion, optima, strict=True):
+        online = se3.compose(by, member.solved.online_pose)
+        found.append(replace(member.solved, optimum=optimum, online_pose=online))
+    return found
+
+
+def align_robots(members: Sequence[Alone], names: Sequence[str]) -> FloatArray:
+    """Return the motions (R, 7) of each robot's frame into that of the first, by landmarks that agree.
+
+    Raises:
+        DataError: nothing ties one of them to the others.
+    """
+    motion, placed = se3.identity(len(members)), [0]
+    while len(placed) < len(members):
+        best, found = 0, None
+        for b in (b for b in range(len(members)) if b not in placed):
+            place = [se3.compose(motion[a], members[a].solved.optimum.estimate.place) for a in placed]
+            theirs, oriented = np.concatenate(place), np.concatenate([members[a].problem.oriented for a in placed])
+            name = np.concatenate([members[a].identity for a in placed])
+            by, count = _align(members[b], name, theirs, oriented)
+            if count > best:
+                best, found = count, (b, by)
+        if found is None:
+            lost = ", ".join(names[b] for b in range(len(members)) if b not in placed)
+            what = f"nothing connects {lost} to {names[0]}"
+            raise DataError(what, hint="common landmark ids, at least three points or one tag, and one clock")
+        motion[found[0]] = found[1]
+        placed.append(found[0])
+    return motion
+
+
+def _align(member: Alone, name: IntArray, theirs: FloatArray, oriented: BoolArray) -> tuple[FloatArray, int]:
+    """The motion (7,) of a robot's frame that brings most of its places to those of others, and how many."""
+    own_name, own = member.identity, member.solved.optimum.estimate.place
+    row, other = np.nonzero((own_name[:, None] == name) & (own_name >= 0)[:, None])
+    if not len(row):
+        return se3.identity(), 0
+    turned = np.flatnonzero(member.problem.oriented[row] & oriented[other])
+    trial = [se3.compose(theirs[other[turned]], se3.inverse(own[row[turned]]))]
+    if len(np.unique(row)) >= FEWEST:
+        trial.append(rigid(own[row, :3], theirs[other, :3])[None])
+    candidate = np.concatenate(trial)
+    if not len(candidate):
+        return se3.identity(), 0
+    gap = np.linalg.norm(se3.transform(candidate[:, None], own[row, :3]) - theirs[other, :3], axis=2)
+    agree = gap < AGREE_M
+    best = int(np.argmax(agree.sum(axis=1) - gap.clip(max=AGREE_M).sum(axis=1) / (AGREE_M * len(row))))
+    some = np.flatnonzero(agree[best])
+    if len(np.unique(row[some])) >= FEWEST:
+        return rigid(own[row[some], :3], theirs[other[some], :3]), len(np.unique(row[some]))
+    return candidate[best], len(np.unique(row[some])) if len(turned) else 0
+
+
+def _lay_together(members: Sequence[Alone], motion: FloatArray) -> tuple[SpatialTogether, JointEstimate]:
+    """The problem of all, and where it is when each robot's own solution is moved by (R, 7)."""
+    stay = np.unique(np.concatenate([member.identity[member.identity >= 0] for member in members]))
+    places, count = [], len(stay)
+    for member in members:
+        own = member.identity
+        row = np.where(own >= 0, np.searchsorted(stay, own), 0)
+        alone = np.flatnonzero(own < 0)
+        row[alone] = count + np.arange(len(alone))
+        count += len(alone)
+        places.append(row)
+    oriented, place = np.zeros(count, dtype=np.bool_), se3.identity(count)
+    known = np.zeros(count, dtype=np.bool_)
+    estimates = [member.solved.optimum.estimate for member in members]
+    for member, by, row, estimate in zip(members, motion, places, estimates, strict=True):
+        moved, turned = se3.compose(by, estimate.place), member.problem.oriented
+        new = ~known[row] | (turned & ~oriented[row])  # of one that has an orientation to one, the former
+        place[row[new]] = moved[new]
+        known[row], oriented[row] = True, oriented[row] | turned
+    place[~oriented, 3:] = se3.NO_TURN
+    robots = []
+    for r, (member, by, row, estimate) in enumerate(zip(members, motion, places, estimates, strict=True)):
+        sigma = member.problem.start_sigma if r == 0 else FREE
+        problem = replace(member.problem, oriented=oriented[row], start_sigma=sigma)
+        robots.append(_Member(problem, se3.compose(by, estimate.pose)))
+    start = JointEstimate(
+        np.concatenate([se3.compose(by, estimate.pose) for by, estimate in zip(motion, estimates, strict=True)]),
+        place,
+        np.concatenate([estimate.state for estimate in estimates]),
+        np.array([estimate.log_scale for estimate in estimates]),
+    )
+    begin_s = np.array([member.intake.start_s for member in members])
+    return SpatialTogether(robots, places, begin_s, start), start
+
+
+class SpatialTogether:
+    """Several problems in space that share places, as one graph.
+
+    Args:
+        robots: the smoother of each.
+        places: (P_r,) of each robot, which of all places its own are.
+        start_s: (R,) beginning of each problem's clock on that of all.
+        around: rough values.
+    """
+
+    def __init__(
+        self, robots: Sequence[_Member], places: Sequence[IntArray], start_s: FloatArray, around: JointEstimate
+    ) -> None:
+        self.robots, self.places = tuple(robots), tuple(places)
+        self.first = np.cumsum([0, *(len(robot.problem.stamp_s) for robot in robots)])
+        self.sensor = np.cumsum([0, *(len(robot.problem.mount) for robot in robots)])
+        n, count, n_sensors = int(self.first[-1]), len(around.place), int(self.sensor[-1])
+        self.oriented = np.zeros(count, dtype=np.bool_)
+        for robot, row in zip(self.robots, self.places, strict=True):
+            self.oriented[row] |= robot.problem.oriented
+        self.variable = [
+            np.concatenate(
+                [np.arange(a, b), n + row, n + count + np.arange(*span), [n + count + n_sensors + r]]
+            ).astype(np.int64)
+            for r, ((a, b), span, row) in enumerate(
+                zip(pairwise(self.first.tolist()), pairwise(self.sensor.tolist()), self.places, strict=True)
+            )
+        ]
+        leaves, when, last = [], [], 0
+        for robot, begin_s in zip(self.robots, start_s, strict=True):
+            leaves.append(last + grouped(len(robot.problem.stamp_s), POSES_A_LEAF))
+            last = int(leaves[-1][-1]) + 1
+            when.append(begin_s + robot.problem.stamp_s)
+        dim = np.concatenate([np.full(n, 6), np.where(self.oriented, 6, 3), np.full(n_sensors, STATES)])
+        dim = np.append(dim, np.ones(len(robots), dtype=np.int64))
+        coordinate = np.column_stack([np.concatenate(when), around.pose[:, :3]])
+        layout = Layout(dim, n + count + np.arange(n_sensors + len(robots)), np.concatenate(leaves), coordinate)
+        blocks = self._blocks([SpatialNoise()] * len(robots), heavy=False)
+        self.structure = exhausted(build_structure(layout, blocks))
+        begin = self.structure.system.tree.begin
+        self._held = np.zeros(begin[-1])
+        self._held[begin[n] : begin[n + count]] = HELD
+        for robot, variable in zip(self.robots, self.variable, strict=True):
+            robot.hold(self._held, begin[variable])
+        of_sensors = [robot.states_information[:-1] for robot in self.robots]
+        of_scales = [robot.states_information[-1:] for robot in self.robots]
+        self._border = Border(np.concatenate([*of_sensors, *of_scales]), _states)
+
+    def minimise(self, start: JointEstimate, noise: Sequence[SpatialNoise], *, most: int) -> Minimum[JointEstimate]:
+        """Run damped Gauss-Newton for so many steps at most."""
+        steps = Steps(most, 1e-5, SETTLED, 0.0, COST_SLACK, FIRST_DAMPING)
+        graph = Graph(self._blocks(noise, heavy=False), self.structure, self._border, self._held, self._retract)
+        return exhausted(minimised(graph, start, steps))
+
+    def parts(self, solution: Minimum[JointEstimate], noise: Sequence[SpatialNoise]) -> list[SpatialOptimum]:
+        """Return what each robot has of the solution, with covariances by all."""
+        graph = Graph(self._blocks(noise, heavy=False), self.structure, self._border, self._held, self._retract)
+        factorised = exhausted(graph.factorised(solution.now))
+        spread = exhausted(factorised.spread())
+        found, count = [], len(self.robots)
+        for r, robot in enumerate(self.robots):
+            blocks = [k for kind in (ODOMETRY, SIGHTINGS) for k in [kind * count + r]]
+            values = np.concatenate([solution.now.values[self.structure.values_of(k)] for k in blocks])
+            weights = tuple(solution.now.weights[k] for k in blocks)
+            robot.learn(factorised, spread, self.variable[r], [self.structure.first[k : k + 2] for k in blocks])
+            own = Linear(values, weights, solution.now.cost, np.zeros(0))
+            found.append(SpatialOptimum(self.own(solution.state, r), noise[r], robot, SpatialLinear(own, robot)))
+        return found
+
+    def own(self, state: JointEstimate, robot: int) -> SpatialEstimate:
+        """Return the values of a robot."""
+        poses, sensors = (slice(*of[robot : robot + 2].tolist()) for of in (self.first, self.sensor))
+        place, log_scale = state.place[self.places[robot]], float(state.log_scale[robot])
+        return SpatialEstimate(state.pose[poses], place, state.state[sensors], log_scale)
+
+    def _blocks(self, noise: Sequence[SpatialNoise], *, heavy: bool) -> tuple[FactorBlock[JointEstimate], ...]:
+        """Odometry of all, detections of all, and what else each has."""
+        kinds = []
+        for r, (robot, own) in enumerate(zip(self.robots, noise, strict=True)):
+            select = partial(self.own, robot=r)
+            first = int(self.first[r])
+            kinds.append(
+                [SharedBlock(block, self.variable[r], first, select) for block in robot.graph(own, heavy=heavy).blocks]
+            )
+        measured = [blocks[kind] for kind in (ODOMETRY, SIGHTINGS) for blocks in kinds]
+        return (*measured, *(block for blocks in kinds for block in blocks[SIGHTINGS + 1 :]))
+
+    def _retract(self, state: JointEstimate, step: FloatArray) -> tuple[JointEstimate, float]:
+        """The values after a step, and how far it went."""
+        n, count = len(state.pose), len(state.place)
+        begin = self.structure.system.tree.begin
+        by, turned, share, size = limit_turns(step, n, self.oriented, begin[n : n + count])
+        place, on = state.place.copy(), self.oriented
+        place[on] = se3.retract(place[on], share * turned[on])
+        place[~on, :3] += share * turned[~on, :3]
+        sensors = share * step[begin[n + count] : begin[n + count + len(state.state)]].reshape(-1, STATES)
+        log_scale = state.log_scale + share * step[len(step) - len(state.log_scale) :]
+        return JointEstimate(se3.retract(state.pose, share * by), place, state.state + sensors, log_scale), size
+
+
+def _states(state: JointEstimate) -> FloatArray:
+    """Return the numbers of the border, whose means are zero."""
+    return np.append(state.state, state.log_scale)
+
+
+class _Member(SpatialSmoother):
+    """A robot among others: its covariances are those by all."""
+
+    def learn(
+        self, factorised: Factorised, spread: Spread, variable: IntArray, factors: Sequence[tuple[int, ...]]
+    ) -> None:
+        """Take what it has of the solution of all, by its own variables and the ranges of its factors."""
+        self._joint, self._variable = factorised, variable
+        first = spread.own_first
+        own = np.concatenate([spread.own[first[k] : first[k + 1]] for k in variable.tolist()])
+        own_first = np.append(0, np.cumsum(np.diff(first)[variable]))
+        at = spread.of_factors_first
+        of_factors = np.concatenate([spread.of_factors[at[low] : at[high]] for low, high in factors])
+        sizes = np.concatenate([np.diff(at[low : high + 1]) for low, high in factors])
+        nothing = np.zeros((0, 0))
+        self._spread = Spread(own, own_first, nothing, of_factors, np.append(0, np.cumsum(sizes)), nothing, nothing)
+
+    def spread(self, now: SpatialLinear) -> Spread:  # noqa: ARG002
+        """Return covariances of its variables, and of what its odometry and detections tie."""
+        return self._spread
+
+    def factorised(self, now: SpatialLinear) -> Factorised:  # noqa: ARG002
+        """Return the equations of all with its sensors and scale in the border."""
+        return _OwnBorder(self._joint, self._variable[-1 - len(self.problem.mount) :])
+
+
+class _OwnBorder(Factorised):
+    """The equations of all, of whose border one robot's part is asked."""
+
+    _own: IntArray
+
+    def __init__(self, joint: Factorised, own: IntArray) -> None:
+        super().__init__(joint.system, joint.values, joint.rows, joint.own_right, joint.information, joint.right)
+        tree = joint.system.tree
+        at = [tree.in_border[k] + np.arange(tree.dim[k]) for k in own.tolist()]
+        object.__setattr__(self, "_own", np.concatenate(at))
+
+    def border_covariance(self) -> FloatArray:
+        """Return the covariance of its sensors and its scale."""
+        return np.asarray(super().border_covariance()[np.ix_(self._own, self._own)])

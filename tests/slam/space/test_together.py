@@ -1,0 +1,116 @@
+"""Several robots in space as one problem: against each alone, and against a dense solver of the same factors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evermap import Config, run_slam, run_together
+from evermap.errors import DataError, InputError
+from evermap.estimate.sparse.system import exhausted
+from evermap.geometry import se3
+from evermap.maps.sessions.spatial import solve_visit
+from evermap.metrics.summary import compare_with_truth
+from evermap.slam.space.together import Alone, _lay_together, align_robots
+from evermap.types import Frames, SpatialRecording, rows_of
+
+from .corridors import tagged_corridor
+from .halls import hall
+
+
+def part(recording: SpatialRecording, first: int, last: int, name: str) -> SpatialRecording:
+    """The frames from `first` to `last` - 1 as a recording of its own, with odometry that begins there."""
+    seen = recording.detections
+    some = rows_of(seen, np.flatnonzero((seen.frame >= first) & (seen.frame < last)))
+    rows = np.arange(first, last)
+    return replace(
+        recording,
+        name=name,
+        odometry=rows_of(recording.odometry, rows),
+        frames=Frames(recording.frames.stamp_s[rows]),
+        detections=replace(some, frame=some.frame - first),
+        truth=rows_of(recording.truth, rows),
+    )
+
+
+def pair(seed: int) -> dict[int, SpatialRecording]:
+    """Two robots in one hall, each on a lap of its own."""
+    whole = hall(seed, n_frames=560, drift=0.05)
+    return {1: part(whole, 0, 280, f"hall {seed}"), 2: part(whole, 280, 560, "other")}
+
+
+def landmark_error(recording: SpatialRecording, result) -> float:
+    return float(compare_with_truth(recording, result, rate_hz=10.0).landmarks.rmse_m)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_two_robots_know_the_hall_better_than_each_alone(seed):
+    recordings = pair(seed)
+    alone = [landmark_error(one, run_slam(one)) for one in recordings.values()]
+    results = run_together(recordings)
+    together = [landmark_error(one, results[number]) for number, one in recordings.items()]
+    assert np.mean(together) < 0.9 * np.mean(alone)
+    assert [results[k].trajectory.frame for k in (1, 2)] == ["first_pose", "first_robot"]
+    # both have what both saw at one place, in one frame
+    _, a, b = np.intersect1d(results[1].landmarks.landmark_id, results[2].landmarks.landmark_id, return_indices=True)
+    assert len(a) > 20
+    np.testing.assert_allclose(results[1].landmarks.position_m[a], results[2].landmarks.position_m[b], atol=1e-12)
+    offset = se3.compose(
+        results[1].trajectory.pose_world_robot[0], se3.inverse(recordings[1].truth.pose_world_robot[0])
+    )
+    true = se3.compose(offset, recordings[2].truth.pose_world_robot)
+    away = np.linalg.norm(results[2].trajectory.pose_world_robot[:, :3] - true[:, :3], axis=1)
+    assert np.sqrt(np.mean(away**2)) < 0.4
+
+
+def test_covariances_are_those_of_a_dense_inverse():
+    recordings = [tagged_corridor(seed, n_frames=12, n_tags=6).recording for seed in (1, 1)]
+    visits = [solve_visit(one, Config(), None, ()) for one in recordings]
+    members = [Alone(visit.intake, visit.solved) for visit in visits]
+    joint, start = _lay_together(members, align_robots(members, ["a", "b"]))
+    noise = [member.solved.optimum.noise for member in members]
+    solution = joint.minimise(start, noise, most=10)
+    system, values = joint.structure.system, solution.now.values
+    size = int(system.tree.begin[-1])
+    information = np.zeros((size, size))
+    for f, rows in enumerate(system.factors.rows.tolist()):
+        block = values[system.tree.value_first[f] : system.tree.value_first[f + 1]].reshape(rows, -1)[:, :-1]
+        tied = system.factors.variable[system.factors.first[f] : system.factors.first[f + 1]]
+        at = np.concatenate([system.tree.begin[k] + np.arange(system.tree.dim[k]) for k in tied])
+        information[np.ix_(at, at)] += block.T @ block
+    information += np.diag(joint._held)
+    border = size - len(joint._border.information)
+    information[border:, border:] += np.diag(joint._border.information)
+    covariance = np.linalg.inv(information)
+    for r, part in enumerate(joint.parts(solution, noise)):
+        spread = part.smoother.spread(part.now)
+        for k, variable in enumerate(joint.variable[r].tolist()):
+            dim = int(system.tree.dim[variable])
+            at = system.tree.begin[variable] + np.arange(dim)
+            own = spread.own[spread.own_first[k] : spread.own_first[k + 1]].reshape(dim, dim)
+            expected = covariance[np.ix_(at, at)]
+            np.testing.assert_allclose(own, expected, atol=1e-5 * np.abs(expected).max())
+        states = joint.variable[r][-2:]
+        at = np.concatenate([system.tree.begin[k] + np.arange(system.tree.dim[k]) for k in states])
+        found = part.smoother.factorised(part.now).border_covariance()
+        np.testing.assert_allclose(found, covariance[np.ix_(at, at)], atol=1e-6 * np.abs(found).max())
+    assert exhausted(joint.structure.system.factorised(values, extra=joint._held)) is not None
+
+
+def test_robots_without_a_common_landmark_are_not_laid_together():
+    recordings = pair(3)
+    seen = recordings[2].detections
+    recordings[2] = replace(recordings[2], detections=replace(seen, landmark_id=seen.landmark_id + 1000))
+    with pytest.raises(DataError, match="nothing connects other to hall 3"):
+        run_together(recordings)
+
+
+def test_robots_in_the_plane_and_in_space_are_refused(tmp_path):
+    from evermap import read_recording
+    from evermap.io.template import write_template
+
+    planar = read_recording(write_template(tmp_path / "drive"))
+    with pytest.raises(InputError, match="some in space"):
+        run_together({1: planar, 2: hall(3, n_frames=40)})
