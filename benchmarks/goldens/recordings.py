@@ -199,7 +199,9 @@ def starloc(session: str, *, data: Path) -> Iterator[Named]:
             print(f"  starloc {session}, {name}: {error}", flush=True)
             yield f"{name}/position_m", None
             continue
-        yield from ((f"{name}/{of}", value) for of, value in scores(recording, result, rate_hz=RATE_HZ))
+        found = scores(recording, result, rate_hz=RATE_HZ)
+        wanted = ("position_m", "landmarks_m") if prior is None else None  # a lost run's turns and NEES say nothing
+        yield from ((f"{name}/{of}", value) for of, value in found if wanted is None or of in wanted)
         yield f"{name}/cpu_s", spent.cpu_s
 
 
