@@ -22,8 +22,9 @@ class Kind(NamedTuple):
 
     Attributes:
         group: accuracy, consistency, changes, beliefs or cost.
-        better: lower; higher; equal, where any change needs a reason; one, for ratios to what is expected.
-        tolerance: relative, of the logarithm for `one`.
+        better: lower; higher; equal, where any change needs a reason; one, for ratios to what is expected, and
+            at_most_one where only too large a ratio says anything.
+        tolerance: relative, of the logarithm for the ratios.
         floor: absolute, in the unit of the figure.
     """
 
@@ -41,6 +42,7 @@ KINDS: dict[str, Kind] = {
     "tracking": Kind("accuracy", "higher", 0.01, 0.002),
     "objective": Kind("accuracy", "lower", 1e-4),
     "nees": Kind("consistency", "one", 0.05),
+    "aligned_nees": Kind("consistency", "at_most_one", 0.05),  # an alignment lowers it, see `metrics.PoseErrors`
     "nis": Kind("consistency", "one", 0.05),
     "correlation": Kind("consistency", "lower", 0.05, 0.02),
     "level": Kind("consistency", "equal", 0.03, 0.0005),
@@ -138,6 +140,8 @@ class Row(NamedTuple):
     note: str = ""
 
 
+LEAST_RATIO = 1e-9
+"""Ratios below are taken for this one."""
 BAD = ("worse", "changed", "missing")
 """Verdicts for which a comparison fails."""
 
@@ -148,10 +152,10 @@ def judge(before: Figure, after: Figure) -> str:
     if old is None or new is None:
         return "same" if old is new else "worse" if new is None else "better"
     better = before.better
-    if better == "one":
-        if min(old, new) <= 0.0:
-            return "same" if old == new else "worse" if new <= 0.0 else "better"
-        step, allowed = abs(math.log(new)) - abs(math.log(old)), before.tolerance
+    if better in ("one", "at_most_one"):
+        lowest = 1.0 if better == "at_most_one" else LEAST_RATIO
+        far = [abs(math.log(max(value, lowest))) for value in (old, new)]
+        step, allowed = far[1] - far[0], before.tolerance
     else:
         step, allowed = new - old, max(before.tolerance * abs(old), before.floor)
         step = -step if better == "higher" else abs(step) if better == "equal" else step
@@ -186,18 +190,11 @@ def _of(figures: Figures, part: str) -> dict[str, Figure]:
 
 def _rows(before: Mapping[str, Figure], after: Mapping[str, Figure]) -> Iterable[Row]:
     for name, old in before.items():
-        new = after.get(name)
-        yield (
-            Row(name, old.value, None, "missing")
-            if new is None
-            else Row(
-                name,
-                old.value,
-                new.value,
-                judge(old, new),
-                f"{old.better} is better" if old.better != "one" else "one is",
-            )
-        )
+        note = {"equal": "", "one": "1 is best", "at_most_one": "1 or less"}.get(old.better, f"{old.better} is better")
+        if name in after:
+            yield Row(name, old.value, after[name].value, judge(old, after[name]), note)
+        else:
+            yield Row(name, old.value, None, "missing", note)
     yield from (Row(name, None, new.value, "new") for name, new in after.items() if name not in before)
 
 

@@ -58,6 +58,9 @@ def made(goldens: ModuleType, values: dict[str, float | None], **states: tuple[s
         ("a/poses/nees", 1.1, 1.3, "worse"),
         ("a/poses/nees", 1.0, 0.5, "worse"),
         ("a/poses/nees", 1.0, 0.0, "worse"),
+        ("a/poses/aligned_nees", 0.1, 0.9, "same"),  # an alignment lowers it: only too much says anything
+        ("a/poses/aligned_nees", 0.1, 1.2, "worse"),
+        ("a/poses/aligned_nees", 1.2, 0.1, "better"),
         ("a/cpu_s", 10.0, 12.0, "same"),
         ("a/cpu_s", 10.0, 13.0, "worse"),
         ("a/cpu_s", 0.2, 0.45, "same"),
