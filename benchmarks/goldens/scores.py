@@ -23,22 +23,20 @@ class MissingDataError(Exception):
 def scores(recording: AnyRecording, result: SlamResult, *, rate_hz: float = 2.0) -> Iterator[Named]:
     """Yield the errors of poses and landmarks, and NEES and NIS over what is expected of them, of one run.
 
-    Poses are aligned, unless the run is in the frame of a map; landmarks are aligned by the poses, and without true
-    poses by themselves. NEES are medians over the median of a chi-square: near the first pose of a map from an unknown
-    start, covariances vanish, and a mean is of those few poses. Those that an alignment has lowered have a kind of
-    their own.
+    Poses are aligned, also in the frame of a map; landmarks are aligned by the poses, and without true poses by
+    themselves. NEES are medians over the median of a chi-square: near the first pose of a map from an unknown start,
+    covariances vanish, and a mean is of those few poses. Their alignment lowers them, as their kind says.
     """
     compared = compare_with_truth(recording, result, rate_hz=rate_hz)
     found, poses, places = metrics_dict(compared), compared.poses, compared.landmarks
     turn = found["heading_rmse_deg"] if found["heading_rmse_deg"] is not None else found["orientation_rmse_deg"]
     at = "landmark_rmse_m" if found["landmark_rmse_m"] is not None else "landmark_rmse_own_alignment_m"
-    nees = "nees" if poses is not None and poses.alignment == "none" else "aligned_nees"
     figures = {
         "position_m": found["pose_rmse_m"],
         "turn_deg": turn,
         "landmarks_m": found[at],
-        f"poses/{nees}": None if poses is None else _typical(poses.nees, poses.dof),
-        f"landmarks/{nees}": None if places is None else _typical(places.nees[places.scored], places.dof),
+        "poses/aligned_nees": None if poses is None else _typical(poses.nees, poses.dof),
+        "landmarks/aligned_nees": None if places is None else _typical(places.nees[places.scored], places.dof),
         "nis": None if found["nis_mean"] is None else found["nis_mean"] / 2.0,
     }
     yield from ((name, value) for name, value in figures.items() if value is not None)
