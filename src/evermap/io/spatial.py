@@ -102,12 +102,12 @@ def sensor_rows(table: Table, column: str, sensors: Sequence[SpatialSensor], fil
         InputError: a name that `file` does not describe.
     """
     known = {sensor.name: row for row, sensor in enumerate(sensors)}
-    labels = table.labels(column)
-    unknown = next((row for row, label in enumerate(labels) if label not in known), None)
-    if unknown is not None:
-        hint = "one of " + ", ".join(known)
-        raise table.error(f"no {column} '{labels[unknown]}' in {file}", row=unknown, field=column, hint=hint)
-    return np.array([known[label] for label in labels], dtype=np.int64)
+    of_row, labels = table.labels(column)
+    for k, label in enumerate(labels):
+        if label not in known:
+            row, hint = int(np.argmax(of_row == k)), "one of " + ", ".join(known)
+            raise table.error(f"no {column} '{label}' in {file}", row=row, field=column, hint=hint)
+    return np.array([known[label] for label in labels], dtype=np.int64)[of_row]
 
 
 def covariances(table: Table, names: tuple[str, ...], *, optional: bool = False) -> FloatArray | None:
