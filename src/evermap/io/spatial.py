@@ -10,6 +10,7 @@ import numpy as np
 
 from evermap.geometry import se3
 from evermap.geometry.camera import unproject
+from evermap.geometry.group import accumulate
 from evermap.geometry.square import square_poses
 from evermap.io.assemble import forward_stamps, last_of_equal
 from evermap.io.table import Table
@@ -212,10 +213,7 @@ def directions(pixel: FloatArray, sensor: IntArray, sensors: Sequence[SpatialSen
 
 def integrated(stamp_s: FloatArray, twist: FloatArray, clock: Clock) -> SpatialOdometry:
     """Return poses from the origin, each velocity (N, 6) held until the next stamp."""
-    pose = se3.identity(len(stamp_s))
-    step = se3.exp(twist[:-1] * np.diff(stamp_s)[:, None])
-    for row in range(len(step)):
-        pose[row + 1] = se3.compose(pose[row], step[row])
+    pose = accumulate(se3.exp(twist[:-1] * np.diff(stamp_s)[:, None]))
     return SpatialOdometry(stamp_s, pose, np.full((len(pose), 6), np.nan), clock=clock)
 
 

@@ -21,6 +21,7 @@ from scipy.linalg import block_diag
 from evermap.config import AssociationConfig, SlamConfig
 from evermap.errors import DataError
 from evermap.geometry import se2, se3
+from evermap.geometry.group import accumulate
 from evermap.slam.association.assignment import (
     NOBODY,
     LooseDetections,
@@ -636,10 +637,7 @@ def _thinned(intake: SpatialIntake) -> SpatialProblem:
 
 def _driven(problem: SpatialProblem) -> FloatArray:
     """(N, 7) poses along the odometry."""
-    pose = se3.identity(len(problem.stamp_s))
-    for k, motion in enumerate(problem.increment):
-        pose[k + 1] = se3.compose(pose[k], motion)
-    return pose
+    return accumulate(problem.increment)
 
 
 def _without(row: IntArray, gone: BoolArray) -> IntArray:
