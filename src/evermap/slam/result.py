@@ -23,12 +23,10 @@ from evermap.types import (
     BoolArray,
     FloatArray,
     Innovations,
-    IntArray,
     Landmarks,
     MapChange,
     Misses,
     ParameterEstimate,
-    Recording,
     SlamResult,
     Trajectory,
 )
