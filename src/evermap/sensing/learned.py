@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 FACES = 6
 """Directions that a landmark's own detectability is learned for: the faces of a cube around it."""
-AGAIN = 0.1
-"""Probability of being occluded up to which a clique counts as seen again."""
 SUMS = ("range_hits", "range_expected", "facing_hits", "facing_expected", "false_hits", "false_looks")
 """What the profile sums up, in the order of the kernels."""
 
@@ -227,7 +225,7 @@ def confirm(
     probability: FloatArray,
     *,
     sure: tuple[float, float] = (0.001, 0.99),
-    p_occluded: float = AGAIN,
+    p_occluded: float = 0.1,
 ) -> LearnedDetection:
     """Learn the profile from the cliques whose presence the last look has made certain.
 
@@ -320,7 +318,13 @@ def _frame(profile: Profile, place: FloatArray, turn: FloatArray) -> SensorFrame
 
 
 def watched(
-    model: LearnedDetection, stamp_s: FloatArray, pose: FloatArray, detected: BoolArray, there: BoolArray
+    model: LearnedDetection,
+    stamp_s: FloatArray,
+    pose: FloatArray,
+    detected: BoolArray,
+    there: BoolArray,
+    *,
+    p_occluded: float = 0.1,
 ) -> LearnedDetection:
     """Return the model after a session with known presence of landmarks.
 
@@ -330,6 +334,7 @@ def watched(
         pose: (F, 4, 4) from the sensor's frame to the world's.
         detected: (F, K) which landmarks were detected.
         there: (F, K) which of them were there; of the others nothing is learned.
+        p_occluded: as of `confirm`.
     """
     from evermap.sensing import kernels
 
@@ -338,8 +343,8 @@ def watched(
     after = replace(model, **{name: getattr(model, name).copy() for name in changed})
     rows = kernels.LandmarkRows(after.landmark_m, after.outward, after.hits, after.expected)
     cliques = kernels.CliqueRows(after.first, after.occluded, after.log_chain, after.pending)
-    log_there, log_gone, p_occluded = np.empty((3, len(model)))
-    out = kernels.LookRows(log_there, log_gone, p_occluded, np.empty(len(model), dtype=np.int64))
+    log_there, log_gone, occluded = np.empty((3, len(model)))
+    out = kernels.LookRows(log_there, log_gone, occluded, np.empty(len(model), dtype=np.int64))
     profile, nobody, law = after.profile, np.zeros(len(model), dtype=np.bool_), _law(after.profile)
     for stamp, one, hit, active in zip(stamp_s.tolist(), pose, detected, there, strict=True):
         if not active.any():
@@ -348,7 +353,7 @@ def watched(
         kernels.look(_frame(profile, one[:3, 3], one[:3, :3]), law, rows, cliques, seen_now, out)
         in_view = out.looked > 0
         after.stamp_s[in_view] = stamp
-        again = in_view & (out.p_occluded < AGAIN)
+        again = in_view & (out.p_occluded < p_occluded)
         if again.any():
             profile = _collected(profile, again, nobody, after.pending, after.log_chain)
             rates = profile.range_rate, profile.facing_rate, profile.p_false
