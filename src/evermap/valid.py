@@ -201,7 +201,9 @@ def _check_spatial_detections(detections: SpatialDetections, frames: int, sensor
              "is not a unit quaternion", "x, y, z, w; nan of points")  # fmt: skip
     covariance = detections.covariance_sensor_m2
     given = ~np.isnan(covariance).all(axis=(1, 2))
-    _require(~given | is_covariance(covariance), row, f"{field}.covariance_sensor_m2",
+    fine = np.ones(len(row), dtype=np.bool_)
+    fine[given] = is_covariance(covariance[given])
+    _require(fine, row, f"{field}.covariance_sensor_m2",
              "is not a covariance: not positive semidefinite", "square metres; nan where unknown")  # fmt: skip
     for name in ("sigma_rad", "tag_size_m"):
         value = getattr(detections, name)

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.geometry import se2, se3
+from evermap.geometry.group import accumulate
 
 both = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 data = st.data()
@@ -243,6 +244,20 @@ def in_space(pose: np.ndarray) -> np.ndarray:
 
 FLAT = [0, 1, 5]
 """Rows of a twist in space that are those of a planar one."""
+
+
+@both
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 15, 16, 17, 1000])
+def test_motions_accumulate_to_their_products(case, count):
+    group, rng = case.group, np.random.default_rng(count)
+    motion = group.exp(rng.normal(size=(count, group.dim)))
+    expected = group.identity(count + 1)
+    for k in range(count):
+        expected[k + 1] = group.compose(expected[k], motion[k])
+    found = accumulate(motion)
+    assert found.shape == expected.shape
+    for one, other in zip(found, expected, strict=True):
+        assert_same(case, one, case.matrix(other))
 
 
 @given(PLANE_CASE.poses(), PLANE_CASE.poses(), PLANE_CASE.twists())

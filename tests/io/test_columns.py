@@ -6,6 +6,7 @@ import csv
 import gzip
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from evermap.errors import InputError
-from evermap.io import columns as module
 from evermap.io.columns import Columns, csv_bytes, named, read_columns
 from evermap.io.landmarks import read_landmarks, write_map_csv
-from evermap.io.table import csv_text, parse_table
+from evermap.io.table import Table, csv_text, parse_by_line, parse_csv, parse_table
 from evermap.types import landmark_id_of
 from evermap.valid import Quantity
 
@@ -61,12 +61,56 @@ def test_every_way_to_write_a_table_gives_the_same(tmp_path: Path, content: str,
         assert value in lines[line - 1]
 
 
-def test_the_fast_road_is_taken_where_it_can_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def careful(*_: Any) -> None:
-        raise AssertionError("a plain table takes the slow road")
+def test_plain_tables_are_read_by_pyarrow(tmp_path: Path) -> None:
+    columns = parse_csv(("# comment\n" + PLAIN).encode(), tmp_path / "t.csv", []).columns
+    assert all(isinstance(cells, pa.Array) for cells in columns.values())
 
-    monkeypatch.setattr(module, "_careful_csv", careful)
-    assert len(read(tmp_path, "# comment\n" + PLAIN)) == 4
+
+ODD = [
+    PLAIN,
+    PLAIN.rstrip("\n"),
+    PLAIN.replace("\n", "\r\n"),
+    PLAIN.replace("\n", "\r"),
+    PLAIN.replace("\n", "\r\r\n"),
+    PLAIN.replace("\n", ",\n"),
+    PLAIN.replace("0.5,b", "\x0b# between\n\n0.5,b"),
+    PLAIN.replace(" a ", '"a ""b"", c"'),
+    PLAIN.replace(" a ", '"a\nb"'),
+    PLAIN.replace(" a ", "'=a"),
+    PLAIN.replace(" a ", 'a"b'),
+    PLAIN + "8,c,1",
+    PLAIN + "8,c,1\n",
+    PLAIN + "8,c,1,1,1\n",
+    PLAIN + "8,c,",
+    PLAIN.replace("\n", "\n\n", 1),
+    "value\n1\n2\n3e",
+    "value\n1\n \n2\n",
+    "value\n1\n\n2",
+    "value\n1\n'2\n",
+    "value\n",
+    "value",
+    "value,value\n1,2\n",
+    "value;other\n1;2\n",
+    "1,2\n3,4\n",
+    "",
+]
+NUMBERS = ["1_0", "nan(1)", "+1", "0x1", "1e999", "1e-999", "\u0661", "\xa01 ", "Infinity", "-nan", "", " ", "1.", ".5"]
+
+
+@pytest.mark.parametrize("content", [*ODD, *(f"value,b\n2,x\n{number},x\n3,x\n" for number in NUMBERS)])
+def test_a_table_is_the_same_in_one_go_and_line_by_line(tmp_path: Path, content: str) -> None:
+    def outcome(parse: Callable[[bytes, Path, list[str]], Table], optional: bool) -> Any:
+        warnings: list[str] = []
+        try:
+            table = parse(content.encode(), tmp_path / "t.csv", warnings)
+            labels = {name: [table.labels(name)[1][k] for k in table.labels(name)[0]] for name in table.columns}
+            numbers = table.numbers(replace(MAYBE, optional=optional)).tobytes() if "value" in table else b""
+        except InputError as error:
+            return str(error), warnings
+        return table.line.tolist(), labels, numbers, table.header_line, warnings
+
+    for optional in (False, True):
+        assert outcome(parse_csv, optional) == outcome(parse_by_line, optional)
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
@@ -210,7 +254,8 @@ def test_no_text_is_a_formula_and_all_are_read_back(tmp_path: Path, comment: str
         assert cells == [*(f"'{name}" for name in FORMULAS), *HARMLESS]
         path = tmp_path / "names.csv"
         path.write_text(text + comment)
-        assert parse_table(path.read_bytes(), path, []).labels("name") == names
+        of_row, labels = parse_table(path.read_bytes(), path, []).labels("name")
+        assert [labels[number] for number in of_row] == names
         found, index = read_columns(path, []).labels("name")
         assert [found[number] for number in index] == names
 

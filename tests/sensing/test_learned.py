@@ -48,6 +48,29 @@ def same(one: LearnedDetection, other: LearnedDetection, rows=slice(None), landm
         np.testing.assert_array_equal(getattr(one, name)[landmarks], getattr(other, name)[landmarks], err_msg=name)
 
 
+def test_a_whole_session_is_its_looks_each_confirmed():
+    rng = np.random.default_rng(3)
+    landmark = cliques(rng)[0]
+    each = np.arange(len(landmark))
+    start = learned.init(landmark, each, Assumed(field=LIDAR, p_false=0.02, p_never_occluded=0.3))
+    looks = list(frames(rng, 60, len(each)))
+    pose = np.tile(np.eye(4), (len(looks), 1, 1))
+    pose[:, :3, 3], pose[:, :3, :3] = [look[1] for look in looks], [look[2] for look in looks]
+    stamp_s, detected = np.array([look[0] for look in looks]), np.array([look[3] for look in looks])
+    there = rng.random(detected.shape) < 0.8
+    there[5] = False
+    found = learned.watched(start, stamp_s, pose, detected, there)
+    model = start
+    for (stamp, position, turn, hit), active in zip(looks, there, strict=True):
+        model, seen = learned.look(model, stamp, position, turn, hit, active=active)
+        model = learned.confirm(model, seen, np.ones(len(each)))
+    same(found, model)
+    for name in (*SHARED, "log_weight"):
+        np.testing.assert_allclose(getattr(found.profile, name), getattr(model.profile, name), rtol=1e-12, atol=1e-12)
+    assert found.profile.range_expected.sum() > start.profile.range_expected.sum() + 10.0
+    np.testing.assert_array_equal(start.hits, learned.init(landmark, each, start.profile).hits)  # not in place
+
+
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_it_is_the_plain_model_frame_by_frame(name, seed):

@@ -6,6 +6,7 @@ axes. Twists hold the translation first, then the rotation, in the frame of the 
 
 from __future__ import annotations
 
+from math import isqrt
 from typing import Protocol
 
 import numpy as np
@@ -78,3 +79,19 @@ SPACE: Group = se3
 def group_of(pose: ArrayLike) -> Group:
     """Return the group of poses (..., 3) or (..., 7), by how many numbers each has."""
     return SPACE if np.shape(pose)[-1] == SPACE.size else PLANE
+
+
+def accumulate(motion: FloatArray) -> FloatArray:
+    """Return the poses (N + 1, size) to which motions (N, size) lead one after the other from the origin.
+
+    Stretches of about sqrt(N) motions are composed all at once, then one is appended to the other.
+    """
+    group, count = group_of(motion), len(motion)
+    length = isqrt(count) + 1
+    pose = group.identity(-(-count // length), length)
+    pose.reshape(-1, group.size)[:count] = motion
+    for k in range(1, length):
+        pose[:, k] = group.compose(pose[:, k - 1], pose[:, k])
+    for k in range(1, len(pose)):
+        pose[k] = group.compose(pose[k - 1, -1], pose[k])
+    return np.concatenate([group.identity(1), pose.reshape(-1, group.size)[:count]])

@@ -60,8 +60,10 @@ def forward_stamps(table: Table) -> FloatArray:
 
 def repeats(values: IntArray) -> IntArray:
     """Return rows that are equal to an earlier one. Shape (N,) or (N, K) -> (number of repeats,)."""
-    _, first = np.unique(values, axis=0, return_index=True)
-    return np.setdiff1d(np.arange(len(values)), first)
+    columns = np.atleast_2d(values.T)
+    order = np.lexsort(columns[::-1])
+    same = np.all(columns[:, order[1:]] == columns[:, order[:-1]], axis=0)
+    return np.sort(order[1:][same])
 
 
 def wrap_far(angle_rad: FloatArray) -> FloatArray:

@@ -1,40 +1,41 @@
 """Long tables of looks and the like: CSV (also gzipped) and Parquet, a million rows in a fraction of a second.
 
-pyarrow reads the file and converts whole columns. Whatever it refuses goes through `Table`, which is slow but finds
-line and cell at fault; both take the same files and give the same values.
+Columns stay pyarrow arrays, of which whole columns are converted. Whatever that refuses goes through `Table`, which
+finds line and cell at fault.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.interrupts import raises
 from evermap.io.files import unpacked
 from evermap.io.table import (
     FORMULA,
-    GUARDED,
     NamedColumns,
     Table,
     arrow_cells,
     arrow_csv,
+    coded,
     dates_as_text,
+    floats_of,
     guarded,
-    numbers_of,
+    mapped,
+    numbers_of_text,
+    one_array,
     pa,
     parse_csv,
     pc,
     pq,
     read_parquet,
-    unguarded,
 )
 from evermap.io.text import quote, reason
-from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
+from evermap.types import UNKNOWN, Clock, FloatArray, IntArray
 from evermap.valid import Quantity
 
 _BATCH_ROWS = 1 << 18
@@ -49,15 +50,10 @@ class Columns(NamedColumns):
     def numbers(self, quantity: Quantity) -> FloatArray:
         cells = self.columns[quantity.name]
         if _is_text(cells.type):
-            text = pc.utf8_trim_whitespace(cells)
-            length, given = numbers_of(pc.binary_length(text), np.int32)
-            blank = given & (length == 0)
-            try:
-                if not quantity.optional and blank.any():
-                    raise pa.ArrowInvalid("an empty cell")
-                values = _as_float(_without(text, given & ~blank))
-            except pa.ArrowInvalid:
+            converted = numbers_of_text(cells, optional=quantity.optional)
+            if converted is None:
                 return self._table({quantity.name: cells.to_pylist()}).numbers(quantity)
+            values = converted
         else:
             values = self._converted(cells, quantity.name)
         quantity.check(values, path=self.path, line=self.line)
@@ -83,7 +79,7 @@ class Columns(NamedColumns):
                 raise self.error(f"{values[wrong[0]]:g} is neither 1 nor 0", row=int(wrong[0]), field=name, hint=hint)
             return values
         words = pc.utf8_lower(pc.utf8_trim_whitespace(cells))
-        row_word, known = _coded(words)
+        row_word, known = coded(words)
         unknown = [k for k, word in enumerate(known) if word not in _FLAGS]
         if unknown:
             row = int(np.flatnonzero(np.isin(row_word, unknown))[0])
@@ -110,7 +106,7 @@ class Columns(NamedColumns):
             cells = arrow_cells(values, ~np.isnan(values)).cast(pa.int64())
         elif not _is_text(cells.type) and not pa.types.is_integer(cells.type) and not pa.types.is_null(cells.type):
             raise self.error(f"contains {cells.type}, not names", row=None, field=name, hint="text or whole numbers")
-        row_name, names = _coded(pc.utf8_trim_whitespace(cells.cast(pa.string())))
+        row_name, names = coded(pc.utf8_trim_whitespace(cells.cast(pa.string())))
         for code, text in enumerate(names):
             if not text.isprintable():
                 row = int(np.argmax(row_name == code))
@@ -131,7 +127,7 @@ class Columns(NamedColumns):
         fits = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean, pa.types.is_null)
         if not any(is_kind(kind) for is_kind in fits):
             raise self.error(f"contains {kind}, not numbers", row=None, field=name, hint="cast the column to float64")
-        return _as_float(cells)
+        return floats_of(cells)
 
 
 def read_columns(path: str | Path, warnings: list[str]) -> Columns:
@@ -147,9 +143,11 @@ def read_columns(path: str | Path, warnings: list[str]) -> Columns:
     data = _content(path)
     if data[:4] == b"PAR1":
         table = read_parquet(data, path)
-        cells = {name: _plain(column) for name, column in zip(table.column_names, table.columns, strict=True)}
+        cells = {name: one_array(column) for name, column in zip(table.column_names, table.columns, strict=True)}
         return Columns(path, cells, np.arange(1, table.num_rows + 1))
-    return _fast_csv(data, path) or _careful_csv(data, path, warnings)
+    parsed = parse_csv(data, path, warnings)
+    cells = {name: arrow_cells(list(c)) if isinstance(c, Sequence) else c for name, c in parsed.columns.items()}
+    return Columns(path, cells, parsed.line, parsed.header_line)
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
@@ -179,7 +177,7 @@ def parquet_batches(path: Path) -> Iterator[Columns]:
                     hint = f"the columns of {files[0].name}, of the same types"
                     raise InputError("has other columns than the files before it", path=file, hint=hint)
                 for batch in source.iter_batches(_BATCH_ROWS, use_threads=False):
-                    cells = dict(zip(batch.schema.names, map(_plain, batch.columns), strict=True))
+                    cells = dict(zip(batch.schema.names, map(one_array, batch.columns), strict=True))
                     yield Columns(path, cells, np.arange(start, start + batch.num_rows))
                     start += batch.num_rows
         except (pa.ArrowException, OSError, ValueError) as error:
@@ -234,22 +232,8 @@ def needs_quotes(cells: Any) -> bool:
 def _cells(column: Any) -> Any:
     """A column for a CSV file, nan as null, and without text that a spreadsheet would execute."""
     if not isinstance(column, np.ndarray):
-        return _mapped(column, FORMULA, guarded) if _is_text(column.type) else column
+        return mapped(column, FORMULA, guarded) if _is_text(column.type) else column
     return arrow_cells(column, ~np.isnan(column) if column.dtype.kind == "f" else None)
-
-
-def _mapped(cells: Any, pattern: str, change: Callable[[str], str]) -> Any:
-    """Return an array of text with a change of each different one, if any matches the pattern."""
-    if not pc.any(pc.match_substring_regex(cells, pattern)).as_py():
-        return cells
-    code, words = _coded(cells)
-    return arrow_cells([*map(change, words), ""], np.arange(len(words) + 1) < len(words)).take(arrow_cells(code))
-
-
-def _without(text: Any, known: BoolArray) -> Any:
-    """Return an array of text with null for unknown values."""
-    valid = np.packbits(np.concatenate([np.zeros(text.offset, dtype=np.bool_), known]), bitorder="little")
-    return pa.Array.from_buffers(text.type, len(text), [pa.py_buffer(valid), *text.buffers()[1:]], offset=text.offset)
 
 
 def _content(path: Path) -> bytes:
@@ -264,65 +248,8 @@ def _content(path: Path) -> bytes:
     return unpacked(data, path)
 
 
-def _fast_csv(data: bytes, path: Path) -> Columns | None:
-    """The table, if it is plain: no comments and empty lines after the header, as many cells as names everywhere."""
-    head = re.match(rb"(?:\xef\xbb\xbf)?(?:[ \t]*(?:#[^\n]*)?\r?\n)*[^\n]*\n", data)
-    if head is None or b"\0" in data or re.search(rb"\n[ \t]*#", data[head.end() - 1 :]):
-        return None
-    header = parse_csv(head[0], path, [])
-    names = list(header.columns)
-    if not raises():
-        pa.enable_signal_handlers(False)  # Arrow's own lose a signal that comes as a table ends, one in ten
-    rows = data.count(b"\n", head.end()) + (not data.endswith(b"\n"))
-    try:
-        table = arrow_csv.read_csv(
-            pa.BufferReader(pa.py_buffer(data).slice(head.end())),
-            read_options=arrow_csv.ReadOptions(column_names=names, use_threads=False),
-            convert_options=arrow_csv.ConvertOptions(
-                column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False
-            ),
-        )
-    except pa.ArrowInvalid:
-        return None
-    if table.num_rows != rows or header.header_line is None:
-        return None
-    cells = {name: _plain(column) for name, column in zip(names, table.columns, strict=True)}
-    if b"'" in data:
-        cells = {name: _mapped(column, GUARDED, unguarded) for name, column in cells.items()}
-    return Columns(path, cells, header.header_line + 1 + np.arange(rows), header.header_line)
-
-
-def _careful_csv(data: bytes, path: Path, warnings: list[str]) -> Columns:
-    table = parse_csv(data, path, warnings)
-    cells = {name: arrow_cells(list(column)) for name, column in table.columns.items()}
-    return Columns(path, cells, table.line, table.header_line)
-
-
-def _plain(column: Any) -> Any:
-    """One array in place of chunks and dictionaries."""
-    if pa.types.is_dictionary(column.type):
-        column = column.cast(column.type.value_type)
-    if pa.types.is_large_string(column.type) or pa.types.is_string_view(column.type):
-        column = column.cast(pa.string())
-    return column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
-
-
 def _is_text(kind: Any) -> bool:
     return bool(pa.types.is_string(kind))
-
-
-def _as_float(cells: Any) -> FloatArray:
-    if pa.types.is_boolean(cells.type):
-        cells = cells.cast(pa.int8())
-    values, known = numbers_of(cells.cast(pa.float64(), safe=False), np.float64)
-    return np.where(known, values, np.nan)
-
-
-def _coded(words: Any) -> tuple[IntArray, list[str]]:
-    """Return the index of each cell among the distinct values, -1 if missing, and these values."""
-    coded = words.dictionary_encode()
-    codes, known = numbers_of(coded.indices, np.int32)
-    return np.where(known, codes, -1).astype(np.int64), coded.dictionary.to_pylist()
 
 
 def _natural(names: list[str]) -> Any:

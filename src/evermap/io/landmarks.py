@@ -134,7 +134,8 @@ def landmarks_from_table(
     names = {} if names is None else names
     ids = table.ids("landmark_id", optional=False, names=names)
     if "name" in table:
-        names |= {int(ids[row]): name for row, name in enumerate(table.labels("name")) if name}
+        of_row, given = table.labels("name")
+        names |= {int(ids[row]): given[k] for row, k in enumerate(of_row.tolist()) if given[k]}
     again = repeats(ids)
     if len(again):
         row = int(again[0])
@@ -268,7 +269,7 @@ def labels_of(class_id: IntArray, class_names: Sequence[str]) -> list[str]:
 def distinct_labels(*tables: Table | None) -> tuple[str, ...]:
     """Return all class labels of the tables, sorted."""
     labels = {label for table in tables if table is not None and "class_id" in table
-              for label in table.labels("class_id")}  # fmt: skip
+              for label in table.labels("class_id")[1]}  # fmt: skip
     return tuple(sorted(labels - {""}))
 
 
@@ -307,12 +308,12 @@ def class_ids(table: Table, class_names: tuple[str, ...]) -> IntArray:
     if "class_id" not in table:
         return np.full(len(table), UNKNOWN, dtype=np.int64)
     number_of = {"": UNKNOWN, **{name: number for number, name in enumerate(class_names)}}
-    labels = table.labels("class_id")
-    for row, label in enumerate(labels):
+    of_row, labels = table.labels("class_id")
+    for k, label in enumerate(labels):
         if label not in number_of:
-            hint = "one of " + ", ".join(class_names)
+            row, hint = int(np.argmax(of_row == k)), "one of " + ", ".join(class_names)
             raise table.error(f"class '{label}' is not among the class names", row=row, field="class_id", hint=hint)
-    return np.array([number_of[label] for label in labels], dtype=np.int64)
+    return np.array([number_of[label] for label in labels], dtype=np.int64)[of_row]
 
 
 def _covariance(table: Table, sigma_m: float) -> FloatArray:

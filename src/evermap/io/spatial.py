@@ -10,6 +10,7 @@ import numpy as np
 
 from evermap.geometry import se3
 from evermap.geometry.camera import unproject
+from evermap.geometry.group import accumulate
 from evermap.geometry.square import square_poses
 from evermap.io.assemble import forward_stamps, last_of_equal
 from evermap.io.table import Table
@@ -102,12 +103,12 @@ def sensor_rows(table: Table, column: str, sensors: Sequence[SpatialSensor], fil
         InputError: a name that `file` does not describe.
     """
     known = {sensor.name: row for row, sensor in enumerate(sensors)}
-    labels = table.labels(column)
-    unknown = next((row for row, label in enumerate(labels) if label not in known), None)
-    if unknown is not None:
-        hint = "one of " + ", ".join(known)
-        raise table.error(f"no {column} '{labels[unknown]}' in {file}", row=unknown, field=column, hint=hint)
-    return np.array([known[label] for label in labels], dtype=np.int64)
+    of_row, labels = table.labels(column)
+    for k, label in enumerate(labels):
+        if label not in known:
+            row, hint = int(np.argmax(of_row == k)), "one of " + ", ".join(known)
+            raise table.error(f"no {column} '{label}' in {file}", row=row, field=column, hint=hint)
+    return np.array([known[label] for label in labels], dtype=np.int64)[of_row]
 
 
 def covariances(table: Table, names: tuple[str, ...], *, optional: bool = False) -> FloatArray | None:
@@ -212,10 +213,7 @@ def directions(pixel: FloatArray, sensor: IntArray, sensors: Sequence[SpatialSen
 
 def integrated(stamp_s: FloatArray, twist: FloatArray, clock: Clock) -> SpatialOdometry:
     """Return poses from the origin, each velocity (N, 6) held until the next stamp."""
-    pose = se3.identity(len(stamp_s))
-    step = se3.exp(twist[:-1] * np.diff(stamp_s)[:, None])
-    for row in range(len(step)):
-        pose[row + 1] = se3.compose(pose[row], step[row])
+    pose = accumulate(se3.exp(twist[:-1] * np.diff(stamp_s)[:, None]))
     return SpatialOdometry(stamp_s, pose, np.full((len(pose), 6), np.nan), clock=clock)
 
 

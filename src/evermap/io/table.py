@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from math import isnan
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError, similar, suggestion
+from evermap.interrupts import raises
 from evermap.io.text import clock_of_date, date_s, decode_text, parse_float, quote, reason
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, landmark_id_of
 from evermap.valid import STAMP_S, Quantity
@@ -103,10 +104,10 @@ class NamedColumns:
 
 
 class Table(NamedColumns):
-    """Columns as cells of text or as numbers (nan where empty)."""
+    """Columns as cells of text, in a list or a pyarrow array, or as numbers (nan where empty)."""
 
     __slots__ = ()
-    columns: Mapping[str, Sequence[str] | FloatArray]
+    columns: Mapping[str, Any]
 
     def one_form(self, first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:
         """Return which of two ways to say the same the table uses; raises InputError where it mixes them."""
@@ -120,7 +121,8 @@ class Table(NamedColumns):
         if isinstance(cells, np.ndarray):
             values: FloatArray = cells
         else:
-            values = self._parse(quantity, cells)
+            converted = None if isinstance(cells, Sequence) else numbers_of_text(cells, optional=quantity.optional)
+            values = self._parse(quantity, texts_of(cells)) if converted is None else converted
         quantity.check(values, path=self.path, line=self.line)
         return values
 
@@ -152,32 +154,38 @@ class Table(NamedColumns):
 
     def _named_ids(self, name: str, optional: bool, names: dict[int, str]) -> IntArray:
         """Ids of a column in which some may be texts."""
-        cells = self.labels(name)
-        texts = {cell for cell in set(cells) if cell and not _is_number(cell)}
+        row_label, labels = self.labels(name)
+        texts = {label for label in labels if label and not _is_number(label)}
         for text in sorted(texts):
             if names.setdefault(landmark_id_of(text), text) != text:
-                other = names[landmark_id_of(text)]
+                other, row = names[landmark_id_of(text)], int(np.argmax(row_label == labels.index(text)))
                 problem = f"{quote(text)} and {quote(other)} have the same hash"
-                raise self.error(problem, row=cells.index(text), field=name, hint="rename one of them")
-        plain = [str(landmark_id_of(cell)) if cell in texts else cell for cell in cells]
-        return replace(self, columns={name: plain}).ids(name, optional=optional)
+                raise self.error(problem, row=row, field=name, hint="rename one of them")
+        plain = [str(landmark_id_of(label)) if label in texts else label for label in labels]
+        cells = arrow_cells(plain).take(arrow_cells(row_label)) if texts else self.columns[name]
+        return replace(self, columns={name: cells}).ids(name, optional=optional)
 
-    def labels(self, name: str) -> list[str]:
-        """Return a column of names, '' where empty. Whole numbers are converted to text."""
+    def labels(self, name: str) -> tuple[IntArray, list[str]]:
+        """Return which of the different names in a column each row (R,) has, and these, in the order of their first
+        rows; '' where a cell is empty. Whole numbers are converted to text.
+        """
         cells = self.columns[name]
-        if not isinstance(cells, np.ndarray):
-            broken = [row for row, cell in enumerate(cells) if not cell.isprintable()]
-            if broken:
-                raise self.error("contains a character that cannot be printed", row=broken[0], field=name)
-            return [cell.strip() for cell in cells]
-        return ["" if np.isnan(value) else f"{value:.17g}" for value in cells.tolist()]
+        if isinstance(cells, np.ndarray):
+            return distinct(["" if np.isnan(value) else f"{value:.17g}" for value in cells.tolist()])
+        row_word, words = distinct(cells) if isinstance(cells, Sequence) else coded(cells)
+        for code, word in enumerate(words):
+            if not word.isprintable():
+                row = int(np.argmax(row_word == code))
+                raise self.error("contains a character that cannot be printed", row=row, field=name)
+        word_label, labels = distinct([word.strip() for word in words])
+        return word_label[row_word], labels
 
     def clock(self, name: str = STAMP_S.name) -> Clock | None:
         """Return what the stamps of a column count, where they are dates (ISO 8601): with a zone, or without; else
         None.
         """
         cells = self.columns.get(name, ())
-        first = "" if isinstance(cells, np.ndarray) else next((cell for cell in cells if cell.strip()), "")
+        first = "" if isinstance(cells, np.ndarray) else next((str(cell) for cell in cells if str(cell).strip()), "")
         return None if not first or _is_number(first) else clock_of_date(first)
 
     def _parse(self, quantity: Quantity, cells: Sequence[str]) -> FloatArray:
@@ -228,11 +236,17 @@ def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
     line.
 
     A last line with too few cells, or without line end and with an empty or broken last cell, was cut off while it
-    was written: it is left out, and `warnings` gets a remark.
+    was written: it is left out, and `warnings` gets a remark. pyarrow reads a plain file; one that is not, or has a
+    fault, is read line by line, with the same result.
 
     Raises:
         InputError: no header, a repeated column name, a line with the wrong number of cells, bytes that are not text.
     """
+    return _parse_plain(data, path) or parse_by_line(data, path, warnings)
+
+
+def parse_by_line(data: bytes, path: Path, warnings: list[str]) -> Table:
+    """Return a CSV table as `parse_csv`, slowly; errors name the line."""
     lines = decode_text(data, path).split("\n")
     content = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line.lstrip()[0] != "#"]
     if not content:
@@ -256,6 +270,42 @@ def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
         columns = [[unguarded(cell) for cell in column] for column in columns]
     line_numbers = np.array([number for number, _ in content[1 : len(rows) + 1]], dtype=np.int64)
     return Table(path, dict(zip(names, columns, strict=True)), line_numbers, content[0][0])
+
+
+def _parse_plain(data: bytes, path: Path) -> Table | None:
+    """The table, if it is plain: no comments and empty lines after the header, as many cells as names everywhere."""
+    head = re.match(rb"(?:\xef\xbb\xbf)?(?:[ \t]*(?:#[^\n]*)?\r?\n)*[^\n]*\n", data)
+    if head is None or b"\0" in data or re.search(rb"\n\s*#", data[head.end() - 1 :]):
+        return None
+    if b"\r" in data and data.count(b"\r") != data.count(b"\r\n"):  # lone ones end lines, too
+        return None
+    header = parse_by_line(head[0], path, [])
+    names = list(header.columns)
+    if not raises():
+        pa.enable_signal_handlers(False)  # Arrow's own lose a signal that comes as a table ends, one in ten
+    unended = not data.endswith(b"\n")
+    rows = data.count(b"\n", head.end()) + unended
+    try:
+        table = arrow_csv.read_csv(
+            pa.BufferReader(pa.py_buffer(data).slice(head.end())),
+            read_options=arrow_csv.ReadOptions(column_names=names, use_threads=False),
+            convert_options=arrow_csv.ConvertOptions(
+                column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False
+            ),
+        )
+    except pa.ArrowInvalid:
+        return None
+    if table.num_rows != rows or header.header_line is None:
+        return None
+    cells = {name: one_array(column) for name, column in zip(names, table.columns, strict=True)}
+    last = cells[names[-1]]
+    if unended and _is_broken(last[-9:].to_pylist()):
+        return None
+    if len(names) == 1 and not numbers_of(pc.binary_length(pc.utf8_trim_whitespace(last)), np.int32)[0].all():
+        return None  # empty lines
+    if b"'" in data:
+        cells = {name: mapped(column, GUARDED, unguarded) for name, column in cells.items()}
+    return Table(path, cells, header.header_line + 1 + np.arange(rows), header.header_line)
 
 
 def parse_parquet(data: bytes, path: Path) -> Table:
@@ -332,6 +382,70 @@ def numbers_of(cells: Any, kind: Any) -> tuple[Any, BoolArray]:
         return values, np.ones(len(cells), dtype=np.bool_)
     known = np.unpackbits(np.frombuffer(valid, np.uint8), count=stop, bitorder="little")[cells.offset :]
     return values, known.astype(np.bool_)
+
+
+def one_array(column: Any) -> Any:
+    """Return one pyarrow array in place of chunks and dictionaries, of text as `pa.string()`."""
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    if pa.types.is_large_string(column.type) or pa.types.is_string_view(column.type):
+        column = column.cast(pa.string())
+    return column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+
+
+def numbers_of_text(cells: Any, *, optional: bool) -> FloatArray | None:
+    """Return the numbers (R,) in a pyarrow array of text, nan where a cell is empty or null; None where one is no
+    number, or is empty without being `optional`.
+    """
+    text = pc.utf8_trim_whitespace(cells)
+    length, given = numbers_of(pc.binary_length(text), np.int32)
+    blank = given & (length == 0)
+    if not optional and blank.any():
+        return None
+    valid = np.packbits(np.concatenate([np.zeros(text.offset, dtype=np.bool_), given & ~blank]), bitorder="little")
+    buffers = [pa.py_buffer(valid), *text.buffers()[1:]]
+    try:
+        values = floats_of(pa.Array.from_buffers(text.type, len(text), buffers, offset=text.offset))
+    except pa.ArrowInvalid:
+        return None
+    odd = np.isnan(values).any() and pc.any(pc.match_substring(text, "(")).as_py()  # nan(1) is a number to Arrow only
+    return None if odd else values
+
+
+def floats_of(cells: Any) -> FloatArray:
+    """Return a pyarrow array that can be cast to numbers as such (R,), nan where null."""
+    if pa.types.is_boolean(cells.type):
+        cells = cells.cast(pa.int8())
+    values, known = numbers_of(cells.cast(pa.float64(), safe=False), np.float64)
+    return np.where(known, values, np.nan)
+
+
+def coded(words: Any) -> tuple[IntArray, list[str]]:
+    """Return the index (R,) of each cell of a pyarrow array among the distinct ones, -1 if null, and these."""
+    found = words.dictionary_encode()
+    codes, known = numbers_of(found.indices, np.int32)
+    return np.where(known, codes, -1).astype(np.int64), found.dictionary.to_pylist()
+
+
+def distinct(words: Sequence[str]) -> tuple[IntArray, list[str]]:
+    """Return the index (R,) of each text among the distinct ones, and these, in the order of their first rows."""
+    code_of: dict[str, int] = {}
+    codes = [code_of.setdefault(word, len(code_of)) for word in words]
+    return np.array(codes, dtype=np.int64), list(code_of)
+
+
+def texts_of(cells: Any) -> Sequence[str]:
+    """Return cells of text as a sequence."""
+    texts: Sequence[str] = cells if isinstance(cells, Sequence) else cells.to_pylist()
+    return texts
+
+
+def mapped(cells: Any, pattern: str, change: Callable[[str], str]) -> Any:
+    """Return a pyarrow array of text with a change of each different one, if any matches the pattern."""
+    if not pc.any(pc.match_substring_regex(cells, pattern)).as_py():
+        return cells
+    code, words = coded(cells)
+    return arrow_cells([*map(change, words), ""], np.arange(len(words) + 1) < len(words)).take(arrow_cells(code))
 
 
 def csv_text(columns: dict[str, Any], comment: str = "") -> str:

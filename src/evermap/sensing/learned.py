@@ -240,8 +240,6 @@ def confirm(
         InputError: probabilities of another shape.
         DataError: an invalid probability of a clique that was looked at.
     """
-    from evermap.sensing import kernels
-
     belief = np.asarray(probability, dtype=np.float64)
     if belief.shape != (len(model),):
         raise InputError(f"shape {belief.shape} instead of ({len(model)},)", field="probability")
@@ -252,17 +250,25 @@ def confirm(
         raise DataError(problem, field="probability", hint="0 to 1")
     there = in_view & (belief > sure[1]) & (seen.p_occluded < p_occluded)
     gone = in_view & (belief < sure[0])
-    profile = model.profile
+    pending, log_chain = model.pending.copy(), model.log_chain.copy()
+    learned = _collected(model.profile, there, gone, pending, log_chain)
+    return replace(model, profile=learned, pending=pending, log_chain=log_chain)
+
+
+def _collected(
+    profile: Profile, there: BoolArray, gone: BoolArray, pending: FloatArray, log_chain: FloatArray
+) -> Profile:
+    """Return the profile with what pends of certain cliques, which is taken from there in place."""
+    from evermap.sensing import kernels
+
     before = {name: np.atleast_1d(getattr(profile, name)) for name in SUMS}
-    sums = np.concatenate([*before.values(), np.zeros(2)])
-    pending, log_chain, log_weight = model.pending.copy(), model.log_chain.copy(), profile.log_weight.copy()
+    sums, log_weight = np.concatenate([*before.values(), np.zeros(2)]), profile.log_weight.copy()
     kernels.collect(there, gone, pending, log_chain, sums, log_weight)
     parts = np.split(sums[:-2], np.cumsum([len(part) for part in before.values()])[:-1])
     after: dict[str, Any] = {
         name: part if len(part) > 1 else float(part[0]) for name, part in zip(SUMS, parts, strict=True)
     }
-    learned = replace(profile, **after, log_weight=log_weight - log_weight.max())
-    return replace(model, profile=learned, pending=pending, log_chain=log_chain)
+    return replace(profile, **after, log_weight=log_weight - log_weight.max())
 
 
 def _sensor(position_m: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -312,7 +318,13 @@ def _frame(profile: Profile, place: FloatArray, turn: FloatArray) -> SensorFrame
 
 
 def watched(
-    model: LearnedDetection, stamp_s: FloatArray, pose: FloatArray, detected: BoolArray, there: BoolArray
+    model: LearnedDetection,
+    stamp_s: FloatArray,
+    pose: FloatArray,
+    detected: BoolArray,
+    there: BoolArray,
+    *,
+    p_occluded: float = 0.1,
 ) -> LearnedDetection:
     """Return the model after a session with known presence of landmarks.
 
@@ -322,9 +334,30 @@ def watched(
         pose: (F, 4, 4) from the sensor's frame to the world's.
         detected: (F, K) which landmarks were detected.
         there: (F, K) which of them were there; of the others nothing is learned.
+        p_occluded: as of `confirm`.
     """
+    from evermap.sensing import kernels
+
+    # as `look` and `confirm`, but with one copy of the state for all frames
+    changed = ("hits", "expected", "stamp_s", "occluded", "log_chain", "pending")
+    after = replace(model, **{name: getattr(model, name).copy() for name in changed})
+    rows = kernels.LandmarkRows(after.landmark_m, after.outward, after.hits, after.expected)
+    cliques = kernels.CliqueRows(after.first, after.occluded, after.log_chain, after.pending)
+    log_there, log_gone, occluded = np.empty((3, len(model)))
+    out = kernels.LookRows(log_there, log_gone, occluded, np.empty(len(model), dtype=np.int64))
+    profile, nobody, law = after.profile, np.zeros(len(model), dtype=np.bool_), _law(after.profile)
     for stamp, one, hit, active in zip(stamp_s.tolist(), pose, detected, there, strict=True):
-        if active.any():
-            model, seen = look(model, stamp, one[:3, 3], one[:3, :3], hit, active=active)
-            model = confirm(model, seen, np.ones(len(model)))
-    return model
+        if not active.any():
+            continue
+        seen_now = kernels.FrameSeen(hit, active, np.nan_to_num(stamp - after.stamp_s))
+        kernels.look(_frame(profile, one[:3, 3], one[:3, :3]), law, rows, cliques, seen_now, out)
+        in_view = out.looked > 0
+        after.stamp_s[in_view] = stamp
+        again = in_view & (out.p_occluded < p_occluded)
+        if again.any():
+            profile = _collected(profile, again, nobody, after.pending, after.log_chain)
+            rates = profile.range_rate, profile.facing_rate, profile.p_false
+            law = law._replace(
+                range_rate=rates[0], facing_rate=rates[1], p_false=rates[2], log_weight=profile.log_weight
+            )
+    return replace(after, profile=profile)

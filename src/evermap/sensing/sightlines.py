@@ -153,7 +153,9 @@ class SightLines:
         hits, looks = self._around(places, place, cell)
         strength = self.rules.strength
         free = np.clip(rate[length] * nominal / middle, *self.rules.rates)
-        p_clear = _p_clear(hits, looks, share, free, self.rules)
+        known = looks > 0.0  # of others the share is all that is known
+        p_clear = np.full(len(known), share)
+        p_clear[known] = _Seen.of(hits[known], looks[known], self.rules).p_clear(share, free[known])
         misses = np.maximum(looks - hits, 0.0)
         lines = Lines(np.ones(len(length)), hits + strength * free, misses + strength * (1.0 - free), 0.0)
         return lines, p_clear, hits > 0.0
@@ -221,9 +223,9 @@ class SightLines:
         voice = np.minimum(1.0, worth / np.maximum(self.looks, 1.0))
         hits, looks = voice * self.hits, voice * self.looks
         free: FloatArray = np.full(n, np.clip(nominal, *rates), dtype=np.float64)
-        share = 0.5
+        share, seen = 0.5, _Seen.of(self.hits, self.looks, self.rules)
         for _ in range(ROUNDS if len(self) else 0):
-            p_clear = _p_clear(self.hits, self.looks, share, free[length], self.rules)
+            p_clear = seen.p_clear(share, free, length)
             own = np.bincount(length, p_clear * hits, n), np.bincount(length, p_clear * looks, n)
             share = float((np.sum(p_clear) + 2.0) / (len(p_clear) + 4.0))
             free = np.clip((own[0] + worth * nominal) / (own[1] + worth), *rates)
@@ -330,21 +332,39 @@ def session_rate(hit: BoolArray, p_detect: FloatArray, weight: FloatArray, rules
     return float(factor @ likely / likely.sum())
 
 
-def _p_clear(hits: FloatArray, looks: FloatArray, prior: float, free: FloatArray, rules: SightConfig) -> FloatArray:
-    """(N,) probability that lines are clear, given hits and looks along them (beta-binomial)."""
-    from scipy.special import expit, gammaln
+class _Seen(NamedTuple):
+    """What was seen along N lines, for the probability that they are clear (beta-binomial).
 
-    known = looks > 0.0  # of others the prior is all that is known
-    hits, misses = hits[known], np.maximum(looks - hits, 0.0)[known]
+    Attributes:
+        hits, misses: (N,) weighted detections and misses.
+        strength: looks that the rate of a clear line is worth.
+        log_blocked: (N,) log likelihood if they are blocked.
+    """
 
-    def log_likelihood(rate: FloatArray | float) -> FloatArray:
-        a, b = rules.strength * np.asarray(rate), rules.strength * (1.0 - np.asarray(rate))
-        return np.asarray(gammaln(a + hits) - gammaln(a) + gammaln(b + misses) - gammaln(b))
+    hits: FloatArray
+    misses: FloatArray
+    strength: float
+    log_blocked: FloatArray
 
-    p_clear = np.full(len(known), prior)
-    odds = log_likelihood(free[known]) - log_likelihood(rules.p_blocked_detect)
-    p_clear[known] = expit(np.log(prior / (1.0 - prior)) + odds)
-    return p_clear
+    @classmethod
+    def of(cls, hits: FloatArray, looks: FloatArray, rules: SightConfig) -> _Seen:
+        """Return what hits (N,) and looks (N,) say."""
+        seen = cls(hits, np.maximum(looks - hits, 0.0), rules.strength, hits)
+        return seen._replace(log_blocked=seen._log_likelihood(np.array([rules.p_blocked_detect]), slice(None)))
+
+    def p_clear(self, prior: float, rate: FloatArray, kind: IntArray | slice = slice(None)) -> FloatArray:
+        """Return the (N,) probability of being clear, by rates (K,) and the kind (N,) of each line, else one each."""
+        from scipy.special import expit
+
+        odds = self._log_likelihood(rate, kind) - self.log_blocked
+        return np.asarray(expit(np.log(prior / (1.0 - prior)) + odds))
+
+    def _log_likelihood(self, rate: FloatArray, kind: IntArray | slice) -> FloatArray:
+        from scipy.special import gammaln
+
+        a, b = self.strength * rate, self.strength * (1.0 - rate)
+        of_hits = gammaln(a[kind] + self.hits) - gammaln(a)[kind]
+        return np.asarray(of_hits + gammaln(b[kind] + self.misses) - gammaln(b)[kind])
 
 
 def _length(cell: IntArray) -> IntArray:

@@ -23,12 +23,10 @@ from evermap.types import (
     BoolArray,
     FloatArray,
     Innovations,
-    IntArray,
     Landmarks,
     MapChange,
     Misses,
     ParameterEstimate,
-    Recording,
     SlamResult,
     Trajectory,
 )
@@ -88,10 +86,16 @@ def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
 
 def trajectory(solved: Solved, frame: str) -> Trajectory:
     """Return smoothed poses at all frames, and in between so that no step is longer than `TRAJECTORY_STEP_S`."""
-    outcome, start_s = solved.outcome, solved.prepared.start_s
     stamps = _dense_stamps(solved.recording.frames.stamp_s, solved.end_s)
+    pose, covariance = poses_at(solved, stamps)
+    return Trajectory(stamps, pose, covariance, frame=frame, clock=solved.recording.clock)
+
+
+def poses_at(solved: Solved, stamps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return smoothed poses (K, 3) at any stamps (K,), and their covariances (K, 3, 3)."""
+    outcome = solved.outcome
     pose, covariance = bridged(
-        stamps - start_s,
+        stamps - solved.prepared.start_s,
         outcome.problem.stamp_s,
         outcome.graph_estimate.pose,
         outcome.graph_marginals.pose,
@@ -104,13 +108,7 @@ def trajectory(solved: Solved, frame: str) -> Trajectory:
     front = outcome.prior.front(outcome.graph_estimate.states, solved.prepared.problem.mount)
     pose, covariance = from_front(pose, covariance, front)
     pose[:, 2] = se2.wrap(pose[:, 2])
-    return Trajectory(stamps, pose, covariance, frame=frame, clock=solved.recording.clock)
-
-
-def rows_at(trajectory: Trajectory, recording: Recording, rows: IntArray) -> IntArray:
-    """Return rows of a trajectory that holds all frames, at some of the frames."""
-    found = np.searchsorted(trajectory.stamp_s, recording.frames.stamp_s[rows] - 1e-9)
-    return np.minimum(found, len(trajectory) - 1)
+    return pose, covariance
 
 
 def _landmarks(solved: Solved, frame: str, position: FloatArray, covariance: FloatArray) -> Landmarks:

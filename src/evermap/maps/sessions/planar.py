@@ -106,10 +106,9 @@ class PlanarVisit:
         """Return at which places of the map the session looked, by the nominal field of view."""
         visit = self.solved
         recording, prepared = visit.recording, visit.prepared
-        trajectory = of_slam.trajectory(visit, "")
         stamps = recording.frames.stamp_s
         frames = np.flatnonzero((stamps >= visit.start_s) & (stamps <= visit.end_s + 1e-9)).astype(np.int64)
-        pose = trajectory.pose_world_robot[of_slam.rows_at(trajectory, recording, frames)]
+        pose, _ = of_slam.poses_at(visit, stamps[frames])
         detection, landmark = _inliers(visit, config.fit.inlier)
         place_of = entry.places_of(prepared.landmark_id)
         _place_glimpsed(place_of, entry, visit, config.fit.glimpse_m)

@@ -22,6 +22,7 @@ from evermap.config import AssociationConfig, SlamConfig
 from evermap.errors import DataError
 from evermap.estimate.sparse.system import Factorised
 from evermap.geometry import se2, se3
+from evermap.geometry.group import accumulate
 from evermap.slam.association.assignment import (
     NOBODY,
     LooseDetections,
@@ -636,10 +637,7 @@ def _thinned(intake: SpatialIntake) -> SpatialProblem:
 
 def _driven(problem: SpatialProblem) -> FloatArray:
     """(N, 7) poses along the odometry."""
-    pose = se3.identity(len(problem.stamp_s))
-    for k, motion in enumerate(problem.increment):
-        pose[k + 1] = se3.compose(pose[k], motion)
-    return pose
+    return accumulate(problem.increment)
 
 
 def _without(row: IntArray, gone: BoolArray) -> IntArray:

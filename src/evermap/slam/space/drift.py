@@ -25,6 +25,7 @@ import numpy as np
 
 from evermap.config import SpaceConfig, StillConfig, TrafficConfig
 from evermap.geometry import se3
+from evermap.geometry.group import accumulate
 from evermap.slam.space.problem import USUAL, SpatialProblem
 from evermap.tracking.standing import HEAVY
 from evermap.types import FloatArray, IntArray
@@ -253,11 +254,7 @@ def bent(pose: FloatArray, bend: float) -> FloatArray:
     step = se3.between(pose[:-1], pose[1:])
     twist = np.zeros((len(step), 6))
     twist[:, 5] = bend * np.linalg.norm(step[:, :3], axis=1)
-    step = se3.retract(step, twist)
-    found = pose.copy()
-    for k in range(len(step)):
-        found[k + 1] = se3.compose(found[k], step[k])
-    return found
+    return se3.compose(pose[:1], accumulate(se3.retract(step, twist)))
 
 
 def gauge_of(
