@@ -13,7 +13,7 @@ from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se3
 from evermap.maps.sessions.spatial import solve_visit
 from evermap.metrics.summary import compare_with_truth
-from evermap.slam.space.together import Alone, _lay_together, align_robots
+from evermap.slam.space.together import SolvedRobot, _lay_together, align_robots
 from evermap.types import Frames, SpatialRecording, rows_of
 
 from .corridors import tagged_corridor
@@ -68,7 +68,7 @@ def test_two_robots_know_the_hall_better_than_each_alone(seed):
 def test_covariances_are_those_of_a_dense_inverse():
     recordings = [tagged_corridor(seed, n_frames=12, n_tags=6).recording for seed in (1, 1)]
     visits = [solve_visit(one, Config(), None, ()) for one in recordings]
-    members = [Alone(visit.intake, visit.solved) for visit in visits]
+    members = [SolvedRobot(visit.intake, visit.solved) for visit in visits]
     joint, start = _lay_together(members, align_robots(members, ["a", "b"]))
     noise = [member.solved.optimum.noise for member in members]
     solution = joint.minimise(start, noise, most=10)

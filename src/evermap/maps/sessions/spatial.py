@@ -33,7 +33,7 @@ from evermap.slam.space.intake import SpatialIntake, most_of, prepare_space
 from evermap.slam.space.problem import ANY_RAD, PlacePrior
 from evermap.slam.space.result import concluded_in_space, identities_of, located, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved, solve_space
-from evermap.slam.space.together import Alone, solve_space_together
+from evermap.slam.space.together import SolvedRobot, solve_space_together
 from evermap.types import (
     UNKNOWN,
     BoolArray,
@@ -308,7 +308,7 @@ def solve_visits_together(visits: Sequence[SpatialVisit]) -> list[SpatialVisit]:
     Raises:
         DataError: nothing ties one of them to the others.
     """
-    members = [Alone(visit.intake, visit.solved) for visit in visits]
+    members = [SolvedRobot(visit.intake, visit.solved) for visit in visits]
     solved = solve_space_together(members, [visit.recording.name for visit in visits])
     return [replace(visit, solved=own) for visit, own in zip(visits, solved, strict=True)]
 

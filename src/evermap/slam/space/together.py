@@ -20,7 +20,7 @@ from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, S
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.geometry import se3
-from evermap.geometry.rigid import rigid
+from evermap.geometry.rigid import AGREE_M, rigid
 from evermap.slam.space.estimate import CONVERGED, ROUNDS, SpatialOptimum, refined
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.linearise import STATES
@@ -40,8 +40,6 @@ from evermap.slam.space.smoother import (
 from evermap.slam.space.solve import FREE, SpatialSolved
 from evermap.types import BoolArray, FloatArray, IntArray
 
-AGREE_M = 0.5
-"""Landmarks of two robots agree where they come to lie this close."""
 FEWEST = 3
 """Points that align two robots; of landmarks with an orientation one does."""
 
@@ -58,7 +56,7 @@ class JointEstimate(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Alone:
+class SolvedRobot:
     """A robot that was solved by itself."""
 
     intake: SpatialIntake
@@ -75,7 +73,7 @@ class Alone:
         return np.where(self.solved.number == 1, self.intake.landmark_id[self.solved.identity], -1)
 
 
-def solve_space_together(members: Sequence[Alone], names: Sequence[str]) -> list[SpatialSolved]:
+def solve_space_together(members: Sequence[SolvedRobot], names: Sequence[str]) -> list[SpatialSolved]:
     """Return robots solved together, in the frame of the first one's first pose.
 
     Args:
@@ -109,7 +107,7 @@ def solve_space_together(members: Sequence[Alone], names: Sequence[str]) -> list
     return found
 
 
-def align_robots(members: Sequence[Alone], names: Sequence[str]) -> FloatArray:
+def align_robots(members: Sequence[SolvedRobot], names: Sequence[str]) -> FloatArray:
     """Return the motions (R, 7) of each robot's frame into that of the first, by landmarks that agree.
 
     Raises:
@@ -134,7 +132,7 @@ def align_robots(members: Sequence[Alone], names: Sequence[str]) -> FloatArray:
     return motion
 
 
-def _align(member: Alone, name: IntArray, theirs: FloatArray, oriented: BoolArray) -> tuple[FloatArray, int]:
+def _align(member: SolvedRobot, name: IntArray, theirs: FloatArray, oriented: BoolArray) -> tuple[FloatArray, int]:
     """The motion (7,) of a robot's frame that brings most of its places to those of others, and how many."""
     own_name, own = member.identity, member.solved.optimum.estimate.place
     row, other = np.nonzero((own_name[:, None] == name) & (own_name >= 0)[:, None])
@@ -156,7 +154,7 @@ def _align(member: Alone, name: IntArray, theirs: FloatArray, oriented: BoolArra
     return candidate[best], len(np.unique(row[some])) if len(turned) else 0
 
 
-def _lay_together(members: Sequence[Alone], motion: FloatArray) -> tuple[SpatialTogether, JointEstimate]:
+def _lay_together(members: Sequence[SolvedRobot], motion: FloatArray) -> tuple[SpatialTogether, JointEstimate]:
     """The problem of all, and where it is when each robot's own solution is moved by (R, 7)."""
     stay = np.unique(np.concatenate([member.identity[member.identity >= 0] for member in members]))
     places, count = [], len(stay)
