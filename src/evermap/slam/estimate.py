@@ -11,11 +11,12 @@ import numpy as np
 from evermap import plugins
 from evermap.config import SlamConfig
 from evermap.interrupts import watched
+from evermap.slam.batch import Outcome
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.joint import Joint, may_search
 from evermap.slam.intake import Prepared, beliefs, prepare
 from evermap.slam.method import Method, Static
-from evermap.slam.streaming import Outcome, StreamingSlam
+from evermap.slam.streaming import StreamingSlam
 from evermap.slam.warmup import warm_up
 from evermap.types import FloatArray, Landmarks, Progress, Recording, Sensor
 

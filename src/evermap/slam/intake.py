@@ -9,11 +9,11 @@ from scipy import sparse
 
 from evermap.config import OdometryConfig, SlamConfig
 from evermap.errors import DataError
+from evermap.slam.batch import PriorMap
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.noise import start_noise
 from evermap.slam.problem import USUAL, Drive, Noise, Problem
-from evermap.slam.streaming import PriorMap
 from evermap.types import UNKNOWN, IntArray, Landmarks, Recording, Sensor
 from evermap.valid import WITHOUT_IDS
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from evermap.geometry import se2
+from evermap.slam.batch import Outcome
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import BEARING, FORWARD, OF_ANGLE, OF_SCALE, SLOPE, SPECS, CalibrationPrior, from_front
 from evermap.slam.check import far_off
@@ -15,7 +16,6 @@ from evermap.slam.estimate import Solved
 from evermap.slam.kernels import NOISE_NAMES
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive
-from evermap.slam.streaming import Outcome
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,

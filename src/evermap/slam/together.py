@@ -17,18 +17,7 @@ from scipy import sparse
 from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
-from evermap.slam.bridge import bridged
-from evermap.slam.calibration import SLOPE, needed
-from evermap.slam.encounters import Encounters, Together
-from evermap.slam.estimate import Solved
-from evermap.slam.intake import beliefs
-from evermap.slam.kernels import N_STATES
-from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
-from evermap.slam.problem import Estimate, Marginals, Noise, Problem
-from evermap.slam.result import online as told_online
-from evermap.slam.smoother import Smoother
-from evermap.slam.sparse.system import exhausted
-from evermap.slam.streaming import (
+from evermap.slam.batch import (
     ALIGNED_INFORMATION,
     FINAL_GAIN,
     FINAL_ROUNDS,
@@ -41,6 +30,17 @@ from evermap.slam.streaming import (
     levels_settled,
     sighted_at,
 )
+from evermap.slam.bridge import bridged
+from evermap.slam.calibration import SLOPE, needed
+from evermap.slam.encounters import Encounters, Together
+from evermap.slam.estimate import Solved
+from evermap.slam.intake import beliefs
+from evermap.slam.kernels import N_STATES
+from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.slam.result import online as told_online
+from evermap.slam.smoother import Smoother
+from evermap.slam.sparse.system import exhausted
 from evermap.types import FloatArray, IntArray, Trajectory
 
 ONE_INSTANT_S = 1e-3
