@@ -7,8 +7,10 @@ states that hardly need to be free are held as stated.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -17,6 +19,7 @@ from evermap.config import SlamConfig
 from evermap.errors import NumericalError
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
+from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior, needed, seated
 from evermap.slam.method import Explanation, Method
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
@@ -28,7 +31,7 @@ from evermap.types import BoolArray, FloatArray, IntArray
 USUAL = SlamConfig()
 ALIGNED_INFORMATION = 1e-2
 """Once in a prior map the first pose is free: held to 10 m only, so that the linear system stays well conditioned."""
-FINAL_ROUNDS = 12
+FINAL_ROUNDS, FINAL_STEPS = 12, 10
 MOST_BREAKS = 8
 """Silences of the odometry after which the parts are laid over each other."""
 ELSEWHERE = 0.1
@@ -37,12 +40,18 @@ STEPS_A_ROUND = 4
 """Gauss-Newton steps of a relinearisation, or between two estimates of the noise, at most."""
 NEAR, NEAR_NOISE = 0.02, 1e-4
 """Step (m, rad or 1) after which the stream goes on, or learns noise: the next step would be far smaller."""
-FINAL_TOLERANCE, FINAL_GAIN = 1e-5, 1e-3
+FINAL_TOLERANCE, FINAL_GAIN = 1e-5, 1e-2
 """Step (m, rad or 1), or what it gains (nats), at which the final optimum is reached."""
 NEAR_NOISE_GAIN = 1e-4
 """Or what a step gains (nats) for each detection: by so little do noise levels change with it."""
-NOISE_NEAR, NOISE_CONVERGED = 0.05, 0.01
-"""Relative change of every noise level below which it is decided what is an outlier, and the final rounds stop."""
+FEWEST_POSES, LEARNED_SHARE = 40, 0.3
+"""Poses that are solved first, and the share of all up to which noise is learned on the way."""
+STEPS_A_PART, NEAR_GAIN = 10, 0.01
+"""Gauss-Newton steps of a part at most; it ends with one that gains so little (nats) for each detection."""
+MOST_WORSE = 1.5
+"""Cost of a part for each number that was measured, relative to that of the part before it, up to which it fits."""
+NOISE_NEAR, NOISE_CONVERGED = 0.05, 0.02
+"""Change of the noise (`NoiseFit.change`) below which it is decided what is needed, and the last rounds stop."""
 FINAL_REVISIONS = 3
 """Times that the method thinks again at the end, at most: other places mean other noise, and that other gates."""
 
@@ -91,6 +100,25 @@ class Outcome:
     revision: Explanation
 
 
+class Part(NamedTuple):
+    """The first measurements of a recording, values near their optimum, noise levels, and whether they fit so far."""
+
+    problem: Problem
+    estimate: Estimate
+    noise: Noise
+    fits: bool
+
+
+class Found(NamedTuple):
+    """An optimum: its smoother, its values, their covariances, its noise levels, and how these were sought."""
+
+    smoother: Smoother
+    estimate: Estimate
+    marginals: Marginals
+    noise: NoiseFit
+    ahead: Extrapolation
+
+
 class Batch:
     """What finishes a session from values near its optimum.
 
@@ -102,7 +130,67 @@ class Batch:
         self._prior, self._start_noise, self._method = prior, noise, method
         self._settings, self._robust, self._estimate_noise = settings, settings.robust, settings.estimate_noise
 
-    def finished(self, problem: Problem, estimate: Estimate, noise: Noise, *, aligned: bool) -> Outcome:
+    def is_driven(self, problem: Problem) -> bool:
+        """Return whether the odometry is nowhere silent for so long that a heading is unknown: then it leads on."""
+        floor = problem.drive.between(problem.stamp_s, self._prior.mean).floor
+        return not np.any(floor[:, 2, 2] > self._settings.odometry.loose_rad**2)
+
+    def parts(self, problem: Problem) -> Iterator[Part]:
+        """Solve the first poses from the odometry alone, then twice as many, until all are; each yields its values.
+
+        Each time the odometry leads on from what was found, with the calibration that was found. Where it leads so far
+        away that the optimum is not found again, fewer poses are added.
+        """
+        problem, noise = replace(problem, prior=self._prior.without_scale()), self._start_noise
+        nowhere = np.full((len(problem.landmark_mean), 2), np.nan)
+        estimate = Estimate(problem.start_pose[None], nowhere, problem.prior.mean)
+        whole, done, share = len(problem.stamp_s), 0, 1.0
+        more, fits = _first_part(whole), True
+        while done < whole:
+            count = min(done + more, whole)
+            some = problem.until(count)
+            smoother, found, marginals = self._led_on(some, estimate, noise)
+            # half a nat for each number that was measured, or what it was before
+            cost = smoother.cost(found) / (len(some.pose_row) + 1.5 * count)
+            good = cost < max(1.0, MOST_WORSE * share)
+            if not good and more > FEWEST_POSES:
+                more //= 2
+                continue
+            estimate, done, share, more = found, count, cost, min(count, 2 * more)
+            fits &= good
+            if self._estimate_noise and (count < LEARNED_SHARE * whole or count == whole):
+                weights = smoother.inlier_probability(estimate)
+                if count == whole:  # outliers as from here on
+                    weights = smoother.under(noise, heavy=False).inlier_probability(estimate)
+                noise = refine_noise(some, estimate, marginals, weights, noise, self._start_noise).noise
+            yield Part(some, estimate, noise, fits)
+
+    def _led_on(self, problem: Problem, before: Estimate, noise: Noise) -> tuple[Smoother, Estimate, Marginals]:
+        """The optimum of more poses than those of the values before."""
+        smoother, start = Smoother(problem, noise, heavy=True, robust=self._robust), _led_on(problem, before, noise)
+        steps, settled = STEPS_A_PART, NEAR_GAIN * len(problem.pose_row)
+        estimate, marginals = exhausted(
+            smoother.solved_in_slices(start, iterations=steps, tolerance=NEAR, settled=settled)
+        )
+        if self._robust:
+            moved = exhausted(voted(smoother, estimate, self._settings.fewest_sightings))
+            if moved is not estimate:
+                estimate, marginals = exhausted(
+                    smoother.solved_in_slices(moved, iterations=steps, tolerance=NEAR, settled=settled)
+                )
+        return smoother, estimate, marginals
+
+    def solved(self, part: Part, prior_map: PriorMap | None) -> Outcome:
+        """Return the optimum near the values of a part, in a prior map where two of its landmarks fit."""
+        problem, estimate, noise, _ = part
+        if prior_map is None or np.count_nonzero(agreeing(prior_map, estimate.landmark)[1]) < 2:
+            return self.finished(problem, estimate, noise, aligned=False, near=True)
+        problem, estimate, _ = entered(problem, estimate, prior_map, self._prior)
+        return self.finished(problem, estimate, noise, aligned=True)
+
+    def finished(
+        self, problem: Problem, estimate: Estimate, noise: Noise, *, aligned: bool, near: bool = False
+    ) -> Outcome:
         """Return the optimum near these values, with noise levels iterated to convergence, and divide the scale.
 
         Args:
@@ -110,37 +198,50 @@ class Batch:
             estimate: where to start.
             noise: the levels there.
             aligned: whether the frame is that of a prior map.
+            near: whether the values are so near that it shows what is an outlier.
         """
-        problem, estimate = self._method.unprejudiced(problem, estimate)
-        if self._robust:  # a landmark whose first sighting was misread may be disputed since the last relinearisation
+        free, start = self._method.unprejudiced(problem, estimate)
+        near, problem, estimate = near and free is problem, free, start
+        if self._robust and not near:  # a landmark whose first sighting was misread may be disputed since
             smoother = Smoother(problem, noise, heavy=True)
             estimate = exhausted(voted(smoother, estimate, self._settings.fewest_sightings))
-        smoother, estimate, fit = self._converged(problem, estimate, noise)
+        found = self._settled(Smoother(problem, noise, robust=self._robust), problem, estimate, noise, heavy=not near)
         if self._robust:
-            better = _readmitted(smoother, _rejoined(smoother, estimate, self._settings), self._settings)
-            if better is not estimate:
-                smoother, estimate, fit = self._converged(problem, better, fit.noise)
-        problem, estimate = self._ahead(problem, estimate, aligned=aligned)
+            rejoined = _rejoined(found.smoother, found.estimate, self._settings)
+            found = self._readmitted(found, rejoined)
+        problem, estimate = self._ahead(problem, found.estimate, aligned=aligned)
         for _ in range(FINAL_REVISIONS):
-            revision = self._method.revise(problem, estimate, fit.noise, heavy=False, final=True)
+            revision = self._method.revise(problem, estimate, found.noise.noise, heavy=False, final=True)
             if revision.problem is problem:
                 break
-            problem = revision.problem
-            smoother, estimate, fit = self._converged(problem, revision.estimate, fit.noise)
+            problem, levels = revision.problem, found.noise.noise
+            smoother = Smoother(problem, levels, robust=self._robust)
+            found = self._settled(smoother, problem, revision.estimate, levels, heavy=True)
+            estimate = found.estimate
         # near enough to tell which states are needed; then all of them are sought together
-        smoother, estimate, marginals = self._optimum(smoother, problem, estimate, fit, aligned=aligned, most=1)
-        problem, worth = smoother.problem, smoother.worth(estimate, marginals)
-        p_needed = needed(problem.prior, estimate.states, marginals.states, worth)
+        worth = found.smoother.worth(found.estimate, found.marginals)
+        p_needed = needed(problem.prior, estimate.states, found.marginals.states, worth)
         if not np.all(np.isnan(p_needed)):
-            prior, states = problem.prior.averaged(p_needed, estimate.states, np.diag(marginals.states), worth)
-            problem, estimate = replace(problem, prior=prior), replace(estimate, states=states)
-            smoother, estimate, fit = self._converged(problem, estimate, fit.noise, near=smoother)
-            if self._robust:  # means may lie so far from the estimate that true sightings are rejected on the way
-                better = _readmitted(smoother, estimate, self._settings)
-                if better is not estimate:
-                    smoother, estimate, fit = self._converged(problem, better, fit.noise, near=smoother)
-        solved = self._optimum(smoother, problem, estimate, fit, aligned=aligned)
-        return divided(solved, self._prior, p_needed, fit, revision, aligned=aligned)
+            prior, states = problem.prior.averaged(p_needed, estimate.states, np.diag(found.marginals.states), worth)
+            problem, estimate = replace(problem, prior=prior), _at_states(estimate, found.marginals, states)
+        problem, estimate = self._ahead(problem, estimate, aligned=aligned)
+        found = self._settled(found.smoother, problem, estimate, found.noise.noise, ahead=found.ahead, final=True)
+        if self._robust:  # means may lie so far from the estimate that true sightings are rejected on the way
+            found = self._readmitted(found, found.estimate, final=True)
+        solved = found.smoother, found.estimate, found.marginals
+        ahead, estimate = self._ahead(found.smoother.problem, found.estimate, aligned=aligned)
+        if ahead is not found.smoother.problem:
+            smoother = found.smoother.under(found.noise.noise, heavy=False, problem=ahead)
+            solved = smoother, estimate, smoother.marginals(estimate)
+        return divided(solved, self._prior, p_needed, found.noise, revision, aligned=aligned)
+
+    def _readmitted(self, found: Found, estimate: Estimate, *, final: bool = False) -> Found:
+        """What was found, or what is from these values or where sightings that were rejected lead (`_readmitted`)."""
+        better = _readmitted(found.smoother, estimate, self._settings)
+        if better is found.estimate:
+            return found
+        smoother = found.smoother
+        return self._settled(smoother, smoother.problem, better, found.noise.noise, heavy=not final, final=final)
 
     def _ahead(self, problem: Problem, estimate: Estimate, *, aligned: bool) -> tuple[Problem, Estimate]:
         """Return the same, rotated so that the first pose has the robot's front ahead, unless it is in a map."""
@@ -151,44 +252,94 @@ class Batch:
         turn = se2.compose(start, se2.inverse(problem.start_pose))
         return replace(problem, start_pose=start), estimate.moved(turn)
 
-    def _optimum(
-        self, smoother: Smoother, problem: Problem, estimate: Estimate, fit: NoiseFit, *, aligned: bool, most: int = 30
-    ) -> tuple[Smoother, Estimate, Marginals]:
-        """The final optimum at the noise that was found, after so many steps at most, and its covariances."""
-        problem, estimate = self._ahead(problem, estimate, aligned=aligned)
-        smoother = smoother.under(fit.noise, heavy=False, problem=problem)
-        solved = smoother.solved_in_slices(estimate, iterations=most, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN)
-        return smoother, *exhausted(solved)
+    def _settled(
+        self,
+        smoother: Smoother,
+        problem: Problem,
+        estimate: Estimate,
+        noise: Noise,
+        *,
+        ahead: Extrapolation | None = None,
+        heavy: bool = False,
+        final: bool = False,
+    ) -> Found:
+        """Return the optimum from these values and its noise levels, in turns until neither changes.
 
-    def _converged(
-        self, problem: Problem, estimate: Estimate, noise: Noise, near: Smoother | None = None
-    ) -> tuple[Smoother, Estimate, NoiseFit]:
-        """The optimum and its noise levels from these values, in turns until neither changes.
-
-        Where the smoother `near`, of the same problem but for its prior, found them, it is known what is an outlier.
+        Args:
+            smoother: one of the same problem but for its prior and its start.
+            problem: what is solved.
+            estimate: where to start.
+            noise: levels to start from.
+            ahead: how they were sought at a problem nearby.
+            heavy: begin with the kernel that never lets go, for values from which it does not show what is an outlier.
+            final: to within what rounding leaves; else near enough to decide what comes next.
         """
-        fit, ahead = None, Extrapolation()
-        smoother = Smoother(problem, noise, robust=self._robust) if near is None else near
-        heavy = near is None  # come close with the kernel that never lets go, then decide what is an outlier
-        steps, settled = STEPS_A_ROUND, NEAR_NOISE_GAIN * len(problem.pose_row)
-        for round_ in range(FINAL_ROUNDS):
+        ahead, within = Extrapolation() if ahead is None else ahead, NOISE_CONVERGED if final else NOISE_NEAR
+        ahead.elsewhere()
+        steps, tolerance, settled = STEPS_A_ROUND, NEAR_NOISE, NEAR_NOISE_GAIN * len(problem.pose_row)
+        if final:
+            steps, tolerance, settled = FINAL_STEPS, FINAL_TOLERANCE, FINAL_GAIN
+        for _ in range(FINAL_ROUNDS):
             smoother = smoother.under(noise, heavy=heavy, problem=problem)
             # values and noise levels settle together: no need for the optimum of levels that will not stay
-            solved = smoother.solved_in_slices(estimate, iterations=steps, tolerance=NEAR_NOISE, settled=settled)
+            solved = smoother.solved_in_slices(estimate, iterations=steps, tolerance=tolerance, settled=settled)
             estimate, marginals = exhausted(solved)
             weights = smoother.inlier_probability(estimate)
             fit = refine_noise(problem, estimate, marginals, weights, noise, self._start_noise)
-            before, steps = noise, 1
+            if not heavy and (fit.change < within or not self._estimate_noise):
+                break
             if self._estimate_noise:
                 noise = fit.noise if heavy else ahead.ahead(noise, fit.noise)
-            if heavy:
-                heavy = round_ == 0 and not levels_settled(before, noise, NOISE_NEAR)
-                steps = 1 if heavy else STEPS_A_ROUND
-            elif levels_settled(before, fit.noise, NOISE_CONVERGED) or not self._estimate_noise:
-                noise = fit.noise if self._estimate_noise else noise
-                break
-        assert fit is not None
-        return smoother, estimate, replace(fit, noise=noise)
+            heavy = False
+        if final or not self._estimate_noise:  # those that the values are an optimum of
+            fit = replace(fit, noise=smoother.noise)
+        return Found(smoother, estimate, marginals, fit, ahead)
+
+
+def _at_states(estimate: Estimate, marginals: Marginals, states: FloatArray) -> Estimate:
+    """Return values with other calibration states (11,), and all else where it is expected then."""
+    away = np.linalg.pinv(marginals.states, hermitian=True) @ (states - estimate.states)
+    step = marginals.with_states @ away
+    n, landmark = len(estimate.pose), estimate.landmark.copy()
+    landmark[estimate.known] += step[3 * n : -len(states)].reshape(-1, 2)
+    return Estimate(se2.compose(estimate.pose, step[: 3 * n].reshape(n, 3)), landmark, states)
+
+
+def _first_part(count: int) -> int:
+    """Return how many poses are solved first: of all of them a half, of that a half, as long as there are enough."""
+    while count >= 2 * FEWEST_POSES:
+        count = (count + 1) // 2
+    return count
+
+
+def _led_on(problem: Problem, estimate: Estimate, noise: Noise) -> Estimate:
+    """Return values of all poses, those beyond the estimate's by odometry, and of all landmarks they saw.
+
+    A new landmark is where its prior or the median of its sightings puts it.
+    """
+    done = len(estimate.pose)
+    reckoned, _ = dead_reckoned(problem.stamp_s[done - 1 :], problem.drive, estimate.states, noise)
+    pose = np.concatenate([estimate.pose, se2.compose(estimate.pose[-1], reckoned[1:])])
+    landmark = estimate.landmark.copy()
+    new = np.isnan(landmark[problem.landmark_row, 0])
+    theirs = problem.seeing(new)
+    at = sighted_at(pose[theirs.pose_row], theirs.reading, estimate.states, problem.mount)
+    middle = middles(theirs.landmark_row, at, len(landmark))
+    return Estimate(pose, np.where(np.isnan(landmark), middle, landmark), estimate.states)
+
+
+def agreeing(prior_map: PriorMap, landmark: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return places (k, 2) of the map's landmarks that were seen, and (k,) which have the relative positions of it.
+
+    Args:
+        prior_map: the map.
+        landmark: (L, 2) positions of the landmarks, nan where never seen; those of further places are not asked.
+    """
+    landmark = landmark[: len(prior_map.given)]
+    both = prior_map.given & np.isfinite(landmark[:, 0])
+    if np.count_nonzero(both) < 2:
+        return prior_map.mean[both], np.zeros(np.count_nonzero(both), dtype=np.bool_)
+    return prior_map.mean[both], consensus(landmark[both], prior_map.mean[both])[1]
 
 
 def entered(
@@ -260,11 +411,6 @@ def divided(
         aligned=aligned,
         revision=revision,
     )
-
-
-def levels_settled(before: Noise, after: Noise, within: float) -> bool:
-    """Return whether no noise level changed by more than this share of itself."""
-    return bool(np.all(np.abs(after.levels / before.levels - 1.0) < within))
 
 
 def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount: FloatArray) -> FloatArray:
@@ -361,9 +507,12 @@ def silent_links(problem: Problem, estimate: Estimate, loose_rad: float) -> Bool
 
 def middles(row: IntArray, at: FloatArray, count: int) -> FloatArray:
     """Return (L, 2) medians of positions (M, 2) of landmarks (M,); nan of those with none."""
-    middle = np.full((count, 2), np.nan)
-    for j in np.unique(row):
-        middle[j] = np.median(at[row == j], axis=0)
+    middle, many = np.full((count, 2), np.nan), np.bincount(row, minlength=count)
+    seen = np.flatnonzero(many)
+    first = np.cumsum(many)[seen] - many[seen]
+    for axis in range(at.shape[1]):
+        ordered = at[np.lexsort((at[:, axis], row)), axis]
+        middle[seen, axis] = 0.5 * (ordered[first + (many[seen] - 1) // 2] + ordered[first + many[seen] // 2])
     return middle
 
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from evermap.config import SlamConfig
 from evermap.geometry import se2
-from evermap.geometry.rigid import consensus
 from evermap.slam.batch import (
     NEAR,
     NEAR_NOISE,
@@ -24,6 +23,7 @@ from evermap.slam.batch import (
     Batch,
     Outcome,
     PriorMap,
+    agreeing,
     entered,
     sighted_at,
     voted,
@@ -96,8 +96,6 @@ class StreamingSlam:
         """(N, 3) causal poses, as soon as each frame was processed."""
         self.online_covariance = np.full((len(problem.stamp_s), 3, 3), np.nan)
         """(N, 3, 3) covariance of each, at the time."""
-        self.nis = np.full(len(problem.pose_row), np.nan)
-        """(M,) squared Mahalanobis distance of every innovation; nan where the landmark was new."""
 
     def step(self, *, later: bool = False) -> None:
         """Process the next pose: predict, compare, add, and relinearise when it is time.
@@ -156,13 +154,11 @@ class StreamingSlam:
         Args:
             problem: all so far; rows that were there stay, new landmarks come last.
         """
-        poses, detections = len(self.online_pose), len(self.nis)
+        poses = len(self.online_pose)
         if len(problem.stamp_s) > poses:  # room for as many again: a frame must not cost what was before it
             room = max(len(problem.stamp_s), 2 * poses)
             self.online_pose = grown(self.online_pose, room)
             self.online_covariance = grown(self.online_covariance, room)
-        if len(problem.pose_row) > detections:
-            self.nis = grown(self.nis, max(len(problem.pose_row), 2 * detections))
         landmark = grown(self._landmark, len(problem.landmark_mean))
         self._adopt(replace(problem, prior=self._problem.prior), landmark)
         self._filter.problem = self._problem
@@ -239,7 +235,6 @@ class StreamingSlam:
         if not len(detections):
             return
         nis, _ = self._filter.distances(detections, landmark)
-        self.nis[detections] = nis
         np.add.at(self._n_compared, landmark, 1)
         surprising = nis > self._settings.votes.surprising
         if np.count_nonzero(surprising):
@@ -277,11 +272,7 @@ class StreamingSlam:
         problem, estimate = self._problem.until(n), self._filter.estimate()
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
         if learn and self._robust:
-            moved = yield from voted(smoother, estimate, self._settings.fewest_sightings)
-            # what was compared with a place that was never the landmark's own says nothing about consistency
-            misplaced = np.any(moved.landmark != estimate.landmark, axis=1) & estimate.known
-            self.nis[: len(problem.pose_row)][misplaced[problem.landmark_row]] = np.nan
-            estimate = moved
+            estimate = yield from voted(smoother, estimate, self._settings.fewest_sightings)
         estimate, marginals = yield from smoother.solved_in_slices(
             estimate, iterations=STEPS_A_ROUND, tolerance=NEAR_NOISE if learn else NEAR
         )
@@ -328,16 +319,14 @@ class StreamingSlam:
     def _can_align(self, *, final: bool = False) -> bool:
         """Return whether most landmarks of the map seen so far have its relative positions; two at the end."""
         assert self._prior_map is not None
-        both = self._prior_map.given & np.isfinite(self._landmark[: len(self._prior_map.given), 0])
-        count = int(both.sum())
-        settings = self._settings.localize
+        given, settings = self._prior_map.given, self._settings.localize
+        count = int(np.count_nonzero(given & np.isfinite(self._landmark[: len(given), 0])))
         if count < (2 if final else settings.fewest):
             return False
         if count == self._align_tried and not final:  # nothing new has been seen since
             return False
         self._align_tried = count
-        at = self._prior_map.mean[both]
-        _, agree = consensus(self._filter.estimate().landmark[: len(both)][both], at)
+        at, agree = agreeing(self._prior_map, self._filter.estimate().landmark)
         if final:
             return bool(agree.sum() >= 2)
         enough = agree.sum() >= settings.fewest and 2 * agree.sum() > count

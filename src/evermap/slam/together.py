@@ -27,7 +27,6 @@ from evermap.slam.batch import (
     STEPS_A_ROUND,
     Outcome,
     divided,
-    levels_settled,
     sighted_at,
 )
 from evermap.slam.bridge import bridged
@@ -260,7 +259,7 @@ def _levelled(
         for member, robot, fit, before in zip(members, joint.robots, fits, ahead, strict=True):
             noise = robot.noise
             if member.settings.estimate_noise:
-                settled &= levels_settled(noise, fit.noise, NOISE_CONVERGED)
+                settled &= fit.change < NOISE_CONVERGED
                 noise = fit.noise if first else before.ahead(noise, fit.noise)
             learning.append(robot.under(noise, heavy=False))
         if settled:
