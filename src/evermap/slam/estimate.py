@@ -80,17 +80,17 @@ def solve(
     in_map = prior_map is not None
     warm_up(search=settings.method == "joint" and may_search(len(prepared.problem.stamp_s), in_map=in_map))
     method = _method(prepared, prior, recording.sensor, settings)
-    problem, prior_map = prepared.problem, prepared.prior_map
+    problem = prepared.problem
     batch, began = Batch(prior, noise, method, settings), time.perf_counter()
     causal = realtime or settings.online or not isinstance(method, Static | Joint)
     if not causal and batch.is_driven(problem):
         part, interrupted = _furthest(batch.parts(problem), problem.stamp_s, progress)
         if interrupted or part.fits:  # else what the stream finds is a better start
-            outcome = batch.solved(part, prior_map)
+            outcome = batch.solved(part, prepared.prior_map)
             done = len(outcome.problem.stamp_s)
             step_s = np.full(done, (time.perf_counter() - began) / done)  # solved together, each has its share
             return Solved(recording, prepared, outcome, None, prior, step_s, interrupted, settings)
-    slam = StreamingSlam(problem, noise, prior, prior_map=prior_map, settings=settings, method=method)
+    slam = StreamingSlam(problem, noise, prior, prior_map=prepared.prior_map, settings=settings, method=method)
     step_s, interrupted = fed(problem.stamp_s, lambda _: slam.step(), least=2, realtime=realtime, progress=progress)
     return Solved(recording, prepared, slam.finish(), slam, prior, step_s, interrupted, settings)
 
