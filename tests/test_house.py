@@ -61,7 +61,7 @@ SETTLED = (
     "live", "maps.sessions", "runs.persist", "sensing", "slam.association", "slam.changes", "slam.space", "tracking",
 )  # fmt: skip
 """Packages whose beliefs and thresholds are keys of the configuration: see docs/architecture.md."""
-SETTLED_MODULES = ("calibration", "known_places", "localize", "problem", "streaming", "votes")
+SETTLED_MODULES = ("batch", "calibration", "known_places", "localize", "problem", "streaming", "votes")
 BELIEF = re.compile(
     r"_(M|M2|S|RAD|HZ|MPS|PX|NATS|P|ODDS)$|^_?(P|SIGMA|FEWEST|LEAST|GATE|CONFIDENCE|MIN|SEEN|SURE|NEAR|FAR)(_|$)"
 )
@@ -84,7 +84,8 @@ OF_THE_CODE = frozenset(
     slam.space.drift.LEAST_OF_SQUARE slam.space.drift.PERSIST_S slam.space.drift.SEEN_TOGETHER
     slam.space.problem.LEAST_WEIGHT slam.space.problem.NO_JUMP_LOG_ODDS slam.space.solve.GROSS_M
     slam.space.solve.SLACK_M slam.space.solve.SLACK_RAD slam.space.solve.STILL_M slam.space.solve.STILL_RAD
-    slam.batch.NEAR slam.batch.NEAR_NOISE slam.batch.NEAR_NOISE_GAIN slam.votes.FEWEST_PAIRS
+    slam.batch.FEWEST_POSES slam.batch.NEAR slam.batch.NEAR_GAIN slam.batch.NEAR_NOISE slam.batch.NEAR_NOISE_GAIN
+    slam.votes.FEWEST_PAIRS
     slam.votes.LEAST_SHARE tracking.frame._NEAR_S tracking.grid.FAR tracking.life.LEAST tracking.standing.STRIDE_S
     """.split()  # noqa: SIM905
 )
