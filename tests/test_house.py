@@ -25,18 +25,18 @@ SETTLED = (
     "live", "maps.sessions", "runs.persist", "sensing", "slam.association", "slam.changes", "slam.space", "tracking",
 )  # fmt: skip
 """Packages whose beliefs and thresholds are keys of the configuration: see docs/architecture.md."""
-SETTLED_MODULES = ("calibration", "known_places", "localize", "problem", "streaming", "votes")
+SETTLED_MODULES = ("batch", "calibration", "known_places", "localize", "problem", "streaming", "votes")
 BELIEF = re.compile(
     r"_(M|M2|S|RAD|HZ|MPS|PX|NATS|P|ODDS)$|^_?(P|SIGMA|FEWEST|LEAST|GATE|CONFIDENCE|MIN|SEEN|SURE|NEAR|FAR)(_|$)"
 )
 """Names by which constants state a probability, a distance, a time, evidence, a gate or a count of sightings."""
 OF_THE_CODE = frozenset(
     """
-    BURST_S FAR FAR_M FAR_OUT FEWEST FEWEST_BINS FEWEST_OF_BOTH FEWEST_PAIRS FEWEST_PARTICLES FEWEST_ROWS GATE
-    GROSS_M GUESS_S HELD_M HELD_NATS IMPLIED_M2 LEAST LEAST_INFORMATION LEAST_LEFT LEAST_M2 LEAST_OF_SQUARE LEAST_P
-    LEAST_SHARE LEAST_SIGMA LEAST_VARIANCE LEAST_WEIGHT MOST_P NEAR NEAR_NOISE NEAR_NOISE_GAIN NO_JUMP_LOG_ODDS
-    PERSIST_S REST_S RETRY_S SAME_NATS SEEN_P SEEN_TOGETHER SIGMA_M SLACK_M SLACK_RAD SMALLEST_P STILL_M STILL_RAD
-    STRIDE_S TESTED_M2 TOLD_S WAIT_S WITNESSED_NATS _NEAR_S _SHORTEST_GAP_S
+    BURST_S FAR FAR_M FAR_OUT FEWEST FEWEST_BINS FEWEST_OF_BOTH FEWEST_PAIRS FEWEST_PARTICLES FEWEST_POSES FEWEST_ROWS
+    GATE GROSS_M GUESS_S HELD_M HELD_NATS IMPLIED_M2 LEAST LEAST_INFORMATION LEAST_LEFT LEAST_M2 LEAST_OF_SQUARE
+    LEAST_P LEAST_SHARE LEAST_SIGMA LEAST_VARIANCE LEAST_WEIGHT MOST_P NEAR NEAR_GAIN NEAR_NOISE NEAR_NOISE_GAIN
+    NO_JUMP_LOG_ODDS PERSIST_S REST_S RETRY_S SAME_NATS SEEN_P SEEN_TOGETHER SIGMA_M SLACK_M SLACK_RAD SMALLEST_P
+    STILL_M STILL_RAD STRIDE_S TESTED_M2 TOLD_S WAIT_S WITNESSED_NATS _NEAR_S _SHORTEST_GAP_S
     """.split()  # noqa: SIM905
 )
 """Of these names, those of tolerances, limits of an iteration, first values and the pace of messages, in any module."""

@@ -16,9 +16,11 @@ import pytest
 
 from evermap import interrupts
 from evermap.cli.warmup import warm_up
+from evermap.config import Config, SlamConfig
 from evermap.interrupts import held, temporary, watched
 from evermap.pipeline import run_slam
-from evermap.slam.streaming import StreamingSlam
+from evermap.slam.batch import Batch, Part
+from evermap.slam.problem import Problem
 from evermap_studies.sim import BuildingConfig, simulate_building
 from evermap_studies.workers import sheltered
 
@@ -38,14 +40,14 @@ def interrupt() -> None:
 
 
 def test_an_interrupt_of_the_warm_up_is_for_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
-    def step(self: StreamingSlam, **given: bool) -> None:
-        steps.append(interrupts._open["watched"])
-        if sum(steps) == 5:  # what was done is enough to end with
+    def parts(self: Batch, problem: Problem) -> Iterator[Part]:
+        for part in whole(self, problem):
+            assert interrupts._open["watched"]
             interrupt()
-        whole(self, **given)
+            yield part  # enough to end with
 
-    whole, steps = StreamingSlam.step, list[int]()
-    monkeypatch.setattr(StreamingSlam, "step", step)
+    whole = Batch.parts
+    monkeypatch.setattr(Batch, "parts", parts)
     with pytest.raises(KeyboardInterrupt):
         warm_up.__wrapped__(search=False)
 
@@ -175,7 +177,8 @@ def test_an_estimate_can_be_interrupted_from_python_at_any_instant() -> None:
     that frame is the last.
     """
     recording = simulate_building(BuildingConfig(days=1, patrol_s=30.0), seed=1).sessions[0]
-    whole = run_slam(recording)
+    config = Config(slam=SlamConfig(online=True))
+    whole = run_slam(recording, config)
     for after in (5, 40, len(whole.step_s)):
         count = []
 
@@ -184,7 +187,7 @@ def test_an_estimate_can_be_interrupted_from_python_at_any_instant() -> None:
             if len(count) == after:
                 interrupt()
 
-        result = run_slam(recording, progress=stop)
+        result = run_slam(recording, config, progress=stop)
         assert result.interrupted
         assert len(count) == after
         np.testing.assert_array_equal(result.step_s.shape, (after,))

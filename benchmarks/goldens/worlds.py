@@ -15,7 +15,7 @@ from benchmarks.goldens.scores import Named, levels, measured, scores
 
 Part = Callable[[Path], Iterator[Named]]
 SOLVERS = (
-    ("evermap.slam.sparse.system", "System", "factorised"),
+    ("evermap.estimate.sparse.system", "System", "factorised"),
     ("evermap.estimate.sparse.system", "System", "factorised"),
 )
 """Where the method is that factorises a whole problem; the first that is there is counted."""

@@ -864,12 +864,12 @@ class SlamResult(Shown):
 
     Attributes:
         trajectory: smoothed poses at every frame that has one, and in between where the gap is long.
-        online: causal poses, one per frame.
+        online: causal poses, one per frame; none in the plane unless `slam.online` asks for them.
         landmarks: the map.
         parameters: calibration states and noise levels.
         innovations: consistency of every detection.
         misses: expected and not detected.
-        step_s: (N,) processing time of every step, one a pose of `online`.
+        step_s: (N,) processing time of every frame; of frames that were solved together, the share of each.
         dead_reckoning: odometry alone from the first pose, at the stamps of `trajectory`.
         warnings: counted remarks of the estimator.
         interrupted: True where the run was stopped before the end of the recording.

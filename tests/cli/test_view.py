@@ -97,7 +97,7 @@ def test_changes_are_those_of_the_run(place: Path, tmp_path: Path) -> None:
 def test_a_run_whose_recording_is_gone_is_shown_without_it(place: Path, tmp_path: Path) -> None:
     copy = tmp_path / "run"
     copy.mkdir()
-    for name in ("trajectory.tum", "online.tum", "map.parquet", "innovations.parquet"):
+    for name in ("trajectory.tum", "map.parquet", "innovations.parquet"):
         (copy / name).write_bytes((place / "run-rec" / name).read_bytes())
     summary = json.loads((place / "run-rec" / "summary.json").read_text())
     summary["recording"]["source"] = str(tmp_path / "nowhere")

@@ -50,7 +50,7 @@ def test_a_recording_fed_live_gives_the_map_and_the_poses_of_its_replay_bit_by_b
     """The online poses of a place that nobody knows differ by rounding: landmarks are numbered as they come. Their ids
     are as read: a vote would have to wait for the seconds after.
     """
-    as_read = AT_THE_END.model_copy(update={"slam": SlamConfig(vote_ids=False)})
+    as_read = AT_THE_END.model_copy(update={"slam": SlamConfig(vote_ids=False, online=True)})
     for number, recording in enumerate(SESSIONS[:3]):
         before = stored(tmp_path / "replay.evermap") if number else LivingMap()
         with engine(tmp_path / "live.evermap", recording) as live:
@@ -330,7 +330,7 @@ def test_a_session_that_meets_a_bug_stops_none_behind_it(
 
 def test_frames_that_are_left_out_change_no_pose_of_the_others(tmp_path: Path) -> None:
     """What a relinearisation takes is done in their time. Only poses that were told before it had ended differ."""
-    config = Config(live={"readings_hz": 3.0, "revision_s": 0.0}, slam=SlamConfig(vote_ids=False))
+    config = Config(live={"readings_hz": 3.0, "revision_s": 0.0}, slam=SlamConfig(vote_ids=False, online=True))
     with engine(tmp_path / "site.evermap", SESSIONS[0], config) as live:
         steps = list(fed(live, SESSIONS[0]))
         made = live.save()

@@ -27,7 +27,7 @@ def test_an_interrupt_leaves_the_finished_part():
         if len(seen) == 100:
             raise KeyboardInterrupt
 
-    run = judge(recording, judged(0).wrong, load_config(None, [AS_READ]), progress=stop_after_100)
+    run = judge(recording, judged(0).wrong, load_config(None, [AS_READ, "slam.online=true"]), progress=stop_after_100)
     result = run.result
     assert result.interrupted
     assert any("interrupted" in warning for warning in result.warnings)
@@ -119,7 +119,8 @@ def test_silent_odometry_alone_is_survived_and_admitted():
 def test_a_robot_whose_odometry_fails_while_it_turns_is_not_lost_for_words():
     """With 30 s of silence the last poses hang on the first by little more than nothing; covariances stay ones."""
     recording = building(0, patrol_s=90.0, rate_hz=2.0).sessions[0]
-    result = run_slam(without_odometry_between(recording, 30.0, 60.0))
+    config = load_config(None, ["slam.online=true"])
+    result = run_slam(without_odometry_between(recording, 30.0, 60.0), config)
     for covariance in (result.trajectory.covariance, result.online.covariance, result.landmarks.covariance_m2):
         assert np.linalg.eigvalsh(covariance)[:, 0].min() > 0.0
     passed = result.online.stamp_s - recording.odometry.stamp_s[0]

@@ -336,7 +336,7 @@ def test_a_sensor_that_sits_elsewhere_is_found_there():
 def test_heading_is_that_of_the_sensor_as_stated():
     """What an estimate without calibration has; both readings are told."""
     recording = robot(SensorKind.LASER, 5, bearing_bias_rad=0.08)
-    result = run_slam(recording)
+    result = run_slam(recording, Config(slam={"online": True}))
     plain = run_slam(recording, Config(slam={"sensor_model": "plain"}))
     turn = se2.wrap(result.trajectory.pose_world_robot[:, 2] - plain.trajectory.pose_world_robot[:, 2])
     assert np.abs(turn).max() < np.radians(2.0)

@@ -15,12 +15,13 @@ from test_smoother import elsewhere, tied
 from evermap.config import SlamConfig
 from evermap.geometry import se2
 from evermap.slam import streaming
+from evermap.slam.batch import sighted_at
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import beliefs, prepare
 from evermap.slam.local_filter import LocalFilter, Motion, SessionFilter, columns
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import StreamingSlam, sighted_at
+from evermap.slam.streaming import StreamingSlam
 from evermap_studies.peers.isam import IncrementalSmoother
 from evermap_studies.sim import WarehouseConfig, simulate_warehouse
 

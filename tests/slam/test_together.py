@@ -11,7 +11,7 @@ from drives import NOISE, driven, nees, seen_from
 from problems import QUIET, World, default_prior, make_world, slow_detection
 from recordings import with_ids
 
-from evermap.config import Config
+from evermap.config import Config, SlamConfig
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se2
 from evermap.metrics.trajectory import interpolate
@@ -270,7 +270,7 @@ def test_robots_that_see_each_other_are_surer_and_right() -> None:
 
 def test_results_are_in_one_frame() -> None:
     """Landmarks of all lie where those of the first do, what was known online lies beside what was smoothed."""
-    results = run_together(dict(enumerate(drives_together(2), start=1)))
+    results = run_together(dict(enumerate(drives_together(2), start=1)), Config(slam=SlamConfig(online=True)))
     first = results[1].landmarks
     assert list(results) == [1, 2, 3]
     for result in results.values():

@@ -50,7 +50,7 @@ _ROWS = (
     ("metrics", "dead_reckoning_rmse_m", "odometry alone, RMSE", "{:.3f} m"),
     ("metrics", "nis_mean", "innovations (2 is consistent)", "{:.2f}"),
     ("timing", "real_time_factor", "speed", "{:.0f} x real time"),
-    ("timing", "step_p99_ms", "99 % of the steps within", "{:.1f} ms"),
+    ("timing", "step_p99_ms", "99 % of the frames within", "{:.1f} ms"),
 )
 
 SURVEY_SIGMA_M = 0.02

@@ -16,9 +16,9 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.looks import Sighting
 from evermap.maps.sessions.session import judged_so_far, lives_of
 from evermap.maps.vicinity import Vicinity, near
+from evermap.slam.batch import sighted_at
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import Located
-from evermap.slam.streaming import sighted_at
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, MapChange, Sensor, rows_of
 
 REST_S = 2.5e-4

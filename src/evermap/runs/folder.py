@@ -456,7 +456,8 @@ def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
     from evermap.runs.object_changes import object_changes_text
 
     write_tum(result.trajectory, folder.path("trajectory.tum"))
-    write_tum(result.online, folder.path("online.tum"))
+    if len(result.online):
+        write_tum(result.online, folder.path("online.tum"))
     write_map_parquet(result.landmarks, folder.path("map.parquet"))
     write_map_geojson(result.landmarks, folder.path("map.geojson"))
     for rank, alternative in enumerate(result.alternatives, start=1):

@@ -239,7 +239,8 @@ def peak_memory_mb() -> float | None:
 
 def _processed_s(recording: AnyRecording, result: SlamResult) -> float:
     """Duration of the part that was processed."""
-    stamps = result.online.stamp_s if result.interrupted else recording.frames.stamp_s
+    done = result.online if len(result.online) else result.trajectory
+    stamps = done.stamp_s if result.interrupted else recording.frames.stamp_s
     return float(stamps[-1] - stamps[0]) if len(stamps) > 1 else 0.0
 
 

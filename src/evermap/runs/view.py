@@ -94,7 +94,7 @@ def _of_run(folder: Path) -> tuple[AnyRecording, SlamResult]:
         summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
         about, clock = summary["recording"], Clock(summary["recording"]["clock"])
         changes = tuple(map(change_of, summary["changes"]))
-        files = ("trajectory.tum", "online.tum", "map.parquet", "innovations.parquet")
+        files = ("trajectory.tum", "map.parquet", "innovations.parquet")
         missing = [name for name in files if not (folder / name).is_file()]
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise ConfigError("is not a run of `slam`", path=folder, hint="a folder with its summary.json") from error
@@ -102,9 +102,11 @@ def _of_run(folder: Path) -> tuple[AnyRecording, SlamResult]:
         raise ConfigError(f"contains no {missing[0]}", path=folder, hint="a complete folder written by `slam`")
     landmarks = read_landmarks(folder / "map.parquet")
     in_space = landmarks.position_m.shape[1] == 3
-    path, online = (
-        read_tum(folder / f"{name}.tum", clock=clock, in_space=in_space) for name in ("trajectory", "online")
-    )
+    path = read_tum(folder / "trajectory.tum", clock=clock, in_space=in_space)
+    if (folder / "online.tum").is_file():
+        online = read_tum(folder / "online.tum", clock=clock, in_space=in_space)
+    else:
+        online = path[np.zeros(0, dtype=np.int64)]
     recording, remarks = _recording(about, clock)
     result = _result(path, online, landmarks, changes=changes, warnings=remarks)
     return recording, replace(result, innovations=_innovations(folder / "innovations.parquet"))

@@ -1,9 +1,9 @@
-"""A recording through the estimator, frame after frame, and what the estimator makes of it."""
+"""A recording through the estimator, as a whole or frame after frame, and what the estimator makes of it."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +11,12 @@ import numpy as np
 from evermap import plugins
 from evermap.config import SlamConfig
 from evermap.interrupts import watched
+from evermap.slam.batch import Batch, Outcome, SolvedPart
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.joint import Joint, may_search
 from evermap.slam.intake import Prepared, beliefs, prepare
 from evermap.slam.method import Method, Static
-from evermap.slam.streaming import Outcome, StreamingSlam
+from evermap.slam.streaming import StreamingSlam
 from evermap.slam.warmup import warm_up
 from evermap.types import FloatArray, Landmarks, Progress, Recording, Sensor
 
@@ -28,9 +29,9 @@ class Solved:
         recording: as it was used.
         prepared: input of the estimator.
         outcome: smoothed values with their covariances.
-        slam: the estimator, for what it knew at the time of each frame.
+        slam: the stream, for what it knew at the time of each frame; None where there was none.
         prior: of the calibration states.
-        step_s: (F,) seconds per processed frame.
+        step_s: (F,) seconds per processed frame; of frames that were solved together, the share of each.
         interrupted: True where it was stopped before its end.
         settings: that it was solved with.
     """
@@ -38,7 +39,7 @@ class Solved:
     recording: Recording
     prepared: Prepared
     outcome: Outcome
-    slam: StreamingSlam
+    slam: StreamingSlam | None
     prior: CalibrationPrior
     step_s: FloatArray
     interrupted: bool
@@ -64,8 +65,10 @@ def solve(
     realtime: bool = False,
     progress: Progress | None = None,
 ) -> Solved:
-    """Estimate poses, landmarks, calibration and noise of a recording.
+    """Estimate poses, landmarks, calibration and noise of a recording: all together, from its odometry.
 
+    Frame after frame first where that start is bad, at the recording's pace, or where `slam.online` asks what was known
+    at the time.
     As `pipeline.run_slam`, of a cleaned recording with known identities; `remarks` on it are the first warnings.
 
     Raises:
@@ -76,17 +79,39 @@ def solve(
     prepared = prepare(recording, prior_map, remarks, settings.odometry)
     in_map = prior_map is not None
     warm_up(search=settings.method == "joint" and may_search(len(prepared.problem.stamp_s), in_map=in_map))
-    slam = StreamingSlam(
-        prepared.problem,
-        noise,
-        prior,
-        prior_map=prepared.prior_map,
-        settings=settings,
-        method=_method(prepared, prior, recording.sensor, settings),
-    )
-    stamp_s = prepared.problem.stamp_s
-    step_s, interrupted = fed(stamp_s, lambda _: slam.step(), least=2, realtime=realtime, progress=progress)
+    method = _method(prepared, prior, recording.sensor, settings)
+    problem = prepared.problem
+    batch, began = Batch(prior, noise, method, settings), time.perf_counter()
+    causal = realtime or settings.online or not isinstance(method, Static | Joint)
+    if not causal and batch.is_driven(problem):
+        part, interrupted = _furthest(batch.parts(problem), problem.stamp_s, progress)
+        if interrupted or part.fits:  # else what the stream finds is a better start
+            outcome = batch.solved(part, prepared.prior_map)
+            done = len(outcome.problem.stamp_s)
+            step_s = np.full(done, (time.perf_counter() - began) / done)  # solved together, each has its share
+            return Solved(recording, prepared, outcome, None, prior, step_s, interrupted, settings)
+    slam = StreamingSlam(problem, noise, prior, prior_map=prepared.prior_map, settings=settings, method=method)
+    step_s, interrupted = fed(problem.stamp_s, lambda _: slam.step(), least=2, realtime=realtime, progress=progress)
     return Solved(recording, prepared, slam.finish(), slam, prior, step_s, interrupted, settings)
+
+
+def _furthest(parts: Iterator[SolvedPart], stamp_s: FloatArray, progress: Progress | None) -> tuple[SolvedPart, bool]:
+    """Return the last part of a recording with frames at (F,) stamps; after an interrupt the last that was done."""
+    part, whole_s = None, float(stamp_s[-1] - stamp_s[0])
+    try:
+        with watched() as watch:
+            if progress is not None:
+                progress(0.0, whole_s)
+            for part in parts:
+                if progress is not None:
+                    progress(float(part.problem.stamp_s[-1] - stamp_s[0]), whole_s)
+                watch.stop_if_asked()
+    except KeyboardInterrupt:
+        if part is None:
+            raise
+        return part, True
+    assert part is not None
+    return part, False
 
 
 def fed(

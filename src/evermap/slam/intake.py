@@ -12,11 +12,11 @@ from evermap.config import OdometryConfig, SlamConfig
 from evermap.errors import DataError
 from evermap.estimate.tie import tie_measurements
 from evermap.geometry import se3
+from evermap.slam.batch import PriorMap
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.noise import start_noise
 from evermap.slam.problem import USUAL, Drive, Noise, Problem
-from evermap.slam.streaming import PriorMap
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Landmarks, Recording, Sensor
 from evermap.valid import WITHOUT_IDS
 

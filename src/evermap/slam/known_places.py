@@ -13,7 +13,7 @@ from evermap.config import LocalizeConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
 from evermap.geometry.rigid import AGREE_M, consensus
-from evermap.slam.streaming import sighted_at
+from evermap.slam.batch import sighted_at
 from evermap.types import FloatArray, IntArray
 
 LEAST_VARIANCE = 1e-6

@@ -19,13 +19,13 @@ from evermap.geometry import se2
 from evermap.sensing.visibility import USUAL as FIELD
 from evermap.sensing.visibility import NominalField
 from evermap.show import Shown
+from evermap.slam.batch import sighted_at
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.filter_kernels import BY_OTHERS
 from evermap.slam.kernels import AT_PLACES, N_SENSOR
 from evermap.slam.known_places import KnownPlaces, LocalTrack, Neighbourhood, Placed
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, Motion, columns
 from evermap.slam.problem import Drive, Noise
-from evermap.slam.streaming import sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
 
 USUAL = LocalizeConfig()

@@ -54,11 +54,14 @@ class NoiseFit:
         noise: the levels.
         detection_relative: (2,) standard deviations of the levels, relative to them.
         odometry_relative: (5,) the same; kinds that act on one axis are hard to tell apart, and that is in it.
+        change: root mean square of what the step changes the noise of a reading or a motion by, relative to it: kinds
+            that change against each other change little.
     """
 
     noise: Noise
     detection_relative: FloatArray
     odometry_relative: FloatArray
+    change: float = 0.0
 
 
 def refine_noise(
@@ -79,9 +82,19 @@ def refine_noise(
         estimate.pose, driven, noise.odometry**2, problem.prior.free, marginals.explained_odometry
     )
     # tr(W P_k) is a count only after multiplying by the variance
-    count = np.maximum(noise.odometry**2 * chances, 0.0)
-    squares_odometry = noise.odometry**4 * pulls
-    odometry = np.sqrt((squares_odometry + pseudo * start.odometry**2) / (count + pseudo))
+    variance = noise.odometry**2
+    count = np.maximum(variance * chances, 0.0)
+    # kinds that act on the same residuals are told apart by a step of scoring in the logarithms of their variances
+    imagined = pseudo * start.odometry**2 / variance
+    gradient = 0.5 * (variance * (pulls - chances) + imagined - pseudo)
+    curvature = variance[:, None] * fisher * variance
+    whole = np.sqrt(0.5 * count / np.maximum(curvature.sum(axis=1), 1e-300))
+    curvature = whole[:, None] * curvature * whole
+    information, curvature = curvature, curvature + np.diag(0.5 * imagined)
+    step = np.clip(0.5 * np.linalg.solve(curvature, gradient), -LARGEST_STEP, LARGEST_STEP)
+    odometry = noise.odometry * np.exp(step)
+    of_motions = float(step @ information @ step) / max(float(information.sum()), 1e-300)
+    of_readings = float(np.max(np.log(detection / noise.detection) ** 2 * (counts > pseudo)))
     # a variance is known less well where others act on the same residuals
     scale = np.sqrt(np.maximum(np.diag(fisher), 1e-300))
     correlation = fisher / np.outer(scale, scale) + 1e-3 * np.eye(len(fisher))
@@ -90,6 +103,7 @@ def refine_noise(
         Noise(detection, odometry, noise.outlier_log_odds),
         1.0 / np.sqrt(2.0 * (counts + pseudo)),
         np.sqrt(inflation / (2.0 * (count + pseudo))),
+        float(np.sqrt(max(of_motions, of_readings))),
     )
 
 
@@ -101,16 +115,24 @@ class Extrapolation:
     """
 
     def __init__(self) -> None:
-        self._levels: list[FloatArray] = []
-        self._steps: list[FloatArray] = []
+        self._last: tuple[FloatArray, FloatArray] | None = None
+        self._by_level: list[FloatArray] = []
+        self._by_step: list[FloatArray] = []
+
+    def elsewhere(self) -> None:
+        """Go on at another problem, so near that steps change with the levels as they did."""
+        self._last = None
 
     def ahead(self, before: Noise, after: Noise) -> Noise:
         """Return levels to go on from, given those before and after a step."""
         level = np.log(before.levels)
         step = np.log(after.levels) - level
-        self._levels, self._steps = [*self._levels, level][-MIXED:], [*self._steps, step][-MIXED:]
-        if len(self._steps) > 1:
-            by_level, by_step = np.diff(self._levels, axis=0).T, np.diff(self._steps, axis=0).T
+        if self._last is not None:
+            self._by_level = [*self._by_level, level - self._last[0]][1 - MIXED :]
+            self._by_step = [*self._by_step, step - self._last[1]][1 - MIXED :]
+        self._last = level, step
+        if self._by_step:
+            by_level, by_step = np.transpose(self._by_level), np.transpose(self._by_step)
             share = np.linalg.lstsq(by_step, step, rcond=LEAST_MIXED)[0]
             step = np.clip(step - (by_level + by_step) @ share, -LARGEST_STEP, LARGEST_STEP)
         mixed = np.exp(level + step)

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from evermap.geometry import se2
+from evermap.slam.batch import Outcome
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import BEARING, FORWARD, OF_ANGLE, OF_SCALE, SLOPE, SPECS, CalibrationPrior, from_front
 from evermap.slam.check import far_off
 from evermap.slam.estimate import Solved
 from evermap.slam.kernels import NOISE_NAMES
+from evermap.slam.linearise import detection_residuals
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive
-from evermap.slam.streaming import Outcome
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,
@@ -35,6 +36,9 @@ TRAJECTORY_STEP_S = 0.1
 """Maximum time between poses of the written trajectory."""
 LONGEST_PAUSE_S = 60.0
 """Maximum pause that is subdivided: a clock set forward by a day would give a million poses."""
+
+LEAST_WEIGHT, LEAST_LEFT = 1e-6, 1e-6
+"""Smallest weight of a detection that is divided by; and of a residual, so much is left, or nothing contradicts it."""
 
 
 def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
@@ -159,8 +163,10 @@ def _changes(solved: Solved, moved: tuple[MapChange, ...]) -> tuple[MapChange, .
 
 
 def online(solved: Solved, frame: str) -> Trajectory:
-    """Return what the robot knew at the time: the newest pose after every processed frame."""
+    """Return what the robot knew at the time: the newest pose after every processed frame; nothing if not asked for."""
     slam, recording = solved.slam, solved.recording
+    if slam is None:
+        return Trajectory(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)), frame=frame, clock=recording.clock)
     done = np.isfinite(slam.online_pose[:, 0])
     pose = slam.online_pose[done].copy()
     pose[:, 2] = se2.wrap(pose[:, 2])
@@ -169,17 +175,27 @@ def online(solved: Solved, frame: str) -> Trajectory:
 
 
 def _innovations(solved: Solved) -> Innovations:
-    """Consistency of every detection that was predicted."""
-    nis, inlier, detections = solved.slam.nis, solved.outcome.inlier, solved.recording.detections
-    told = np.flatnonzero(np.isfinite(nis[: len(inlier)]))
+    """Return the NIS of all detections, each as if it had not been used; none of those that say all of a landmark.
+
+    As `space.result` has it: with H = J S J' of whitened Jacobians and the covariance S, and the weight w, of the
+    residual r it is r' (1 - w H)^-1 (1 - w H + H)^-1 r.
+    """
+    outcome, detections = solved.outcome, solved.recording.detections
+    problem, weight = outcome.problem, np.maximum(outcome.inlier, LEAST_WEIGHT)[:, None, None]
+    sigma = outcome.noise.noise.of_detections(problem.sigma_given)
+    used = outcome.graph_marginals.explained_detections
+    left = np.eye(2) - used
+    told = np.flatnonzero(np.trace(left, axis1=1, axis2=2) > LEAST_LEFT)
+    r, left, own = (detection_residuals(problem, outcome.graph_estimate) / sigma)[told, :, None], left[told], used[told]
+    nis = (np.linalg.solve(left, r) * np.linalg.solve(left + own / weight[told], r)).sum(axis=(1, 2))
     detection = solved.prepared.used[told]
     measured: BoolArray = ~(detections.sigma_bearing_rad[detection] >= ANY_BEARING_RAD)
     return Innovations(
         stamp_s=solved.recording.frames.stamp_s[detections.frame[detection]],
         detection=detection,
         landmark_id=detections.landmark_id[detection],
-        nis=nis[told],
-        p_inlier=inlier[told],
+        nis=np.maximum(nis, 0.0),
+        p_inlier=outcome.inlier[told],
         dof=None if measured.all() else 1 + measured.astype(np.int64),
     )
 

@@ -18,6 +18,18 @@ from evermap.errors import DataError
 from evermap.estimate.gauss_newton import Steps
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
+from evermap.slam.batch import (
+    ALIGNED_INFORMATION,
+    FINAL_GAIN,
+    FINAL_ROUNDS,
+    FINAL_TOLERANCE,
+    NEAR_NOISE,
+    NOISE_CONVERGED,
+    STEPS_A_ROUND,
+    Outcome,
+    divided,
+    sighted_at,
+)
 from evermap.slam.bridge import bridged
 from evermap.slam.calibration import SLOPE, needed
 from evermap.slam.encounters import Encounters, Together
@@ -28,19 +40,6 @@ from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.result import online as told_online
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import (
-    ALIGNED_INFORMATION,
-    FINAL_GAIN,
-    FINAL_ROUNDS,
-    FINAL_TOLERANCE,
-    NEAR_NOISE,
-    NOISE_CONVERGED,
-    STEPS_A_ROUND,
-    Outcome,
-    divided,
-    levels_settled,
-    sighted_at,
-)
 from evermap.types import FloatArray, IntArray, Trajectory
 
 ONE_INSTANT_S = 1e-3
@@ -259,7 +258,7 @@ def _levelled(
         for member, robot, fit, before in zip(members, joint.robots, fits, ahead, strict=True):
             noise = robot.noise
             if member.settings.estimate_noise:
-                settled &= levels_settled(noise, fit.noise, NOISE_CONVERGED)
+                settled &= fit.change < NOISE_CONVERGED
                 noise = fit.noise if first else before.ahead(noise, fit.noise)
             learning.append(robot.under(noise, heavy=False))
         if settled:

@@ -16,12 +16,12 @@ import numpy as np
 from evermap.config import SlamConfig, VotesConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
+from evermap.slam.batch import sighted_at
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.intake import prepare
 from evermap.slam.kernels import kernel
 from evermap.slam.noise import START
 from evermap.slam.space.intake import prepare_space, without_range
-from evermap.slam.streaming import sighted_at
 from evermap.types import (
     UNKNOWN,
     AnyRecording,

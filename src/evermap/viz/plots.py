@@ -188,7 +188,7 @@ def _nothing_but_frames(result: SlamResult) -> Recording:
     nothing = np.zeros(0)
     whole = nothing.astype(np.int64)
     detections = Detections(whole, whole, nothing, nothing, whole, nothing, nothing, whole)
-    return Recording("", Odometry(nothing, nothing, nothing, nothing), Frames(result.online.stamp_s), detections)
+    return Recording("", Odometry(nothing, nothing, nothing, nothing), Frames(result.trajectory.stamp_s), detections)
 
 
 MOST_SPELLS = 80

@@ -247,6 +247,8 @@ def _landmark_card(metrics: Mapping[str, Any]) -> str | None:
 def _latency(timing: Mapping[str, Any]) -> str:
     if timing["step_p99_ms"] is None:
         return "Duration of the recording over the time it took."
+    if timing["step_max_ms"] == timing["step_p50_ms"]:
+        return "Duration of the recording over the time it took, all frames together."
     p50, p99 = timing["step_p50_ms"], timing["step_p99_ms"]
     return f"99% of the steps were done within {p99:.1f} ms, half within {p50:.1f} ms."
 

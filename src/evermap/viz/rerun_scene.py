@@ -357,7 +357,7 @@ class _RunScene:
                 ends = innovations.stamp_s[rows[[0, -1]]]
                 self._plot(f"nis/{name}", ends, np.full(2, np.log10(level)), MUTED)
         step_s = self._result.step_s
-        if len(step_s):
+        if len(step_s) and len(step_s) == len(self._result.online):
             rows = _thin(len(step_s))
             self._plot("latency/step_ms", self._result.online.stamp_s[rows], 1e3 * step_s[rows])
         poses = self._evaluation.poses

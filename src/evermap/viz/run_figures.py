@@ -177,7 +177,7 @@ def draw_consistency(result: SlamResult) -> NamedFigure | None:
 def draw_latency(recording: AnyRecording, result: SlamResult, real_time_factor: float | None) -> NamedFigure | None:
     """Draw the processing time of every step, with the median, the 99th percentile and the time there was."""
     count = len(result.step_s)
-    if count == 0:
+    if count == 0 or len(result.online) != count:  # frames that were solved together
         return None
     stamps, step_ms = result.online.stamp_s, 1e3 * np.maximum(result.step_s, 1e-7)
     p50, p99 = np.percentile(step_ms, [50, 99])

@@ -13,9 +13,9 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.gaussian import own_landmarks
 from evermap.maps.sessions.placing import Held, refitted
 from evermap.pipeline import solve_alone
+from evermap.slam.batch import Outcome
 from evermap.slam.estimate import Solved
 from evermap.slam.problem import Estimate
-from evermap.slam.streaming import Outcome
 from evermap.types import FloatArray, IntArray
 from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, SimulatedSensor, simulate_building
 

@@ -27,7 +27,7 @@ from evermap_studies.demo.truth import truth_of
 
 SCENARIO = Scenario(days=2, patrol_lengths_s=(40.0, 60.0), wing_opens_day=1, change_rate=3.0)
 SEED = 3
-FILES = ("trajectory.tum", "online.tum", "map.geojson", "true_events.jsonl", "changes.jsonl")
+FILES = ("trajectory.tum", "map.geojson", "true_events.jsonl", "changes.jsonl")
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -22,8 +22,8 @@ from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, of_plac
 from evermap.geometry.group import PLANE, SPACE
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap, Metres
+from evermap.slam.batch import Outcome
 from evermap.slam.problem import Marginals
-from evermap.slam.streaming import Outcome
 from evermap.types import BoolArray, FloatArray, IntArray, landmark_id_of
 
 

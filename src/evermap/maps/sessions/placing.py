@@ -18,11 +18,11 @@ from evermap.maps.bodies import squared_length
 from evermap.maps.living import LivingMap, Places, rows_among
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.maps.vicinity import Vicinity, near
+from evermap.slam.batch import ALIGNED_INFORMATION, FINAL_GAIN, FINAL_TOLERANCE, Outcome, divided, sighted_at
 from evermap.slam.calibration import FORWARD, SLOPE, CalibrationPrior
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_GAIN, FINAL_TOLERANCE, Outcome, divided, sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
 
 VisitT = TypeVar("VisitT")

@@ -10,8 +10,8 @@ from scipy import sparse
 
 from evermap.config import AssociationConfig, SlamConfig
 from evermap.slam.association.features import Likeness, Traits
+from evermap.slam.batch import USUAL, sighted_at
 from evermap.slam.problem import Estimate, Problem
-from evermap.slam.streaming import USUAL, sighted_at
 from evermap.types import UNKNOWN, AnyRecordingT, BoolArray, FloatArray, IntArray
 
 NOBODY = -1

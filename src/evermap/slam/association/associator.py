@@ -24,13 +24,13 @@ from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.association.merging import Differences, Solution, accepted_rise, propose_merges, tried_by_halves
 from evermap.slam.association.revise import likely_real, reassigned, unseen_nats, with_overlooked
 from evermap.slam.association.wrong_associations import displaced_stretches, laid, weighed_visits
+from evermap.slam.batch import USUAL, sighted_at
 from evermap.slam.filter_kernels import BY_PLACE, GATED, WIDTH, spread_of_frame
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, Motion, columns
 from evermap.slam.noise import Extrapolation, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import USUAL, sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 FIRST_BATCH, BATCH_SHARE = 40, 0.05

@@ -23,8 +23,8 @@ from evermap.geometry.group import group_of
 from evermap.geometry.rigid import rigid
 from evermap.slam.association.assignment import Assignment, alike, same_name
 from evermap.slam.association.jcbb import Pairings, most_pairings
+from evermap.slam.batch import USUAL
 from evermap.slam.problem import Marginals
-from evermap.slam.streaming import USUAL
 from evermap.types import BoolArray, FloatArray, IntArray
 
 MAX_SEEDS = 12

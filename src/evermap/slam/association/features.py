@@ -18,8 +18,8 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from evermap.config import ReadingsConfig, SlamConfig
+from evermap.slam.batch import USUAL
 from evermap.slam.kernels import kernel
-from evermap.slam.streaming import USUAL
 from evermap.types import FloatArray, IntArray
 
 _Found = TypeVar("_Found")

@@ -21,12 +21,13 @@ from evermap.slam.association.associator import Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.features import Traits, best_with_traits, learned
 from evermap.slam.association.particles import drawn
+from evermap.slam.batch import USUAL
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import USUAL, StreamingSlam
+from evermap.slam.streaming import StreamingSlam
 from evermap.types import UNKNOWN, FloatArray, IntArray, Recording
 
 _Found: TypeAlias = tuple[Associator, Assignment]

@@ -20,7 +20,7 @@ from evermap.config import AssociationConfig
 from evermap.slam.association.assignment import alike, same_name
 from evermap.slam.association.consensus import FREE, Candidates, Consensus, consensus
 from evermap.slam.association.jcbb import gates
-from evermap.slam.streaming import USUAL
+from evermap.slam.batch import USUAL
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 _Part = TypeVar("_Part")

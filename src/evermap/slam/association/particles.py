@@ -21,11 +21,11 @@ from evermap.config import SlamConfig
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.features import Likeness, Traits, Variances, same_nats
 from evermap.slam.association.jcbb import gates
+from evermap.slam.batch import USUAL
 from evermap.slam.calibration import seated
 from evermap.slam.filter_kernels import vectorised
 from evermap.slam.kernels import N_STATES, composed, kernel, wrapped
 from evermap.slam.problem import Estimate
-from evermap.slam.streaming import USUAL
 from evermap.types import UNKNOWN, FloatArray, IntArray
 
 MOST_PARTICLES, FEWEST_PARTICLES = 300, 30

@@ -21,7 +21,7 @@ from evermap.geometry import se2
 from evermap.geometry.group import SPACE, group_of
 from evermap.geometry.rigid import rigid
 from evermap.slam.association.constellation import MAX_MOTIONS, LocalMap, agreed_pairs
-from evermap.slam.streaming import USUAL
+from evermap.slam.batch import USUAL
 from evermap.types import BoolArray, FloatArray, IntArray
 
 NEIGHBOURS = 7

@@ -16,11 +16,11 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
+from evermap.slam.batch import middles, sighted_at
 from evermap.slam.calibration import SLOPE, CalibrationPrior
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import middles, sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
 TINY_INFORMATION = 1e-6

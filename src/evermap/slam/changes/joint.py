@@ -16,6 +16,7 @@ from scipy import sparse
 
 from evermap.config import SlamConfig
 from evermap.geometry.rigid import consensus
+from evermap.slam.batch import outvoted
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, in_sensor_metres, landmark_evidence
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained, parting_time, unswayed
@@ -25,7 +26,6 @@ from evermap.slam.method import Compare, Explanation, Method, Rival
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Noise, Problem, independent
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import outvoted
 from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
 
 VISIT_MARGIN, MOST_VISITS = 0.5, 8

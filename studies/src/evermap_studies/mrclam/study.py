@@ -51,7 +51,7 @@ class Setting:
         """Defaults but for the sensor model."""
         from evermap.config import load_config
 
-        return load_config(None, [f"slam.sensor_model={self.sensor_model}"])
+        return load_config(None, [f"slam.sensor_model={self.sensor_model}", "slam.online=true"])
 
 
 SETTINGS = (

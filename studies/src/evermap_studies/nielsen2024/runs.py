@@ -230,7 +230,7 @@ def run_job(job: Job, data: Path, reference: Reference) -> tuple[Row, SlamResult
         **run_scores(recording, result, reference.trajectory, original.truth, at),
         **change_scores(true_changes(job, original), result, original, job.during),
         "recording_s": float(np.ptp(recording.frames.stamp_s)),
-        "frames": len(result.online),
+        "frames": len(result.step_s),
         "wall_s": wall,
         "cpu_s": cpu,
         "step_p99_ms": float(np.percentile(1e3 * result.step_s, 99)),

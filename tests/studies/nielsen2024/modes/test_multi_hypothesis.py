@@ -10,8 +10,9 @@ from moving import MovingWorld, make_moving_world, model_of
 from problems import default_prior
 
 from evermap.config import SlamConfig
+from evermap.slam.batch import Outcome
 from evermap.slam.method import Static
-from evermap.slam.streaming import Outcome, StreamingSlam
+from evermap.slam.streaming import StreamingSlam
 from evermap.types import FloatArray, IntArray
 from evermap_studies.nielsen2024.modes.multi_hypothesis import MultiHypothesis
 
