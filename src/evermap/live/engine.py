@@ -28,8 +28,8 @@ from evermap.maps.sessions.believe import aged
 from evermap.runs.sessions import Entered
 from evermap.slam.calibration import DELAY
 from evermap.slam.intake import beliefs
-from evermap.slam.known_places import KnownPlaces
-from evermap.slam.localize import FrameSightings, Localizer, Located
+from evermap.slam.known_places import FrameSightings, KnownPlaces
+from evermap.slam.localize import Localizer, Located
 from evermap.slam.mapper import Mapper
 from evermap.slam.problem import Drive
 from evermap.types import Clock, FloatArray, IntArray, Landmarks, MapChange, Sensor, Trajectory

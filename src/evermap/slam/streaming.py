@@ -23,8 +23,9 @@ from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior, needed, seated
 from evermap.slam.filter_kernels import told
 from evermap.slam.kernels import N_STATES
-from evermap.slam.local_filter import Motion, SessionFilter, grown
+from evermap.slam.local_filter import Motion, SessionFilter
 from evermap.slam.method import Explanation, Method, Static
+from evermap.slam.nearby_places import grown
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Drive, Estimate, Marginals, Noise, Problem, independent
 from evermap.slam.smoother import COST_SLACK, DETECTIONS, Smoother
