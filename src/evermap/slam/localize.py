@@ -73,11 +73,14 @@ class BaseLocalizer(Shown):
         places: the map.
         local: the filter.
         settings: when its place in the map is known, and when it is lost.
+        most: detections of a frame that are used.
         learn: hold the pose by landmarks that the map lacks, too, where they were seen first; else they are not used.
     """
 
-    def __init__(self, places: KnownPlaces, local: NearbyPlaces, settings: LocalizeConfig, *, learn: bool) -> None:
-        self.places, self._settings, self._filter = places, settings, local
+    def __init__(
+        self, places: KnownPlaces, local: NearbyPlaces, settings: LocalizeConfig, *, most: int, learn: bool
+    ) -> None:
+        self.places, self._settings, self._filter, self._most = places, settings, local, most
         self._log_p = np.log(np.maximum(places.p_here, settings.least_belief))
         self._believed = self._log_p.copy()
         self._stamp_s: float | None = None
@@ -127,7 +130,7 @@ class BaseLocalizer(Shown):
         self._stamp_s = stamp_s
         first, last = self.places.rows_of(seen.landmark_id)
         named = seen.readable & (seen.landmark_id != UNKNOWN)
-        used = np.flatnonzero(named & (last > first))[:MOST_CONSIDERED]
+        used = np.flatnonzero(named & (last > first))[: self._most]
         if self._track is None and self._is_vague:
             self._track = self._begin_track()
         if self._track is not None:
@@ -135,7 +138,7 @@ class BaseLocalizer(Shown):
             self._search(stamp_s)
         place = np.full(len(named), UNKNOWN, dtype=np.int64)
         nis, p_inlier = np.full((2, len(named)), np.nan)
-        new = np.flatnonzero(named & (last == first) & self.learn)[: max(MOST_CONSIDERED - len(used), 0)]
+        new = np.flatnonzero(named & (last == first) & self.learn)[: max(self._most - len(used), 0)]
         if self._is_placed and len(used) + len(new):
             place[used], nis[used], p_inlier[used] = self._update(stamp_s, first[used], last[used], seen, used, new)
         pose_dim = self._filter.group.dim
@@ -330,7 +333,7 @@ class Localizer(BaseLocalizer):
         self._field, self._prior, self.noise = NominalField(sensor, looks), prior, noise
         self._mount = np.array(sensor.mount_robot_sensor, dtype=np.float64)
         self._local = LocalFilter(self._mount, prior, most=MOST_CONSIDERED, considered=True)
-        super().__init__(places, self._local, settings, learn=learn)
+        super().__init__(places, self._local, settings, most=MOST_CONSIDERED, learn=learn)
         self._near = Neighbourhood(places.position_m, self._field.reach_m)
         self._believed_there = np.zeros(len(places), dtype=np.bool_)
         self._believed_there[places.most_probable()] = True

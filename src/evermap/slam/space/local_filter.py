@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg.lapack import dpotri
 
 from evermap.estimate.robust import weigh
 from evermap.geometry import se3
@@ -209,7 +210,7 @@ class SpatialFilter(NearbyPlaces):
                 place = _carried(start_place, step[own:].reshape(count, -1), turn @ step[3:6], frame.turned)
             changed = 0.0
             if is_unsure:
-                now = _weigh_by_the_others(spread, noise, pull, odds, iteration == 0, credible, weight, frame.n_rows)
+                now = _weigh_by_the_others(root[0], pull, odds, iteration == 0, credible, weight, frame.n_rows)
                 changed = float(np.abs(now - weight).max())
                 weight = now
             if np.abs(step - before).max() < small and changed < SETTLED_WEIGHT:
@@ -415,8 +416,7 @@ def _surprises(
 
 
 def _weigh_by_the_others(
-    spread: FloatArray,
-    noise: FloatArray,
+    root: FloatArray,
     pull: FloatArray,
     log_odds: FloatArray,
     heavy: bool,
@@ -426,7 +426,8 @@ def _weigh_by_the_others(
 ) -> FloatArray:
     """Return weights, at most `credible`, from each detection's innovation given all others, as `filter_kernels`."""
     count = len(weight)
-    inverse = np.linalg.inv(spread + np.diag(noise))
+    lower = np.tril(dpotri(root, lower=True)[0])
+    inverse = lower + np.tril(lower, -1).T
     alone = np.linalg.inv(_blocks(inverse, count))
     off = (alone @ pull.reshape(count, -1, 1))[..., 0]
     more = 1.0 / weight - 1.0  # noise by which it was held to be an outlier

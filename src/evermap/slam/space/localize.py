@@ -17,7 +17,7 @@ from evermap.geometry.rigid import AGREE_M, rigid
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam.filter_kernels import BY_OTHERS
 from evermap.slam.known_places import MOST_LANDMARKS, RETRY_S, SIGMA_M, KnownPlaces, Placed
-from evermap.slam.localize import MOST_CONSIDERED, USUAL, BaseLocalizer
+from evermap.slam.localize import USUAL, BaseLocalizer
 from evermap.slam.space.linearise import POINT
 from evermap.slam.space.local_filter import OF_PLACE, SpatialFilter, SpatialFrame, SpatialMotion
 from evermap.slam.space.problem import USUAL as IN_SPACE
@@ -34,6 +34,8 @@ CERTAIN_NATS = 2.0
 """By which one explanation of a single tag must be more probable than the other."""
 VAGUE_M, VAGUE_RAD = 2.0, 0.5
 """A pose that is less certain is searched for: what it sees can't be linearised there."""
+MOST_CONSIDERED = 128
+"""As in the plane, where a place has a third of the numbers."""
 OF_POINT, OF_TAG, ENOUGH_NUMBERS, FEWEST_NUMBERS = 3, 6, 9, 6
 """Numbers that a point and a tag tell of the pose; those that a start needs, three more than it has, and those that do
 where nothing else comes into view."""
@@ -246,7 +248,7 @@ class SpatialLocalizer(BaseLocalizer):
         self._mount, self._sigma, self.noise, self._driven = mount, sigma, noise, driven
         self._symmetries, self._space = symmetries, space
         self._local = SpatialFilter(mount, sigma, noise, symmetries, most=MOST_CONSIDERED, considered=True)
-        super().__init__(places, self._local, settings, learn=learn)
+        super().__init__(places, self._local, settings, most=MOST_CONSIDERED, learn=learn)
 
     def over(self, places: SpatialPlaces) -> SpatialLocalizer:
         """Return one that goes on from here in another state of the map."""
