@@ -110,6 +110,21 @@ def test_sessions_in_space_of_which_one_is_late(days: list[Path], tmp_path: Path
     np.testing.assert_allclose(ended, [86_400.0 + 0.5 * (N_FRAMES - 1)])  # there on the second day
 
 
+def test_a_replay_in_space_enters_what_slam_enters(days: list[Path], tmp_path: Path) -> None:
+    live, site = tmp_path / "live.evermap", tmp_path / "slam.evermap"
+    for day in days[:2]:
+        assert run("live", "--replay", day, "--map", live).exit_code == 0
+        slam(day, "--map", site, "--out", tmp_path / day.name)
+    with open_store(live) as one, open_store(site) as other:
+        ours, theirs = one.load().landmarks(), other.load().landmarks()
+    np.testing.assert_allclose(ours.position_m, theirs.position_m, atol=1e-6)
+    np.testing.assert_allclose(ours.p_exists, theirs.p_exists, atol=0.02)
+    result = run("live", "--replay", days[1], "--map", live, "--localize", "--json")
+    poses = [json.loads(line) for line in result.stdout.splitlines() if "qw" in line]
+    assert len(poses) > 0.9 * N_FRAMES
+    assert poses[-1]["frame"] == "prior_map"
+
+
 def test_what_does_not_fit_is_one_line(days: list[Path], tmp_path: Path) -> None:
     site, out = tmp_path / "site.evermap", tmp_path / "out"
     slam(days[0], "--map", site, "--out", out)

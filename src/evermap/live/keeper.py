@@ -210,7 +210,7 @@ class Keeper:
 
 def _check_fits(living: LivingMap, clock: Clock, dim: int) -> None:
     """Raise `InputError` for a map of another clock, or in space where the sensor is in the plane, or the reverse."""
-    if len(living.places) and living.dim != dim:
+    if living.dim != dim and (len(living.places) or dim == 2):
         of = {2: "in the plane", 3: "in space"}
         instead = {2: "evermap.types.SpatialSensor", 3: "evermap.Sensor"}[dim]
         raise InputError(f"a map {of[5 - dim]}, the sensor is {of[dim]}", field="map", hint=instead)
