@@ -113,7 +113,8 @@ def localize_in_space(
 ) -> SlamResult:
     """Localise a recording in space, as `localize` in the plane; its odometry may be missing.
 
-    Detections of which only the direction was seen are not used, nor are delays of sensors estimated.
+    Noise levels are learned from frame to frame. Detections of which only the direction was seen are not used, nor are
+    delays of sensors estimated.
 
     Raises:
         DataError: the robot's place in the map could not be found.
@@ -143,7 +144,8 @@ def localize_in_space(
 
     run = _feed(recording, localizer, frame, step, realtime=realtime, progress=progress)
     spread = np.sqrt(np.diag(localizer.states_covariance))
-    parameters = noise_parameters(noise, seen.kind[usable], np.zeros(int(usable.sum()), dtype=np.bool_), driven=driven)
+    kind = seen.kind[usable]
+    parameters = noise_parameters(localizer.noise, kind, np.zeros(len(kind), dtype=np.bool_), driven=driven)
     for row, sensor in enumerate(recording.sensors):
         at = slice(6 * row, 6 * row + 6)
         parameters += mount_parameters(sensor.name, localizer.states[at], spread[at], sigma[at])

@@ -161,6 +161,26 @@ def test_a_robot_that_was_carried_away_finds_itself_again() -> None:
     assert any("searched for" in text for text in result.warnings)
 
 
+@pytest.mark.parametrize(
+    ("sigma_m", "stated_m", "drift"), [(0.03, 0.03, 0.03), (0.1, 0.02, 0.03), (0.03, 0.15, 0.03), (0.03, 0.03, 0.15)]
+)
+def test_noise_that_is_other_than_stated_is_learned_on_the_way(sigma_m: float, stated_m: float, drift: float) -> None:
+    """Else a detector that is five times as bad as it says has most of its detections taken for outliers."""
+    recording = hall(1, n_frames=200, sigma_m=sigma_m, drift=drift)
+    assert recording.true_landmarks is not None
+    seen = recording.detections
+    stated = np.tile(stated_m**2 * np.eye(3), (len(seen), 1, 1))
+    recording = replace(recording, detections=replace(seen, covariance_sensor_m2=stated))
+    result = localize_in_space(recording, surveyed(recording.true_landmarks, 0.02, 0))
+    learned = {one.name: one.value for one in result.parameters}
+    assert learned["direction_noise_factor"] == pytest.approx(sigma_m / stated_m, rel=0.15)
+    assert learned["range_noise_factor"] == pytest.approx(sigma_m / stated_m, rel=0.15)
+    assert learned["sigma_odometry_m"] == pytest.approx(drift, rel=0.2)
+    assert learned["sigma_odometry_rad"] == pytest.approx(drift / 3.0, rel=0.25)
+    assert (result.innovations.p_inlier > 0.5).mean() > 0.95
+    assert 3.0 < np.median(nees(result, recording)) < 9.0
+
+
 def test_moved_landmarks_are_doubted_and_carry_nobody_away() -> None:
     recording = hall(8, n_frames=120)
     assert recording.true_landmarks is not None

@@ -34,6 +34,7 @@ from evermap.slam.filter_kernels import (
 )
 from evermap.slam.nearby_places import MOST_ACTIVE, NearbyPlaces
 from evermap.slam.space.linearise import ACROSS, ALONG, POINT, ROWS, STATES, TAIL, SpatialSightings, linearise_sightings
+from evermap.slam.space.online_noise import OnlineNoise
 from evermap.slam.space.problem import OdometryPath, SpatialNoise
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -127,7 +128,8 @@ class SpatialFilter(NearbyPlaces):
         considered: bool = False,
     ) -> None:
         super().__init__(SPACE, np.zeros(len(sigma)), sigma**2, OF_PLACE, 7, most=most, considered=considered)
-        self._mount, self._level = mount, noise.levels
+        self._mount, self.levels = mount, noise.levels
+        """(6,) noise levels."""
         self._back = np.zeros((len(mount), 1, 6))
         self._axis = np.array([kind.axis for kind in symmetries])
         self._first_turn = np.append(0, np.cumsum([len(kind.turns) for kind in symmetries]))
@@ -168,9 +170,15 @@ class SpatialFilter(NearbyPlaces):
         return _squared(spread, residual), np.linalg.slogdet(spread)[1]
 
     def update(
-        self, rows: IntArray, seen: SpatialFrame, *, weighing: int = BELIEVED, log_odds: FloatArray | None = None
+        self,
+        rows: IntArray,
+        seen: SpatialFrame,
+        *,
+        weighing: int = BELIEVED,
+        log_odds: FloatArray | None = None,
+        noise: OnlineNoise | None = None,
     ) -> tuple[FloatArray, FloatArray]:
-        """Update by detections of places (M,) in the covariance, as `filter_kernels.update`.
+        """Update by detections of places (M,) in the covariance, as `filter_kernels.update`; `noise` learns from them.
 
         Returns:
             (M,) squared distance of each innovation by itself, before the frame was used, and (M,) weights.
@@ -190,6 +198,8 @@ class SpatialFilter(NearbyPlaces):
             residual, jacobian = frame.linearise(pose, states, place)
             self._to_start(jacobian, start, start_place, place, step, frame.turned)
             gain, spread = _gain(jacobian, part, own)
+            if iteration == 0:
+                innovations = spread, residual, jacobian[..., :6].copy()
             if weighing == BY_OTHERS and iteration == 0:
                 nis, is_unsure = _surprises(part, jacobian, spread, residual, own, frame.n_rows)
                 credible = np.maximum([weigh(*one, 0.0, 0.0)[0] for one in zip(nis, odds, strict=True)], LEAST_WEIGHT)
@@ -199,8 +209,8 @@ class SpatialFilter(NearbyPlaces):
                 unknown = _blocks(spread, count) if iteration == 0 else 0.0
                 squared = _squared(unknown + np.eye(residual.shape[1]), residual)
                 weight = 1.0 / (1.0 + squared / (TAIL * frame.n_rows))
-            noise = np.repeat(1.0 / weight, residual.shape[1])
-            root = cho_factor(spread + np.diag(noise), lower=True)
+            own_noise = np.repeat(1.0 / weight, residual.shape[1])
+            root = cho_factor(spread + np.diag(own_noise), lower=True)
             by = np.concatenate([np.broadcast_to(step[:own], (count, own)), step[own:].reshape(count, -1)], axis=1)
             innovation = (residual - np.einsum("mra,ma->mr", jacobian, by)).ravel()
             pull, before = cho_solve(root, innovation), step
@@ -225,6 +235,9 @@ class SpatialFilter(NearbyPlaces):
             white = solve_triangular(root[0], np.column_stack([across, innovation]), lower=True)
             self.covariance -= white[:, :-1].T @ white[:, :-1]
             self._carry(-(white[:, :-1].T @ white[:, -1]), turn)
+        if noise is not None:
+            noise.learn(*innovations, weight, frame.kind, frame.n_rows)
+            self.levels = noise.now.levels
         back = se3.adjoint(se3.exp(-step[:6]))
         self.covariance[:6] = back @ self.covariance[:6]
         self.covariance[:, :6] = self.covariance[:, :6] @ back.T
@@ -238,7 +251,7 @@ class SpatialFilter(NearbyPlaces):
         mount = self.mount[sensor]
         eye = se3.compose(self.pose, mount)
         place, by_own = se3.compose(eye, seen_at), np.zeros((OF_PLACE, self.own))
-        inverse = np.linalg.inv(seen.root[which]) * self._level[[ACROSS, ACROSS, ALONG]]
+        inverse = np.linalg.inv(seen.root[which]) * self.levels[[ACROSS, ACROSS, ALONG]]
         spread, of_sensor = np.zeros((6, 6)), slice(6 + STATES * sensor, 6 + STATES * (sensor + 1))
         if oriented:
             onto = se3.rotation_of(seen_at).T
@@ -317,13 +330,14 @@ class _Frame:
 
     Attributes:
         turned: (M,) places with an orientation.
+        kind: (M,) what is used of each detection.
         n_rows: (M,) residuals of each.
     """
 
     def __init__(self, of: SpatialFilter, rows: IntArray, seen: SpatialFrame) -> None:
         count, self._of = len(rows), of
         self.turned = np.isfinite(of.position[rows, 3])
-        kind = np.where(self.turned, seen.kind, POINT)
+        self.kind = kind = np.where(self.turned, seen.kind, POINT)
         dim = np.where(self.turned, 6, 3)
         self.n_rows = ROWS[kind]
         self._sensor = seen.sensor
@@ -349,7 +363,7 @@ class _Frame:
         place = np.where(self.turned[:, None] | (np.arange(7) < 3), place, np.append(np.zeros(3), se3.NO_TURN))
         values, weight, residual = np.zeros(int(seen.first[-1])), np.zeros(count), np.zeros((count, 8))
         linearise_sightings(
-            pose[None], place, of._mount_at(states), of._back, of._level, seen, False, values, weight, residual
+            pose[None], place, of._mount_at(states), of._back, of.levels, seen, False, values, weight, residual
         )
         most = int(self.n_rows.max())
         jacobian = np.zeros((count, most, of.own + OF_PLACE))

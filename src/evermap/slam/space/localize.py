@@ -20,6 +20,7 @@ from evermap.slam.known_places import MOST_LANDMARKS, RETRY_S, SIGMA_M, KnownPla
 from evermap.slam.localize import USUAL, BaseLocalizer
 from evermap.slam.space.linearise import POINT
 from evermap.slam.space.local_filter import OF_PLACE, SpatialFilter, SpatialFrame, SpatialMotion
+from evermap.slam.space.online_noise import OnlineNoise
 from evermap.slam.space.problem import USUAL as IN_SPACE
 from evermap.slam.space.problem import OdometryPath, SpatialNoise
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
@@ -225,7 +226,7 @@ class SpatialLocalizer(BaseLocalizer):
         places: the map.
         mount: (S, 7) poses of the sensors on the robot.
         sigma: (6 S + 1,) of the states: twists of the mounts, and the logarithm of the odometry's scale.
-        noise: standard deviations; they are not estimated. Without odometry those of a hand.
+        noise: standard deviations to start from. Without odometry those of a hand, which stay.
         driven: whether there is odometry.
         symmetries: turns after which landmarks look the same, the first without any.
         settings: when its place in the map is known, and when it is lost.
@@ -245,21 +246,36 @@ class SpatialLocalizer(BaseLocalizer):
         space: SpaceConfig = IN_SPACE,
         learn: bool = False,
     ) -> None:
-        self._mount, self._sigma, self.noise, self._driven = mount, sigma, noise, driven
+        self._mount, self._sigma, self._start, self._driven = mount, sigma, noise, driven
+        self._noise = OnlineNoise(noise, space, driven=driven)
         self._symmetries, self._space = symmetries, space
         self._local = SpatialFilter(mount, sigma, noise, symmetries, most=MOST_CONSIDERED, considered=True)
         super().__init__(places, self._local, settings, most=MOST_CONSIDERED, learn=learn)
 
+    @property
+    def noise(self) -> SpatialNoise:
+        """Noise levels as they are known now."""
+        return self._noise.now
+
     def over(self, places: SpatialPlaces) -> SpatialLocalizer:
         """Return one that goes on from here in another state of the map."""
         there = SpatialLocalizer(
-            places, self._mount, self._sigma, self.noise, driven=self._driven, symmetries=self._symmetries,
+            places, self._mount, self._sigma, self._start, driven=self._driven, symmetries=self._symmetries,
             settings=self._settings, space=self._space, learn=self.learn,
         )  # fmt: skip
+        there._noise, there._local.levels = self._noise, self._local.levels
         return self._going_on(there)
 
+    def _drive(self, motion: SpatialMotion) -> None:
+        super()._drive(motion)
+        self._noise.drive(motion.increment, motion.covariance)
+
+    def _place_at(self, placed: Placed) -> None:
+        super()._place_at(placed)
+        self._noise.forget_motion()
+
     def _begin_track(self) -> SpatialTrack:
-        return SpatialTrack(self._settings, self._mount, self.noise.pixel, driven=self._driven)
+        return SpatialTrack(self._settings, self._mount, self._start.pixel, driven=self._driven)
 
     def _motion(self, drive: OdometryPath | None, start_s: float, stop_s: float) -> SpatialMotion:
         return SpatialMotion.over(drive, start_s, stop_s, self._local.log_scale, self.noise)
@@ -277,7 +293,10 @@ class SpatialLocalizer(BaseLocalizer):
         some = seen.rows(which)
         kind = np.where(np.isfinite(self._local.position[row, 3]), some.kind, POINT)
         log_odds = np.array(self._space.outlier_log_odds)[kind] + self._believed[row]
-        return self._local.update(row, some, weighing=BY_OTHERS, log_odds=log_odds)
+        noise = self._noise if self._track is None else None  # where it is lost nothing fits
+        found = self._local.update(row, some, weighing=BY_OTHERS, log_odds=log_odds, noise=noise)
+        self._noise.forget_motion()
+        return found
 
     def _sight(self, row: int, seen: SpatialFrame, which: int) -> None:
         oriented = bool(seen.kind[which] != POINT and seen.symmetry[which] == 0)
