@@ -134,6 +134,23 @@ def test_a_camera_without_odometry_is_located_by_each_view() -> None:
     assert np.sqrt(np.mean(away**2)) < 0.3
 
 
+def test_a_camera_that_was_off_for_a_night_is_located_again() -> None:
+    world = tagged_corridor(3, odometry=False)
+    recording = world.recording
+    truth = recording.truth
+    assert truth is not None
+    night_s = np.where(np.arange(160) < 80, 0.0, 36_000.0)
+    later = replace(
+        recording,
+        frames=replace(recording.frames, stamp_s=recording.frames.stamp_s + night_s),
+        truth=replace(truth, stamp_s=truth.stamp_s + night_s),
+    )
+    result = localize_in_space(later, surveyed(world.tags, 0.005, 1), CORRIDOR)
+    away = np.linalg.norm(errors(result, later)[:, :3], axis=1)[result.trajectory.stamp_s > 36_000.0]
+    assert len(away) > 70
+    assert np.median(away) < 0.1
+
+
 def test_a_robot_that_was_carried_away_finds_itself_again() -> None:
     recording = hall(6, n_frames=160)
     assert recording.true_landmarks is not None

@@ -37,6 +37,8 @@ VAGUE_M, VAGUE_RAD = 2.0, 0.5
 """A pose that is less certain is searched for: what it sees can't be linearised there."""
 MOST_CONSIDERED = 128
 """As in the plane, where a place has a third of the numbers."""
+FARTHEST_M = 100.0
+"""A pose that may be so far off is not known."""
 OF_POINT, OF_TAG, ENOUGH_NUMBERS, FEWEST_NUMBERS = 3, 6, 9, 6
 """Numbers that a point and a tag tell of the pose; those that a start needs, three more than it has, and those that do
 where nothing else comes into view."""
@@ -268,6 +270,8 @@ class SpatialLocalizer(BaseLocalizer):
 
     def _drive(self, motion: SpatialMotion) -> None:
         super()._drive(motion)
+        if np.diag(self._local.covariance)[:3].max() > FARTHEST_M**2:
+            self._local.pose = np.full(7, np.nan)  # so it is not known
         self._noise.drive(motion.increment, motion.covariance)
 
     def _place_at(self, placed: Placed) -> None:
