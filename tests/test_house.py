@@ -84,6 +84,9 @@ OF_THE_CODE = frozenset(
     slam.space.drift.LEAST_OF_SQUARE slam.space.drift.PERSIST_S slam.space.drift.SEEN_TOGETHER
     slam.space.problem.LEAST_WEIGHT slam.space.problem.NO_JUMP_LOG_ODDS slam.space.solve.GROSS_M
     slam.space.solve.SLACK_M slam.space.solve.SLACK_RAD slam.space.solve.STILL_M slam.space.solve.STILL_RAD
+    slam.space.localize.AGREE_RAD slam.space.localize.CERTAIN_NATS slam.space.localize.FARTHEST_M
+    slam.space.localize.FEWEST_NUMBERS slam.space.localize.FLAT_M slam.space.localize.SIGMA_RAD
+    slam.space.localize.VAGUE_M slam.space.localize.VAGUE_RAD slam.space.mapper.START_M slam.space.mapper.START_RAD
     slam.streaming.NEAR slam.streaming.NEAR_NOISE slam.streaming.NEAR_NOISE_GAIN slam.votes.FEWEST_PAIRS
     slam.votes.LEAST_SHARE tracking.frame._NEAR_S tracking.grid.FAR tracking.life.LEAST tracking.standing.STRIDE_S
     """.split()  # noqa: SIM905
