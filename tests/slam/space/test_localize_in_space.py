@@ -151,6 +151,28 @@ def test_a_camera_that_was_off_for_a_night_is_located_again() -> None:
     assert np.median(away) < 0.1
 
 
+def test_a_camera_without_odometry_finds_itself_in_the_very_frame_that_does_not_fit() -> None:
+    recording = replace(hall(6, n_frames=200), odometry=None)
+    assert recording.true_landmarks is not None
+    truth = recording.truth
+    assert truth is not None
+    kept = np.append(np.arange(60), np.arange(100, 140))  # to another end of the hall within half a second
+    seen = recording.detections
+    seen = rows_of(seen, np.isin(seen.frame, kept))
+    stamps = recording.frames.stamp_s[: len(kept)]
+    jumped = replace(
+        recording,
+        frames=replace(recording.frames, stamp_s=stamps),
+        detections=replace(seen, frame=np.searchsorted(kept, seen.frame)),
+        truth=replace(truth[kept], stamp_s=stamps),
+    )
+    result = localize_in_space(jumped, surveyed(recording.true_landmarks, 0.02, 6), HALL)
+    at = np.searchsorted(result.trajectory.stamp_s, stamps[60])
+    away = np.linalg.norm(errors(result, jumped)[:, :3], axis=1)
+    assert np.linalg.norm(np.diff(truth.pose_world_robot[[59, 100], :3], axis=0)) > 4.0
+    assert away[at] < 0.3
+
+
 def test_a_robot_that_was_carried_away_finds_itself_again() -> None:
     recording = hall(6, n_frames=160)
     assert recording.true_landmarks is not None

@@ -302,6 +302,22 @@ class SpatialLocalizer(BaseLocalizer):
         self._noise.forget_motion()
         return found
 
+    def _update(
+        self, stamp_s: float, first: IntArray, last: IntArray, seen: SpatialFrame, used: IntArray, new: IntArray
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """As in the plane; a frame that does not fit is searched for at once where nothing ties the next one to it."""
+        was_searched = self._track is not None
+        found = super()._update(stamp_s, first, last, seen, used, new)
+        fits = 2 * np.count_nonzero(found[2] > 0.5) >= len(used)
+        if self._driven or was_searched or fits or len(used) < self._settings.fewest:
+            return found
+        pose, self._track = self._local.pose, self._begin_track()
+        self._track.see(stamp_s, seen, used, self._local.states)
+        self._search(stamp_s)
+        if self._local.pose is pose:
+            return found
+        return super()._update(stamp_s, first, last, seen, used, new)
+
     def _sight(self, row: int, seen: SpatialFrame, which: int) -> None:
         oriented = bool(seen.kind[which] != POINT and seen.symmetry[which] == 0)
         self._local.sight(row, *self._local.place_of(seen, which, oriented=oriented))
