@@ -264,11 +264,12 @@ class NearbyPlaces:
         """Put a known place back where those of its neighbours that are in the covariance take it."""
         there = np.flatnonzero(self._slot[ties.rows] >= 0) if len(ties.rows) else NO_PLACES
         dim = self.dim
-        given, own, gain = ties.rows[there], ties.joint[:dim, :dim], np.zeros((dim, 0))
+        given, own = ties.rows[there], ties.joint[:dim, :dim]
+        gain: FloatArray = np.zeros((dim, 0))
         at = self._columns_of(1 + there)
         if len(there):
             known = ties.joint[np.ix_(at, at)] + LEAST_VARIANCE * np.eye(len(at))
-            gain = np.linalg.solve(known, ties.joint[at, :dim]).T
+            gain = np.asarray(np.linalg.solve(known, ties.joint[at, :dim]).T, dtype=np.float64)
         self._enter(row, given, gain, own - gain @ ties.joint[at, :dim])
         if self._considered:  # whatever its neighbours are held to be
             slot = self.columns(self._slot[[row]])
