@@ -184,7 +184,8 @@ def run_localization(
     from evermap.maps import vicinity
     from evermap.maps.sessions import believe, session, spatial
     from evermap.slam import check, intake
-    from evermap.slam.localize_recording import localize
+    from evermap.slam.localize_recording import localize, localize_in_space
+    from evermap.slam.space.moving import has_traffic
 
     config = config or Config()
     if config.slam.unknown_ids:
@@ -193,9 +194,15 @@ def run_localization(
     if not len(living.places):
         raise DataError("the map is empty", field="living", hint="enter a session first")
     if isinstance(recording, SpatialRecording):
+        recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
         recording, living = session.admitted(recording, living)
-        p_site = believe.aged(living, config.living, float(recording.frames.stamp_s[0])).p_here
-        return run_slam(recording, config, prior_map=spatial.standing(living, p_site), progress=progress)
+        named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])
+        if has_traffic(recording):  # boxes at rest are told from those that move by what comes later
+            p_site = believe.aged(living, config.living, start_s).p_here
+            return run_slam(recording, config, prior_map=spatial.standing(living, p_site), progress=progress)
+        places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))
+        joint = living.covariance_m2
+        return localize_in_space(recording, places, config, joint_m2=joint, realtime=realtime, progress=progress)
     recording = check.valid(recording, config.sensor)
     remarks = check.odd(recording, settings=config.slam.check)
     recording, living = session.admitted(recording, living)

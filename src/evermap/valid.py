@@ -177,6 +177,17 @@ def validate_spatial(recording: Any) -> None:
         check_landmarks(recording.true_landmarks, "true_landmarks")
 
 
+def check_frame_in_space(detections: SpatialDetections, sensors: int) -> None:
+    """Raise InputError for detections of one frame in space that cannot be."""
+    _check_spatial_detections(detections, 1, sensors)
+
+
+def check_rig(sensors: Iterable[SpatialSensor]) -> None:
+    """Raise InputError for sensors in space that cannot be."""
+    for sensor in sensors:
+        _check_spatial_sensor(sensor)
+
+
 def _check_content(recording: AnyRecording) -> None:
     source = recording.source or None
     if recording.odometry is not None and len(recording.odometry) < 2:

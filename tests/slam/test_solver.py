@@ -18,7 +18,7 @@ from evermap.slam import streaming
 from evermap.slam.batch import sighted_at
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import beliefs, prepare
-from evermap.slam.local_filter import LocalFilter, Motion, SessionFilter, columns
+from evermap.slam.local_filter import LocalFilter, Motion, SessionFilter
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import StreamingSlam
@@ -268,7 +268,7 @@ def test_the_filter_is_the_smoother_where_all_is_nearly_linear():
     np.testing.assert_allclose(local.position, batch.position, atol=2e-4)
     np.testing.assert_allclose(local.pose, batch.pose, atol=2e-4)
     slots = local.bring(np.arange(3))
-    own, other = np.append(np.arange(3), columns(slots)), np.append(np.arange(3), columns(np.arange(3)))
+    own, other = np.append(np.arange(3), local.columns(slots)), np.append(np.arange(3), local.columns(np.arange(3)))
     np.testing.assert_allclose(
         local.covariance[np.ix_(own, own)], batch.covariance[np.ix_(other, other)], rtol=0.05, atol=2e-5
     )

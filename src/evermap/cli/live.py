@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from evermap.live.feed import Reading
     from evermap.live.ros import Listener
     from evermap.live.wires import Mailbox, Wire
-    from evermap.types import AnyRecording, MapChange, Sensor
+    from evermap.types import AnyRecording, MapChange
 
 EVERY_S = 0.5
 """Time between two progress lines."""
@@ -98,7 +98,7 @@ def live(
         refuse_given("needs a map", "--map FILE", sensor=sensor, topics=topics, **told)
     _check_source(map_file, replay, sensor, connected=connected)
     recording = None if replay is None else read_recording(replay, robot=robot)
-    _check_needed(recording, chosen, sensor, topics)
+    _check_needed(recording, chosen, sensor, topics, map_file=map_file, connected=connected)
     mailbox = Mailbox() if replay is None else None
     wires = wires_of(zenoh, foxglove, mailbox)
     try:
@@ -125,7 +125,15 @@ def _check_source(map_file: str | None, replay: Path | None, sensor: Path | None
         raise ConfigError("the sensor is not described", field="sensor", hint="--sensor sensor.toml")
 
 
-def _check_needed(recording: AnyRecording | None, config: Config, sensor: Path | None, topics: Path | None) -> None:
+def _check_needed(
+    recording: AnyRecording | None,
+    config: Config,
+    sensor: Path | None,
+    topics: Path | None,
+    *,
+    map_file: str | None,
+    connected: bool,
+) -> None:
     """Refuse a recording of ranges only, and files that would say what a recording in the plane says itself."""
     from evermap.slam.cleaning import of_ranges_only
     from evermap.types import Recording
@@ -133,6 +141,13 @@ def _check_needed(recording: AnyRecording | None, config: Config, sensor: Path |
     if isinstance(recording, Recording) and of_ranges_only(recording.detections, config.slam.cleaning):
         problem = f"'{recording.name}' has ranges without bearings, which are located by what is seen later"
         raise ConfigError(problem, field="replay", hint="evermap slam --map")
+    if recording is not None and not isinstance(recording, Recording) and sensor is None and map_file is not None:
+        if connected:
+            problem = f"'{recording.name}' is in space, and connections take poses in the plane"
+            raise ConfigError(problem, field="replay", hint="--sensor FILE: in the plane; or without connections")
+        if recording.odometry is None:
+            problem = f"'{recording.name}' has no odometry; it is solved when it ends"
+            raise ConfigError(problem, field="replay", hint="evermap slam --map")
     for name, path in (("sensor", sensor), ("topics", topics)):
         if path is not None and isinstance(recording, Recording):
             problem = f"'{recording.name}' describes its topics and sensors itself"
@@ -214,22 +229,26 @@ class _Drive:
 
         recording = self.recording
         about: dict[str, Any] = {"name": datetime.now(UTC).strftime("live %Y-%m-%d %H:%M:%S")}
-        sensor: Sensor | Path | None = self.sensor
+        sensor: Any = self.sensor
         if isinstance(recording, Recording):
             about = {"clock": recording.clock, "class_names": recording.class_names, "name": recording.name}
             sensor = recording.sensor
-        elif sensor is None:
-            problem = "is in space; sessions in space are solved when they end"
-            raise ConfigError(problem, field="replay", hint="evermap slam --map; in the plane with --sensor FILE")
+        elif recording is not None and sensor is None:
+            about = {"clock": recording.clock, "class_names": recording.class_names, "name": recording.name}
+            about["symmetries"] = recording.symmetries
+            sensor = recording.sensors
         return Engine(self.map_file, sensor, self.config, mapping=mapping, beside=beside, **about)
 
     def _readings(self, engine: Engine, shown: _Shown, *, realtime: bool) -> Iterator[Reading | None]:
-        from evermap.live.feed import replayed
+        from evermap.live.feed import replayed, replayed_in_space
         from evermap.live.ros import Listener, heard, spoken
-        from evermap.types import Recording
+        from evermap.types import Recording, Sensor
 
         if isinstance(self.recording, Recording):
             return replayed(self.recording, paced=realtime)
+        if not isinstance(engine.sensor, Sensor):
+            assert self.recording is not None
+            return replayed_in_space(self.recording, paced=realtime)
         self.listener = Listener(engine.sensor, self.topics, say)
         if self.recording is not None:
             return spoken(self.recording, self.listener, shown.refused, paced=realtime)
@@ -325,7 +344,7 @@ class _Shown:
         """Pose, speed, landmarks, changes."""
         if math.isnan(now.stamp_s):
             return "waiting for odometry and detections"
-        x, y, theta = now.pose_world_robot.tolist()
+        x, y, theta = _seen_from_above(now)
         before, self._before = self._before, (now.stamp_s, x, y)
         speed = ""
         if before is not None and now.stamp_s > before[0] and not math.isnan(x - before[1]):
@@ -335,16 +354,29 @@ class _Shown:
         return f"{place}{speed}  {len(now.in_view)} landmarks in view  {self._n_changes} changes{lost}"
 
 
+_PARTS = {3: ("x_m", "y_m", "theta_rad"), 7: ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")}
+"""Numbers of a pose, in the plane and in space."""
+
+
+def _seen_from_above(now: Now) -> tuple[float, float, float]:
+    """Return x, y and heading."""
+    if len(now.pose_world_robot) == 3:
+        x, y, theta = now.pose_world_robot.tolist()
+        return x, y, theta
+    from evermap.geometry import se3
+
+    ahead = se3.rotation_of(now.pose_world_robot)[:2, 0]
+    x, y = now.pose_world_robot[:2].tolist()
+    return x, y, math.atan2(ahead[1], ahead[0])
+
+
 def _pose(now: Now) -> dict[str, Any]:
     from evermap.types import json_number
 
-    x, y, theta = (json_number(value) for value in now.pose_world_robot.tolist())
     names = [now.in_view.names.get(one, one) for one in now.in_view.landmark_id.tolist()]
     return {
         "stamp_s": json_number(now.stamp_s),
-        "x_m": x,
-        "y_m": y,
-        "theta_rad": theta,
+        **dict(zip(_PARTS[len(now.pose_world_robot)], map(json_number, now.pose_world_robot.tolist()), strict=True)),
         "covariance": [[json_number(value) for value in row] for row in now.covariance.tolist()],
         "frame": now.frame,
         "lost": now.lost,

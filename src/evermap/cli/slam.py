@@ -455,8 +455,9 @@ def _refuse_unread(asked: _Asked, *, in_space: bool, boxes: bool = False) -> Non
     from evermap import config
 
     in_map = asked.map_file is not None
+    unread_in_space = [key for key in config.UNREAD_IN_SPACE if not (asked.localize and key == "slam.localize")]
     unread = {
-        "for a recording in space": config.UNREAD_IN_SPACE if in_space else (),
+        "for a recording in space": unread_in_space if in_space else (),
         "for a recording in the plane": () if in_space else config.UNREAD_IN_THE_PLANE,
         "for a recording without boxes without identity": () if boxes or not in_space else config.UNREAD_WITHOUT_BOXES,
         "without --map": () if in_map else config.UNREAD_WITHOUT_MAP,
@@ -550,7 +551,7 @@ def _run_in_map(
 
     config, localize = asked.config, asked.localize
     in_space = isinstance(recording, SpatialRecording)
-    if asked.realtime and (in_space or not localize):
+    if asked.realtime and not localize:
         raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
     common, by_class = priors_by_class(asked.priors)
     said = priors_of(common, by_class)

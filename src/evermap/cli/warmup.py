@@ -60,6 +60,11 @@ def warm_up(
         from evermap.slam.association.consensus import warm_up as of_the_association
 
         of_the_association()
+    if in_space and localize and not traffic:
+        from evermap.slam.localize_recording import warm_up_in_space
+
+        warm_up_in_space()
+        return
     if in_space:
         warmup.seldom_used()
     if in_space and sessions:

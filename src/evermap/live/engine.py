@@ -9,31 +9,52 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from evermap.compiled import single_threaded
 from evermap.config import Config
-from evermap.errors import ConfigError
+from evermap.errors import ConfigError, InputError
+from evermap.geometry.group import PLANE, SPACE, Group
+from evermap.geometry.symmetry import Symmetry
 from evermap.live.inbox import Inbox, LiveFrame, recording_of
 from evermap.live.judge import Judge, warm_up
 from evermap.live.keeper import Keeper, News
+from evermap.live.spatial_inbox import SpatialInbox, detections_of
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import aged
 from evermap.runs.sessions import Entered
 from evermap.slam.calibration import DELAY
 from evermap.slam.intake import beliefs
-from evermap.slam.known_places import KnownPlaces
-from evermap.slam.localize import FrameSightings, Localizer, Located
+from evermap.slam.known_places import FrameSightings, KnownPlaces
+from evermap.slam.localize import BaseLocalizer, Localizer, Located
+from evermap.slam.localize_recording import warm_up_in_space
 from evermap.slam.mapper import Mapper
 from evermap.slam.problem import Drive
-from evermap.types import Clock, FloatArray, IntArray, Landmarks, MapChange, Sensor, Trajectory
-from evermap.valid import check_sensor
+from evermap.slam.space.intake import frames_of, start_noise, state_sigmas
+from evermap.slam.space.localize import SpatialLocalizer, SpatialPlaces
+from evermap.slam.space.mapper import SpatialMapper
+from evermap.slam.space.problem import OdometryPath, SpatialNoise
+from evermap.types import (
+    UNKNOWN,
+    Clock,
+    FloatArray,
+    Frames,
+    IntArray,
+    Landmarks,
+    MapChange,
+    Sensor,
+    SpatialRecording,
+    SpatialSensor,
+    Trajectory,
+    rows_of,
+)
+from evermap.valid import check_rig, check_sensor
 
 Numbers = Sequence[float] | FloatArray
 
@@ -44,8 +65,8 @@ class Now:
 
     Attributes:
         stamp_s: of the newest odometry; nan before any.
-        pose_world_robot: (3,) there; nan while it is not known.
-        covariance: (3, 3) of it, in the robot's frame.
+        pose_world_robot: (3,) there, in space (7,); nan while it is not known.
+        covariance: (3, 3) of it, in the robot's frame; in space (6, 6).
         frame: 'prior_map', or 'first_pose' where there is no map yet.
         lost: the pose is not known, or kept by odometry alone while it is searched for.
         online: poses of the frames that this step has processed.
@@ -70,17 +91,21 @@ class Now:
 class Engine:
     """Feed readings with `odometry` and `detections`, from any thread, and call `step` for estimates.
 
+    With sensors in space it is fed with `odometry_in_space` and `detections_in_space`.
+
     As a context manager it enters the drive when the block ends; after an error or a crash the next engine does.
 
     Args:
         map: file of a living map, made where there is none; or a map in memory, which stays as it is.
-        sensor: what sees landmarks, or a `sensor.toml`, which may name clock and classes, too.
+        sensor: what sees landmarks, or a `sensor.toml`, which may name clock and classes, too; a `SpatialSensor`, or
+            several of them, in space.
         config: settings; None for the defaults.
         mapping: False only localises; see `mapping`.
         clock: what stamps count.
         class_names: of landmarks; others are added as they come.
         name: of the session.
         beside: False does in `step` itself what else is done beside it; for tests and replays.
+        symmetries: in space turns after which landmarks look the same, as of `SpatialRecording`.
 
     Raises:
         InputError: no map, or no sensor.
@@ -90,7 +115,7 @@ class Engine:
     def __init__(
         self,
         map: str | Path | LivingMap,  # noqa: A002 (the word that callers expect)
-        sensor: Sensor | str | Path,
+        sensor: Sensor | SpatialSensor | Sequence[SpatialSensor] | str | Path,
         config: Config | None = None,
         *,
         mapping: bool = True,
@@ -98,28 +123,43 @@ class Engine:
         class_names: Sequence[str] = (),
         name: str = "live",
         beside: bool = True,
+        symmetries: Mapping[str, tuple[str, ...]] | None = None,
     ) -> None:
         self._config = config or Config()
         if self._config.slam.unknown_ids:
             problem = "association of landmarks without identity needs later detections"
             raise ConfigError(problem, field="slam.unknown_ids", hint="a recording: evermap slam --unknown-ids")
         recording = recording_of(sensor, name, clock, tuple(class_names))
-        self._sensor = self._config.sensor.applied_to(recording.sensor)
-        check_sensor(self._sensor)
-        self._inbox = Inbox(recording, self._config)
+        self._rig: SpatialRecording | None = None
+        """Sensors and classes in space, without readings; None in the plane."""
+        self._sensor: Sensor | tuple[SpatialSensor, ...]
+        if isinstance(recording, SpatialRecording):
+            self._sensor = self._config.sensor.applied_in_space(recording.sensors)
+            self._rig = replace(recording, sensors=self._sensor, symmetries=symmetries or {})
+            check_rig(self._sensor)
+            self._inbox: Inbox = SpatialInbox(self._rig, self._config)
+        else:
+            self._sensor = self._config.sensor.applied_to(recording.sensor)
+            check_sensor(self._sensor)
+            self._inbox = Inbox(recording, self._config)
+        self._group = PLANE if self._rig is None else SPACE
         self._lock, self._told = threading.RLock(), News()
         path = None if isinstance(map, LivingMap) else Path(map)
         self._keeper = Keeper(path, self._config, self._inbox, self._told, threads=beside)
-        self._filter: Localizer | Mapper | None = None
+        self._filter: Localizer | Mapper | SpatialLocalizer | SpatialMapper | None = None
         self._judge: Judge | None = None
+        self._table = Landmarks.at([], np.zeros((0, 2)))
         self._located: Located | None = None
         self._last: LiveFrame | None = None
         self._online: list[tuple[float, FloatArray, FloatArray]] = []
         self._session_s = self._judged_s = -math.inf
         self._met: set[int] = set()
         self._in_view = Landmarks.at([], np.zeros((0, 2)), frame="first_pose")
-        self._mapping = mapping
-        self._living = self._keeper.begin(map if isinstance(map, LivingMap) else None, recording.clock, mapping=mapping)
+        if self._rig is not None:
+            self._in_view = Landmarks.in_space([], np.zeros((0, 3)))
+        self._mapping, dim = mapping, self._group.point_dim
+        given = map if isinstance(map, LivingMap) else None
+        self._living = self._keeper.begin(given, recording.clock, dim=dim, mapping=mapping)
 
     @property
     def mapping(self) -> bool:
@@ -135,7 +175,7 @@ class Engine:
             elif self._mapping and not mapping:
                 self._keeper.end_session()
             self._mapping, self._session_s = mapping, self._inbox.settled_s
-            if isinstance(self._filter, Localizer):
+            if isinstance(self._filter, BaseLocalizer):
                 self._filter.learn = mapping
 
     @property
@@ -144,8 +184,8 @@ class Engine:
         return self._living
 
     @property
-    def sensor(self) -> Sensor:
-        """The sensor of landmarks."""
+    def sensor(self) -> Sensor | tuple[SpatialSensor, ...]:
+        """The sensor of landmarks; in space all of them."""
         return self._sensor
 
     @property
@@ -176,8 +216,9 @@ class Engine:
             until_s: until when they are known to hold, as between two poses; where only the next ones tell, leave out.
 
         Raises:
-            InputError: no finite numbers, or so late that frames after it are processed.
+            InputError: no finite numbers, or so late that frames after it are processed; the sensors are in space.
         """
+        self._refuse_of(SPACE, "odometry_in_space")
         self._inbox.odometry(stamp_s, (forward_mps, lateral_mps, angular_radps), until_s)
 
     def detections(
@@ -203,10 +244,69 @@ class Engine:
             sigma_bearing_rad: (M,) the same.
 
         Raises:
-            InputError: values that cannot be, or so late that frames after it are processed.
+            InputError: values that cannot be, or so late that frames after it are processed; the sensors are in space.
         """
+        self._refuse_of(SPACE, "detections_in_space")
         columns = landmark_id, range_m, bearing_rad, class_name, sigma_range_m, sigma_bearing_rad
         self._inbox.detections(stamp_s, columns)
+
+    def odometry_in_space(self, stamp_s: float, pose: Numbers | None = None, *, twist: Numbers | None = None) -> None:
+        """Take a pose of the odometry, in a frame that drifts; or velocities, which hold until the next ones.
+
+        Args:
+            stamp_s: of the pose, or from when on the velocities hold.
+            pose: (7,) x, y, z, qx, qy, qz, qw.
+            twist: (6,) along x, y, z of the robot [m/s], and about them [rad/s]; in the order of their stamps.
+
+        Raises:
+            InputError: neither, both, or values that cannot be; too late; the sensor is in the plane.
+        """
+        self._refuse_of(PLANE, "odometry")
+        assert isinstance(self._inbox, SpatialInbox)
+        if (pose is None) == (twist is None):
+            raise InputError("a pose or a twist is needed", field="pose", hint="one of the two")
+        if pose is not None:
+            self._inbox.pose(stamp_s, pose)
+        else:
+            self._inbox.twist(stamp_s, twist)
+
+    def detections_in_space(
+        self,
+        stamp_s: float,
+        landmark_id: Sequence[int | str] | IntArray = (),
+        position_sensor_m: FloatArray | None = None,
+        *,
+        rotation: FloatArray | None = None,
+        corner_px: FloatArray | None = None,
+        tag_size_m: Numbers | None = None,
+        covariance_sensor_m2: FloatArray | None = None,
+        sigma_rad: Numbers | None = None,
+        sensor: int | Sequence[int] | IntArray = 0,
+        class_name: Sequence[str | None] | None = None,
+    ) -> None:
+        """Take the detections of a frame: points, landmarks with an orientation, or corners of square tags.
+
+        Args:
+            stamp_s: when it looked.
+            landmark_id: (M,) detected landmarks, as numbers or texts; -1 for unknown.
+            position_sensor_m: (M, 3) in the frame of the sensor; nan of tags by their corners.
+            rotation: (M, 4) quaternions of landmarks there; nan of points.
+            corner_px: (M, 4, 2) corners of tags in the image, as of `SpatialDetections`.
+            tag_size_m: (M,) edges of these.
+            covariance_sensor_m2: (M, 3, 3) of positions.
+            sigma_rad: (M,) of orientations.
+            sensor: (M,) which of the sensors.
+            class_name: (M,) classes, None for unknown ones.
+
+        Raises:
+            InputError: values that cannot be; so late that frames after it are processed; the sensor is in the plane.
+        """
+        self._refuse_of(PLANE, "detections")
+        given = {
+            "position_sensor_m": position_sensor_m, "rotation": rotation, "corner_px": corner_px,
+            "tag_size_m": tag_size_m, "covariance_sensor_m2": covariance_sensor_m2, "sigma_rad": sigma_rad,
+        }  # fmt: skip
+        self._inbox.detections(stamp_s, (landmark_id, class_name, sensor, given))
 
     @single_threaded()
     def step(self) -> Now:
@@ -214,7 +314,8 @@ class Engine:
         with self._lock:
             if self._keeper.collect():
                 self._keeper.beside("load", self._go_on)
-            ready = self._inbox.ready(0.0 if self._filter is None else float(self._filter.states[DELAY]))
+            is_delayed = isinstance(self._filter, Localizer | Mapper)
+            ready = self._inbox.ready(float(self._filter.states[DELAY]) if is_delayed else 0.0)  # type: ignore[union-attr]
             for frame, odometry, kept in ready:
                 self._process(frame, odometry, kept=kept)
             if isinstance(self._filter, Mapper) and not any(kept for *_, kept in ready):
@@ -243,7 +344,10 @@ class Engine:
     @single_threaded()
     def warm_up(self) -> None:
         """Compile the kernels, or load them, so that no step has to wait for it."""
-        warm_up(self._config)
+        if self._rig is not None:
+            warm_up_in_space()
+        else:
+            warm_up(self._config)
 
     @single_threaded()
     def save(self) -> Entered | None:
@@ -292,26 +396,51 @@ class Engine:
             self._begin(frame.stamp_s)
         if not self._session_s > -math.inf:
             self._session_s = self._judged_s = frame.stamp_s
-        rows, start_s = frame.rows, self._inbox.first_s
-        seen = FrameSightings(frame.landmark_id, rows[:, 1:3].copy(), rows[:, 4:6].copy())
-        if isinstance(self._filter, Localizer):
-            drive = Drive.from_rows(odometry[:, 0] - start_s, odometry[:, 1:], self._config.slam.odometry)
-            located = self._filter.step(frame.stamp_s - start_s, drive, seen)
-        else:
-            assert self._filter is not None
-            driven = odometry - [start_s, 0.0, 0.0, 0.0]
+        seen, since_s = self._sightings(frame), frame.stamp_s - self._inbox.first_s
+        if isinstance(self._filter, Mapper):
+            driven = odometry - [self._inbox.first_s, 0.0, 0.0, 0.0]
             if not kept:
                 self._filter.skip(driven)
                 return
-            located = self._filter.step(frame.stamp_s - start_s, driven, seen)
+            located = self._filter.step(since_s, driven, seen)
+        else:
+            assert self._filter is not None
+            located = self._filter.step(since_s, self._drive_of(odometry), seen)
         self._located, self._last = located, frame
-        if isinstance(self._filter, Mapper):
+        if isinstance(self._filter, BaseLocalizer):
+            self._met.update(frame.landmark_id[located.p_inlier > 0.5].tolist())
+        else:
             self._in_view = self._filter.landmarks(frame.landmark_id, self._config.living.decisions.new_clique_p)
         self._online.append((frame.stamp_s, located.pose, located.covariance))
         if self._judge is not None:
             self._judge.look(frame, located, self._filter.states)
-            self._met.update(frame.landmark_id[located.p_inlier > 0.5].tolist())
             self._in_view = self._judge.in_view(located)
+        elif isinstance(self._filter, SpatialLocalizer):
+            seen_there = np.unique(frame.landmark_id[located.place != UNKNOWN])
+            self._in_view = rows_of(self._table, np.isin(self._table.landmark_id, seen_there))
+
+    def _refuse_of(self, group: Group, instead: str) -> None:
+        """Refuse readings of another group than the sensor's."""
+        if self._group is group:
+            problem = f"the sensor is in {'space' if group is SPACE else 'the plane'}"
+            raise InputError(problem, field="sensor", hint=f"Engine.{instead}")
+
+    def _sightings(self, frame: LiveFrame) -> Any:
+        """Return the detections of a frame as the filter reads them."""
+        rows = frame.rows
+        if self._rig is None:
+            return FrameSightings(frame.landmark_id, rows[:, 1:3].copy(), rows[:, 4:6].copy())
+        names, detections = self._inbox.class_names, detections_of(rows, np.zeros(len(rows), dtype=np.int64))
+        look = Frames(np.array([frame.stamp_s]), clock=self._rig.clock)
+        recording = replace(self._rig, frames=look, detections=detections, class_names=names)
+        return frames_of(recording, self._config.slam.space)[0]
+
+    def _drive_of(self, odometry: FloatArray) -> Any:
+        """Return odometry, from the first one on, as the filter reads it."""
+        stamp_s = odometry[:, 0] - self._inbox.first_s
+        if self._rig is None:
+            return Drive.from_rows(stamp_s, odometry[:, 1:], self._config.slam.odometry)
+        return OdometryPath(stamp_s, odometry[:, 1:])
 
     def _begin(self, stamp_s: float) -> None:
         """Choose the filter: in a map the robot is localised, a place without one is mapped."""
@@ -319,11 +448,35 @@ class Engine:
         if len(self._living.places):
             places = self._places(self._living, stamp_s)
             self._filter = self._localizer(places, learn=self._mapping)
-            self._judge = Judge(self._living, places, self._sensor, self._config)
+            self._judge, self._table = self._judge_of(self._living, places), self._living.landmarks()
+        elif self._rig is not None:
+            mount, sigma, level, symmetries = self._beliefs_in_space()
+            self._filter = SpatialMapper(mount, sigma, level, symmetries, self._config.slam.space)
         else:
+            assert isinstance(self._sensor, Sensor)
             self._filter = Mapper(self._sensor, *beliefs(self._sensor, self._config.slam), self._config.slam)
 
-    def _localizer(self, places: KnownPlaces, *, learn: bool) -> Localizer:
+    def _judge_of(self, living: LivingMap, places: KnownPlaces, before: Judge | None = None) -> Judge | None:
+        """Return what asks for changes during the drive; None in space, where detection is learned from a session."""
+        if not isinstance(self._sensor, Sensor):
+            return None
+        return Judge(living, places, self._sensor, self._config, before)
+
+    def _beliefs_in_space(self) -> tuple[FloatArray, FloatArray, SpatialNoise, tuple[Symmetry, ...]]:
+        """Return mounts, deviations of states, noise and symmetries in space."""
+        assert self._rig is not None
+        settings, sensors = self._config.slam.space, self._rig.sensors
+        mount = np.array([one.mount_robot_sensor for one in sensors])
+        symmetries = (Symmetry(), *(Symmetry.generated(texts) for texts in self._rig.symmetries.values()))
+        return mount, state_sigmas(sensors, settings, driven=True), start_noise(settings, driven=True), symmetries
+
+    def _localizer(self, places: Any, *, learn: bool) -> Localizer | SpatialLocalizer:
+        if not isinstance(self._sensor, Sensor):
+            mount, sigma, level, symmetries = self._beliefs_in_space()
+            return SpatialLocalizer(
+                places, mount, sigma, level, driven=True, symmetries=symmetries, settings=self._config.slam.localize,
+                space=self._config.slam.space, learn=learn,
+            )  # fmt: skip
         settings, looks = self._config.slam, self._config.living.looks
         prior, noise = beliefs(self._sensor, settings)
         prior = prior.gaussian()
@@ -331,6 +484,8 @@ class Engine:
 
     def _places(self, living: LivingMap, stamp_s: float) -> KnownPlaces:
         rows = living.sighted_rows(aged(living, self._config.living, stamp_s).p_here)
+        if self._rig is not None:
+            return SpatialPlaces.in_space(rows, living.covariance_m2, self._config.slam.space)
         return KnownPlaces.of(rows.landmark_id, rows.position_m, living.covariance_m2, rows.p_exists).existing()
 
     def _keep_house(self) -> None:
@@ -357,40 +512,43 @@ class Engine:
         """Return whether the session so far shows enough of the map to be entered; an exploring one continues."""
         return (
             len(self._met) >= self._config.slam.localize.enough
-            if isinstance(self._filter, Localizer)
+            if isinstance(self._filter, BaseLocalizer)
             else self._keeper.n_sessions == 1
         )
 
     def _go_on(self) -> None:
         """Go on in the newest map, from where the robot is."""
-        before, config = self._filter, self._config
+        before = self._filter
         living, changes = self._keeper.load(create=True)
         if before is None or not len(living.places):
             self._living = living
             return
         places = self._places(living, self._inbox.settled_s)
-        judge = Judge(living, places, self._sensor, config, self._judge)
+        judge = self._judge_of(living, places, self._judge)
         with self._lock:
             self._told.add([*(self._judge.told() if self._judge is not None else ()), *changes])
             self._told.known.clear()
-            if isinstance(before, Localizer):
+            if isinstance(before, SpatialLocalizer):
+                assert isinstance(places, SpatialPlaces)
+                self._filter = before.over(places)
+            elif isinstance(before, Localizer):
+                assert isinstance(self._sensor, Sensor)
                 self._filter = before.over(places, self._sensor)
             else:
                 self._filter = self._localizer(places, learn=True)
                 if (here := self._located) is not None and self._last is not None and np.isfinite(here.pose[0]):
                     self._filter.place_at(self._last.stamp_s - self._inbox.first_s, here.pose, here.covariance)
-            self._living, self._judge = living, judge
+            self._living, self._judge, self._table = living, judge, living.landmarks()
 
     def _now(self) -> Now:
         stamp_s, located, filter_ = self._inbox.odometry_s, self._located, self._filter
-        in_map = not isinstance(filter_, Mapper)
-        frame = "prior_map" if in_map else "first_pose"
-        pose, covariance = np.full(3, math.nan), np.full((3, 3), math.nan)
+        in_map = not isinstance(filter_, Mapper | SpatialMapper)
+        frame, dim = "prior_map" if in_map else "first_pose", self._group.dim
+        pose, covariance = np.full(self._group.size, math.nan), np.full((dim, dim), math.nan)
         if located is not None and filter_ is not None and self._last is not None:
             pose, covariance = located.pose, located.covariance
             if stamp_s > self._last.stamp_s:
-                driven = self._inbox.window() - [self._inbox.first_s, 0.0, 0.0, 0.0]
-                drive = Drive.from_rows(driven[:, 0], driven[:, 1:], self._config.slam.odometry)
+                drive = self._drive_of(self._inbox.window())
                 pose, covariance = filter_.ahead(stamp_s - self._inbox.first_s, drive)
         online, self._online = self._online, []
         changes, warnings = self._told.taken()
@@ -400,7 +558,7 @@ class Engine:
             covariance=covariance,
             frame=frame,
             lost=located is None or located.lost or bool(np.isnan(pose[0])),
-            online=_trajectory_of(online, frame, self._living.clock),
+            online=_trajectory_of(online, self._group, frame, self._living.clock),
             in_view=self._in_view,
             changes=changes,
             revision=self._keeper.revision,
@@ -408,9 +566,11 @@ class Engine:
         )
 
 
-def _trajectory_of(online: list[tuple[float, FloatArray, FloatArray]], frame: str, clock: Clock) -> Trajectory:
+def _trajectory_of(
+    online: list[tuple[float, FloatArray, FloatArray]], group: Group, frame: str, clock: Clock
+) -> Trajectory:
     """Return the poses that are known, of stamps, poses and covariances."""
     known = [one for one in online if math.isfinite(one[1][0])]
     stamps, poses, spread = zip(*known, strict=True) if known else ((), (), ())
-    pose, covariance = np.array(poses).reshape(-1, 3), np.array(spread).reshape(-1, 3, 3)
+    pose, covariance = np.array(poses).reshape(-1, group.size), np.array(spread).reshape(-1, group.dim, group.dim)
     return Trajectory(np.array(stamps), pose, covariance, frame, clock)

@@ -14,7 +14,7 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.live.engine import Engine, Now, Numbers
-from evermap.types import Recording
+from evermap.types import FloatArray, IntArray, Recording, SpatialRecording
 
 
 class Velocity(NamedTuple):
@@ -39,7 +39,29 @@ class SensorLook(NamedTuple):
     sigma_bearing_rad: Numbers | None = None
 
 
-Reading = Velocity | SensorLook
+class SpatialPose(NamedTuple):
+    """Odometry in space, as `Engine.odometry_in_space` takes it."""
+
+    stamp_s: float
+    pose: FloatArray
+
+
+class SpatialLook(NamedTuple):
+    """A frame in space, as `Engine.detections_in_space` takes it."""
+
+    stamp_s: float
+    landmark_id: Sequence[int | str]
+    position_sensor_m: FloatArray
+    rotation: FloatArray
+    corner_px: FloatArray
+    tag_size_m: FloatArray
+    covariance_sensor_m2: FloatArray
+    sigma_rad: FloatArray
+    sensor: IntArray
+    class_name: Sequence[str | None]
+
+
+Reading = Velocity | SensorLook | SpatialPose | SpatialLook
 _Stamped = TypeVar("_Stamped", bound=tuple[Any, ...])
 
 
@@ -62,6 +84,27 @@ def replayed(recording: Recording, *, paced: bool = False) -> Iterator[Reading |
         ids = [recording.landmark_names.get(name, name) for name in seen.landmark_id[rows].tolist()]
         sigmas = seen.sigma_range_m[rows], seen.sigma_bearing_rad[rows]
         yield SensorLook(float(stamps[k]), ids, seen.range_m[rows], seen.bearing_rad[rows], names, *sigmas)
+        yield None
+
+
+def replayed_in_space(recording: SpatialRecording, *, paced: bool = False) -> Iterator[Reading | None]:
+    """Yield the readings of a recording in space, as `replayed`."""
+    odometry, seen = recording.odometry, recording.detections
+    count = 0 if odometry is None else len(odometry)
+    first = np.searchsorted(seen.frame, np.arange(len(recording.frames) + 1))
+    stamps = np.concatenate([[] if odometry is None else odometry.stamp_s, recording.frames.stamp_s])
+    order = np.argsort(stamps, kind="stable").tolist()
+    for _, k in in_time(zip(stamps[order].tolist(), order, strict=True), paced=paced):
+        if odometry is not None and k < count:
+            yield SpatialPose(float(stamps[k]), odometry.pose_world_robot[k])
+            continue
+        rows = slice(*first[k - count : k - count + 2])
+        names = [recording.class_names[row] if row >= 0 else None for row in seen.class_id[rows].tolist()]
+        ids = [recording.landmark_names.get(name, name) for name in seen.landmark_id[rows].tolist()]
+        yield SpatialLook(
+            float(stamps[k]), ids, seen.position_sensor_m[rows], seen.rotation[rows], seen.corner_px[rows],
+            seen.tag_size_m[rows], seen.covariance_sensor_m2[rows], seen.sigma_rad[rows], seen.sensor[rows], names,
+        )  # fmt: skip
         yield None
 
 
@@ -88,8 +131,11 @@ def run_live(
                 tell(engine.step())
             elif isinstance(reading, Velocity):
                 engine.odometry(*reading)
+            elif isinstance(reading, SpatialPose):
+                engine.odometry_in_space(*reading)
             else:
                 values = reading._asdict()
-                engine.detections(values.pop("stamp_s"), **values)
+                take = engine.detections_in_space if isinstance(reading, SpatialLook) else engine.detections
+                take(values.pop("stamp_s"), **values)
         except InputError as error:
             refused(error.one_line())

@@ -18,9 +18,11 @@ import numpy as np
 
 from evermap.config import Config
 from evermap.errors import InputError
+from evermap.io.spatial import spatial_detections
 from evermap.slam.ranges import RANGE_ONLY
 from evermap.types import (
     UNKNOWN,
+    AnyRecording,
     Clock,
     Detections,
     FloatArray,
@@ -29,6 +31,9 @@ from evermap.types import (
     Odometry,
     Recording,
     Sensor,
+    SpatialOdometry,
+    SpatialRecording,
+    SpatialSensor,
     landmark_id_of,
 )
 from evermap.valid import (
@@ -68,16 +73,18 @@ class LiveFrame(NamedTuple):
 class Inbox:
     """Readings fed so far. Every method may be called from any thread.
 
-    `about` has name, sensor, clock and classes of the recording that is made of the readings.
+    `about` has name, sensors, clock and classes of the recording that is made of the readings; a row of odometry is a
+    stamp and what is known from then on, `width` numbers.
     """
 
-    def __init__(self, about: Recording, config: Config) -> None:
+    def __init__(self, about: AnyRecording, config: Config, *, width: int = 4) -> None:
         live = config.live
         self._before_s, self._silent_s = live.clocks_s, config.slam.odometry.silence_s
         self._stray_s = config.slam.cleaning.stray_s
         self._lock = threading.Lock()
-        self._about, self._reorder_s, self._readings_hz = about, live.reorder_s, live.readings_hz
-        self._odometry, self._n_odometry = np.empty((4, ROOM)), 0
+        self._about: Any = about
+        self._reorder_s, self._readings_hz = live.reorder_s, live.readings_hz
+        self._odometry, self._n_odometry = np.empty((width, ROOM)), 0
         self._pending: list[LiveFrame] = []
         self._kept: list[LiveFrame] = []
         self._room = live.readings_hz * BURST_S
@@ -100,7 +107,7 @@ class Inbox:
         """
         quantities = STAMP_S, FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS
         for quantity, value in zip(quantities, (stamp_s, *velocity), strict=True):
-            _check(quantity, value)
+            checked_number(quantity, value)
         forward_mps, lateral_mps, angular_radps = (float(part) for part in velocity)
         row = float(stamp_s), forward_mps, lateral_mps, angular_radps
         with self._lock:
@@ -113,7 +120,7 @@ class Inbox:
         Raises:
             InputError: values that cannot be, or the stamp is before frames that were processed.
         """
-        _check(STAMP_S, stamp_s)
+        checked_number(STAMP_S, stamp_s)
         frame = LiveFrame(float(stamp_s), self._rows(*columns))
         with self._lock:
             self._refuse_late(frame.stamp_s, "detections")
@@ -146,7 +153,7 @@ class Inbox:
         with self._lock:
             return self._window(self.settled_s)
 
-    def written(self, *, last: bool = False) -> Recording:
+    def written(self, *, last: bool = False) -> Any:
         """Return what is kept, as far as nothing can come in between, the `last` time all odometry that there is; what
         was returned is kept no more.
         """
@@ -156,7 +163,7 @@ class Inbox:
             frames, self._kept, self._n_written = self._kept, [], until
             self._forget()
             classes, texts = tuple(self._classes), dict(self._texts)
-        return _recorded(self._about, odometry, frames, classes, texts)
+        return self._recorded(odometry, frames, classes, texts)
 
     def cut(self, name: str) -> None:
         """Begin another recording after the last frame that was given out; its odometry begins some seconds before."""
@@ -167,9 +174,15 @@ class Inbox:
             self._about = replace(self._about, name=name)
 
     @property
+    def class_names(self) -> tuple[str, ...]:
+        """Classes so far."""
+        with self._lock:
+            return tuple(self._classes)
+
+    @property
     def name(self) -> str:
         """Name of the recording."""
-        return self._about.name
+        return str(self._about.name)
 
     def __len__(self) -> int:
         """Frames of the recording so far, those that were written included."""
@@ -193,7 +206,7 @@ class Inbox:
         put()
         self.newest_s = max(self.newest_s, stamp_s)
 
-    def _put_odometry(self, row: tuple[float, float, float, float], until_s: float) -> None:
+    def _put_odometry(self, row: tuple[float, ...], until_s: float) -> None:
         at, count = self._odometry_until(row[0]), self._n_odometry
         if at < count and self._odometry[0, at] == row[0]:
             return
@@ -221,7 +234,7 @@ class Inbox:
         """Drop the odometry that was written and that no frame will be given out with."""
         first = min(max(self._odometry_until(self.settled_s - self._before_s) - 1, 0), self._n_written)
         kept = self._odometry[:, first : self._n_odometry]
-        self._odometry = np.hstack([kept, np.empty((4, ROOM))])
+        self._odometry = np.hstack([kept, np.empty((len(kept), ROOM))])
         self._n_odometry, self._n_written = kept.shape[1], self._n_written - first
 
     def _keep(self, frame: LiveFrame, before_s: float) -> bool:
@@ -245,7 +258,15 @@ class Inbox:
         )
         raise InputError(problem, field="stamp_s", hint="one clock for all readings, or a larger live.reorder_s")
 
-    def _rows(self, ids: Any, ranges: Any, bearings: Any, classes: Any, *sigmas: Any) -> FloatArray:
+    def _recorded(
+        self, odometry: FloatArray, frames: list[LiveFrame], classes: tuple[str, ...], texts: dict[int, str]
+    ) -> Any:
+        """Return a recording of some readings."""
+        return _recorded(self._about, odometry, frames, classes, texts)
+
+    def _rows(self, *columns: Any) -> FloatArray:
+        """(M, 6) rows of the detections of a frame."""
+        ids, ranges, bearings, classes, *sigmas = columns
         names = [ids] if isinstance(ids, str) else list(ids)
         rows = np.full((len(names), 6), np.nan)
         rows[:, 0], rows[:, 3] = [self._number(name) for name in names], UNKNOWN
@@ -281,17 +302,21 @@ class Inbox:
         return self._classes.index(name)
 
 
-def joined(parts: Sequence[Recording]) -> Recording:
+def joined(parts: Sequence[AnyRecording]) -> AnyRecording:
     """Return one recording of consecutive parts."""
     begin, *rest = parts
     first = np.cumsum([0, *(len(part.frames) for part in parts[:-1])])
     frame = np.concatenate([part.detections.frame + k for part, k in zip(parts, first, strict=True)])
-    return replace(
-        parts[-1],
-        odometry=begin.odometry.joined(*(part.odometry for part in rest)),
+    last: Any = parts[-1]
+    odometry: Any = [part.odometry for part in (begin, *rest)]
+    detections: Any = [part.detections for part in (begin, *rest)]
+    joined_up: AnyRecording = replace(
+        last,
+        odometry=odometry[0].joined(*odometry[1:]),
         frames=begin.frames.joined(*(part.frames for part in rest)),
-        detections=replace(begin.detections.joined(*(part.detections for part in rest)), frame=frame.astype(np.int64)),
+        detections=replace(detections[0].joined(*detections[1:]), frame=frame.astype(np.int64)),
     )
+    return joined_up
 
 
 def _recorded(
@@ -324,12 +349,19 @@ def _columns(rows: FloatArray) -> list[FloatArray]:
     return [np.ascontiguousarray(column) for column in rows.T]
 
 
-def recording_of(sensor: object, name: str, clock: Clock, class_names: tuple[str, ...]) -> Recording:
-    """Return a recording without readings, of a sensor or a `sensor.toml`.
+def recording_of(sensor: object, name: str, clock: Clock, class_names: tuple[str, ...]) -> AnyRecording:
+    """Return a recording without readings, of a sensor or a `sensor.toml`; in space of one sensor or several.
 
     Raises:
         InputError: neither.
     """
+    given = (sensor,) if isinstance(sensor, SpatialSensor) else sensor
+    none, no = np.zeros(0), np.zeros(0, dtype=np.int64)
+    if isinstance(given, tuple | list) and given and all(isinstance(one, SpatialSensor) for one in given):
+        odometry = SpatialOdometry(none, np.zeros((0, 7)), np.zeros((0, 6)), clock)
+        seen = spatial_detections(no)
+        frames = Frames(none, clock=clock)
+        return SpatialRecording(name, odometry, frames, seen, tuple(given), class_names=class_names, clock=clock)
     if isinstance(sensor, str | Path):
         from evermap.io.sensor_toml import parse_sensor_toml
 
@@ -341,15 +373,17 @@ def recording_of(sensor: object, name: str, clock: Clock, class_names: tuple[str
         name, sensor, clock = said.name or name, said.sensor, said.clock
         class_names = said.class_names or class_names
     if not isinstance(sensor, Sensor):
-        hint = "evermap.Sensor(range_max_m=8.0), or the path of a sensor.toml"
+        hint = "evermap.Sensor(range_max_m=8.0), evermap.types.SpatialSensor(), or the path of a sensor.toml"
         raise InputError(f"a Sensor is needed, not {type(sensor).__name__}", field="sensor", hint=hint)
-    none, no = np.zeros(0), np.zeros(0, dtype=np.int64)
     nothing = Detections(no, no, none, none, no, none, none, no)
-    odometry, frames = Odometry(none, none, none, none, clock), Frames(none, clock=clock)
-    return Recording(name, odometry, frames, nothing, sensor, clock=clock, class_names=class_names)
+    return Recording(
+        name, Odometry(none, none, none, none, clock), Frames(none, clock=clock), nothing, sensor, clock=clock,
+        class_names=class_names,
+    )  # fmt: skip
 
 
-def _check(quantity: Any, value: Any) -> None:
+def checked_number(quantity: Any, value: Any) -> None:
+    """Raise InputError for what is no number, or none that can be."""
     try:
         told = np.array([value], dtype=np.float64)
     except (TypeError, ValueError):

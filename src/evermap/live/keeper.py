@@ -74,7 +74,7 @@ class Keeper:
             raise InputError("a map in memory cannot be changed", field="map", hint="a file, or mapping=False")
         return self._path
 
-    def begin(self, living: LivingMap | None, clock: Clock, *, mapping: bool) -> LivingMap:
+    def begin(self, living: LivingMap | None, clock: Clock, *, dim: int, mapping: bool) -> LivingMap:
         """Return the map, of the file where it is not in memory, and feed it where that is wanted.
 
         Raises:
@@ -87,7 +87,7 @@ class Keeper:
             self.feed()
         try:
             living = self.load(create=mapping)[0] if living is None else living
-            _check_fits(living, clock)
+            _check_fits(living, clock, dim)
         except EvermapError:
             self.close()
             raise
@@ -208,11 +208,12 @@ class Keeper:
             self._told.warnings.append(f"{brought.name}: not entered: {brought.problem}")
 
 
-def _check_fits(living: LivingMap, clock: Clock) -> None:
-    """Raise `InputError` for a map in space, or of another clock."""
-    if living.dim != 2:
-        hint = "sessions in space are solved when they end: enter_session"
-        raise InputError("a map in space", field="map", hint=hint)
+def _check_fits(living: LivingMap, clock: Clock, dim: int) -> None:
+    """Raise `InputError` for a map of another clock, or in space where the sensor is in the plane, or the reverse."""
+    if living.dim != dim and (len(living.places) or dim == 2):
+        of = {2: "in the plane", 3: "in space"}
+        instead = {2: "evermap.types.SpatialSensor", 3: "evermap.Sensor"}[dim]
+        raise InputError(f"a map {of[5 - dim]}, the sensor is {of[dim]}", field="map", hint=instead)
     if len(living.places) and living.clock != clock:
         problem = f"stamps are on the clock '{clock}', those of the map on '{living.clock}'"
         hint = f"clock = '{living.clock}' in sensor.toml, or evermap.Engine(..., clock='{living.clock}')"

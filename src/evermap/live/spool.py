@@ -24,7 +24,7 @@ from evermap.live.inbox import joined
 from evermap.maps.store import StaleRevisionError, open_store
 from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap.runs.sessions import Entered, TwiceError, enter_session
-from evermap.types import Recording
+from evermap.types import AnyRecording
 
 TRIES = 3
 """Attempts to enter a session while another process changes the map."""
@@ -74,7 +74,7 @@ class Spool:
         """Keep the settings that sessions are entered with from here on."""
         (self.folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
 
-    def write(self, recording: Recording) -> None:
+    def write(self, recording: AnyRecording) -> None:
         """Put a part of the present session on the disk."""
         if self._file is None:
             there = (int(path.stem) for path in self.folder.glob("[0-9]*.readings"))
@@ -142,7 +142,7 @@ def recover(map_file: str | Path) -> tuple[Brought, ...]:
         spool.close()
 
 
-def read_parts(path: Path) -> Iterator[Recording]:
+def read_parts(path: Path) -> Iterator[AnyRecording]:
     """Yield the parts of a session until the end of the file, or to where a crash cut it off."""
     data = path.read_bytes()
     at = 0
@@ -151,13 +151,11 @@ def read_parts(path: Path) -> Iterator[Recording]:
         part = data[at + 8 : at + 8 + size]
         if len(part) < size:
             return
-        recording = unpack_recording(part)
-        assert isinstance(recording, Recording)
-        yield recording
+        yield unpack_recording(part)
         at += 8 + size
 
 
-def _entered(map_file: Path, recording: Recording, config: Config, path: Path) -> Brought:
+def _entered(map_file: Path, recording: AnyRecording, config: Config, path: Path) -> Brought:
     problem = ""
     for _ in range(TRIES):
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -14,10 +14,23 @@ from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
 from evermap.geometry.rigid import AGREE_M, consensus
 from evermap.slam.batch import sighted_at
-from evermap.types import FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
 LEAST_VARIANCE = 1e-6
 """Of a place, m^2: a survey is good to a millimetre."""
+
+
+class FrameSightings(NamedTuple):
+    """Detections of one frame: (M,) landmark_id, (M, 2) range [m] and bearing [rad], (M, 2) sigmas, nan where none."""
+
+    landmark_id: IntArray
+    reading: FloatArray
+    sigma_given: FloatArray
+
+    @property
+    def readable(self) -> BoolArray:
+        """(M,) detections with a range and a bearing."""
+        return np.asarray(np.all(np.isfinite(self.reading), axis=1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,18 +57,24 @@ class KnownPlaces:
     def __len__(self) -> int:
         return len(self.landmark_id)
 
+    @property
+    def value(self) -> FloatArray:
+        """(P, 2) the places, as the filter has them."""
+        return self.position_m
+
     @classmethod
     def of(
         cls, landmark_id: IntArray, position_m: FloatArray, covariance_m2: JointCovariance, p_here: FloatArray
     ) -> KnownPlaces:
         """Return the places in any order; the covariance as blocks (P, 2, 2), joint (2 P, 2 P), or in chunks."""
         order = np.argsort(landmark_id, kind="stable")
-        own = np.ascontiguousarray(blocks(covariance_m2)[order] + LEAST_VARIANCE * np.eye(2))
+        dim = position_m.shape[1]
+        own = np.ascontiguousarray(blocks(covariance_m2, dim)[order] + LEAST_VARIANCE * np.eye(dim))
         independent = not isinstance(covariance_m2, ChunkedCovariance) and covariance_m2.ndim == 3
         joint = None if independent else covariance_m2
         return cls(landmark_id[order], position_m[order], own, p_here[order], joint, order)
 
-    def existing(self) -> KnownPlaces:
+    def existing(self) -> Self:
         """Return those of a probability above 0."""
         rows = np.flatnonzero(self.p_here > 0.0)
         return replace(
@@ -71,7 +90,8 @@ class KnownPlaces:
         """Return (2 K, 2 K) covariance of some places together."""
         if self.joint_m2 is None:
             return self.covariance_m2[rows[0]] if len(rows) == 1 else np.asarray(block_diag(*self.covariance_m2[rows]))
-        return of_places(self.joint_m2, self.joint_row[rows]) + LEAST_VARIANCE * np.eye(2 * len(rows))
+        dim = self.position_m.shape[1]
+        return of_places(self.joint_m2, self.joint_row[rows], dim) + LEAST_VARIANCE * np.eye(dim * len(rows))
 
     def rows_of(self, landmark_id: IntArray) -> tuple[IntArray, IntArray]:
         """Return the first row of (M,) landmarks, and the one after the last; both equal where the map lacks one."""
@@ -145,12 +165,12 @@ class LocalTrack:
         """Advance the pose by a motion (3,)."""
         self._pose = se2.compose(self._pose, increment)
 
-    def see(self, stamp_s: float, landmark_id: IntArray, reading: FloatArray, states: FloatArray) -> None:
-        """Add sightings (M, 2) of landmarks of the map, range and bearing; forget those that are too old."""
+    def see(self, stamp_s: float, seen: FrameSightings, used: IntArray, states: FloatArray) -> None:
+        """Add sightings (M,) of landmarks of the map; forget those that are too old."""
         if np.isnan(self._began_s):
             self._began_s = stamp_s
-        at = sighted_at(self._pose, reading, states, self._mount)
-        for name, position in zip(landmark_id.tolist(), at, strict=True):
+        at = sighted_at(self._pose, seen.reading[used], states, self._mount)
+        for name, position in zip(seen.landmark_id[used].tolist(), at, strict=True):
             self._seen.pop(name, None)
             self._seen[name] = (stamp_s, position)
         old = [name for name, (seen_s, _) in self._seen.items() if seen_s < stamp_s - self._settings.track_s]

@@ -1,8 +1,9 @@
-"""A recording driven through a map that is not changed: the frames in order, and what comes out as plain arrays."""
+"""A recording driven through a map that is not changed, in the plane or in space: frame by frame."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,29 +11,39 @@ import numpy as np
 
 from evermap.config import Config
 from evermap.errors import DataError
-from evermap.geometry import se2
+from evermap.geometry import se3
 from evermap.geometry.chunked import JointCovariance
+from evermap.geometry.group import group_of
 from evermap.sensing.visibility import NominalField
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.estimate import fed
-from evermap.slam.known_places import KnownPlaces
-from evermap.slam.localize import FrameSightings, Localizer, Located
+from evermap.slam.known_places import FrameSightings, KnownPlaces
+from evermap.slam.localize import BaseLocalizer, Localizer, Located
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive, Noise
 from evermap.slam.ranges import RANGE_ONLY
 from evermap.slam.result import dead_reckoning, described
+from evermap.slam.space.intake import frames_of, path_of, start_noise, state_sigmas
+from evermap.slam.space.linearise import POINT, POSE, ROWS
+from evermap.slam.space.local_filter import SpatialFrame
+from evermap.slam.space.localize import SpatialLocalizer, SpatialPlaces
+from evermap.slam.space.problem import OdometryPath, SpatialNoise
+from evermap.slam.space.result import SCALE, mount_parameters, noise_parameters
 from evermap.types import (
     UNKNOWN,
+    AnyRecording,
     BoolArray,
     FloatArray,
     Innovations,
     IntArray,
     Landmarks,
     Misses,
+    ParameterEstimate,
     Progress,
     Recording,
     Sensor,
     SlamResult,
+    SpatialRecording,
     Trajectory,
 )
 
@@ -73,11 +84,86 @@ def localize(
     warm_up()
     settings, looks = config.slam.localize, config.living.looks
     localizer = Localizer(places, recording.sensor, prior.gaussian(), noise, settings=settings, looks=looks)
-    run = _feed(localizer, recording, drive, realtime=realtime, progress=progress)
-    if not run.placed.any():
-        problem = "cannot localise in the map: too few of the detected landmarks have the relative positions of the map"
-        raise DataError(f"{recording.name}: {problem}", hint="check that it is the map of this place")
-    return _result(run, prior, drive, landmarks)
+    seen, stamps, odometry_s = recording.detections, recording.frames.stamp_s, recording.odometry.stamp_s
+    frame = np.flatnonzero((stamps >= odometry_s[0]) & (stamps <= odometry_s[-1]))
+
+    def step(stamp_s: float, rows: slice) -> Located:
+        sightings = FrameSightings(
+            seen.landmark_id[rows],
+            np.column_stack([seen.range_m[rows], seen.bearing_rad[rows]]),
+            np.column_stack([seen.sigma_range_m[rows], seen.sigma_bearing_rad[rows]]),
+        )
+        return localizer.step(stamp_s - odometry_s[0], drive, sightings)
+
+    run = _feed(recording, localizer, frame, step, realtime=realtime, progress=progress)
+    fit = NoiseFit(noise, np.zeros_like(noise.detection), np.zeros_like(noise.odometry))
+    parameters = described(localizer.states, localizer.states_covariance, fit, prior)
+    result = _result(run, parameters, landmarks)
+    return replace(result, dead_reckoning=dead_reckoning(result.trajectory, drive, odometry_s[0]))
+
+
+def localize_in_space(
+    recording: SpatialRecording,
+    landmarks: Landmarks,
+    config: Config = USUAL,
+    *,
+    joint_m2: JointCovariance | None = None,
+    realtime: bool = False,
+    progress: Progress | None = None,
+) -> SlamResult:
+    """Localise a recording in space, as `localize` in the plane; its odometry may be missing.
+
+    Noise levels are learned from frame to frame. Detections of which only the direction was seen are not used, nor are
+    delays of sensors estimated.
+
+    Raises:
+        DataError: the robot's place in the map could not be found.
+    """
+    warm_up_in_space()
+    settings, driven = config.slam.space, recording.odometry is not None
+    covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2
+    places = SpatialPlaces.in_space(landmarks, covariance, settings)
+    landmarks = landmarks[np.flatnonzero(landmarks.p_exists > 0.0)]
+    seen, symmetries = frames_of(recording, settings)
+    stamps, given = recording.frames.stamp_s, recording.detections
+    start_s = float(stamps[0]) if recording.odometry is None else float(recording.odometry.stamp_s[0])
+    drive, noise = path_of(recording, start_s), start_noise(settings, driven=driven)
+    sigma = state_sigmas(recording.sensors, settings, driven=driven)
+    mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])
+    localizer = SpatialLocalizer(
+        places, mount, sigma, noise, driven=driven, symmetries=symmetries, settings=config.slam.localize, space=settings
+    )
+    usable = seen.readable & (given.landmark_id != UNKNOWN)
+    if recording.odometry is None:  # between frames with a landmark it may be anywhere
+        frame = np.unique(given.frame[usable])
+    else:
+        frame = np.flatnonzero((stamps >= start_s) & (stamps <= recording.odometry.stamp_s[-1]))
+
+    def step(stamp_s: float, rows: slice) -> Located:
+        return localizer.step(stamp_s - start_s, drive, seen.rows(np.arange(rows.start, rows.stop)))
+
+    run = _feed(recording, localizer, frame, step, realtime=realtime, progress=progress)
+    spread = np.sqrt(np.diag(localizer.states_covariance))
+    kind = seen.kind[usable]
+    parameters = noise_parameters(localizer.noise, kind, np.zeros(len(kind), dtype=np.bool_), driven=driven)
+    for row, sensor in enumerate(recording.sensors):
+        at = slice(6 * row, 6 * row + 6)
+        parameters += mount_parameters(sensor.name, localizer.states[at], spread[at], sigma[at])
+    if sigma[-1] > 0.0:
+        scale = float(np.exp(localizer.states[-1]))
+        of_scale = float(scale * spread[-1]), 1.0, float(sigma[-1])
+        parameters.append(ParameterEstimate("odometry_scale", scale, *of_scale, "", meaning=SCALE))
+    result = _result(run, tuple(parameters), landmarks)
+    turned = np.isfinite(places.rotation[np.maximum(run.all("place"), 0), 0])[run.all("place") != UNKNOWN]
+    dof = ROWS[np.where(turned, seen.kind[result.innovations.detection], POINT)]
+    path = result.trajectory
+    driven_pose = np.zeros((0, 7))
+    if drive is not None:
+        driven_pose = se3.interpolate(*drive, path.stamp_s - start_s)
+        driven_pose = se3.compose(path.pose_world_robot[:1], se3.between(driven_pose[:1], driven_pose))
+    count = len(driven_pose)
+    alone = Trajectory(path.stamp_s[:count], driven_pose, np.zeros((count, 6, 6)), path.frame, path.clock)
+    return replace(result, innovations=replace(result.innovations, dof=dof), dead_reckoning=alone)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +171,7 @@ class _Run:
     """Results of the frames.
 
     Attributes:
-        recording, localizer: what was fed, and to whom.
+        recording, localizer: what was fed, and to whom; in the plane or in space.
         frame: (F,) rows of `Recording.frames` that were processed.
         first: (F,) row of the first detection of each.
         located: one a frame.
@@ -93,8 +179,8 @@ class _Run:
         interrupted: True where the recording goes on.
     """
 
-    recording: Recording
-    localizer: Localizer
+    recording: AnyRecording
+    localizer: BaseLocalizer
     frame: IntArray
     first: IntArray
     located: list[Located]
@@ -159,47 +245,53 @@ class _Run:
 
 
 def _feed(
-    localizer: Localizer, recording: Recording, drive: Drive, *, realtime: bool, progress: Progress | None
+    recording: AnyRecording,
+    localizer: BaseLocalizer,
+    frame: IntArray,
+    step: Callable[[float, slice], Located],
+    *,
+    realtime: bool,
+    progress: Progress | None,
 ) -> _Run:
-    """Frame after frame, while there is odometry, through the filter."""
-    seen, stamps, odometry_s = recording.detections, recording.frames.stamp_s, recording.odometry.stamp_s
-    frame = np.flatnonzero((stamps >= odometry_s[0]) & (stamps <= odometry_s[-1]))
+    """Feed frames (F,), one after the other: `step` takes a stamp and rows of detections.
+
+    Raises:
+        DataError: the robot's place in the map could not be found.
+    """
+    stamps, seen = recording.frames.stamp_s, recording.detections
     first, last = np.searchsorted(seen.frame, frame), np.searchsorted(seen.frame, frame, side="right")
     located: list[Located] = []
-
-    def step(row: int) -> None:
-        low, high = first[row], last[row]
-        sightings = FrameSightings(
-            seen.landmark_id[low:high],
-            np.column_stack([seen.range_m[low:high], seen.bearing_rad[low:high]]),
-            np.column_stack([seen.sigma_range_m[low:high], seen.sigma_bearing_rad[low:high]]),
-        )
-        located.append(localizer.step(stamps[frame[row]] - odometry_s[0], drive, sightings))
-
-    step_s, interrupted = fed(stamps[frame], step, realtime=realtime, progress=progress)
+    step_s, interrupted = fed(
+        stamps[frame],
+        lambda row: located.append(step(float(stamps[frame[row]]), slice(int(first[row]), int(last[row])))),
+        realtime=realtime,
+        progress=progress,
+    )
     done = len(step_s)
-    return _Run(recording, localizer, frame[:done], first[:done], located[:done], step_s, interrupted)
+    run = _Run(recording, localizer, frame[:done], first[:done], located[:done], step_s, interrupted)
+    if not run.placed.any():
+        problem = "cannot localise in the map: too few of the detected landmarks have the relative positions of the map"
+        raise DataError(f"{recording.name}: {problem}", hint="check that it is the map of this place")
+    return run
 
 
-def _result(run: _Run, prior: CalibrationPrior, drive: Drive, landmarks: Landmarks) -> SlamResult:
-    """Return what the frames said, as plain arrays."""
-    recording, localizer, placed, misses = run.recording, run.localizer, run.placed, run.misses
+def _result(run: _Run, parameters: tuple[ParameterEstimate, ...], landmarks: Landmarks) -> SlamResult:
+    """Return what the frames said, as plain arrays; without dead reckoning."""
+    recording, placed, misses = run.recording, run.placed, run.misses
     pose = np.array([one.pose for one in run.located])[placed]
-    pose[:, 2] = se2.wrap(pose[:, 2])
+    pose = group_of(pose).normalised(pose)
     spread = np.array([one.covariance for one in run.located])[placed]
     stamp_s = recording.frames.stamp_s[run.frame[placed]]
     trajectory = Trajectory(stamp_s, pose, spread, frame="prior_map", clock=recording.clock)
-    noise = localizer.noise
-    fit = NoiseFit(noise, np.zeros_like(noise.detection), np.zeros_like(noise.odometry))
     return SlamResult(
         trajectory=trajectory,
         online=trajectory,
         landmarks=_with_counts(landmarks, run, misses),
-        parameters=described(localizer.states, localizer.states_covariance, fit, prior),
+        parameters=parameters,
         innovations=run.innovations,
         misses=misses,
         step_s=run.step_s[placed],
-        dead_reckoning=dead_reckoning(trajectory, drive, recording.odometry.stamp_s[0]),
+        dead_reckoning=trajectory,
         warnings=run.warnings,
         interrupted=run.interrupted,
     )
@@ -217,6 +309,24 @@ def warm_up() -> None:
     for stamp_s in (0.0, 0.1):
         localizer.step(stamp_s, Drive.from_rows(np.array([0.0, 0.1]), np.zeros((2, 3))), seen)
     NominalField(sensor).p_detect(np.zeros((1, 3)), at)  # for places that are believed to exist
+
+
+@functools.cache
+def warm_up_in_space() -> None:
+    """Compile, or load, what the frames of `localize_in_space` need: two of a tag and three points."""
+    at = se3.exp(np.hstack([[[3.0, 0.0, 0.0], [3.0, 1.0, 0.0], [3.0, 0.0, 1.0], [4.0, 1.0, 1.0]], np.zeros((4, 3))]))
+    known = Landmarks.in_space(np.arange(4), at[:, :3], rotation=np.where(np.arange(4)[:, None], np.nan, at[:, 3:]))
+    places = SpatialPlaces.in_space(replace(known, p_exists=np.ones(4)), np.tile(np.eye(3), (4, 1, 1)))
+    localizer = SpatialLocalizer(places, se3.identity(1), np.zeros(7), SpatialNoise(), driven=True)
+    kind, nothing = np.where(np.arange(4) == 0, POSE, POINT), np.zeros(4)
+    seen = SpatialFrame(
+        np.arange(4), np.ones(4, dtype=np.bool_), np.zeros(4, dtype=np.int64), kind, np.stack([at, at]), nothing,
+        np.tile(np.eye(3), (4, 1, 1)), np.ones(4), np.zeros((4, 4, 2)), np.zeros((4, 4, 2, 2)), nothing,
+        np.zeros(4, dtype=np.int64),
+    )  # fmt: skip
+    path = OdometryPath(np.array([0.0, 1.0]), se3.identity(2))
+    for stamp_s in (0.0, 0.1):
+        localizer.step(stamp_s, path, seen)
 
 
 def _with_counts(landmarks: Landmarks, run: _Run, misses: Misses) -> Landmarks:

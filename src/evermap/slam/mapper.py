@@ -15,7 +15,8 @@ from scipy import sparse
 from evermap.config import SlamConfig
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import FIRST_POSE_INFORMATION
-from evermap.slam.localize import FrameSightings, Located
+from evermap.slam.known_places import FrameSightings
+from evermap.slam.localize import Located
 from evermap.slam.problem import SPANS, Drive, Noise, Problem, beyond_jitter, padded
 from evermap.slam.streaming import StreamingSlam
 from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Sensor

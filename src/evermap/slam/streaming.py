@@ -32,8 +32,9 @@ from evermap.slam.batch import (
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.filter_kernels import told
 from evermap.slam.kernels import N_STATES
-from evermap.slam.local_filter import Motion, SessionFilter, grown
+from evermap.slam.local_filter import Motion, SessionFilter
 from evermap.slam.method import Method, Static
+from evermap.slam.nearby_places import grown
 from evermap.slam.noise import refine_noise
 from evermap.slam.problem import Drive, Noise, Problem
 from evermap.slam.smoother import Smoother

@@ -27,7 +27,8 @@ from evermap.slam.association.wrong_associations import displaced_stretches, lai
 from evermap.slam.batch import USUAL, sighted_at
 from evermap.slam.filter_kernels import BY_PLACE, GATED, WIDTH, spread_of_frame
 from evermap.slam.linearise import detection_residuals
-from evermap.slam.local_filter import NO_PLACES, LocalFilter, Motion, columns
+from evermap.slam.local_filter import LocalFilter, Motion
+from evermap.slam.nearby_places import NO_PLACES
 from evermap.slam.noise import Extrapolation, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
@@ -320,7 +321,7 @@ class Associator:
     def _may_be_one(self, a: int, b: int) -> bool:
         """True if the difference of two landmarks is insignificant."""
         local = self._filter
-        at = columns(local.bring(np.array([a, b])))
+        at = local.columns(local.bring(np.array([a, b])))
         by = np.hstack([np.eye(2), -np.eye(2)])
         spread = by @ local.covariance[np.ix_(at, at)] @ by.T + 1e-12 * np.eye(2)
         gap = local.position[a] - local.position[b]
@@ -644,7 +645,7 @@ def pairings_of_frame(
     followed = log_det[inside] <= 2.0 * np.log(sigma[seen[inside]]).sum(axis=1) + wider
     source, target, seen, count = source[inside], target[inside], seen[inside], len(inside)
     at, joint = np.empty((count, WIDTH), dtype=np.int64), np.empty((2 * count, 2 * count))
-    at[:, :BY_PLACE], at[:, BY_PLACE:] = np.arange(BY_PLACE), columns(local.bring(target)).reshape(-1, 2)
+    at[:, :BY_PLACE], at[:, BY_PLACE:] = np.arange(BY_PLACE), local.columns(local.bring(target)).reshape(-1, 2)
     if count:
         scratch = np.empty((2 * count, len(local.covariance)))
         spread_of_frame(local.covariance, by[inside].reshape(2 * count, WIDTH), at, scratch, joint)

@@ -14,9 +14,10 @@ from evermap.estimate.tie import tie_measurements
 from evermap.geometry import se3
 from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
-from evermap.geometry.symmetry import HINT, Symmetries
+from evermap.geometry.symmetry import HINT, Symmetries, Symmetry
 from evermap.slam.space.linearise import CORNERS, POINT, POSE
-from evermap.slam.space.problem import USUAL, OdometryPath, SpatialProblem
+from evermap.slam.space.local_filter import SpatialFrame
+from evermap.slam.space.problem import USUAL, OdometryPath, SpatialNoise, SpatialProblem
 from evermap.types import (
     ANY_RANGE_M2,
     UNKNOWN,
@@ -138,6 +139,47 @@ def _moved(odometry: SpatialOdometry | None, from_s: FloatArray, to_s: FloatArra
         return se3.identity(len(from_s))
     then, now = (se3.interpolate(odometry.stamp_s, odometry.pose_world_robot, at_s) for at_s in (from_s, to_s))
     return se3.between(then, now)
+
+
+def frames_of(recording: SpatialRecording, settings: SpaceConfig = USUAL) -> tuple[SpatialFrame, tuple[Symmetry, ...]]:
+    """Return all detections as a filter reads them, each by itself, and the symmetries of landmarks.
+
+    Those of which only the direction was seen are not readable: their ranges follow from what is seen later.
+    """
+    given = recording.detections
+    usable = ~without_range(recording)
+    where, broken = _where(recording, usable, settings)
+    readable, kind = usable & ~broken, where.kind.copy()
+    root = np.zeros((len(given), 3, 3))
+    root[readable] = _roots(where.covariance[readable], where.measured[readable, :3])
+    names = dict(enumerate(recording.class_names))
+    alike = Symmetries.of_classes(recording.symmetries, [names.get(one, str(one)) for one in given.class_id.tolist()])
+    symmetry = np.where(kind == CORNERS, 0, alike.of)
+    kind[np.array([one.free for one in alike.kinds])[symmetry]] = POINT
+    other = np.where(np.isfinite(where.other), where.other, where.measured)
+    seen = SpatialFrame(
+        given.landmark_id, readable, given.sensor, kind, np.stack([where.measured, other]), where.other_log_odds, root,
+        where.sigma_rad, where.corner, where.corner_root, 0.5 * np.nan_to_num(given.tag_size_m), symmetry,
+    )  # fmt: skip
+    return seen, alike.kinds
+
+
+def start_noise(settings: SpaceConfig, *, driven: bool) -> SpatialNoise:
+    """Return the noise levels to start from."""
+    goes = (settings.drift_m, settings.drift_rad) if driven else (settings.hand_mps, settings.hand_radps)
+    return SpatialNoise(*goes, pixel=settings.sigma_px)
+
+
+def state_sigmas(sensors: Sequence[SpatialSensor], settings: SpaceConfig, *, driven: bool) -> FloatArray:
+    """Return (6 S + 1,) standard deviations of the mounts' twists and of the logarithm of the odometry's scale."""
+    by_corners = any(sensor.intrinsics is not None for sensor in sensors)
+    scale = scale_between(sensors, settings, settings.scale_sigma if by_corners else 0.0)[0] if driven else 0.0
+    return np.append(_mount_sigma(sensors, settings), scale)
+
+
+def path_of(recording: SpatialRecording, start_s: float) -> OdometryPath | None:
+    """Return the odometry, with stamps from an instant on; None without."""
+    return _path(recording, start_s, 0.0)
 
 
 def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:

@@ -16,7 +16,7 @@ from evermap.geometry import se3
 from evermap.slam.calibration import OF_SCALE
 from evermap.slam.space.intake import SpatialIntake, most_of
 from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PIXEL, POSE, ROTATION, ROWS, TRANSLATION
-from evermap.slam.space.problem import SpatialProblem
+from evermap.slam.space.problem import SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear
 from evermap.slam.space.solve import SpatialSolved
 from evermap.types import (
@@ -222,31 +222,13 @@ def _sizes(told: _Told, count: int) -> FloatArray:
 
 
 def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
-    optimum, problem, levels = told.solved.optimum, told.problem, told.solved.optimum.noise.levels
-    has = {
-        TRANSLATION: problem.driven,
-        ROTATION: problem.driven,
-        ACROSS: bool((problem.kind != CORNERS).any()),
-        ALONG: bool(((problem.kind != CORNERS) & ~problem.ray).any()),
-        ORIENTATION: bool((problem.kind == POSE).any()),
-        PIXEL: bool((problem.kind == CORNERS).any()),
-    }
-    found = [
-        ParameterEstimate(name, float(levels[row]), 0.0, np.nan, np.nan, unit, meaning=meaning)
-        for row, (name, unit, meaning) in _LEVELS.items()
-        if has[row]
-    ]
+    optimum, problem = told.solved.optimum, told.problem
+    found = noise_parameters(optimum.noise, problem.kind, problem.ray, driven=problem.driven)
     border = optimum.smoother.factorised(optimum.now).border_covariance()
     *of_sensors, of_scale = np.sqrt(np.diag(border))
     sigma = np.reshape(of_sensors, (-1, 6))
-    parts = [*((f"mount_{axis}_m", "m") for axis in "xyz"), *((f"mount_r{axis}_rad", "rad") for axis in "xyz")]
     for row, sensor in enumerate(told.recording.sensors):
-        for column, (part, unit) in enumerate(parts):
-            prior = float(problem.mount_sigma[row, column])
-            if prior > 0.0:
-                value = float(optimum.estimate.state[row, column])
-                name, spread = f"{sensor.name}_{part}", float(sigma[row, column])
-                found.append(ParameterEstimate(name, value, spread, 0.0, prior, unit, meaning=MOUNT))
+        found += mount_parameters(sensor.name, optimum.estimate.state[row], sigma[row], problem.mount_sigma[row])
         if np.isfinite(told.solved.delay_sigma_s[row]):
             value, spread = float(problem.delay_s[row]), float(told.solved.delay_sigma_s[row])
             prior, name = problem.settings.delay_sigma_s, f"{sensor.name}_delay_s"
@@ -254,6 +236,33 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
     if problem.scale_sigma > 0.0:
         found += _scales(told, float(of_scale))
     return tuple(found)
+
+
+def noise_parameters(noise: SpatialNoise, kind: IntArray, ray: BoolArray, *, driven: bool) -> list[ParameterEstimate]:
+    """Return the noise levels of what there is: detections (M,) of kinds, some of them `ray` only, and odometry."""
+    has = {
+        TRANSLATION: driven,
+        ROTATION: driven,
+        ACROSS: bool((kind != CORNERS).any()),
+        ALONG: bool(((kind != CORNERS) & ~ray).any()),
+        ORIENTATION: bool((kind == POSE).any()),
+        PIXEL: bool((kind == CORNERS).any()),
+    }
+    return [
+        ParameterEstimate(name, float(noise.levels[row]), 0.0, np.nan, np.nan, unit, meaning=meaning)
+        for row, (name, unit, meaning) in _LEVELS.items()
+        if has[row]
+    ]
+
+
+def mount_parameters(name: str, value: FloatArray, sigma: FloatArray, prior: FloatArray) -> list[ParameterEstimate]:
+    """Return what is estimated of the mount of a sensor: twists (6,), their standard deviations, and those before."""
+    parts = [*((f"mount_{axis}_m", "m") for axis in "xyz"), *((f"mount_r{axis}_rad", "rad") for axis in "xyz")]
+    return [
+        ParameterEstimate(f"{name}_{part}", float(value[k]), float(sigma[k]), 0.0, float(prior[k]), unit, meaning=MOUNT)
+        for k, (part, unit) in enumerate(parts)
+        if prior[k] > 0.0
+    ]
 
 
 def _undivided(told: _Told) -> float:

@@ -20,7 +20,7 @@ from evermap.slam.calibration import narrowed
 from evermap.slam.space.against_map import MapComparison, compared
 from evermap.slam.space.drift import drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, first_places, oriented
-from evermap.slam.space.intake import SpatialIntake
+from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import CORNERS, POINT
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.repair import rejoined, repaired, split, unjumped
@@ -84,8 +84,7 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     problem, framed = _without_frames(problem)
     identity = np.arange(len(intake.landmark_id))
     settings = problem.settings
-    goes = (settings.drift_m, settings.drift_rad) if problem.driven else (settings.hand_mps, settings.hand_radps)
-    noise = SpatialNoise(*goes, pixel=settings.sigma_px)
+    noise = start_noise(settings, driven=problem.driven)
     by_corners = (problem.kind == CORNERS) | problem.ray
     # pixels err by themselves, detectors of objects by the view
     if problem.driven and 2 * np.sum(~by_corners) > len(by_corners):
