@@ -178,6 +178,7 @@ class Problem:
         landmark_information: (2 L, 2 L) sparse inverse of their joint prior covariance, empty where there is none.
             Blocks off the diagonal tie landmarks to each other, for example those that may have moved together. A dense
             array is taken, too.
+        share: (M,) of the information of each detection that is new; None where all of it is.
     """
 
     stamp_s: FloatArray
@@ -192,6 +193,7 @@ class Problem:
     start_information: float
     landmark_mean: FloatArray
     landmark_information: sparse.csr_array
+    share: FloatArray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "landmark_information", sparse.csr_array(self.landmark_information))
@@ -268,6 +270,7 @@ class Problem:
         """Return the problem with some of its detections only."""
         names = ("pose_row", "landmark_row", "reading", "sigma_given")
         some: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
+        some["share"] = None if self.share is None else self.share[rows]
         return replace(self, **some)
 
 
