@@ -319,7 +319,10 @@ def solved(
 ) -> Visit:
     """Return a recording with identities solved, by itself or in a map that is given; arguments as of `run_slam`."""
     if isinstance(recording, SpatialRecording):
-        intake = prepare_space(recording, config.slam.space, remarks)
+        of_slam = config.slam
+        intake = prepare_space(
+            recording, of_slam.space, remarks, robust=of_slam.robust, estimate_noise=of_slam.estimate_noise
+        )
         return SpatialVisit(recording, intake, solve_space(intake, prior_map, progress=progress))
     alone = solve(recording, config.slam, prior_map=prior_map, remarks=remarks, realtime=realtime, progress=progress)
     return PlanarVisit(alone)

@@ -190,7 +190,8 @@ class SpatialSmoother:
         sensor = n + count
         root = np.sqrt(np.maximum(problem.lasted_s, 1e-3))
         sigma = np.repeat(np.column_stack([noise.translation * root, noise.rotation * root]), 3, axis=1)
-        jump = problem.settings.jump_log_odds if problem.driven else NO_JUMP_LOG_ODDS
+        jump = problem.settings.jump_log_odds if problem.driven and problem.robust else NO_JUMP_LOG_ODDS
+        heavy = heavy and problem.robust
         first_seen = np.zeros(count, dtype=np.int64)
         first_seen[problem.place[::-1]] = problem.pose_row[::-1]
         prior = problem.prior.place
