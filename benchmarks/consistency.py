@@ -67,7 +67,7 @@ def recordings(part: str) -> Iterator[tuple[str, AnyRecording]]:
         convert = FOLDER / "starloc" / "starloc_to_plain.py"
         for session in sorted(path.name for path in (FOLDER / "starloc").iterdir() if path.name[-3:] in ("_s1", "_s2")):
             with tempfile.TemporaryDirectory() as plain:
-                command = [sys.executable, convert, FOLDER / "starloc", session, plain, "--truth"]
+                command = [sys.executable, str(convert), str(FOLDER / "starloc"), session, plain, "--truth"]
                 subprocess.run(command, check=True)
                 yield f"starloc {session}", read_recording(plain)
     elif part == "ycbv":
@@ -135,7 +135,7 @@ def run(parts: tuple[str, ...] = PARTS, say: Callable[[str], Any] = print) -> di
 
 def _by_part(rows: dict[str, dict[str, float]]) -> dict[str, list[dict[str, float]]]:
     """Rows by the kind of recording, which its name begins with."""
-    kinds = {"mrclam": [], "starloc": [], "ycbv": [], "tagslam": [], "robot": []}
+    kinds: dict[str, list[dict[str, float]]] = {"mrclam": [], "starloc": [], "ycbv": [], "tagslam": [], "robot": []}
     for name, row in rows.items():
         if name.split()[0] in kinds:
             kinds[name.split()[0]].append(row)

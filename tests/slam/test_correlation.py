@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evermap.config import Config
+from evermap.metrics.summary import compare_with_truth
+from evermap.pipeline import run_slam
 from evermap.slam.correlation import Lasting, lasting_errors
+from evermap_studies.worlds.lasers import LaserWorld, simulate_laser
 
 LANDMARKS, EACH, STEP_S = 30, 240, 0.25
 
@@ -61,3 +65,15 @@ def test_correlation_adds_to_variances_by_brute_force():
     expected = np.einsum("mds,mn,nds->s", influence, correlation, influence)
     assert lasting.variance_beside(influence, stamp_s, place) == pytest.approx(expected)
     assert lasting.information(stamp_s, place) == pytest.approx(1.0 / (1.0 + correlation.sum(axis=1)))
+
+
+def test_covariances_are_honest_where_a_visit_errs_alike():
+    """Twelve times too small, poses and landmarks, if detections counted as independent."""
+    world = LaserWorld(lasting_m=0.02, lasting_rad=np.radians(0.25))
+    recording = simulate_laser(world, 0)
+    config = Config.model_validate({"slam": {"sensor_model": "plain", "method": "nohyp"}})
+    found = compare_with_truth(recording, run_slam(recording, config))
+    assert found.poses is not None
+    assert found.landmarks_anchored is not None
+    assert 0.2 < np.mean(found.poses.anchored_nees) / 2.0 < 2.5
+    assert 0.2 < np.mean(found.landmarks_anchored.nees) / 2.0 < 2.5
