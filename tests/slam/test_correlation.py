@@ -68,7 +68,7 @@ def test_correlation_adds_to_variances_by_brute_force():
 
 
 def test_covariances_are_honest_where_a_visit_errs_alike():
-    """Twelve times too small, poses and landmarks, if detections counted as independent."""
+    """NEES of poses and landmarks is ten times its expectation if detections count as independent."""
     world = LaserWorld(lasting_m=0.02, lasting_rad=np.radians(0.25))
     recording = simulate_laser(world, 0)
     config = Config.model_validate({"slam": {"sensor_model": "plain", "method": "nohyp"}})
