@@ -1209,8 +1209,8 @@ class SurvivalConfig(Section):
 
 UNREAD_IN_THE_PLANE = ("slam.space", "slam.association.space", "track", "living.boxes")
 UNREAD_IN_SPACE = (
-    "slam.method", "slam.sensor_model", "slam.robust", "slam.outlier_log_odds", "slam.rejected_in_a_row",
-    "slam.narrowing", "slam.estimate_noise", "slam.odometry_noise_factor", "slam.calibration", "slam.modes",
+    "slam.method", "slam.sensor_model", "slam.outlier_log_odds", "slam.rejected_in_a_row",
+    "slam.narrowing", "slam.odometry_noise_factor", "slam.calibration", "slam.modes",
     "slam.changes", "slam.noise", "slam.odometry", "slam.ranges", "slam.localize", "slam.cleaning", "slam.check",
     "slam.association.particles", "living.metre",
 )  # fmt: skip

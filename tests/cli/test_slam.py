@@ -331,7 +331,7 @@ def test_what_is_for_one_robot_is_refused(template: Path, options: list[str], sa
         (False, ["--set", "slam.association.p_new=0.3"], ["slam.association.p_new", "without --unknown-ids"]),
         (False, ["--set", "persist.rows_at_once=3"], ["persist.rows_at_once", "by this command"]),
         (True, ["--set", "slam.calibration.fix.range_slope=0"], ["slam.calibration.fix.range_slope", "in space"]),
-        (True, ["--set", "robust=false"], ["slam.robust", "in space"]),
+        (True, ["--set", "outlier_log_odds=9"], ["slam.outlier_log_odds", "in space"]),
         (True, ["--method", "nn"], ["--method", "in space"]),
         (True, ["--sensor-model", "plain"], ["--sensor-model", "in space"]),
         (True, ["--set", "track.rest_for_s=1"], ["track.rest_for_s", "without boxes"]),

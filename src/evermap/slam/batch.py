@@ -403,7 +403,7 @@ def divided(
         askew=(askew[0], askew[1]),
         problem=smoother.problem,
         graph_estimate=estimate,
-        graph_marginals=marginals,
+        graph_marginals=marginals if others else smoother.counted(estimate, marginals),
         noise=noise,
         inlier=smoother.inlier_probability(estimate),
         scale=scale,

@@ -28,7 +28,8 @@ INTERVALS_A_SLICE, DETECTIONS_A_SLICE = 1000, 2000
 
 
 class Readings(NamedTuple):
-    """Detections as the kernel reads them: (M,) rows of pose and place, (M, 2) readings and sigmas; (3,) mount.
+    """Detections as the kernel reads them: (M,) rows of pose and place, (M, 2) readings and sigmas, (M,) shares of
+    information that is new; (3,) mount.
 
     `free` (11,) are the calibration states that are estimated; `log_odds` and `tail` as for `robust.weigh`.
     """
@@ -37,6 +38,7 @@ class Readings(NamedTuple):
     place: IntArray
     reading: FloatArray
     sigma: FloatArray
+    share: FloatArray
     mount: FloatArray
     free: BoolArray
     log_odds: float
@@ -103,9 +105,9 @@ def linearise_detections(
         )  # fmt: skip
         squared = (z[0] / seen.sigma[m, 0]) ** 2 + (z[1] / seen.sigma[m, 1]) ** 2
         weight[m], loss = weigh(squared, seen.log_odds, seen.tail, 0.0)
-        cost += loss
+        cost += seen.share[m] * loss
         for row in range(2):
-            scale = math.sqrt(weight[m]) / seen.sigma[m, row]
+            scale = math.sqrt(weight[m] * seen.share[m]) / seen.sigma[m, row]
             for a in range(3):
                 values[at + a] = scale * jx[row, a]
             for a in range(2):

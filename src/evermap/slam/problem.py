@@ -180,6 +180,7 @@ class Problem:
             Blocks off the diagonal tie landmarks to each other, for example those that may have moved together. A dense
             array is taken, too.
         measurements: of other kinds than odometry and detections; what they say about height and tilt has no effect.
+        share: (M,) of the information of each detection that is new; None where all of it is.
     """
 
     stamp_s: FloatArray
@@ -195,6 +196,7 @@ class Problem:
     landmark_mean: FloatArray
     landmark_information: sparse.csr_array
     measurements: tuple[Tied, ...] = ()
+    share: FloatArray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "landmark_information", sparse.csr_array(self.landmark_information))
@@ -272,6 +274,7 @@ class Problem:
         """Return the problem with some of its detections only."""
         names = ("pose_row", "landmark_row", "reading", "sigma_given")
         some: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
+        some["share"] = None if self.share is None else self.share[rows]
         return replace(self, **some)
 
 

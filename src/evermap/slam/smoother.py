@@ -5,6 +5,8 @@ Calibration states, which all measurements share, are the border of the eliminat
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from evermap.estimate.gauss_newton import Steps
@@ -13,6 +15,7 @@ from evermap.estimate.measurement import MeasurementFactors, Tied
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
 from evermap.slam.calibration import DELAY
+from evermap.slam.correlation import Lasting, lasting_errors
 from evermap.slam.kernels import HEAVY_TAIL, N_MOTION, N_SENSOR, N_STATES
 from evermap.slam.linearise import (
     OF_DETECTION,
@@ -22,9 +25,10 @@ from evermap.slam.linearise import (
     Readings,
     StartFactor,
     build_place_priors,
+    detection_residuals,
 )
 from evermap.slam.problem import Estimate, Marginals, Noise, PlanarView, Problem
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import ANY_BEARING_RAD, BoolArray, FloatArray, IntArray
 
 COST_SLACK = 0.5
 """Nats by which the cost may rise in a step: weights change with calibration states and residuals, which is no harm."""
@@ -117,7 +121,8 @@ class Smoother(Solver[Estimate]):
 
         What each stretch of the recording adds to the states is summed before it is squared, which makes no assumption
         on how errors hang together within it: White's covariance (1980), with stretches as clusters (Liang and Zeger
-        1986). 1 for states that are not free, and at least.
+        1986). Errors that are known to be `lasting` for longer are correlated by landmark. The larger variance holds;
+        1 for states that are not free, and at least.
         """
         problem, n = self.problem, len(estimate.pose)
         if not problem.prior.free.any():
@@ -144,6 +149,8 @@ class Smoother(Solver[Estimate]):
         np.add.at(pull, stretch[problem.pose_row], np.einsum("nrs,nr->ns", of_seen, seen[..., -1]))
         independent = (of_driven**2).sum(axis=(0, 1)) + (of_seen**2).sum(axis=(0, 1))
         found = (pull**2).sum(axis=0) * STRETCHES / (STRETCHES - 1.0)
+        alike = self.lasting(estimate).variance_beside(of_seen, stamp[problem.pose_row], problem.landmark_row)
+        found = np.maximum(found, independent + alike)
         free = problem.prior.free & (independent > 0.0)
         worth = np.where(free, np.maximum(found / np.where(free, independent, 1.0), 1.0), 1.0)
         # the delay shows where the velocity changes; where it only jitters, no delay explains it
@@ -151,6 +158,21 @@ class Smoother(Solver[Estimate]):
         changes = max(float((driven[..., 6] ** 2).sum()), 1e-300)
         worth[DELAY] /= max(1.0 - jitter / changes, LEAST_CHANGE)
         return worth
+
+    def lasting(self, estimate: Estimate) -> Lasting:
+        """Return how long errors of detections last, by the residuals there."""
+        problem, sigma = self.problem, self.noise.of_detections(self.problem.sigma_given)
+        residual = detection_residuals(problem, estimate) / np.where(sigma < ANY_BEARING_RAD, sigma, np.nan)
+        stamp_s = problem.stamp_s[problem.pose_row]
+        return lasting_errors(residual, self.inlier_probability(estimate), stamp_s, problem.landmark_row)
+
+    def counted(self, estimate: Estimate, marginals: Marginals) -> Marginals:
+        """Return covariances with each detection counted as what it is worth beside others of its landmark."""
+        lasting, problem = self.lasting(estimate), self.problem
+        if not lasting.any:
+            return marginals
+        share = lasting.information(problem.stamp_s[problem.pose_row], problem.landmark_row)
+        return self.under(self.noise, heavy=self.heavy, problem=replace(problem, share=share)).marginals(estimate)
 
     def detections(self, estimate: Estimate) -> FloatArray:
         """Return (M, 2, 13) detections, linearised and whitened: by pose, place, sensor states; and the right side."""
@@ -193,6 +215,7 @@ class Smoother(Solver[Estimate]):
             rank[problem.landmark_row],
             problem.reading,
             noise.of_detections(problem.sigma_given),
+            np.ones(len(problem.pose_row)) if problem.share is None else problem.share,
             problem.mount,
             problem.prior.free,
             noise.outlier_log_odds if self.robust else np.inf,

@@ -16,6 +16,7 @@ from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import WindowEvidence, compare
 from evermap.slam.changes.search import find_changes
+from evermap.slam.correlation import Lasting
 from evermap.slam.noise import START, refine_noise
 from evermap.slam.problem import Drive, Estimate, Problem
 from evermap.slam.smoother import Smoother
@@ -75,6 +76,7 @@ def smoothed() -> None:
     estimate, marginals = exhausted(smoother.solved_in_slices(start, iterations=1))
     refine_noise(problem, estimate, marginals, smoother.inlier_probability(estimate), START)
     smoother.worth(estimate, marginals)
+    Lasting(np.ones(1), np.ones(1)).information(problem.stamp_s[problem.pose_row], problem.landmark_row)
     _ = marginals.pose, marginals.consecutive
     smoother.information(estimate, np.array([0, len(pose) - 1]))
     seldom_used()

@@ -298,7 +298,10 @@ def solve_visit(
     progress: Progress | None = None,
 ) -> SpatialVisit:
     """Return a recording with identities solved, by itself or in a map that is given; arguments as of `run_slam`."""
-    intake = prepare_space(recording, config.slam.space, remarks)
+    of_slam = config.slam
+    intake = prepare_space(
+        recording, of_slam.space, remarks, robust=of_slam.robust, estimate_noise=of_slam.estimate_noise
+    )
     return SpatialVisit(recording, intake, solve_space(intake, prior_map, progress=progress))
 
 
@@ -330,7 +333,10 @@ def localised_in_space(
     """Return a session solved at its alignment with a map, or with the part of a large one that it can observe. The map
     has the session's classes (`session.admitted`).
     """
-    settings, intake = config.living, prepare_space(recording, config.slam.space, remarks)
+    settings, of_slam = config.living, config.slam
+    intake = prepare_space(
+        recording, of_slam.space, remarks, robust=of_slam.robust, estimate_noise=of_slam.estimate_noise
+    )
     large, named = len(living.places) > settings.whole_places, cliques_of(living, names_of(intake).ravel())
     part = Vicinity.of(living, named, settings).part if large else living
     p_site = aged(part, settings, intake.start_s).p_here

@@ -18,7 +18,7 @@ sandwich by clusters, Liang and Zeger 1986). A bend is taken only where it is cl
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -26,27 +26,30 @@ import numpy as np
 from evermap.config import SpaceConfig, StillConfig, TrafficConfig
 from evermap.geometry import se3
 from evermap.geometry.group import accumulate
+from evermap.slam.correlation import (
+    BINS,
+    FEWEST_BINS,
+    FEWEST_PAIRS,
+    MOST_LAGS,
+    PERSIST_S,
+    PERSISTS,
+    Curve,
+    Lasting,
+    curve_columns,
+    fit_curve,
+)
 from evermap.slam.space.problem import USUAL, SpatialProblem
 from evermap.tracking.standing import HEAVY
 from evermap.types import FloatArray, IntArray
 
 STILL = StillConfig()
-PERSIST_S = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
-"""Correlation times of detection errors that are tried together; none that is longer than the recording."""
 SIGHTINGS_A_PLACE = 150
-BINS, FEWEST_BINS, FEWEST_PAIRS = 14, 4, 30
 SEEN_TOGETHER, FEWEST_OF_BOTH = 12, 10
 """Landmarks whose pairs are asked, those seen most; instants, or pairs of these, that it takes."""
 MEDIAN = 2.366
 """Of the chi-square distribution with three degrees of freedom."""
-MOST_LAGS = 50.0
-"""Lags that follow one another in a recording vary independently, but shorter ones are no better known than so many."""
-ROUNDS_OF_FIT, LEAST_OF_SQUARE = 6, 0.1
 LEVERS = (0.5, 1.0, 1.5, 2.0, 3.0)
 """Drift of one landmark over that which pairs share: farther ones move more when the odometry turns."""
-PERSISTS = 2.0
-"""Nats a curve by which errors that persist must explain all curves better than white ones: of two numbers more for
-each of them (Akaike 1974)."""
 
 
 class Drift(NamedTuple):
@@ -54,20 +57,15 @@ class Drift(NamedTuple):
 
     Attributes:
         translation: of the odometry [m / sqrt(s)]; rotation: [rad / sqrt(s)]; None where too little is seen twice.
+            The least that explains what is seen, since a good odometry is worth more than detections that err alike.
+        doubt: factor from these to what is expected of them, which may be no less than 1.
         share: (M,) of the information of each detection that is new.
     """
 
     translation: float | None
     rotation: float | None
+    doubt: float
     share: FloatArray
-
-
-class _Curve(NamedTuple):
-    """Medians of squared distances (K,), for one axis, by their lags [s], and half the degrees of freedom of each."""
-
-    lag_s: FloatArray
-    square: FloatArray
-    worth: FloatArray
 
 
 def drift_of(problem: SpatialProblem, driven: FloatArray) -> Drift:
@@ -77,31 +75,35 @@ def drift_of(problem: SpatialProblem, driven: FloatArray) -> Drift:
     """
     sensor = se3.compose(driven[problem.pose_row], problem.mount[problem.sensor])
     at, stamp_s = se3.transform(sensor, problem.measured[:, :3]), problem.stamp_s[problem.pose_row]
-    share, curves = np.ones(len(problem.place)), list[_Curve]()
+    curves = list[Curve]()
     for place in range(len(problem.oriented)):
         mine = np.flatnonzero(problem.place == place)
         i, j = _instants(len(mine))
         lag_s = np.abs(stamp_s[mine[j]] - stamp_s[mine[i]])
         lag_s, square = _medians(lag_s, ((at[mine[j]] - at[mine[i]]) ** 2).sum(axis=1) / MEDIAN)
         if len(lag_s) >= FEWEST_BINS:
-            curves.append(_Curve(lag_s, square, _worth(stamp_s[mine], lag_s)))
+            curves.append(Curve(lag_s, square, _worth(stamp_s[mine], lag_s)))
     if not curves:
-        return Drift(None, None, share)
-    growth = float(np.clip(min(_least_growth(curve) for curve in curves), *_shared_growth(problem, at, stamp_s)))
+        return Drift(None, None, 1.0, np.ones(len(problem.place)))
+    shared = _shared_growth(problem, at, stamp_s)
+    growth = min(_least_growth(curve) for curve in curves)
+    if shared is not None:  # at most a standard deviation above what pairs share
+        growth = float(np.clip(growth, max(shared.mean - shared.sigma, 0.0), max(shared.mean, 0.0) + shared.sigma))
     persist_s = [each_s for each_s in PERSIST_S if each_s <= max(float(np.ptp(stamp_s)), PERSIST_S[0])]
     gain, lasting = 0.0, np.zeros(len(persist_s))
     for curve in curves:
-        white = max(_fitted(curve, [], lever * growth)[1] for lever in LEVERS)
-        parts, log_likelihood = max((_fitted(curve, persist_s, lever * growth) for lever in LEVERS), key=lambda f: f[1])
+        white = max(fit_curve(curve, [], lever * growth)[1] for lever in LEVERS)
+        parts, log_likelihood = max(
+            (fit_curve(curve, persist_s, lever * growth) for lever in LEVERS), key=lambda f: f[1]
+        )
         gain += max(log_likelihood - white, 0.0)
         lasting += parts[1:] / max(float(parts.sum()), 1e-12) / len(curves)
-    if gain > PERSISTS * len(curves):
-        for place in range(len(problem.oriented)):
-            mine = np.flatnonzero(problem.place == place)
-            share[mine] = 1.0 / (1.0 + _others(stamp_s[mine], np.array(persist_s)) @ lasting)
+    found = Lasting(np.array(persist_s), lasting * (gain > PERSISTS * len(curves)))
+    share = found.information(stamp_s, problem.place)
     translation = float(np.sqrt(max(0.5 * growth, problem.settings.steady_m**2)))
     range_m = float(np.median(np.linalg.norm(problem.measured[:, :3], axis=1)))
-    return Drift(translation, translation / max(range_m, 1.0), share)
+    expected = translation if shared is None else max(translation, float(np.sqrt(0.5 * shared.expected)))
+    return Drift(translation, translation / max(range_m, 1.0), expected / translation, share)
 
 
 def _instants(count: int) -> tuple[IntArray, IntArray]:
@@ -115,10 +117,24 @@ def _worth(stamp_s: FloatArray, lag_s: FloatArray) -> FloatArray:
     return 1.5 * np.clip(np.ptp(stamp_s) / lag_s, 1.0, MOST_LAGS)
 
 
-def _shared_growth(problem: SpatialProblem, at: FloatArray, stamp_s: FloatArray) -> tuple[float, float]:
-    """Between which bounds the variance of what moves two landmarks alike grows, by the second: a standard deviation
-    below and above; 0 and inf where no two are seen together.
-    """
+class _Growth(NamedTuple):
+    """Growth of the variance of what moves two landmarks alike [m^2/s], by least squares: it may be below 0."""
+
+    mean: float
+    sigma: float
+
+    @property
+    def expected(self) -> float:
+        """Return the expectation, given that it isn't negative: of a normal distribution above 0."""
+        from scipy.special import log_ndtr
+
+        z = self.mean / self.sigma
+        beyond = math.exp(-0.5 * z * z - 0.5 * math.log(2.0 * math.pi) - float(log_ndtr(z)))
+        return max(self.mean + self.sigma * beyond, 0.0)
+
+
+def _shared_growth(problem: SpatialProblem, at: FloatArray, stamp_s: FloatArray) -> _Growth | None:
+    """Return how the variance of what moves two landmarks alike grows; None where no two are seen together."""
     often = np.argsort(-np.bincount(problem.place, minlength=len(problem.oriented)), kind="stable")[:SEEN_TOGETHER]
     rows = [np.flatnonzero(problem.place == place) for place in often]
     slope = weight = 0.0
@@ -136,38 +152,16 @@ def _shared_growth(problem: SpatialProblem, at: FloatArray, stamp_s: FloatArray)
             variance = (0.25 * (sums + differences)) ** 2 / _worth(stamp_s[a], lags_s)
             slope += float((lags_s * 0.25 * (sums - differences) / variance).sum())
             weight += float((lags_s**2 / variance).sum())
-    if weight == 0.0:
-        return 0.0, np.inf
-    return max(slope / weight - weight**-0.5, 0.0), max(slope / weight, 0.0) + weight**-0.5
+    return None if weight == 0.0 else _Growth(slope / weight, weight**-0.5)
 
 
-def _least_growth(curve: _Curve) -> float:
+def _least_growth(curve: Curve) -> float:
     """Return the unbounded growth of a curve, in addition to persistent errors."""
     from scipy.optimize import nnls
 
-    columns = np.column_stack([*_columns(curve, PERSIST_S[:-2]), curve.lag_s])
+    columns = np.column_stack([*curve_columns(curve, PERSIST_S[:-2]), curve.lag_s])
     found, _ = nnls(columns / curve.square[:, None], np.ones(len(curve.lag_s)))
     return float(found[-1])
-
-
-def _columns(curve: _Curve, persist_s: Sequence[float]) -> list[FloatArray]:
-    """Shapes of white noise, and of errors that persist for each of some times."""
-    return [np.ones(len(curve.lag_s)), *(1.0 - np.exp(-curve.lag_s / each_s) for each_s in persist_s)]
-
-
-def _fitted(curve: _Curve, persist_s: Sequence[float], growth: float) -> tuple[FloatArray, float]:
-    """Parts of a curve, white and persistent for each of some times, beside what grows by the second; and their log
-    likelihood (squares are Gamma distributed; reweighted by what is fitted).
-    """
-    from scipy.optimize import nnls
-
-    columns, known = np.column_stack(_columns(curve, persist_s)), growth * curve.lag_s
-    found, fitted = np.zeros(columns.shape[1]), curve.square
-    for _ in range(ROUNDS_OF_FIT):
-        weight = np.sqrt(curve.worth) / fitted
-        found, _ = nnls(columns * weight[:, None], (curve.square - known) * weight)
-        fitted = np.maximum(columns @ found + known, LEAST_OF_SQUARE * curve.square)
-    return found, float(curve.worth @ (-np.log(fitted) - curve.square / fitted))
 
 
 def _medians(lag_s: FloatArray, square: FloatArray, fewest: int = FEWEST_PAIRS) -> tuple[FloatArray, FloatArray]:
@@ -181,17 +175,6 @@ def _medians(lag_s: FloatArray, square: FloatArray, fewest: int = FEWEST_PAIRS) 
     bins = [row == k for k in range(1, BINS) if np.count_nonzero(row == k) >= fewest]
     median = np.array([[np.median(lag_s[mine]), np.median(square[mine])] for mine in bins]).reshape(-1, 2)
     return median[:, 0], np.maximum(median[:, 1], 1e-12)
-
-
-def _others(stamp_s: FloatArray, persist_s: FloatArray) -> FloatArray:
-    """(K, T) how many other detections of one place err like each, for each correlation time: sums of correlations."""
-    decay, found = np.exp(-np.diff(stamp_s)[:, None] / persist_s), np.zeros((len(stamp_s), len(persist_s)))
-    for rows, kept in ((range(1, len(found)), decay), (range(len(found) - 2, -1, -1), decay[::-1])):
-        total = np.zeros(len(persist_s))
-        for row, share in zip(rows, kept, strict=True):
-            total = share * (total + 1.0)
-            found[row] += total
-    return found
 
 
 ROUNDS = 10

@@ -69,6 +69,8 @@ def converged(
 def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, begun: SpatialNoise) -> SpatialNoise:
     """Return noise levels by expectation-maximisation: residuals and their uncertainties, by inlier weight."""
     problem, kind = smoother.problem, smoother.problem.kind
+    if not problem.estimate_noise:
+        return noise
     n_steps, spread, worth = len(problem.increment), smoother.spread(now), problem.settings.pseudo_count
     trace = _traces(smoother, spread.of_factors, spread.of_factors_first)
     levels, before, start = noise.levels.copy(), noise.levels, begun.levels

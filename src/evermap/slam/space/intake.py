@@ -63,7 +63,13 @@ class SpatialIntake:
 
 
 def prepare_space(
-    recording: SpatialRecording, settings: SpaceConfig, remarks: tuple[str, ...] = (), *, fewest: int = 2
+    recording: SpatialRecording,
+    settings: SpaceConfig,
+    remarks: tuple[str, ...] = (),
+    *,
+    fewest: int = 2,
+    robust: bool = True,
+    estimate_noise: bool = True,
 ) -> SpatialIntake:
     """Select the usable part: detections of known identity, during the odometry.
 
@@ -72,6 +78,8 @@ def prepare_space(
         settings: priors of the sensors.
         remarks: on the recording, before those on what was left out.
         fewest: frames with a landmark that it takes.
+        robust: whether outliers are down-weighted.
+        estimate_noise: whether noise levels are learned.
 
     Raises:
         DataError: fewer than `fewest` frames with a landmark of known identity.
@@ -124,6 +132,8 @@ def prepare_space(
         path=_path(recording, stamps[pose_frame[0]], settings.delay_sigma_s),
         measurements=tied,
         start_sigma=np.max([[1e-4] * 6, *(of.kind.first_sigma for of in tied)], axis=0),
+        robust=robust,
+        estimate_noise=estimate_noise,
         settings=settings,
     )
     return SpatialIntake(

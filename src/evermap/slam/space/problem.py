@@ -116,6 +116,8 @@ class SpatialProblem:
         start_sigma: (6,) how firmly the first pose is held where it is.
         path: the odometry, in the time of the poses, from which delays are estimated; None without.
         measurements: of other kinds than odometry and detections.
+        robust: whether outliers are down-weighted.
+        estimate_noise: whether noise levels are learned.
         settings: what is believed of sensors and of a map.
     """
 
@@ -151,6 +153,8 @@ class SpatialProblem:
     start_sigma: FloatArray = field(default_factory=lambda: np.full(6, 1e-4))
     path: OdometryPath | None = None
     measurements: tuple[Tied, ...] = ()
+    robust: bool = True
+    estimate_noise: bool = True
     settings: SpaceConfig = USUAL
 
     def earlier(self) -> FloatArray:
@@ -207,7 +211,7 @@ class SpatialProblem:
         return SpatialSightings(
             self.pose_row, self.place, self.sensor, self.kind, oriented, self.measured, self.measured_root,
             self.sigma_rad, self.corner, self.corner_root, self.half_m, first, self.share,
-            np.array(self.settings.outlier_log_odds),
+            np.array(self.settings.outlier_log_odds) if self.robust else np.full(3, np.inf),
             self.symmetries.of[self.place], np.array([kind.axis for kind in kinds]),
             np.append(0, np.cumsum([len(kind.turns) for kind in kinds])), np.vstack([kind.turns for kind in kinds]),
             self.ray,

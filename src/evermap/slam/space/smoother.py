@@ -5,6 +5,7 @@ The border of the elimination tree are the sensors' mounts, which all detections
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +16,7 @@ from evermap.estimate.measurement import MeasurementFactors, Tied
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.geometry import se3
+from evermap.slam.correlation import Lasting, lasting_errors
 from evermap.slam.space.drift import STRETCHES
 from evermap.slam.space.factors import MapFactors, SightingFactors, SpatialOdometryFactors, SpatialStartFactor
 from evermap.slam.space.linearise import OF_STEP, POINT, ROWS, STATES
@@ -157,6 +159,28 @@ class SpatialSmoother:
             found[some, k] = -values[seen.first[some] + (k + 1) * width[some] - 1] / scale[some]
         return found
 
+    def lasting(self, now: SpatialLinear) -> Lasting:
+        """Return how long errors of detections last, by their residuals there."""
+        problem = self.problem
+        residual = np.where(np.arange(8) < ROWS[problem.kind][:, None], now.residual, np.nan)
+        return lasting_errors(residual, now.weight, problem.stamp_s[problem.pose_row], problem.place)
+
+    def counted(
+        self, estimate: SpatialEstimate, now: SpatialLinear, share: FloatArray | None = None
+    ) -> SpatialSmoother:
+        """Return the smoother that counts each detection as what it is worth beside others of its place.
+
+        Args:
+            estimate: the optimum.
+            now: the problem there.
+            share: (M,) of their information that is new; None or all of it: by the residuals, unless known already.
+        """
+        problem = self.problem
+        share = None if share is None or np.all(share == 1.0) else share
+        if share is None and np.all(problem.share == 1.0) and (lasting := self.lasting(now)).any:
+            share = lasting.information(problem.stamp_s[problem.pose_row], problem.place)
+        return self if share is None else SpatialSmoother(replace(problem, share=share), estimate.pose)
+
     def scale_by_stretches(self, now: SpatialLinear) -> tuple[float, float]:
         """Return the variance of the odometry's scale, and what one with correlated residuals has over it, at least 1.
 
@@ -170,7 +194,8 @@ class SpatialSmoother:
         stretch = np.minimum((STRETCHES * share).astype(np.int64), STRETCHES - 1)
         pose, scale = with_scale[: 6 * n].reshape(n, 6), with_scale[-1:]
         by = np.hstack([pose[:-1], pose[1:], np.tile(scale, (n - 1, 1))])
-        parts = [(stretch[:-1], now.values[:odometry].reshape(n - 1, 6, OF_STEP), by)]
+        driven, nothing = now.values[:odometry].reshape(n - 1, 6, OF_STEP), np.zeros(0, dtype=np.int64)
+        parts = [(stretch[:-1], driven, by, nothing)]
         for kind, n_rows in enumerate(ROWS.tolist()):
             for dim in (3, 6):
                 some = np.flatnonzero((seen.kind == kind) & (seen.oriented == (dim == 6)))
@@ -179,13 +204,16 @@ class SpatialSmoother:
                 sensor = begin[n + len(problem.oriented) + seen.sensor[some]][:, None] + np.arange(STATES)
                 by = np.hstack([pose[seen.pose_row[some]], with_scale[place], with_scale[sensor]])
                 rows = now.values[at].reshape(len(some), n_rows, 13 + dim)
-                parts.append((stretch[seen.pose_row[some]], rows, by))
-        pull, independent = np.zeros(STRETCHES), 0.0
-        for of, rows, by in parts:
+                parts.append((stretch[seen.pose_row[some]], rows, by, some))
+        pull, independent, influence = np.zeros(STRETCHES), 0.0, np.zeros((len(seen.kind), 8, 1))
+        for of, rows, by, some in parts:
             told = np.einsum("mra,ma->mr", rows[..., :-1], by)
             pull += np.bincount(of, (told * rows[..., -1]).sum(axis=1), STRETCHES)
             independent += float((told**2).sum())
+            influence[some, : told.shape[1], 0] = told[: len(some)]
         found = (pull**2).sum() * STRETCHES / (STRETCHES - 1.0)
+        alike = self.lasting(now).variance_beside(influence, problem.stamp_s[seen.pose_row], seen.place)
+        found = max(found, independent + float(alike[0]))
         return float(scale[0]), max(float(found / max(independent, 1e-300)), 1.0)
 
     def _blocks(self, noise: SpatialNoise, *, heavy: bool) -> tuple[FactorBlock[SpatialEstimate], ...]:
@@ -194,7 +222,8 @@ class SpatialSmoother:
         sensor = n + count
         root = np.sqrt(np.maximum(problem.lasted_s, 1e-3))
         sigma = np.repeat(np.column_stack([noise.translation * root, noise.rotation * root]), 3, axis=1)
-        jump = problem.settings.jump_log_odds if problem.driven else NO_JUMP_LOG_ODDS
+        jump = problem.settings.jump_log_odds if problem.driven and problem.robust else NO_JUMP_LOG_ODDS
+        heavy = heavy and problem.robust
         first_seen = np.zeros(count, dtype=np.int64)
         first_seen[problem.place[::-1]] = problem.pose_row[::-1]
         prior = problem.prior.place

@@ -86,9 +86,11 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     settings = problem.settings
     noise = start_noise(settings, driven=problem.driven)
     by_corners = (problem.kind == CORNERS) | problem.ray
+    counted, drift = None, drift_of(problem, intake.driven_pose) if problem.driven else None
     # pixels err by themselves, detectors of objects by the view
-    if problem.driven and 2 * np.sum(~by_corners) > len(by_corners):
-        drift = drift_of(problem, intake.driven_pose)
+    if drift is not None and 2 * np.sum(~by_corners) <= len(by_corners):
+        counted = drift.share  # places of tags by their corners err alike all the same
+    elif drift is not None:
         problem = replace(problem, share=np.where(by_corners, 1.0, drift.share))
         if problem.steady:
             noise = replace(noise, translation=settings.steady_m, rotation=settings.steady_rad)
@@ -128,6 +130,12 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     from_map = None
     if len(stated):
         optimum, from_map = compared(optimum, stated)
+    smoother, sober = optimum.smoother.counted(optimum.estimate, optimum.now, counted), optimum.noise
+    if drift is not None and counted is None and not problem.steady:
+        goes = (drift.translation or 0.0) * drift.doubt, (drift.rotation or 0.0) * drift.doubt
+        sober = replace(sober, translation=max(sober.translation, goes[0]), rotation=max(sober.rotation, goes[1]))
+    now = smoother.linearised(optimum.estimate, sober, heavy=False)
+    optimum = replace(optimum, smoother=smoother, now=now)  # for covariances, which are no better than all this
     return SpatialSolved(optimum, identity, times_of(identity), from_map, delay_sigma_s, stepwise.pose, spread, step_s)
 
 

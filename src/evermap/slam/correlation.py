@@ -1,0 +1,184 @@
+"""Errors that last: what each detection is worth beside others of its landmark that err alike.
+
+Residuals of one landmark differ by more the more time is between them: at once by white noise, to a limit by errors
+that persist for a while (a view, a pole's side, the light). White and persistent parts are fitted to half the mean
+squared difference of residuals by their lag (a variogram, Matheron 1963), which a wrong position of the landmark, or
+whatever else is the same for all of its residuals, does not change.
+
+Of detections whose errors have the correlations `a_mn`, each counts as `1 / sum_n a_mn` of an independent one: for the
+mean of a stationary sequence that is what its information comes to, `n (1 - a) / (1 + a)` of the first-order
+autoregressive one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evermap.compiled import kept
+from evermap.types import BoolArray, FloatArray, IntArray
+
+kernel = kept(effort=1, error_model="numpy")
+
+PERSIST_S = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+"""Correlation times of detection errors that are tried together; none that is longer than the recording."""
+BINS, FEWEST_BINS, FEWEST_PAIRS = 14, 4, 30
+MOST_LAGS = 50.0
+"""Lags that follow one another in a recording vary independently, but shorter ones are no better known than so many."""
+ROUNDS_OF_FIT, LEAST_OF_SQUARE = 6, 0.1
+PERSISTS = 2.0
+"""Nats a curve by which errors that persist must explain all curves better than white ones: of two numbers more for
+each of them (Akaike 1974)."""
+LEAST_WEIGHT = 0.5
+"""Inlier probability from which a residual counts."""
+
+
+class Curve(NamedTuple):
+    """Mean or median squares (K,) of differences, for one axis, by their lags [s], and half the degrees of freedom."""
+
+    lag_s: FloatArray
+    square: FloatArray
+    worth: FloatArray
+
+
+class Lasting(NamedTuple):
+    """How long errors last.
+
+    Attributes:
+        persist_s: (T,) correlation times.
+        share: (T,) of the variance that has each; the rest is white.
+    """
+
+    persist_s: FloatArray
+    share: FloatArray
+
+    @property
+    def any(self) -> bool:
+        """Return whether some last."""
+        return bool(self.share.any())
+
+    def information(self, stamp_s: FloatArray, place: IntArray) -> FloatArray:
+        """Return (M,) shares of the information of detections of places (M,) at (M,) stamps, sorted by time."""
+        if not self.any:
+            return np.ones(len(place))
+        one = np.ones((len(place), 1))
+        before, after = (
+            carry(one, np.ascontiguousarray(each_s), np.ascontiguousarray(each), self.persist_s, self.share)[:, 0]
+            for each_s, each in ((stamp_s, place), (-stamp_s[::-1], place[::-1]))
+        )
+        return np.asarray(1.0 / (1.0 + before + after[::-1]))
+
+    def variance_beside(self, influence: FloatArray, stamp_s: FloatArray, place: IntArray) -> FloatArray:
+        """Return (S,) variances of linear estimates that correlation adds, beside those of independent errors.
+
+        Args:
+            influence: (M, D, S) of each whitened component on them.
+            stamp_s: (M,) of the detections, sorted.
+            place: (M,) what was seen.
+        """
+        if not self.any:
+            return np.zeros(influence.shape[2])
+        flat = np.ascontiguousarray(influence.reshape(len(place), -1))
+        both = 2.0 * (flat * carry(flat, stamp_s, place, self.persist_s, self.share)).sum(axis=0)
+        return np.asarray(both.reshape(influence.shape[1:]).sum(axis=0))
+
+
+@kernel
+def carry(value: FloatArray, stamp_s: FloatArray, place: Any, persist_s: FloatArray, share: FloatArray) -> FloatArray:
+    """Return (M, S) sums of values (M, S) of the same place before, each by its correlation with the present one."""
+    count = 0
+    for m in range(len(place)):
+        count = max(count, place[m] + 1)
+    kinds, width = len(persist_s), value.shape[1]
+    total, last = np.zeros((count, kinds, width)), np.full(count, np.nan)
+    found = np.zeros(value.shape)
+    for m in range(len(place)):
+        j = place[m]
+        for k in range(kinds):
+            kept = math.exp(-(stamp_s[m] - last[j]) / persist_s[k]) if last[j] == last[j] else 0.0
+            for a in range(width):
+                total[j, k, a] *= kept
+                found[m, a] += share[k] * total[j, k, a]
+                total[j, k, a] += value[m, a]
+        last[j] = stamp_s[m]
+    return found
+
+
+def lasting_errors(residual: FloatArray, weight: FloatArray, stamp_s: FloatArray, place: IntArray) -> Lasting:
+    """Return how long errors last, by the residuals of all landmarks together.
+
+    Args:
+        residual: (M, D) whitened; nan where a detection has fewer components.
+        weight: (M,) inlier probabilities.
+        stamp_s: (M,) of the detections, sorted.
+        place: (M,) what was seen.
+    """
+    persist_s = np.array([each for each in PERSIST_S if each <= max(float(np.ptp(stamp_s)), PERSIST_S[0])])
+    none = Lasting(persist_s, np.zeros(len(persist_s)))
+    curve = _pooled(residual, weight > LEAST_WEIGHT, stamp_s, place)
+    if len(curve.lag_s) < FEWEST_BINS:
+        return none
+    white, (parts, log_likelihood) = fit_curve(curve, [], 0.0)[1], fit_curve(curve, persist_s.tolist(), 0.0)
+    if log_likelihood - white < PERSISTS:
+        return none
+    return Lasting(persist_s, parts[1:] / max(float(parts.sum()), 1e-12))
+
+
+def _pooled(residual: FloatArray, used: BoolArray, stamp_s: FloatArray, place: IntArray) -> Curve:
+    """Half of the mean squares of differences, a component, over pairs of residuals of one landmark."""
+    rows = np.flatnonzero(used)
+    rows = rows[np.argsort(place[rows], kind="stable")]
+    lags, squares = [], []
+    apart = 1
+    while apart < len(rows):  # of all pairs those 1, 2, 3, 4, 6, 8, 12, ... sightings apart
+        one, other = rows[:-apart], rows[apart:]
+        same = place[one] == place[other]
+        one, other = one[same], other[same]
+        if not len(one):
+            break
+        lags.append(stamp_s[other] - stamp_s[one])
+        squares.append(np.nanmean((residual[other] - residual[one]) ** 2, axis=1))
+        apart += max(1, apart // 2)
+    if not lags:
+        return Curve(*np.zeros((3, 0)))
+    lag_s, square = np.concatenate(lags), 0.5 * np.concatenate(squares)
+    lag_s, square = lag_s[lag_s > 0.0], square[lag_s > 0.0]
+    if len(lag_s) < FEWEST_PAIRS:
+        return Curve(*np.zeros((3, 0)))
+    edges = np.geomspace(lag_s.min(), lag_s.max() * (1.0 + 1e-9), BINS)
+    row = np.digitize(lag_s, edges)
+    count = np.bincount(row, minlength=BINS)
+    bins = [k for k in range(1, BINS) if count[k] >= FEWEST_PAIRS]
+    lag = np.array([np.median(lag_s[row == k]) for k in bins])
+    mean = np.array([square[row == k].mean() for k in bins])
+    # pairs that overlap in time say the same: so many differ, of all landmarks
+    first, last = np.full((2, place.max() + 1), np.inf)
+    np.minimum.at(first, place[rows], stamp_s[rows])
+    np.minimum.at(last, place[rows], -stamp_s[rows])
+    span = np.where(np.isfinite(first), -last - first, 0.0)
+    worth = np.array([np.clip(span[span >= each] / each, 1.0, MOST_LAGS).sum() for each in lag])
+    return Curve(
+        lag, np.maximum(mean, 1e-12), 0.5 * residual.shape[1] * np.maximum(np.minimum(worth, count[bins]), 1.0)
+    )
+
+
+def curve_columns(curve: Curve, persist_s: tuple[float, ...] | list[float]) -> list[FloatArray]:
+    """Return shapes of white noise, and of errors that persist for each of some times."""
+    return [np.ones(len(curve.lag_s)), *(1.0 - np.exp(-curve.lag_s / each_s) for each_s in persist_s)]
+
+
+def fit_curve(curve: Curve, persist_s: tuple[float, ...] | list[float], growth: float) -> tuple[FloatArray, float]:
+    """Return the parts of a curve, white and persistent for each of some times, beside what grows by the second; and
+    their log likelihood (squares are Gamma distributed; reweighted by what is fitted).
+    """
+    from scipy.optimize import nnls
+
+    columns, known = np.column_stack(curve_columns(curve, persist_s)), growth * curve.lag_s
+    found, fitted = np.zeros(columns.shape[1]), curve.square
+    for _ in range(ROUNDS_OF_FIT):
+        weight = np.sqrt(curve.worth) / fitted
+        found, _ = nnls(columns * weight[:, None], (curve.square - known) * weight)
+        fitted = np.maximum(columns @ found + known, LEAST_OF_SQUARE * curve.square)
+    return found, float(curve.worth @ (-np.log(fitted) - curve.square / fitted))
