@@ -85,6 +85,7 @@ def live(
     from evermap.io import read_recording
     from evermap.live.wires import Mailbox, wires_of
     from evermap.maps.store import is_address
+    from evermap.slam.plane import in_its_space
 
     chosen = configured(config, settings, within="live", also=["slam", "living", "sensor", "output"])
     if map_file is not None and is_address(map_file):
@@ -98,6 +99,8 @@ def live(
         refuse_given("needs a map", "--map FILE", sensor=sensor, topics=topics, **told)
     _check_source(map_file, replay, sensor, connected=connected)
     recording = None if replay is None else read_recording(replay, robot=robot)
+    if recording is not None and map_file is not None and sensor is None and topics is None:
+        recording = in_its_space(recording, chosen.slam, dim=2)
     _check_needed(recording, chosen, sensor, topics)
     mailbox = Mailbox() if replay is None else None
     wires = wires_of(zenoh, foxglove, mailbox)

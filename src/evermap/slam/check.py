@@ -103,12 +103,18 @@ def findings(recording: Recording, *, identities: bool = True, settings: CheckCo
 
 def findings_in_space(recording: SpatialRecording, settings: SlamConfig) -> tuple[Finding, ...]:
     """Return everything that is odd about a valid recording in space, the worst first; its truth is not looked at."""
-    found = [*_left_out(recording, settings), *_motion(recording, settings.check), *_limits_in_space(recording)]
+    found = [*_left_out(recording, settings), *_read_wrongly_in_space(recording, settings)]
+    return tuple(sorted(found, key=lambda finding: finding.usable))
+
+
+def _read_wrongly_in_space(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:
+    """Units, axes, clocks, limits, identities and jumps: all but what the estimator leaves out, and says so itself."""
+    found = [*_motion(recording, settings.check), *_limits_in_space(recording)]
     if settings.unknown_ids is not True:
         found += _identities(recording, settings.check)
     if recording.odometry is not None and all(finding.usable for finding in found):
         found += _jumps(recording.odometry, settings.cleaning)
-    return tuple(sorted(found, key=lambda finding: finding.usable))
+    return found
 
 
 def odd(recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> tuple[str, ...]:
@@ -389,7 +395,7 @@ def _motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]:
     return found
 
 
-def unusable(recording: Recording, settings: CheckConfig) -> Finding | None:
+def unusable(recording: AnyRecording, settings: CheckConfig) -> Finding | None:
     """Return why static landmarks seem to move by the odometry of a recording; None if they do not."""
     return next(iter(_motion(recording, settings)), None)
 
@@ -420,7 +426,7 @@ def screened(
 ) -> tuple[Any, tuple[str, ...]]:
     """Return a recording without ids that other detections contradict, and remarks on it.
 
-    A recording in space, or one without ids to use, is returned as it is. With `repair`, what is impossible in a
+    One without ids to use is returned as it is. With `repair`, what is impossible in a
     recording in the plane is left out (`slam.cleaning`), instead of refused.
 
     Raises:
@@ -434,6 +440,7 @@ def screened(
     settings, remarks = config.slam, tuple[str, ...]()
     if isinstance(recording, SpatialRecording):
         recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
+        remarks = tuple(finding.message for finding in _read_wrongly_in_space(recording, settings))
     else:
         if repair:
             recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
@@ -453,7 +460,7 @@ def screened(
 def check_recording(recording: AnyRecording, config: Config | None = None) -> Check:
     """Return a summary of a recording, and its problems: units, signs, clocks, identities, limits, gaps, jumps.
 
-    In the plane `run_slam`, `run_session` and `run_localization` tell the same in the warnings of their results.
+    `run_slam`, `run_session` and `run_localization` tell the same in the warnings of their results.
 
     Args:
         recording: what a reader returned; its truth is not looked at.
@@ -463,10 +470,12 @@ def check_recording(recording: AnyRecording, config: Config | None = None) -> Ch
         InputError: no recording, or one with values that cannot be.
         DataError: nothing can be estimated from it.
     """
+    from evermap.slam.plane import in_its_space
     from evermap.slam.space.moving import has_traffic
 
     config = config or Config()
     settings = config.slam
+    recording = in_its_space(recording, settings)
     if isinstance(recording, SpatialRecording):
         validate_spatial(recording)
         recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))

@@ -213,13 +213,13 @@ def off(residual: FloatArray) -> FloatArray:
 
 def pairs_of(recording: AnyRecording, settings: CheckConfig = USUAL) -> Pairs | None:
     """Return pairs of sightings; None if hardly any landmark is seen twice during the odometry."""
-    first, second = _pairs(recording, settings)
+    first, second = sighting_pairs(recording, settings)
     if len(first) < settings.fewest:
         return None
     return (SpatialPairs if isinstance(recording, SpatialRecording) else PlanarPairs)(recording, first, second)  # type: ignore[arg-type]
 
 
-def _pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, IntArray]:
+def sighting_pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, IntArray]:
     """Return pairs of rows of detections of one landmark, within a few seconds and during the odometry."""
     detections = recording.detections
     stamp_s = recording.frames.stamp_s[detections.frame]
@@ -374,7 +374,7 @@ def clock_steps(recording: Recording) -> tuple[FloatArray, FloatArray]:
         (K,) stamps of frames, the first -inf, and (K,) delays that hold from then on [s].
     """
     settings = USUAL
-    first, second = _pairs(recording, settings)
+    first, second = sighting_pairs(recording, settings)
     if len(first) < settings.fewest:
         return np.array([-inf]), np.zeros(1)
     pairs = PlanarPairs(recording, first, second)
