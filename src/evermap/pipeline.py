@@ -124,10 +124,10 @@ def run_session(
         entered = bring_in(solve_alone(recording, living, config, progress=progress), living, config)
         return session.begun_with(entered, whole)
     recording, remarks = check.screened(nameless.without_ids(recording, config), config)
+    session.check_static(recording, config)
     recording, living = session.admitted(recording, living)
     if config.slam.unknown_ids:
         recording, living = session.admitted(nameless.named_in(recording, living, config), living)
-    session.check_static(recording, config)
     entered = session.brought_in(boxes.localised(recording, living, config, remarks, progress), living, config.living)
     return session.begun_with(entered, whole)
 

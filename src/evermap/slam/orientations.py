@@ -23,16 +23,14 @@ TURNED_RAD = 0.3
 WITH_ROBOT = 0.3
 """Share of the robot's turn by which orientations in the sensor's frame change that do not see it; it must be the
 median, as must the rest of the turn in the world."""
-UNRELATED_RAD = 1.0
-"""Median difference of orientations in the world above which they say nothing: random ones differ by 2.2."""
 
 
 def without_unmeasured(recording: AnyRecordingT, settings: CheckConfig) -> AnyRecordingT:
     """Return a recording without orientations that nobody measured, with a warning for each sensor that gave them.
 
     Those of a sensor are left out if all are the default (0, 0, 0, 1); if all are another constant although the robot
-    turned; or if those of one landmark, seconds apart, turn with the robot, or are unrelated, in the world. Boxes,
-    tags with corners, and classes with symmetries are not asked.
+    turned; or if those of one landmark, seconds apart, turn with the robot. Boxes, tags with corners, and classes with
+    symmetries are not asked.
     """
     if not isinstance(recording, SpatialRecording):
         return recording
@@ -86,6 +84,4 @@ def _why_unmeasured(recording: SpatialRecording, mine: BoolArray, settings: Chec
     in_world = se3.angle_between(se3.compose(eye[first], own[first]), se3.compose(eye[second], own[second]))
     if np.median(in_sensor / angle) < WITH_ROBOT and np.median(in_world / angle) > 1.0 - WITH_ROBOT:
         return "they turn with the robot"
-    if np.median(in_world) > UNRELATED_RAD:
-        return f"those of one landmark differ by {np.median(in_world):.1f} rad within seconds"
     return ""

@@ -19,6 +19,7 @@ import numpy as np
 from evermap.config import CheckConfig, SlamConfig
 from evermap.errors import ConfigError
 from evermap.geometry import se2, se3
+from evermap.slam.check import unusable
 from evermap.slam.mistakes import sighting_pairs
 from evermap.slam.orientations import without_unmeasured
 from evermap.slam.space.intake import positions_of, without_range
@@ -77,6 +78,9 @@ def in_its_space(recording: AnyRecording, settings: SlamConfig, *, dim: int | No
     if obstacle or not is_on_floor(recording, settings.check):
         return recording
     if dim != 2 and np.isfinite(recording.detections.corner_px[:, 0, 0]).any():
+        return recording
+    wrong = unusable(recording, settings.check)
+    if wrong is not None and not wrong.usable:  # refused by its name there: velocities in mm/s are no velocities
         return recording
     why = "the odometry is planar and landmarks keep their heights (slam.plane = false: in space)"
     return _in_plane(recording, why)
