@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from bags import TILTED, write_floor
-from evermap_studies.sim import BuildingConfig, simulate_building
 
 from evermap import check_recording, run_localization, run_session, run_slam
 from evermap.config import Config
@@ -22,6 +22,7 @@ from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.orientations import without_unmeasured
 from evermap.slam.plane import in_its_space
 from evermap.types import Recording, SlamResult, SpatialRecording
+from evermap_studies.sim import BuildingConfig, simulate_building
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 
@@ -50,8 +51,8 @@ def measured(recording: Recording, sigma_rad: float = 0.05) -> Callable[[int, in
     return rotation
 
 
-def bag(folder: Path, day: int = 0, **how: object) -> SpatialRecording:
-    recording = read_recording(write_floor(folder / f"bag{day}", days()[day], **how))  # type: ignore[arg-type]
+def bag(folder: Path, day: int = 0, **how: Any) -> SpatialRecording:
+    recording = read_recording(write_floor(folder / f"bag{day}", days()[day], **how))
     assert isinstance(recording, SpatialRecording)
     return recording
 
@@ -59,7 +60,9 @@ def bag(folder: Path, day: int = 0, **how: object) -> SpatialRecording:
 def error_m(result: SlamResult, day: int) -> float:
     truth = days()[day].truth
     assert truth is not None
-    return evaluate_trajectory(result.trajectory, truth).rmse_m
+    errors = evaluate_trajectory(result.trajectory, truth)
+    assert errors is not None
+    return errors.rmse_m
 
 
 @pytest.mark.parametrize(("day", "kind"), [(0, "objects"), (1, "tags")])
@@ -124,7 +127,7 @@ def test_only_a_robot_on_a_floor_is_in_the_plane(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("how", "unit"), [({"unit": 1e3}, "millimetres"), ({"odometry_unit": 1e3}, "millimetres")])
 def test_units_of_a_bag_are_checked(how: dict[str, float], unit: str, tmp_path: Path) -> None:
-    recording = bag(tmp_path, **how)
+    recording = bag(tmp_path, 0, **how)
     check = check_recording(recording)
     assert not check.usable
     assert unit in check.findings[0].message

@@ -1,4 +1,4 @@
-"""Orientations that nobody measured: defaults of messages, and those that turn with the robot.
+"""Orientations that were not measured: defaults of messages, and those that turn with the robot.
 
 A point detector fills the orientation of its message with ROS's default (0, 0, 0, 1), or with a constant. Taken for
 measurements they say that landmarks turn as the robot does: dead reckoning is better. An orientation that was measured
@@ -26,7 +26,7 @@ median, as must the rest of the turn in the world."""
 
 
 def without_unmeasured(recording: AnyRecordingT, settings: CheckConfig) -> AnyRecordingT:
-    """Return a recording without orientations that nobody measured, with a warning for each sensor that gave them.
+    """Return a recording without orientations that were not measured, with a warning for each sensor that gave them.
 
     Those of a sensor are left out if all are the default (0, 0, 0, 1); if all are another constant although the robot
     turned; or if those of one landmark, seconds apart, turn with the robot. Boxes, tags with corners, and classes with
