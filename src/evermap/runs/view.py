@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from evermap.config import Config
 from evermap.errors import ConfigError, EvermapError
 from evermap.io.spatial import spatial_detections
-from evermap.maps.living import LivingMap
-from evermap.maps.sessions.session import in_its_space
+from evermap.maps.sessions.session import as_estimated
 from evermap.runs.folder import SUMMARY
 from evermap.runs.summary import change_of
 from evermap.types import (
@@ -109,9 +107,8 @@ def _of_run(folder: Path) -> tuple[AnyRecording, SlamResult]:
         read_tum(folder / f"{name}.tum", clock=clock, in_space=in_space) for name in ("trajectory", "online")
     )
     recording, remarks = _recording(about, clock)
-    if isinstance(recording, SpatialRecording) and not in_space:  # a robot on a floor
-        recording = in_its_space(recording, LivingMap.begun(landmarks), Config())
     result = _result(path, online, landmarks, changes=changes, warnings=remarks)
+    recording = as_estimated(recording, result)
     return recording, replace(result, innovations=_innovations(folder / "innovations.parquet"))
 
 

@@ -43,6 +43,8 @@ LEVEL_RAD = 0.01
 """Roll and pitch of the odometry of a robot on a floor."""
 HEIGHT_SHARE = 0.1
 """Difference between two heights of one landmark, as a share of its range, that a mount or a ramp must explain."""
+FEWEST_LANDMARKS = 3
+"""Landmarks whose heights must be known to show a floor."""
 OVERHEAD = 0.1
 """Share of its range that a detection must be away along the floor: else it has no bearing."""
 FIELD_MARGIN_RAD = 0.05
@@ -119,7 +121,7 @@ def is_on_floor(recording: SpatialRecording, settings: CheckConfig) -> bool:
         return False
     height, range_m = _on_floor(recording)[:, 2], np.linalg.norm(positions_of(recording), axis=1)
     first, second = sighting_pairs(recording, settings)
-    if not len(first):
+    if len(first) < settings.fewest or len(np.unique(recording.detections.landmark_id[first])) < FEWEST_LANDMARKS:
         return False
     apart = np.abs(height[first] - height[second]) / np.maximum(range_m[first], range_m[second])
     return bool(np.median(apart) < HEIGHT_SHARE)

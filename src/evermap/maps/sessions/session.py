@@ -118,6 +118,14 @@ def in_its_space(recording: AnyRecording, living: LivingMap | None, config: Conf
     return plane.in_its_space(recording, config.slam, dim=dim)
 
 
+def as_estimated(recording: AnyRecording, result: SlamResult) -> AnyRecording:
+    """Return a recording in the space of its result: in the plane where it was estimated there."""
+    flat = result.trajectory.pose_world_robot.shape[1] == 3
+    if not flat or not isinstance(recording, SpatialRecording):
+        return recording
+    return plane.in_its_space(recording, Config().slam, dim=2)
+
+
 def check_static(recording: SpatialRecording, config: Config) -> None:
     """Refuse a session in which a mistake in units, axes or clocks makes static landmarks move.
 
