@@ -21,7 +21,8 @@ from evermap.metrics.summary import compare_with_truth
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.runs.sessions import Entered
 from evermap.show import LONGEST, Shown, ShownTable
-from evermap.slam.check import Check, Finding
+from evermap.slam.check import Check
+from evermap.slam.mistakes import Finding
 from evermap.survival import Exponential, PiecewiseConstantHazard, StepLifetime, Weibull
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazard_regression import HazardDraws

@@ -618,6 +618,9 @@ class SlamConfig(Section):
     estimate_noise: bool = key(True, "learn noise levels from the recording; off: keep the nominal ones")
     odometry_noise_factor: Positive = key(1.0, "factor on the initial odometry noise, kept if estimate_noise is off")
     online: bool = key(False, "also compute what the robot knew at the time of each frame: `online.tum`, step times")
+    plane: bool | None = key(
+        None, "estimate a recording in space in the plane, or not; without: where it is one of a robot on a floor"
+    )
     seed: int = key(0, "random seed", ge=0)
     calibration: CalibrationConfig = part(CalibrationConfig, "calibration states")
     modes: ModesConfig = part(ModesConfig, "methods 'max-mixture' to 'viterbi': landmarks with several positions")

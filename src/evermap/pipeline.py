@@ -42,11 +42,13 @@ def run_slam(
         NumericalError: no finite optimum.
     """
     from evermap.maps.sessions import nameless, session
-    from evermap.slam import association, check
+    from evermap.slam import association, check, plane
     from evermap.slam.space.moving import has_traffic, run_in_traffic
 
     config = config or Config()
+    recording, prior_map, told = plane.with_prior(recording, prior_map, config.slam)
     recording, remarks = check.screened(recording, config, prior_map)
+    remarks = (*told, *remarks)
     if config.slam.unknown_ids and prior_map is not None:
         recording = nameless.numbered_in(recording, prior_map, config)  # type: ignore[type-var]
     else:
@@ -127,11 +129,13 @@ def run_session(
     from evermap.slam import check
 
     config = config or Config()
+    recording = session.in_its_space(recording, living, config)
     living, whole = session.opened(living, recording), recording
     if not isinstance(recording, SpatialRecording):
         entered = bring_in(solve_alone(recording, living, config, progress=progress), living, config)
         return session.begun_with(entered, whole)
     recording, remarks = check.screened(nameless.without_ids(recording, config), config)
+    session.check_static(recording, config)
     recording, living = session.admitted(recording, living)
     if config.slam.unknown_ids:
         recording, living = session.admitted(nameless.named_in(recording, living, config), living)
@@ -193,6 +197,7 @@ def run_localization(
         raise ConfigError(problem, field="slam.unknown_ids", hint="leave it out, or enter the session")
     if not len(living.places):
         raise DataError("the map is empty", field="living", hint="enter a session first")
+    recording = session.in_its_space(recording, living, config)
     if isinstance(recording, SpatialRecording):
         recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
         recording, living = session.admitted(recording, living)

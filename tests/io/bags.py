@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.geometry import se3
+from evermap.geometry import se2, se3
 from evermap.geometry.camera import project
 from evermap.types import SpatialSensor
 
@@ -291,4 +291,79 @@ def write(path: Path, detector: str, *, late_s: float = 0.0, mounted: bool = Tru
     for file in path.glob("*.db3"):  # those of Humble do not hold the types of their messages
         with closing(sqlite3.connect(file)) as database, database:
             database.execute("DELETE FROM message_definitions")
+    return path
+
+
+TILTED = np.append([0.15, 0.0, 0.4], se3.from_angles([0.0, 0.3, 0.0])[3:])
+"""A mount above the floor, that looks down."""
+
+
+def dead_reckoned(odometry: Any) -> np.ndarray:
+    """(N, 7) poses that the velocities of a robot on a floor lead to, from the origin."""
+    pose, step = np.zeros(3), np.diff(odometry.stamp_s)
+    found = [pose]
+    twist = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
+    for row in range(len(step)):
+        pose = se2.compose(pose, se2.exp(twist[row] * step[row]))
+        found.append(pose)
+    return se3.from_plane(np.array(found))
+
+
+def write_floor(
+    path: Path,
+    recording: Any,
+    *,
+    mount: np.ndarray = TILTED,
+    kind: str = "objects",
+    odometry_unit: float = 1.0,
+    unit: float = 1.0,
+    rotation: Callable[[int, int], np.ndarray] | None = None,
+    clock_s: float = 0.0,
+) -> Path:
+    """A bag of ROS 2 of a recording in the plane: points by `Detection3DArray`, or tags by `ArucoMarkers`, in a frame
+    that is mounted at a pose, each landmark at a height of its own.
+
+    `rotation`: quaternion of the orientation of a landmark in a frame, by its row; without: the default of ROS.
+    """
+    from rosbags import rosbag2
+    from rosbags.rosbag2 import StoragePlugin
+
+    ros, seen, frames = release(2), recording.detections, recording.frames.stamp_s + clock_s
+    flat, poses = np.array(recording.sensor.mount_robot_sensor), dead_reckoned(recording.odometry)
+    ahead = np.column_stack([seen.range_m * np.cos(seen.bearing_rad), seen.range_m * np.sin(seen.bearing_rad)])
+    height = 0.2 + 0.1 * (seen.landmark_id % 13)
+    at = se3.transform(se3.inverse(mount), np.column_stack([se2.transform(flat, ahead), height])) * unit
+    seen_type = {"objects": "vision_msgs/Detection3DArray", "tags": "aruco_msgs/ArucoMarkers"}[kind]
+    topics = {"/odom": "nav_msgs/Odometry", "/tf_static": "tf2_msgs/TFMessage", "/seen": seen_type}
+    with rosbag2.Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
+        full = {topic: "{}/msg/{}".format(*name.split("/")) for topic, name in topics.items()}
+        to = {topic: bag.add_connection(topic, name, typestore=ros.store) for topic, name in full.items()}
+
+        def put(topic: str, stamp_s: float, message: Any) -> None:
+            bag.write(to[topic], round(stamp_s * 1e9), ros.store.serialize_cdr(message, full[topic]))
+
+        put("/tf_static", frames[0], ros.transform(frames[0], "base_link", "eye", mount))
+        scale = np.array([odometry_unit] * 3 + [1.0] * 4)
+        for stamp_s, pose in zip(recording.odometry.stamp_s + clock_s, poses, strict=True):
+            put("/odom", stamp_s, ros.odometry(stamp_s, pose * scale))
+        first = np.searchsorted(seen.frame, np.arange(len(frames) + 1))
+        for frame, stamp_s in enumerate(frames):
+            rows = range(first[frame], first[frame + 1])
+            turn = [se3.NO_TURN if rotation is None else rotation(frame, row) for row in rows]
+            found = [ros.pose(np.append(at[row], one)) for row, one in zip(rows, turn, strict=True)]
+            header = ros.header(stamp_s, "eye")
+            if kind == "tags":
+                names = seen.landmark_id[rows.start : rows.stop]
+                put("/seen", stamp_s, ros.make("aruco_msgs/ArucoMarkers", header, names, found))
+                continue
+            boxes = []
+            for row, pose in zip(rows, found, strict=True):
+                label = recording.class_names[seen.class_id[row]] if seen.class_id[row] >= 0 else ""
+                spread = ros.make("geometry_msgs/PoseWithCovariance", pose, np.zeros(36))
+                hypothesis = ros.make("vision_msgs/ObjectHypothesis", label, 0.9)
+                result = ros.make("vision_msgs/ObjectHypothesisWithPose", hypothesis, spread)
+                box = ros.make("vision_msgs/BoundingBox3D", pose, ros.make("geometry_msgs/Vector3", 0.0, 0.0, 0.0))
+                name = str(seen.landmark_id[row]) if seen.landmark_id[row] >= 0 else ""
+                boxes.append(ros.make("vision_msgs/Detection3D", header, [result], box, name))
+            put("/seen", stamp_s, ros.make("vision_msgs/Detection3DArray", header, boxes))
     return path

@@ -15,7 +15,8 @@ from evermap import check_recording, run_session, run_slam
 from evermap.errors import DataError, InputError
 from evermap.io import list_robots, read_mrclam, read_recording, write_template
 from evermap.slam.calibration import SPECS
-from evermap.slam.check import USUAL, far_off
+from evermap.slam.check import far_off
+from evermap.slam.mistakes import USUAL
 from evermap.types import ParameterEstimate, Recording
 from evermap_studies.sim import BuildingConfig, simulate_building
 

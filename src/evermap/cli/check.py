@@ -52,7 +52,7 @@ def check(
     from evermap.io import read_recording
     from evermap.slam.check import check_recording
 
-    reads = ("check", "cleaning", "space", "unknown_ids")
+    reads = ("check", "cleaning", "space", "plane", "unknown_ids")
     unread = [f"slam.{name}" for name in SlamConfig.model_fields if name not in reads]
     refuse_unread(settings or [], {"by this command": unread}, within="slam.check")
     found = check_recording(read_recording(input, robot=robot), chosen)

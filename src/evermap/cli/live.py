@@ -85,6 +85,7 @@ def live(
     from evermap.io import read_recording
     from evermap.live.wires import Mailbox, wires_of
     from evermap.maps.store import is_address
+    from evermap.slam.plane import in_its_space
 
     chosen = configured(config, settings, within="live", also=["slam", "living", "sensor", "output"])
     if map_file is not None and is_address(map_file):
@@ -98,6 +99,8 @@ def live(
         refuse_given("needs a map", "--map FILE", sensor=sensor, topics=topics, **told)
     _check_source(map_file, replay, sensor, connected=connected)
     recording = None if replay is None else read_recording(replay, robot=robot)
+    if recording is not None and map_file is not None and sensor is None and topics is None:
+        recording = in_its_space(recording, chosen.slam, dim=_dimension_of(Path(map_file)))
     _check_needed(recording, chosen, sensor, topics, map_file=map_file, connected=connected)
     mailbox = Mailbox() if replay is None else None
     wires = wires_of(zenoh, foxglove, mailbox)
@@ -111,6 +114,17 @@ def live(
     finally:
         for wire in wires:
             wire.close()
+
+
+def _dimension_of(map_file: Path) -> int | None:
+    """Return whether a map is in the plane (2) or in space (3); None where there is none yet, or nothing in it."""
+    from evermap.maps.store import open_store
+
+    if not map_file.exists():
+        return None
+    with open_store(map_file) as store:
+        living = store.load(store.head())
+    return living.dim if len(living.places) else None
 
 
 def _check_source(map_file: str | None, replay: Path | None, sensor: Path | None, *, connected: bool) -> None:

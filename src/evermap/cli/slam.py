@@ -307,12 +307,15 @@ def _run_alone(recording: AnyRecording, prior: Landmarks | None, out: Path, aske
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.pipeline import run_slam
     from evermap.slam.changes.joint import may_search
+    from evermap.slam.plane import with_prior
+    from evermap.slam.space.moving import has_traffic
     from evermap.types import SpatialRecording
 
     unknown_ids = asked.config.slam.unknown_ids
-    if isinstance(recording, SpatialRecording):
-        from evermap.slam.space.moving import has_traffic
-
+    recording, prior, _ = with_prior(recording, prior, asked.config.slam)
+    in_space = isinstance(recording, SpatialRecording)
+    _refuse_unread(asked, in_space=in_space, boxes=has_traffic(recording))
+    if in_space:
         if asked.realtime:
             problem = "all frames of a recording in space are solved together"
             raise ConfigError(problem, field="realtime", hint="leave it out")
@@ -469,14 +472,11 @@ def _refuse_unread(asked: _Asked, *, in_space: bool, boxes: bool = False) -> Non
 def _read(path: Path, asked: _Asked) -> AnyRecording:
     """Read a recording, and write it condensed where that is asked for: repaired first, as before it enters a map."""
     from evermap.io import read_recording
-    from evermap.slam.space.moving import has_traffic
-    from evermap.types import Recording
 
     session = asked.offline_session
     if session is not None and session.exists() and not asked.force:
         raise ConfigError(f"{session} is there already", field="offline_session", hint="another name, or --force")
     recording = read_recording(path, robot=asked.robot, topics=asked.topics)
-    _refuse_unread(asked, in_space=not isinstance(recording, Recording), boxes=has_traffic(recording))
     if session is not None:
         from evermap.io.native_write import write_session
         from evermap.maps.sessions.session import repaired
@@ -544,20 +544,20 @@ def _run_in_map(
     """Run, write the folder, then commit the map, so that every session in the map has its folder."""
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.existence.models import priors_of
+    from evermap.maps.sessions.session import in_its_space
     from evermap.maps.store import open_store
     from evermap.pipeline import run_localization
     from evermap.runs.sessions import at_time, begin_map, enter_session
+    from evermap.slam.space.moving import has_traffic
     from evermap.types import SpatialRecording
 
     config, localize = asked.config, asked.localize
-    in_space = isinstance(recording, SpatialRecording)
     if asked.realtime and not localize:
         raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
     common, by_class = priors_by_class(asked.priors)
     said = priors_of(common, by_class)
     others = [name for name in said if name not in (by_class or {})]  # a file tells of classes of other sites, too
     unknown = config.slam.unknown_ids
-    warm_up(lambda: compile_kernels(unknown_ids=unknown, sessions=not localize, localize=localize, in_space=in_space))
     with held():  # a map without its tables is none
         opened = open_store(map_file, create=not localize)
     kept(map_file, f"the map {map_file} is unchanged")
@@ -566,6 +566,15 @@ def _run_in_map(
         entered: Entered | None = None
         if survey is not None and not (later and len(store.load().places)):
             begin_map(store, survey, recording, command_line())
+        if isinstance(recording, SpatialRecording):
+            recording = in_its_space(recording, store.load(), config)
+        in_space = isinstance(recording, SpatialRecording)
+        _refuse_unread(asked, in_space=in_space, boxes=has_traffic(recording))
+        if asked.realtime and in_space:
+            raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
+        warm_up(
+            lambda: compile_kernels(unknown_ids=unknown, sessions=not localize, localize=localize, in_space=in_space)
+        )
         with progress_bar(recording.name) as progress:
             if localize:
                 stamps = recording.frames.stamp_s

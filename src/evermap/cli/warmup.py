@@ -55,7 +55,7 @@ def warm_up(
         in_space: what recordings in space need, or sessions of them, and nothing else.
         traffic: what boxes without identity in these need, too.
     """
-    config = Config(slam={"unknown_ids": unknown_ids})
+    config = Config(slam={"unknown_ids": unknown_ids, "plane": False if in_space else None})
     if unknown_ids:
         from evermap.slam.association.consensus import warm_up as of_the_association
 

@@ -401,8 +401,10 @@ def write_run(
         ConfigError: `out` must not or cannot be written.
         MissingExtraError: `scene` is True and rerun-sdk is missing, or `mcap` and rosbags.
     """
+    from evermap.maps.sessions.session import as_estimated
     from evermap.metrics.summary import RATE_HZ, compare_with_truth, metrics_dict
 
+    recording = as_estimated(recording, result)
     wanted = getattr(config, "output", None)
     rate_hz = float(getattr(wanted, "score_rate_hz", RATE_HZ))
     info = info or RunInfo()

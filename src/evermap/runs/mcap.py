@@ -60,6 +60,9 @@ def write_mcap(recording: AnyRecording, result: SlamResult, path: Path) -> None:
     Raises:
         MissingExtraError: `rosbags` is not installed.
     """
+    from evermap.maps.sessions.session import as_estimated
+
+    recording = as_estimated(recording, result)
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
     except ImportError:

@@ -33,7 +33,7 @@ from evermap.maps.store import (
 from evermap.maps.store.content import DamagedError
 from evermap.maps.store.measured import RECORDING, TRAJECTORY, pack_recording, pack_trajectory, unpack_recording
 from evermap.show import Shown
-from evermap.types import Progress
+from evermap.types import Progress, SpatialRecording
 from evermap.valid import check_type
 
 if TYPE_CHECKING:
@@ -167,11 +167,14 @@ def enter_session(
         DataError, NumericalError: as `pipeline.run_session`.
     """
     from evermap.maps.learning import with_priors
+    from evermap.maps.sessions.session import in_its_space
     from evermap.pipeline import run_session
 
     check_type(recording)
     head = store.head()
     newest = store.load(head)
+    recording = in_its_space(recording, newest, config or Config())
+    config = _of_its_space(recording, config)
     data = pack_recording(recording)
     kept = _recordings(store, head)
     _refuse_twice(store, kept, data, recording)
@@ -426,7 +429,8 @@ def _session_again(store: MapStore, step: _Step, living: LivingMap, config: Conf
     recording = replace(_kept_recording(store, step.recording, number), robot=robot)
     problem = f"revision {number} cannot be brought in again"
     try:
-        session = run_session(recording, living, config or parse_config(step.revision.provenance.config))
+        config = _of_its_space(recording, config or parse_config(step.revision.provenance.config))
+        session = run_session(recording, living, config)
     except DataError as error:
         raise UnbridgedError(f"{problem}: {error}") from None
     if session.slam.interrupted:  # half of a session must not take the place of the whole
@@ -435,6 +439,15 @@ def _session_again(store: MapStore, step: _Step, living: LivingMap, config: Conf
         problem = f"{problem}: {session.set_aside[0]}"
         raise UnbridgedError(problem, path=store.where, hint="sessions that overlap with both, then this one again")
     return session
+
+
+def _of_its_space(recording: AnyRecording, config: Config | None) -> Config | None:
+    """Return settings by which a recording in space stays there, and one in the plane is no contradiction."""
+    stays = False if isinstance(recording, SpatialRecording) else None
+    if config is None and stays is None:
+        return None
+    config = config or Config()
+    return config.model_copy(update={"slam": config.slam.model_copy(update={"plane": stays})})
 
 
 @dataclass(frozen=True, slots=True)

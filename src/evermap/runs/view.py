@@ -13,6 +13,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, EvermapError
 from evermap.io.spatial import spatial_detections
+from evermap.maps.sessions.session import as_estimated
 from evermap.runs.folder import SUMMARY
 from evermap.runs.summary import change_of
 from evermap.types import (
@@ -109,6 +110,7 @@ def _of_run(folder: Path) -> tuple[AnyRecording, SlamResult]:
         online = path[np.zeros(0, dtype=np.int64)]
     recording, remarks = _recording(about, clock)
     result = _result(path, online, landmarks, changes=changes, warnings=remarks)
+    recording = as_estimated(recording, result)
     return recording, replace(result, innovations=_innovations(folder / "innovations.parquet"))
 
 

@@ -20,7 +20,7 @@ from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.show import Shown
 from evermap.slam.cleaning import clean, spikes
-from evermap.slam.mistakes import HONEST, USUAL, likeliest, off, pairs_of
+from evermap.slam.mistakes import USUAL, Finding, find_motion
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -40,21 +40,6 @@ OUTSIDE = 0.05
 """Share of the image size by which undistorted corners of tags may lie outside of the image."""
 _OTHER_UNIT = "another unit than metres, or a wrong limit"
 _OTHER_SIGN = "another unit or sign, or wrong limits"
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One problem of a recording.
-
-    Attributes:
-        code: short and stable, for programs.
-        message: the problem, its size, and the likely cause.
-        usable: False if estimates would be meaningless.
-    """
-
-    code: str
-    message: str
-    usable: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +80,7 @@ def findings(recording: Recording, *, identities: bool = True, settings: CheckCo
 
     The sensor's limits are in force; `identities` is False where those of its detections are not used.
     """
-    found = [*_motion(recording, settings), *_limits(recording)]
+    found = [*find_motion(recording, settings), *_limits(recording)]
     if identities:
         found += _identities(recording, settings)
     return tuple(sorted(found, key=lambda finding: finding.usable))
@@ -103,12 +88,18 @@ def findings(recording: Recording, *, identities: bool = True, settings: CheckCo
 
 def findings_in_space(recording: SpatialRecording, settings: SlamConfig) -> tuple[Finding, ...]:
     """Return everything that is odd about a valid recording in space, the worst first; its truth is not looked at."""
-    found = [*_left_out(recording, settings), *_motion(recording, settings.check), *_limits_in_space(recording)]
+    found = [*_left_out(recording, settings), *_read_wrongly_in_space(recording, settings)]
+    return tuple(sorted(found, key=lambda finding: finding.usable))
+
+
+def _read_wrongly_in_space(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:
+    """Units, axes, clocks, limits, identities and jumps: all but what the estimator leaves out, and says so itself."""
+    found = [*find_motion(recording, settings.check), *_limits_in_space(recording)]
     if settings.unknown_ids is not True:
         found += _identities(recording, settings.check)
     if recording.odometry is not None and all(finding.usable for finding in found):
         found += _jumps(recording.odometry, settings.cleaning)
-    return tuple(sorted(found, key=lambda finding: finding.usable))
+    return found
 
 
 def odd(recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> tuple[str, ...]:
@@ -356,44 +347,6 @@ def _identities(recording: AnyRecording, settings: CheckConfig) -> list[Finding]
     return [Finding("own-identities", message, usable=count < settings.own_ids)]
 
 
-def _motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]:
-    """Return mistakes that make static landmarks appear to move."""
-    pairs = pairs_of(recording, settings)
-    if pairs is None:
-        return []
-    if pairs.still:
-        moved = off(pairs.residual(HONEST)) > 0.1
-        if np.sum(moved) < settings.fewest or np.mean(moved) < 0.1:
-            return []
-        message = (
-            f"the odometry is zero throughout, but {np.mean(moved):.0%} of the landmarks seen again within seconds "
-            f"have moved in the sensor's view: the robot drove ({pairs.speeds})"
-        )
-        return [Finding("no-odometry", message, usable=False)]
-    undone = HONEST
-    found: list[Finding] = []
-    for _ in range(3):
-        mistake = likeliest(pairs, undone, {finding.code for finding in found}, settings)
-        if mistake is None:
-            break
-        found.append(Finding(mistake.code, mistake.message, usable=False))
-        undone = mistake.after(undone)
-    usual = float(np.median(off(pairs.residual(undone))))
-    if usual > settings.off:
-        message = (
-            f"landmarks are not static: seen again within seconds, half of them are over {usual:.2g} rad or "
-            f"{usual:.0%} of their range from the prediction by odometry; mixed identities, or "
-            "mistakes in several units, signs or frames at once"
-        )
-        return [Finding("landmarks-move", message)]
-    return found
-
-
-def unusable(recording: Recording, settings: CheckConfig) -> Finding | None:
-    """Return why static landmarks seem to move by the odometry of a recording; None if they do not."""
-    return next(iter(_motion(recording, settings)), None)
-
-
 def valid(recording: Recording, sensor: SensorConfig, prior_map: Landmarks | None = None) -> Recording:
     """Return the recording with the sensor that the configuration states.
 
@@ -420,7 +373,7 @@ def screened(
 ) -> tuple[Any, tuple[str, ...]]:
     """Return a recording without ids that other detections contradict, and remarks on it.
 
-    A recording in space, or one without ids to use, is returned as it is. With `repair`, what is impossible in a
+    One without ids to use is returned as it is. With `repair`, what is impossible in a
     recording in the plane is left out (`slam.cleaning`), instead of refused.
 
     Raises:
@@ -434,6 +387,7 @@ def screened(
     settings, remarks = config.slam, tuple[str, ...]()
     if isinstance(recording, SpatialRecording):
         recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
+        remarks = tuple(finding.message for finding in _read_wrongly_in_space(recording, settings))
     else:
         if repair:
             recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
@@ -453,7 +407,7 @@ def screened(
 def check_recording(recording: AnyRecording, config: Config | None = None) -> Check:
     """Return a summary of a recording, and its problems: units, signs, clocks, identities, limits, gaps, jumps.
 
-    In the plane `run_slam`, `run_session` and `run_localization` tell the same in the warnings of their results.
+    `run_slam`, `run_session` and `run_localization` tell the same in the warnings of their results.
 
     Args:
         recording: what a reader returned; its truth is not looked at.
@@ -463,10 +417,12 @@ def check_recording(recording: AnyRecording, config: Config | None = None) -> Ch
         InputError: no recording, or one with values that cannot be.
         DataError: nothing can be estimated from it.
     """
+    from evermap.slam.plane import in_its_space
     from evermap.slam.space.moving import has_traffic
 
     config = config or Config()
     settings = config.slam
+    recording = in_its_space(recording, settings)
     if isinstance(recording, SpatialRecording):
         validate_spatial(recording)
         recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))

@@ -29,7 +29,7 @@ class Mistake:
     """A mistake: the change of the readings that undoes it, and its name.
 
     Attributes:
-        code, message: as in `slam.check.Finding`.
+        code, message: as in `Finding`.
         lengths: factor on all ranges, or its inverse on all speeds, which is the same.
         bearing, offset_rad: a bearing becomes `bearing * b + offset_rad`.
         turn, forward: factors on the turn rate and the forward speed.
@@ -213,13 +213,13 @@ def off(residual: FloatArray) -> FloatArray:
 
 def pairs_of(recording: AnyRecording, settings: CheckConfig = USUAL) -> Pairs | None:
     """Return pairs of sightings; None if hardly any landmark is seen twice during the odometry."""
-    first, second = _pairs(recording, settings)
+    first, second = sighting_pairs(recording, settings)
     if len(first) < settings.fewest:
         return None
     return (SpatialPairs if isinstance(recording, SpatialRecording) else PlanarPairs)(recording, first, second)  # type: ignore[arg-type]
 
 
-def _pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, IntArray]:
+def sighting_pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, IntArray]:
     """Return pairs of rows of detections of one landmark, within a few seconds and during the odometry."""
     detections = recording.detections
     stamp_s = recording.frames.stamp_s[detections.frame]
@@ -374,7 +374,7 @@ def clock_steps(recording: Recording) -> tuple[FloatArray, FloatArray]:
         (K,) stamps of frames, the first -inf, and (K,) delays that hold from then on [s].
     """
     settings = USUAL
-    first, second = _pairs(recording, settings)
+    first, second = sighting_pairs(recording, settings)
     if len(first) < settings.fewest:
         return np.array([-inf]), np.zeros(1)
     pairs = PlanarPairs(recording, first, second)
@@ -428,3 +428,56 @@ def _dead_reckoned(odometry: Odometry, forward: float, turn: float) -> FloatArra
     x = np.append(0.0, np.cumsum(ahead * np.cos(heading) - aside * np.sin(heading)))
     y = np.append(0.0, np.cumsum(ahead * np.sin(heading) + aside * np.cos(heading)))
     return np.stack([x, y, turned])
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One problem of a recording.
+
+    Attributes:
+        code: short and stable, for programs.
+        message: the problem, its size, and the likely cause.
+        usable: False if estimates would be meaningless.
+    """
+
+    code: str
+    message: str
+    usable: bool = True
+
+
+def find_motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]:
+    """Return mistakes that make static landmarks appear to move."""
+    pairs = pairs_of(recording, settings)
+    if pairs is None:
+        return []
+    if pairs.still:
+        moved = off(pairs.residual(HONEST)) > 0.1
+        if np.sum(moved) < settings.fewest or np.mean(moved) < 0.1:
+            return []
+        message = (
+            f"the odometry is zero throughout, but {np.mean(moved):.0%} of the landmarks seen again within seconds "
+            f"have moved in the sensor's view: the robot drove ({pairs.speeds})"
+        )
+        return [Finding("no-odometry", message, usable=False)]
+    undone = HONEST
+    found: list[Finding] = []
+    for _ in range(3):
+        mistake = likeliest(pairs, undone, {finding.code for finding in found}, settings)
+        if mistake is None:
+            break
+        found.append(Finding(mistake.code, mistake.message, usable=False))
+        undone = mistake.after(undone)
+    usual = float(np.median(off(pairs.residual(undone))))
+    if usual > settings.off:
+        message = (
+            f"landmarks are not static: seen again within seconds, half of them are over {usual:.2g} rad or "
+            f"{usual:.0%} of their range from the prediction by odometry; mixed identities, or "
+            "mistakes in several units, signs or frames at once"
+        )
+        return [Finding("landmarks-move", message)]
+    return found
+
+
+def unusable(recording: AnyRecording, settings: CheckConfig) -> Finding | None:
+    """Return why static landmarks seem to move by the odometry of a recording; None if they do not."""
+    return next(iter(find_motion(recording, settings)), None)

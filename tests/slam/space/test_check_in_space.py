@@ -15,12 +15,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from evermap import check_recording
+from evermap import check_recording, run_slam
 from evermap.cli.main import app
 from evermap.config import Config
 from evermap.errors import InputError
 from evermap.io import read_recording, write_native
 from evermap.io.spatial import with_tag_poses
+from evermap.maps.store import open_store
 from evermap.types import SpatialRecording
 
 from .corridors import tagged_corridor
@@ -202,3 +203,17 @@ def test_turned_by_the_mount() -> None:
         ahead.apply([[1, 0, 0], [0, 1, 0], [0, 0, 1]]), [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-12
     )
     np.testing.assert_allclose((ahead * Rotation.from_quat(SpatialPairs.angles[1].turned)).magnitude(), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("mistake", ["positions in mm", "odometry in mm", "x ahead"])
+def test_a_mistake_is_refused_by_its_name_before_anything_enters_a_map(mistake: str, tmp_path: Path) -> None:
+    spoil, _, words = MISTAKES[mistake]
+    write_native(spoil(room()), tmp_path / "room")
+    site = tmp_path / "site.evermap"
+    run = CliRunner().invoke(app, ["slam", str(tmp_path / "room"), "--map", str(site), "--out", str(tmp_path / "out")])
+    assert run.exit_code == 2
+    assert re.search(words, run.output)
+    with open_store(str(site)) as store:
+        assert not len(store.load().members)
+    alone = run_slam(spoil(room()))
+    assert any(re.search(words, line) for line in alone.warnings)

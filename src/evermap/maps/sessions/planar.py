@@ -21,9 +21,9 @@ from evermap.maps.sessions.placing import Held, Laid, Localised
 from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.slam import result as of_slam
 from evermap.slam.batch import Outcome, silent_links
-from evermap.slam.check import unusable
 from evermap.slam.cleaning import some_frames
 from evermap.slam.estimate import Solved, solve
+from evermap.slam.mistakes import unusable
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Progress, Recording, Sensor, SlamResult
 
 

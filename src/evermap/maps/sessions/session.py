@@ -17,14 +17,16 @@ from evermap.maps.sessions import believe, decide
 from evermap.maps.sessions.believe import Believed, arrived, departed
 from evermap.maps.sessions.extend import Extended, Found, extended
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Sighting, Watch, arrivals, looked_at
-from evermap.maps.sessions.placing import Laid, Localised
+from evermap.maps.sessions.placing import ANYWAY, Laid, Localised
 from evermap.maps.sessions.planar import PlanarVisit
 from evermap.maps.sessions.spatial import SpatialVisit, solve_visit
 from evermap.maps.vicinity import in_chunks
 from evermap.show import Shown
+from evermap.slam import plane
 from evermap.slam.association.features import medians
 from evermap.slam.cleaning import clean
 from evermap.slam.estimate import solve
+from evermap.slam.mistakes import unusable
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -102,6 +104,35 @@ def admitted(recording: RecordingT, living: LivingMap) -> tuple[RecordingT, Livi
         landmark_texts=tuple(sorted({*living.landmark_texts, *recording.landmark_names.values()})),
         clock=recording.clock,
     )
+
+
+def in_its_space(recording: AnyRecording, living: LivingMap | None, config: Config) -> AnyRecording:
+    """Return a recording as it goes into a map: in the plane where it is one of a robot on a floor (`slam.plane`).
+
+    Raises:
+        ConfigError: `slam.plane` is set, and it cannot be there.
+    """
+    dim = None if living is None or not len(living.places) else living.dim
+    return plane.in_its_space(recording, config.slam, dim=dim)
+
+
+def as_estimated(recording: AnyRecording, result: SlamResult) -> AnyRecording:
+    """Return a recording in the space of its result: in the plane where it was estimated there."""
+    flat = result.trajectory.pose_world_robot.shape[1] == 3
+    if not flat or not isinstance(recording, SpatialRecording):
+        return recording
+    return plane.in_its_space(recording, Config().slam, dim=2)
+
+
+def check_static(recording: SpatialRecording, config: Config) -> None:
+    """Refuse a session in which a mistake in units, axes or clocks makes static landmarks move.
+
+    Raises:
+        DataError: names the mistake, as `evermap check` does. Where `living.search` is not 'joint', nothing is refused.
+    """
+    wrong = unusable(recording, config.slam.check) if config.living.search == "joint" else None
+    if wrong is not None and not wrong.usable:
+        raise DataError(f"{recording.name}: {wrong.message}", hint=ANYWAY)
 
 
 def opened(living: LivingMap | None, recording: AnyRecording) -> LivingMap:

@@ -1,0 +1,87 @@
+"""Orientations that were not measured: defaults of messages, and those that turn with the robot.
+
+A point detector fills the orientation of its message with ROS's default (0, 0, 0, 1), or with a constant. Taken for
+measurements they say that landmarks turn as the robot does: dead reckoning is better. An orientation that was measured
+is the same in the world whichever way the robot looks, up to its noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from evermap.config import CheckConfig
+from evermap.geometry import se3
+from evermap.slam.mistakes import sighting_pairs
+from evermap.types import AnyRecordingT, BoolArray, SpatialRecording
+
+SAME = 1e-6
+"""Difference between the numbers of two quaternions that are equal."""
+TURNED_RAD = 0.3
+"""Turn of the robot between two sightings from which on they say whether an orientation turns with it."""
+WITH_ROBOT = 0.3
+"""Share of the robot's turn by which orientations in the sensor's frame change that do not see it; it must be the
+median, as must the rest of the turn in the world."""
+
+
+def without_unmeasured(recording: AnyRecordingT, settings: CheckConfig) -> AnyRecordingT:
+    """Return a recording without orientations that were not measured, with a warning for each sensor that gave them.
+
+    Those of a sensor are left out if all are the default (0, 0, 0, 1); if all are another constant although the robot
+    turned; or if those of one landmark, seconds apart, turn with the robot. Boxes, tags with corners, and classes with
+    symmetries are not asked.
+    """
+    if not isinstance(recording, SpatialRecording):
+        return recording
+    seen = recording.detections
+    warnings: list[str] = []
+    asked = np.isfinite(seen.rotation).all(axis=1) & ~np.isfinite(seen.corner_px[:, 0, 0])
+    asked &= ~np.isfinite(seen.size_m).all(axis=1)
+    symmetric = [row for row, name in enumerate(recording.class_names) if name in recording.symmetries]
+    asked &= ~np.isin(seen.class_id, symmetric)
+    drop = np.zeros(len(seen), dtype=np.bool_)
+    for row, sensor in enumerate(recording.sensors):
+        mine = asked & (seen.sensor == row)
+        why = _why_unmeasured(recording, mine, settings) if mine.any() else ""
+        if why:
+            drop |= mine
+            warnings.append(f"orientations of '{sensor.name}' are not measured and not used: {why}")
+    if not warnings:
+        return recording
+    left = replace(
+        seen,
+        rotation=np.where(drop[:, None], np.nan, seen.rotation),
+        sigma_rad=np.where(drop, np.nan, seen.sigma_rad),
+    )
+    return replace(recording, detections=left, warnings=(*recording.warnings, *warnings))
+
+
+def _why_unmeasured(recording: SpatialRecording, mine: BoolArray, settings: CheckConfig) -> str:
+    """Return what shows that orientations of detections (M,) of a sensor were not measured; '' if nothing does."""
+    seen, odometry = recording.detections, recording.odometry
+    rotation = seen.rotation[mine]
+    if np.abs(np.abs(rotation) - se3.NO_TURN).max() < SAME:
+        return f"all {len(rotation)} are the default (0, 0, 0, 1)"
+    if odometry is None:
+        return ""
+    stamp_s = recording.frames.stamp_s[seen.frame]
+    robot = se3.interpolate(odometry.stamp_s, odometry.pose_world_robot, stamp_s)
+    turned = se3.angle_between(robot[mine][0], robot[mine]).max() > TURNED_RAD
+    if turned and len(rotation) >= settings.fewest and np.abs(rotation - rotation[0]).max() < SAME:
+        return f"all {len(rotation)} are the same"
+    first, second = sighting_pairs(recording, settings)
+    some = mine[first] & mine[second]
+    first, second = first[some], second[some]
+    mount = recording.sensors[int(seen.sensor[mine][0])].mount_robot_sensor
+    eye, own = se3.compose(robot, np.array(mount)), se3.turn(seen.rotation)
+    angle = se3.angle_between(eye[first], eye[second])
+    much = angle > TURNED_RAD
+    if np.count_nonzero(much) < settings.fewest:
+        return ""
+    first, second, angle = first[much], second[much], angle[much]
+    in_sensor = se3.angle_between(own[first], own[second])
+    in_world = se3.angle_between(se3.compose(eye[first], own[first]), se3.compose(eye[second], own[second]))
+    if np.median(in_sensor / angle) < WITH_ROBOT and np.median(in_world / angle) > 1.0 - WITH_ROBOT:
+        return "they turn with the robot"
+    return ""
