@@ -24,6 +24,7 @@ from evermap.slam.space.linearise import CORNERS, POINT
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.repair import rejoined, repaired, split, unjumped
 from evermap.slam.space.smoother import SpatialSmoother
+from evermap.slam.space.starts import by_constellations
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
 
 FREE = np.repeat([1e3, ANY_RAD], 3)
@@ -99,10 +100,12 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     estimate = stepwise
     if problem.driven:
         whole = _along(problem, intake.driven_pose, known, place)
-        points = converged(problem.as_points(), _likelier(problem, noise, stepwise, whole), noise)
+        points = converged(problem.as_points(), _likeliest(problem.as_points(), noise, [stepwise, whole]), noise)
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)
+    elif 2 * np.count_nonzero(problem.kind == POINT) > len(problem.kind):
+        estimate = _likeliest(problem, noise, [stepwise, *by_constellations(problem, noise)])
     optimum, delay_sigma_s = _with_delays(converged(problem, estimate, noise))
     optimum = repaired(optimum)
     problem = optimum.smoother.problem
@@ -236,16 +239,13 @@ def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[Spati
     return replace(problem, prior=prior, start_sigma=FREE), stated
 
 
-def _likelier(
-    problem: SpatialProblem, noise: SpatialNoise, stepwise: SpatialEstimate, whole: SpatialEstimate
-) -> SpatialEstimate:
-    """Return initial values: frame by frame, or along the whole odometry; the more probable ones."""
-    points = problem.as_points()
+def _likeliest(problem: SpatialProblem, noise: SpatialNoise, starts: list[SpatialEstimate]) -> SpatialEstimate:
+    """Return the initial values that lead to the most probable ones."""
     cost = []
-    for start in (stepwise, whole):
-        smoother = SpatialSmoother(points, start.pose)
+    for start in starts:
+        smoother = SpatialSmoother(problem, start.pose)
         cost.append(smoother.optimum(start, noise, heavy=True, iterations=10)[1].cost)
-    return whole if cost[1] <= cost[0] else stepwise
+    return starts[len(starts) - 1 - int(np.argmin(cost[::-1]))]  # of equal ones the last
 
 
 def _along(problem: SpatialProblem, driven: FloatArray, known: BoolArray, place: FloatArray) -> SpatialEstimate:
