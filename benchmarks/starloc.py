@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import evermap as em
 from evermap.geometry import se3
@@ -74,9 +75,7 @@ def recordings(folder: Path) -> Iterator[tuple[str, SpatialRecording, float, flo
         name = place.parent.name
         with tempfile.TemporaryDirectory() as out:
             plain = Path(out) / name
-            subprocess.run(
-                [sys.executable, folder / "starloc_to_plain.py", folder, name, plain, "--truth"], check=True
-            )
+            subprocess.run([sys.executable, folder / "starloc_to_plain.py", folder, name, plain, "--truth"], check=True)
             recording = read_recording(plain)
             rig = tomllib.loads((plain / CAMERA_FILE).read_text(encoding="utf-8"))["camera"]["left"]
         assert isinstance(recording, SpatialRecording)
@@ -92,7 +91,9 @@ def corrected(survey: Landmarks) -> Landmarks:
     return replace(survey, landmark_id=label[order], position_m=survey.position_m[order])
 
 
-def compare(name: str, recording: SpatialRecording, known: str, given: Landmarks | None, rig: tuple[float, float]) -> Row:
+def compare(
+    name: str, recording: SpatialRecording, known: str, given: Landmarks | None, rig: tuple[float, float]
+) -> Row:
     """Solve a session and score it beside gtsam."""
     truth, survey = recording.truth, recording.true_landmarks
     assert truth is not None
@@ -169,9 +170,10 @@ def by_gtsam(
     settings.setMaxIterations(200)
     found = gtsam.LevenbergMarquardtOptimizer(graph, start, settings).optimize()
     poses = [found.atPose3(row) for row in range(len(pose))]
-    turns = [one.rotation().toQuaternion() for one in poses]
-    whole = [[*one.translation(), q.x(), q.y(), q.z(), q.w()] for one, q in zip(poses, turns, strict=True)]
-    return np.array(whole), {name: found.atPoint3(10**6 + name) for name in names.tolist()}
+    turn = Rotation.from_matrix([one.rotation().matrix() for one in poses]).as_quat()
+    return np.hstack([[one.translation() for one in poses], turn]), {
+        name: found.atPoint3(10**6 + name) for name in names.tolist()
+    }
 
 
 def _pose3(pose: FloatArray) -> Any:
