@@ -18,7 +18,7 @@ from evermap.geometry.symmetry import Symmetries
 from evermap.slam.calibration import narrowed
 from evermap.slam.space.against_map import MapComparison, compared
 from evermap.slam.space.drift import drift_of
-from evermap.slam.space.estimate import SpatialOptimum, converged, first_places, oriented
+from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.linearise import CORNERS, POINT
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
@@ -40,6 +40,9 @@ STILL_M, STILL_RAD = 0.03, 0.03
 """What a robot is off by that was there a moment ago."""
 OUTLIER, LOST = 10.0, 15.0
 """Nats that a detection, and a motion, cost at most: a wrong identity, a robot that was carried."""
+MOST_DRIFT, INDEPENDENT = 3.0, 0.2
+"""Drift over that which landmarks show along the odometry, where two levers of two make up for the odometry's shape;
+and correlation of consecutive residuals of a landmark, up to which these are independent."""
 WORTH = 3.0
 """Nats by which a candidate must beat the predicted pose."""
 
@@ -85,17 +88,9 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     settings = problem.settings
     goes = (settings.drift_m, settings.drift_rad) if problem.driven else (settings.hand_mps, settings.hand_radps)
     noise = SpatialNoise(*goes, pixel=settings.sigma_px)
-    by_corners = (problem.kind == CORNERS) | problem.ray
-    # pixels err by themselves, detectors of objects by the view
-    if problem.driven and 2 * np.sum(~by_corners) > len(by_corners):
-        drift = drift_of(problem, intake.driven_pose)
-        problem = replace(problem, share=np.where(by_corners, 1.0, drift.share))
-        if problem.steady:
-            noise = replace(noise, translation=settings.steady_m, rotation=settings.steady_rad)
-        elif drift.translation is not None and drift.rotation is not None:
-            noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
     known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
+    problem, noise = _with_drift(problem, noise, intake.driven_pose, known, place)
     stepwise, spread, step_s = incremental(problem, noise, known, place, progress)
     estimate = stepwise
     if problem.driven:
@@ -129,6 +124,42 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     if len(stated):
         optimum, from_map = compared(optimum, stated)
     return SpatialSolved(optimum, identity, times_of(identity), from_map, delay_sigma_s, stepwise.pose, spread, step_s)
+
+
+def _with_drift(
+    problem: SpatialProblem, noise: SpatialNoise, driven: FloatArray, known: BoolArray, place: FloatArray
+) -> tuple[SpatialProblem, SpatialNoise]:
+    """Return the problem with what each detection is worth, and the noise levels with the drift of the odometry.
+
+    Pixels err by themselves, detectors of objects by the view. That errors persist follows from the odometry alone,
+    of which a fast turn or a drift of other than usual form may be wrong. So independent errors are asked as well.
+    """
+    by_corners = (problem.kind == CORNERS) | problem.ray
+    if not problem.driven or 2 * np.sum(~by_corners) <= len(by_corners):
+        return problem, noise
+    drift, settings = drift_of(problem, driven), problem.settings
+    share = np.where(by_corners, 1.0, drift.share)
+    if problem.steady:
+        noise = replace(noise, translation=settings.steady_m, rotation=settings.steady_rad)
+    elif drift.translation is not None and drift.rotation is not None:
+        if share.min() < 1.0:
+            alone = converged(problem.as_points(), _along(problem, driven, known, place), noise)
+            if _are_independent(alone, drift.translation):
+                return problem, replace(alone.noise, pixel=noise.pixel)
+        noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
+    return replace(problem, share=share), noise
+
+
+def _are_independent(optimum: SpatialOptimum, drift_m: float) -> bool:
+    """Tell whether errors of detections are independent: their residuals are, at an optimum that takes them for that.
+
+    And the odometry drifts there not much more than landmarks that are seen together show, by `drift_m`. Else what
+    persists was put into the poses.
+    """
+    problem, noise = optimum.smoother.problem, optimum.noise
+    range_m = float(np.median(np.linalg.norm(problem.measured[:, :3], axis=1)))
+    drifts = np.hypot(noise.translation, noise.rotation * range_m) < MOST_DRIFT * drift_m
+    return drifts and correlation(optimum) < INDEPENDENT
 
 
 def _with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, FloatArray]:
