@@ -30,6 +30,8 @@ from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
 FREE = np.repeat([1e3, ANY_RAD], 3)
 """Deviation by which the first pose is held where a map says where it is [m, rad]. Two points of a map leave it a turn
 about the line between them; one by a thousand radians would drown what the odometry knows in rounding."""
+HELD = np.full(6, 1e-4)
+"""And without a map."""
 MOST_TRIED = 200
 GROSS_M = 1.0
 SPLITS = 2
@@ -43,6 +45,10 @@ OUTLIER, LOST = 10.0, 15.0
 MOST_DRIFT, INDEPENDENT = 3.0, 0.2
 """Drift over that which landmarks show along the odometry, where two levers of two make up for the odometry's shape;
 and correlation of consecutive residuals of a landmark, up to which these are independent."""
+SEEDS = 3
+"""Frames from which constellations are begun where there is no odometry."""
+MOST_OUTLIERS = 0.01
+"""Share of the detections along the odometry, beyond which other starts are tried."""
 WORTH = 3.0
 """Nats by which a candidate must beat the predicted pose."""
 
@@ -90,17 +96,19 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     noise = SpatialNoise(*goes, pixel=settings.sigma_px)
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
     known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
-    problem, noise = _with_drift(problem, noise, intake.driven_pose, known, place)
+    problem, noise = _with_drift(problem, noise, intake.driven_pose)
     stepwise, spread, step_s = incremental(problem, noise, known, place, progress)
-    estimate = stepwise
+    estimate, of_points = stepwise, 2 * np.count_nonzero(problem.kind == POINT) > len(problem.kind)
     if problem.driven:
         whole = _along(problem, intake.driven_pose, known, place)
         points = converged(problem.as_points(), _likeliest(problem.as_points(), noise, [stepwise, whole]), noise)
+        if of_points and _is_doubtful(points):
+            points = _or_better(points, by_constellations(problem, points.noise, 1))
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)
-    elif 2 * np.count_nonzero(problem.kind == POINT) > len(problem.kind):
-        estimate = _likeliest(problem, noise, [stepwise, *by_constellations(problem, noise)])
+    elif of_points:
+        estimate = _likeliest(problem, noise, [stepwise, *by_constellations(problem, noise, SEEDS)])
     optimum, delay_sigma_s = _with_delays(converged(problem, estimate, noise))
     optimum = repaired(optimum)
     problem = optimum.smoother.problem
@@ -127,7 +135,7 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
 
 
 def _with_drift(
-    problem: SpatialProblem, noise: SpatialNoise, driven: FloatArray, known: BoolArray, place: FloatArray
+    problem: SpatialProblem, noise: SpatialNoise, driven: FloatArray
 ) -> tuple[SpatialProblem, SpatialNoise]:
     """Return the problem with what each detection is worth, and the noise levels with the drift of the odometry.
 
@@ -143,7 +151,8 @@ def _with_drift(
         noise = replace(noise, translation=settings.steady_m, rotation=settings.steady_rad)
     elif drift.translation is not None and drift.rotation is not None:
         if share.min() < 1.0:
-            alone = converged(problem.as_points(), _along(problem, driven, known, place), noise)
+            free = replace(problem.as_points(), prior=PlacePrior.none(), start_sigma=HELD)
+            alone = converged(free, first_places(free, driven), noise)
             if _are_independent(alone, drift.translation):
                 return problem, replace(alone.noise, pixel=noise.pixel)
         noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
@@ -268,6 +277,24 @@ def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[Spati
     stated[:, :3] = stated[:, :3].max(axis=1, keepdims=True)
     prior = PlacePrior(place.astype(np.int64), pose, np.maximum(stated, settings.loose_m), np.ones(len(rows)))
     return replace(problem, prior=prior, start_sigma=FREE), stated
+
+
+def _is_doubtful(optimum: SpatialOptimum) -> bool:
+    """Tell whether the odometry jumps, or more detections are outliers than there are wrong identities elsewhere."""
+    outliers = np.mean(optimum.now.weight < optimum.smoother.problem.settings.inlier)
+    return bool(outliers > MOST_OUTLIERS or (optimum.now.odometry_weight < 0.5).any())
+
+
+def _or_better(optimum: SpatialOptimum, starts: list[SpatialEstimate]) -> SpatialOptimum:
+    """Return the optimum, or a more probable one from another start, at the same noise."""
+    smoother, noise, gain = optimum.smoother, optimum.noise, optimum.smoother.problem.settings.repair.gain_nats
+    cost = optimum.now.cost
+    for start in starts:
+        found = converged(smoother.problem, start, noise)
+        there = smoother.linearised(found.estimate, noise, heavy=False).cost
+        if there < cost - gain:
+            optimum, cost = found, there
+    return optimum
 
 
 def _likeliest(problem: SpatialProblem, noise: SpatialNoise, starts: list[SpatialEstimate]) -> SpatialEstimate:

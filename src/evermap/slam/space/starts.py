@@ -18,8 +18,6 @@ from evermap.geometry.rigid import rigid
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.types import BoolArray, FloatArray, IntArray
 
-SEEDS = 3
-"""Frames to begin with that are tried."""
 TRIPLETS = 16
 """Triplets of points in one frame that are tried, the widest of them."""
 OUTLIER = 16.0
@@ -203,16 +201,17 @@ def seeds(problem: SpatialProblem, count: int) -> list[int]:
     return found
 
 
-def by_constellations(problem: SpatialProblem, noise: SpatialNoise) -> list[SpatialEstimate]:
+def by_constellations(problem: SpatialProblem, noise: SpatialNoise, count: int) -> list[SpatialEstimate]:
     """Return initial values, one from each of some frames to begin with; from the places of a map, if there is one.
 
     Args:
         problem: the measurements.
         noise: levels to start from.
+        count: frames to begin with, at most.
     """
     if (problem.prior.weight > problem.settings.inlier).any():
         return [_grown(problem, noise, None)]
-    return [_grown(problem, noise, seed) for seed in seeds(problem, SEEDS)]
+    return [_grown(problem, noise, seed) for seed in seeds(problem, count)]
 
 
 def _grown(problem: SpatialProblem, noise: SpatialNoise, seed: int | None) -> SpatialEstimate:
