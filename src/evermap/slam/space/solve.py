@@ -46,7 +46,7 @@ MOST_DRIFT, INDEPENDENT = 3.0, 0.2
 """Drift over that which landmarks show along the odometry, where two levers of two make up for the odometry's shape;
 and correlation of consecutive residuals of a landmark, up to which these are independent."""
 SEEDS = 3
-"""Frames from which constellations are begun where there is no odometry."""
+"""Frames from which constellations are begun."""
 MOST_OUTLIERS = 0.01
 """Share of the detections along the odometry, beyond which other starts are tried."""
 WORTH = 3.0
@@ -103,7 +103,7 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
         whole = _along(problem, intake.driven_pose, known, place)
         points = converged(problem.as_points(), _likeliest(problem.as_points(), noise, [stepwise, whole]), noise)
         if of_points and _is_doubtful(points):
-            points = _or_better(points, by_constellations(problem, points.noise, 1))
+            points = _or_better(points, by_constellations(problem, points.noise, SEEDS))
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)

@@ -95,10 +95,6 @@ class _Growth:
             np.searchsorted(problem.pose_row, np.arange(n + 1)), float(np.median(np.linalg.norm(point, axis=1))),
         )  # fmt: skip
 
-    def scale(self) -> FloatArray:
-        """Return (6,) by which a turn counts as the length that it moves a point in view."""
-        return np.repeat([1.0, self.radius_m], 3)
-
     def neighbours(self) -> tuple[IntArray, BoolArray]:
         """Return (2, N) the located frames before and after each in time, and whether there are any."""
         at, rows = np.flatnonzero(self.located), np.arange(len(self.located))
@@ -119,8 +115,8 @@ class _Growth:
         led = se3.compose(self.pose[other], se3.between(self.odometry[other], self.odometry[row]))
         return led, np.linalg.inv(self.spread[other] + moved)
 
-    def uncertainty(self) -> FloatArray:
-        """Return (N,) standard deviation [m] that each frame's pose would have, in its worst direction."""
+    def information(self) -> FloatArray:
+        """Return (N, 6, 6) of each frame's pose by the places that are known, and by located frames next to it."""
         problem = self.problem
         told = np.flatnonzero(self.known[problem.place])
         wide = np.trace(self.place_spread[problem.place[told]], axis1=1, axis2=2) / 3.0
@@ -131,8 +127,12 @@ class _Growth:
         for other, there in zip(*self.neighbours(), strict=True):
             some = np.flatnonzero(~self.located & there)
             total[some] += self.motion(some, other[some])[1]
-        by = 1.0 / self.scale()
-        least = np.linalg.eigvalsh(by[:, None] * total * by)[:, 0]
+        return total
+
+    def uncertainty(self, information: FloatArray) -> FloatArray:
+        """Return (N,) standard deviation [m] of each frame's pose, in its worst direction; inf of those located."""
+        by = np.repeat([1.0, 1.0 / self.radius_m], 3)
+        least = np.linalg.eigvalsh(by[:, None] * information * by)[:, 0]
         return np.where(self.located, np.inf, 1.0 / np.sqrt(np.maximum(least, ANYWHERE)))
 
     def locate(self, row: int, *, surely: bool = True) -> bool:
@@ -266,18 +266,16 @@ def located_again(
 
 def _closed(bad: BoolArray, stamp_s: FloatArray) -> BoolArray:
     """(N,) frames that are bad, or within `NEAR_S` of such ones on both sides."""
-    at = stamp_s[bad]
+    at = np.concatenate([[-np.inf], stamp_s[bad], [np.inf]])
     after = np.searchsorted(at, stamp_s)
-    before_s = stamp_s - at[np.maximum(after - 1, 0)]
-    after_s = at[np.minimum(after, len(at) - 1)] - stamp_s
-    return np.asarray(bad | ((np.abs(before_s) < NEAR_S) & (np.abs(after_s) < NEAR_S)))
+    return np.asarray((stamp_s - at[after - 1] < NEAR_S) & (at[after] - stamp_s < NEAR_S) | bad)
 
 
 def _grow(growth: _Growth) -> None:
     """Locate all frames, the best determined ones first, and the places that they see."""
     surely, failed = True, np.zeros(len(growth.located), dtype=np.bool_)
     while not growth.located.all():
-        unsure = np.where(failed, np.inf, growth.uncertainty())
+        unsure = np.where(failed, np.inf, growth.uncertainty(growth.information()))
         least = float(unsure.min())
         if not np.isfinite(least) or (surely and least > LOST_M and failed.any()):
             if not surely:
