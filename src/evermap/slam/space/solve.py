@@ -24,7 +24,7 @@ from evermap.slam.space.linearise import CORNERS, POINT
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.repair import rejoined, repaired, split, unjumped
 from evermap.slam.space.smoother import SpatialSmoother
-from evermap.slam.space.starts import by_constellations
+from evermap.slam.space.starts import by_constellations, lost_frames
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
 
 FREE = np.repeat([1e3, ANY_RAD], 3)
@@ -47,8 +47,6 @@ MOST_DRIFT, INDEPENDENT = 3.0, 0.2
 and correlation of consecutive residuals of a landmark, up to which these are independent."""
 SEEDS = 3
 """Frames from which constellations are begun."""
-MOST_OUTLIERS = 0.01
-"""Share of the detections along the odometry, beyond which other starts are tried."""
 WORTH = 3.0
 """Nats by which a candidate must beat the predicted pose."""
 
@@ -102,7 +100,7 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     if problem.driven:
         whole = _along(problem, intake.driven_pose, known, place)
         points = converged(problem.as_points(), _likeliest(problem.as_points(), noise, [stepwise, whole]), noise)
-        if of_points and _is_doubtful(points):
+        if of_points and not problem.steady and _is_doubtful(points):
             points = _or_better(points, by_constellations(problem, points.noise, SEEDS))
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
         voted = oriented(problem, estimate, points.now.weight)
@@ -280,9 +278,9 @@ def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[Spati
 
 
 def _is_doubtful(optimum: SpatialOptimum) -> bool:
-    """Tell whether the odometry jumps, or more detections are outliers than there are wrong identities elsewhere."""
-    outliers = np.mean(optimum.now.weight < optimum.smoother.problem.settings.inlier)
-    return bool(outliers > MOST_OUTLIERS or (optimum.now.odometry_weight < 0.5).any())
+    """Tell whether the odometry jumps, or there are frames in which most is taken for outliers."""
+    jumps = (optimum.now.odometry_weight < optimum.smoother.problem.settings.inlier).any()
+    return bool(jumps or lost_frames(optimum.smoother.problem, optimum.now.weight).any())
 
 
 def _or_better(optimum: SpatialOptimum, starts: list[SpatialEstimate]) -> SpatialOptimum:

@@ -20,6 +20,8 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 TRIPLETS = 16
 """Triplets of points in one frame that are tried, the widest of them."""
+MOST_FRAMES = 1000
+"""Frames of which those to begin with are chosen, at most."""
 OUTLIER = 16.0
 """Squared normalised distance of an outlier, at which a point costs no more."""
 REFINED = 6
@@ -189,13 +191,15 @@ def seeds(problem: SpatialProblem, count: int) -> list[int]:
     n = len(problem.stamp_s)
     seen = np.zeros((n, len(problem.oriented)), dtype=np.float64)
     seen[problem.pose_row, problem.place] = 1.0
+    rows = np.arange(0, n, 1 + n // MOST_FRAMES)
+    seen = seen[rows]
     shares = seen @ seen.T >= 3.0
     score, found = shares.sum(axis=1) + 1e-3 * seen.sum(axis=1), list[int]()
     for _ in range(count):
         best = int(np.argmax(score))
         if score[best] < 1.0:
             break
-        found.append(best)
+        found.append(int(rows[best]))
         score[shares[best]] = 0.0
         score[best] = 0.0
     return found
@@ -245,10 +249,7 @@ def located_again(
         estimate: the values.
         weight: (M,) of the detections there: outliers have next to none.
     """
-    n, good = len(problem.stamp_s), weight > problem.settings.inlier
-    seen = np.bincount(problem.pose_row, minlength=n)
-    agrees = np.bincount(problem.pose_row[good], minlength=n)
-    bad = (seen - agrees >= FEWEST_LOST) & (2 * agrees < seen)
+    good, bad = weight > problem.settings.inlier, lost_frames(problem, weight)
     if not bad.any() or bad.all():
         return None
     bad = _closed(bad, problem.stamp_s)
@@ -262,6 +263,14 @@ def located_again(
     place = estimate.place.copy()
     place[~growth.given & growth.known, :3] = growth.place[~growth.given & growth.known]
     return SpatialEstimate(growth.pose, place, estimate.state, estimate.log_scale)
+
+
+def lost_frames(problem: SpatialProblem, weight: FloatArray) -> BoolArray:
+    """Return (N,) frames in which most detections, and at least two, are outliers by their weights (M,)."""
+    seen = np.bincount(problem.pose_row, minlength=len(problem.stamp_s))
+    good = weight > problem.settings.inlier
+    agrees = np.bincount(problem.pose_row[good], minlength=len(seen))
+    return np.asarray((seen - agrees >= FEWEST_LOST) & (2 * agrees < seen))
 
 
 def _closed(bad: BoolArray, stamp_s: FloatArray) -> BoolArray:
