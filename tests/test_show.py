@@ -36,6 +36,7 @@ from evermap.types import (
     Innovations,
     Landmarks,
     MapChange,
+    Measurements,
     Misses,
     Odometry,
     Recording,
@@ -76,6 +77,7 @@ RECORDING = Recording(
     true_landmarks=LANDMARKS,
     robot_sightings=RobotSightings(STAMPS, IDS, STAMPS, STAMPS),
     warnings=("a warning",) * N,
+    measurements=(Measurements("floor", STAMPS, {"z_m": STAMPS}, IDS),),
 )
 RESULT = SlamResult(
     trajectory=trajectory(0.1),
@@ -139,6 +141,7 @@ OBJECTS: dict[str, Any] = {
         RECORDING.detections,
         RECORDING.truth,
         RECORDING.robot_sightings,
+        RECORDING.measurements[0],
         RESULT.innovations,
         RESULT.misses,
         RESULT.alternatives[0],

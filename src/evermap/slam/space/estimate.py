@@ -100,6 +100,20 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
     return SpatialNoise(*np.maximum(levels, problem.settings.least_noise).tolist())
 
 
+def correlation(optimum: SpatialOptimum) -> float:
+    """Return the correlation of the residuals of positions with those of the same place in the frame that saw it next.
+
+    Outliers do not count. It is 0 where fewer than two frames see a place.
+    """
+    problem, now = optimum.smoother.problem, optimum.now
+    good = np.flatnonzero((now.weight > problem.settings.inlier) & (problem.kind != CORNERS))
+    order = good[np.lexsort((problem.pose_row[good], problem.place[good]))]
+    same = problem.place[order[1:]] == problem.place[order[:-1]]
+    before, after = now.residual[order[:-1][same], :3], now.residual[order[1:][same], :3]
+    total = 0.5 * float((before**2).sum() + (after**2).sum())
+    return float((before * after).sum()) / total if total > 0.0 else 0.0
+
+
 def _level(before: float, start: float, total: float, count: float, worth: float) -> float:
     """A standard deviation: `total` are squares by the one before, `start` counts for `worth` numbers."""
     return float(np.sqrt((total * before**2 + worth * start**2) / (count + worth)))

@@ -16,6 +16,7 @@ from evermap.geometry import se3
 from evermap.slam.space.estimate import SpatialOptimum, as_seen, converged, oriented
 from evermap.slam.space.linearise import linearise_sightings
 from evermap.slam.space.problem import LEAST_WEIGHT, SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.starts import located_again
 from evermap.types import BoolArray, FloatArray, IntArray
 
 ROUNDS = 3
@@ -27,7 +28,7 @@ def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
     problem = optimum.smoother.problem
     for _ in range(ROUNDS):
         before = optimum
-        for explain in (bridged, other_explanations):
+        for explain in (bridged, other_explanations, _located_again):
             if (start := explain(optimum)) is None:
                 continue
             found = converged(problem, start, optimum.noise, heavy_rounds=0)
@@ -38,6 +39,10 @@ def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
         if optimum is before:
             break
     return optimum
+
+
+def _located_again(optimum: SpatialOptimum) -> SpatialEstimate | None:
+    return located_again(optimum.smoother.problem, optimum.noise, optimum.estimate, optimum.now.weight)
 
 
 def bridged(optimum: SpatialOptimum) -> SpatialEstimate | None:

@@ -18,18 +18,21 @@ from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
 from evermap.slam.calibration import narrowed
 from evermap.slam.space.against_map import MapComparison, compared
-from evermap.slam.space.drift import drift_of
-from evermap.slam.space.estimate import SpatialOptimum, converged, first_places, oriented
+from evermap.slam.space.drift import Drift, drift_of
+from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import CORNERS, POINT
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.repair import rejoined, repaired, split, unjumped
 from evermap.slam.space.smoother import SpatialSmoother
+from evermap.slam.space.starts import by_constellations, lost_frames
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
 
 FREE = np.repeat([1e3, ANY_RAD], 3)
 """Deviation by which the first pose is held where a map says where it is [m, rad]. Two points of a map leave it a turn
 about the line between them; one by a thousand radians would drown what the odometry knows in rounding."""
+HELD = np.full(6, 1e-4)
+"""And without a map."""
 MOST_TRIED = 200
 GROSS_M = 1.0
 SPLITS = 2
@@ -40,6 +43,11 @@ STILL_M, STILL_RAD = 0.03, 0.03
 """What a robot is off by that was there a moment ago."""
 OUTLIER, LOST = 10.0, 15.0
 """Nats that a detection, and a motion, cost at most: a wrong identity, a robot that was carried."""
+MOST_DRIFT, INDEPENDENT = 3.0, 0.2
+"""Drift over that which landmarks show along the odometry, where two levers of two make up for the odometry's shape;
+and correlation of consecutive residuals of a landmark, up to which these are independent."""
+SEEDS = 3
+"""Frames from which constellations are begun."""
 WORTH = 3.0
 """Nats by which a candidate must beat the predicted pose."""
 
@@ -85,27 +93,21 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     identity = np.arange(len(intake.landmark_id))
     settings = problem.settings
     noise = start_noise(settings, driven=problem.driven)
-    by_corners = (problem.kind == CORNERS) | problem.ray
-    counted, drift = None, drift_of(problem, intake.driven_pose) if problem.driven else None
-    # pixels err by themselves, detectors of objects by the view
-    if drift is not None and 2 * np.sum(~by_corners) <= len(by_corners):
-        counted = drift.share  # places of tags by their corners err alike all the same
-    elif drift is not None:
-        problem = replace(problem, share=np.where(by_corners, 1.0, drift.share))
-        if problem.steady:
-            noise = replace(noise, translation=settings.steady_m, rotation=settings.steady_rad)
-        elif drift.translation is not None and drift.rotation is not None:
-            noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
     known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
+    problem, noise, drift, counted = _with_drift(problem, noise, intake.driven_pose)
     stepwise, spread, step_s = incremental(problem, noise, known, place, progress)
-    estimate = stepwise
+    estimate, of_points = stepwise, 2 * np.count_nonzero(problem.kind == POINT) > len(problem.kind)
     if problem.driven:
         whole = _along(problem, intake.driven_pose, known, place)
-        points = converged(problem.as_points(), _likelier(problem, noise, stepwise, whole), noise)
+        points = converged(problem.as_points(), _likeliest(problem.as_points(), noise, [stepwise, whole]), noise)
+        if of_points and not problem.steady and _is_doubtful(points):
+            points = _or_better(points, by_constellations(problem, points.noise, SEEDS))
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)
+    elif of_points:
+        estimate = _likeliest(problem, noise, [stepwise, *by_constellations(problem, noise, SEEDS)])
     problem, estimate = _in_measured_frame(problem, estimate, framed)
     optimum, delay_sigma_s = _with_delays(converged(problem, estimate, noise))
     optimum = repaired(optimum)
@@ -165,6 +167,47 @@ def _in_measured_frame(
         loose = np.maximum(problem.start_sigma, tied.kind.first_sigma)
         problem = replace(problem, measurements=(*problem.measurements, tied), start_sigma=loose)
     return problem, estimate
+
+
+def _with_drift(
+    problem: SpatialProblem, noise: SpatialNoise, driven: FloatArray
+) -> tuple[SpatialProblem, SpatialNoise, Drift | None, FloatArray | None]:
+    """Return the problem with what each detection is worth, and the noise levels with the drift of the odometry.
+
+    And the drift where it was used, or what detections are worth (M,) where that is for covariances only.
+
+    Pixels err by themselves, detectors of objects by the view. That errors persist follows from the odometry alone,
+    of which a fast turn or a drift of other than usual form may be wrong. So independent errors are asked as well.
+    """
+    by_corners = (problem.kind == CORNERS) | problem.ray
+    if not problem.driven:
+        return problem, noise, None, None
+    drift, settings = drift_of(problem, driven), problem.settings
+    if 2 * np.sum(~by_corners) <= len(by_corners):  # places of tags by their corners err alike all the same
+        return problem, noise, drift, drift.share
+    share = np.where(by_corners, 1.0, drift.share)
+    if problem.steady:
+        noise = replace(noise, translation=settings.steady_m, rotation=settings.steady_rad)
+    elif drift.translation is not None and drift.rotation is not None:
+        if share.min() < 1.0 and settings.delay_sigma_s == 0.0:  # a delay that is not known yet is in all residuals
+            free = replace(problem.as_points(), prior=PlacePrior.none(), start_sigma=HELD)
+            alone = converged(free, first_places(free, driven), noise)
+            if _are_independent(alone, drift.translation):
+                return problem, replace(alone.noise, pixel=noise.pixel), None, None
+        noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
+    return replace(problem, share=share), noise, drift, None
+
+
+def _are_independent(optimum: SpatialOptimum, drift_m: float) -> bool:
+    """Tell whether errors of detections are independent: their residuals are, at an optimum that takes them for that.
+
+    And the odometry drifts there not much more than landmarks that are seen together show, by `drift_m`. Else what
+    persists was put into the poses.
+    """
+    problem, noise = optimum.smoother.problem, optimum.noise
+    range_m = float(np.median(np.linalg.norm(problem.measured[:, :3], axis=1)))
+    drifts = np.hypot(noise.translation, noise.rotation * range_m) < MOST_DRIFT * drift_m
+    return drifts and correlation(optimum) < INDEPENDENT
 
 
 def _with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, FloatArray]:
@@ -275,16 +318,31 @@ def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[Spati
     return replace(problem, prior=prior, start_sigma=FREE), stated
 
 
-def _likelier(
-    problem: SpatialProblem, noise: SpatialNoise, stepwise: SpatialEstimate, whole: SpatialEstimate
-) -> SpatialEstimate:
-    """Return initial values: frame by frame, or along the whole odometry; the more probable ones."""
-    points = problem.as_points()
+def _is_doubtful(optimum: SpatialOptimum) -> bool:
+    """Tell whether the odometry jumps, or there are frames in which most is taken for outliers."""
+    jumps = (optimum.now.odometry_weight < optimum.smoother.problem.settings.inlier).any()
+    return bool(jumps or lost_frames(optimum.smoother.problem, optimum.now.weight).any())
+
+
+def _or_better(optimum: SpatialOptimum, starts: list[SpatialEstimate]) -> SpatialOptimum:
+    """Return the optimum, or a more probable one from another start, at the same noise."""
+    smoother, noise, gain = optimum.smoother, optimum.noise, optimum.smoother.problem.settings.repair.gain_nats
+    cost = optimum.now.cost
+    for start in starts:
+        found = converged(smoother.problem, start, noise)
+        there = smoother.linearised(found.estimate, noise, heavy=False).cost
+        if there < cost - gain:
+            optimum, cost = found, there
+    return optimum
+
+
+def _likeliest(problem: SpatialProblem, noise: SpatialNoise, starts: list[SpatialEstimate]) -> SpatialEstimate:
+    """Return the initial values that lead to the most probable ones."""
     cost = []
-    for start in (stepwise, whole):
-        smoother = SpatialSmoother(points, start.pose)
+    for start in starts:
+        smoother = SpatialSmoother(problem, start.pose)
         cost.append(smoother.optimum(start, noise, heavy=True, iterations=10)[1].cost)
-    return whole if cost[1] <= cost[0] else stepwise
+    return starts[len(starts) - 1 - int(np.argmin(cost[::-1]))]  # of equal ones the last
 
 
 def _along(problem: SpatialProblem, driven: FloatArray, known: BoolArray, place: FloatArray) -> SpatialEstimate:
