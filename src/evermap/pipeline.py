@@ -77,6 +77,7 @@ def run_together(
         ConfigError: landmarks without identities are those of one robot (`slam.unknown_ids`).
         NumericalError: no finite optimum.
     """
+    from evermap.estimate.tie import without_frames
     from evermap.maps.sessions import planar, session, spatial
     from evermap.slam import check, estimate, together
 
@@ -89,7 +90,7 @@ def run_together(
         raise ConfigError(problem, field="slam.unknown_ids", hint=hint)
     alone, visits, results = {}, list[spatial.SpatialVisit](), {}
     for number, given in recordings.items():
-        recording, remarks = check.screened(given, config)
+        recording, remarks = check.screened(replace(given, measurements=without_frames(given.measurements)), config)
         if isinstance(recording, SpatialRecording):
             visits.append(spatial.solve_visit(recording, config, None, remarks, progress=progress))
             continue

@@ -68,6 +68,11 @@ class Tied:
         """Return (K, 1) other poses or places; (K, 0) of measurements of a pose alone."""
         return self.other[:, None] if self.kind.ties != "pose" else np.zeros((len(self.row), 0), dtype=np.int64)
 
+    def renumbered(self, row: IntArray) -> Tied:
+        """Return the same for other numbers (N,) of the poses."""
+        other = row[self.other] if self.kind.ties == "pose_pose" else self.other
+        return replace(self, row=row[self.row], other=other)
+
     def until(self, n_poses: int) -> Tied:
         """Return those that tie none but the first so many poses."""
         return self.among(0, n_poses)

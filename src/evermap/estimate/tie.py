@@ -61,3 +61,8 @@ def _instants(
     """Return the last pose before each instant, and the motion (K, 7) from there."""
     row = np.clip(np.searchsorted(stamp_s, instant_s, side="right") - 1, 0, len(stamp_s) - 1)
     return row.astype(np.int64), move(stamp_s[row], instant_s)
+
+
+def without_frames(tables: Sequence[Measurements]) -> tuple[Measurements, ...]:
+    """Return the measurements without those that have a frame of their own: what is laid over others has none."""
+    return tuple(table for table in tables if find_kinds()[table.kind].frame is None)

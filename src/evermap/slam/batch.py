@@ -17,8 +17,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from evermap.config import SlamConfig
 from evermap.errors import NumericalError
+from evermap.estimate.measurement import Tied
 from evermap.estimate.sparse.system import Slices, exhausted
-from evermap.geometry import se2
+from evermap.geometry import se2, se3
 from evermap.geometry.rigid import consensus
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior, needed, seated
@@ -180,13 +181,20 @@ class Batch:
                 )
         return smoother, estimate, marginals
 
-    def solved(self, part: SolvedPart, prior_map: PriorMap | None) -> Outcome:
-        """Return the optimum near the values of a part, in a prior map where two of its landmarks fit."""
+    def solved(self, part: SolvedPart, prior_map: PriorMap | None, framed: tuple[Tied, ...] = ()) -> Outcome:
+        """Return the optimum near the values of a part, in a prior map where two of its landmarks fit.
+
+        Else in the frame of measurements that have one of their own, `framed`.
+        """
         problem, estimate, noise, _ = part
-        if prior_map is None or np.count_nonzero(agreeing(prior_map, estimate.landmark)[1]) < 2:
-            return self.finished(problem, estimate, noise, aligned=False, near=True)
-        problem, estimate, _ = entered(problem, estimate, prior_map, self._prior)
-        return self.finished(problem, estimate, noise, aligned=True)
+        estimate = _with_measured_places(problem, estimate)
+        if prior_map is not None and np.count_nonzero(agreeing(prior_map, estimate.landmark)[1]) >= 2:
+            problem, estimate, _ = entered(problem, estimate, prior_map, self._prior)
+            return self.finished(problem, estimate, noise, aligned=True)
+        if framed:
+            problem, estimate = _in_measured_frame(problem, estimate, framed, self._prior)
+            return self.finished(problem, estimate, noise, aligned=True)
+        return self.finished(problem, estimate, noise, aligned=False, near=True)
 
     def finished(
         self, problem: Problem, estimate: Estimate, noise: Noise, *, aligned: bool, near: bool = False
@@ -326,6 +334,28 @@ def _led_on(problem: Problem, estimate: Estimate, noise: Noise) -> Estimate:
     at = sighted_at(pose[theirs.pose_row], theirs.reading, estimate.states, problem.mount)
     middle = middles(theirs.landmark_row, at, len(landmark))
     return Estimate(pose, np.where(np.isnan(landmark), middle, landmark), estimate.states)
+
+
+def _with_measured_places(problem: Problem, estimate: Estimate) -> Estimate:
+    """Return values with the places of landmarks that further kinds of measurements alone have seen."""
+    landmark, pose = estimate.landmark.copy(), se3.from_plane(estimate.pose)
+    for tied in problem.measurements:
+        for row, at in tied.locate(pose, np.flatnonzero(~estimate.known)).items():
+            landmark[row] = at[:2]
+    return replace(estimate, landmark=landmark)
+
+
+def _in_measured_frame(
+    problem: Problem, estimate: Estimate, framed: tuple[Tied, ...], prior: CalibrationPrior
+) -> tuple[Problem, Estimate]:
+    """Return problem and values in the frame of measurements that have one, which say what a metre is, too."""
+    framed = tuple(tied.until(len(estimate.pose)) for tied in framed)
+    for tied in framed:
+        motion = tied.find_frame(se3.from_plane(estimate.pose))
+        assert motion is not None
+        estimate = estimate.moved(np.append(motion[:2], 2.0 * np.arctan2(motion[5], motion[6])))
+    held = replace(problem, start_pose=estimate.pose[0], start_information=ALIGNED_INFORMATION, prior=prior)
+    return replace(held, measurements=(*problem.measurements, *framed)), estimate
 
 
 def agreeing(prior_map: PriorMap, landmark: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -86,11 +86,14 @@ def solve(
     if not causal and batch.is_driven(problem):
         part, interrupted = _furthest(batch.parts(problem), problem.stamp_s, progress)
         if interrupted or part.fits:  # else what the stream finds is a better start
-            outcome = batch.solved(part, prepared.prior_map)
+            outcome = batch.solved(part, prepared.prior_map, prepared.framed)
             done = len(outcome.problem.stamp_s)
             step_s = np.full(done, (time.perf_counter() - began) / done)  # solved together, each has its share
             return Solved(recording, prepared, outcome, None, prior, step_s, interrupted, settings)
-    slam = StreamingSlam(problem, noise, prior, prior_map=prepared.prior_map, settings=settings, method=method)
+    slam = StreamingSlam(
+        problem, noise, prior,
+        prior_map=prepared.prior_map, framed=prepared.framed, settings=settings, method=method,
+    )  # fmt: skip
     step_s, interrupted = fed(problem.stamp_s, lambda _: slam.step(), least=2, realtime=realtime, progress=progress)
     return Solved(recording, prepared, slam.finish(), slam, prior, step_s, interrupted, settings)
 

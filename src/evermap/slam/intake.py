@@ -10,6 +10,7 @@ from scipy import sparse
 
 from evermap.config import OdometryConfig, SlamConfig
 from evermap.errors import DataError
+from evermap.estimate.measurement import Tied
 from evermap.estimate.tie import tie_measurements
 from evermap.geometry import se3
 from evermap.slam.batch import PriorMap
@@ -35,6 +36,7 @@ class Prepared:
         used: (M,) rows of `Recording.detections` that are used.
         landmark_id: (L,) ids behind the problem's landmark rows.
         prior_map: the map to localise in, in those rows.
+        framed: measurements with a frame of their own, such as GNSS fixes; those of the problem have none.
         warnings: what was left out, counted.
     """
 
@@ -45,6 +47,7 @@ class Prepared:
     landmark_id: IntArray
     prior_map: PriorMap | None
     warnings: tuple[str, ...]
+    framed: tuple[Tied, ...] = ()
 
     def given_map(self) -> GivenMap | None:
         """Return the prior map as the joint search compares with it: landmark by landmark, with covariances."""
@@ -105,10 +108,11 @@ def prepare(
         start_information=FIRST_POSE_INFORMATION,
         landmark_mean=np.zeros((len(landmark_id), 2)),
         landmark_information=sparse.csr_array((2 * len(landmark_id), 2 * len(landmark_id))),
-        measurements=tied,
+        measurements=tuple(of for of in tied if of.kind.frame is None),
     )
     in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
-    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings))
+    framed = tuple(of for of in tied if of.kind.frame is not None)
+    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings), framed)
 
 
 def _frames_with_pose(recording: Recording, seen_in: IntArray, moving: BoolArray) -> IntArray:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from evermap.estimate.measurement import frame_of
 from evermap.geometry import se2
 from evermap.slam.batch import Outcome
 from evermap.slam.bridge import bridged, dead_reckoned
@@ -44,7 +45,10 @@ LEAST_WEIGHT, LEAST_LEFT = 1e-6, 1e-6
 def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
     """Return trajectory and map, changes, and alternatives; from `scratch` in the frame of that name."""
     prepared, outcome, recording = solved.prepared, solved.outcome, solved.recording
-    frame, revision = "prior_map" if outcome.aligned else scratch, outcome.revision
+    frame, revision = (
+        frame_of(outcome.problem.measurements, "prior_map") if outcome.aligned else scratch,
+        outcome.revision,
+    )
     path = trajectory(solved, frame)
     states = described(
         outcome.estimate.states,
@@ -59,7 +63,7 @@ def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
     if solved.interrupted:
         done_s, all_s = (float(np.ptp(s)) for s in (path.stamp_s, recording.frames.stamp_s))
         warnings.append(f"interrupted after {done_s:.0f} of {all_s:.0f} s of the recording")
-    if prepared.prior_map is not None and not outcome.aligned:
+    if prepared.prior_map is not None and frame != "prior_map":
         warnings.append(
             "cannot localise in the prior map: too few of the detected landmarks have the relative positions of the "
             "map; the result is in the frame of the first pose"
@@ -128,6 +132,12 @@ def _landmarks(solved: Solved, frame: str, position: FloatArray, covariance: Flo
     first, last = np.full(count, np.inf), np.full(count, -np.inf)
     np.minimum.at(first, done, stamps[: len(done)])
     np.maximum.at(last, done, stamps[: len(done)])
+    hits = np.bincount(done, minlength=count)
+    for tied in (tied for tied in outcome.problem.measurements if tied.kind.ties == "pose_place"):
+        hits += np.bincount(tied.other, minlength=count)
+        at_s = recording.frames.stamp_s[prepared.pose_frame[tied.row]]
+        np.minimum.at(first, tied.other, at_s)
+        np.maximum.at(last, tied.other, at_s)
     classes = np.full(count, UNKNOWN, dtype=np.int64)
     classes[prepared.problem.landmark_row] = recording.detections.class_id[prepared.used]
     return Landmarks(
@@ -136,7 +146,7 @@ def _landmarks(solved: Solved, frame: str, position: FloatArray, covariance: Flo
         covariance_m2=covariance[known],
         class_id=classes[known],
         p_exists=np.ones(int(known.sum())),
-        n_hits=np.bincount(done, minlength=count)[known].astype(np.int64),
+        n_hits=hits[known].astype(np.int64),
         n_misses=np.zeros(int(known.sum()), dtype=np.int64),
         first_seen_s=first[known],
         last_seen_s=last[known],

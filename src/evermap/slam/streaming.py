@@ -14,6 +14,7 @@ from itertools import count as counted
 import numpy as np
 
 from evermap.config import SlamConfig
+from evermap.estimate.measurement import Tied
 from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
 from evermap.slam.batch import (
@@ -24,6 +25,7 @@ from evermap.slam.batch import (
     Batch,
     Outcome,
     PriorMap,
+    SolvedPart,
     agreeing,
     entered,
     sighted_at,
@@ -70,11 +72,12 @@ class StreamingSlam:
         prior: CalibrationPrior,
         *,
         prior_map: PriorMap | None = None,
+        framed: tuple[Tied, ...] = (),
         settings: SlamConfig = USUAL,
         method: Method | None = None,
     ) -> None:
         self._prior = prior
-        self._prior_map = prior_map
+        self._prior_map, self._framed = prior_map, framed
         self._problem = replace(problem, prior=prior.without_scale())
         self._start_noise = self._noise = noise
         self._settings, self._robust, self._estimate_noise = settings, settings.robust, settings.estimate_noise
@@ -198,6 +201,8 @@ class StreamingSlam:
             self._enter_map()
         self._job = None
         problem, estimate = self._problem.until(self._n_poses), self._filter.estimate()
+        if self._framed and not self._aligned:
+            return self._batch.solved(SolvedPart(problem, estimate, self._noise, fits=True), None, self._framed)
         return self._batch.finished(problem, estimate, self._noise, aligned=self._aligned)
 
     def _assign(self, row: int, detections: IntArray) -> None:

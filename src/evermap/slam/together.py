@@ -140,11 +140,12 @@ def _extended(member: Solved, stamp_s: FloatArray) -> tuple[Problem, Estimate]:
         outcome.noise.noise,
     )  # fmt: skip
     states, _, scale, _ = member.prior.split_scale(graph.states, np.zeros((N_STATES, N_STATES)))
-    count = len(graph.landmark)
+    count, row = len(graph.landmark), np.searchsorted(stamp_s, problem.stamp_s)
     extended = replace(
         problem,
         stamp_s=stamp_s,
-        pose_row=np.searchsorted(stamp_s, problem.stamp_s)[problem.pose_row],
+        pose_row=row[problem.pose_row],
+        measurements=tuple(tied.renumbered(row) for tied in problem.measurements),
         landmark_mean=np.zeros((count, 2)),
         landmark_information=sparse.csr_array((2 * count, 2 * count)),
     )

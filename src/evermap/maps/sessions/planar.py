@@ -9,6 +9,7 @@ from scipy import sparse
 
 from evermap.config import Config, LivingConfig, MetreConfig
 from evermap.errors import DataError, NumericalError
+from evermap.estimate.tie import without_frames
 from evermap.geometry import se2
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
@@ -128,6 +129,7 @@ def solve_session(
         NumericalError: no finite optimum.
     """
     settings = config.slam.model_copy(update={"method": "nohyp", "unknown_ids": False})
+    recording = replace(recording, measurements=without_frames(recording.measurements))
     return solve(recording, settings, remarks=remarks, progress=progress)
 
 

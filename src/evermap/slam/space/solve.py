@@ -46,6 +46,8 @@ OUTLIER, LOST = 10.0, 15.0
 MOST_DRIFT, INDEPENDENT = 3.0, 0.2
 """Drift over that which landmarks show along the odometry, where two levers of two make up for the odometry's shape;
 and correlation of consecutive residuals of a landmark, up to which these are independent."""
+STRIDES, SAME_METRE = 20, 0.03
+"""Shares of a drive whose ways are compared, the longer half, and by which these differ at most, in the median."""
 SEEDS = 3
 """Frames from which constellations are begun."""
 WORTH = 3.0
@@ -192,7 +194,7 @@ def _with_drift(
         if share.min() < 1.0 and settings.delay_sigma_s == 0.0:  # a delay that is not known yet is in all residuals
             free = replace(problem.as_points(), prior=PlacePrior.none(), start_sigma=HELD)
             alone = converged(free, first_places(free, driven), noise)
-            if _are_independent(alone, drift.translation):
+            if _are_independent(alone, drift.translation) and _is_of_one_metre(alone.estimate.pose, driven):
                 return problem, replace(alone.noise, pixel=noise.pixel), None, None
         noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
     return replace(problem, share=share), noise, drift, None
@@ -208,6 +210,14 @@ def _are_independent(optimum: SpatialOptimum, drift_m: float) -> bool:
     range_m = float(np.median(np.linalg.norm(problem.measured[:, :3], axis=1)))
     drifts = np.hypot(noise.translation, noise.rotation * range_m) < MOST_DRIFT * drift_m
     return drifts and correlation(optimum) < INDEPENDENT
+
+
+def _is_of_one_metre(pose: FloatArray, driven: FloatArray) -> bool:
+    """Tell whether ways are as long as by the odometry, whose metre holds where nothing is stated of the ranges."""
+    stride = max(1, len(pose) // STRIDES)
+    way, by_odometry = (np.linalg.norm(of[stride:, :3] - of[:-stride, :3], axis=1) for of in (pose, driven))
+    ratio = way / np.maximum(by_odometry, 1e-9)
+    return bool(abs(np.median(ratio[by_odometry > np.median(by_odometry)]) - 1.0) < SAME_METRE)
 
 
 def _with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, FloatArray]:
