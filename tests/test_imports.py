@@ -35,7 +35,7 @@ RULES = {
     "viz": "errors types geometry survival metrics existence",
     "slam": "errors interrupts compiled plugins show types config geometry valid sensing tracking estimate",
     "maps": "errors show types config geometry survival valid sensing existence tracking estimate slam",
-    "pipeline": "errors compiled types config slam maps",
+    "pipeline": "errors compiled types config estimate slam maps",
     "runs": (
         "errors interrupts show types config geometry survival valid io metrics existence tracking viz maps pipeline"
     ),

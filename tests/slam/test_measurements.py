@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from recordings import building, with_detections
 
-from evermap import run_slam
+from evermap import Config, run_slam
 from evermap.geometry import se2
 from evermap.metrics.summary import compare_with_truth
 from evermap.metrics.trajectory import interpolate
@@ -65,3 +65,43 @@ def test_what_is_said_of_height_and_tilt_changes_nothing(kind):
     plain = run_slam(drive()).trajectory
     both = np.isin(found.trajectory.stamp_s, plain.stamp_s)
     np.testing.assert_allclose(found.trajectory.pose_world_robot[both], plain.pose_world_robot, atol=2e-3)
+
+
+def absolute_error(result: SlamResult) -> float:
+    """RMSE in the frame of the truth; nothing is aligned."""
+    away = result.trajectory.pose_world_robot[:, :2] - true_pose(result.trajectory.stamp_s)[:, :2]
+    return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+
+
+@pytest.mark.parametrize("online", [False, True])
+@pytest.mark.parametrize("p_wrong", [0.0, 0.1])
+def test_fixes_put_the_drive_where_it_was(p_wrong, online):
+    random, truth = np.random.default_rng(0), drive().truth
+    stamp_s = np.arange(truth.stamp_s[0] + 0.3, truth.stamp_s[-1] - 0.3, 1.0)
+    at = se2.transform(true_pose(stamp_s), np.array([-0.4, 0.1])) + random.normal(0.0, 0.1, (len(stamp_s), 2))
+    at[random.random(len(at)) < p_wrong] += [6.0, -9.0]
+    lever = {"lever_x_m": np.full(len(at), -0.4), "lever_y_m": np.full(len(at), 0.1)}
+    recording = measured("gnss", stamp_s, x_m=at[:, 0], y_m=at[:, 1], sigma_xy_m=np.full(len(at), 0.1), **lever)
+    result = run_slam(recording, Config(slam={"online": online}))
+    assert result.trajectory.frame == result.landmarks.frame == "gnss"
+    assert absolute_error(result) < 0.1
+
+
+@pytest.mark.parametrize("kind", ["ranges", "bearings"])
+def test_landmarks_that_are_only_measured_are_mapped_and_hold_the_drive(kind):
+    random, truth = np.random.default_rng(4), drive().truth
+    low, high = truth.pose_world_robot[:, :2].min(axis=0) - 3.0, truth.pose_world_robot[:, :2].max(axis=0) + 3.0
+    beacon = np.array([low, [low[0], high[1]], high, [high[0], low[1]]])
+    when = np.arange(truth.stamp_s[0] + 0.3, truth.stamp_s[-1] - 0.3, 1.0)
+    stamp_s, which = np.repeat(when, 4), np.tile(np.arange(4), len(when))
+    seen = np.array([se2.transform(se2.inverse(pose), beacon[k]) for pose, k in zip(true_pose(stamp_s), which)])
+    if kind == "ranges":
+        columns = {"range_m": np.hypot(*seen.T) + random.normal(0.0, 0.05, len(seen))}
+        columns["sigma_m"] = np.full(len(seen), 0.05)
+    else:
+        columns = {"azimuth_rad": np.arctan2(seen[:, 1], seen[:, 0]) + random.normal(0.0, 0.01, len(seen))}
+        columns["sigma_rad"] = np.full(len(seen), 0.01)
+    result = run_slam(measured(kind, stamp_s, 100_000 + which, **columns))
+    assert position_error(result) < 0.5 * error_without()
+    mine = result.landmarks.landmark_id >= 100_000
+    assert result.landmarks.n_hits[mine].tolist() == [len(when)] * 4
