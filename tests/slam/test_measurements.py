@@ -94,7 +94,9 @@ def test_landmarks_that_are_only_measured_are_mapped_and_hold_the_drive(kind):
     beacon = np.array([low, [low[0], high[1]], high, [high[0], low[1]]])
     when = np.arange(truth.stamp_s[0] + 0.3, truth.stamp_s[-1] - 0.3, 1.0)
     stamp_s, which = np.repeat(when, 4), np.tile(np.arange(4), len(when))
-    seen = np.array([se2.transform(se2.inverse(pose), beacon[k]) for pose, k in zip(true_pose(stamp_s), which)])
+    seen = np.array(
+        [se2.transform(se2.inverse(pose), beacon[k]) for pose, k in zip(true_pose(stamp_s), which, strict=True)]
+    )
     if kind == "ranges":
         columns = {"range_m": np.hypot(*seen.T) + random.normal(0.0, 0.05, len(seen))}
         columns["sigma_m"] = np.full(len(seen), 0.05)
