@@ -19,7 +19,7 @@ from evermap.cli.warmup import warm_up
 from evermap.config import Config, SlamConfig
 from evermap.interrupts import held, temporary, watched
 from evermap.pipeline import run_slam
-from evermap.slam.batch import Batch, Part
+from evermap.slam.batch import Batch, SolvedPart
 from evermap.slam.problem import Problem
 from evermap_studies.sim import BuildingConfig, simulate_building
 from evermap_studies.workers import sheltered
@@ -40,7 +40,7 @@ def interrupt() -> None:
 
 
 def test_an_interrupt_of_the_warm_up_is_for_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
-    def parts(self: Batch, problem: Problem) -> Iterator[Part]:
+    def parts(self: Batch, problem: Problem) -> Iterator[SolvedPart]:
         for part in whole(self, problem):
             assert interrupts._open["watched"]
             interrupt()

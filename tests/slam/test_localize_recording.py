@@ -70,7 +70,7 @@ def test_what_is_known_at_the_time_is_nearly_as_good_as_with_a_map_that_is_learn
     assert recording.true_landmarks is not None
     landmarks = surveyed(recording.true_landmarks, 0.005)
     result = located(recording, landmarks)
-    whole = run_slam(recording, Config(slam={"method": "nohyp"}), prior_map=landmarks)
+    whole = run_slam(recording, Config(slam={"method": "nohyp", "online": True}), prior_map=landmarks)
     assert result.trajectory.frame == "prior_map"
     settled_s = result.online.stamp_s[0] + 20.0
     both = np.intersect1d(result.online.stamp_s, whole.online.stamp_s)  # it has no poses where nothing was seen

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from evermap.config import NoiseConfig
+from evermap.estimate.noise import restricted_level
 from evermap.slam.kernels import kernel, multiply
 from evermap.slam.linearise import detection_residuals, root_of
 from evermap.slam.preintegration import Intervals, linearise_interval
@@ -76,7 +77,7 @@ def refine_noise(
     learned = np.where(np.isfinite(problem.sigma_given), 0.0, weights[:, None])
     left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
     squares, counts = (learned * residual**2).sum(axis=0), (learned * np.maximum(left, 0.0)).sum(axis=0)
-    detection = np.sqrt((squares + pseudo * start.detection**2) / (counts + pseudo))
+    detection = restricted_level(squares, counts, start.detection, pseudo)
     driven = problem.drive.between(problem.stamp_s, estimate.states)
     pulls, chances, fisher = _odometry_sums(
         estimate.pose, driven, noise.odometry**2, problem.prior.free, marginals.explained_odometry
@@ -84,15 +85,8 @@ def refine_noise(
     # tr(W P_k) is a count only after multiplying by the variance
     variance = noise.odometry**2
     count = np.maximum(variance * chances, 0.0)
-    # kinds that act on the same residuals are told apart by a step of scoring in the logarithms of their variances
-    imagined = pseudo * start.odometry**2 / variance
-    gradient = 0.5 * (variance * (pulls - chances) + imagined - pseudo)
-    curvature = variance[:, None] * fisher * variance
-    whole = np.sqrt(0.5 * count / np.maximum(curvature.sum(axis=1), 1e-300))
-    curvature = whole[:, None] * curvature * whole
-    information, curvature = curvature, curvature + np.diag(0.5 * imagined)
-    step = np.clip(0.5 * np.linalg.solve(curvature, gradient), -LARGEST_STEP, LARGEST_STEP)
-    odometry = noise.odometry * np.exp(step)
+    odometry = restricted_level(variance**2 * pulls, count, start.odometry, pseudo)
+    step, information = np.log(odometry / noise.odometry), variance[:, None] * fisher * variance
     of_motions = float(step @ information @ step) / max(float(information.sum()), 1e-300)
     of_readings = float(np.max(np.log(detection / noise.detection) ** 2 * (counts > pseudo)))
     # a variance is known less well where others act on the same residuals

@@ -16,6 +16,7 @@ from scipy import sparse
 
 from evermap.errors import DataError
 from evermap.estimate.gauss_newton import Steps
+from evermap.estimate.noise import restricted_level
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.batch import (
@@ -283,8 +284,8 @@ def _refined(
     for r, member in enumerate(members):
         if member.settings.estimate_noise:
             mine, pseudo = joint.met.robot == r, _start(member).pseudo_count
-            counts = left[mine].sum(axis=0) + pseudo
-            sigma[r] = np.sqrt((square[mine].sum(axis=0) + pseudo * start[r] ** 2) / counts)
+            counts = left[mine].sum(axis=0)
+            sigma[r] = restricted_level(square[mine].sum(axis=0), counts, start[r], pseudo)
     return sigma
 
 
