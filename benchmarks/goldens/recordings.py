@@ -21,6 +21,7 @@ from benchmarks.goldens.scores import (
     changes,
     counted,
     levels,
+    longest_frame_ms,
     mean_of,
     measured,
     moved,
@@ -119,13 +120,13 @@ def dlr(data: Path) -> Iterator[Named]:
     from evermap_studies.peers import factors as plain
     from evermap_studies.peers.plain_gtsam import levenberg_marquardt
 
-    recording, ticks = scale.dlr_recording(present(data / "dlr")), scale.Ticks()
+    recording = scale.dlr_recording(present(data / "dlr"))
     with measured() as spent:
-        result = em.run_slam(recording, progress=ticks)
+        result = em.run_slam(recording)
     yield from scores(recording, result)
     yield from levels(result, ("sigma_range_m", "sigma_bearing_rad"))
     yield "cpu_s", spent.cpu_s
-    yield "longest/frame_ms", 1e3 * float(ticks.frame_s[scale.STREAM_FROM :].max())
+    yield "longest/frame_ms", longest_frame_ms(recording)
     factors = plain.factors_of(recording, scale.learned_noise(result))
     peer = levenberg_marquardt(factors, plain.dead_reckoned_start(factors), marginals=False)
     yield "lm/over_peer", spent.cpu_s / peer.solve.cpu_s

@@ -99,3 +99,14 @@ def measured() -> Iterator[Spent]:
     spent, began = Spent(), time.process_time()
     yield spent
     spent.cpu_s = time.process_time() - began
+
+
+def longest_frame_ms(recording: AnyRecording) -> float:
+    """Return the longest frame of the stream, after the first ones; without the key `slam.online` all runs stream."""
+    import evermap as em
+    from benchmarks import scale
+    from evermap.config import SlamConfig
+
+    ticks, streams = scale.Ticks(), {"online": True} if "online" in SlamConfig.model_fields else {}
+    em.run_slam(recording, em.Config(slam=streams), progress=ticks)
+    return 1e3 * float(ticks.frame_s[scale.STREAM_FROM :].max())

@@ -78,6 +78,7 @@ class Outcome:
         askew: direction in which the robot drives, from its front, and its standard deviation [rad].
         problem: with the start and priors that the optimum belongs to, in the graph's metres.
         graph_estimate, graph_marginals: values and covariances as the graph holds them, before the scale was divided.
+        fit_marginals: the covariances of the fit, with errors that last as if they were independent.
         noise: levels and how well they are known.
         inlier: (M,) probability of every detection to be no outlier.
         scale: factor from the graph's metres to metres; log_scale_sigma: its uncertainty.
@@ -93,6 +94,7 @@ class Outcome:
     problem: Problem
     graph_estimate: Estimate
     graph_marginals: Marginals
+    fit_marginals: Marginals
     noise: NoiseFit
     inlier: FloatArray
     scale: float
@@ -434,6 +436,7 @@ def divided(
         problem=smoother.problem,
         graph_estimate=estimate,
         graph_marginals=marginals if others else smoother.counted(estimate, marginals),
+        fit_marginals=marginals,
         noise=noise,
         inlier=smoother.inlier_probability(estimate),
         scale=scale,

@@ -115,7 +115,9 @@ def lasting_errors(residual: FloatArray, weight: FloatArray, stamp_s: FloatArray
         stamp_s: (M,) of the detections, sorted.
         place: (M,) what was seen.
     """
-    persist_s = np.array([each for each in PERSIST_S if each <= max(float(np.ptp(stamp_s)), PERSIST_S[0])])
+    persist_s = np.array(
+        [each for each in PERSIST_S if each <= max(float(np.ptp(stamp_s)) if len(stamp_s) else 0.0, PERSIST_S[0])]
+    )
     none = Lasting(persist_s, np.zeros(len(persist_s)))
     curve = _pooled(residual, weight > LEAST_WEIGHT, stamp_s, place)
     if len(curve.lag_s) < FEWEST_BINS:

@@ -193,7 +193,7 @@ def _innovations(solved: Solved) -> Innovations:
     outcome, detections = solved.outcome, solved.recording.detections
     problem, weight = outcome.problem, np.maximum(outcome.inlier, LEAST_WEIGHT)[:, None, None]
     sigma = outcome.noise.noise.of_detections(problem.sigma_given)
-    used = outcome.graph_marginals.explained_detections
+    used = outcome.fit_marginals.explained_detections
     left = np.eye(2) - used
     told = np.flatnonzero(np.trace(left, axis1=1, axis2=2) > LEAST_LEFT)
     r, left, own = (detection_residuals(problem, outcome.graph_estimate) / sigma)[told, :, None], left[told], used[told]

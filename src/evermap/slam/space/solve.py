@@ -139,7 +139,10 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
         goes = (drift.translation or 0.0) * drift.doubt, (drift.rotation or 0.0) * drift.doubt
         sober = replace(sober, translation=max(sober.translation, goes[0]), rotation=max(sober.rotation, goes[1]))
     now = smoother.linearised(optimum.estimate, sober, heavy=False)
-    optimum = replace(optimum, smoother=smoother, now=now)  # for covariances, which are no better than all this
+    fitted = optimum.smoother, optimum.now
+    optimum = replace(
+        optimum, smoother=smoother, now=now, fitted=fitted
+    )  # for covariances, which are no better than all this
     return SpatialSolved(optimum, identity, times_of(identity), from_map, delay_sigma_s, stepwise.pose, spread, step_s)
 
 
@@ -186,7 +189,7 @@ def _with_drift(
         return problem, noise, None, None
     drift, settings = drift_of(problem, driven), problem.settings
     if 2 * np.sum(~by_corners) <= len(by_corners):  # places of tags by their corners err alike all the same
-        return problem, noise, drift, drift.share
+        return problem, noise, drift, np.where(problem.ray, 1.0, drift.share)  # ranges of rays were triangulated
     share = np.where(by_corners, 1.0, drift.share)
     if problem.steady:
         noise = replace(noise, translation=settings.steady_m, rotation=settings.steady_rad)
