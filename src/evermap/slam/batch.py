@@ -165,7 +165,7 @@ class Batch:
                 weights = smoother.inlier_probability(estimate)
                 if count == whole:  # outliers as from here on
                     weights = smoother.under(noise, heavy=False).inlier_probability(estimate)
-                noise = refine_noise(some, estimate, marginals, weights, noise, self._start_noise).noise
+                noise = refine_noise(some, estimate, marginals, weights, noise, self._start_noise, scoring=True).noise
             yield SolvedPart(some, estimate, noise, fits)
 
     def _led_on(self, problem: Problem, before: Estimate, noise: Noise) -> tuple[Smoother, Estimate, Marginals]:
@@ -295,7 +295,7 @@ class Batch:
             solved = smoother.solved_in_slices(estimate, iterations=steps, tolerance=tolerance, settled=settled)
             estimate, marginals = exhausted(solved)
             weights = smoother.inlier_probability(estimate)
-            fit = refine_noise(problem, estimate, marginals, weights, noise, self._start_noise)
+            fit = refine_noise(problem, estimate, marginals, weights, noise, self._start_noise, scoring=True)
             if not heavy and (fit.change < within or not self._estimate_noise):
                 break
             if self._estimate_noise:

@@ -66,9 +66,19 @@ class NoiseFit:
 
 
 def refine_noise(
-    problem: Problem, estimate: Estimate, marginals: Marginals, weights: FloatArray, noise: Noise, start: Noise = START
+    problem: Problem,
+    estimate: Estimate,
+    marginals: Marginals,
+    weights: FloatArray,
+    noise: Noise,
+    start: Noise = START,
+    *,
+    scoring: bool = False,
 ) -> NoiseFit:
     """Take one step from `noise` towards the restricted-likelihood noise levels.
+
+    With `scoring`, by the Fisher information of all kinds of odometry noise together: kinds that act on the same
+    residuals are told apart in fewer steps, from levels that are not far off.
 
     `estimate` is the optimum under `noise`, with its covariances and the inlier probabilities (M,); `start` are levels
     that `start.pseudo_count` imaginary residuals vouch for.
@@ -87,6 +97,14 @@ def refine_noise(
     count = np.maximum(variance * chances, 0.0)
     odometry = restricted_level(variance**2 * pulls, count, start.odometry, pseudo)
     step, information = np.log(odometry / noise.odometry), variance[:, None] * fisher * variance
+    if scoring:
+        imagined = pseudo * start.odometry**2 / variance
+        gradient = 0.5 * (variance * (pulls - chances) + imagined - pseudo)
+        whole = np.sqrt(0.5 * count / np.maximum(information.sum(axis=1), 1e-300))
+        information = whole[:, None] * information * whole
+        step = 0.5 * np.linalg.solve(information + np.diag(0.5 * imagined), gradient)
+        step = np.clip(step, -LARGEST_STEP, LARGEST_STEP)
+        odometry = noise.odometry * np.exp(step)
     of_motions = float(step @ information @ step) / max(float(information.sum()), 1e-300)
     of_readings = float(np.max(np.log(detection / noise.detection) ** 2 * (counts > pseudo)))
     # a variance is known less well where others act on the same residuals

@@ -299,7 +299,7 @@ class StreamingSlam:
         if learn and self._estimate_noise:
             yield from marginals.in_slices()
             weights = smoother.inlier_probability(estimate)
-            fit = refine_noise(problem, estimate, marginals, weights, self._noise, self._start_noise)
+            fit = refine_noise(problem, estimate, marginals, weights, self._noise, self._start_noise, scoring=True)
             self._noise = fit.noise
             smoother = smoother.under(self._noise, heavy=True)
         marginals = yield from smoother.marginals_in_slices(estimate)

@@ -253,7 +253,9 @@ def _levelled(
         estimate, marginals = joint.solved(estimate, Steps(STEPS_A_ROUND, NEAR_NOISE))
         own, parts = joint.estimates(estimate), joint.parts(estimate, marginals)
         fits = [
-            refine_noise(robot.problem, one, part, robot.inlier_probability(one), robot.noise, _start(member))
+            refine_noise(
+                robot.problem, one, part, robot.inlier_probability(one), robot.noise, _start(member), scoring=True
+            )
             for member, robot, one, part in zip(members, joint.robots, own, parts, strict=True)
         ]
         learning, settled = [], not first
