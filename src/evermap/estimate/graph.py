@@ -9,7 +9,7 @@ together are a concatenation of their blocks (`SharedBlock`), and a new measurem
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -270,8 +270,3 @@ def _coordinates(layout: Layout, factors: Factors, pose: IntArray) -> FloatArray
         found = np.bincount(mine, sums[those], minlength=len(alone)) / np.maximum(total, 1)
         at[n_leaves:, axis] = np.where(total > 0, found, at[:n_leaves, axis].mean())
     return at
-
-
-def with_blocks(graph: Graph[State], blocks: Sequence[FactorBlock[State]]) -> Graph[State]:
-    """Return the graph with other values of its blocks, such as noise levels; their ties must be the same."""
-    return replace(graph, blocks=tuple(blocks))

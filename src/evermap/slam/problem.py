@@ -341,7 +341,7 @@ class PlanarView:
         return np.column_stack([state.landmark, np.zeros(len(state.landmark))])
 
     def by_pose(self, by_twist: FloatArray) -> FloatArray:
-        """Return derivatives (K, r, 3) by steps forward and left, and by turns."""
+        """Return derivatives (K, r, 3) by forward and lateral translation and by rotation."""
         return by_twist[..., [0, 1, 5]]
 
     def by_place(self, state: Estimate, place: IntArray, by_position: FloatArray) -> list[FloatArray]:  # noqa: ARG002
