@@ -14,13 +14,10 @@ import numpy as np
 
 from evermap.estimate.graph import Room, State, State_contra
 from evermap.estimate.kind import Columns, MeasurementKind, stacked
-from evermap.estimate.robust import weigh
+from evermap.estimate.robust import HEAVY_TAIL, weigh
 from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se3
 from evermap.types import BoolArray, FloatArray, IntArray
-
-HEAVY_TAIL = 9.0
-"""Square of a residual, a number, at which the Cauchy begins, while the estimate may be far off: `robust.weigh`."""
 
 
 class PoseView(Protocol[State_contra]):

@@ -6,6 +6,9 @@ import math
 
 from evermap.compiled import kept
 
+HEAVY_TAIL = 9.0
+"""Square of a residual at which the Cauchy begins, while the estimate may be far off."""
+
 kernel = kept(effort=1, error_model="numpy")
 
 

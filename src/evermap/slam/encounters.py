@@ -27,10 +27,10 @@ from evermap.estimate.graph import (
     build_structure,
     grouped,
 )
-from evermap.estimate.robust import weigh
+from evermap.estimate.robust import HEAVY_TAIL, weigh
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, exhausted
-from evermap.slam.kernels import HEAVY_TAIL, N_MOTION, N_SENSOR, N_STATES, detection_residual, kernel
+from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES, detection_residual, kernel
 from evermap.slam.problem import Block, Estimate, Marginals
 from evermap.slam.smoother import COST_SLACK, DETECTIONS, HELD, ODOMETRY, POSES_A_LEAF, Smoother, retract
 from evermap.types import BoolArray, FloatArray, IntArray

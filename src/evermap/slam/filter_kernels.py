@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from evermap.compiled import kept
-from evermap.estimate.robust import weigh
+from evermap.estimate.robust import HEAVY_TAIL, weigh
 from evermap.slam.kernels import (
     AT_PLACES,
-    HEAVY_TAIL,
     N_MOTION,
     N_NOISE,
     N_SENSOR,

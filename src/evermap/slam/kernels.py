@@ -33,8 +33,6 @@ MAX_STEP_S = 0.1
 N_SENSOR, N_MOTION = 7, 4
 """Calibration states of the sensor and, behind them, of the odometry (`calibration.SPECS`)."""
 N_STATES = N_SENSOR + N_MOTION
-HEAVY_TAIL = 9.0
-"""Square of a detection's residual at which the Cauchy begins, while the estimate may be far off: `robust.weigh`."""
 AT_PLACES = 3 + N_STATES
 """Where places begin in a joint covariance: behind the newest pose and the calibration states."""
 

@@ -12,11 +12,12 @@ import numpy as np
 from evermap.estimate.gauss_newton import Steps
 from evermap.estimate.graph import Border, FactorBlock, Graph, GraphStructure, Layout, build_structure, grouped
 from evermap.estimate.measurement import MeasurementFactors, Tied
+from evermap.estimate.robust import HEAVY_TAIL
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
 from evermap.slam.calibration import DELAY
 from evermap.slam.correlation import Lasting, lasting_errors
-from evermap.slam.kernels import HEAVY_TAIL, N_MOTION, N_SENSOR, N_STATES
+from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES
 from evermap.slam.linearise import (
     OF_DETECTION,
     OF_INTERVAL,

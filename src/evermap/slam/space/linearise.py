@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.compiled import kept
-from evermap.estimate.robust import weigh
+from evermap.estimate.robust import HEAVY_TAIL, weigh
 from evermap.slam.kernels3d import (
     axis_residual,
     matrix_of,
@@ -35,8 +35,6 @@ BEHIND = 0.02
 """A corner must be this far ahead of the camera [m]; of one that is not nothing can be said."""
 JUMP_SHARE = 1e-4
 """Information of odometry that jumped, as a share of what it has else: it may be wrong by a hundred times as much."""
-TAIL = 9.0
-"""Square of a residual, a number, at which the Cauchy begins, while the estimate may be far off."""
 
 kernel = kept(effort=1, error_model="numpy")
 
@@ -117,7 +115,7 @@ def linearise_odometry(
         squared = 0.0
         for a in range(6):
             squared += (e[a] / sigma[i, a]) ** 2
-        weight[i], loss = weigh(squared, log_odds, 6.0 * TAIL if heavy else 0.0, JUMP_SHARE)
+        weight[i], loss = weigh(squared, log_odds, 6.0 * HEAVY_TAIL if heavy else 0.0, JUMP_SHARE)
         cost += loss
         for a in range(6):
             scale = math.sqrt(weight[i]) / sigma[i, a]
@@ -174,7 +172,7 @@ def linearise_sightings(
         for a in range(rows):
             squared += e[a] * e[a]
             residual[m, a] = e[a]
-        weight[m], loss = weigh(squared, seen.log_odds[kind], rows * TAIL if heavy else 0.0, 0.0)
+        weight[m], loss = weigh(squared, seen.log_odds[kind], rows * HEAVY_TAIL if heavy else 0.0, 0.0)
         cost += seen.share[m] * loss
         scale, at = math.sqrt(weight[m] * seen.share[m]), seen.first[m]
         for a in range(rows):

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.linalg.lapack import dpotri
 
-from evermap.estimate.robust import weigh
+from evermap.estimate.robust import HEAVY_TAIL, weigh
 from evermap.geometry import se3
 from evermap.geometry.group import SPACE
 from evermap.geometry.symmetry import Symmetry
@@ -33,7 +33,7 @@ from evermap.slam.filter_kernels import (
     UNSURE,
 )
 from evermap.slam.nearby_places import MOST_ACTIVE, NearbyPlaces
-from evermap.slam.space.linearise import ACROSS, ALONG, POINT, ROWS, STATES, TAIL, SpatialSightings, linearise_sightings
+from evermap.slam.space.linearise import ACROSS, ALONG, POINT, ROWS, STATES, SpatialSightings, linearise_sightings
 from evermap.slam.space.online_noise import OnlineNoise
 from evermap.slam.space.problem import OdometryPath, SpatialNoise
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -208,7 +208,7 @@ class SpatialFilter(NearbyPlaces):
                 # before anything is known of this frame: as surprising as its innovation is
                 unknown = _blocks(spread, count) if iteration == 0 else 0.0
                 squared = _squared(unknown + np.eye(residual.shape[1]), residual)
-                weight = 1.0 / (1.0 + squared / (TAIL * frame.n_rows))
+                weight = 1.0 / (1.0 + squared / (HEAVY_TAIL * frame.n_rows))
             own_noise = np.repeat(1.0 / weight, residual.shape[1])
             root = cho_factor(spread + np.diag(own_noise), lower=True)
             by = np.concatenate([np.broadcast_to(step[:own], (count, own)), step[own:].reshape(count, -1)], axis=1)
@@ -446,7 +446,7 @@ def _weigh_by_the_others(
     off = (alone @ pull.reshape(count, -1, 1))[..., 0]
     more = 1.0 / weight - 1.0  # noise by which it was held to be an outlier
     squared = np.maximum(_squared(alone - more[:, None, None] * np.eye(alone.shape[1]), off), 0.0)
-    tail = TAIL * n_rows if heavy else np.zeros(count)
+    tail = HEAVY_TAIL * n_rows if heavy else np.zeros(count)
     now = [weigh(*one, 0.0)[0] for one in zip(squared, log_odds, tail, strict=True)]
     return np.minimum(np.maximum(now, LEAST_WEIGHT), credible)
 

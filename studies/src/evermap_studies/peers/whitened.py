@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from evermap.estimate.robust import weigh
+from evermap.estimate.robust import HEAVY_TAIL, weigh
 from evermap.slam.kernels import (
-    HEAVY_TAIL,
     N_SENSOR,
     detection_residual,
     integrate_odometry,
