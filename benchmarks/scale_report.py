@@ -48,7 +48,12 @@ def as_markdown(shown: dict[str, Any]) -> str:
 def claims(shown: dict[str, Any]) -> str:
     """Return a table of what is expected of sessions, frames, DLR and maps, and whether it is met."""
     rows = [row for row in shown["sessions"] if "evermap" in row]
-    found = [_claim(f"{_TIME} {row['landmarks']:,} landmarks", 2.0, _ratio(row)) for row in rows]
+    found = [_claim(f"{_TIME} {row['landmarks']:,} landmarks", 1.5, _ratio(row)) for row in rows]
+    found += [
+        _claim(f"{_MAPPED} {row['landmarks']:,} landmarks", 2.0, _ratio(row, "mapped"))
+        for row in rows
+        if "mapped" in row
+    ]
     if "evermap" in shown["exponents"]:
         over = shown["exponents"]["evermap"]["landmarks"]
         span = f"{rows[0]['landmarks']:,} to {rows[-1]['landmarks']:,}"
@@ -64,10 +69,10 @@ def claims(shown: dict[str, Any]) -> str:
         stream = shown["stream"]
         seen = stream["sightings"] / stream["poses"]
         of = f"in a session of {stream['landmarks']:,} landmarks, {seen:.0f} in view"
-        for name, limit in {"median_ms": 0.3, "p99_ms": 5.0, "longest_ms": 50.0}.items():
+        for name, limit in {"median_ms": 0.3, "p99_ms": 5.0, "longest_ms": 20.0}.items():
             found.append(_claim(f"frame {of}: {FRAMES[name]}", limit, shown["stream"]["evermap"][name], "ms"))
     if shown.get("dlr") is not None:
-        found.append(_claim("DLR with identities", 3.0, shown["dlr"]["evermap"]["cpu_s"], "s"))
+        found.append(_claim("DLR with identities", 1.5, shown["dlr"]["evermap"]["cpu_s"], "s"))
         above = shown["dlr"]["plain"]["objective"] / shown["dlr"]["best"] - 1.0
         found.append(_claim("DLR: objective of the plain problem above gtsam's best", 1e-6, above))
     if "maps" in shown:
@@ -79,7 +84,8 @@ YEAR = 10_000
 """Sessions of a building that are claimed: a year."""
 MANY = 4_000
 """Landmarks from which a session's memory is claimed."""
-_TIME = "CPU time of a session, over gtsam LM and Marginals:"
+_TIME = "CPU time of a session, over gtsam's LM alone:"
+_MAPPED = "CPU time of a session into a new map, over gtsam's LM alone:"
 
 
 def _claims_of_maps(shown: dict[str, Any]) -> list[list[str]]:
@@ -141,8 +147,13 @@ def _claim(name: str, limit: float, value: float | str, unit: str = "") -> list[
     return [name, most, f"{_number(value)} {unit}".strip(), "yes" if value <= limit else "**no**"]
 
 
-def _ratio(row: dict[str, Any]) -> float:
-    return float(row["evermap"]["cpu_s"] / row["lm"]["cpu_s"])
+def _ratio(row: dict[str, Any], ours: str = "evermap") -> float:
+    """CPU time with all covariances over that of Levenberg-Marquardt, whose marginals are not counted."""
+    return float(row[ours]["cpu_s"] / _alone_s(row))
+
+
+def _alone_s(row: dict[str, Any], start: str = "lm") -> float:
+    return float(row[start]["cpu_s"] - row[start]["marginals_cpu_s"])
 
 
 def figure(shown: dict[str, Any], before: dict[str, Any] | None = None) -> Figure:
@@ -255,12 +266,12 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, left: int = 0)
 def _sessions(rows: Sequence[dict[str, Any]]) -> str:
     names = [key for key in CONTENDERS if any(key in row for row in rows)]
     head = ["landmarks", "drive", "poses", "sightings", *(f"{CONTENDERS[key]} [s]" for key in names)]
-    head += ["evermap / gtsam", "evermap [MB]", "gtsam [MB]"]
+    head += ["gtsam LM, without marginals [s]", "evermap / it", "evermap [MB]", "gtsam [MB]"]
     table = []
     for row in rows:
         cells = [f"{row['landmarks']:,}", f"{row['minutes']:.0f} min", f"{row['poses']:,}", f"{row['sightings']:,}"]
         cells += [_seconds(row, key) for key in names]
-        cells.append(f"{_ratio(row):.2f}" if "evermap" in row else UNKNOWN)
+        cells += [_number(_alone_s(row)), f"{_ratio(row):.2f}" if "evermap" in row else UNKNOWN]
         grown = [row.get("memory", {}).get(who) for who in ("evermap", "gtsam")]
         table.append([*cells, *(UNKNOWN if found is None else f"{found['grown_mb']:.0f}" for found in grown)])
     return _table(head, table)
@@ -308,11 +319,11 @@ def _streams(rows: Sequence[dict[str, Any]]) -> str:
 
 def _dlr(row: dict[str, Any]) -> str:
     head = ["DLR: landmarks", "poses", "sightings", "evermap [s]", "evermap, plain [s]", "gtsam LM, from odometry [s]"]
-    head += ["longest frame [ms]", "objective above gtsam's best"]
+    head += ["gtsam LM, without marginals [s]", "objective above gtsam's best"]
     cells = [f"{row[name]:,}" for name in ("landmarks", "poses", "sightings")]
     cells += [_seconds(row, key) for key in ("evermap", "plain", "lm_odometry")]
     above = row["plain"]["objective"] / row["best"] - 1.0
-    return _table(head, [[*cells, _number(row["evermap"]["longest_ms"]), f"{above:.1e}"]])
+    return _table(head, [[*cells, _number(_alone_s(row, "lm_odometry")), f"{above:.1e}"]])
 
 
 _MAP_TABLES = {

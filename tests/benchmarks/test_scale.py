@@ -122,7 +122,7 @@ def test_tables_and_the_figure_show_every_size(
     other = {**row, "landmarks": 2 * SMALL, "lm_odometry": {**row["lm_odometry"], "objective": 2.0 * row["best"]}}
     memory = {who: {"peak_mb": 200.0, "grown_mb": 20.0} for who in ("evermap", "gtsam")}
     rows = [{**row, "memory": memory}, {**other, "memory": memory}]
-    shown = {"sessions": rows, "exponents": scale.exponents(rows), "dlr": None}
+    shown = {"sessions": rows, "exponents": scale.exponents(rows), "dlr": rows[0]}
     shown["stream"] = {**row, "evermap": stream}
     shown |= {"maps": _maps()}
     text = report.as_markdown(shown)
@@ -204,3 +204,13 @@ def test_dlr_is_read_from_its_packed_tables(scale: ModuleType, shared_data: Path
     assert len(recording.detections) == 14_745
     assert (~known).sum() == 436
     assert len(np.unique(recording.detections.landmark_id[known])) == 576
+
+
+def test_a_session_is_compared_with_the_peer_without_its_marginals(report: ModuleType) -> None:
+    row = {"landmarks": 400, "evermap": {"cpu_s": 3.0}, "mapped": {"cpu_s": 5.0}}
+    row["lm"] = {"cpu_s": 12.0, "marginals_cpu_s": 10.0, "objective": 1.0}
+    text = report.claims({"sessions": [row], "exponents": {}, "stream": {}})
+    assert [line.split("|")[2:5] for line in text.splitlines() if "LM alone" in line] == [
+        [" ≤ 1.5 ", " 1.5 ", " yes "],
+        [" ≤ 2 ", " 2.5 ", " **no** "],
+    ]
