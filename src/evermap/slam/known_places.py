@@ -9,10 +9,10 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.linalg import block_diag
 
+from evermap.align.candidates import AGREE_M, find_consensus
 from evermap.config import LocalizeConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
-from evermap.geometry.rigid import AGREE_M, consensus
 from evermap.slam.batch import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -189,7 +189,7 @@ class LocalTrack:
         local, row = self._candidates(places)
         landmark = places.landmark_id[row]
         belief = np.maximum(places.p_here[row], settings.least_belief)
-        motion, agree = consensus(local, places.position_m[row], landmark=landmark, weight=belief)
+        motion, agree = find_consensus(local, places.position_m[row], landmark=landmark, weight=belief)
         count = int(agree.sum())
         if count < least or not (2 * count > len(names) or count >= settings.enough):
             return None

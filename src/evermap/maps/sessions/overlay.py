@@ -17,10 +17,11 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 from scipy.linalg.lapack import dpotri
 
+from evermap.align.candidates import AGREE_M, find_consensus
 from evermap.config import OverlayConfig
 from evermap.geometry import se2
 from evermap.geometry.group import PLANE, SPACE
-from evermap.geometry.rigid import AGREE_M, consensus, rigid
+from evermap.geometry.rigid import rigid
 from evermap.types import FloatArray, IntArray
 
 ELSEWHERE = -1
@@ -129,7 +130,7 @@ def lay_over(
         return None
     if motion is None:
         weight = np.exp(known.log_p_site[known.site])
-        motion, _ = consensus(
+        motion, _ = find_consensus(
             sighted.position_m[known.landmark],
             known.position_m,
             landmark=known.landmark,

@@ -10,10 +10,11 @@ from itertools import combinations
 
 import numpy as np
 
+from evermap.align.candidates import AGREE_M
 from evermap.config import LocalizeConfig, SpaceConfig
 from evermap.geometry import se3
 from evermap.geometry.chunked import JointCovariance
-from evermap.geometry.rigid import AGREE_M, rigid
+from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam.filter_kernels import BY_OTHERS
 from evermap.slam.known_places import MOST_LANDMARKS, RETRY_S, SIGMA_M, KnownPlaces, Placed

@@ -14,13 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evermap.align.candidates import AGREE_M
 from evermap.errors import DataError
 from evermap.estimate.gauss_newton import Minimum, Steps, minimised
 from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, SharedBlock, build_structure, grouped
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.geometry import se3
-from evermap.geometry.rigid import AGREE_M, rigid
+from evermap.geometry.rigid import rigid
 from evermap.slam.space.estimate import CONVERGED, ROUNDS, SpatialOptimum, refined
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.linearise import STATES
