@@ -30,13 +30,13 @@ def test_the_answer_is_that_of_one_pair_after_the_other(seed):
     target = rng.uniform(-4, 4, (count, 2))
     source = se2.transform(rng.uniform(-3, 3, 3), target + rng.normal(0, 0.25, (count, 2)))
     source[rng.random(count) < 0.4] += rng.normal(0, 1, 2)
-    best, best_score = np.zeros(count, dtype=np.bool_), (0, 0.0)
+    best, best_score = np.zeros(count, dtype=np.bool_), 0.0
     for pair in itertools.combinations(range(count), 2):
         a, b = source[list(pair)], target[list(pair)]
         span = np.linalg.norm(b[0] - b[1])
         if span >= AGREE_M and abs(span - np.linalg.norm(a[0] - a[1])) <= AGREE_M:
             gap = np.linalg.norm(se2.transform(rigid(a, b), source) - target, axis=1)
-            score = (int(np.sum(gap < AGREE_M)), -gap[gap < AGREE_M].sum())
+            score = np.maximum(1.0 - (gap / AGREE_M) ** 2, 0.0).sum()
             if score > best_score:
                 best, best_score = gap < AGREE_M, score
     found, agree = find_consensus(source, target)

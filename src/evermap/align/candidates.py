@@ -42,11 +42,10 @@ def find_consensus(
         return np.zeros(3), agree
     pose = _rigid_pairs(source[i], source[j], target[i], target[j])
     best = _best(pose, source, target, worth, np.flatnonzero(np.append(True, name[1:] != name[:-1])))
-    gap = _gaps(pose[best : best + 1], source, target)[0]
-    near = np.flatnonzero(gap < AGREE_M)
-    near = near[np.lexsort((gap[near], -worth[near], name[near]))]
-    near = near[np.append(True, name[near][1:] != name[near][:-1])]
-    near = np.sort(near[worth[near] > 0.0])
+    fit = _fit(_gaps(pose[best : best + 1], source, target)[0]) * worth
+    near = np.flatnonzero(fit > 0.0)
+    near = near[np.lexsort((-fit[near], name[near]))]
+    near = np.sort(near[np.unique(name[near], return_index=True)[1]])
     if len(near) < 2:
         return np.zeros(3), agree
     agree[order[near]] = True
@@ -92,16 +91,18 @@ def _rigid_pairs(a: FloatArray, b: FloatArray, to_a: FloatArray, to_b: FloatArra
 
 
 def _best(pose: FloatArray, source: FloatArray, target: FloatArray, worth: FloatArray, first: IntArray) -> int:
-    """Return the motion (m, 3) of highest score, the nearest among equal ones; landmarks begin at the rows `first`."""
-    score, distance = np.empty(len(pose)), np.empty(len(pose))
+    """Return the motion (m, 3) of highest score; landmarks begin at the rows `first`."""
+    score = np.empty(len(pose))
     step = max(1, AT_ONCE // len(source))
     for k in range(0, len(pose), step):
-        gap = _gaps(pose[k : k + step], source, target)
-        near = gap < AGREE_M
-        score[k : k + step] = np.maximum.reduceat(near * worth, first, axis=1).sum(axis=1)
-        nearest = np.minimum.reduceat(gap, first, axis=1)
-        distance[k : k + step] = np.where(nearest < AGREE_M, nearest, 0.0).sum(axis=1)
-    return int(np.lexsort((distance, -score))[0])
+        fit = _fit(_gaps(pose[k : k + step], source, target)) * worth
+        score[k : k + step] = np.maximum.reduceat(fit, first, axis=1).sum(axis=1)
+    return int(np.argmax(score))
+
+
+def _fit(gap: FloatArray) -> FloatArray:
+    """How well points agree by their distance: 1 at the place, 0 from `AGREE_M` on (M-SAC: Torr and Zisserman 2000)."""
+    return np.asarray(np.maximum(1.0 - (gap / AGREE_M) ** 2, 0.0))
 
 
 def _gaps(pose: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:
