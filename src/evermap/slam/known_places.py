@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.linalg import block_diag
 
-from evermap.align.candidates import AGREE_M, find_consensus
+from evermap.align.candidates import AGREE_M, Matches, find_consensus, score_motions
 from evermap.config import LocalizeConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
@@ -189,7 +189,8 @@ class LocalTrack:
         local, row = self._candidates(places)
         landmark = places.landmark_id[row]
         belief = np.maximum(places.p_here[row], settings.least_belief)
-        motion, agree = find_consensus(local, places.position_m[row], landmark=landmark, weight=belief)
+        matches = Matches.of(local, places.position_m[row], landmark=landmark, weight=belief)
+        motion, agree = find_consensus(matches)
         count = int(agree.sum())
         if count < least or not (2 * count > len(names) or count >= settings.enough):
             return None
@@ -200,12 +201,9 @@ class LocalTrack:
     def agreement(self, pose_map_robot: FloatArray, places: KnownPlaces) -> float:
         """Return how well the track fits the map with the robot at a pose (3,): 1 per landmark exactly at a place."""
         local, row = self._candidates(places)
-        motion = se2.compose(pose_map_robot, se2.inverse(self._pose))
-        gap = np.linalg.norm(se2.transform(motion, local) - places.position_m[row], axis=1)
-        fit = np.zeros(len(self._seen))
-        _, name = np.unique(places.landmark_id[row], return_inverse=True)
-        np.maximum.at(fit, name, 1.0 - (gap / AGREE_M) ** 2)
-        return float(fit.sum())
+        motion = se2.compose(pose_map_robot, se2.inverse(self._pose))[None]
+        matches = Matches.of(local, places.position_m[row], landmark=places.landmark_id[row])
+        return float(score_motions(motion, matches)[0])
 
     def _candidates(self, places: KnownPlaces) -> tuple[FloatArray, IntArray]:
         """(K, 2) positions in the track and (K,) rows of the map, one pair for every place a landmark may be at."""

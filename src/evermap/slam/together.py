@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from evermap.align.candidates import find_consensus
+from evermap.align.candidates import Matches, find_consensus
 from evermap.errors import DataError
 from evermap.estimate.gauss_newton import Steps
 from evermap.estimate.noise import restricted_level
@@ -187,7 +187,7 @@ def _placed(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], 
         for b in set(range(len(own))) - placed:
             theirs, mine = zip(*(ties(a, b) for a in placed), strict=True)
             there = [se2.transform(motion[a], at) for a, at in zip(placed, theirs, strict=True)]
-            by, agree = find_consensus(np.concatenate(mine), np.concatenate(there))
+            by, agree = find_consensus(Matches.of(np.concatenate(mine), np.concatenate(there)))
             if agree.sum() > best:
                 best, found = int(agree.sum()), (b, by)
         if found is None or best < members[0].settings.localize.fewest:

@@ -8,7 +8,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from scipy import sparse
 
-from evermap.align.candidates import find_consensus
+from evermap.align.candidates import Matches, find_consensus
 from evermap.config import FitConfig, LivingConfig, OverlayConfig
 from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se2, se3
@@ -211,7 +211,7 @@ def unbent(
     places, body = living.places, living.members.clique_id[rows_among(living.members.landmark_id, where.landmark_id)]
     place, probability = where.place.copy(), where.probability.copy()
     while len(moved):
-        motion, agree = find_consensus(position_m[moved], places.position_m[home[moved]])
+        motion, agree = find_consensus(Matches.of(position_m[moved], places.position_m[home[moved]]))
         gap = np.full(len(moved), np.inf)
         for _ in range(BENT_ROUNDS):
             if np.count_nonzero(agree) < 2:
