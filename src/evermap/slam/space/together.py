@@ -14,14 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.align.candidates import AGREE_M
+from evermap.align.candidates import Matches, find_consensus
 from evermap.errors import DataError
 from evermap.estimate.gauss_newton import Minimum, Steps, minimised
 from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, SharedBlock, build_structure, grouped
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.geometry import se3
-from evermap.geometry.rigid import rigid
 from evermap.slam.space.estimate import CONVERGED, ROUNDS, SpatialOptimum, refined
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.linearise import STATES
@@ -40,9 +39,6 @@ from evermap.slam.space.smoother import (
 )
 from evermap.slam.space.solve import FREE, SpatialSolved
 from evermap.types import BoolArray, FloatArray, IntArray
-
-FEWEST = 3
-"""Points that align two robots; of landmarks with an orientation one does."""
 
 
 class JointEstimate(NamedTuple):
@@ -139,20 +135,11 @@ def _align(member: SolvedRobot, name: IntArray, theirs: FloatArray, oriented: Bo
     row, other = np.nonzero((own_name[:, None] == name) & (own_name >= 0)[:, None])
     if not len(row):
         return se3.identity(), 0
-    turned = np.flatnonzero(member.problem.oriented[row] & oriented[other])
-    trial = [se3.compose(theirs[other[turned]], se3.inverse(own[row[turned]]))]
-    if len(np.unique(row)) >= FEWEST:
-        trial.append(rigid(own[row, :3], theirs[other, :3])[None])
-    candidate = np.concatenate(trial)
-    if not len(candidate):
-        return se3.identity(), 0
-    gap = np.linalg.norm(se3.transform(candidate[:, None], own[row, :3]) - theirs[other, :3], axis=2)
-    agree = gap < AGREE_M
-    best = int(np.argmax(agree.sum(axis=1) - gap.clip(max=AGREE_M).sum(axis=1) / (AGREE_M * len(row))))
-    some = np.flatnonzero(agree[best])
-    if len(np.unique(row[some])) >= FEWEST:
-        return rigid(own[row[some], :3], theirs[other[some], :3]), len(np.unique(row[some]))
-    return candidate[best], len(np.unique(row[some])) if len(turned) else 0
+    mine, there = own[row].copy(), theirs[other].copy()
+    mine[~member.problem.oriented[row], 3:] = np.nan
+    there[~oriented[other], 3:] = np.nan
+    motion, agree = find_consensus(Matches.of(mine, there, landmark=row))
+    return motion, int(np.count_nonzero(agree))
 
 
 def _lay_together(members: Sequence[SolvedRobot], motion: FloatArray) -> tuple[SpatialTogether, JointEstimate]:
