@@ -27,7 +27,7 @@ RULES = {
     "survival": "errors show types",
     "valid": "errors types",
     "estimate": "errors compiled types geometry",
-    "align": "types geometry",
+    "align": "types config geometry",
     "io": "errors compiled interrupts types geometry valid estimate",
     "metrics": "errors show types geometry",
     "sensing": "errors compiled types config geometry",

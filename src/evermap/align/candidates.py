@@ -117,19 +117,19 @@ def rank_motions(matches: Matches, *, most: int = 2, agree_m: float = AGREE_M) -
     motion, log_prior = propose_motions(table, agree_m)
     score = _scores(motion, table, agree_m) + BY_EXPLANATION * log_prior
     left, found = np.argsort(-score, kind="stable"), list[tuple[FloatArray, BoolArray]]()
-    source = table.points[0]
-    outermost = source[np.unique(np.append(source.argmin(axis=0), source.argmax(axis=0)))] if len(source) else source
     while len(left) and len(found) < most:
-        best = motion[left[0]]
-        some = _agreeing(best, table, agree_m)
-        if _determine(table, some):
+        some = _agreeing(motion[left[0]], table, agree_m)
+        if not _determine(table, some):
+            break
+        best = _refitted(motion[left[0]], table, some)
+        if all(_steps(best[None], other, table)[0] > APART * agree_m for other, _ in found):
             agree = np.zeros(len(table), dtype=np.bool_)
             agree[order[some]] = True
-            found.append((_refitted(best, table, some), agree))
-        if len(found) == most or not len(some):
-            break
-        step = table.group.transform(motion[left][:, None], outermost) - table.group.transform(best, outermost)
-        left = left[np.linalg.norm(step, axis=2).max(axis=1) > APART * agree_m]
+            found.append((best, agree))
+        if len(found) < most:
+            steps = _steps(motion[left], best, table)
+            steps[0] = 0.0
+            left = left[steps > APART * agree_m]
     return found
 
 
@@ -151,6 +151,14 @@ def propose_motions(matches: Matches, agree_m: float = AGREE_M) -> tuple[FloatAr
     triple = _triples_of_one_shape(source, target, matches.landmark, agree_m)
     by_points = rigid(source[triple], target[triple]).reshape(-1, SPACE.size)
     return np.vstack([by_tags, by_points]), np.append(matches.log_prior[tag], np.zeros(len(triple)))
+
+
+def _steps(motion: FloatArray, other: FloatArray, matches: Matches) -> FloatArray:
+    """(C,) how far apart each of some motions and another one take a landmark that stands farthest out."""
+    source = matches.points[0]
+    outermost = source[np.unique(np.append(source.argmin(axis=0), source.argmax(axis=0)))]
+    step = matches.group.transform(motion[:, None], outermost) - matches.group.transform(other, outermost)
+    return np.asarray(np.linalg.norm(step, axis=2).max(axis=1))
 
 
 def _agreeing(motion: FloatArray, matches: Matches, agree_m: float) -> IntArray:
