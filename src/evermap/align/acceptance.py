@@ -148,8 +148,10 @@ def log_odds_of(
         spread = _with_block(spread, SIGMA_RAD**2 * np.eye(3 * len(turned)))
         log_chance += len(turned) * LOG_TURNS[SPACE.point_dim]
     log_motion = -log_room(moved, target, rules) - LOG_TURNS[dim]
-    log_density = log_density_of(np.concatenate(error), np.linalg.cholesky(spread), np.vstack(freedom), log_motion)
-    return log_density + log_chance + _log_prior_of(matches, agree, rules) - math.log(rules.p_another_place)
+    factor = np.asarray(np.linalg.cholesky(spread), dtype=np.float64)
+    log_density = log_density_of(np.concatenate(error), factor, np.vstack(freedom), log_motion)
+    log_prior = _log_prior_of(matches, agree, rules) + float(matches.log_prior[some].sum())
+    return log_density + log_chance + log_prior - math.log(rules.p_another_place)
 
 
 def log_density_of(error: FloatArray, factor: FloatArray, freedom: FloatArray, log_motion: float | None) -> float:

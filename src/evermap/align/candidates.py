@@ -122,14 +122,14 @@ def rank_motions(matches: Matches, *, most: int = 2, agree_m: float = AGREE_M) -
         if not _determine(table, some):
             break
         best = _refitted(motion[left[0]], table, some)
-        if all(_steps(best[None], other, table)[0] > APART * agree_m for other, _ in found):
+        if all(_are_apart(best[None], other, table, agree_m)[0] for other, _ in found):
             agree = np.zeros(len(table), dtype=np.bool_)
             agree[order[some]] = True
             found.append((best, agree))
         if len(found) < most:
-            steps = _steps(motion[left], best, table)
-            steps[0] = 0.0
-            left = left[steps > APART * agree_m]
+            apart = _are_apart(motion[left], best, table, agree_m)
+            apart[0] = False
+            left = left[apart]
     return found
 
 
@@ -153,12 +153,15 @@ def propose_motions(matches: Matches, agree_m: float = AGREE_M) -> tuple[FloatAr
     return np.vstack([by_tags, by_points]), np.append(matches.log_prior[tag], np.zeros(len(triple)))
 
 
-def _steps(motion: FloatArray, other: FloatArray, matches: Matches) -> FloatArray:
-    """(C,) how far apart each of some motions and another one take a landmark that stands farthest out."""
-    source = matches.points[0]
+def _are_apart(motion: FloatArray, other: FloatArray, matches: Matches, agree_m: float) -> BoolArray:
+    """(C,) which motions take an outermost landmark, or an orientation, elsewhere than another motion does."""
+    source, group = matches.points[0], matches.group
     outermost = source[np.unique(np.append(source.argmin(axis=0), source.argmax(axis=0)))]
-    step = matches.group.transform(motion[:, None], outermost) - matches.group.transform(other, outermost)
-    return np.asarray(np.linalg.norm(step, axis=2).max(axis=1))
+    step = group.transform(motion[:, None], outermost) - group.transform(other, outermost)
+    apart = np.linalg.norm(step, axis=2).max(axis=1) > APART * agree_m
+    if matches.oriented.any():
+        apart |= se3.angle_between(motion, np.broadcast_to(other, motion.shape)) > AGREE_RAD
+    return np.asarray(apart)
 
 
 def _agreeing(motion: FloatArray, matches: Matches, agree_m: float) -> IntArray:

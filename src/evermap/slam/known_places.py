@@ -9,7 +9,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.linalg import block_diag
 
-from evermap.align.candidates import AGREE_M, Matches, find_consensus, score_motions
+from evermap.align.acceptance import SIGMA_M, accept_alignment
+from evermap.align.candidates import Matches, score_motions
 from evermap.config import LocalizeConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
@@ -128,8 +129,6 @@ MOST_LANDMARKS = 40
 """That are kept, the newest: more make no surer."""
 RETRY_S = 1.0
 """Between two attempts where no other landmark has come into view."""
-SIGMA_M = 0.5 * AGREE_M
-"""Of one landmark of the drive, laid over the map."""
 
 
 class Placed(NamedTuple):
@@ -190,12 +189,10 @@ class LocalTrack:
         landmark = places.landmark_id[row]
         belief = np.maximum(places.p_here[row], settings.least_belief)
         matches = Matches.of(local, places.position_m[row], landmark=landmark, weight=belief)
-        motion, agree = find_consensus(matches)
-        count = int(agree.sum())
-        if count < least or not (2 * count > len(names) or count >= settings.enough):
+        found = accept_alignment(matches, settings, fewest=least, spread_m=settings.spread_online_m)
+        if not found:
             return None
-        if np.ptp(local[agree], axis=0).max() < settings.spread_online_m:
-            return None
+        motion, agree = found.motion, found.agree
         return Placed(se2.compose(motion, self._pose), *self._uncertainty(motion[2], local[agree], row[agree]))
 
     def agreement(self, pose_map_robot: FloatArray, places: KnownPlaces) -> float:

@@ -9,13 +9,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from evermap.align.candidates import Matches, find_consensus, score_motions
+from evermap.align.acceptance import SIGMA_M, SIGMA_RAD, accept_alignment
+from evermap.align.candidates import Matches, score_motions
 from evermap.config import LocalizeConfig, SpaceConfig
 from evermap.geometry import se3
 from evermap.geometry.chunked import JointCovariance
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam.filter_kernels import BY_OTHERS
-from evermap.slam.known_places import MOST_LANDMARKS, RETRY_S, SIGMA_M, KnownPlaces, Placed
+from evermap.slam.known_places import MOST_LANDMARKS, RETRY_S, KnownPlaces, Placed
 from evermap.slam.localize import USUAL, BaseLocalizer
 from evermap.slam.space.linearise import POINT
 from evermap.slam.space.local_filter import OF_PLACE, SpatialFilter, SpatialFrame, SpatialMotion
@@ -24,10 +25,6 @@ from evermap.slam.space.problem import USUAL as IN_SPACE
 from evermap.slam.space.problem import OdometryPath, SpatialNoise
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
 
-SIGMA_RAD = 0.2
-"""Standard deviation of the orientation of one landmark laid over the map."""
-CERTAIN_NATS = 2.0
-"""By which one explanation of a single tag must be more probable than the other."""
 VAGUE_M, VAGUE_RAD = 2.0, 0.5
 """A pose that is less certain is searched for: what it sees can't be linearised there."""
 MOST_CONSIDERED = 128
@@ -134,20 +131,14 @@ class SpatialTrack:
             return None
         self._tried = (stamp_s, names)
         alone = not self._driven or stamp_s - self._began_s >= settings.alone_s
-        matches, row, odds = self._candidates(places)
-        motion, agree = find_consensus(matches)
-        some = np.flatnonzero(agree)
-        count, turned = len(some), matches.oriented[some]
+        matches, row = self._candidates(places)
+        found = accept_alignment(matches, settings)
+        some = np.flatnonzero(found.agree)
+        turned = matches.oriented[some]
         numbers = int(np.where(turned, OF_TAG, OF_POINT).sum())
-        if numbers < (FEWEST_NUMBERS if alone else ENOUGH_NUMBERS):
+        if not found or numbers < (FEWEST_NUMBERS if alone else ENOUGH_NUMBERS):
             return None
-        if count < settings.fewest and not turned.any():
-            return None
-        if not (2 * count > len(names) or count >= settings.enough):
-            return None
-        if count == 1 and odds[some[0]] < CERTAIN_NATS:
-            return None
-        pose = se3.compose(motion, self._pose)
+        pose = se3.compose(found.motion, self._pose)
         return Placed(pose, *_uncertainty(pose, places.value[row[some]], turned, row[some]))
 
     def agreement(self, pose_map_robot: FloatArray, places: SpatialPlaces) -> float:
@@ -156,10 +147,9 @@ class SpatialTrack:
         motion = se3.compose(pose_map_robot, se3.inverse(self._pose))[None]
         return float(score_motions(motion, replace(matches, weight=np.ones(len(matches))))[0])
 
-    def _candidates(self, places: SpatialPlaces) -> tuple[Matches, IntArray, FloatArray]:
-        """One row for every place a landmark may be at, and another where a tag has two explanations.
-
-        With the rows (K,) of the map, and log odds (K,) of the first explanation of each; inf where it is the only one.
+    def _candidates(self, places: SpatialPlaces) -> tuple[Matches, IntArray]:
+        """One row for every place a landmark may be at, and another where a tag has two explanations; with
+        the rows (K,) of the map.
         """
         first, last = places.rows_of(np.fromiter(self._seen, dtype=np.int64))
         count = last - first
@@ -179,7 +169,7 @@ class SpatialTrack:
             weight=np.maximum(places.p_here[row[every]], self._settings.least_belief),
             log_prior=np.append(np.zeros(len(row)), -np.maximum(odds[either], 0.0)),
         )
-        return matches, row[every], odds[every]
+        return matches, row[every]
 
 
 class SpatialLocalizer(BaseLocalizer):
