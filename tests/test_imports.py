@@ -27,14 +27,15 @@ RULES = {
     "survival": "errors show types",
     "valid": "errors types",
     "estimate": "errors compiled types geometry",
+    "align": "types config geometry",
     "io": "errors compiled interrupts types geometry valid estimate",
     "metrics": "errors show types geometry",
     "sensing": "errors compiled types config geometry",
     "existence": "errors compiled show types survival io sensing",
     "tracking": "errors compiled show types config geometry survival valid io sensing existence",
     "viz": "errors types geometry survival metrics existence",
-    "slam": "errors interrupts compiled plugins show types config geometry valid sensing tracking estimate",
-    "maps": "errors show types config geometry survival valid sensing existence tracking estimate slam",
+    "slam": "errors interrupts compiled plugins show types config geometry valid sensing tracking estimate align",
+    "maps": "errors show types config geometry survival valid sensing existence tracking estimate align slam",
     "pipeline": "errors compiled types config estimate slam maps",
     "runs": (
         "errors interrupts show types config geometry survival valid io metrics existence tracking viz maps pipeline"

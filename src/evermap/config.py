@@ -232,11 +232,24 @@ class RangesConfig(Section):
     first_m: Positive = key(1.0, "least standard deviation of the place at which the estimator begins [m]")
 
 
-class LocalizeConfig(Section):
+class RoomConfig(Section):
+    """What tells that landmarks lie over a map from landmarks of another place, where each stands anywhere."""
+
+    p_another_place: Share = key(1e-3, "probability that a session is from another place")
+    smallest_room_m2: Positive = key(50.0, "minimum area in which moved landmarks may be found [m^2]")
+    lowest_room_m: Positive = key(1.0, "height of a room in space, at least [m]")
+
+
+class LocalizeConfig(RoomConfig):
     """When the place of a robot in a map is known, and when it is lost; landmarks are found by their identity."""
 
     fewest: Count = key(3, "landmarks that must have the relative positions of the map")
-    enough: Count = key(5, "so many do by no accident, even if they are fewer than half")
+    p_stands: Share = key(0.9, "probability that a landmark is where the map has it, at most: groups move together")
+    certain_nats: NotNegative = key(
+        6.0, "log odds of an alignment over another place, from which it is accepted [nats]"
+    )
+    lead_nats: NotNegative = key(3.0, "the same over the next best alignment [nats]")
+    enough: Count = key(5, "landmarks of the map that a live session has met when it is entered")
     alone_s: NotNegative = key(10.0, "where no third landmark comes into view for so long, two are enough [s]")
     spread_m: Positive = key(1.0, "how far apart they must be, for a recording that is smoothed afterwards [m]")
     spread_online_m: Positive = key(
@@ -727,7 +740,7 @@ class FitConfig(Section):
     loose_rad: Positive = key(0.1, "the same for the heading [rad]")
 
 
-class OverlayConfig(Section):
+class OverlayConfig(RoomConfig):
     """Priors of the search for what stands where the map has it."""
 
     nudge_m: Positive = key(0.7, "standard deviation of a small move, each axis [m]")
@@ -736,8 +749,6 @@ class OverlayConfig(Section):
     share_turned: Share = key(0.1, "share of moves in space that are turns of a landmark in its place")
     turned_m: Positive = key(0.05, "standard deviation of the position of one turned in its place, each axis [m]")
     p_split: Share = key(1e-3, "probability that landmarks assigned to one body are not")
-    p_another_place: Share = key(1e-3, "probability that a session is from another place")
-    smallest_room_m2: Positive = key(50.0, "minimum area in which moved bodies may be found [m^2]")
     drifts_m: tuple[Positive, ...] = key(
         (0.01, 0.02, 0.04, 0.08),
         "candidate standard deviations of unmoved landmarks from session to session, the likeliest first [m]",
@@ -748,7 +759,6 @@ class OverlayConfig(Section):
     )
     free_m: Positive = key(20.0, "standard deviation of a session's place around the one agreed on, each axis [m]")
     free_rad: Positive = key(3.0, "the same of its heading [rad]")
-    lowest_room_m: Positive = key(1.0, "height of a room in space, at least [m]")
     stood_rad: tuple[Positive, ...] = key(
         (0.02, 0.06, 0.15),
         "standard deviations of a common apparent turn of unmoved landmarks in space [rad]",
@@ -1049,7 +1059,7 @@ class StillConfig(Section):
     window_s: Positive = key(2.0, "time over which a velocity is estimated [s]")
     least_s: Positive = key(0.4, "time that a track or a stay must last [s] ...")
     fewest: Count = key(4, "... and detections that it takes")
-    p_stands: Share = key(0.8, "probability from which an object is taken to be static")
+    p_stands: Share = key(0.9, "probability from which an object is taken to be static")
     same_m: Positive = key(0.5, "stays this close are one [m]")
     elsewhere_m: Positive = key(2.0, "what left was farther away than this [m]")
     when_s: NotNegative = key(0.5, "when a thing came to rest, or left, is known to within this to both sides [s]")

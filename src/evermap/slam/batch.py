@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from evermap.align.candidates import Matches, find_consensus
 from evermap.config import SlamConfig
 from evermap.errors import NumericalError
 from evermap.estimate.measurement import Tied
 from evermap.estimate.sparse.system import Slices, exhausted
 from evermap.geometry import se2, se3
-from evermap.geometry.rigid import consensus
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior, needed, seated
 from evermap.slam.method import Explanation, Method
@@ -371,7 +371,7 @@ def agreeing(prior_map: PriorMap, landmark: FloatArray) -> tuple[FloatArray, Boo
     both = prior_map.given & np.isfinite(landmark[:, 0])
     if np.count_nonzero(both) < 2:
         return prior_map.mean[both], np.zeros(np.count_nonzero(both), dtype=np.bool_)
-    return prior_map.mean[both], consensus(landmark[both], prior_map.mean[both])[1]
+    return prior_map.mean[both], find_consensus(Matches.of(landmark[both], prior_map.mean[both]))[1]
 
 
 def entered(
@@ -386,7 +386,7 @@ def entered(
     new = len(estimate.landmark) - len(prior_map.given)  # places that landmarks have besides their own
     mean, given = np.pad(prior_map.mean, ((0, new), (0, 0))), np.pad(prior_map.given, (0, new))
     both = given & estimate.known
-    pose_map_world, _ = consensus(estimate.landmark[both], mean[both])
+    pose_map_world, _ = find_consensus(Matches.of(estimate.landmark[both], mean[both]))
     moved = estimate.moved(pose_map_world)
     moved = replace(moved, landmark=np.where(both[:, None], mean, moved.landmark))
     problem = replace(
@@ -483,7 +483,7 @@ def _rejoined(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> E
             middles(problem.landmark_row[some], at[some], len(estimate.landmark)) for some in (piece, ~piece)
         )
         both = np.flatnonzero(np.isfinite(mine[:, 0]) & np.isfinite(theirs[:, 0]))
-        motion, agree = consensus(mine[both], theirs[both])
+        motion, agree = find_consensus(Matches.of(mine[both], theirs[both]))
         if np.count_nonzero(agree) < settings.localize.fewest or not np.any(np.abs(motion) > ELSEWHERE):
             continue
         pose, landmark = estimate.pose.copy(), estimate.landmark.copy()

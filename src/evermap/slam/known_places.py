@@ -9,10 +9,11 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.linalg import block_diag
 
+from evermap.align.acceptance import SIGMA_M, accept_alignment
+from evermap.align.candidates import Matches, score_motions
 from evermap.config import LocalizeConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
-from evermap.geometry.rigid import AGREE_M, consensus
 from evermap.slam.batch import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -128,8 +129,6 @@ MOST_LANDMARKS = 40
 """That are kept, the newest: more make no surer."""
 RETRY_S = 1.0
 """Between two attempts where no other landmark has come into view."""
-SIGMA_M = 0.5 * AGREE_M
-"""Of one landmark of the drive, laid over the map."""
 
 
 class Placed(NamedTuple):
@@ -189,23 +188,19 @@ class LocalTrack:
         local, row = self._candidates(places)
         landmark = places.landmark_id[row]
         belief = np.maximum(places.p_here[row], settings.least_belief)
-        motion, agree = consensus(local, places.position_m[row], landmark=landmark, weight=belief)
-        count = int(agree.sum())
-        if count < least or not (2 * count > len(names) or count >= settings.enough):
+        matches = Matches.of(local, places.position_m[row], landmark=landmark, weight=belief)
+        found = accept_alignment(matches, settings, fewest=least, spread_m=settings.spread_online_m)
+        if not found:
             return None
-        if np.ptp(local[agree], axis=0).max() < settings.spread_online_m:
-            return None
+        motion, agree = found.motion, found.agree
         return Placed(se2.compose(motion, self._pose), *self._uncertainty(motion[2], local[agree], row[agree]))
 
     def agreement(self, pose_map_robot: FloatArray, places: KnownPlaces) -> float:
         """Return how well the track fits the map with the robot at a pose (3,): 1 per landmark exactly at a place."""
         local, row = self._candidates(places)
-        motion = se2.compose(pose_map_robot, se2.inverse(self._pose))
-        gap = np.linalg.norm(se2.transform(motion, local) - places.position_m[row], axis=1)
-        fit = np.zeros(len(self._seen))
-        _, name = np.unique(places.landmark_id[row], return_inverse=True)
-        np.maximum.at(fit, name, 1.0 - (gap / AGREE_M) ** 2)
-        return float(fit.sum())
+        motion = se2.compose(pose_map_robot, se2.inverse(self._pose))[None]
+        matches = Matches.of(local, places.position_m[row], landmark=places.landmark_id[row])
+        return float(score_motions(motion, matches)[0])
 
     def _candidates(self, places: KnownPlaces) -> tuple[FloatArray, IntArray]:
         """(K, 2) positions in the track and (K,) rows of the map, one pair for every place a landmark may be at."""

@@ -14,11 +14,12 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
+from evermap.align.acceptance import accept_alignment
+from evermap.align.candidates import Matches
 from evermap.errors import DataError
 from evermap.estimate.gauss_newton import Steps
 from evermap.estimate.noise import restricted_level
 from evermap.geometry import se2
-from evermap.geometry.rigid import consensus
 from evermap.slam.batch import (
     ALIGNED_INFORMATION,
     FINAL_GAIN,
@@ -183,16 +184,19 @@ def _placed(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], 
 
     motion, placed = np.zeros((len(own), 3)), {0}
     while len(placed) < len(own):
-        best, found = 0, None
+        best, found, reason = -np.inf, None, "no common landmarks"
         for b in set(range(len(own))) - placed:
             theirs, mine = zip(*(ties(a, b) for a in placed), strict=True)
             there = [se2.transform(motion[a], at) for a, at in zip(placed, theirs, strict=True)]
-            by, agree = consensus(np.concatenate(mine), np.concatenate(there))
-            if agree.sum() > best:
-                best, found = int(agree.sum()), (b, by)
-        if found is None or best < members[0].settings.localize.fewest:
+            laid = accept_alignment(
+                Matches.of(np.concatenate(mine), np.concatenate(there)), members[0].settings.localize
+            )
+            if laid and laid.log_odds > best:
+                best, found = laid.log_odds, (b, laid.motion)
+            reason = laid.reason if len(laid.agree) else reason
+        if found is None:
             lost = ", ".join(members[r].recording.name for r in range(len(own)) if r not in placed)
-            what = f"nothing connects {lost} to {members[0].recording.name}"
+            what = f"nothing connects {lost} to {members[0].recording.name}: {reason}"
             raise DataError(what, hint="common landmark ids or mutual sightings, and one clock")
         motion[found[0]] = found[1]
         placed.add(found[0])

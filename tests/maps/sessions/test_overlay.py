@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evermap.align.candidates import Matches, find_consensus
 from evermap.geometry import se2, se3
-from evermap.geometry.rigid import consensus
 from evermap.maps.sessions.overlay import ELSEWHERE, USUAL, Known, Overlay, Sighted, _Options, lay_over
 
 from .worlds import Densely, World, sites_of, world
@@ -19,7 +19,7 @@ def agreed(one: World) -> np.ndarray:
     known = one.known
     weight = np.maximum(np.exp(known.log_p_site[known.site]), 1e-3)
     source = one.sighted.position_m[known.landmark]
-    return consensus(source, known.position_m, landmark=known.landmark, weight=weight)[0]
+    return find_consensus(Matches.of(source, known.position_m, landmark=known.landmark, weight=weight))[0]
 
 
 def laid(one: World, search: str = "joint") -> Overlay:

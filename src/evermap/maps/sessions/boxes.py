@@ -18,11 +18,12 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from evermap.align.acceptance import accept_alignment
+from evermap.align.candidates import Matches
 from evermap.config import BoxesConfig, Config
 from evermap.errors import NumericalError
 from evermap.geometry import se3
 from evermap.geometry.chunked import blocks
-from evermap.geometry.rigid import consensus
 from evermap.maps.bodies import squared_length
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import Witnessed, aged
@@ -204,9 +205,9 @@ def _placed(
     row, place = _named(taken, solved, living)
     own, there = solved.optimum.estimate.place[row, :3], living.places.position_m[place]
     if len(row) > 1:
-        motion, agree = consensus(own[:, :2], there[:, :2])
-        if agree.sum() > 1:
-            return in_space(motion, own[agree], there[agree]), 1.0
+        named = accept_alignment(Matches.of(own[:, :2], there[:, :2]), known.slam.localize, fewest=2)
+        if named:
+            return in_space(named.motion, own[named.agree], there[named.agree]), 1.0
     metre = taken.known > 0 or taken.gauge.stated is not None
     return placed(seen_boxes(taken, solved, known.settings), known, metre=metre)
 

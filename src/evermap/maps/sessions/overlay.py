@@ -17,10 +17,11 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 from scipy.linalg.lapack import dpotri
 
+from evermap.align.candidates import AGREE_M, Matches, find_consensus
 from evermap.config import OverlayConfig
 from evermap.geometry import se2
 from evermap.geometry.group import PLANE, SPACE
-from evermap.geometry.rigid import AGREE_M, consensus, rigid
+from evermap.geometry.rigid import rigid
 from evermap.types import FloatArray, IntArray
 
 ELSEWHERE = -1
@@ -129,12 +130,13 @@ def lay_over(
         return None
     if motion is None:
         weight = np.exp(known.log_p_site[known.site])
-        motion, _ = consensus(
+        matches = Matches.of(
             sighted.position_m[known.landmark],
             known.position_m,
             landmark=known.landmark,
             weight=np.maximum(weight, 1e-3),
         )
+        motion, _ = find_consensus(matches)
         gap = np.linalg.norm(se2.transform(motion, sighted.position_m[known.landmark]) - known.position_m, axis=1)
         if len(np.unique(known.landmark[gap < AGREE_M])) < 2:
             return None

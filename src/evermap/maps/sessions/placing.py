@@ -8,11 +8,12 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from scipy import sparse
 
+from evermap.align.candidates import Matches, find_consensus
 from evermap.config import FitConfig, LivingConfig, OverlayConfig
 from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import of_places
-from evermap.geometry.rigid import consensus, rigid
+from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
 from evermap.maps.bodies import squared_length
 from evermap.maps.living import LivingMap, Places, rows_among
@@ -210,7 +211,7 @@ def unbent(
     places, body = living.places, living.members.clique_id[rows_among(living.members.landmark_id, where.landmark_id)]
     place, probability = where.place.copy(), where.probability.copy()
     while len(moved):
-        motion, agree = consensus(position_m[moved], places.position_m[home[moved]])
+        motion, agree = find_consensus(Matches.of(position_m[moved], places.position_m[home[moved]]))
         gap = np.full(len(moved), np.inf)
         for _ in range(BENT_ROUNDS):
             if np.count_nonzero(agree) < 2:

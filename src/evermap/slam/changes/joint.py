@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
+from evermap.align.candidates import Matches, find_consensus
 from evermap.config import SlamConfig
-from evermap.geometry.rigid import consensus
 from evermap.slam.batch import outvoted
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, in_sensor_metres, landmark_evidence
@@ -94,7 +94,7 @@ class Joint(Method):
         """The whole moved to where most landmarks are at their places: those seen first may have been the others."""
         assert self._given is not None
         both = self._given.given & estimate.known
-        motion, agree = consensus(estimate.landmark[both], self._given.mean[both])
+        motion, agree = find_consensus(Matches.of(estimate.landmark[both], self._given.mean[both]))
         if np.count_nonzero(agree) < 2:
             return estimate
         return estimate.moved(motion)

@@ -6,17 +6,17 @@ A tag tells the whole pose, three points do, and odometry ties those that were s
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 
 import numpy as np
 
+from evermap.align.acceptance import SIGMA_M, SIGMA_RAD, accept_alignment
+from evermap.align.candidates import Matches, score_motions
 from evermap.config import LocalizeConfig, SpaceConfig
 from evermap.geometry import se3
 from evermap.geometry.chunked import JointCovariance
-from evermap.geometry.rigid import AGREE_M, rigid
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam.filter_kernels import BY_OTHERS
-from evermap.slam.known_places import MOST_LANDMARKS, RETRY_S, SIGMA_M, KnownPlaces, Placed
+from evermap.slam.known_places import MOST_LANDMARKS, RETRY_S, KnownPlaces, Placed
 from evermap.slam.localize import USUAL, BaseLocalizer
 from evermap.slam.space.linearise import POINT
 from evermap.slam.space.local_filter import OF_PLACE, SpatialFilter, SpatialFrame, SpatialMotion
@@ -25,14 +25,6 @@ from evermap.slam.space.problem import USUAL as IN_SPACE
 from evermap.slam.space.problem import OdometryPath, SpatialNoise
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
 
-AGREE_RAD, SIGMA_RAD = 0.5, 0.2
-"""An orientation agrees with the map to within this; and what it is good for, of one landmark laid over the map."""
-POINTS_OF_TRIPLES, MOST_TRIPLES = 14, 300
-"""Landmarks whose triples are tried, and triples."""
-FLAT_M = 0.3
-"""A triangle has this height at least, or it leaves a turn about its long side."""
-CERTAIN_NATS = 2.0
-"""By which one explanation of a single tag must be more probable than the other."""
 VAGUE_M, VAGUE_RAD = 2.0, 0.5
 """A pose that is less certain is searched for: what it sees can't be linearised there."""
 MOST_CONSIDERED = 128
@@ -139,86 +131,45 @@ class SpatialTrack:
             return None
         self._tried = (stamp_s, names)
         alone = not self._driven or stamp_s - self._began_s >= settings.alone_s
-        table = self._candidates(places)
-        motion, odds = self._motions(table, places)
-        if not len(motion):
+        matches, row = self._candidates(places)
+        found = accept_alignment(matches, settings)
+        some = np.flatnonzero(found.agree)
+        turned = matches.oriented[some]
+        numbers = int(np.where(turned, OF_TAG, OF_POINT).sum())
+        if not found or numbers < (FEWEST_NUMBERS if alone else ENOUGH_NUMBERS):
             return None
-        belief = np.maximum(places.p_here[table.row], settings.least_belief)
-        fit, turned = _fit(motion, table, places)
-        score = _of_names(fit * belief, table.name) + 1e-3 * np.minimum(odds, 0.0)
-        best = int(np.argmax(score))
-        agree = np.flatnonzero((fit[best] > 0.0) & (fit[best] >= _best_of_name(fit[best], table.name)))
-        count = len(np.unique(table.name[agree]))
-        numbers = int(np.where(turned[best, agree], OF_TAG, OF_POINT).sum())
-        if numbers < (FEWEST_NUMBERS if alone else ENOUGH_NUMBERS):
-            return None
-        if count < settings.fewest and not turned[best, agree].any():
-            return None
-        if not (2 * count > len(names) or count >= settings.enough):
-            return None
-        if count == 1 and table.odds[agree[0]] < CERTAIN_NATS:
-            return None
-        found = motion[best]
-        if count >= 3 and _height(table.local[agree, 0, :3]) > FLAT_M:
-            found = rigid(table.local[agree, 0, :3], places.position_m[table.row[agree]])
-        pose = se3.compose(found, self._pose)
-        return Placed(pose, *_uncertainty(pose, places.value[table.row[agree]], turned[best, agree], table.row[agree]))
+        pose = se3.compose(found.motion, self._pose)
+        return Placed(pose, *_uncertainty(pose, places.value[row[some]], turned, row[some]))
 
     def agreement(self, pose_map_robot: FloatArray, places: SpatialPlaces) -> float:
         """Return how well the track fits the map with the robot at a pose (7,): 1 per landmark exactly at a place."""
-        table = self._candidates(places)
+        matches = self._candidates(places)[0]
         motion = se3.compose(pose_map_robot, se3.inverse(self._pose))[None]
-        return float(_of_names(_fit(motion, table, places)[0], table.name)[0])
+        return float(score_motions(motion, replace(matches, weight=np.ones(len(matches))))[0])
 
-    def _candidates(self, places: SpatialPlaces) -> _Candidates:
-        """One row for every place a landmark may be at."""
+    def _candidates(self, places: SpatialPlaces) -> tuple[Matches, IntArray]:
+        """One row for every place a landmark may be at, and another where a tag has two explanations; with
+        the rows (K,) of the map.
+        """
         first, last = places.rows_of(np.fromiter(self._seen, dtype=np.int64))
         count = last - first
         within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         name = np.repeat(np.arange(len(first)), count)
         row = np.repeat(first, count) + within
         seen = list(self._seen.values())
-        local = np.array([ways for _, ways, *_ in seen]).reshape(-1, 2, 7)[name]
-        turned = np.array([one[3] for one in seen], dtype=np.bool_)[name] & np.isfinite(places.rotation[row, 0])
-        return _Candidates(local, row, name, turned, np.array([one[2] for one in seen])[name])
-
-    def _motions(self, table: _Candidates, places: SpatialPlaces) -> tuple[FloatArray, FloatArray]:
-        """(C, 7) motions from the track to the map that tags, or three landmarks, tell; (C,) log odds of each."""
-        tags = np.flatnonzero(table.turned)
-        back = se3.inverse(table.local[tags])
-        by_tags = se3.compose(places.value[table.row[tags]][:, None], back)
-        odds = np.column_stack([np.zeros(len(tags)), -table.odds[tags]])
-        kept = np.column_stack([np.ones(len(tags), dtype=np.bool_), np.isfinite(table.odds[tags])])
-        some = np.unique(table.name, return_index=True)[1]
-        some = some[np.linspace(0, len(some) - 1, min(len(some), POINTS_OF_TRIPLES)).astype(np.int64)]
-        triple = np.array(list(combinations(some.tolist(), 3)), dtype=np.int64).reshape(-1, 3)
-        source, target = table.local[triple, 0, :3], places.position_m[table.row[triple]]
-        ways = [(0, 1), (1, 2), (2, 0)]
-        gap = [np.abs(_span(source, a, b) - _span(target, a, b)) for a, b in ways]
-        fits = (np.max(gap, axis=0) < AGREE_M) & (_heights(target) > FLAT_M)
-        chosen = np.flatnonzero(fits)
-        chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), MOST_TRIPLES)).astype(np.int64)]
-        by_points = rigid(source[chosen], target[chosen]).reshape(-1, 7)
-        return np.vstack([by_tags[kept], by_points]), np.append(odds[kept], np.zeros(len(by_points)))
-
-
-@dataclass(frozen=True, slots=True)
-class _Candidates:
-    """(K,) pairs of a landmark of the track and a place of the map.
-
-    Attributes:
-        local: (K, 2, 7) where it was seen, by both explanations.
-        row: of the place.
-        name: which landmark.
-        turned: both have an orientation.
-        odds: log odds of the first explanation; inf where it is the only one.
-    """
-
-    local: FloatArray
-    row: IntArray
-    name: IntArray
-    turned: BoolArray
-    odds: FloatArray
+        ways = np.array([ways for _, ways, *_ in seen]).reshape(-1, 2, 7)[name]
+        ways[~np.array([turned for *_, turned in seen], dtype=np.bool_)[name], :, 3:] = np.nan
+        odds = np.array([odds for _, _, odds, _ in seen])[name]
+        either = np.flatnonzero(np.isfinite(odds) & np.isfinite(places.rotation[row, 0]))
+        every = np.append(np.arange(len(row)), either)
+        matches = Matches.of(
+            np.concatenate([ways[:, 0], ways[either, 1]]),
+            places.value[row[every]],
+            landmark=name[every],
+            weight=np.maximum(places.p_here[row[every]], self._settings.least_belief),
+            log_prior=np.append(np.zeros(len(row)), -np.maximum(odds[either], 0.0)),
+        )
+        return matches, row[every]
 
 
 class SpatialLocalizer(BaseLocalizer):
@@ -321,50 +272,6 @@ class SpatialLocalizer(BaseLocalizer):
     def _sight(self, row: int, seen: SpatialFrame, which: int) -> None:
         oriented = bool(seen.kind[which] != POINT and seen.symmetry[which] == 0)
         self._local.sight(row, *self._local.place_of(seen, which, oriented=oriented))
-
-
-def _fit(motion: FloatArray, table: _Candidates, places: SpatialPlaces) -> tuple[FloatArray, BoolArray]:
-    """(C, K) how well each pair agrees under motions (C, 7), 1 exactly at its place, and whether its orientation does,
-    too. What has an orientation agrees by that or not at all.
-    """
-    known = places.value[table.row]
-    at = se3.transform(motion[:, None, None], table.local[None, ..., :3])
-    gap = np.linalg.norm(at - known[:, None, :3], axis=3)
-    turned = np.broadcast_to(table.turned[:, None], gap.shape)
-    local, placed = table.local[table.turned], known[table.turned]
-    angle = np.zeros(gap.shape)
-    angle[:, table.turned] = se3.angle_between(se3.compose(motion[:, None, None], local[None]), placed[:, None])
-    fit = np.where(turned & (angle > AGREE_RAD), 0.0, np.maximum(1.0 - (gap / AGREE_M) ** 2, 0.0))
-    return fit.max(axis=2), np.broadcast_to(table.turned, fit.shape[:2])
-
-
-def _of_names(fit: FloatArray, name: IntArray) -> FloatArray:
-    """(C,) sums over landmarks of the best of each."""
-    first = np.flatnonzero(np.append(True, name[1:] != name[:-1]))
-    return np.asarray(np.maximum.reduceat(fit, first, axis=1).sum(axis=1)) if len(name) else np.zeros(len(fit))
-
-
-def _best_of_name(fit: FloatArray, name: IntArray) -> FloatArray:
-    """(K,) the best of each pair's landmark."""
-    first = np.flatnonzero(np.append(True, name[1:] != name[:-1]))
-    return np.asarray(np.maximum.reduceat(fit, first)[np.cumsum(np.append(0, name[1:] != name[:-1]))])
-
-
-def _span(points: FloatArray, a: int, b: int) -> FloatArray:
-    return np.asarray(np.linalg.norm(points[:, a] - points[:, b], axis=1))
-
-
-def _heights(points: FloatArray) -> FloatArray:
-    """(T,) least heights of triangles (T, 3, 3)."""
-    across = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-    longest = np.maximum(np.maximum(_span(points, 0, 1), _span(points, 1, 2)), _span(points, 2, 0))
-    return np.asarray(np.linalg.norm(across, axis=1) / np.maximum(longest, 1e-9))
-
-
-def _height(points: FloatArray) -> float:
-    """How far points (K, 3) lie off a line."""
-    arm = points - points.mean(axis=0)
-    return float(np.linalg.svd(arm, compute_uv=False)[1])
 
 
 def _uncertainty(

@@ -17,12 +17,13 @@ from evermap.slam.localize import Located
 from evermap.slam.nearby_places import NO_PLACES
 from evermap.slam.space.linearise import CORNERS, POINT
 from evermap.slam.space.local_filter import SpatialFilter, SpatialFrame, SpatialMotion
-from evermap.slam.space.localize import CERTAIN_NATS
 from evermap.slam.space.problem import OdometryPath, SpatialNoise
 from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks
 
 START_M, START_RAD = 1e-4, 1e-4
 """Standard deviations of the first pose: the map begins there."""
+CERTAIN_NATS = 2.0
+"""By which one explanation of a single tag must be more probable than the other."""
 
 
 class SpatialMapper:

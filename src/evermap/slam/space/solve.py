@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evermap.align.candidates import Matches, find_consensus
 from evermap.estimate.measurement import Tied
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
@@ -369,17 +370,15 @@ def _along(problem: SpatialProblem, driven: FloatArray, known: BoolArray, place:
 
 def _whole(problem: SpatialProblem, driven: FloatArray, known: BoolArray, place: FloatArray) -> FloatArray:
     """The pose (7,) of the odometry's frame in the map on which most sightings of known places agree."""
-    met = np.flatnonzero(known[problem.place] & problem.oriented[problem.place] & (problem.kind != POINT))
-    if not len(met):
-        return se3.identity()
-    some = met[:: max(1, len(met) // MOST_TRIED)]
-    mount = problem.mount[problem.sensor]
-    seen = se3.compose(driven[problem.pose_row], se3.compose(mount, problem.explanations))
-    trial = se3.compose(place[problem.place[some]], se3.inverse(seen[:, some])).reshape(-1, 7)
-    at = se3.transform(trial[:, None], seen[0, some, :3])
-    gap = np.linalg.norm(at - place[problem.place[some], :3], axis=2)
-    best = int(np.argmin(np.minimum((gap / GROSS_M) ** 2, 1.0).sum(axis=1)))
-    return np.asarray(trial[best])
+    met = np.flatnonzero(known[problem.place])
+    met = met[:: max(1, len(met) // MOST_TRIED)]
+    ways = se3.compose(problem.mount[problem.sensor[met]], problem.explanations[:, met])
+    seen, there = se3.compose(driven[problem.pose_row[met]], ways), place[problem.place[met]].copy()
+    about_axis = (problem.symmetries[problem.place[met]].unseen > 0.0).any(axis=-1)
+    there[~problem.oriented[problem.place[met]] | (problem.kind[met] == POINT) | about_axis, 3:] = np.nan
+    other = np.isfinite(there[:, 3]) & (ways != ways[0]).any(axis=2)
+    way, row = np.nonzero(np.concatenate([np.ones_like(other[:1]), other[1:]]))
+    return find_consensus(Matches.of(seen[way, row], there[row], landmark=row), agree_m=GROSS_M)[0]
 
 
 def incremental(

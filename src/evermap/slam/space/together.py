@@ -14,13 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evermap.align.acceptance import Acceptance, accept_alignment
+from evermap.align.candidates import Matches
+from evermap.config import LocalizeConfig
 from evermap.errors import DataError
 from evermap.estimate.gauss_newton import Minimum, Steps, minimised
 from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, SharedBlock, build_structure, grouped
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.geometry import se3
-from evermap.geometry.rigid import AGREE_M, rigid
 from evermap.slam.space.estimate import CONVERGED, ROUNDS, SpatialOptimum, refined
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.linearise import STATES
@@ -40,8 +42,7 @@ from evermap.slam.space.smoother import (
 from evermap.slam.space.solve import FREE, SpatialSolved
 from evermap.types import BoolArray, FloatArray, IntArray
 
-FEWEST = 3
-"""Points that align two robots; of landmarks with an orientation one does."""
+USUAL = LocalizeConfig()
 
 
 class JointEstimate(NamedTuple):
@@ -107,7 +108,7 @@ def solve_space_together(members: Sequence[SolvedRobot], names: Sequence[str]) -
     return found
 
 
-def align_robots(members: Sequence[SolvedRobot], names: Sequence[str]) -> FloatArray:
+def align_robots(members: Sequence[SolvedRobot], names: Sequence[str], rules: LocalizeConfig = USUAL) -> FloatArray:
     """Return the motions (R, 7) of each robot's frame into that of the first, by landmarks that agree.
 
     Raises:
@@ -115,43 +116,34 @@ def align_robots(members: Sequence[SolvedRobot], names: Sequence[str]) -> FloatA
     """
     motion, placed = se3.identity(len(members)), [0]
     while len(placed) < len(members):
-        best, found = 0, None
+        best, found, reason = -np.inf, None, "no common landmarks"
         for b in (b for b in range(len(members)) if b not in placed):
             place = [se3.compose(motion[a], members[a].solved.optimum.estimate.place) for a in placed]
             theirs, oriented = np.concatenate(place), np.concatenate([members[a].problem.oriented for a in placed])
             name = np.concatenate([members[a].identity for a in placed])
-            by, count = _align(members[b], name, theirs, oriented)
-            if count > best:
-                best, found = count, (b, by)
+            laid = _align(members[b], name, theirs, oriented, rules)
+            if laid and laid.log_odds > best:
+                best, found = laid.log_odds, (b, laid.motion)
+            reason = laid.reason if len(laid.agree) else reason
         if found is None:
             lost = ", ".join(names[b] for b in range(len(members)) if b not in placed)
-            what = f"nothing connects {lost} to {names[0]}"
+            what = f"nothing connects {lost} to {names[0]}: {reason}"
             raise DataError(what, hint="common landmark ids, at least three points or one tag, and one clock")
         motion[found[0]] = found[1]
         placed.append(found[0])
     return motion
 
 
-def _align(member: SolvedRobot, name: IntArray, theirs: FloatArray, oriented: BoolArray) -> tuple[FloatArray, int]:
-    """The motion (7,) of a robot's frame that brings most of its places to those of others, and how many."""
+def _align(
+    member: SolvedRobot, name: IntArray, theirs: FloatArray, oriented: BoolArray, rules: LocalizeConfig
+) -> Acceptance:
+    """The motion of a robot's frame that brings most of its places to those of others, if it is accepted."""
     own_name, own = member.identity, member.solved.optimum.estimate.place
     row, other = np.nonzero((own_name[:, None] == name) & (own_name >= 0)[:, None])
-    if not len(row):
-        return se3.identity(), 0
-    turned = np.flatnonzero(member.problem.oriented[row] & oriented[other])
-    trial = [se3.compose(theirs[other[turned]], se3.inverse(own[row[turned]]))]
-    if len(np.unique(row)) >= FEWEST:
-        trial.append(rigid(own[row, :3], theirs[other, :3])[None])
-    candidate = np.concatenate(trial)
-    if not len(candidate):
-        return se3.identity(), 0
-    gap = np.linalg.norm(se3.transform(candidate[:, None], own[row, :3]) - theirs[other, :3], axis=2)
-    agree = gap < AGREE_M
-    best = int(np.argmax(agree.sum(axis=1) - gap.clip(max=AGREE_M).sum(axis=1) / (AGREE_M * len(row))))
-    some = np.flatnonzero(agree[best])
-    if len(np.unique(row[some])) >= FEWEST:
-        return rigid(own[row[some], :3], theirs[other[some], :3]), len(np.unique(row[some]))
-    return candidate[best], len(np.unique(row[some])) if len(turned) else 0
+    mine, there = own[row].copy(), theirs[other].copy()
+    mine[~member.problem.oriented[row], 3:] = np.nan
+    there[~oriented[other], 3:] = np.nan
+    return accept_alignment(Matches.of(mine, there, landmark=row), rules)
 
 
 def _lay_together(members: Sequence[SolvedRobot], motion: FloatArray) -> tuple[SpatialTogether, JointEstimate]:

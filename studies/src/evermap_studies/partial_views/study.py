@@ -233,12 +233,12 @@ class _Truth:
 
     def alignment(self, living: LivingMap, session: int) -> FloatArray:
         """(3,) the map in the frame of the truth, by the landmarks that lie where they stand."""
-        from evermap.geometry.rigid import consensus
+        from evermap.align.candidates import Matches, find_consensus
 
         claimed = living.landmarks(p_least=0.5)
         still = self._still(claimed, session)
         at = self.position_m[session, claimed.landmark_id]
-        pose, agree = consensus(claimed.position_m[still], at[still])
+        pose, agree = find_consensus(Matches.of(claimed.position_m[still], at[still]))
         return pose if agree.any() else np.zeros(3)
 
     def _still(self, claimed: Landmarks, session: int) -> BoolArray:

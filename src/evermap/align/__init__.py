@@ -1,0 +1,1 @@
+"""Landmarks laid over landmarks: candidate motions, their joint Gaussian evidence, and whether one is accepted."""
