@@ -154,9 +154,9 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     from evermap.slam import check
 
     recording, remarks = check.screened(nameless.without_ids(recording, config), config, repair=True)
-    recording, _ = session.admitted(recording, living)
+    recording = session.admit_recording(recording, living)
     if config.slam.unknown_ids:
-        recording, _ = session.admitted(nameless.named_in(recording, living, config), living)
+        recording = session.admit_recording(nameless.named_in(recording, living, config), living)
     return planar.solve_session(recording, remarks, config, progress)
 
 
@@ -165,7 +165,7 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
     """Enter a session that was solved alone into a map: the second half of `run_session` in the plane."""
     from evermap.maps.sessions import planar, session
 
-    _, living = session.admitted(alone.recording, living)
+    living = session.with_names_of(living, alone.recording)
     return session.brought_in(planar.localised(alone, living, config), living, config.living)
 
 

@@ -232,7 +232,7 @@ def unbent(
 
 def homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
     """Return (K,) rows of the map's places at which landmarks are most probably expected; -1 for none."""
-    site = replace(living, sites=replace(living.sites, p_here=p_site)).site_of()
+    site = living.site_of(p_site)
     at = rows_among(living.members.landmark_id, where.landmark_id)
     return np.where(at >= 0, living.place_row(where.landmark_id, site[at]), -1)
 
