@@ -112,12 +112,13 @@ class _Session:
         self.p_away = np.clip(1.0 - np.bincount(row, sites.p_here, minlength=count), 0.0, 1.0)
         self.missed, self.sight = now.log_evidence <= -settings.least_evidence, looks.sight % 2
         self.least = np.full(count, settings.least_evidence)
-        if longest is not None:
+        gone = np.flatnonzero(self.missed & (self.p_away >= EXISTS))  # others are not told to have vanished
+        if longest is not None and len(gone):
             np.maximum.at(newest_s, row, sites.seen_s)
-            age_s = np.maximum(now.until_s - newest_s, 0.0)
-            p_stays = longest.longest(class_of(entered, self.cliques), age_s, settings.credible)
+            age_s = np.maximum(now.until_s - newest_s[gone], 0.0)
+            p_stays = longest.longest(class_of(entered, self.cliques[gone]), age_s, settings.credible)
             p_stays = np.clip(p_stays, 1e-12, 1.0 - 1e-12)
-            self.least = np.maximum(self.least, np.log(p_stays / (1.0 - p_stays)))
+            self.least[gone] = np.maximum(self.least[gone], np.log(p_stays / (1.0 - p_stays)))
         self.newest = {clique: k for k, clique in enumerate(stays.clique_id.tolist())}
         self.last_s, self.gone_s, self.p_gone = stays.last_s.copy(), stays.gone_s.copy(), stays.p_gone.copy()
         self.p_kept, self.since_s = sites.p_kept.copy(), sites.since_s.copy()

@@ -78,6 +78,20 @@ class Extended:
         place[here] = self.place[there]
         return place
 
+    def has_places_of(self, other: Extended) -> bool:
+        """Return whether the places of both maps are the same, and their bodies most probably at the same sites."""
+        mine, theirs = self.living, other.living
+        return all(
+            np.array_equal(one, another)
+            for one, another in (
+                (mine.members.clique_id, theirs.members.clique_id),
+                (mine.site_of(), theirs.site_of()),
+                (mine.places.site_id, theirs.places.site_id),
+                (mine.places.position_m, theirs.places.position_m),
+                (self.place, other.place),
+            )
+        )
+
 
 def extended(living: LivingMap, aged: Sites, found: Found, config: LivingConfig, drift_m: float) -> Extended:
     """Return the map with what a session found, by its sites as believed when the session began, and by how much places

@@ -16,6 +16,7 @@ from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap, Metres
 from evermap.maps.sessions import believe, gaussian, placing
 from evermap.maps.sessions.extend import Extended, Found, first_and_last
+from evermap.maps.sessions.gaussian import OwnLandmarks
 from evermap.maps.sessions.looks import Sighting, Watch
 from evermap.maps.sessions.overlay import ELSEWHERE
 from evermap.maps.sessions.placing import Held, Laid, Localised
@@ -145,16 +146,16 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
         return Localised.lost(PlanarVisit(alone), living, (wrong.message, placing.ANYWAY))
     if wrong is not None and known:
         return lost
-    large = len(living.places) > settings.whole_places
-    vicinity, where = near_session(living, alone, settings) if large else (None, None)
+    large, own = len(living.places) > settings.whole_places, gaussian.own_landmarks(alone.outcome, settings.fit)
+    vicinity, where = near_session(living, alone, own, settings) if large else (None, None)
     part, visit = living if vicinity is None else vicinity.part, alone
     p_site = believe.aged(part, settings, alone.start_s).p_here
-    where = where if large else laid(part, p_site, alone, settings)
+    where = where if large else laid(part, p_site, alone, own, settings)
     if where is None and len(part.places):
         return Localised.lost(PlanarVisit(alone), living, placing.NOT_FOUND)
     if where is not None:
         in_part = vicinity is not None
-        part, where, visit = refit(part, p_site, where, alone, settings, robust=config.slam.robust, part=in_part)
+        part, where, visit = refit(part, p_site, where, alone, own, settings, robust=config.slam.robust, part=in_part)
     if joint:
         if cut:
             some = without(visit, *doubtful(visit, where, settings))
@@ -171,9 +172,8 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
     return Localised(PlanarVisit(visit), part, where, vicinity)
 
 
-def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingConfig) -> Laid | None:
-    """Return the alignment of the session with the map; None if no landmarks match."""
-    own = gaussian.own_landmarks(alone.outcome, config.fit)
+def laid(living: LivingMap, p_site: FloatArray, alone: Solved, own: OwnLandmarks, config: LivingConfig) -> Laid | None:
+    """Return the alignment of the session, by its own landmarks, with the map; None if no landmarks match."""
     names = alone.prepared.landmark_id[own.row]
     log_sigma = float(np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance)))
     where = placing.laid_over(living, p_site, names, own.position_m, gaussian.of_unknown_size(own, log_sigma), config)
@@ -199,15 +199,16 @@ def _seen_together(alone: Solved, row: IntArray, least: float) -> sparse.csr_arr
     return sparse.csr_array(seen @ seen.T)
 
 
-def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tuple[Vicinity, Laid | None]:
+def near_session(
+    living: LivingMap, alone: Solved, own: OwnLandmarks, config: LivingConfig
+) -> tuple[Vicinity, Laid | None]:
     """Return the part of a large map that a session can observe, and its alignment there; None as of `laid`.
 
     That is what the sensor may have seen on its way, once the session is laid over those that it names, and some more.
     """
-    own = gaussian.own_landmarks(alone.outcome, config.fit)
     named = cliques_of(living, alone.prepared.landmark_id[own.row])
     seen = Vicinity.of(living, named, config)
-    where = laid(seen.part, believe.aged(seen.part, config, alone.start_s).p_here, alone, config)
+    where = laid(seen.part, believe.aged(seen.part, config, alone.start_s).p_here, alone, own, config)
     if where is None:
         return seen, None
     path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
@@ -215,7 +216,15 @@ def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tupl
 
 
 def refit(
-    living: LivingMap, p_site: FloatArray, where: Laid, alone: Solved, config: LivingConfig, *, robust: bool, part: bool
+    living: LivingMap,
+    p_site: FloatArray,
+    where: Laid,
+    alone: Solved,
+    own: OwnLandmarks,
+    config: LivingConfig,
+    *,
+    robust: bool,
+    part: bool,
 ) -> tuple[LivingMap, Laid, Solved]:
     """Return the session solved again with its matched landmarks constrained by the map, and the rescaled map.
 
@@ -225,7 +234,6 @@ def refit(
     outcome, names = alone.outcome, alone.prepared.landmark_id
     size = outcome.scale
     if outcome.log_scale_sigma > 0.0:
-        own = gaussian.own_landmarks(outcome, config.fit)
         _, mine, theirs = np.intersect1d(names[own.row], where.landmark_id[where.place >= 0], return_indices=True)
         places = where.place[where.place >= 0][theirs]
         shown = gaussian.log_ratio(

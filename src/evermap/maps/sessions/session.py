@@ -237,7 +237,7 @@ class Judged:
         entry: the map with these, before its beliefs were updated.
         now: its beliefs.
         seen: looks at its places.
-        eye: (F, 3) poses of the sensor on the floor.
+        watch: which places it looked at.
     """
 
     living: LivingMap
@@ -246,7 +246,7 @@ class Judged:
     entry: Extended
     now: Believed
     seen: PlaceLooks
-    eye: FloatArray
+    watch: Watch
 
 
 def judged(
@@ -255,19 +255,19 @@ def judged(
     visit: Visit,
     config: LivingConfig,
     classes: ClassLives | None = None,
-    found: Found | None = None,
+    known: Judged | None = None,
 ) -> Judged:
     """Return the map after the session, and the changes.
 
     What was found goes into the map, then hits and misses into beliefs, and those into decisions. A map's first session
-    lies nowhere. When it is judged for the second time it is known what it teaches of lifetimes, and what was found.
+    lies nowhere. When it is judged for the second time, what it teaches of lifetimes and what was found are `known`.
     """
     start_s, end_s, sensor = visit.start_s, visit.end_s, visit.floor_sensor
     aged = believe.aged(living, config, start_s)
-    found = visit.found(where, living, config) if found is None else found
+    found = visit.found(where, living, config) if known is None else known.found
     living, drift_m = (visit.begun(living), 0.0) if where is None else (living, where.drift_m)
     entry = extended(living, aged, found, config, drift_m)
-    watch = visit.watched(entry, config)
+    watch = known.watch if known is not None and known.entry.has_places_of(entry) else visit.watched(entry, config)
     seen = looked_at(entry.living, entry.p_start, watch, config)
     now = believe.believed(entry, seen, sensor, (start_s, end_s), config)
     now, seen = departed(now, seen, visit.witnessed, entry)
@@ -279,7 +279,7 @@ def judged(
     if config.cliques and config.existence and config.misses:
         after = without_missed(entry.before, after, config.grouping)
     after = decide.without_forgotten(after, config.most_sites, config.decisions)
-    return Judged(after, changes, found, entry, now, seen, watch.eye)
+    return Judged(after, changes, found, entry, now, seen, watch)
 
 
 def missed(living: LivingMap, p_site: FloatArray, seen: PlaceLooks, visit: Visit) -> Misses:
@@ -307,7 +307,7 @@ def learned(judged: Judged, classes: ClassLives | None, config: LivingConfig) ->
         weight = np.where(seen.settled, 1.0, judged.now.sites.p_here[seen.rows.site])
         names = places.site_id, places.landmark_id
         lines = lines.learned(names, seen.place, seen.cell, seen.rows.hit, weight, seen.rate)
-        views = views.seen_from(judged.eye, after.stamp_s, seen.rate)
+        views = views.seen_from(judged.watch.eye, after.stamp_s, seen.rate)
     return replace(after, sightlines=lines, views=views, lives=after.lives if classes is None else classes.lives)
 
 
@@ -340,7 +340,7 @@ def brought_in(
     classes = lives_after(judged_now.living, config)
     if classes is not None:
         living = replace(living, lives=replace(classes.lives, looks_s=living.lives.looks_s))
-        judged_now = judged(living, where, visit, config, classes, judged_now.found)
+        judged_now = judged(living, where, visit, config, classes, judged_now)
         classes = lives_after(judged_now.living, config)
     after = told(judged_now, learned(judged_now, classes, config), where, visit)
     living = after.living if session.vicinity is None else session.vicinity.put_back(after.living)
