@@ -121,7 +121,10 @@ def extended(living: LivingMap, aged: Sites, found: Found, config: LivingConfig,
         )
     nothing = np.zeros(len(new), dtype=np.int64)
     places = living.places.joined(Places(site, found.landmark_id[new], found.position_m[new], nothing, nothing))
-    places = _turned(replace(places, position_m=position), found, seen, new)
+    places = replace(places, position_m=position)
+    if found.rotation is not None and found.rotation_covariance is not None:
+        turn = _turned(places, found.place, found.rotation, found.rotation_covariance)
+        places = replace(places, rotation=turn[0], rotation_covariance=turn[1])
     sites, p_start, is_new = _with_sites(living, aged, found, clique, (fresh, new_ids), config.decisions.new_clique_p)
     sorted_rows = np.lexsort((places.landmark_id, places.site_id))
     place = found.place.copy()
@@ -144,20 +147,20 @@ def extended(living: LivingMap, aged: Sites, found: Found, config: LivingConfig,
     )
 
 
-def _turned(places: Places, found: Found, seen: IntArray, new: IntArray) -> Places:
-    """Places with the orientations of the session: of those that it saw (rows `seen`), and of the new ones at the end.
-
-    An orientation that the session did not see stays.
+def _turned(
+    places: Places, place: IntArray, rotation: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Orientations of places, and their covariances, with those of a session's landmarks (K,): at their `place`, of new
+    ones at the end. An orientation that the session did not see stays.
     """
-    if found.rotation is None or found.rotation_covariance is None:
-        return places
-    at = np.concatenate([seen, len(places) - len(new) + np.arange(len(new))])
-    of = np.concatenate([np.flatnonzero(found.place >= 0), new])
-    known = np.isfinite(found.rotation[of, 0])
-    rotation, covariance = places.rotation.copy(), places.rotation_covariance.copy()
-    rotation[at[known]] = found.rotation[of[known]]
-    covariance[at[known]] = found.rotation_covariance[of[known]]
-    return replace(places, rotation=rotation, rotation_covariance=covariance)
+    new = np.flatnonzero(place < 0)
+    at = np.concatenate([place[place >= 0], len(places) - len(new) + np.arange(len(new))])
+    of = np.concatenate([np.flatnonzero(place >= 0), new])
+    known = np.isfinite(rotation[of, 0])
+    turned, spread = places.rotation.copy(), places.rotation_covariance.copy()
+    turned[at[known]] = rotation[of[known]]
+    spread[at[known]] = covariance[of[known]]
+    return turned, spread
 
 
 def _with_bodies(

@@ -369,7 +369,7 @@ def _solved(problem: Problem, noise: Noise, start: Estimate, *, robust: bool) ->
     """The optimum near `start`, and its covariances."""
     # first with the kernel that never lets go: what was near the session's own map need not be near this one
     near = Smoother(problem, noise, heavy=True, robust=robust)
-    start = near.optimum(start, iterations=HEAVY_STEPS, tolerance=1e-3)
+    start, _ = exhausted(near.solved_in_slices(start, iterations=HEAVY_STEPS, tolerance=1e-3))
     smoother = near.under(noise, heavy=False)
     return smoother, *exhausted(smoother.solved_in_slices(start, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -251,27 +252,19 @@ def refit(
         size *= found.session_factor
         alone = _remarked(alone, shown[0], found, config.metre)
 
-    def in_map(where: Laid) -> tuple[Outcome, bool]:
-        stand = np.flatnonzero(where.place >= 0)
-        row = np.searchsorted(names, where.landmark_id[stand])
-        position = living.places.position_m[where.place[stand]]
-        motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
-        covariance = gaussian.drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
-        return placing.refitted(
-            outcome, outcome.prior, motion, size, Held(row, position, covariance), settings=config.fit, robust=robust
-        )
-
-    solved, straightened = in_map(where)
+    hold = functools.partial(_hold, outcome, names, living, size)
+    solve_held = functools.partial(placing.refitted, outcome, outcome.prior, settings=config.fit, robust=robust)
+    solved, straightened = solve_held(*hold(where))
     if where.assumed.any() and solved.inlier.mean() < (1.0 - config.fit.most_lost) * outcome.inlier.mean():
         place = np.where(where.assumed, ELSEWHERE, where.place)
         as_seen = replace(where, place=place, assumed=np.zeros_like(where.assumed))
-        other, straightened_too = in_map(as_seen)
+        other, straightened_too = solve_held(*hold(as_seen))
         if other.inlier.mean() > solved.inlier.mean():  # it was not bent: they did move together
             where, solved, straightened = as_seen, other, straightened_too
     if straightened:
         # where it lies if nothing has moved
         at_home = replace(where, place=np.where(where.place >= 0, where.place, placing.homes(living, p_site, where)))
-        solved, _ = in_map(at_home)
+        solved, _ = solve_held(*hold(at_home))
         landmark = alone.prepared.problem.landmark_row[: len(solved.inlier)]
         n_fit, count = (np.bincount(landmark, w, minlength=len(names)) for w in (solved.inlier, np.ones(len(landmark))))
         stays = (2.0 * n_fit > count)[np.searchsorted(names, where.landmark_id)]
@@ -280,8 +273,20 @@ def refit(
             place=np.where(stays, at_home.place, where.place),
             probability=np.where(stays, 1.0, where.probability),
         )
-        solved, _ = in_map(where)
+        solved, _ = solve_held(*hold(where))
     return living, where, replace(alone, outcome=solved)
+
+
+def _hold(
+    outcome: Outcome, landmark_id: IntArray, living: LivingMap, size: float, where: Laid
+) -> tuple[FloatArray, float, Held]:
+    """Return where the frame of a session is in the map (3,), `size`, and its landmarks (L,) that a map holds."""
+    stand = np.flatnonzero(where.place >= 0)
+    row = np.searchsorted(landmark_id, where.landmark_id[stand])
+    position = living.places.position_m[where.place[stand]]
+    motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
+    covariance = gaussian.drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
+    return motion, size, Held(row, position, covariance)
 
 
 def _remarked(alone: Solved, log_ratio: float, found: gaussian.Size, settings: MetreConfig) -> Solved:

@@ -270,9 +270,10 @@ def judged(
     watch = known.watch if known is not None and known.entry.has_places_of(entry) else visit.watched(entry, config)
     seen = looked_at(entry.living, entry.p_start, watch, config)
     now = believe.believed(entry, seen, sensor, (start_s, end_s), config)
-    now, seen = departed(now, seen, visit.witnessed, entry)
     came = arrivals(entry.before, entry.living, now.until_s, seen, sensor, config.looks)
-    came = arrived(came, visit.witnessed, entry)
+    if len(visit.witnessed.landmark_id):
+        came = arrived(came, visit.witnessed, entry)
+        now, seen = departed(now, seen, visit.witnessed, entry)
     after, changes = decide.decided(
         entry.before, entry.living, now, seen, came, start_s, classes, settings=config.decisions
     )
