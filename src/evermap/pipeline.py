@@ -157,13 +157,13 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     It is the same for all maps that agree on classes and deleted landmarks, whatever else they believe.
     """
     from evermap.maps.sessions import nameless, planar, session
-    from evermap.slam import check
+    from evermap.slam import check, estimate
 
     recording, remarks = check.screened(nameless.without_ids(recording, config), config, repair=True)
     recording = session.admit_recording(recording, living)
     if config.slam.unknown_ids:
         recording = session.admit_recording(nameless.named_in(recording, living, config), living)
-    return planar.solve_session(recording, remarks, config, progress)
+    return estimate.solve(*planar.prepare_alone(recording, config), remarks=remarks, progress=progress)
 
 
 @single_threaded()

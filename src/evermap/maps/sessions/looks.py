@@ -68,7 +68,8 @@ class Watch(NamedTuple):
         """Return what a sensor in the plane looked at, by its nominal field of view, of places (P, 2)."""
         seen = sighting.frame, sighting.place
         listed = NominalField(sensor, settings).looks(sighting.pose_map_robot, position_m, seen)
-        return cls(sighting.stamp_s, listed, sensor_poses(sighting, sensor))
+        eye = se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor))
+        return cls(sighting.stamp_s, listed, eye)
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,11 +260,6 @@ def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolA
         known = np.array([1.0, 1.0, 0.0])  # lines that were unknown are counted where a clique is known to stand
         p_hidden = lines.after_session(known * hidden, known * shown).p_hidden
     return p_hidden
-
-
-def sensor_poses(sighting: Sighting, sensor: Sensor) -> FloatArray:
-    """Return (F, 3) poses of the sensor in the map."""
-    return np.asarray(se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from evermap.config import Config, LivingConfig, MetreConfig
+from evermap.config import Config, LivingConfig, MetreConfig, SlamConfig
 from evermap.errors import DataError, NumericalError
 from evermap.estimate.tie import without_frames
 from evermap.geometry import se2
@@ -27,7 +27,7 @@ from evermap.slam.batch import Outcome, silent_links
 from evermap.slam.cleaning import some_frames
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import unusable
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Progress, Recording, Sensor, SlamResult
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Recording, Sensor, SlamResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,18 +121,12 @@ class PlanarVisit:
         return Watch.of(sighting, entry.living.places.position_m, recording.sensor, config.looks)
 
 
-def solve_session(
-    recording: Recording, remarks: tuple[str, ...], config: Config, progress: Progress | None = None
-) -> Solved:
-    """Solve a cleaned session with known identities alone. Moves are searched for after its alignment with the map.
-
-    Raises:
-        DataError: fewer than two frames with a landmark of known identity.
-        NumericalError: no finite optimum.
+def prepare_alone(recording: Recording, config: Config) -> tuple[Recording, SlamConfig]:
+    """Return a cleaned session with known identities, and the settings, for its solution alone: moves are searched for
+    after its alignment with the map.
     """
     settings = config.slam.model_copy(update={"method": "nohyp", "unknown_ids": False})
-    recording = replace(recording, measurements=without_frames(recording.measurements))
-    return solve(recording, settings, remarks=remarks, progress=progress)
+    return replace(recording, measurements=without_frames(recording.measurements)), settings
 
 
 def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = True) -> Localised[PlanarVisit]:
@@ -140,20 +134,21 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
     (`session.admitted`); and `cut`, without doubtful frames (`doubtful`), if there are any.
     """
     settings, known = config.living, len(living.places) > 0
-    lost = Localised.lost(PlanarVisit(alone), living, placing.CONTRADICTED if known else placing.DISTORTED)
+    lost = functools.partial(Localised.lost, PlanarVisit(alone), living)
+    contradicted = placing.CONTRADICTED if known else placing.DISTORTED
     joint = settings.search == "joint"
     wrong = unusable(alone.recording, config.slam.check) if joint and cut else None
     if wrong is not None and not wrong.usable:
-        return Localised.lost(PlanarVisit(alone), living, (wrong.message, placing.ANYWAY))
+        return lost((wrong.message, placing.ANYWAY))
     if wrong is not None and known:
-        return lost
+        return lost(contradicted)
     large, own = len(living.places) > settings.whole_places, gaussian.own_landmarks(alone.outcome, settings.fit)
     vicinity, where = near_session(living, alone, own, settings) if large else (None, None)
     part, visit = living if vicinity is None else vicinity.part, alone
     p_site = believe.aged(part, settings, alone.start_s).p_here
     where = where if large else laid(part, p_site, alone, own, settings)
     if where is None and len(part.places):
-        return Localised.lost(PlanarVisit(alone), living, placing.NOT_FOUND)
+        return lost(placing.NOT_FOUND)
     if where is not None:
         in_part = vicinity is not None
         part, where, visit = refit(part, p_site, where, alone, own, settings, robust=config.slam.robust, part=in_part)
@@ -161,15 +156,16 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
         if cut:
             some = without(visit, *doubtful(visit, where, settings))
             if some is None:
-                return lost
+                return lost(contradicted)
             if some is not visit.recording:
                 try:
-                    return localised(solve_session(some, visit.prepared.warnings, config), living, config, cut=False)
+                    rest = solve(*prepare_alone(some, config), remarks=visit.prepared.warnings)
+                    return localised(rest, living, config, cut=False)
                 except (DataError, NumericalError):  # too little is left
-                    return lost
+                    return lost(contradicted)
         # what fits together by itself does not fit once it is held there
         if where is not None and visit.outcome.inlier.mean() < settings.fit.least_fit * alone.outcome.inlier.mean():
-            return lost
+            return lost(contradicted)
     return Localised(PlanarVisit(visit), part, where, vicinity)
 
 
