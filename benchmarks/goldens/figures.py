@@ -56,6 +56,7 @@ KINDS: dict[str, Kind] = {
     "frame_ms": Kind("cost", "lower", 0.5, 5.0),
     "over_peer": Kind("cost", "lower", 0.25, 0.1),
     "factorisations": Kind("cost", "lower", 0.03),
+    "count": Kind("cost", "lower", 0.03),
 }  # fmt: skip
 """Kinds of figures; the last word of a figure's name is its kind. Costs have room for other work on the machine."""
 

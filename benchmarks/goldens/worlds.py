@@ -177,12 +177,23 @@ def template(*, in_space: bool) -> Part:
     return run
 
 
+def session_path(_: Path) -> Iterator[Named]:
+    """The code that a reader steps through when a second session enters a map."""
+    from benchmarks.session_path import second_session
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = second_session(Path(folder))
+    for name, count in path.figures().items():
+        yield f"{name}/count", count
+
+
 def parts() -> dict[str, Part]:
     """Return all parts by name."""
     return {
         "template": template(in_space=False),
         "template_in_space": template(in_space=True),
         **{f"warehouse_{size}": warehouse(size) for size in SIZES},
+        "session_path": session_path,
         "rooms": rooms,
         "mrclam6_changing": mrclam6_changing,
         "partial_views": partial_views,

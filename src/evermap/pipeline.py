@@ -13,7 +13,10 @@ from evermap.types import AnyRecording, Landmarks, Progress, Recording, SlamResu
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
+    from evermap.maps.sessions.placing import Localised
+    from evermap.maps.sessions.planar import PlanarVisit
     from evermap.maps.sessions.session import Session
+    from evermap.maps.sessions.spatial import SpatialVisit
     from evermap.slam.estimate import Solved
 
 
@@ -126,22 +129,25 @@ def run_session(
         DataError: nothing can be estimated, or the session is earlier than the map.
         NumericalError: no finite optimum.
     """
-    from evermap.maps.sessions import boxes, nameless, session
+    from evermap.maps.sessions import boxes, nameless, planar, session
     from evermap.slam import check
 
     config = config or Config()
     recording = session.in_its_space(recording, living, config)
     living, whole = session.opened(living, recording), recording
-    if not isinstance(recording, SpatialRecording):
-        entered = bring_in(solve_alone(recording, living, config, progress=progress), living, config)
-        return session.begun_with(entered, whole)
-    recording, remarks = check.screened(nameless.without_ids(recording, config), config)
-    session.check_static(recording, config)
-    recording, living = session.admitted(recording, living)
-    if config.slam.unknown_ids:
-        recording, living = session.admitted(nameless.named_in(recording, living, config), living)
-    entered = session.brought_in(boxes.localised(recording, living, config, remarks, progress), living, config.living)
-    return session.begun_with(entered, whole)
+    located: Localised[PlanarVisit] | Localised[SpatialVisit]
+    if isinstance(recording, SpatialRecording):
+        recording, remarks = check.screened(nameless.without_ids(recording, config), config)
+        session.check_static(recording, config)
+        recording, living = session.admitted(recording, living)
+        if config.slam.unknown_ids:
+            recording, living = session.admitted(nameless.named_in(recording, living, config), living)
+        located = boxes.localised(recording, living, config, remarks, progress)
+    else:
+        alone = solve_alone(recording, living, config, progress=progress)
+        living = session.with_names_of(living, alone.recording)
+        located = planar.localised(alone, living, config)
+    return session.begun_with(session.brought_in(located, living, config.living), whole)
 
 
 @single_threaded()
@@ -151,13 +157,13 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     It is the same for all maps that agree on classes and deleted landmarks, whatever else they believe.
     """
     from evermap.maps.sessions import nameless, planar, session
-    from evermap.slam import check
+    from evermap.slam import check, estimate
 
     recording, remarks = check.screened(nameless.without_ids(recording, config), config, repair=True)
-    recording, _ = session.admitted(recording, living)
+    recording = session.admit_recording(recording, living)
     if config.slam.unknown_ids:
-        recording, _ = session.admitted(nameless.named_in(recording, living, config), living)
-    return planar.solve_session(recording, remarks, config, progress)
+        recording = session.admit_recording(nameless.named_in(recording, living, config), living)
+    return estimate.solve(*planar.prepare_alone(recording, config), remarks=remarks, progress=progress)
 
 
 @single_threaded()
@@ -165,7 +171,7 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
     """Enter a session that was solved alone into a map: the second half of `run_session` in the plane."""
     from evermap.maps.sessions import planar, session
 
-    _, living = session.admitted(alone.recording, living)
+    living = session.with_names_of(living, alone.recording)
     return session.brought_in(planar.localised(alone, living, config), living, config.living)
 
 

@@ -16,7 +16,7 @@ from typer.core import TyperGroup
 from evermap import __version__, interrupts, plugins
 from evermap.cli import bench, check, convert, info, learn, live, persist, reproduce, serve, slam, survival, track, view
 from evermap.cli import map as living_map
-from evermap.cli.options import Verb, option
+from evermap.cli.options import Verb, name_options, option
 from evermap.cli.terminal import fail, say, warn
 from evermap.errors import EvermapError, EvermapWarning
 
@@ -61,6 +61,7 @@ class Verbs(TyperGroup):
         try:
             return super().invoke(ctx)
         except EvermapError as error:
+            name_options(error, ctx)
             fail(error.one_line())
             raise typer.Exit(EXIT_USER) from None
         except KeyboardInterrupt as stop:

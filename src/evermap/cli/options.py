@@ -186,17 +186,27 @@ def default_out(name: str) -> Path:
 class _SpeaksOfOptions:
     """Mixin of commands and groups whose errors and remarks name options instead of the core's arguments."""
 
-    def invoke(self, ctx: Any) -> Any:
-        """Run the command, or the group or one of its commands."""
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        """Return the context of the command, which is from now on the one that errors and remarks are told in."""
+        ctx = super().make_context(*args, **kwargs)  # type: ignore[misc]
         remark_as.set(lambda text: with_options(text, ctx))
-        try:
-            return super().invoke(ctx)  # type: ignore[misc]
-        except EvermapError as error:
-            error.problem = with_options(error.problem, ctx)
-            error.hint = error.hint and with_options(error.hint, ctx)
-            if error.line is None:  # in a line of a file it is a column or a key
-                error.field = error.field and (_option(error.field, ctx) or error.field)
-            raise
+        ctx.meta[TOLD_IN] = ctx
+        return ctx
+
+
+TOLD_IN = "evermap.verb"
+"""Key of the context of the innermost command, in what all contexts share."""
+
+
+def name_options(error: EvermapError, ctx: Any) -> None:
+    """Let an error name options of the command that raised it instead of the core's arguments."""
+    verb = ctx.meta.get(TOLD_IN)
+    if verb is None:
+        return
+    error.problem = with_options(error.problem, verb)
+    error.hint = error.hint and with_options(error.hint, verb)
+    if error.line is None:  # in a line of a file it is a column or a key
+        error.field = error.field and (_option(error.field, verb) or error.field)
 
 
 class Verb(_SpeaksOfOptions, TyperCommand):

@@ -231,8 +231,10 @@ def slam(
     asked = asked._replace(map_file=map_file, priors=prior or [], localize=localize)
     if len(paths) > 1:
         _each(paths, out, asked)
+    elif asked.map_file is None:
+        _run_alone(*_read_inputs(paths[0], out, asked), asked)
     else:
-        _estimate(paths[0], out, asked)
+        _run_in_map(*_read_inputs(paths[0], out, asked), asked)
 
 
 class _Asked(NamedTuple):
@@ -262,7 +264,7 @@ class _Asked(NamedTuple):
 
 
 def _each(paths: Sequence[Path], out: Path | None, asked: _Asked) -> None:
-    """Work on several recordings; one that is refused stops none of the others.
+    """Work on several sessions of a map; one that is refused stops none of the others.
 
     Raises:
         DataError: any was refused.
@@ -272,7 +274,7 @@ def _each(paths: Sequence[Path], out: Path | None, asked: _Asked) -> None:
         say(f"session {number + 1} of {len(paths)}: {path}")
         folder = None if out is None else out / default_out(path.resolve().name).name
         try:
-            _estimate(path, folder, asked, later=number > 0)
+            _run_in_map(*_read_inputs(path, folder, asked), asked, later=number > 0)
         except EvermapError as error:
             refused.append(str(path))
             fail(error.one_line())
@@ -280,11 +282,8 @@ def _each(paths: Sequence[Path], out: Path | None, asked: _Asked) -> None:
         raise DataError(f"{len(refused)} of {len(paths)} sessions were refused: {', '.join(refused)}")
 
 
-def _estimate(path: Path, out: Path | None, asked: _Asked, *, later: bool = False) -> None:
-    """Read a recording, run, and write the folder.
-
-    `later`: of several sessions it is not the first, and needs the survey only if none before it began the map.
-    """
+def _read_inputs(path: Path, out: Path | None, asked: _Asked) -> tuple[AnyRecording, Landmarks | None, Path]:
+    """Return the recording, the landmarks to start from, and the folder of the run, which may be written to."""
     from evermap.io import shifted
     from evermap.runs.folder import check_replaceable
 
@@ -295,11 +294,7 @@ def _estimate(path: Path, out: Path | None, asked: _Asked, *, later: bool = Fals
         out = default_out(recording.name)
         check_replaceable(out, force=asked.force, inputs=asked.inputs)
     survey = None if asked.prior_map is None else _prior_landmarks(asked.prior_map, asked.prior_sigma_m, recording)
-    landmarks = None if survey is None else shifted(survey, asked.shifts)
-    if asked.map_file is None:
-        _run_alone(recording, landmarks, out, asked)
-    else:
-        _run_in_map(recording, landmarks, out, asked, asked.map_file, later=later)
+    return recording, None if survey is None else shifted(survey, asked.shifts), out
 
 
 def _run_alone(recording: AnyRecording, prior: Landmarks | None, out: Path, asked: _Asked) -> None:
@@ -539,9 +534,12 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) ->
 
 
 def _run_in_map(
-    recording: AnyRecording, survey: Landmarks | None, out: Path, asked: _Asked, map_file: str, *, later: bool
+    recording: AnyRecording, survey: Landmarks | None, out: Path, asked: _Asked, *, later: bool = False
 ) -> None:
-    """Run, write the folder, then commit the map, so that every session in the map has its folder."""
+    """Run, write the folder, then commit the map, so that every session in the map has its folder.
+
+    `later`: of several sessions it is not the first, and needs the survey only if none before it began the map.
+    """
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.existence.models import priors_of
     from evermap.maps.sessions.session import in_its_space
@@ -551,7 +549,8 @@ def _run_in_map(
     from evermap.slam.space.moving import has_traffic
     from evermap.types import SpatialRecording
 
-    config, localize = asked.config, asked.localize
+    config, localize, map_file = asked.config, asked.localize, asked.map_file
+    assert map_file is not None
     if asked.realtime and not localize:
         raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
     common, by_class = priors_by_class(asked.priors)

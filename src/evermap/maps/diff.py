@@ -206,13 +206,15 @@ def with_swaps(
     found: Sequence[MapChange], before: LivingMap, after: LivingMap, settings: DecisionConfig = USUAL
 ) -> tuple[MapChange, ...]:
     """Return changes in which two moves to each other's place are one exchange, or of identities."""
+    moved = [k for k, change in enumerate(found) if change.kind is ChangeKind.MOVED]
+    if len(moved) < 2:
+        return tuple(found)
     then, now = before.landmarks(), after.landmarks()
 
     def at(records: Landmarks, names: tuple[int, ...]) -> FloatArray:
         rows = np.isin(records.landmark_id, names)
         return np.asarray(records.position_m[rows].mean(axis=0)) if rows.any() else np.full(_dim(before, after), np.nan)
 
-    moved = [k for k, change in enumerate(found) if change.kind is ChangeKind.MOVED]
     was = {k: at(then, found[k].landmark_ids) for k in moved}
     is_at = {k: at(now, found[k].landmark_ids) for k in moved}
     swapped: dict[int, int] = {}

@@ -415,9 +415,11 @@ class LivingMap(Shown):
         stamp_s[np.searchsorted(self.sites.site_id, self.dated.site_id)] = self.dated.stamp_s
         return stamp_s
 
-    def site_of(self) -> IntArray:
-        """Return (L,) the most probable `site_id` of each landmark's clique, `UNKNOWN` where it has none."""
-        order = np.lexsort((self.sites.p_here, self.sites.clique_id))
+    def site_of(self, p_site: FloatArray | None = None) -> IntArray:
+        """Return (L,) the most probable `site_id` of each landmark's clique, `UNKNOWN` where it has none; by the
+        probabilities (S,) of the sites, None for those of the map.
+        """
+        order = np.lexsort((self.sites.p_here if p_site is None else p_site, self.sites.clique_id))
         clique = self.sites.clique_id[order]
         last = np.flatnonzero(np.diff(clique, append=-1) != 0)  # one a clique, by clique
         site = np.append(self.sites.site_id[order[last]], UNKNOWN)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from evermap.config import LivingConfig
-from evermap.maps.living import LivingMap
+from evermap.maps.living import LivingMap, Sites
 from evermap.maps.sessions.extend import Extended, Found, extended
 from evermap.types import FloatArray
 
@@ -42,12 +42,12 @@ def found(
 
 def begun(session: Found, config: LivingConfig | None = None) -> Extended:
     """A first session."""
-    return extended(LivingMap(), np.zeros(0), session, config or LivingConfig(), 0.0)
+    return extended(LivingMap(), Sites.empty(), session, config or LivingConfig(), 0.0)
 
 
 def next_map(living: LivingMap, session: Found, config: LivingConfig | None = None) -> Extended:
     """A further one."""
-    return extended(living, living.sites.p_here, session, config or LivingConfig(), 0.0)
+    return extended(living, living.sites, session, config or LivingConfig(), 0.0)
 
 
 def assert_consistent(living: LivingMap) -> None:

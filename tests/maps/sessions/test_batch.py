@@ -42,7 +42,7 @@ def test_two_sessions_one_after_the_other_are_both_at_once(seed: int) -> None:
     names_b, at_b, spread_b = own(second)
     everyone = np.union1d(names_a, names_b)
     np.testing.assert_array_equal(begun.places.landmark_id[np.argsort(begun.places.landmark_id)], names_a)
-    where = laid(begun, begun.sites.p_here, second, config.living)
+    where = laid(begun, begun.sites.p_here, second, own_landmarks(second.outcome), config.living)
     assert where is not None
     both = np.intersect1d(names_a, names_b)
     assert (where.place[np.isin(where.landmark_id, both)] >= 0).all()

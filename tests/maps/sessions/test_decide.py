@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evermap.existence.sites import SiteLooks
+from evermap.existence.sites import Evidence, SiteLooks
 from evermap.maps.lives import Life, Lives
 from evermap.maps.living import LivingMap, Stays
 from evermap.maps.sessions import decide
+from evermap.maps.sessions.believe import Believed
 from evermap.maps.sessions.extend import Extended
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks
 from evermap.sensing.sightlines import nominal_lines
@@ -38,6 +39,11 @@ class Look:
     hit: bool
     at: tuple[float, float] | None = None
     counts: bool = True
+
+
+def beliefs(living: LivingMap, log_evidence: FloatArray) -> Believed:
+    """Those that a map has, as if a session had said so."""
+    return Believed(living.stamp_s, living.places, living.sites, log_evidence, Evidence.empty())
 
 
 @dataclass(slots=True)
@@ -103,7 +109,8 @@ class Story:
         said = np.full(len(np.unique(after.sites.clique_id)), 5.0)
         for name in (*away, *(log_evidence or {})):
             said[self._row_of(after, name)] = (log_evidence or {}).get(name, -5.0)
-        self.living, changes = decide.decided(before, after, seen, said, self._arrivals(after, arrived or {}), start_s)
+        came = self._arrivals(after, arrived or {})
+        self.living, changes = decide.decided(before, after, beliefs(after, said), seen, came, start_s)
         assert_consistent(self.living)
         assert (self.living.sites.p_kept <= self.living.sites.p_here).all()
         return changes
@@ -439,7 +446,7 @@ def test_whatever_is_believed_nothing_is_told_without_looks(seed: int) -> None:
         none = Arrivals(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
         stays = living.stays
         now = replace(living, sites=sites, stamp_s=start_s + 99.0)
-        after, changes = decide.decided(living, now, looks, said, none, start_s)
+        after, changes = decide.decided(living, now, beliefs(now, said), looks, none, start_s)
         looked = {int(cliques[c]) for c, tells in zip(looks.rows.clique, looks.counts, strict=True) if tells}
         body = dict(zip(after.members.landmark_id.tolist(), after.members.clique_id.tolist(), strict=True))
         for change in changes:
@@ -462,7 +469,7 @@ def test_whatever_is_believed_nothing_is_told_without_looks(seed: int) -> None:
         nothing = rows_of(looks.rows, np.zeros(0, np.int64))
         empty = np.zeros(0, np.int64)
         blind = replace(looks, rows=nothing, place=empty, cell=empty, counts=empty > 0, settled=empty > 0)
-        _, again = decide.decided(after, after, blind, np.zeros(len(cliques)), none, start_s + 99.0)
+        _, again = decide.decided(after, after, beliefs(after, np.zeros(len(cliques))), blind, none, start_s + 99.0)
         assert again == ()
         living = after
 

@@ -59,7 +59,7 @@ def test_a_map_is_consistent_whatever_is_found_and_names_are_never_used_again(se
     ever: set[int] = set()
     for _ in range(4):
         session = random_session(random, living)
-        entry = extended(living, living.sites.p_here, session, config, 0.01)
+        entry = extended(living, living.sites, session, config, 0.01)
         after = entry.living
         assert_consistent(believing(entry))
         fresh = set(after.sites.site_id.tolist()) - set(living.sites.site_id.tolist())
@@ -168,7 +168,7 @@ def test_a_member_that_went_away_from_its_body_is_a_body_of_its_own_with_its_old
     there = after.place_row(np.array([3]), after.site_of()[after.members.landmark_id == 3])
     back = extended(
         believing(entry),
-        entry.p_start,
+        believing(entry).sites,
         found([3], [[0.0, 0.5]], place=[int(next(r for r in rows if r != there[0]))]),
         LivingConfig(),
         0.0,

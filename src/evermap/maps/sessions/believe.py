@@ -14,7 +14,7 @@ import numpy as np
 from evermap.config import LivingConfig
 from evermap.existence.sites import Evidence, SiteBeliefs, SiteDynamics, SiteLooks, SiteSensor, follow_sites
 from evermap.maps.lives import Life
-from evermap.maps.living import EXISTS, LivingMap, Sites, class_of, clique_rows, site_middles
+from evermap.maps.living import EXISTS, LivingMap, Places, Sites, class_of, clique_rows, site_middles
 from evermap.maps.sessions.extend import Extended, first_and_last
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Watch
 from evermap.sensing.sightlines import KNOWN, Lines, nominal_lines
@@ -29,16 +29,20 @@ LEAST_P, MOST_P = 1e-6, 1.0 - 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Believed:
-    """The map with the session's beliefs.
+    """What a session makes of the beliefs of a map that has its places and sites.
 
     Attributes:
-        living: all but stays and what is learned.
+        until_s: instant of the beliefs.
+        places: with hits and misses.
+        sites: with beliefs and sightings.
         log_evidence: (C,) what the session's looks say for 'it stands at one of its sites' against 'it is away', as a
             log likelihood ratio, by clique, in the order of `living.clique_rows`.
         evidence: of every clique and frame.
     """
 
-    living: LivingMap
+    until_s: float
+    places: Places
+    sites: Sites
     log_evidence: FloatArray
     evidence: Evidence
 
@@ -95,7 +99,7 @@ def _with_beliefs(sites: Sites, p_start: FloatArray, after: SiteBeliefs) -> Site
 def believed(
     entry: Extended, seen: PlaceLooks, sensor: Sensor, span_s: tuple[float, float], config: LivingConfig
 ) -> Believed:
-    """Return the map with the beliefs and the counts of a session, which goes from one instant to another."""
+    """Return the beliefs and the counts after a session, which goes from one instant to another."""
     (start_s, end_s), living, rows, sites = span_s, entry.living, seen.rows, entry.living.sites
     until_s, hit, missed = max(end_s, living.stamp_s), rows.hit, seen.counts & ~rows.hit
     places = replace(
@@ -122,8 +126,7 @@ def believed(
     arrived = np.isfinite(first) & ~stood & (sites.p_here >= EXISTS)
     since_s = np.where(arrived & ~entry.is_new, first, sites.since_s)
     sites = replace(sites, since_s=since_s, seen_s=np.maximum(sites.seen_s, last))
-    living = replace(living, stamp_s=until_s, session_start_s=start_s, places=places, sites=sites)
-    return Believed(living, log_evidence, evidence)
+    return Believed(until_s, places, sites, log_evidence, evidence)
 
 
 def _log_odds(clique: IntArray, p_here: FloatArray, n: int) -> FloatArray:
@@ -222,19 +225,18 @@ class Witnessed:
 
 
 def departed(now: Believed, seen: PlaceLooks, what: Witnessed, entry: Extended) -> tuple[Believed, PlaceLooks]:
-    """Return the map with observed departures, their evidence by clique and by frame, and looks that have them."""
-    site, living = what.sites(entry), now.living
+    """Return beliefs with observed departures, their evidence by clique and by frame, and looks that have them."""
+    site = what.sites(entry)
     left = np.flatnonzero(np.isfinite(what.until_s) & (site >= 0))
     if not len(left):
         return now, seen
-    sites, (cliques, clique_of) = living.sites, clique_rows(living.sites)
+    sites, (cliques, clique_of) = now.sites, clique_rows(now.sites)
     at, p_left = site[left], np.clip(what.probability[left], LEAST_P, MOST_P)
     clique = clique_of[at]
     p_here, p_kept, log_evidence = sites.p_here.copy(), sites.p_kept.copy(), now.log_evidence.copy()
     p_here[at] *= 1.0 - p_left
     p_kept[at] *= 1.0 - p_left
     log_evidence[clique] = -WITNESSED_NATS
-    living = replace(living, sites=replace(sites, p_here=p_here, p_kept=p_kept))
     total = np.bincount(clique_of, p_here, minlength=len(cliques))
     stamp_s, none, one = what.until_s[left] + what.when_s, np.zeros(len(left), np.int64), np.ones(len(left), np.int64)
     of_left = Evidence(
@@ -242,7 +244,9 @@ def departed(now: Believed, seen: PlaceLooks, what: Witnessed, entry: Extended) 
     )
     evidence = now.evidence.joined(of_left)
     evidence = evidence[np.lexsort((evidence.stamp_s, evidence.clique_id))]
-    return Believed(living, log_evidence, evidence), _with_looks(living, seen, at, clique, stamp_s)
+    sites = replace(sites, p_here=p_here, p_kept=p_kept)
+    now = replace(now, sites=sites, log_evidence=log_evidence, evidence=evidence)
+    return now, _with_looks(entry.living, seen, at, clique, stamp_s)
 
 
 def _with_looks(
@@ -277,13 +281,13 @@ def _with_looks(
     )
 
 
-def arrived(came: Arrivals, living: LivingMap, what: Witnessed, entry: Extended) -> Arrivals:
+def arrived(came: Arrivals, what: Witnessed, entry: Extended) -> Arrivals:
     """Return arrivals by earlier looks, with the observed ones, and departures among these."""
     site = what.sites(entry)
     seen = {
         int(site[k]): (float(what.since_s[k] - what.when_s), float(what.probability[k]))
         for k in np.flatnonzero(np.isfinite(what.since_s) & (site >= 0))
     }
-    new = ~np.isin(living.sites.site_id[site], entry.before.sites.site_id) | np.isfinite(what.since_s)
+    new = ~np.isin(entry.living.sites.site_id[site], entry.before.sites.site_id) | np.isfinite(what.since_s)
     left = np.flatnonzero(np.isfinite(what.until_s) & (site >= 0) & new)
     return replace(came, came=seen, left_s={int(site[k]): float(what.until_s[k] + what.when_s) for k in left})

@@ -11,6 +11,7 @@ from evermap.geometry.chunked import taken
 from evermap.maps.diff import elsewhere, motion_of, with_swaps
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
+from evermap.maps.sessions.believe import Believed
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange, landmark_id_of
 
@@ -19,33 +20,34 @@ USUAL = DecisionConfig()
 
 def decided(
     before: LivingMap,
-    after: LivingMap,
+    entered: LivingMap,
+    now: Believed,
     looks: PlaceLooks,
-    log_evidence: FloatArray,
     arrivals: Arrivals,
     start_s: float,
     longest: ClassLives | None = None,
     *,
     settings: DecisionConfig = USUAL,
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
-    """Return the map with updated stays, and the changes since the last report, by clique.
+    """Return the map after a session, with its beliefs and updated stays, and the changes since the last report, by
+    clique.
 
     A stay continues until looks end it: age alone lowers a belief, and is never reported as a change. A clique that was
     away and is seen again has returned only if it had left.
 
     Args:
         before: the map as the session found it.
-        after: with the session's beliefs, and sites with their sightings.
-        looks: of the session, at places of `after`.
-        log_evidence: (C,) what they say for 'it stands somewhere' against 'it is away', by clique.
+        entered: with the session's places and sites, believed as before it.
+        now: beliefs after it.
+        looks: of the session, at places of `entered`.
         arrivals: what earlier looks said of the places of new sites.
         start_s: beginning of the session.
         longest: how long things stay: a clique is told to have vanished where the looks outweigh the longest lifetimes
             that are credible. None where nothing is known of lifetimes.
         settings: how much it takes.
     """
-    session = _Session(before, after, looks, log_evidence, arrivals, start_s, longest, settings)
-    told, hidden, shown = _told(before, after), session.hidden, session.shown
+    session = _Session(before, entered, now, looks, arrivals, start_s, longest, settings)
+    told, hidden, shown = _told(before, entered), session.hidden, session.shown
     for row, clique in enumerate(session.cliques.tolist()):
         if session.missed[row] and not session.was_hit[row]:  # the more probably hidden, the more it stands there
             hidden[session.sight[row]] += 1.0 - session.p_away[row]
@@ -55,10 +57,13 @@ def decided(
             session.was_away(row)
     hidden[2], shown[2] = looks.unwitnessed
     after = replace(
-        after,
+        entered,
+        stamp_s=now.until_s,
+        session_start_s=start_s,
+        places=now.places,
+        sites=replace(now.sites, p_kept=session.p_kept, since_s=session.since_s),
         stays=session.stays(),
-        sites=replace(after.sites, p_kept=session.p_kept, since_s=session.since_s),
-        sightlines=after.sightlines.after_session(hidden, shown),
+        sightlines=entered.sightlines.after_session(hidden, shown),
     )
     return after, with_swaps(session.found, before, after, settings)
 
@@ -67,6 +72,7 @@ class _Session:
     """What is decided of cliques one after the other; columns of stays, sites and sight are written to as it goes.
 
     Attributes:
+        sites: with the session's beliefs and sightings.
         cliques: (C,) ids; site: (C,) row of the most probable site of each; stands: (C,) whether it is there.
         p_away: (C,) probability that it stands nowhere; log_evidence: (C,) of the looks, for 'it stands somewhere'.
         least: (C,) evidence against it that it takes to tell that it vanished; missed: (C,) whether it was missed.
@@ -81,17 +87,18 @@ class _Session:
     def __init__(
         self,
         before: LivingMap,
-        after: LivingMap,
+        entered: LivingMap,
+        now: Believed,
         looks: PlaceLooks,
-        log_evidence: FloatArray,
         arrivals: Arrivals,
         start_s: float,
         longest: ClassLives | None,
         settings: DecisionConfig,
     ) -> None:
-        self.before, self.after, self.looks, self.log_evidence = before, after, looks, log_evidence
+        self.before, self.entered, self.looks = before, entered, looks
         self.arrivals, self.start_s, self.settings = arrivals, start_s, settings
-        sites, stays = after.sites, after.stays
+        self.sites, self.log_evidence = now.sites, now.log_evidence
+        sites, stays = now.sites, entered.stays
         self.cliques, row = clique_rows(sites)
         count = len(self.cliques)
         hit: BoolArray = looks.rows.hit
@@ -103,14 +110,15 @@ class _Session:
         self.site[row[order]] = order  # the last that is written is the most probable, the first of equal ones
         self.stands = sites.p_here[self.site] >= EXISTS
         self.p_away = np.clip(1.0 - np.bincount(row, sites.p_here, minlength=count), 0.0, 1.0)
-        self.missed, self.sight = log_evidence <= -settings.least_evidence, looks.sight % 2
+        self.missed, self.sight = now.log_evidence <= -settings.least_evidence, looks.sight % 2
         self.least = np.full(count, settings.least_evidence)
-        if longest is not None:
+        gone = np.flatnonzero(self.missed & (self.p_away >= EXISTS))  # others are not told to have vanished
+        if longest is not None and len(gone):
             np.maximum.at(newest_s, row, sites.seen_s)
-            age_s = np.maximum(after.stamp_s - newest_s, 0.0)
-            p_stays = longest.longest(class_of(after, self.cliques), age_s, settings.credible)
+            age_s = np.maximum(now.until_s - newest_s[gone], 0.0)
+            p_stays = longest.longest(class_of(entered, self.cliques[gone]), age_s, settings.credible)
             p_stays = np.clip(p_stays, 1e-12, 1.0 - 1e-12)
-            self.least = np.maximum(self.least, np.log(p_stays / (1.0 - p_stays)))
+            self.least[gone] = np.maximum(self.least[gone], np.log(p_stays / (1.0 - p_stays)))
         self.newest = {clique: k for k, clique in enumerate(stays.clique_id.tolist())}
         self.last_s, self.gone_s, self.p_gone = stays.last_s.copy(), stays.gone_s.copy(), stays.p_gone.copy()
         self.p_kept, self.since_s = sites.p_kept.copy(), sites.since_s.copy()
@@ -137,20 +145,20 @@ class _Session:
 
     def was_away(self, row: int) -> None:
         """Decide on a clique that was away, or is new."""
-        clique, site, sites = int(self.cliques[row]), int(self.site[row]), self.after.sites
+        clique, site, sites = int(self.cliques[row]), int(self.site[row]), self.sites
         newest = self.newest.get(clique, -1)
         if site in self.arrivals.left_s and not self.stands[row]:
             self._came_and_left(row, site, newest)
             return
         if not (self.stands[row] and self.hits[site]):
             if newest >= 0 and np.isfinite(self.gone_s[newest]):
-                at = _row(self.after, int(self.after.stays.site_id[newest]))
+                at = _row(self.entered, int(self.entered.stays.site_id[newest]))
                 self.p_gone[newest] = np.clip(1.0 - self.p_kept[at], 0.0, 1.0) if at >= 0 else self.p_gone[newest]
             return
         seen_s = float(sites.seen_s[site])
         share = min(self.p_kept[site] / sites.p_here[site], 1.0)
         self.p_kept[site] = sites.p_here[site]
-        same = newest >= 0 and self.after.stays.site_id[newest] == sites.site_id[site]
+        same = newest >= 0 and self.entered.stays.site_id[newest] == sites.site_id[site]
         self.hidden[self.sight[row]] += share * self.p_gone[newest] if same else 0.0
         if same and share >= 1.0 - EXISTS:  # it had never left
             self.last_s[newest], self.gone_s[newest], self.p_gone[newest] = seen_s, np.inf, 0.0
@@ -162,22 +170,22 @@ class _Session:
             self.p_gone[newest] = max(self.p_gone[newest], probability)
         since = self._begins(clique, site, elsewhere_s)
         if probability >= EXISTS:
-            p, left = probability * float(sites.p_here[site]), _last_site(self.before, self.after, clique)
+            p, left = probability * float(sites.p_here[site]), _last_site(self.before, self.entered, clique)
             n_misses = int(self.misses[left]) if left >= 0 else 0
             self._tell(kind, left, site, elsewhere_s, since, p, int(self.hits[site]), n_misses)
 
     def stays(self) -> Stays:
         """Return old and new ones, in the order of their beginning."""
-        stays = replace(self.after.stays, last_s=self.last_s, gone_s=self.gone_s, p_gone=self.p_gone)
+        stays = replace(self.entered.stays, last_s=self.last_s, gone_s=self.gone_s, p_gone=self.p_gone)
         if not self.begun:
             return stays
         clique_id, site, *times = (np.array(part) for part in zip(*self.begun, strict=True))
-        site_id, middle_m = self.after.sites.site_id[site], site_middles(self.after)[site]
-        stays = stays.joined(Stays(clique_id, site_id, class_of(self.after, clique_id), middle_m, *times))
+        site_id, middle_m = self.sites.site_id[site], site_middles(self.entered)[site]
+        stays = stays.joined(Stays(clique_id, site_id, class_of(self.entered, clique_id), middle_m, *times))
         return stays[np.argsort(stays.first_s, kind="stable")]
 
     def _goes_on(self, row: int, stay: int) -> None:
-        site, sites = int(self.site[row]), self.after.sites
+        site, sites = int(self.site[row]), self.sites
         if stay < 0:  # a body that was taken apart: its part goes on
             first_s, last_s = float(sites.since_s[site]), float(sites.seen_s[site])
             self.begun.append((int(self.cliques[row]), site, -np.inf, first_s, last_s, np.inf, 0.0))
@@ -197,8 +205,8 @@ class _Session:
         site = int(self.site[row])
         left_s = self._ends(old, stay, 1.0)
         since = self._begins(int(self.cliques[row]), site, left_s)
-        self.p_kept[site] = p_moved = float(self.after.sites.p_here[site])
-        if elsewhere(*_motion(self.after, old, site), self.settings):
+        self.p_kept[site] = p_moved = float(self.sites.p_here[site])
+        if elsewhere(*_motion(self.entered, old, site), self.settings):
             n_hits, n_misses = int(self.hits[site]), int(self.misses[old])
             self._tell(ChangeKind.MOVED, old, site, left_s, since, p_moved, n_hits, n_misses)
 
@@ -223,7 +231,7 @@ class _Session:
 
     def _ends(self, old: int, stay: int, probability: float) -> float:
         """The stay at a site ends; returns when the clique was seen there last."""
-        left_s = float(self.after.sites.seen_s[old])
+        left_s = float(self.sites.seen_s[old])
         if stay >= 0:
             left_s = max(float(self.last_s[stay]), left_s)
             self.last_s[stay] = left_s
@@ -233,7 +241,7 @@ class _Session:
 
     def _begins(self, clique: int, site: int, elsewhere_s: float, gone_s: float = np.inf, p_gone: float = 0.0) -> float:
         """A stay begins, and may have ended by now; returns when it was seen first."""
-        sites = self.after.sites
+        sites = self.sites
         since = max(float(sites.since_s[site]), float(np.nextafter(elsewhere_s, np.inf)))
         last_s = max(float(sites.seen_s[site]), since)
         self.begun.append((clique, site, elsewhere_s, since, last_s, max(gone_s, last_s), p_gone))
@@ -246,18 +254,18 @@ class _Session:
         since = self._begins(int(self.cliques[row]), site, elsewhere_s, left_s, p_away)
         if probability >= EXISTS:
             self._tell(kind, -1, site, elsewhere_s, since, probability, int(self.hits[site]), 0)
-        last_s = float(self.after.sites.seen_s[site])
+        last_s = float(self.sites.seen_s[site])
         self._tell(ChangeKind.VANISHED, site, -1, last_s, max(left_s, last_s), p_away, 0, int(self.misses[site]))
 
     def _tell(
         self, kind: ChangeKind, left: int, site: int, from_s: float, to_s: float, p: float, n_hits: int, n_misses: int
     ) -> None:
         """Tell the change of a clique from one site (row, -1 for none) to another."""
-        away = np.full(self.after.dim, np.nan), 0.0
-        step, turn = _motion(self.after, left, site) if site >= 0 and left >= 0 else away
-        there = self.after.places.site_id == self.after.sites.site_id[site if site >= 0 else left]
+        away = np.full(self.entered.dim, np.nan), 0.0
+        step, turn = _motion(self.entered, left, site) if site >= 0 and left >= 0 else away
+        there = self.entered.places.site_id == self.sites.site_id[site if site >= 0 else left]
         change = MapChange(
-            landmark_ids=tuple(np.sort(self.after.places.landmark_id[there]).tolist()),
+            landmark_ids=tuple(np.sort(self.entered.places.landmark_id[there]).tolist()),
             kind=kind,
             stamp_from_s=from_s if np.isfinite(from_s) else float("nan"),
             stamp_to_s=to_s,
@@ -303,7 +311,7 @@ def without_forgotten(living: LivingMap, most_sites: int, settings: DecisionConf
     if len(stays) > settings.most_stays:
         stays = stays[np.sort(np.argsort(stays.last_s, kind="stable")[-settings.most_stays :])]
     if kept.all():
-        return replace(living, stays=stays)
+        return living if stays is living.stays else replace(living, stays=stays)
     rows = np.flatnonzero(np.isin(living.places.site_id, sites.site_id[kept]))
     return replace(
         living,
@@ -378,11 +386,10 @@ def _last_site(before: LivingMap, after: LivingMap, clique: int) -> int:
 
 def without_strays(living: LivingMap) -> LivingMap:
     """Return a map without sizes, traits and names of landmarks that it has forgotten."""
-    living = replace(living, traits=living.traits[np.isin(living.traits.landmark_id, living.members.landmark_id)])
-    boxes = living.boxes
-    stays = np.isin(boxes.landmark_id, living.members.landmark_id)
-    if stays.all():
+    traits, boxes, known = living.traits, living.boxes, living.members.landmark_id
+    has_traits, has_box = np.isin(traits.landmark_id, known), np.isin(boxes.landmark_id, known)
+    if has_traits.all() and has_box.all():
         return living
-    gone = set(boxes.landmark_id[~stays].tolist())
+    gone = set(boxes.landmark_id[~has_box].tolist())
     texts = tuple(text for text in living.landmark_texts if landmark_id_of(text) not in gone)
-    return replace(living, boxes=boxes[stays], landmark_texts=texts)
+    return replace(living, traits=traits[has_traits], boxes=boxes[has_box], landmark_texts=texts)

@@ -78,12 +78,26 @@ class Extended:
         place[here] = self.place[there]
         return place
 
+    def has_places_of(self, other: Extended) -> bool:
+        """Return whether the places of both maps are the same, and their bodies most probably at the same sites."""
+        mine, theirs = self.living, other.living
+        return all(
+            np.array_equal(one, another)
+            for one, another in (
+                (mine.members.clique_id, theirs.members.clique_id),
+                (mine.site_of(), theirs.site_of()),
+                (mine.places.site_id, theirs.places.site_id),
+                (mine.places.position_m, theirs.places.position_m),
+                (self.place, other.place),
+            )
+        )
 
-def extended(living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig, drift_m: float) -> Extended:
-    """Return the map with what a session found, by beliefs (S,) in its sites when the session began, and by how much
-    places may have been off when it was solved.
+
+def extended(living: LivingMap, aged: Sites, found: Found, config: LivingConfig, drift_m: float) -> Extended:
+    """Return the map with what a session found, by its sites as believed when the session began, and by how much places
+    may have been off when it was solved.
     """
-    before, living, p_site, found = _with_bodies(living, p_site, found, config, drift_m)
+    before, living, aged, found = _with_bodies(living, aged, found, config, drift_m)
     members, cliques_ever = _with_members(living, found, config)
     clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id)]
     stands, new = np.flatnonzero(found.place >= 0), np.flatnonzero(found.place < 0)
@@ -107,8 +121,11 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
         )
     nothing = np.zeros(len(new), dtype=np.int64)
     places = living.places.joined(Places(site, found.landmark_id[new], found.position_m[new], nothing, nothing))
-    places = _turned(replace(places, position_m=position), found, seen, new)
-    sites, p_start, is_new = _with_sites(living, p_site, found, clique, (fresh, new_ids), config.decisions.new_clique_p)
+    places = replace(places, position_m=position)
+    if found.rotation is not None and found.rotation_covariance is not None:
+        turn = _turned(places, found.place, found.rotation, found.rotation_covariance)
+        places = replace(places, rotation=turn[0], rotation_covariance=turn[1])
+    sites, p_start, is_new = _with_sites(living, aged, found, clique, (fresh, new_ids), config.decisions.new_clique_p)
     sorted_rows = np.lexsort((places.landmark_id, places.site_id))
     place = found.place.copy()
     place[new] = len(living.places) + np.arange(len(new))
@@ -130,35 +147,35 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
     )
 
 
-def _turned(places: Places, found: Found, seen: IntArray, new: IntArray) -> Places:
-    """Places with the orientations of the session: of those that it saw (rows `seen`), and of the new ones at the end.
-
-    An orientation that the session did not see stays.
+def _turned(
+    places: Places, place: IntArray, rotation: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Orientations of places, and their covariances, with those of a session's landmarks (K,): at their `place`, of new
+    ones at the end. An orientation that the session did not see stays.
     """
-    if found.rotation is None or found.rotation_covariance is None:
-        return places
-    at = np.concatenate([seen, len(places) - len(new) + np.arange(len(new))])
-    of = np.concatenate([np.flatnonzero(found.place >= 0), new])
-    known = np.isfinite(found.rotation[of, 0])
-    rotation, covariance = places.rotation.copy(), places.rotation_covariance.copy()
-    rotation[at[known]] = found.rotation[of[known]]
-    covariance[at[known]] = found.rotation_covariance[of[known]]
-    return replace(places, rotation=rotation, rotation_covariance=covariance)
+    new = np.flatnonzero(place < 0)
+    at = np.concatenate([place[place >= 0], len(places) - len(new) + np.arange(len(new))])
+    of = np.concatenate([np.flatnonzero(place >= 0), new])
+    known = np.isfinite(rotation[of, 0])
+    turned, spread = places.rotation.copy(), places.rotation_covariance.copy()
+    turned[at[known]] = rotation[of[known]]
+    spread[at[known]] = covariance[of[known]]
+    return turned, spread
 
 
 def _with_bodies(
-    living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig, drift_m: float
-) -> tuple[LivingMap, LivingMap, FloatArray, Found]:
-    """Return the map before and after, beliefs in its sites, and the found landmarks, with regrouped bodies."""
-    expected = replace(living, sites=replace(living.sites, p_here=p_site))
-    clique_id = _bodies(expected, found, config, drift_m)
+    living: LivingMap, aged: Sites, found: Found, config: LivingConfig, drift_m: float
+) -> tuple[LivingMap, LivingMap, Sites, Found]:
+    """Return the map before and after, its sites as believed now, and the found landmarks, with regrouped bodies."""
+    clique_id = _bodies(living, aged.p_here, found, config, drift_m)
     if np.array_equal(clique_id, living.members.clique_id):
-        return living, living, p_site, found
-    before, (living, moved_to) = relabelled(living, clique_id)[0], relabelled(expected, clique_id)
+        return living, living, aged, found
+    before = relabelled(living, clique_id)[0]
+    living, moved_to = relabelled(replace(living, sites=aged), clique_id)
     if not np.array_equal(before.sites.site_id, living.sites.site_id):  # united under another of their sites
         before = living
     found = replace(found, place=np.where(found.place >= 0, moved_to[found.place], -1))
-    return before, living, living.sites.p_here, found
+    return before, living, living.sites, found
 
 
 def _with_members(living: LivingMap, found: Found, config: LivingConfig) -> tuple[Members, int]:
@@ -211,19 +228,21 @@ def _join_known(clique: IntArray, new: IntArray, members: Members, found: Found,
             clique[mine] = near[min(near)]
 
 
-def _bodies(living: LivingMap, found: Found, config: LivingConfig, drift_m: float) -> IntArray:
-    """Return (L,) cliques of the map's landmarks: split if members separated, joined if they moved as one."""
+def _bodies(living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig, drift_m: float) -> IntArray:
+    """Return (L,) cliques of the map's landmarks: split if members separated, joined if they moved as one; by beliefs
+    (S,) in its sites.
+    """
     if not config.cliques or not len(living.members):
         return living.members.clique_id
     members, places = living.members, living.places
-    stood = living.place_row(members.landmark_id, living.site_of())
+    stood = living.place_row(members.landmark_id, living.site_of(p_site))
     _, member, row = np.intersect1d(members.landmark_id, found.landmark_id, return_indices=True)
     known = stood[member] >= 0
     member, row = member[known], row[known]
     fate = np.full(len(members), Fate.UNSEEN, dtype=np.int64)
     fate[member] = np.where(found.place[row] == stood[member], Fate.STAYED, Fate.MOVED)
     if not (fate == Fate.MOVED).any():
-        return _torn(living, members.clique_id, found, config.clique_reach_m)
+        return _torn(living, p_site, members.clique_id, found, config.clique_reach_m)
     before = places.position_m[np.maximum(stood, 0)]
     after, spread = before.copy(), np.zeros((len(members), living.dim, living.dim))
     after[member] = found.position_m[row]
@@ -239,10 +258,10 @@ def _bodies(living: LivingMap, found: Found, config: LivingConfig, drift_m: floa
         next_id=living.n_cliques_ever,
         settings=config.grouping,
     )
-    return _torn(living, clique_id, found, config.clique_reach_m)
+    return _torn(living, p_site, clique_id, found, config.clique_reach_m)
 
 
-def _torn(living: LivingMap, clique_id: IntArray, found: Found, reach_m: float) -> IntArray:
+def _torn(living: LivingMap, p_site: FloatArray, clique_id: IntArray, found: Found, reach_m: float) -> IntArray:
     """Split off members of cliques that cannot be at the site of the others: a clique occupies one site.
 
     Those who stand at another known site, or at a new place though they have one at the site of the others, or out of
@@ -258,7 +277,7 @@ def _torn(living: LivingMap, clique_id: IntArray, found: Found, reach_m: float) 
         known = mine[at[mine] >= 0]
         if len(mine) < 2 or not len(known):
             continue
-        believed = sites.p_here[np.searchsorted(sites.site_id, at[known])]
+        believed = p_site[np.searchsorted(sites.site_id, at[known])]
         main = at[known[np.argmax(believed)]]
         there = mine[at[mine] == main]
         has_one = living.place_row(members.landmark_id[member[mine]], np.full(len(mine), main)) >= 0
@@ -277,14 +296,14 @@ def _torn(living: LivingMap, clique_id: IntArray, found: Found, reach_m: float) 
 
 def _with_sites(
     living: LivingMap,
-    p_site: FloatArray,
+    aged: Sites,
     found: Found,
     clique: IntArray,
     new: tuple[IntArray, IntArray],
     p_fresh: float,
 ) -> tuple[Sites, FloatArray, BoolArray]:
     """The map's sites and the new ones, with beliefs before the session's looks are counted."""
-    p_start, (fresh, new_ids) = p_site.copy(), new
+    p_start, (fresh, new_ids) = aged.p_here.copy(), new
     p_new, first, last = np.zeros(len(fresh)), np.zeros(len(fresh)), np.zeros(len(fresh))
     for k, name in enumerate(fresh):
         mine = np.flatnonzero((clique == name) & (found.place < 0))
@@ -292,5 +311,6 @@ def _with_sites(
         old = np.flatnonzero(living.sites.clique_id == name)
         p_new[k] = min(float(found.probability[mine].min()), 0.999) if len(old) else p_fresh
         p_start[old] *= 1.0 - p_new[k]
-    sites = living.sites.joined(Sites(new_ids, fresh, p_new, p_new, first, last))
+    old_sites = replace(living.sites, p_kept=aged.p_kept)
+    sites = old_sites.joined(Sites(new_ids, fresh, p_new, p_new, first, last))
     return sites, np.append(p_start, p_new), np.arange(len(sites)) >= len(living.sites)

@@ -68,7 +68,8 @@ class Watch(NamedTuple):
         """Return what a sensor in the plane looked at, by its nominal field of view, of places (P, 2)."""
         seen = sighting.frame, sighting.place
         listed = NominalField(sensor, settings).looks(sighting.pose_map_robot, position_m, seen)
-        return cls(sighting.stamp_s, listed, sensor_poses(sighting, sensor))
+        eye = se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor))
+        return cls(sighting.stamp_s, listed, eye)
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,11 +262,6 @@ def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolA
     return p_hidden
 
 
-def sensor_poses(sighting: Sighting, sensor: Sensor) -> FloatArray:
-    """Return (F, 3) poses of the sensor in the map."""
-    return np.asarray(se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor)))
-
-
 @dataclass(frozen=True, slots=True)
 class Arrivals:
     """Cliques seen at new sites: (A,) rows.
@@ -287,10 +283,15 @@ class Arrivals:
 
 
 def arrivals(
-    before: LivingMap, after: LivingMap, looks: PlaceLooks, sensor: Sensor, settings: LooksConfig = USUAL
+    before: LivingMap,
+    after: LivingMap,
+    until_s: float,
+    looks: PlaceLooks,
+    sensor: Sensor,
+    settings: LooksConfig = USUAL,
 ) -> Arrivals:
-    """Return what earlier sessions saw of the places of new sites: of the map before, and after the session found
-    these.
+    """Return what earlier sessions saw of the places of new sites until now: of the map before, and after the session
+    found these.
     """
     new = np.flatnonzero(~np.isin(after.sites.site_id, before.sites.site_id))
     looked, p_appeared = np.full(len(new), -np.inf), np.zeros(len(new))
@@ -320,7 +321,7 @@ def arrivals(
             continue
         p_missed = p_hidden + (1.0 - p_hidden) * np.exp([log_missed[stamp] for stamp in enough.tolist()])
         stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
-        p_after = came_after(np.exp(stay.log_survival(after.stamp_s - enough)), p_missed, settings.lasting * p_hidden)
+        p_after = came_after(np.exp(stay.log_survival(until_s - enough)), p_missed, settings.lasting * p_hidden)
         at = int(np.flatnonzero(p_after >= settings.sure).max(initial=0))
         looked[k], p_appeared[k] = enough[at], p_after[at]
     return Arrivals(new, looked, p_appeared)

@@ -233,7 +233,7 @@ def unbent(
 
 def homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
     """Return (K,) rows of the map's places at which landmarks are most probably expected; -1 for none."""
-    site = replace(living, sites=replace(living.sites, p_here=p_site)).site_of()
+    site = living.site_of(p_site)
     at = rows_among(living.members.landmark_id, where.landmark_id)
     return np.where(at >= 0, living.place_row(where.landmark_id, site[at]), -1)
 
@@ -370,7 +370,7 @@ def _solved(problem: Problem, noise: Noise, start: Estimate, *, robust: bool) ->
     """The optimum near `start`, and its covariances."""
     # first with the kernel that never lets go: what was near the session's own map need not be near this one
     near = Smoother(problem, noise, heavy=True, robust=robust)
-    start = near.optimum(start, iterations=HEAVY_STEPS, tolerance=1e-3)
+    start, _ = exhausted(near.solved_in_slices(start, iterations=HEAVY_STEPS, tolerance=1e-3))
     smoother = near.under(noise, heavy=False)
     return smoother, *exhausted(smoother.solved_in_slices(start, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN))
 

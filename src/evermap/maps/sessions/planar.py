@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
-from evermap.config import Config, LivingConfig, MetreConfig
+from evermap.config import Config, LivingConfig, MetreConfig, SlamConfig
 from evermap.errors import DataError, NumericalError
 from evermap.estimate.tie import without_frames
 from evermap.geometry import se2
@@ -16,6 +17,7 @@ from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap, Metres
 from evermap.maps.sessions import believe, gaussian, placing
 from evermap.maps.sessions.extend import Extended, Found, first_and_last
+from evermap.maps.sessions.gaussian import OwnLandmarks
 from evermap.maps.sessions.looks import Sighting, Watch
 from evermap.maps.sessions.overlay import ELSEWHERE
 from evermap.maps.sessions.placing import Held, Laid, Localised
@@ -25,7 +27,7 @@ from evermap.slam.batch import Outcome, silent_links
 from evermap.slam.cleaning import some_frames
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import unusable
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Progress, Recording, Sensor, SlamResult
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Recording, Sensor, SlamResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,18 +121,12 @@ class PlanarVisit:
         return Watch.of(sighting, entry.living.places.position_m, recording.sensor, config.looks)
 
 
-def solve_session(
-    recording: Recording, remarks: tuple[str, ...], config: Config, progress: Progress | None = None
-) -> Solved:
-    """Solve a cleaned session with known identities alone. Moves are searched for after its alignment with the map.
-
-    Raises:
-        DataError: fewer than two frames with a landmark of known identity.
-        NumericalError: no finite optimum.
+def prepare_alone(recording: Recording, config: Config) -> tuple[Recording, SlamConfig]:
+    """Return a cleaned session with known identities, and the settings, for its solution alone: moves are searched for
+    after its alignment with the map.
     """
     settings = config.slam.model_copy(update={"method": "nohyp", "unknown_ids": False})
-    recording = replace(recording, measurements=without_frames(recording.measurements))
-    return solve(recording, settings, remarks=remarks, progress=progress)
+    return replace(recording, measurements=without_frames(recording.measurements)), settings
 
 
 def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = True) -> Localised[PlanarVisit]:
@@ -138,42 +134,43 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
     (`session.admitted`); and `cut`, without doubtful frames (`doubtful`), if there are any.
     """
     settings, known = config.living, len(living.places) > 0
-    lost = Localised.lost(PlanarVisit(alone), living, placing.CONTRADICTED if known else placing.DISTORTED)
+    lost = functools.partial(Localised.lost, PlanarVisit(alone), living)
+    contradicted = placing.CONTRADICTED if known else placing.DISTORTED
     joint = settings.search == "joint"
     wrong = unusable(alone.recording, config.slam.check) if joint and cut else None
     if wrong is not None and not wrong.usable:
-        return Localised.lost(PlanarVisit(alone), living, (wrong.message, placing.ANYWAY))
+        return lost((wrong.message, placing.ANYWAY))
     if wrong is not None and known:
-        return lost
-    large = len(living.places) > settings.whole_places
-    vicinity, where = near_session(living, alone, settings) if large else (None, None)
+        return lost(contradicted)
+    large, own = len(living.places) > settings.whole_places, gaussian.own_landmarks(alone.outcome, settings.fit)
+    vicinity, where = near_session(living, alone, own, settings) if large else (None, None)
     part, visit = living if vicinity is None else vicinity.part, alone
     p_site = believe.aged(part, settings, alone.start_s).p_here
-    where = where if large else laid(part, p_site, alone, settings)
+    where = where if large else laid(part, p_site, alone, own, settings)
     if where is None and len(part.places):
-        return Localised.lost(PlanarVisit(alone), living, placing.NOT_FOUND)
+        return lost(placing.NOT_FOUND)
     if where is not None:
         in_part = vicinity is not None
-        part, where, visit = refit(part, p_site, where, alone, settings, robust=config.slam.robust, part=in_part)
+        part, where, visit = refit(part, p_site, where, alone, own, settings, robust=config.slam.robust, part=in_part)
     if joint:
         if cut:
             some = without(visit, *doubtful(visit, where, settings))
             if some is None:
-                return lost
+                return lost(contradicted)
             if some is not visit.recording:
                 try:
-                    return localised(solve_session(some, visit.prepared.warnings, config), living, config, cut=False)
+                    rest = solve(*prepare_alone(some, config), remarks=visit.prepared.warnings)
+                    return localised(rest, living, config, cut=False)
                 except (DataError, NumericalError):  # too little is left
-                    return lost
+                    return lost(contradicted)
         # what fits together by itself does not fit once it is held there
         if where is not None and visit.outcome.inlier.mean() < settings.fit.least_fit * alone.outcome.inlier.mean():
-            return lost
+            return lost(contradicted)
     return Localised(PlanarVisit(visit), part, where, vicinity)
 
 
-def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingConfig) -> Laid | None:
-    """Return the alignment of the session with the map; None if no landmarks match."""
-    own = gaussian.own_landmarks(alone.outcome, config.fit)
+def laid(living: LivingMap, p_site: FloatArray, alone: Solved, own: OwnLandmarks, config: LivingConfig) -> Laid | None:
+    """Return the alignment of the session, by its own landmarks, with the map; None if no landmarks match."""
     names = alone.prepared.landmark_id[own.row]
     log_sigma = float(np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance)))
     where = placing.laid_over(living, p_site, names, own.position_m, gaussian.of_unknown_size(own, log_sigma), config)
@@ -199,15 +196,16 @@ def _seen_together(alone: Solved, row: IntArray, least: float) -> sparse.csr_arr
     return sparse.csr_array(seen @ seen.T)
 
 
-def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tuple[Vicinity, Laid | None]:
+def near_session(
+    living: LivingMap, alone: Solved, own: OwnLandmarks, config: LivingConfig
+) -> tuple[Vicinity, Laid | None]:
     """Return the part of a large map that a session can observe, and its alignment there; None as of `laid`.
 
     That is what the sensor may have seen on its way, once the session is laid over those that it names, and some more.
     """
-    own = gaussian.own_landmarks(alone.outcome, config.fit)
     named = cliques_of(living, alone.prepared.landmark_id[own.row])
     seen = Vicinity.of(living, named, config)
-    where = laid(seen.part, believe.aged(seen.part, config, alone.start_s).p_here, alone, config)
+    where = laid(seen.part, believe.aged(seen.part, config, alone.start_s).p_here, alone, own, config)
     if where is None:
         return seen, None
     path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
@@ -215,7 +213,15 @@ def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tupl
 
 
 def refit(
-    living: LivingMap, p_site: FloatArray, where: Laid, alone: Solved, config: LivingConfig, *, robust: bool, part: bool
+    living: LivingMap,
+    p_site: FloatArray,
+    where: Laid,
+    alone: Solved,
+    own: OwnLandmarks,
+    config: LivingConfig,
+    *,
+    robust: bool,
+    part: bool,
 ) -> tuple[LivingMap, Laid, Solved]:
     """Return the session solved again with its matched landmarks constrained by the map, and the rescaled map.
 
@@ -225,7 +231,6 @@ def refit(
     outcome, names = alone.outcome, alone.prepared.landmark_id
     size = outcome.scale
     if outcome.log_scale_sigma > 0.0:
-        own = gaussian.own_landmarks(outcome, config.fit)
         _, mine, theirs = np.intersect1d(names[own.row], where.landmark_id[where.place >= 0], return_indices=True)
         places = where.place[where.place >= 0][theirs]
         shown = gaussian.log_ratio(
@@ -243,27 +248,19 @@ def refit(
         size *= found.session_factor
         alone = _remarked(alone, shown[0], found, config.metre)
 
-    def in_map(where: Laid) -> tuple[Outcome, bool]:
-        stand = np.flatnonzero(where.place >= 0)
-        row = np.searchsorted(names, where.landmark_id[stand])
-        position = living.places.position_m[where.place[stand]]
-        motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
-        covariance = gaussian.drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
-        return placing.refitted(
-            outcome, outcome.prior, motion, size, Held(row, position, covariance), settings=config.fit, robust=robust
-        )
-
-    solved, straightened = in_map(where)
+    hold = functools.partial(_hold, outcome, names, living, size)
+    solve_held = functools.partial(placing.refitted, outcome, outcome.prior, settings=config.fit, robust=robust)
+    solved, straightened = solve_held(*hold(where))
     if where.assumed.any() and solved.inlier.mean() < (1.0 - config.fit.most_lost) * outcome.inlier.mean():
         place = np.where(where.assumed, ELSEWHERE, where.place)
         as_seen = replace(where, place=place, assumed=np.zeros_like(where.assumed))
-        other, straightened_too = in_map(as_seen)
+        other, straightened_too = solve_held(*hold(as_seen))
         if other.inlier.mean() > solved.inlier.mean():  # it was not bent: they did move together
             where, solved, straightened = as_seen, other, straightened_too
     if straightened:
         # where it lies if nothing has moved
         at_home = replace(where, place=np.where(where.place >= 0, where.place, placing.homes(living, p_site, where)))
-        solved, _ = in_map(at_home)
+        solved, _ = solve_held(*hold(at_home))
         landmark = alone.prepared.problem.landmark_row[: len(solved.inlier)]
         n_fit, count = (np.bincount(landmark, w, minlength=len(names)) for w in (solved.inlier, np.ones(len(landmark))))
         stays = (2.0 * n_fit > count)[np.searchsorted(names, where.landmark_id)]
@@ -272,8 +269,20 @@ def refit(
             place=np.where(stays, at_home.place, where.place),
             probability=np.where(stays, 1.0, where.probability),
         )
-        solved, _ = in_map(where)
+        solved, _ = solve_held(*hold(where))
     return living, where, replace(alone, outcome=solved)
+
+
+def _hold(
+    outcome: Outcome, landmark_id: IntArray, living: LivingMap, size: float, where: Laid
+) -> tuple[FloatArray, float, Held]:
+    """Return where the frame of a session is in the map (3,), `size`, and its landmarks (L,) that a map holds."""
+    stand = np.flatnonzero(where.place >= 0)
+    row = np.searchsorted(landmark_id, where.landmark_id[stand])
+    position = living.places.position_m[where.place[stand]]
+    motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
+    covariance = gaussian.drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
+    return motion, size, Held(row, position, covariance)
 
 
 def _remarked(alone: Solved, log_ratio: float, found: gaussian.Size, settings: MetreConfig) -> Solved:

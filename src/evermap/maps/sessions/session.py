@@ -12,7 +12,7 @@ from evermap.errors import DataError
 from evermap.existence.sites import Evidence
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
-from evermap.maps.living import EXISTS, LivingMap
+from evermap.maps.living import EXISTS, LivingMap, Places, Stays
 from evermap.maps.sessions import believe, decide
 from evermap.maps.sessions.believe import Believed, arrived, departed
 from evermap.maps.sessions.extend import Extended, Found, extended
@@ -75,11 +75,42 @@ class Session(Shown):
 
 
 def admitted(recording: RecordingT, living: LivingMap) -> tuple[RecordingT, LivingMap]:
+    """Return the recording as of `admit_recording`, and the map as of `with_names_of`, which raise the same."""
+    return admit_recording(recording, living), with_names_of(living, recording)
+
+
+def admit_recording(recording: RecordingT, living: LivingMap) -> RecordingT:
     """Return the recording without landmarks that an operator deleted, and with the map's class numbers.
 
     Raises:
         DataError: another clock than the map's, or of the plane where that is of space.
     """
+    _check_fits(recording, living)
+    names = _class_names(living, recording)
+    number = np.array([names.index(name) for name in recording.class_names] + [UNKNOWN], dtype=np.int64)
+    kept = ~np.isin(recording.detections.landmark_id, living.members.landmark_id[living.members.deleted])
+    detections = rows_of(recording.detections, kept)
+    detections = replace(detections, class_id=number[detections.class_id])
+    return replace(recording, detections=detections, class_names=names)
+
+
+def with_names_of(living: LivingMap, recording: AnyRecording) -> LivingMap:
+    """Return the map with the names of a recording's classes and landmarks, and with its clock.
+
+    Raises:
+        DataError: another clock than the map's, or of the plane where that is of space.
+    """
+    _check_fits(recording, living)
+    return replace(
+        living,
+        class_names=_class_names(living, recording),
+        landmark_texts=tuple(sorted({*living.landmark_texts, *recording.landmark_names.values()})),
+        clock=recording.clock,
+    )
+
+
+def _check_fits(recording: AnyRecording, living: LivingMap) -> None:
+    """Refuse a recording of another space or on another clock than the map."""
     if (living.dim == 3) != isinstance(recording, SpatialRecording):
         of = {2: "the plane", 3: "space"}
         raise DataError(
@@ -93,17 +124,11 @@ def admitted(recording: RecordingT, living: LivingMap) -> tuple[RecordingT, Livi
             field="stamp_s",
             hint="sessions of one map need one clock, preferably seconds since 1970",
         )
-    names = living.class_names + tuple(name for name in recording.class_names if name not in living.class_names)
-    number = np.array([names.index(name) for name in recording.class_names] + [UNKNOWN], dtype=np.int64)
-    kept = ~np.isin(recording.detections.landmark_id, living.members.landmark_id[living.members.deleted])
-    detections = rows_of(recording.detections, kept)
-    detections = replace(detections, class_id=number[detections.class_id])
-    return replace(recording, detections=detections, class_names=names), replace(
-        living,
-        class_names=names,
-        landmark_texts=tuple(sorted({*living.landmark_texts, *recording.landmark_names.values()})),
-        clock=recording.clock,
-    )
+
+
+def _class_names(living: LivingMap, recording: AnyRecording) -> tuple[str, ...]:
+    """Names of the map's classes, then of the recording's new ones."""
+    return living.class_names + tuple(name for name in recording.class_names if name not in living.class_names)
 
 
 def in_its_space(recording: AnyRecording, living: LivingMap | None, config: Config) -> AnyRecording:
@@ -143,11 +168,10 @@ def opened(living: LivingMap | None, recording: AnyRecording) -> LivingMap:
         DataError: it begins before the newest session of the map.
     """
     check_type(recording)
-    begun = _empty(recording)
     if living is None:
-        living = begun
-    elif begun.dim == 3 and not len(living.places):
-        living = replace(living, places=begun.places, stays=begun.stays, clock=begun.clock)
+        living = _empty(recording)
+    elif isinstance(recording, SpatialRecording) and not len(living.places):
+        living = replace(living, places=Places.empty(3), stays=Stays.empty(3), clock=recording.clock)
     if len(recording.frames):
         start_s = float(recording.frames.stamp_s[0])
         living = living.from_now_on(start_s)
@@ -197,6 +221,8 @@ def begun_with(session: Session, recording: AnyRecording) -> Session:
     if not session.found:
         return session
     start_s = float(np.fmin(recording.frames.stamp_s[0], session.living.session_start_s))
+    if start_s == session.living.session_start_s:
+        return session
     return replace(session, living=replace(session.living, session_start_s=start_s))
 
 
@@ -205,55 +231,67 @@ class Judged:
     """What a session says of a map.
 
     Attributes:
-        living: the map after it.
+        living: the map after it, but for what it teaches of lifetimes and of lines of sight.
         changes: what changed since the session before.
-        evidence: what was seen of every clique, frame by frame.
-        misses: of landmarks at their most probable places, as the map counts them.
-        classes: learned lifetimes of classes; None if nothing was learned.
         found: landmarks of the session.
+        entry: the map with these, before its beliefs were updated.
+        now: its beliefs.
+        seen: looks at its places.
+        watch: which places it looked at.
     """
 
     living: LivingMap
     changes: tuple[MapChange, ...]
-    evidence: Evidence
-    misses: Misses
-    classes: ClassLives | None
     found: Found
+    entry: Extended
+    now: Believed
+    seen: PlaceLooks
+    watch: Watch
 
 
 def judged(
-    living: LivingMap, where: Laid | None, visit: Visit, config: LivingConfig, known: Judged | None = None
+    living: LivingMap,
+    where: Laid | None,
+    visit: Visit,
+    config: LivingConfig,
+    classes: ClassLives | None = None,
+    known: Judged | None = None,
 ) -> Judged:
-    """Return the map after the session, the changes, the evidence and the misses.
+    """Return the map after the session, and the changes.
 
     What was found goes into the map, then hits and misses into beliefs, and those into decisions. A map's first session
-    lies nowhere. Lifetimes that the session teaches are `known` when it is judged for the second time.
+    lies nowhere. When it is judged for the second time, what it teaches of lifetimes and what was found are `known`.
     """
-    if known is not None:
-        living = replace(living, lives=replace(known.living.lives, looks_s=living.lives.looks_s))
-    living = replace(living, sightlines=replace(living.sightlines, rules=config.sight))
-    aged = believe.aged(living, config, visit.start_s)
-    living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
+    start_s, end_s, sensor = visit.start_s, visit.end_s, visit.floor_sensor
+    aged = believe.aged(living, config, start_s)
     found = visit.found(where, living, config) if known is None else known.found
     living, drift_m = (visit.begun(living), 0.0) if where is None else (living, where.drift_m)
-    entry = extended(living, aged.p_here, found, config, drift_m)
-    watch = visit.watched(entry, config)
+    entry = extended(living, aged, found, config, drift_m)
+    watch = known.watch if known is not None and known.entry.has_places_of(entry) else visit.watched(entry, config)
     seen = looked_at(entry.living, entry.p_start, watch, config)
-    now = believe.believed(entry, seen, visit.floor_sensor, (visit.start_s, visit.end_s), config)
-    now, seen = departed(now, seen, visit.witnessed, entry)
-    after, changes = decided(entry, now, seen, visit, config, known.classes if known is not None else None)
-    after, classes = learned(after, seen, replace(entry, living=now.living), watch.eye, config)
-    return Judged(after, changes, now.evidence, missed(now.living, seen, visit), classes, found)
+    now = believe.believed(entry, seen, sensor, (start_s, end_s), config)
+    came = arrivals(entry.before, entry.living, now.until_s, seen, sensor, config.looks)
+    if len(visit.witnessed.landmark_id):
+        came = arrived(came, visit.witnessed, entry)
+        now, seen = departed(now, seen, visit.witnessed, entry)
+    after, changes = decide.decided(
+        entry.before, entry.living, now, seen, came, start_s, classes, settings=config.decisions
+    )
+    if config.cliques and config.existence and config.misses:
+        after = without_missed(entry.before, after, config.grouping)
+    after = decide.without_forgotten(after, config.most_sites, config.decisions)
+    return Judged(after, changes, found, entry, now, seen, watch)
 
 
-def missed(living: LivingMap, seen: PlaceLooks, visit: Visit) -> Misses:
-    """Return the looks that count as misses of landmarks at their most probable places after the session.
+def missed(living: LivingMap, p_site: FloatArray, seen: PlaceLooks, visit: Visit) -> Misses:
+    """Return the looks that count as misses of landmarks at their most probable places after the session, by beliefs
+    (S,) in the sites of the map.
 
     These are looks in the field of view, without a detection, along lines of sight that are known to be clear.
     """
     place = seen.place
     member = np.searchsorted(living.members.landmark_id, living.places.landmark_id)
-    here = living.site_of()[member] == living.places.site_id
+    here = living.site_of(p_site)[member] == living.places.site_id
     rows = np.flatnonzero(seen.counts & ~seen.rows.hit & here[place])
     rows = rows[np.lexsort((place[rows], seen.rows.stamp_s[rows]))]
     frame = np.searchsorted(visit.recording.frames.stamp_s, seen.rows.stamp_s[rows])
@@ -261,57 +299,35 @@ def missed(living: LivingMap, seen: PlaceLooks, visit: Visit) -> Misses:
     return Misses(frame.astype(np.int64), living.places.landmark_id[place[rows]], p_detect)
 
 
-def decided(
-    entry: Extended, now: Believed, seen: PlaceLooks, visit: Visit, config: LivingConfig, classes: ClassLives | None
-) -> tuple[LivingMap, tuple[MapChange, ...]]:
-    """Return the map with updated stays and without forgotten cliques, and the changes since the previous session, by
-    what it teaches of how long things stay, None for nothing.
-    """
-    before = entry.before
-    came = arrivals(before, now.living, seen, visit.floor_sensor, config.looks)
-    came = arrived(came, now.living, visit.witnessed, entry)
-    after, changes = decide.decided(
-        before, now.living, seen, now.log_evidence, came, visit.start_s, classes, settings=config.decisions
-    )
-    if not config.learn_sight:
-        after = replace(after, sightlines=before.sightlines)
-    if config.cliques and config.existence and config.misses:
-        after = without_missed(before, after, config.grouping)
-    return decide.without_forgotten(after, config.most_sites, config.decisions), changes
-
-
-def learned(
-    after: LivingMap, seen: PlaceLooks, entry: Extended, eye: FloatArray, config: LivingConfig
-) -> tuple[LivingMap, ClassLives | None]:
-    """Return the map with what the session taught of lifetimes, and of from where places are seen."""
+def learned(judged: Judged, classes: ClassLives | None, config: LivingConfig) -> LivingMap:
+    """Return the map after a session, with what it taught of lifetimes, and of from where places are seen."""
+    after, seen = judged.living, judged.seen
+    lines, views = after.sightlines if config.learn_sight else judged.entry.before.sightlines, after.views
     if config.learn_sight and config.existence:
-        names = entry.living.places.site_id, entry.living.places.landmark_id
-        p_there = entry.living.sites.p_here[seen.rows.site]
-        weight = np.where(seen.settled, 1.0, p_there)
-        lines = after.sightlines.learned(names, seen.place, seen.cell, seen.rows.hit, weight, seen.rate)
-        views = after.views.seen_from(eye, after.stamp_s, seen.rate)
-        after = replace(after, sightlines=lines, views=views)
-    if not config.learn_lifetimes:
-        return after, None
-    classes = ClassLives.of(after.stays, after.lives, after.stamp_s, config.lifetimes)
-    return replace(after, lives=classes.lives), classes
+        places = judged.entry.living.places
+        weight = np.where(seen.settled, 1.0, judged.now.sites.p_here[seen.rows.site])
+        names = places.site_id, places.landmark_id
+        lines = lines.learned(names, seen.place, seen.cell, seen.rows.hit, weight, seen.rate)
+        views = views.seen_from(judged.watch.eye, after.stamp_s, seen.rate)
+    return replace(after, sightlines=lines, views=views, lives=after.lives if classes is None else classes.lives)
 
 
-def told(found: Judged, where: Laid | None, visit: Visit) -> Session:
+def told(judged: Judged, living: LivingMap, where: Laid | None, visit: Visit) -> Session:
     """Return the session with its map and changes; its landmarks have hits and misses of all sessions of the map."""
     frame = "first_pose" if where is None else "prior_map"
-    names = {**visit.recording.landmark_names, **found.living.landmark_names}
-    known = replace(found.living.landmarks(), frame=frame, names=names)
+    names = {**visit.recording.landmark_names, **living.landmark_names}
+    known = replace(living.landmarks(), frame=frame, names=names)
     landmarks, gone = rows_of(known, known.p_exists >= EXISTS), rows_of(known, known.p_exists < EXISTS)
-    changes = tuple(change.named(names) for change in found.changes)
-    slam = replace(visit.concluded(), landmarks=landmarks, misses=found.misses, changes=changes, gone=gone)
-    return Session(found.living, True, visit.used, slam, changes, found.evidence)
+    changes = tuple(change.named(names) for change in judged.changes)
+    misses = missed(judged.entry.living, judged.now.sites.p_here, judged.seen, visit)
+    slam = replace(visit.concluded(), landmarks=landmarks, misses=misses, changes=changes, gone=gone)
+    return Session(living, True, visit.used, slam, changes, judged.now.evidence)
 
 
 def brought_in(
     session: Localised[PlanarVisit] | Localised[SpatialVisit], whole: LivingMap, config: LivingConfig
 ) -> Session:
-    """Return the result of a session in a map, computed twice: the second time with the lifetimes learned in the first.
+    """Return the result of a session in a map, judged twice: the second time with the lifetimes learned in the first.
 
     A session that cannot be localised keeps its own result, and the map is unchanged.
     """
@@ -320,10 +336,16 @@ def brought_in(
         slam = existing(visit, visit.concluded(), config)
         slam = replace(slam, warnings=(*slam.warnings, f"set aside: {session.reason[0]}"))
         return Session(whole, False, visit.used, slam, (), Evidence.empty(), session.reason)
-    known = judged(session.living, where, visit, config)
-    told_now = told(judged(session.living, where, visit, config, known), where, visit)
-    after = told_now.living if session.vicinity is None else session.vicinity.put_back(told_now.living)
-    return replace(told_now, living=decide.without_strays(in_chunks(with_traits(after, visit.used), config)))
+    living = replace(session.living, sightlines=replace(session.living.sightlines, rules=config.sight))
+    judged_now = judged(living, where, visit, config)
+    classes = lives_after(judged_now.living, config)
+    if classes is not None:
+        living = replace(living, lives=replace(classes.lives, looks_s=living.lives.looks_s))
+        judged_now = judged(living, where, visit, config, classes, judged_now)
+        classes = lives_after(judged_now.living, config)
+    after = told(judged_now, learned(judged_now, classes, config), where, visit)
+    living = after.living if session.vicinity is None else session.vicinity.put_back(after.living)
+    return replace(after, living=decide.without_strays(in_chunks(with_traits(living, visit.used), config)))
 
 
 def with_traits(living: LivingMap, recording: AnyRecording) -> LivingMap:
@@ -374,16 +396,18 @@ def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult
         rotation=mapped.rotation,
         rotation_covariance=mapped.rotation_covariance,
     )
-    empty = replace(_empty(visit.recording), class_names=visit.recording.class_names)
-    empty = replace(empty, sightlines=replace(empty.sightlines, rules=config.sight))
-    entry = extended(empty, np.zeros(0), found, config, 0.0)
+    empty = _empty(visit.recording)
+    lines = replace(empty.sightlines, rules=config.sight)
+    empty = replace(empty, class_names=visit.recording.class_names, sightlines=lines)
+    entry = extended(empty, empty.sites, found, config, 0.0)
     seen = looked_at(entry.living, entry.p_start, visit.watched(entry, config), config)
-    now = believe.believed(entry, seen, visit.floor_sensor, (visit.start_s, visit.end_s), config).living
-    judged_now = now.landmarks(p_least=0.0)
+    now = believe.believed(entry, seen, visit.floor_sensor, (visit.start_s, visit.end_s), config)
+    living = replace(entry.living, stamp_s=now.until_s, places=now.places, sites=now.sites)
+    judged_now = living.landmarks(p_least=0.0)
     row = np.searchsorted(judged_now.landmark_id, mapped.landmark_id)
     p_exists = judged_now.p_exists[row] if config.existence else mapped.p_exists
     mapped = replace(mapped, p_exists=p_exists, n_misses=judged_now.n_misses[row])
-    return replace(slam, landmarks=mapped, misses=missed(now, seen, visit))
+    return replace(slam, landmarks=mapped, misses=missed(living, now.sites.p_here, seen, visit))
 
 
 def judged_so_far(
@@ -393,9 +417,9 @@ def judged_so_far(
     report; without places that the map does not have yet, and bodies. How long things stay is as `lives_of` tells.
     """
     start_s, end_s = (max(float(stamp_s), living.stamp_s) for stamp_s in sighting.stamp_s[[0, -1]])
-    living = replace(living, sightlines=replace(living.sightlines, rules=config.sight))
     aged = believe.aged(living, config, start_s)
-    living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
+    lines = replace(living.sightlines, rules=config.sight)
+    living = replace(living, sightlines=lines, sites=replace(living.sites, p_kept=aged.p_kept))
     looks = config.looks.model_copy(update={"settled_s": min(config.looks.settled_online_s, config.looks.settled_s)})
     config = config.model_copy(update={"looks": looks})
     seen = looked_at(living, aged.p_here, Watch.of(sighting, living.places.position_m, sensor, looks), config)
@@ -403,11 +427,15 @@ def judged_so_far(
     entry = Extended(living, living, none, none, aged.p_here, np.zeros(len(living.sites), dtype=np.bool_))
     now = believe.believed(entry, seen, sensor, (start_s, end_s), config)
     nowhere = Arrivals(none, np.zeros(0), np.zeros(0))
-    settings = config.decisions
-    after, changes = decide.decided(
-        living, now.living, seen, now.log_evidence, nowhere, start_s, classes, settings=settings
-    )
+    after, changes = decide.decided(living, living, now, seen, nowhere, start_s, classes, settings=config.decisions)
     return after, tuple(change.named(after.landmark_names) for change in changes)
+
+
+def lives_after(living: LivingMap, config: LivingConfig) -> ClassLives | None:
+    """Return what a map teaches of lifetimes after a session; None if nothing is to be learned."""
+    if not config.learn_lifetimes:
+        return None
+    return ClassLives.of(living.stays, living.lives, living.stamp_s, config.lifetimes)
 
 
 def lives_of(living: LivingMap, config: LivingConfig) -> ClassLives | None:
