@@ -13,10 +13,12 @@ from recordings import building
 from evermap.config import Config, SlamConfig
 from evermap.geometry import se2
 from evermap.maps.sessions.nameless import numbered_in
+from evermap.slam import linearise, preintegration
 from evermap.slam.association import with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator, compared, correlated, fit_sighting_noise
 from evermap.slam.association.features import Traits
+from evermap.slam.association.identify import _by_names
 from evermap.slam.association.merging import propose_merges
 from evermap.slam.association.revise import (
     HIDDEN,
@@ -107,6 +109,37 @@ def test_one_landmark_that_is_five_becomes_one_again() -> None:
     everyone = np.ones(broken.n_landmarks, dtype=bool)
     pairs = propose_merges(compared(broken, marginals, 0.1), probability=0.97, among=everyone, last=True, refused=set())
     np.testing.assert_array_equal(broken.merged(pairs).landmark_row, row)
+
+
+def in_slices_of(factors: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, constant in (
+        (linearise, "INTERVALS_A_SLICE"),
+        (linearise, "DETECTIONS_A_SLICE"),
+        (preintegration, "A_SLICE"),
+    ):
+        monkeypatch.setattr(module, constant, factors)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_how_the_work_is_cut_changes_no_bit(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Slices are a constant of performance: neither a cost, nor an association, nor what names lead to depends on it.
+
+    Of the names some are right, so that odometry leads to them; or they contradict each other, so that it does not.
+    """
+    made = world(seed, p_outlier=0.05)
+    true = made.problem.landmark_row
+    costs, found, poses = [], [], []
+    for factors in (7, 10**6):
+        in_slices_of(factors, monkeypatch)
+        costs.append(Smoother(made.problem, made.noise, heavy=True).cost(made.truth))
+        found.append(associated(made))
+        names = np.where(true < 3, true, UNKNOWN), true % 3
+        poses.append([_by_names(made.problem, name, made.noise, KNOWN_SENSORS, NAMELESS) for name in names])
+    assert costs[0] == costs[1]
+    np.testing.assert_array_equal(found[0].landmark_row, found[1].landmark_row)
+    np.testing.assert_array_equal(found[0].estimate.pose, found[1].estimate.pose)
+    np.testing.assert_array_equal(found[0].estimate.landmark, found[1].estimate.landmark)
+    np.testing.assert_array_equal(poses[0], poses[1])
 
 
 def test_a_detection_of_nothing_is_nobodys() -> None:
