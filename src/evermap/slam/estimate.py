@@ -92,7 +92,7 @@ def solve(
             return Solved(recording, prepared, outcome, None, prior, step_s, interrupted, settings)
     slam = StreamingSlam(
         problem, noise, prior,
-        prior_map=prepared.prior_map, framed=prepared.framed, settings=settings, method=method,
+        prior_map=prepared.prior_map, framed=prepared.framed, settings=settings, method=method, paced=causal,
     )  # fmt: skip
     step_s, interrupted = fed(problem.stamp_s, lambda _: slam.step(), least=2, realtime=realtime, progress=progress)
     return Solved(recording, prepared, slam.finish(), slam, prior, step_s, interrupted, settings)

@@ -58,14 +58,16 @@ def root_of(information: FloatArray, root: FloatArray) -> None:
 
 @kernel
 def linearise_odometry(
-    pose: FloatArray, driven: Intervals, variance: FloatArray, free: Any, values: FloatArray, begin: int, end: int
-) -> float:
+    pose: FloatArray, driven: Intervals, variance: FloatArray, free: Any, values: FloatArray, begin: int, end: int,
+    cost: float,
+) -> float:  # fmt: skip
     """Linearise the odometry from poses `begin` to `end - 1` of (N, 3), by the `free` (11,) calibration states.
 
     `variance` (5,) is that of each kind of noise. Filled in are `values`, those of a factor for each interval. Returns
-    the negative log likelihood, up to a constant.
+    the negative log likelihood, up to a constant, added to `cost`, that of the intervals before: a sum in one order,
+    however it is cut.
     """
-    cost, at = 0.0, ODOMETRY * begin
+    at = ODOMETRY * begin
     information, e, root = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
     j = np.zeros((3, OF_INTERVAL - 1))
     for i in range(begin, end):
@@ -89,14 +91,14 @@ def linearise_odometry(
 @kernel
 def linearise_detections(
     pose: FloatArray, place: FloatArray, states: FloatArray, seen: Readings, values: FloatArray, weight: FloatArray,
-    first: int, last: int,
+    first: int, last: int, cost: float,
 ) -> float:  # fmt: skip
     """Linearise the detections from `first` to `last - 1` at poses (N, 3), places (P, 2) and states (11,).
 
     Filled in are `values`, those of a factor for each detection, and inlier weights (M,). Returns the negative log
-    likelihood, up to a constant.
+    likelihood, up to a constant, added to `cost`, that of the detections before.
     """
-    cost, at = 0.0, DETECTION * first
+    at = DETECTION * first
     z, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, N_SENSOR))
     for m in range(first, last):
         detection_residual(
@@ -154,7 +156,9 @@ class OdometryFactors(NamedTuple):
         driven = yield from problem.drive.in_slices(problem.stamp_s, state.states)
         for begin in range(0, count, INTERVALS_A_SLICE):
             end = min(begin + INTERVALS_A_SLICE, count)
-            cost += linearise_odometry(state.pose, driven, self.variance, problem.prior.free, out.values, begin, end)
+            cost = linearise_odometry(
+                state.pose, driven, self.variance, problem.prior.free, out.values, begin, end, cost
+            )
             yield (end - begin) / INTERVALS_A_SLICE
         return cost
 
@@ -194,8 +198,8 @@ class DetectionFactors(NamedTuple):
         place, cost, count = state.landmark[self.known], 0.0, len(out.weights)
         for first in range(0, count, DETECTIONS_A_SLICE):
             last = min(first + DETECTIONS_A_SLICE, count)
-            cost += linearise_detections(
-                state.pose, place, state.states, self.seen, out.values, out.weights, first, last
+            cost = linearise_detections(
+                state.pose, place, state.states, self.seen, out.values, out.weights, first, last, cost
             )
             yield (last - first) / DETECTIONS_A_SLICE
         return cost

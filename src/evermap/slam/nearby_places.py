@@ -8,9 +8,10 @@ or a map knows are tied as that says, exactly.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -88,6 +89,13 @@ class NearbyPlaces:
         self._left: dict[int, Ties] = {}
         self._given_position, self._neighbours = np.zeros((0, width)), NEIGHBOURS
         self._given_joint: Callable[[IntArray], FloatArray] | None = None
+
+    def copied(self) -> Self:
+        """Return a copy: what is done with it leaves this one as it is."""
+        other = copy.copy(self)
+        for name in ("pose", "states", "covariance", "position", "_row", "_used_at", "_slot", "_left"):
+            setattr(other, name, getattr(self, name).copy())
+        return other
 
     @property
     def active(self) -> IntArray:

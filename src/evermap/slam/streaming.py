@@ -62,7 +62,8 @@ class StreamingSlam:
 
     Nothing of the problem beyond the current row is looked at, but odometry up to the delay. `noise` is where the noise
     levels start, `prior` are calibration priors as the user means them. Without a `prior_map` it maps from scratch,
-    without a `method` it takes the world to be static.
+    without a `method` it takes the world to be static. Where it is not `paced`, as nobody waits for a frame, the stream
+    goes on from the relinearisation in the frame in which that begins: then no constant of the pace changes a result.
     """
 
     def __init__(
@@ -75,8 +76,9 @@ class StreamingSlam:
         framed: tuple[Tied, ...] = (),
         settings: SlamConfig = USUAL,
         method: Method | None = None,
+        paced: bool = True,
     ) -> None:
-        self._prior = prior
+        self._prior, self._paced = prior, paced
         self._prior_map, self._framed = prior_map, framed
         self._problem = replace(problem, prior=prior.without_scale())
         self._start_noise = self._noise = noise
@@ -181,8 +183,9 @@ class StreamingSlam:
             self._job = self._relinearised(learn=False)
 
     def _a_frame_ms(self) -> float:
-        """Work on a relinearisation in a frame: a few slices, or all of it where it may change places."""
-        return np.inf if self._job is not None and self._method.revises(self._problem) else SLICES_A_FRAME
+        """Work on a relinearisation in a frame: a few slices; all if not paced, or where it may change places."""
+        at_once = self._job is not None and (not self._paced or self._method.revises(self._problem))
+        return np.inf if at_once else SLICES_A_FRAME
 
     def work(self, most_ms: float = np.inf) -> None:
         """Advance a relinearisation by what the last frame owes to it, up to the slice that reaches `most_ms`."""

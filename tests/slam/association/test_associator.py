@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from bits import bits
 from identity_scores import identity_scores
 from problems import World, make_world
 from recordings import building
@@ -13,11 +16,14 @@ from recordings import building
 from evermap.config import Config, SlamConfig
 from evermap.geometry import se2
 from evermap.maps.sessions.nameless import numbered_in
+from evermap.slam import linearise, preintegration
 from evermap.slam.association import with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator, compared, correlated, fit_sighting_noise
 from evermap.slam.association.features import Traits
+from evermap.slam.association.identify import _by_names
 from evermap.slam.association.merging import propose_merges
+from evermap.slam.association.particles import drawn
 from evermap.slam.association.revise import (
     HIDDEN,
     LOOK_BINS,
@@ -27,6 +33,7 @@ from evermap.slam.association.revise import (
     with_overlooked,
 )
 from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.local_filter import Motion
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, Landmarks
@@ -107,6 +114,96 @@ def test_one_landmark_that_is_five_becomes_one_again() -> None:
     everyone = np.ones(broken.n_landmarks, dtype=bool)
     pairs = propose_merges(compared(broken, marginals, 0.1), probability=0.97, among=everyone, last=True, refused=set())
     np.testing.assert_array_equal(broken.merged(pairs).landmark_row, row)
+
+
+def in_slices_of(factors: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, constant in (
+        (linearise, "INTERVALS_A_SLICE"),
+        (linearise, "DETECTIONS_A_SLICE"),
+        (preintegration, "A_SLICE"),
+    ):
+        monkeypatch.setattr(module, constant, factors)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_how_the_work_is_cut_changes_no_bit(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Slices are a constant of performance: neither a cost, nor an association, nor what names lead to depends on it.
+
+    Of the names some are right, so that odometry leads to them; or they contradict each other, so that it does not.
+    """
+    made = world(seed, p_outlier=0.05)
+    true = made.problem.landmark_row
+    costs, found, poses = [], [], []
+    for factors in (7, 10**6):
+        in_slices_of(factors, monkeypatch)
+        costs.append(Smoother(made.problem, made.noise, heavy=True).cost(made.truth))
+        found.append(associated(made))
+        names = np.where(true < 3, true, UNKNOWN), true % 3
+        poses.append([_by_names(made.problem, name, made.noise, KNOWN_SENSORS, NAMELESS) for name in names])
+    assert costs[0] == costs[1]
+    np.testing.assert_array_equal(found[0].landmark_row, found[1].landmark_row)
+    np.testing.assert_array_equal(found[0].estimate.pose, found[1].estimate.pose)
+    np.testing.assert_array_equal(found[0].estimate.landmark, found[1].estimate.landmark)
+    np.testing.assert_array_equal(poses[0], poses[1])
+
+
+def driven(world: World, settings: SlamConfig = NAMELESS) -> Associator:
+    hidden = replace(world.problem, landmark_row=np.full_like(world.problem.landmark_row, -99))
+    associator = Associator(hidden, world.noise, settings=settings)
+    for _ in hidden.stamp_s:
+        associator.step()
+    return associator
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rejected_trials_change_nothing(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Merged, split and realigned ones, whole searches, and what is only asked for: not a bit of what is held."""
+    made = world(seed, p_outlier=0.05)
+    associator = driven(made)
+    found = associator.finish()
+    row, pose = found.landmark_row, found.measured.pose_row
+    broken = found.split([np.flatnonzero((row == 2) & (pose // 12 == part)) for part in range(1, 5)])
+    late = np.where(row == 1, 0, np.where(row == 0, NOBODY, row))  # of one landmark, after a while that of another
+    twisted = replace(found, landmark_row=np.where(pose > 45, late, np.where((row == 0) & (pose > 15), NOBODY, row)))
+    solved, twisted, trials = associator._solved(broken), associator._solved(twisted), list[int]()
+    before, value, other = bits(associator), bits(solved), bits(twisted)
+
+    def rejected(*_: object) -> float:
+        trials.append(1)
+        return -math.inf
+
+    with monkeypatch.context() as no:
+        no.setattr("evermap.slam.association.associator.accepted_rise", rejected)
+        no.setattr("evermap.slam.association.associator._is_better", lambda *_: rejected() > 0.0)
+        assert associator._all_merged(solved) is solved
+        assert len(trials) > 1
+        count = len(trials)
+        assert associator._contradictions_split(twisted, set()) is twisted
+        assert len(trials) > count
+    assert (bits(solved), bits(twisted)) == (value, other)
+    associator.finish(broken)
+    associator.finish(drawn(found, made.noise.odometry, seed=seed, wider=1.0)[0])
+    associator.against(broken)
+    associator.learned_odometry(broken)
+    assert bits(associator) == before
+
+
+def test_wheels_that_did_not_slip_leave_the_filter_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame that no landmark matches is asked whether the wheels slipped: a trial in a filter of its own."""
+    made = world(1, p_seen=0.3, p_outlier=0.3)
+    rules = NAMELESS.association.model_copy(update={"slip_nats": math.inf})
+    asked = driven(made, NAMELESS.model_copy(update={"association": rules}))
+
+    def never(self: Associator, row: int, detections: np.ndarray) -> Any:
+        local = self._filter
+        motion = Motion.between(self._problem, self.noise, row, local.states)
+        self._have_near(se2.compose(local.pose, motion.increment))
+        local.drive(motion)
+        return self._match(local, detections)
+
+    monkeypatch.setattr(Associator, "_after_driving", never)
+    without = driven(made, NAMELESS.model_copy(update={"association": rules}))
+    assert bits(asked) == bits(without)
 
 
 def test_a_detection_of_nothing_is_nobodys() -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from bits import bits
 from identity_scores import identity_scores
 
 from evermap import run_session, run_slam
@@ -16,6 +18,8 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.nameless import numbered_in
 from evermap.maps.sessions.session import Session
 from evermap.slam.association import with_identities
+from evermap.slam.association.in_space import SpatialAssociator
+from evermap.slam.space.intake import prepare_space
 from evermap.types import UNKNOWN, ChangeKind, Landmarks, SpatialRecording, rows_of
 
 from .corridors import tagged_corridor
@@ -81,6 +85,33 @@ def test_landmarks_of_two_classes_at_one_place_stay_two():
     kind = np.arange(len(seen)) % 2
     doubled = replace(seen, class_id=kind, landmark_id=2 * seen.landmark_id + kind)
     scored(replace(recording, detections=doubled, class_names=("tag", "board")), purity=1.0, completeness=1.0)
+
+
+def test_rejected_trials_in_space_change_nothing(monkeypatch):
+    """Merged ones, whole searches, and what is only asked for: not a bit of what is held."""
+    recording = hall(3, n_points=20, n_frames=150)
+    intake = prepare_space(recording, NAMELESS.slam.space)
+    none = np.full((len(intake.used), 2), UNKNOWN)
+    associator = SpatialAssociator(intake, none, NAMELESS.slam)
+    found = associator.finish()
+    late = associator._problem.pose_row > np.median(associator._problem.pose_row)
+    twice = np.where(late & (found.row == 2), found.row.max() + 1, found.row)
+    solved, trials = associator._solved(twice, found.estimate.pose, found.noise), list[int]()
+    before, value = bits(associator), bits(solved)
+
+    def rejected(*_: object) -> float:
+        trials.append(1)
+        return -math.inf
+
+    with monkeypatch.context() as no:
+        no.setattr("evermap.slam.association.in_space.accepted_rise", rejected)
+        assert associator._merged(solved) is solved
+    assert trials
+    assert len(associator._merged(solved).estimate.place) == len(found.estimate.place)
+    associator.against(solved, None, found)
+    associator.finish(solved)
+    associator.finish()
+    assert (bits(associator), bits(solved)) == (before, value)
 
 
 def test_identities_of_the_recording_are_not_looked_at():

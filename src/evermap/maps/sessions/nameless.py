@@ -11,6 +11,7 @@ orientation are the same only if that agrees, too, but one may have been turned 
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
@@ -304,15 +305,13 @@ class _Assigned:
         """Return (K,) rows of the map's members, -1 for new ones; and where all lie, None if nothing matches."""
         place, where = self._placed(self._alike & self._not_unlike()), None
         if self._traits is not None and not np.any(place >= 0):  # all may be unlike, in another light
-            self._compare(self._placed(self._alike))
-            place = self._placed(self._alike & self._not_unlike())
+            compared = self._compared(self._placed(self._alike))
+            place = self._placed(self._alike & compared._not_unlike())
         member = np.full(len(place), -1, dtype=np.int64)
         while np.any(place >= 0):
-            self._compare(place)
-            place = self._grown(place)
-            self._compare(place)
+            place = self._compared(place)._grown(place)
             where = self._where(np.arange(len(place)), place)
-            member = self._assigned(where, place)
+            member = self._compared(place)._assigned(where, place)
             more = self._regained(where, member, place)
             if np.array_equal(more, place):
                 break
@@ -402,12 +401,14 @@ class _Assigned:
         sure = found.pairs[found.margin >= math.log(p_merge / (1.0 - p_merge))]
         return group[k[sure]], m[sure]
 
-    def _compare(self, place: IntArray) -> None:
-        """Learn from certain matches how columns differ between the session and the map."""
-        if self._traits is not None:
-            held = np.flatnonzero(place >= 0)
-            member = self._stood.landmark[place[held]]
-            self._traits = self._traits.compared(held, member, self._settings.fewest_compared)
+    def _compared(self, place: IntArray) -> Self:
+        """Return the same with how columns differ between the session and the map, learned from certain matches."""
+        if self._traits is None:
+            return self
+        held, other = np.flatnonzero(place >= 0), copy.copy(self)
+        member = self._stood.landmark[place[held]]
+        other._traits = self._traits.compared(held, member, self._settings.fewest_compared)
+        return other
 
     def _placed(self, allowed: BoolArray) -> IntArray:
         """Return (K,) rows of the places that landmarks of one stretch certainly match, -1 for the others; of the

@@ -61,12 +61,24 @@ SAME_SHARE = 0.002
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """An assignment at its optimum, with covariances, cost and smoother."""
+    """An assignment at its optimum, with covariances, cost and smoother: a trial, until something goes on from it.
+
+    Attributes:
+        sigma: (M, 2) standard deviations of all detections of the recording, learned from its residuals: those of the
+            solution that follows, if this one is accepted.
+    """
 
     assignment: Assignment
     marginals: Marginals
     cost: float
     smoother: Smoother
+    sigma: FloatArray
+
+    @property
+    def density_m2(self) -> float:
+        """Density of the landmarks [1/m^2]."""
+        now = self.assignment
+        return landmark_density(now.estimate.landmark, now.sightings, now.settings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,14 +147,14 @@ class Associator:
             covariance = local.covariance.copy()
             covariance[:3, :3] = np.eye(3) / self._problem.start_information
             local.hold(self._problem.start_pose, local.states, covariance, NO_PLACES, local.position)
-            frame = self._match(detections)
+            frame = self._match(local, detections)
         else:
             frame = self._after_driving(row, detections)
         self._use(frame, detections)
-        self._pose[row] = local.pose
+        self._pose[row] = self._filter.pose
         self._done += 1
         if self._done == self._next_batch:
-            self._go_on_from(self._settled(self._without_chance(self._assignment()), RECENT))
+            self._go_on_from(self._settled(self._without_chance(self._assignment()), self._sigma, RECENT))
             self._next_batch = self._done + max(FIRST_BATCH, int(BATCH_SHARE * self._done))
 
     def _after_driving(self, row: int, detections: IntArray) -> _Frame:
@@ -150,18 +162,17 @@ class Associator:
         local, problem = self._filter, self._problem
         motion = Motion.between(problem, self.noise, row, local.states)
         self._have_near(se2.compose(local.pose, motion.increment))
-        before = local.pose.copy(), local.covariance.copy()
+        trial = local.copied()
         local.drive(motion)
-        frame = self._match(detections)
+        frame = self._match(local, detections)
         if len(frame.taken):
             return frame
-        after = local.pose, local.covariance  # did the wheels slip, or stamps jitter in a turn?
-        local.pose, local.covariance = before
-        local.drive(Motion.between(problem, self._slipping, row, local.states))
-        slipped = self._match(detections)
+        # did the wheels slip, or stamps jitter in a turn?
+        trial.drive(Motion.between(problem, self._slipping, row, trial.states))
+        slipped = self._match(trial, detections)
         if len(slipped.taken) and slipped.evidence >= frame.evidence + self._rules.slip_nats:
+            self._filter = trial
             return slipped
-        local.pose, local.covariance = after
         return frame
 
     def _have_near(self, pose: FloatArray) -> None:
@@ -172,7 +183,8 @@ class Associator:
     def having(self, traits: Traits) -> Associator:
         """Return a copy, with the same frames processed, that also uses traits."""
         other = copy.copy(self)
-        other._traits = traits
+        other._traits, other._filter = traits, self._filter.copied()
+        other._row, other._pose = self._row.copy(), self._pose.copy()
         return other
 
     def heed_names(self, pose: Callable[[], FloatArray]) -> None:
@@ -183,7 +195,7 @@ class Associator:
         Args:
             pose: returns these poses (N, 3); called only if needed.
         """
-        solved = self._settled(self._assignment())
+        solved = self._settled(self._assignment(), self._sigma)
         self._go_on_from(solved)
         now = solved.assignment
         if not len(_twice(now)):
@@ -212,20 +224,18 @@ class Associator:
         """
         refused: set[tuple[int, int]] = set()
         total = math.inf
-        first = begun is None
+        first, sigma = begun is None, self._sigma if begun is None else begun.measured.sigma_given
         if begun is None:
             begun = self._assignment()
-        else:
-            self._sigma = begun.measured.sigma_given
-        solved = self._realigned(self._contradictions_split(self._settled(begun), refused))
+        solved = self._realigned(self._contradictions_split(self._settled(begun, sigma), refused))
         for left in reversed(range(LAST_ROUNDS)):
             before = solved.assignment
-            again = reassigned(before, solved.marginals.explained_detections, density=self._density_m2)
+            again = reassigned(before, solved.marginals.explained_detections, density=solved.density_m2)
             again = with_overlooked(again)
             again = again.without(_seldom(again))
             count = min(before.n_landmarks, again.n_landmarks)
             changed = np.mean(_partners(before.landmark_row) != _partners(again.landmark_row))
-            solved = self._contradictions_split(self._settled(again), refused)
+            solved = self._contradictions_split(self._settled(again, solved.sigma), refused)
             total, last = self._total(solved), total
             hopeless = total - left * (last - total) > goal
             same = changed <= SAME_SHARE and solved.assignment.n_landmarks == before.n_landmarks == count
@@ -266,9 +276,8 @@ class Associator:
         Args:
             assignment: as `finish` returns it, of this associator or another one of the same recording.
         """
-        assignment = self._solved(assignment).assignment
-        measured = self._with_sigma(assignment.measured)  # its own noise
-        return self._total(self._solved(replace(assignment, measured=measured)))
+        solved = self._solved(assignment)
+        return self._total(self._solved(_with_sigma(solved.assignment, solved.sigma)))  # its own noise
 
     def _total(self, solved: _Solved) -> float:
         """`against` under the noise of the solution."""
@@ -279,11 +288,11 @@ class Associator:
         explained = fit + self.noise.outlier_log_odds * nobody
         return explained / self.worth + landmarks + unseen_nats(assignment)
 
-    def _match(self, detections: IntArray) -> _Frame:
-        """Weigh the detections of the frame against the landmarks so far."""
+    def _match(self, local: LocalFilter, detections: IntArray) -> _Frame:
+        """Weigh the detections of the frame against the landmarks so far, as the filter has them."""
         kind = self._kind[detections], self._of_kind
         pairings, followed = pairings_of_frame(
-            self._filter, self._problem, self._sigma, detections,
+            local, self._problem, self._sigma, detections,
             density=self._density_m2, kind=kind, settings=self._rules,
         )  # fmt: skip
         read = self._traits.singly(detections[pairings.source])
@@ -294,10 +303,13 @@ class Associator:
         np.add.at(known, pairings.source, probability)
         away = self._problem.stamp_s[self._done] - self._seen_s[pairings.target] > self._rules.forget_s
         least = np.where(away & ~followed, self._rules.p_return, self._rules.p_match)
-        taken = np.flatnonzero((probability >= least) | self._harmless(pairings, probability, known, least))
+        harmless = self._harmless(local, pairings, probability, known, least)
+        taken = np.flatnonzero((probability >= least) | harmless)
         return _Frame(pairings, taken, 1.0 - known, evidence)
 
-    def _harmless(self, pairings: Pairings, probability: FloatArray, known: FloatArray, least: FloatArray) -> BoolArray:
+    def _harmless(
+        self, local: LocalFilter, pairings: Pairings, probability: FloatArray, known: FloatArray, least: FloatArray
+    ) -> BoolArray:
         """(K,) the best pairing of a detection if a wrong choice does no harm, and is corrected later.
 
         That is so if the gate is small, or if the rivals are probably the same landmark.
@@ -315,12 +327,11 @@ class Associator:
             if area_m2 < self._rules.tight_m2:
                 best[first] = True
             elif known[s] >= least[first]:
-                best[first] = all(self._may_be_one(pairings.target[first], pairings.target[k]) for k in rivals)
+                best[first] = all(self._may_be_one(local, pairings.target[first], pairings.target[k]) for k in rivals)
         return best
 
-    def _may_be_one(self, a: int, b: int) -> bool:
+    def _may_be_one(self, local: LocalFilter, a: int, b: int) -> bool:
         """True if the difference of two landmarks is insignificant."""
-        local = self._filter
         at = local.columns(local.bring(np.array([a, b])))
         by = np.hstack([np.eye(2), -np.eye(2)])
         spread = by @ local.covariance[np.ix_(at, at)] @ by.T + 1e-12 * np.eye(2)
@@ -350,7 +361,9 @@ class Associator:
         local.update(self._row[new], problem.reading[new], self._sigma[new], weighing=GATED)
 
     def _go_on_from(self, solved: _Solved) -> None:
+        """Accept a solution: all that was learned with it is that of the frames to come."""
         assignment = solved.assignment
+        self._sigma, self._density_m2 = solved.sigma, solved.density_m2
         self._row[: len(assignment.landmark_row)] = assignment.landmark_row
         self._pose[: self._done] = assignment.estimate.pose
         self._of_kind, self._seen_s, self._like = assignment.of_kind, assignment.last_seen_s, assignment.like()
@@ -365,20 +378,16 @@ class Associator:
         row, kind = self._row[:count].copy(), self._kind[:count]
         return Assignment(measured, row, estimate, kind, self._traits.until(count), self._settings)
 
-    def _with_sigma(self, measured: Problem) -> Problem:
-        """The measurements with the learned noise of sightings."""
-        count = len(measured.pose_row)
-        return replace(measured, sigma_given=self._sigma[:count])
-
     def _without_chance(self, assignment: Assignment) -> Assignment:
         """The assignment without landmarks with too few sightings, long ago."""
         age = assignment.measured.stamp_s[-1] - assignment.last_seen_s
         return assignment.without(_seldom(assignment) & (age > self._rules.forget_s))
 
-    def _settled(self, assignment: Assignment, recent: int | None = None) -> _Solved:
-        """Solve the batch, and merge duplicates of all landmarks or of those seen last."""
-        assignment = replace(assignment, measured=self._with_sigma(assignment.measured))
-        return self._all_merged(self._solved(assignment), recent)
+    def _settled(self, assignment: Assignment, sigma: FloatArray, recent: int | None = None) -> _Solved:
+        """Solve the batch with the noise (M, 2) of detections, and merge duplicates of all landmarks or of those seen
+        last.
+        """
+        return self._all_merged(self._solved(_with_sigma(assignment, sigma)), recent)
 
     def _all_merged(
         self, solved: _Solved, recent: int | None = None, *, within: tuple[int, int] | None = None
@@ -398,8 +407,7 @@ class Associator:
             return trial if trial.cost - solved.cost <= accepted_rise(pairs, now.sightings, 2, self._rules) else None
 
         for _ in range(MERGE_ROUNDS):
-            now = solved.assignment
-            self._density_m2 = density = landmark_density(now.estimate.landmark, now.sightings, settings)
+            now, density = solved.assignment, solved.density_m2
             among, known = _latest(now, recent), np.ones(now.n_landmarks, dtype=bool)
             if within is not None:
                 known = np.arange(now.n_landmarks) < now.n_landmarks - within[1]
@@ -432,7 +440,7 @@ class Associator:
         if part is None or not len(part.root):
             return solved
         rules, best = self._rules, solved
-        every = overlays(part.source, part.target, part.allowed, density=self._density_m2, settings=self._settings)
+        every = overlays(part.source, part.target, part.allowed, density=solved.density_m2, settings=self._settings)
         least = self._total(self._real(solved)) - rules.constellation.certain_nats
         for overlay in every[:REALIGNED]:
             trial = self._all_merged(self._solved(solved.assignment.merged(part.rows(overlay.pairs))))
@@ -461,7 +469,7 @@ class Associator:
         for _ in range(SPLIT_ROUNDS):
             now = solved.assignment
             linear = solved.smoother.detections(now.estimate)
-            visits = weighed_visits(now, solved.marginals, linear, density=self._density_m2)
+            visits = weighed_visits(now, solved.marginals, linear, density=solved.density_m2)
             doubtful = visits.evidence < math.log(rules.p_merge / (1.0 - rules.p_merge))
             by_traits = visits.by_traits < -rules.readings.misread_nats
             doubtful &= (visits.squared > gates(1, rules.contradiction)[1]) | by_traits
@@ -480,7 +488,7 @@ class Associator:
             now = solved.assignment
             trusted = now.sightings >= self._settings.fewest_sightings
             stretches = displaced_stretches(
-                now, solved.marginals, trusted, density=self._density_m2, probability=self._rules.p_merge
+                now, solved.marginals, trusted, density=solved.density_m2, probability=self._rules.p_merge
             )
             starts = (laid(now, stretch, before) for stretch in stretches[:STRETCHES] for before in BEFORE)
             trials = (self._all_merged(self._solved(start)) for start in starts)
@@ -491,7 +499,7 @@ class Associator:
         return solved
 
     def _solved(self, assignment: Assignment, noise: Noise | None = None) -> _Solved:
-        """Optimum, covariances and cost; also learns the noise of sightings, even if the solution is rejected later."""
+        """Optimum, covariances and cost, and the noise of sightings that its residuals show."""
         problem = assignment.problem()
         noise = self.noise if noise is None else noise
         smoother = Smoother(problem, noise, heavy=True)
@@ -503,9 +511,9 @@ class Associator:
         left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
         start = self._rules.noise_floor * self._start_noise.detection
         noise_of = fit_sighting_noise(unknown, estimate, start, left, self._rules)
-        self._sigma = self._rules.noise_caution * noise_of.of_detections(self._problem)
+        sigma = self._rules.noise_caution * noise_of.of_detections(self._problem)
         cost = smoother.under(noise, heavy=False).cost(estimate) - assignment.traits.evidence(*assignment.of_visits())
-        return _Solved(replace(assignment, estimate=estimate), marginals, cost, smoother)
+        return _Solved(replace(assignment, estimate=estimate), marginals, cost, smoother, sigma)
 
 
 def compared(assignment: Assignment, marginals: Marginals, density: float) -> Solution:
@@ -538,6 +546,12 @@ def compared(assignment: Assignment, marginals: Marginals, density: float) -> So
         place, marginals.landmark, differences, assignment.sightings, assignment.last_seen_s,
         *seen_together(frame, row, n_frames, len(place), around), kind, settings,
     )  # fmt: skip
+
+
+def _with_sigma(assignment: Assignment, sigma: FloatArray) -> Assignment:
+    """The assignment with other standard deviations of detections, the first of (M, 2)."""
+    measured = replace(assignment.measured, sigma_given=sigma[: len(assignment.measured.pose_row)])
+    return replace(assignment, measured=measured)
 
 
 def _twice(assignment: Assignment) -> FloatArray:

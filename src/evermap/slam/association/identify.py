@@ -21,10 +21,11 @@ from evermap.slam.association.associator import Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.features import Traits, best_with_traits, learned
 from evermap.slam.association.particles import drawn
-from evermap.slam.batch import USUAL
+from evermap.slam.batch import USUAL, Batch
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
 from evermap.slam.kernels import N_STATES
+from evermap.slam.method import Static
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import StreamingSlam
@@ -201,14 +202,19 @@ def searched(associator: Associator, assignment: Assignment, again: Callable[[Fl
 def _by_names(
     problem: Problem, name: IntArray, noise: Noise, prior: CalibrationPrior, settings: SlamConfig
 ) -> FloatArray:
-    """(N, 3) poses estimated from the detections with a name (M,) alone."""
+    """(N, 3) poses estimated from the detections with a name (M,) alone, as a whole where the odometry leads."""
     named = name != UNKNOWN
     names, row = np.unique(name[named], return_inverse=True)
     landmark = np.full(len(name), NOBODY)
     landmark[named] = row
     start = Estimate(np.zeros((len(problem.stamp_s), 3)), np.zeros((len(names), 2)), prior.mean)
     some = Assignment(problem, landmark, start, name[:, None], Traits.none(len(name))).problem()
-    slam = StreamingSlam(some, noise, prior.without_scale(), settings=settings)
+    batch = Batch(prior.without_scale(), noise, Static(len(names)), settings)
+    if batch.is_driven(some):
+        *_, part = batch.parts(some)
+        if part.fits:
+            return batch.solved(part, None).estimate.pose
+    slam = StreamingSlam(some, noise, prior.without_scale(), settings=settings, paced=False)
     for _ in some.stamp_s:
         slam.step()
     return slam.finish().estimate.pose

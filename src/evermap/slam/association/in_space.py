@@ -156,6 +156,16 @@ class _Nearby:
         self.covariance = 0.5 * (after + after.T)
 
 
+class _Followed(NamedTuple):
+    """Landmarks (M,) of the detections, filled in view after view; class and name (L, 2) of each landmark, and what
+    each is like.
+    """
+
+    row: IntArray
+    of: IntArray
+    like: Likeness
+
+
 class _Match(NamedTuple):
     """Certain pairings: rows of a view with rows of the nearby landmarks; p (n,) of each detection to be new; and the
     evidence over only new landmarks [nats].
@@ -169,12 +179,16 @@ class _Match(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """Landmarks (M,) of detections at the optimum, the linearisation there, and its cost [nats]."""
+    """Landmarks (M,) of detections at the optimum, the linearisation there, its noise levels, the density of landmarks
+    [1/m^3], and its cost [nats]: a trial, until something goes on from it.
+    """
 
     row: IntArray
     estimate: SpatialEstimate
     smoother: SpatialSmoother
     now: SpatialLinear
+    noise: SpatialNoise
+    density: float
     cost: float
 
 
@@ -194,7 +208,6 @@ class SpatialAssociator:
     ) -> None:
         problem = self._problem = _thinned(intake)
         self._traits = Traits.none(len(problem.pose_row), settings) if traits is None else traits
-        self._like = self._traits.nothing(0)
         self._kind, self.settings, self._rules = kind, settings, settings.association
         caution, space = self._rules.odometry_caution, problem.settings
         self._noise = SpatialNoise(caution * space.drift_m, caution * space.drift_rad, pixel=space.sigma_px)
@@ -204,31 +217,29 @@ class SpatialAssociator:
         self._ways = se3.compose(mount, problem.either)
         self._turned = problem.kind != POINT
         self._view = np.unique(problem.pose_row * len(problem.mount) + problem.sensor, return_inverse=True)[1]
-        self._row: IntArray = np.full(len(self._view), NOBODY)
-        self._of = np.zeros((0, 2), dtype=np.int64)  # class and name of each landmark
         self._density = density_of_unmet(np.zeros((0, 3)), settings)
 
-    def having(self, traits: Traits) -> SpatialAssociator:
-        """Return an associator of the same detections that also uses traits."""
+    def having(self, traits: Traits, known: _Solved) -> SpatialAssociator:
+        """Return an associator of the same detections that also uses traits, and begins with the noise and the density
+        of a solution.
+        """
         other = copy.copy(self)
-        other._traits, other._like = traits, traits.nothing(0)
-        other._row, other._of = np.full_like(self._row, NOBODY), self._of[:0]
+        other._traits, other._noise, other._density = traits, known.noise, known.density
         return other
 
     def of_visits(self, solved: _Solved) -> tuple[IntArray, IntArray]:
         """Return `visits_of` these landmarks."""
         return visits_of(self._problem.stamp_s[self._problem.pose_row], solved.row, self._rules.forget_s)
 
-    def against(self, solved: _Solved, traits: Traits | None) -> float:
-        """Return the negative log likelihood [nats] of all detections, and of their traits, up to a constant.
+    def against(self, solved: _Solved, traits: Traits | None, first: _Solved) -> float:
+        """Return the negative log likelihood [nats] of all detections, and of their traits, up to a constant: by the
+        noise and the density of a `first` solution.
 
         An unassigned detection is of one of the landmarks that there are elsewhere, as in `_reassigned`.
         """
-        density = self._density
-        again = self._solved(solved.row, solved.estimate.pose)
-        self._density = density
-        spread = self._covariance(solved.row == NOBODY)
-        nobody = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(density)
+        again = self._solved(solved.row, solved.estimate.pose, first.noise)
+        spread = self._covariance(solved.row == NOBODY, first.noise)
+        nobody = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(first.density)
         numbers = np.where(again.smoother.problem.oriented, 6, 3)
         cost = again.now.cost + np.maximum(nobody, 0.0).sum()
         cost += 0.5 * self._rules.landmark_nats * numbers.sum()  # stated for two numbers
@@ -238,18 +249,18 @@ class SpatialAssociator:
         """Return the landmarks of all detections, from `known` ones on; those seen seldom are among them."""
         fewest = self.settings.fewest_sightings
         if known is None:
-            self._follow()
-            row = _without(self._row, np.zeros(len(self._of), dtype=np.bool_))
-            known = self._learned(row, _driven(self._problem))
+            row = self._follow()
+            row = _without(row, np.zeros(int(row.max(initial=-1)) + 1, dtype=np.bool_))
+            known = self._learned(row, _driven(self._problem), self._noise)
         else:
-            known = self._solved(known.row, known.estimate.pose)
+            known = self._solved(known.row, known.estimate.pose, self._noise)
         solved = self._merged(known)
         for _ in range(LAST_ROUNDS):
-            again = self._with_overlooked(self._reassigned(solved), solved.estimate.pose)
+            again = self._with_overlooked(self._reassigned(solved), solved)
             again = _without(again, np.bincount(again[again >= 0]) < fewest)
             if np.array_equal(again, solved.row):
                 break
-            solved = self._merged(self._learned(again, solved.estimate.pose))
+            solved = self._merged(self._learned(again, solved.estimate.pose, solved.noise))
         return solved
 
     def concluded(self, solved: _Solved) -> tuple[IntArray, LocalMap, sparse.csr_array, LooseDetections]:
@@ -262,7 +273,7 @@ class SpatialAssociator:
         together, _ = seen_together(self._view, row, views, len(kept), 0)
         some = np.flatnonzero((row == NOBODY) & (self._kind[:, -1] == UNKNOWN))
         at = se3.transform(solved.estimate.pose[self._problem.pose_row[some]], self._at[some])
-        loose = LooseDetections(some, at, self._wide_m()[some], self._kind[some, 0])
+        loose = LooseDetections(some, at, self._wide_m(solved.noise)[some], self._kind[some, 0])
         return row, self._local(solved, kept), together, loose
 
     def _local(self, solved: _Solved, rows: IntArray) -> LocalMap:
@@ -279,41 +290,43 @@ class SpatialAssociator:
         told = turned & (problem.symmetries.of[rows] == 0)  # what looks the same in several has none
         return LocalMap(place[:, :3], covariance, np.where(told[:, None], place[:, 3:], np.nan))
 
-    def _follow(self) -> None:
-        """Pair the detections of every view with the landmarks of the last seconds."""
+    def _follow(self) -> IntArray:
+        """(M,) landmarks: the detections of every view are paired with the landmarks of the last seconds."""
         problem, near = self._problem, _Nearby()
+        found = _Followed(np.full(len(self._view), NOBODY), np.zeros((0, 2), dtype=np.int64), self._traits.nothing(0))
         begin = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
         for frame, now_s in enumerate(problem.stamp_s.tolist()):
             near.keep(now_s - near.seen_s <= self._rules.forget_s)
             rows = np.arange(begin[frame], begin[frame + 1])
             views = [rows[self._view[rows] == one] for one in np.unique(self._view[rows])]
             if frame:
-                near = self._after_driving(near, frame, views[0])
+                near = self._after_driving(near, found, frame, views[0])
             for view in views:
-                self._use(near, view, self._match(near, view), now_s)
+                found = self._use(near, found, view, self._match(near, found, view), now_s)
+        return found.row
 
-    def _after_driving(self, before: _Nearby, frame: int, view: IntArray) -> _Nearby:
+    def _after_driving(self, before: _Nearby, found: _Followed, frame: int, view: IntArray) -> _Nearby:
         """The nearby landmarks after the motion to a frame; if none matches, after one with slipping wheels."""
         motion, lasted_s = self._problem.increment[frame - 1], self._problem.lasted_s[frame - 1]
         variance = lasted_s * np.array([self._noise.translation, self._noise.rotation]) ** 2
         near = before.driven(motion, variance)
-        match = self._match(near, view)
+        match = self._match(near, found, view)
         if len(match.source) or not len(near.row):
             return near
         for times in range(1, SLIPS + 1):
             slipped = before.driven(motion, self._rules.slip ** (2 * times) * variance)
-            other = self._match(slipped, view)
+            other = self._match(slipped, found, view)
             if len(other.source) and other.evidence >= match.evidence + times * self._rules.slip_nats:
                 return slipped
         return near
 
-    def _match(self, near: _Nearby, view: IntArray) -> _Match:
+    def _match(self, near: _Nearby, found: _Followed, view: IntArray) -> _Match:
         """Weigh the detections of a view against the nearby landmarks."""
-        rules = self._rules
+        rules, of = self._rules, found.of
         source, target = (each.ravel() for each in np.indices((len(view), len(near.row))))
-        kept = alike(self._kind[view[source]], self._of[near.row[target]])
+        kept = alike(self._kind[view[source]], of[near.row[target]])
         source, target = source[kept], target[kept]
-        own = self._covariance(view)
+        own = self._covariance(view, self._noise)
         innovation = self._at[view[source]] - near.place[target]
         at = 3 * target[:, None] + np.arange(3)
         spread = near.covariance[at[:, :, None], at[:, None, :]] + own[source]
@@ -328,8 +341,8 @@ class SpatialAssociator:
         # the neighbourhood of a tracked landmark is mapped; other gates may contain an unmapped one by chance
         followed = log_det <= least + 3.0 * math.log(rules.followed**2)
         new = np.log(np.where(followed, rules.unmet_share, 1.0) * self._density)
-        new -= rules.name_nats * same_name(self._kind[view[source]], self._of[near.row[target]])
-        new -= self._traits.same(self._traits.singly(view[source]), self._like.part(near.row[target]))
+        new -= rules.name_nats * same_name(self._kind[view[source]], of[near.row[target]])
+        new -= self._traits.same(self._traits.singly(view[source]), found.like.part(near.row[target]))
         pairs = Pairings(
             source, target, innovation, joint.reshape(3 * len(source), 3 * len(source)), new, len(view), least
         )
@@ -359,33 +372,32 @@ class SpatialAssociator:
         sigma = np.hypot(np.hypot(sigma, self._problem.sigma_rad[detection]), rules.turn_floor_rad)
         return np.asarray(~turned | ~self._turned[detection] | (angle <= rules.turn_sigmas * sigma))
 
-    def _use(self, near: _Nearby, view: IntArray, match: _Match, now_s: float) -> None:
+    def _use(self, near: _Nearby, found: _Followed, view: IntArray, match: _Match, now_s: float) -> _Followed:
         """Update with the certain pairings, and start landmarks from detections without candidates."""
-        known = view[match.source]
-        self._row[known] = near.row[match.target]
-        self._of[self._row[known]] = np.maximum(self._of[self._row[known]], self._kind[known])
+        row, of, known = found.row, found.of.copy(), view[match.source]
+        row[known] = near.row[match.target]
+        of[row[known]] = np.maximum(of[row[known]], self._kind[known])
         new = view[match.p_new >= self._rules.p_new]
-        self._row[new] = len(self._of) + np.arange(len(new))
-        self._of = np.vstack([self._of, self._kind[new]])
+        row[new] = len(of) + np.arange(len(new))
         seen = np.append(known, new)
-        self._like = self._traits.followed(self._like, self._row[seen], seen)
-        near.meet(self._row[new])
+        near.meet(row[new])
         at = np.append(match.target, len(near.row) - len(new) + np.arange(len(new)))
-        near.update(at, self._at[seen], self._covariance(seen))
+        near.update(at, self._at[seen], self._covariance(seen, self._noise))
         sigma = np.where(self._turned[seen], self._problem.sigma_rad[seen], 0.0)
         near.ways[:, at], near.sigma_rad[at], near.seen_s[at] = self._ways[:, seen], sigma, now_s
+        return _Followed(row, np.vstack([of, self._kind[new]]), self._traits.followed(found.like, row[seen], seen))
 
-    def _learned(self, row: IntArray, pose: FloatArray) -> _Solved:
-        """Solve for landmarks (M,) and noise, from poses that may be far off."""
+    def _learned(self, row: IntArray, pose: FloatArray, noise: SpatialNoise) -> _Solved:
+        """Solve for landmarks (M,) and noise, from poses that may be far off and noise levels."""
         problem = self._problem_of(row)
-        points = converged(problem.as_points(), first_places(problem, pose), self._noise, heavy_rounds=ROUNDS)
+        points = converged(problem.as_points(), first_places(problem, pose), noise, heavy_rounds=ROUNDS)
         noise = points.noise
         if problem.oriented.any():
             problem, start = _one_way(problem, points.estimate, points.now.weight)
             noise = converged(problem, start, noise, heavy_rounds=ROUNDS).noise
         caution = self._rules.odometry_caution
-        self._noise = replace(noise, translation=caution * noise.translation, rotation=caution * noise.rotation)
-        return self._solved(row, points.estimate.pose)
+        noise = replace(noise, translation=caution * noise.translation, rotation=caution * noise.rotation)
+        return self._solved(row, points.estimate.pose, noise)
 
     def _problem_of(self, row: IntArray) -> SpatialProblem:
         """The measurements of landmarks (M,)."""
@@ -397,20 +409,20 @@ class SpatialAssociator:
         symmetries = problem.symmetries[problem.place[used[first]]]
         return replace(problem, **some, place=row[used], oriented=turned, symmetries=symmetries)
 
-    def _solved(self, row: IntArray, pose: FloatArray) -> _Solved:
+    def _solved(self, row: IntArray, pose: FloatArray, noise: SpatialNoise) -> _Solved:
         """Solve for landmarks (M,), from poses that may be far off: positions first, then orientations, too."""
         problem = self._problem_of(row)
         points = SpatialSmoother(problem.as_points(), pose)
-        estimate, _ = points.optimum(first_places(problem, pose), self._noise, heavy=True)
-        estimate, now = points.optimum(estimate, self._noise, heavy=False)
+        estimate, _ = points.optimum(first_places(problem, pose), noise, heavy=True)
+        estimate, now = points.optimum(estimate, noise, heavy=False)
         smoother = points
         if problem.oriented.any():
             problem, estimate = _one_way(problem, estimate, now.weight)
             smoother = SpatialSmoother(problem, pose)
-            estimate, _ = smoother.optimum(estimate, self._noise, heavy=True)
-            estimate, now = smoother.optimum(estimate, self._noise, heavy=False)
-        self._density = landmark_density(estimate.place[:, :3], np.bincount(problem.place), self.settings)
-        solved = _Solved(row, estimate, smoother, now, now.cost)
+            estimate, _ = smoother.optimum(estimate, noise, heavy=True)
+            estimate, now = smoother.optimum(estimate, noise, heavy=False)
+        density = landmark_density(estimate.place[:, :3], np.bincount(problem.place), self.settings)
+        solved = _Solved(row, estimate, smoother, now, noise, density, now.cost)
         return replace(solved, cost=now.cost - self._traits.evidence(*self.of_visits(solved)))
 
     def _merged(self, solved: _Solved) -> _Solved:
@@ -419,7 +431,7 @@ class SpatialAssociator:
 
         def merge(pairs: list[tuple[int, int]]) -> _Solved | None:
             row = np.where(solved.row >= 0, merged_rows(pairs, len(among))[solved.row], NOBODY)
-            trial = self._solved(_without(row, ~among), solved.estimate.pose)
+            trial = self._solved(_without(row, ~among), solved.estimate.pose, solved.noise)
             numbers = np.where(solved.smoother.problem.oriented[[u for u, _ in pairs]], 6, 3)
             rise = accepted_rise(pairs, solution.sightings, numbers, self._rules)
             return trial if trial.cost - solved.cost <= rise else None
@@ -446,7 +458,7 @@ class SpatialAssociator:
         sightings, last_s = np.bincount(row, minlength=count), np.zeros(count)
         np.maximum.at(last_s, row, self._problem.stamp_s[self._problem.pose_row[used]])
         like = np.array([alike(each, of).mean() for each in of])
-        log_density = np.log(self._density * like)
+        log_density = np.log(solved.density * like)
         factorised = solved.smoother.factorised(solved.now)
         known = self._traits, self._likeness(solved)
         differences = _Differing(solved, factorised, self._shared_m2(solved), log_density, of, *known, rules)
@@ -458,16 +470,16 @@ class SpatialAssociator:
 
     def _shared_m2(self, solved: _Solved) -> FloatArray:
         """(L,) `shared_variance` of the landmarks."""
-        return shared_variance(self._wide_m(), solved.row, len(solved.estimate.place), self._rules)
+        return shared_variance(self._wide_m(solved.noise), solved.row, len(solved.estimate.place), self._rules)
 
-    def _covariance(self, rows: IntArray | BoolArray | slice) -> FloatArray:
-        """(K, 3, 3) covariances of positions in the frame of the robot, at the current noise levels."""
-        root = self._root[rows] * np.array([self._noise.across, self._noise.across, self._noise.along])
+    def _covariance(self, rows: IntArray | BoolArray | slice, noise: SpatialNoise) -> FloatArray:
+        """(K, 3, 3) covariances of positions in the frame of the robot."""
+        root = self._root[rows] * np.array([noise.across, noise.across, noise.along])
         return np.asarray(root @ np.swapaxes(root, 1, 2))
 
-    def _wide_m(self) -> FloatArray:
+    def _wide_m(self, noise: SpatialNoise) -> FloatArray:
         """(M,) standard deviation of a position, along its widest axis."""
-        return np.asarray(np.sqrt(np.linalg.eigvalsh(self._covariance(slice(None)))[:, 2]))
+        return np.asarray(np.sqrt(np.linalg.eigvalsh(self._covariance(slice(None), noise))[:, 2]))
 
     def _reassigned(self, solved: _Solved) -> IntArray:
         """(M,) the most probable landmark of every detection, given all poses; see `revise.reassigned`."""
@@ -475,7 +487,7 @@ class SpatialAssociator:
         tail_by, tail_share, widened = of_space.tail, of_space.tail_share, of_space.widened
         pose, place = solved.estimate.pose[self._problem.pose_row], solved.estimate.place
         at, gate = se3.transform(pose, self._at), gates(1, rules.gate_confidence, 3)[1]
-        reach = tail_by * math.sqrt(widened * gate) * float(np.quantile(self._wide_m(), 0.99))
+        reach = tail_by * math.sqrt(widened * gate) * float(np.quantile(self._wide_m(solved.noise), 0.99))
         seen, row = in_reach(place[:, :3], at, reach)
         kept = may_be_of(self._kind[seen], labels_of(self._kind, solved.row, len(place))[row])
         seen, row = seen[kept], row[kept]
@@ -484,10 +496,10 @@ class SpatialAssociator:
         kept = self._within(seen, np.stack([turned, turned]), oriented, np.zeros(len(seen)))
         seen, row = seen[kept], row[kept]
         axes = se3.rotation_of(pose[seen])
-        spread = widened * axes @ self._covariance(seen) @ np.swapaxes(axes, 1, 2)
+        spread = widened * axes @ self._covariance(seen, solved.noise) @ np.swapaxes(axes, 1, 2)
         off = at[seen] - place[row, :3]
         squared = np.einsum("ki,ki->k", off, np.linalg.solve(spread, off[..., None])[..., 0])
-        score = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(self._density)
+        score = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(solved.density)
         tail = math.log(tail_share) - 3.0 * math.log(tail_by) - 0.5 * squared / tail_by**2
         score += np.logaddexp(math.log(1.0 - tail_share) - 0.5 * squared, tail)
         score += self._traits.same(self._traits.singly(seen), self._likeness(solved).part(row))
@@ -500,12 +512,12 @@ class SpatialAssociator:
         visits = self._traits.of_visits(visit, len(landmark))
         return self._traits.of_landmarks(visits, landmark, len(solved.estimate.place))
 
-    def _with_overlooked(self, row: IntArray, pose: FloatArray) -> IntArray:
-        """(M,) landmarks, with a new one per cluster of unassigned detections from enough views."""
+    def _with_overlooked(self, row: IntArray, solved: _Solved) -> IntArray:
+        """(M,) landmarks, with a new one per cluster of unassigned detections from enough views, by a solution."""
         fewest = self.settings.fewest_sightings
         left = np.flatnonzero(row == NOBODY)
-        at = se3.transform(pose[self._problem.pose_row[left]], self._at[left])
-        found = lying_together(at, self._wide_m()[left], self._kind[left], self._view[left], fewest)
+        at = se3.transform(solved.estimate.pose[self._problem.pose_row[left]], self._at[left])
+        found = lying_together(at, self._wide_m(solved.noise)[left], self._kind[left], self._view[left], fewest)
         after = row.copy()
         for k, mine in enumerate(found):
             after[left[mine]] = int(row.max(initial=-1)) + 1 + k
@@ -601,11 +613,11 @@ def _with_traits(plain: SpatialAssociator, first: _Solved, features: FloatArray)
 
     def explain(_: _Solved, trial: _Solved) -> tuple[float, Traits | None]:
         own = learned(features, *plain.of_visits(trial), settings=plain.settings)
-        return plain.against(trial, own), own
+        return plain.against(trial, own, first), own
 
     def again(best: _Solved, traits: Traits) -> _Solved:
         right = traits.evidence(*plain.of_visits(best)) > 0.0  # else most of it is wrong
-        return plain.having(traits).finish(best if right else None)
+        return plain.having(traits, first).finish(best if right else None)
 
     within_visits = learned(features, *plain.of_visits(first), revisits=False, settings=plain.settings)
     return best_with_traits(first, within_visits, explain, again)
