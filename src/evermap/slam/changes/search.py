@@ -384,6 +384,8 @@ def _climb_from_many_starts(
         landmark = attempt % count
         label[:], onset[:], turns[:] = (0, 0, False) if attempt < count else best
         free = int(label.max()) + 1
+        if count <= attempt < 2 * count and free == 1:  # as if nothing had moved: as before
+            continue
         if attempt >= 2 * count and label[landmark] > 0:
             label[landmark] = 0
         elif label[landmark] > 0 or free > groups:
