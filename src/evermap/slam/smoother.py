@@ -15,6 +15,7 @@ from evermap.estimate.measurement import MeasurementFactors, Tied
 from evermap.estimate.robust import HEAVY_TAIL
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
+from evermap.estimate.sparse.tree import tree_of
 from evermap.slam.calibration import DELAY
 from evermap.slam.correlation import Lasting, lasting_errors
 from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES
@@ -186,11 +187,16 @@ class Smoother(Solver[Estimate]):
         Returns:
             (n, n) and (n,), n = 3 poses + 2 known landmarks + 11: information and right side of a step from `estimate`.
         """
-        now, graph = self.linearised(estimate), self.graph(estimate)
+        return exhausted(self.information_in_slices(estimate, poses))
+
+    def information_in_slices(self, estimate: Estimate, poses: IntArray) -> Slices[tuple[FloatArray, FloatArray]]:
+        """Return what `information` does, in slices."""
+        now, graph = (yield from self.linearised_in_slices(estimate)), (yield from self.graph_in_slices(estimate))
         structure, tree, n = graph.structure, graph.structure.system.tree, len(estimate.pose)
         kept = np.concatenate([poses, np.arange(n, len(tree.dim))])
-        above = System(tree.dim, structure.system.factors, structure.coordinate, kept)
-        solved = exhausted(above.factorised(now.values, extra=graph.held))
+        ordered = yield from tree_of(tree.dim, structure.system.factors, structure.coordinate, kept)
+        above = System(tree.dim, structure.system.factors, structure.coordinate, kept, ordered)
+        solved = yield from above.factorised(now.values, extra=graph.held)
         information, right = solved.information, solved.right
         information[-N_STATES:, -N_STATES:] += np.diag(graph.border.information)
         right[-N_STATES:] += now.border_right

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.config import ChangesConfig
+from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
-from evermap.slam.changes.evidence import Comparison, WindowEvidence
+from evermap.slam.changes.evidence import Comparison, WindowEvidence, dense_ms
 from evermap.slam.changes.gain import Tables, hypothesis_gain, log_onset, log_prior
 from evermap.slam.kernels import kernel
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -18,6 +19,8 @@ NEAR = 5.0
 """
 MOST_WIDENED = 30
 """so many of them at most."""
+MS_OF_CLIMB = 0.5
+"""Milliseconds of a usual core that a climb takes, about."""
 
 
 class Hypotheses(NamedTuple):
@@ -46,13 +49,14 @@ def find_changes(
     prior: ChangesConfig,
     *,
     start: Hypotheses | None = None,
-) -> Hypotheses:
-    """Return the most probable sets of changes, and all that were weighed on the way.
+) -> Slices[Hypotheses]:
+    """Return the most probable sets of changes, and all that were weighed on the way, in slices.
 
     Groups turn about the centroid of mapped positions (L, 2); the first hypothesis of `start` is one start of the
     search.
     """
     candidates = _candidates(evidence, comparison, len(position), prior, start)
+    yield dense_ms(len(comparison.pull))
     quadratic, linear = item_columns(evidence, comparison, position, n_windows, candidates)
     count = len(candidates)
     label, onset = np.zeros(count, np.int64), np.zeros(prior.most_groups + 1, np.int64)
@@ -68,10 +72,12 @@ def find_changes(
         log_onset(n_windows),
     )
     may_turn, weighed = prior.p_rotated > 0.0, Weighed.nothing(count, prior.most_groups)
-    _climb_from_many_starts((label, onset, turns), tables, weighed, may_turn=may_turn)
+    yield dense_ms(len(linear))
+    yield from _climb_from_many_starts((label, onset, turns), tables, weighed, may_turn=may_turn)
     near = weighed.ranked
     for k in near[weighed.gain[near] > weighed.best[0] - NEAR][:MOST_WIDENED]:
         _climb(weighed.label[k], weighed.onset[k], weighed.turns[k], may_turn, tables, weighed, False)
+        yield MS_OF_CLIMB
     ranked = weighed.ranked
     labels = np.zeros((len(ranked), len(position)), np.int64)
     labels[:, candidates] = weighed.label[ranked]
@@ -370,7 +376,7 @@ def _add_best_pair(
 
 def _climb_from_many_starts(
     start: tuple[IntArray, IntArray, BoolArray], tables: Tables, weighed: Weighed, *, may_turn: bool
-) -> None:
+) -> Slices[None]:
     """Climb from a start, from the best pair of every landmark, and from the best so far with each landmark changed.
 
     A static landmark changes by moving on its own, and by moving with the one that goes with it best. Not
@@ -379,6 +385,7 @@ def _climb_from_many_starts(
     label, onset, turns = start
     count, groups = len(label), len(onset) - 1
     best_gain = _climb(label, onset, turns, may_turn, tables, weighed, True)
+    yield MS_OF_CLIMB
     best = label.copy(), onset.copy(), turns.copy()
     for attempt in range(3 * count):
         landmark = attempt % count
@@ -395,5 +402,6 @@ def _climb_from_many_starts(
         else:
             _add_best_pair(landmark, free, may_turn, tables, label, onset, turns)
         gain = _climb(label, onset, turns, may_turn, tables, weighed, True)
+        yield MS_OF_CLIMB
         if gain > best_gain:
             best, best_gain = (label.copy(), onset.copy(), turns.copy()), gain
