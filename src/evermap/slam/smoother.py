@@ -24,6 +24,7 @@ from evermap.slam.linearise import (
     OF_INTERVAL,
     DetectionFactors,
     OdometryFactors,
+    PlacePriors,
     Readings,
     StartFactor,
     build_place_priors,
@@ -60,6 +61,8 @@ class Smoother(Solver[Estimate]):
         self.heavy = heavy
         self.robust = robust
         self._structure: tuple[BoolArray, GraphStructure] | None = None
+        self._priors: tuple[BoolArray, tuple[PlacePriors, ...]] | None = None
+        self._blocks: tuple[BoolArray, tuple[FactorBlock[Estimate], ...]] | None = None
 
     @property
     def states_sigma(self) -> FloatArray:
@@ -72,7 +75,7 @@ class Smoother(Solver[Estimate]):
         Another `problem` may differ only in its start and in the prior of the calibration states.
         """
         other = Smoother(self.problem if problem is None else problem, noise, heavy=heavy, robust=self.robust)
-        other._structure = self._structure
+        other._structure, other._priors = self._structure, self._priors
         return other
 
     def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6) -> Estimate:
@@ -215,7 +218,14 @@ class Smoother(Solver[Estimate]):
 
     def blocks(self, known: BoolArray) -> tuple[FactorBlock[Estimate], ...]:
         """Return the factors: `ODOMETRY`, `DETECTIONS`, the start, and priors of the `known` (L,) landmarks."""
+        if self._blocks is None or not np.array_equal(self._blocks[0], known):
+            self._blocks = known, self._build_blocks(known)
+        return self._blocks[1]
+
+    def _build_blocks(self, known: BoolArray) -> tuple[FactorBlock[Estimate], ...]:
         problem, noise, n = self.problem, self.noise, len(self.problem.stamp_s)
+        if self._priors is None or not np.array_equal(self._priors[0], known):
+            self._priors = known, build_place_priors(problem, known, n)
         rank, sensor = np.cumsum(known) - 1, n + int(known.sum())
         seen = Readings(
             problem.pose_row,
@@ -232,7 +242,7 @@ class Smoother(Solver[Estimate]):
             OdometryFactors(problem, noise.odometry**2, sensor + 1),
             DetectionFactors(seen, known, n, sensor),
             StartFactor(problem.start_pose, problem.start_information),
-            *build_place_priors(problem, known, n),
+            *self._priors[1],
             *(self._measured(tied, known, n + rank) for tied in problem.measurements),
         )
 

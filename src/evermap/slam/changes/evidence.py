@@ -17,6 +17,7 @@ from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
 from evermap.estimate.sparse.system import Slices
+from evermap.geometry import se2
 from evermap.slam.batch import middles, sighted_at
 from evermap.slam.calibration import SLOPE, CalibrationPrior
 from evermap.slam.kernels import N_STATES
@@ -24,7 +25,7 @@ from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.types import BoolArray, FloatArray, IntArray
 
-MS_OF_DETECTION, MS_OF_CUBE = 1e-3, 3e-8
+MS_OF_DETECTION, MS_OF_CUBE = 1e-3, 1e-7
 """Milliseconds of a usual core for each detection that is sorted, and each cubed number of a dense system."""
 TINY_INFORMATION = 1e-6
 """Of poses at the borders of windows that nothing holds [1/m^2]: a kilometre."""
@@ -154,11 +155,13 @@ def landmark_evidence(
         np.column_stack([information[np.ix_(others, mine)], right[others]]),
     )
     cross = information[np.ix_(mine, others)]
-    held_somewhere = information + TINY_INFORMATION * np.eye(len(right))
-    covariance = np.asarray(np.linalg.inv(held_somewhere)[np.ix_(states, states)], dtype=np.float64)
-    _, _, scale, log_sigma = prior.split_scale(estimate.states, covariance)
-    if not sized:
-        scale, log_sigma = 1.0, 0.0
+    scale, log_sigma = 1.0, 0.0
+    if sized:
+        yield dense_ms(len(right))
+        held_somewhere = information + TINY_INFORMATION * np.eye(len(right))
+        covariance = np.linalg.solve(held_somewhere, np.eye(len(right))[:, states])[states]
+        _, _, scale, log_sigma = prior.split_scale(estimate.states, covariance)
+    yield dense_ms(len(right))
     centre = estimate.landmark[estimate.known].mean(axis=0)
     position = np.concatenate([piece.position for piece in pieces])
     return WindowEvidence(
@@ -200,11 +203,13 @@ def compare(evidence: WindowEvidence, mean: FloatArray, covariance: FloatArray, 
     column = np.searchsorted(seen, evidence.landmark)
     count, n_seen = len(evidence.landmark), len(seen)
     anchor = np.where(mapped[:, None], mean, evidence.first_seen(mean))[seen]
-    spread = np.zeros((2 * count, 2 * n_seen + 1))  # unknowns behind all copies: places and size
-    rows = np.arange(count)
-    spread[2 * rows, 2 * column] = spread[2 * rows + 1, 2 * column + 1] = 1.0
+    # unknowns behind all copies: places and size
     offset = evidence.position - anchor[column]
-    spread[:, -1] = evidence.log_scale_sigma * (evidence.position - evidence.position.mean(axis=0)).ravel()
+    size = evidence.log_scale_sigma * (evidence.position - evidence.position.mean(axis=0)).ravel()
+    places = sparse.csr_array(
+        (np.ones(2 * count), (np.arange(2 * count), se2.xy_rows(column))), shape=(2 * count, 2 * n_seen)
+    )
+    spread = sparse.csr_array(sparse.hstack([places, size[:, None]]))
     prior = np.zeros((2 * n_seen + 1, 2 * n_seen + 1))
     log_prior_determinant = 0.0
     for k in np.flatnonzero(mapped[seen]):
@@ -215,7 +220,7 @@ def compare(evidence: WindowEvidence, mean: FloatArray, covariance: FloatArray, 
     # without a map the whole is free to be anywhere
     prior[np.diag_indices(2 * n_seen)] += TINY_INFORMATION
     pull = evidence.pull + evidence.information @ offset.ravel()
-    weighted = evidence.information @ spread
+    weighted = np.asarray((spread.T @ evidence.information).T)
     inner = cho_factor(spread.T @ weighted + prior)
     solved = cho_solve(inner, np.column_stack([weighted.T, spread.T @ pull]))
     precision = evidence.information - weighted @ solved[:, :-1]

@@ -236,6 +236,7 @@ class Joint(Method):
             comparison = compare(soft, given.mean, given.covariance, given.given)
             yield dense_ms(len(soft.pull))
             swap = likeliest_swap(soft, comparison, given, self._prior.p_swapped)
+            yield dense_ms(len(soft.pull))
             if swap is None:
                 break
             other = with_swap(given, swap.first, swap.second)
@@ -398,7 +399,7 @@ def likeliest_swap(evidence: WindowEvidence, comparison: Comparison, given: Give
     count = len(candidates)
     if count < 2:
         return None
-    quadratic, linear = item_columns(evidence, comparison, given.mean, 1, candidates)
+    quadratic, linear = exhausted(item_columns(evidence, comparison, given.mean, 1, candidates))
     precision = quadratic.reshape(count, 4, count, 4)[:, :2, :, :2]
     pull = linear.reshape(count, 4)[:, :2]
     place = given.mean[candidates]

@@ -9,7 +9,7 @@ import numpy as np
 from evermap.config import ChangesConfig
 from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
-from evermap.slam.changes.evidence import Comparison, WindowEvidence, dense_ms
+from evermap.slam.changes.evidence import Comparison, WindowEvidence
 from evermap.slam.changes.gain import Tables, hypothesis_gain, log_onset, log_prior
 from evermap.slam.kernels import kernel
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -19,8 +19,8 @@ NEAR = 5.0
 """
 MOST_WIDENED = 30
 """so many of them at most."""
-MS_OF_CLIMB = 0.5
-"""Milliseconds of a usual core that a climb takes, about."""
+MS_OF_CLIMB, MS_OF_CANDIDATE, MS_OF_NUMBER = 0.5, 0.01, 2e-6
+"""Milliseconds of a usual core: of a climb, about, of a landmark by itself, and of a pass over a number of a table."""
 
 
 class Hypotheses(NamedTuple):
@@ -56,8 +56,8 @@ def find_changes(
     search.
     """
     candidates = _candidates(evidence, comparison, len(position), prior, start)
-    yield dense_ms(len(comparison.pull))
-    quadratic, linear = item_columns(evidence, comparison, position, n_windows, candidates)
+    yield MS_OF_CANDIDATE * len(position)
+    quadratic, linear = yield from item_columns(evidence, comparison, position, n_windows, candidates)
     count = len(candidates)
     label, onset = np.zeros(count, np.int64), np.zeros(prior.most_groups + 1, np.int64)
     turns = np.zeros(prior.most_groups + 1, bool)
@@ -72,7 +72,6 @@ def find_changes(
         log_onset(n_windows),
     )
     may_turn, weighed = prior.p_rotated > 0.0, Weighed.nothing(count, prior.most_groups)
-    yield dense_ms(len(linear))
     yield from _climb_from_many_starts((label, onset, turns), tables, weighed, may_turn=may_turn)
     near = weighed.ranked
     for k in near[weighed.gain[near] > weighed.best[0] - NEAR][:MOST_WIDENED]:
@@ -107,8 +106,8 @@ def _candidates(
 
 def item_columns(
     evidence: WindowEvidence, comparison: Comparison, position: FloatArray, n_windows: int, candidates: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return `T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'.
+) -> Slices[tuple[FloatArray, FloatArray]]:
+    """Return `T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'; in slices.
 
     With one window for all of the session's, the items are 'this candidate, always'.
     """
@@ -129,12 +128,21 @@ def item_columns(
     linear = np.cumsum(linear.reshape(size)[::-1], axis=0)[::-1]
     half = np.einsum("rkqm,qmb->rkqb", precision, columns)
     blocks = np.einsum("rka,rkqb->raqb", columns, half)
+    yield MS_OF_NUMBER * blocks.size
     quadratic = np.zeros((n_windows * len(candidates), 4, n_windows * len(candidates), 4))
-    np.add.at(quadratic.transpose(0, 2, 1, 3), (item[:, None], item[None, :]), blocks.transpose(0, 2, 1, 3))
+    if len(np.unique(item)) == len(item):
+        quadratic[item[:, None], :, item[None, :], :] = blocks.transpose(0, 2, 1, 3)
+    else:
+        np.add.at(quadratic.transpose(0, 2, 1, 3), (item[:, None], item[None, :]), blocks.transpose(0, 2, 1, 3))
+    yield MS_OF_NUMBER * (blocks.size + quadratic.size)
     quadratic = quadratic.reshape(*size, *size)
-    for axis in (0, 3):
-        quadratic = np.flip(np.cumsum(np.flip(quadratic, axis), axis=axis), axis)
-    return np.ascontiguousarray(quadratic.reshape(linear.size, linear.size)), linear.ravel()
+    for later in range(n_windows - 1, 0, -1):
+        quadratic[later - 1] += quadratic[later]
+    yield MS_OF_NUMBER * quadratic.size
+    for later in range(n_windows - 1, 0, -1):
+        quadratic[:, :, :, later - 1] += quadratic[:, :, :, later]
+    yield MS_OF_NUMBER * quadratic.size
+    return quadratic.reshape(linear.size, linear.size), linear.ravel()
 
 
 WORTH_KEEPING = 25.0
