@@ -291,9 +291,17 @@ def build_place_priors(problem: Problem, known: BoolArray, places: int) -> tuple
     first_seen = np.full(len(known), -1)
     first_seen[problem.landmark_row[::-1]] = problem.pose_row[::-1]
     found: dict[tuple[int, int], list[tuple[IntArray, FloatArray]]] = {}
-    for part in np.split(given, 1 + np.flatnonzero(np.diff(group[given]))):
-        mine = part.astype(np.int64)
-        size, direction = np.linalg.eigh(between_rows(information, se2.xy_rows(mine)).toarray())
+    parts = np.split(given, 1 + np.flatnonzero(np.diff(group[given])))
+    alone = np.array([part[0] for part in parts if len(part) == 1], dtype=np.int64)
+    own = np.zeros((len(alone), 2, 2))
+    own[:, 0, 0], own[:, 1, 1] = information.diagonal()[2 * alone], information.diagonal()[2 * alone + 1]
+    own[:, 0, 1], own[:, 1, 0] = information.diagonal(1)[2 * alone], information.diagonal(-1)[2 * alone]
+    together = [part.astype(np.int64) for part in parts if len(part) > 1]
+    tied = (between_rows(information, se2.xy_rows(part)).toarray() for part in together)
+    for mine, (size, direction) in (
+        *zip(alone[:, None], zip(*np.linalg.eigh(own), strict=True), strict=True),
+        *zip(together, map(np.linalg.eigh, tied), strict=True),
+    ):
         kept = size > 1e-12 * size[-1]
         root = np.sqrt(size[kept])[:, None] * direction[:, kept].T
         found.setdefault((len(mine), len(root)), []).append((mine, root))

@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from evermap.estimate.sparse.system import Slices
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray, MapChange
 
@@ -85,6 +86,17 @@ class Method(Protocol):
         """Return whether `revise` may change this problem before the end; else it is solved beside the stream."""
         del problem
         return True
+
+    def beside(self) -> Method | None:
+        """Return a copy that revises in slices while this one assigns; None if the stream has to wait for `revise`."""
+        return None
+
+    def revise_in_slices(
+        self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool
+    ) -> Slices[Explanation]:
+        """Return what `revise` does, in slices."""
+        yield 0.0
+        return self.revise(problem, estimate, noise, heavy=heavy, final=final)
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
         """Return the best explanation of everything so far, from the optimum with the places decided so far.

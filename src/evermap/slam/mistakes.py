@@ -10,10 +10,11 @@ come nearer by it.
 from __future__ import annotations
 
 from collections.abc import Container
+from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 from math import inf, log, pi
-from typing import TypeAlias
+from typing import Self, TypeAlias
 
 import numpy as np
 
@@ -134,6 +135,8 @@ _AXES = tuple(
 _DELAYS_S = (*np.arange(1.0, 10.0, 0.5).tolist(), *np.arange(10.0, 61.0, 1.0).tolist())
 AT_ONCE = 32
 """Number of corrections that are tried together: arrays of a megabyte."""
+SHARES = 16
+"""Parts of the pairs, half of which may rule out candidates one after the other."""
 LEAST_STEP_S = 0.4
 """Minimum clock difference that is reported; smaller ones are estimated by the calibration."""
 _FACTORS = tuple(10.0**power for power in np.arange(-4.0, 4.01, 0.1) if abs(power) > 0.25)
@@ -167,6 +170,9 @@ def likeliest(pairs: Pairs, undone: Mistake, told: Container[str], settings: Che
     def after(mistakes: list[Mistake]) -> FloatArray:
         return pairs.residual(*(mistake.after(undone) for mistake in mistakes))
 
+    candidates = _possible(pairs, candidates, undone, before, settings)
+    if not candidates:
+        return None
     parts = [candidates[row : row + AT_ONCE] for row in range(0, len(candidates), AT_ONCE)]
     losses = np.concatenate([_nearer(pairs, before, after(part), settings) for part in parts])
     best, least = candidates[int(np.argmin(losses))], losses.min()
@@ -184,6 +190,28 @@ def likeliest(pairs: Pairs, undone: Mistake, told: Container[str], settings: Che
     else:
         return best
     return near[int(np.argmin(_loss(after(near), settings)))]
+
+
+def _possible(
+    pairs: Pairs, candidates: list[Mistake], undone: Mistake, before: FloatArray, settings: CheckConfig
+) -> list[Mistake]:
+    """Return the candidates but for those that a share of the pairs shows to gain too little: `_nearer` gives them inf.
+
+    Losses are no less than 0, so that of some pairs bounds the gain over all.
+    """
+    most = len(before[0]) * float(_loss(before, settings)) - settings.gain
+    spent = np.zeros(len(candidates))
+    for share in range(SHARES // 2):
+        part = pairs.among(slice(share, None, SHARES))
+        for row in range(0, len(candidates), SHARES * AT_ONCE):
+            tried = slice(row, row + SHARES * AT_ONCE)
+            after = part.residual(*(mistake.after(undone) for mistake in candidates[tried]))
+            spent[tried] += after.shape[-1] * _loss(after, settings)
+        possible = np.flatnonzero(spent < most).tolist()
+        candidates, spent = [candidates[row] for row in possible], spent[possible]
+        if not candidates:
+            break
+    return candidates
 
 
 def _nearer(pairs: Pairs, before: FloatArray, after: FloatArray, settings: CheckConfig) -> FloatArray:
@@ -260,12 +288,20 @@ class PlanarPairs:
 
     def __init__(self, recording: Recording, first: IntArray, second: IntArray) -> None:
         detections = recording.detections
-        self._odometry = recording.odometry
+        self._odometry, self._tracks = recording.odometry, dict[tuple[float, float], FloatArray]()
         self._mount = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64)
         stamp_s = recording.frames.stamp_s[detections.frame]
         self._stamp_s = stamp_s[first], stamp_s[second]
         self._range_m = detections.range_m[first], detections.range_m[second]
         self._bearing_rad = detections.bearing_rad[first], detections.bearing_rad[second]
+
+    def among(self, rows: slice) -> Self:
+        """Return some of the pairs."""
+        part = copy(self)
+        part._stamp_s = self._stamp_s[0][rows], self._stamp_s[1][rows]
+        part._range_m = self._range_m[0][rows], self._range_m[1][rows]
+        part._bearing_rad = self._bearing_rad[0][rows], self._bearing_rad[1][rows]
+        return part
 
     @property
     def still(self) -> bool:
@@ -300,10 +336,12 @@ class PlanarPairs:
         delay_s = np.array([each.delay_s for each in mistakes])
         motion = np.empty((len(mistakes), len(self._stamp_s[0]), 3))
         for row, (forward, turn) in enumerate(ways.tolist()):
-            track, mine = _dead_reckoned(self._odometry, forward, turn), way == row
+            if (forward, turn) not in self._tracks:
+                self._tracks[forward, turn] = _dead_reckoned(self._odometry, forward, turn)
+            mine = way == row
             delays_s, which = np.unique(delay_s[mine], return_inverse=True)
             at_s = np.stack(self._stamp_s)[:, None] + delays_s[:, None]
-            pose = np.stack([np.interp(at_s, self._odometry.stamp_s, column) for column in track], axis=-1)
+            pose = _interpolated(at_s, self._odometry.stamp_s, self._tracks[forward, turn])
             motion[mine] = se2.between(*se2.compose(pose, self._mount))[which]
         return motion
 
@@ -326,6 +364,14 @@ class SpatialPairs:
         self._mount = mount[detections.sensor[first]], mount[detections.sensor[second]]
         position = positions_of(recording)
         self._seen = position[first], position[second]
+
+    def among(self, rows: slice) -> Self:
+        """Return some of the pairs."""
+        part = copy(self)
+        part._stamp_s = self._stamp_s[0][rows], self._stamp_s[1][rows]
+        part._mount = self._mount[0][rows], self._mount[1][rows]
+        part._seen = self._seen[0][rows], self._seen[1][rows]
+        return part
 
     @property
     def still(self) -> bool:
@@ -419,7 +465,7 @@ def _cheapest(loss: FloatArray, step: float) -> IntArray:
 
 
 def _dead_reckoned(odometry: Odometry, forward: float, turn: float) -> FloatArray:
-    """(3, N) x, y and unwrapped heading at the odometry's stamps, with factors on speed and turn rate."""
+    """(N, 3) x, y and unwrapped heading at the odometry's stamps, with factors on speed and turn rate."""
     step_s = np.diff(odometry.stamp_s)
     turned = np.append(0.0, np.cumsum(turn * odometry.angular_radps[:-1] * step_s))
     heading = turned[:-1] + 0.5 * np.diff(turned)
@@ -427,7 +473,16 @@ def _dead_reckoned(odometry: Odometry, forward: float, turn: float) -> FloatArra
     aside = odometry.lateral_mps[:-1] * step_s
     x = np.append(0.0, np.cumsum(ahead * np.cos(heading) - aside * np.sin(heading)))
     y = np.append(0.0, np.cumsum(ahead * np.sin(heading) + aside * np.cos(heading)))
-    return np.stack([x, y, turned])
+    return np.column_stack([x, y, turned])
+
+
+def _interpolated(at_s: FloatArray, stamp_s: FloatArray, track: FloatArray) -> FloatArray:
+    """(..., 3) a track (N, 3) at stamps (...), its ends beyond them, as `np.interp` of each column."""
+    after = np.clip(np.searchsorted(stamp_s, at_s), 1, len(stamp_s) - 1)
+    lasted_s = np.maximum(stamp_s[after] - stamp_s[after - 1], 1e-300)  # stamps may be equal
+    share = np.clip((at_s - stamp_s[after - 1]) / lasted_s, 0.0, 1.0)
+    low = track[after - 1]
+    return np.asarray(low + share[..., None] * (track[after] - low))
 
 
 @dataclass(frozen=True, slots=True)

@@ -457,18 +457,22 @@ class Marginals:
         at = tree.in_border[self._block.border] + np.arange(N_STATES)
         return self._solved.border_covariance()[np.ix_(at, at)]
 
-    @property
+    @cached_property
     def with_states(self) -> FloatArray:
         """(G, 11) covariance of everything with the calibration states: poses, known landmarks, states."""
-        begin, part = self._solved.system.tree.begin, self._block
+        tree, part = self._solved.system.tree, self._block
+        begin = tree.begin
         first, states = begin[part.first], begin[part.border]
         rows = [
             np.arange(first, first + 3 * self._n),
             (begin[part.landmarks][:, None] + np.arange(2)).ravel(),
             np.arange(states, states + N_STATES),
         ]
-        found: FloatArray = self._solved.columns(part.border + np.arange(2))[np.concatenate(rows)]
-        return found
+        if not self._solved.system.has_border_throughout:
+            found: FloatArray = self._solved.columns(part.border + np.arange(2))[np.concatenate(rows)]
+            return found
+        at = int(tree.in_border[part.border])
+        return self._held.with_border[np.concatenate(rows), at : at + N_STATES]
 
     @property
     def explained_odometry(self) -> FloatArray:

@@ -15,6 +15,7 @@ from evermap.estimate.measurement import MeasurementFactors, Tied
 from evermap.estimate.robust import HEAVY_TAIL
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
+from evermap.estimate.sparse.tree import tree_of
 from evermap.slam.calibration import DELAY
 from evermap.slam.correlation import Lasting, lasting_errors
 from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES
@@ -23,6 +24,7 @@ from evermap.slam.linearise import (
     OF_INTERVAL,
     DetectionFactors,
     OdometryFactors,
+    PlacePriors,
     Readings,
     StartFactor,
     build_place_priors,
@@ -59,6 +61,8 @@ class Smoother(Solver[Estimate]):
         self.heavy = heavy
         self.robust = robust
         self._structure: tuple[BoolArray, GraphStructure] | None = None
+        self._priors: tuple[BoolArray, tuple[PlacePriors, ...]] | None = None
+        self._blocks: tuple[BoolArray, tuple[FactorBlock[Estimate], ...]] | None = None
 
     @property
     def states_sigma(self) -> FloatArray:
@@ -71,7 +75,7 @@ class Smoother(Solver[Estimate]):
         Another `problem` may differ only in its start and in the prior of the calibration states.
         """
         other = Smoother(self.problem if problem is None else problem, noise, heavy=heavy, robust=self.robust)
-        other._structure = self._structure
+        other._structure, other._priors = self._structure, self._priors
         return other
 
     def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6) -> Estimate:
@@ -186,11 +190,16 @@ class Smoother(Solver[Estimate]):
         Returns:
             (n, n) and (n,), n = 3 poses + 2 known landmarks + 11: information and right side of a step from `estimate`.
         """
-        now, graph = self.linearised(estimate), self.graph(estimate)
+        return exhausted(self.information_in_slices(estimate, poses))
+
+    def information_in_slices(self, estimate: Estimate, poses: IntArray) -> Slices[tuple[FloatArray, FloatArray]]:
+        """Return what `information` does, in slices."""
+        now, graph = (yield from self.linearised_in_slices(estimate)), (yield from self.graph_in_slices(estimate))
         structure, tree, n = graph.structure, graph.structure.system.tree, len(estimate.pose)
         kept = np.concatenate([poses, np.arange(n, len(tree.dim))])
-        above = System(tree.dim, structure.system.factors, structure.coordinate, kept)
-        solved = exhausted(above.factorised(now.values, extra=graph.held))
+        ordered = yield from tree_of(tree.dim, structure.system.factors, structure.coordinate, kept)
+        above = System(tree.dim, structure.system.factors, structure.coordinate, kept, ordered)
+        solved = yield from above.factorised(now.values, extra=graph.held)
         information, right = solved.information, solved.right
         information[-N_STATES:, -N_STATES:] += np.diag(graph.border.information)
         right[-N_STATES:] += now.border_right
@@ -209,7 +218,14 @@ class Smoother(Solver[Estimate]):
 
     def blocks(self, known: BoolArray) -> tuple[FactorBlock[Estimate], ...]:
         """Return the factors: `ODOMETRY`, `DETECTIONS`, the start, and priors of the `known` (L,) landmarks."""
+        if self._blocks is None or not np.array_equal(self._blocks[0], known):
+            self._blocks = known, self._build_blocks(known)
+        return self._blocks[1]
+
+    def _build_blocks(self, known: BoolArray) -> tuple[FactorBlock[Estimate], ...]:
         problem, noise, n = self.problem, self.noise, len(self.problem.stamp_s)
+        if self._priors is None or not np.array_equal(self._priors[0], known):
+            self._priors = known, build_place_priors(problem, known, n)
         rank, sensor = np.cumsum(known) - 1, n + int(known.sum())
         seen = Readings(
             problem.pose_row,
@@ -226,7 +242,7 @@ class Smoother(Solver[Estimate]):
             OdometryFactors(problem, noise.odometry**2, sensor + 1),
             DetectionFactors(seen, known, n, sensor),
             StartFactor(problem.start_pose, problem.start_information),
-            *build_place_priors(problem, known, n),
+            *self._priors[1],
             *(self._measured(tied, known, n + rank) for tied in problem.measurements),
         )
 

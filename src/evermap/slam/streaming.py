@@ -84,7 +84,7 @@ class StreamingSlam:
         self._start_noise = self._noise = noise
         self._settings, self._robust, self._estimate_noise = settings, settings.robust, settings.estimate_noise
         self._method = Static(len(problem.landmark_mean)) if method is None else method
-        self._batch = Batch(prior, noise, self._method, settings)
+        self._named = problem.landmark_row
         self._filter = SessionFilter(self._problem, noise, robust=settings.robust)
         self._job: Slices[None] | None = None
         self._owed_ms = 0.0
@@ -167,6 +167,7 @@ class StreamingSlam:
             self.online_covariance = grown(self.online_covariance, room)
         landmark = grown(self._landmark, len(problem.landmark_mean))
         self._adopt(replace(problem, prior=self._problem.prior), landmark)
+        self._named = problem.landmark_row
         self._filter.problem = self._problem
 
     def _plan(self, detections: IntArray) -> None:
@@ -183,9 +184,11 @@ class StreamingSlam:
             self._job = self._relinearised(learn=False)
 
     def _a_frame_ms(self) -> float:
-        """Work on a relinearisation in a frame: a few slices; all if not paced, or where it may change places."""
-        at_once = self._job is not None and (not self._paced or self._method.revises(self._problem))
-        return np.inf if at_once else SLICES_A_FRAME
+        """Work on a relinearisation in a frame: a few slices; all if not paced, or where no place may change meanwhile."""
+        if self._job is None:
+            return SLICES_A_FRAME
+        waits = self._method.revises(self._problem) and self._method.beside() is None
+        return SLICES_A_FRAME if self._paced and not waits else np.inf
 
     def work(self, most_ms: float = np.inf) -> None:
         """Advance a relinearisation by what the last frame owes to it, up to the slice that reaches `most_ms`."""
@@ -204,30 +207,38 @@ class StreamingSlam:
             self._enter_map()
         self._job = None
         problem, estimate = self._problem.until(self._n_poses), self._filter.estimate()
+        batch = Batch(self._prior, self._start_noise, self._method, self._settings)
         if self._framed and not self._aligned:
-            return self._batch.solved(SolvedPart(problem, estimate, self._noise, fits=True), None, self._framed)
-        return self._batch.finished(problem, estimate, self._noise, aligned=self._aligned)
+            return batch.solved(SolvedPart(problem, estimate, self._noise, fits=True), None, self._framed)
+        return batch.finished(problem, estimate, self._noise, aligned=self._aligned)
 
     def _assign(self, row: int, detections: IntArray) -> None:
         """Ask the method for the places of the coming pose's detections."""
+        problem = self._assigned(self._problem, self._method, self._filter, self._landmark, row, detections)
+        if problem is not self._problem:
+            self._adopt(problem, grown(self._landmark, len(problem.landmark_mean)))
+            self._filter.problem = self._problem
+
+    @staticmethod
+    def _assigned(
+        problem: Problem, method: Method, running: SessionFilter, landmark: FloatArray, row: int, detections: IntArray
+    ) -> Problem:
+        """Return the problem with the places that a method has for the detections of the pose after a filter's."""
 
         def distances(of: IntArray, places: IntArray) -> tuple[FloatArray, FloatArray]:
             squared, log_volume = np.full((2, len(of)), np.nan)
-            known = np.isfinite(self._landmark[places, 0])
+            known = np.isfinite(landmark[places, 0])
             if row > 0 and known.any():
-                squared[known], log_volume[known] = self._filter.distances(of[known], places[known])
+                squared[known], log_volume[known] = running.distances(of[known], places[known])
             return squared, log_volume
 
-        before = self._problem.landmark_row[detections]
-        places = self._method.assign(self._problem, row, detections, distances)
+        before = problem.landmark_row[detections]
+        places = method.assign(problem, row, detections, distances)
         if not np.count_nonzero(places != before):
-            return
-        landmark_row = self._problem.landmark_row.copy()
+            return problem
+        landmark_row = problem.landmark_row.copy()
         landmark_row[detections] = places
-        count = max(len(self._landmark), int(places.max()) + 1)
-        problem = replace(self._problem, landmark_row=landmark_row).with_places(count)
-        self._adopt(problem, grown(self._landmark, count))
-        self._filter.problem = self._problem
+        return replace(problem, landmark_row=landmark_row).with_places(max(len(landmark), int(places.max()) + 1))
 
     def _adopt(self, problem: Problem, landmark: FloatArray) -> None:
         """Other places from here on, perhaps more of them or fewer; the first are the landmarks as before."""
@@ -260,16 +271,17 @@ class StreamingSlam:
 
     def _meet_new_landmarks(self, running: SessionFilter, landmark: FloatArray, detections: IntArray) -> None:
         """Initialise landmarks that are seen for the first time: from the map, or from this sighting."""
-        new = np.isnan(landmark[self._problem.landmark_row[detections], 0])
+        problem = running.problem
+        new = np.isnan(landmark[problem.landmark_row[detections], 0])
         for m in detections[new] if np.count_nonzero(new) else ():
-            j = self._problem.landmark_row[m]
+            j = problem.landmark_row[m]
             if np.isfinite(landmark[j, 0]):  # twice in this frame
                 continue
-            if self._problem.mapped[j]:
-                prior = self._problem.conditional_prior(j, np.isfinite(landmark[:, 0]))
-                landmark[j] = prior.place(landmark, self._problem.landmark_mean)
+            if problem.mapped[j]:
+                prior = problem.conditional_prior(j, np.isfinite(landmark[:, 0]))
+                landmark[j] = prior.place(landmark, problem.landmark_mean)
             else:
-                reading, mount = self._problem.reading[m], self._problem.mount
+                reading, mount = problem.reading[m], problem.mount
                 landmark[j] = sighted_at(running.pose, reading, running.states, mount)
 
     def _relinearised(self, *, learn: bool) -> Slices[None]:
@@ -278,6 +290,7 @@ class StreamingSlam:
         With `learn`, also vote on places, ask the method, and learn the noise.
         """
         self._relinearised_at = n = self._n_poses
+        method, revised = self._method, None
         problem, estimate = self._problem.until(n), self._filter.estimate()
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
         if learn and self._robust:
@@ -285,20 +298,20 @@ class StreamingSlam:
         estimate, marginals = yield from smoother.solved_in_slices(
             estimate, iterations=STEPS_A_ROUND, tolerance=NEAR_NOISE if learn else NEAR
         )
-        if learn and self._method.revises(problem):
-            revision = self._method.revise(problem, estimate, self._noise, heavy=True, final=False)
+        if learn and method.revises(problem):
+            method = method.beside() or method  # frames that come meanwhile are assigned as before
+            revision = yield from method.revise_in_slices(problem, estimate, self._noise, heavy=True, final=False)
             if revision.problem is not problem:
                 problem, estimate = revision.problem, revision.estimate
                 smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
                 marginals = yield from smoother.marginals_in_slices(estimate)
-                coming = self._problem.landmark_row[len(problem.landmark_row) :]
-                whole = replace(
+                coming = self._named[len(problem.landmark_row) :]
+                revised = replace(
                     self._problem,
                     landmark_row=np.append(problem.landmark_row, coming),
                     landmark_mean=problem.landmark_mean,
                     landmark_information=problem.landmark_information,
                 )
-                self._adopt(whole, estimate.landmark)
         if learn and self._estimate_noise:
             yield from marginals.in_slices()
             weights = smoother.inlier_probability(estimate)
@@ -309,21 +322,26 @@ class StreamingSlam:
         if learn:
             unknown = np.zeros((N_STATES, N_STATES))
             self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, unknown)[2]
-        following = SessionFilter(self._problem, self._noise, robust=self._robust)
-        following.restart(estimate, self._noise, self._problem, marginals)
+        following = SessionFilter(self._problem if revised is None else revised, self._noise, robust=self._robust)
+        following.restart(estimate, self._noise, following.problem, marginals)
         yield 1.0
         landmark = estimate.landmark.copy()
         for row in counted(n):
-            following.problem = self._problem
-            landmark = grown(landmark, len(self._problem.landmark_mean))
+            following.problem = self._problem if revised is None else revised
+            landmark = grown(landmark, len(following.problem.landmark_mean))
             if row == self._n_poses:
                 break
+            detections = following.problem.detections_of(row)
             following.drive(following.motion(row))
-            detections = self._problem.detections_of(row)
+            if revised is not None:
+                revised = self._assigned(revised, method, following, landmark, row, detections)
+                following.problem, landmark = revised, grown(landmark, len(revised.landmark_mean))
             self._meet_new_landmarks(following, landmark, detections)
             following.add(row, landmark)
             yield min(CAUGHT_UP_MS + OF_PAIR_MS * len(detections) ** 2, 0.5 * SLICES_A_FRAME)
-        self._filter, self._landmark = following, landmark
+        if revised is not None:
+            self._adopt(revised, landmark)
+        self._method, self._filter, self._landmark = method, following, landmark
 
     def _can_align(self, *, final: bool = False) -> bool:
         """Return whether most landmarks of the map seen so far have its relative positions; two at the end."""

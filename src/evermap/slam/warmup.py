@@ -63,7 +63,7 @@ def searched() -> None:
     place, sure, count = 3.0 * np.eye(3, 2), np.eye(6), 3
     evidence = WindowEvidence(np.arange(count), np.zeros(count, dtype=np.int64), place, sure, np.zeros(6), 0.0)
     comparison = compare(evidence, place, np.tile(np.eye(2), (count, 1, 1)), np.ones(count, dtype=np.bool_))
-    find_changes(evidence, comparison, place, 1, ChangesConfig())
+    exhausted(find_changes(evidence, comparison, place, 1, ChangesConfig()))
 
 
 @functools.cache

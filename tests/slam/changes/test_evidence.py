@@ -12,6 +12,7 @@ from references import log_group_prior, log_normal, random_covariance, static_ev
 from test_gain import gain_of
 
 from evermap.config import ChangesConfig
+from evermap.estimate.sparse.system import exhausted
 from evermap.slam.calibration import AHEAD, ASIDE, FORWARD, SKEW, SLIP, SLOPE
 from evermap.slam.changes.evidence import WindowEvidence, compare, in_sensor_metres, landmark_evidence
 from evermap.slam.problem import Estimate, Problem, independent
@@ -22,7 +23,7 @@ KNOWN_SIZE = default_prior(range_slope=0.0)
 
 def evidence_of(world: World, bounds: list[int], estimate: Estimate | None = None) -> WindowEvidence:
     estimate = world.truth if estimate is None else estimate
-    return landmark_evidence(world.problem, estimate, world.noise, world.problem.prior, np.array(bounds), 3)
+    return exhausted(landmark_evidence(world.problem, estimate, world.noise, world.problem.prior, np.array(bounds), 3))
 
 
 def problem_of_copies(problem: Problem, evidence: WindowEvidence, bounds: list[int]) -> Problem:

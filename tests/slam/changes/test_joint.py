@@ -6,15 +6,19 @@ Every scene is run with many seeds, and how often it comes out right is asserted
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from worlds import Move, Session, landmark_rmse, make_session, pose_rmse
 
-from evermap.config import ChangesConfig
+from evermap.config import ChangesConfig, SlamConfig
+from evermap.estimate.sparse.system import Slices
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
+from evermap.slam.changes.joint import Joint
 from evermap.slam.method import Explanation
 from evermap.slam.smoother import Smoother
+from evermap.slam.streaming import StreamingSlam
 from evermap.types import ChangeKind, MapChange
 
 BEFORE = Move((1, 2, 5), (0.3, -0.2))
@@ -196,3 +200,35 @@ def test_same_session_same_answer() -> None:
 
 def test_empty_map_holds_nothing() -> None:
     assert not GivenMap.empty(3).given.any()
+
+
+def test_a_stream_goes_on_while_changes_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    move = replace(WITHIN, at_s=60.3)
+    session = make_session(0, move, with_map=False)
+    problem, world = session.problem, session.world
+    method = session.method()
+    slam = StreamingSlam(problem, world.noise, problem.prior, method=method, settings=SlamConfig(estimate_noise=False))
+    searches: list[list[int]] = []
+    in_slices = Joint.revise_in_slices
+
+    def watched(self: Joint, *given: Any, **named: Any) -> Slices[Explanation]:
+        searches.append([slam._n_poses])
+        search = in_slices(self, *given, **named)
+        while True:
+            try:
+                share = next(search)
+            except StopIteration as found:
+                return found.value
+            yield share
+            searches[-1].append(slam._n_poses)
+
+    monkeypatch.setattr(Joint, "revise_in_slices", watched)
+    told: list[int] = []  # places that the detections of each frame had
+    for row in range(len(problem.stamp_s)):
+        slam.step()
+        told += slam._problem.landmark_row[problem.detections_of(row)].tolist()
+    assert max(each[-1] - each[0] for each in searches) > 2
+    moved = np.isin(problem.landmark_row, move.members) & (problem.stamp_s[problem.pose_row] > move.at_s + 10.0)
+    assert (slam._problem.landmark_row[moved] >= len(session.before)).all()
+    assert (np.array(told)[moved] < len(session.before)).any()  # of frames that came meanwhile
+    assert all_found(slam.finish().revision.changes, move)

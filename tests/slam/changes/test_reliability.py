@@ -10,6 +10,7 @@ from references import static_evidence
 from worlds import Move, make_session
 
 from evermap.config import ChangesConfig
+from evermap.estimate.sparse.system import exhausted
 from evermap.slam.changes.evidence import compare, landmark_evidence
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.weigh import MAP_FACTORS, Verdict, weigh
@@ -88,7 +89,7 @@ def verdict_on_drawn_evidence(seed: int, n_windows: int) -> tuple[float, bool]:
     evidence = replace(plain, position=plain.position + e, information=information)
     mean = position + factor * SIGMA_MAP_M * rng.normal(size=position.shape)
     covariance = np.tile(SIGMA_MAP_M**2 * np.eye(2), (N_LANDMARKS, 1, 1))
-    verdict = weigh(evidence, GivenMap(mean, covariance, np.ones(N_LANDMARKS, bool)), PRIOR, n_windows)
+    verdict = exhausted(weigh(evidence, GivenMap(mean, covariance, np.ones(N_LANDMARKS, bool)), PRIOR, n_windows))
     return verdict.probability, is_right(verdict, moves)
 
 
@@ -135,7 +136,7 @@ def test_misfit_of_a_static_world_is_a_chi_square(n_windows: int) -> None:
         )
         estimate = Smoother(free, world.noise).optimum(world.truth)
         bounds = np.linspace(0, 200, n_windows + 1).astype(int)
-        evidence = landmark_evidence(free, estimate, world.noise, world.problem.prior, bounds, 3)
+        evidence = exhausted(landmark_evidence(free, estimate, world.noise, world.problem.prior, bounds, 3))
         comparison = compare(evidence, given.mean, given.covariance, given.given)
         misfit += comparison.misfit
         freedom += comparison.freedom

@@ -9,6 +9,7 @@ import pytest
 from references import static_evidence
 
 from evermap.config import ChangesConfig
+from evermap.estimate.sparse.system import exhausted
 from evermap.slam.changes.evidence import WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.search import find_changes
@@ -39,9 +40,10 @@ def dropped(evidence: WindowEvidence, given: GivenMap) -> set[tuple[int, int]]:
     def search(evidence, start):
         soft = evidence.softened(0.02)
         comparison = compare(soft, given.mean, given.covariance, given.given)
-        return comparison, find_changes(soft, comparison, given.mean, WINDOWS, PRIOR, start=start)
+        found = yield from find_changes(soft, comparison, given.mean, WINDOWS, PRIOR, start=start)
+        return comparison, found
 
-    kept = without_transients(evidence, given.mean, PRIOR, search)
+    kept = exhausted(without_transients(evidence, given.mean, PRIOR, search))
     left = set(zip(kept.landmark.tolist(), kept.window.tolist(), strict=True))
     return set(zip(evidence.landmark.tolist(), evidence.window.tolist(), strict=True)) - left
 
@@ -62,7 +64,7 @@ def test_displaced_in_one_window_only(seed: int, window: int) -> None:
     shift[window, 2] = [0.5, 0.3]
     evidence, given = evidence_with(shift, seed)
     assert dropped(evidence, given) == {(2, window)}
-    assert weigh(evidence, given, PRIOR, WINDOWS).groups == ()
+    assert exhausted(weigh(evidence, given, PRIOR, WINDOWS)).groups == ()
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -72,7 +74,7 @@ def test_lasting_moves_stay(seed: int, since: int) -> None:
     shift[since:, [2, 4]] = [0.5, 0.3]
     evidence, given = evidence_with(shift, seed)
     assert dropped(evidence, given) == set()
-    verdict = weigh(evidence, given, PRIOR, WINDOWS)
+    verdict = exhausted(weigh(evidence, given, PRIOR, WINDOWS))
     assert [(group.members.tolist(), group.window) for group in verdict.groups] == [([2, 4], since)]
     np.testing.assert_allclose(verdict.groups[0].motion[:2], [0.5, 0.3], atol=0.06)
 
@@ -84,5 +86,5 @@ def test_a_transient_beside_a_lasting_move(seed: int) -> None:
     shift[2, 3] = [0.6, 0.0]
     evidence, given = evidence_with(shift, seed)
     assert dropped(evidence, given) == {(3, 2)}
-    verdict = weigh(evidence, given, PRIOR, WINDOWS)
+    verdict = exhausted(weigh(evidence, given, PRIOR, WINDOWS))
     assert [(group.members.tolist(), group.window) for group in verdict.groups] == [([0, 4], 1)]

@@ -34,7 +34,7 @@ class Spread(NamedTuple):
     Attributes:
         own: covariance of each variable by itself, one after the other, in rows.
         own_first: (V + 1,) where they begin.
-        with_border: (numbers, B) covariance of every number with those of the border.
+        with_border: (numbers, B) covariance of every number with those of the border that are in its front.
         of_factors: `A S A'` of each factor with Jacobian A, (rows, rows) each, one after the other; none of factors
             with `LARGE_FACTOR` rows, as of a map.
         of_factors_first: (F + 1,) where they begin.

@@ -187,6 +187,14 @@ class System:
         np.maximum.at(rows, fronts, factors.rows[self.tree.factor])
         self._large = np.maximum(self.tree.own, rows) * self.tree.size**2 >= LARGE
 
+    @cached_property
+    def has_border_throughout(self) -> bool:
+        """Whether all fronts hold the whole border: then so does what `Factorised.spread` finds with it."""
+        tree = self.tree
+        front = np.repeat(np.arange(len(tree.parent)), np.diff(tree.first))
+        held = np.bincount(front[tree.in_border[tree.variable] >= 0], minlength=len(tree.parent))
+        return bool(np.all(held == len(tree.border)))
+
     def cuts(self, work: ArrayLike) -> list[tuple[int, int, float]]:
         """Return ranges of fronts with about a slice of work (T,) each, and the share of a slice that each takes."""
         total = np.append(0.0, np.cumsum(np.asarray(work, dtype=np.float64))) / SLICE

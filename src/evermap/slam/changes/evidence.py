@@ -16,6 +16,8 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
+from evermap.estimate.sparse.system import Slices
+from evermap.geometry import se2
 from evermap.slam.batch import middles, sighted_at
 from evermap.slam.calibration import SLOPE, CalibrationPrior
 from evermap.slam.kernels import N_STATES
@@ -23,6 +25,8 @@ from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.types import BoolArray, FloatArray, IntArray
 
+MS_OF_DETECTION, MS_OF_CUBE = 1e-3, 1e-7
+"""Milliseconds of a usual core for each detection that is sorted, and each cubed number of a dense system."""
 TINY_INFORMATION = 1e-6
 """Of poses at the borders of windows that nothing holds [1/m^2]: a kilometre."""
 
@@ -108,6 +112,11 @@ class Comparison(NamedTuple):
     freedom: float
 
 
+def dense_ms(numbers: int) -> float:
+    """Return the milliseconds that a dense system of so many numbers takes."""
+    return MS_OF_CUBE * numbers**3
+
+
 def landmark_evidence(
     problem: Problem,
     estimate: Estimate,
@@ -117,8 +126,8 @@ def landmark_evidence(
     fewest: int,
     *,
     sized: bool = True,
-) -> WindowEvidence:
-    """Eliminate poses and calibration of a linearised problem, window by window.
+) -> Slices[WindowEvidence]:
+    """Eliminate poses and calibration of a linearised problem, window by window, in slices.
 
     The problem's priors of start and landmarks are left out; every landmark that was seen has a position in the
     estimate, and `prior` is of the calibration as the user means it. Windows begin at the poses `bounds` (W + 1,), of
@@ -129,8 +138,12 @@ def landmark_evidence(
     estimate = in_sensor_metres(estimate, prior)
     held = prior.without_scale()
     n_windows = len(bounds) - 1
-    pieces = [_piece(problem, estimate, noise, held, (bounds[w], bounds[w + 1], fewest)) for w in range(n_windows)]
+    pieces: list[_Piece] = []
+    for w in range(n_windows):
+        piece = yield from _piece(problem, estimate, noise, held, (bounds[w], bounds[w + 1], fewest))
+        pieces.append(piece)
     information, right, at_pose = _joined(pieces)
+    yield dense_ms(len(right))
     states = np.arange(len(right) - N_STATES, len(right))
     information[states, states] += 1.0 / held.sigma**2
     right[states] += (held.mean - estimate.states) / held.sigma**2
@@ -142,11 +155,13 @@ def landmark_evidence(
         np.column_stack([information[np.ix_(others, mine)], right[others]]),
     )
     cross = information[np.ix_(mine, others)]
-    held_somewhere = information + TINY_INFORMATION * np.eye(len(right))
-    covariance = np.asarray(np.linalg.inv(held_somewhere)[np.ix_(states, states)], dtype=np.float64)
-    _, _, scale, log_sigma = prior.split_scale(estimate.states, covariance)
-    if not sized:
-        scale, log_sigma = 1.0, 0.0
+    scale, log_sigma = 1.0, 0.0
+    if sized:
+        yield dense_ms(len(right))
+        held_somewhere = information + TINY_INFORMATION * np.eye(len(right))
+        covariance = np.linalg.solve(held_somewhere, np.eye(len(right))[:, states])[states]
+        _, _, scale, log_sigma = prior.split_scale(estimate.states, covariance)
+    yield dense_ms(len(right))
     centre = estimate.landmark[estimate.known].mean(axis=0)
     position = np.concatenate([piece.position for piece in pieces])
     return WindowEvidence(
@@ -188,11 +203,13 @@ def compare(evidence: WindowEvidence, mean: FloatArray, covariance: FloatArray, 
     column = np.searchsorted(seen, evidence.landmark)
     count, n_seen = len(evidence.landmark), len(seen)
     anchor = np.where(mapped[:, None], mean, evidence.first_seen(mean))[seen]
-    spread = np.zeros((2 * count, 2 * n_seen + 1))  # unknowns behind all copies: places and size
-    rows = np.arange(count)
-    spread[2 * rows, 2 * column] = spread[2 * rows + 1, 2 * column + 1] = 1.0
+    # unknowns behind all copies: places and size
     offset = evidence.position - anchor[column]
-    spread[:, -1] = evidence.log_scale_sigma * (evidence.position - evidence.position.mean(axis=0)).ravel()
+    size = evidence.log_scale_sigma * (evidence.position - evidence.position.mean(axis=0)).ravel()
+    places = sparse.csr_array(
+        (np.ones(2 * count), (np.arange(2 * count), se2.xy_rows(column))), shape=(2 * count, 2 * n_seen)
+    )
+    spread = sparse.csr_array(sparse.hstack([places, size[:, None]]))
     prior = np.zeros((2 * n_seen + 1, 2 * n_seen + 1))
     log_prior_determinant = 0.0
     for k in np.flatnonzero(mapped[seen]):
@@ -203,7 +220,7 @@ def compare(evidence: WindowEvidence, mean: FloatArray, covariance: FloatArray, 
     # without a map the whole is free to be anywhere
     prior[np.diag_indices(2 * n_seen)] += TINY_INFORMATION
     pull = evidence.pull + evidence.information @ offset.ravel()
-    weighted = evidence.information @ spread
+    weighted = np.asarray((spread.T @ evidence.information).T)
     inner = cho_factor(spread.T @ weighted + prior)
     solved = cho_solve(inner, np.column_stack([weighted.T, spread.T @ pull]))
     precision = evidence.information - weighted @ solved[:, :-1]
@@ -234,7 +251,7 @@ class _Piece(NamedTuple):
 
 def _piece(
     problem: Problem, estimate: Estimate, noise: Noise, prior: CalibrationPrior, window: tuple[int, int, int]
-) -> _Piece:
+) -> Slices[_Piece]:
     start, stop, fewest = window
     last = min(stop + 1, len(problem.stamp_s))
     low, high = np.searchsorted(problem.pose_row, [start, stop])
@@ -258,7 +275,8 @@ def _piece(
     position = middles(part.landmark_row, sighted, count)  # of the landmarks by the poses of this window alone
     local = Estimate(estimate.pose[start:last], position, estimate.states)
     ends = np.unique([0, last - start - 1])
-    information, right = Smoother(part, noise).information(local, ends[::-1])
+    yield MS_OF_DETECTION * len(used)
+    information, right = yield from Smoother(part, noise).information_in_slices(local, ends[::-1])
     if len(ends) == 1:  # a window of one pose: it is the first and there is no other
         information, right = np.pad(information, ((3, 0), (3, 0))), np.pad(right, (3, 0))
     return _Piece(landmark, position, information, right)

@@ -15,6 +15,7 @@ from scipy import sparse
 
 from evermap.config import ChangesConfig
 from evermap.estimate.robust import weigh
+from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
 from evermap.slam.kernels import N_SENSOR, detection_residual, kernel
 from evermap.slam.problem import Estimate, Noise, Problem, between_rows, embedded, independent, padded
@@ -141,8 +142,8 @@ HELD_M = 0.005
 """To this the other landmarks are held meanwhile."""
 
 
-def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArray) -> Estimate:
-    """Return the estimate with poses that are not distorted by sightings of the members.
+def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArray) -> Slices[Estimate]:
+    """Return the estimate with poses that are not distorted by sightings of the members, in slices.
 
     Sightings that were given to the wrong places have drawn the poses towards these, and would be right again there.
     """
@@ -153,7 +154,7 @@ def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArr
         landmark_information=independent(np.tile(np.eye(2) / HELD_M**2, (len(problem.landmark_mean), 1, 1))),
     )
     start = Estimate(estimate.pose, estimate.landmark[: len(problem.landmark_mean)], estimate.states)
-    free = Smoother(rest, noise, heavy=True).optimum(start, iterations=5, tolerance=1e-4)
+    free, _ = yield from Smoother(rest, noise, heavy=True).solved_in_slices(start, iterations=5, tolerance=1e-4)
     return Estimate(free.pose, estimate.landmark, free.states)
 
 

@@ -8,6 +8,7 @@ and its solution is where everything is linearised next, until the groups stay.
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,9 +17,17 @@ from scipy import sparse
 
 from evermap.align.candidates import Matches, find_consensus
 from evermap.config import SlamConfig
+from evermap.estimate.sparse.system import Slices, exhausted
 from evermap.slam.batch import outvoted
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, in_sensor_metres, landmark_evidence
+from evermap.slam.changes.evidence import (
+    Comparison,
+    WindowEvidence,
+    compare,
+    dense_ms,
+    in_sensor_metres,
+    landmark_evidence,
+)
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained, parting_time, unswayed
 from evermap.slam.changes.search import item_columns
 from evermap.slam.changes.weigh import Verdict, weigh
@@ -99,7 +108,17 @@ class Joint(Method):
             return estimate
         return estimate.moved(motion)
 
+    def beside(self) -> Joint:
+        """Return a copy that searches while this one assigns by what was found before."""
+        return copy(self)
+
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
+        """Return what `revise_in_slices` does."""
+        return exhausted(self.revise_in_slices(problem, estimate, noise, heavy=heavy, final=final))
+
+    def revise_in_slices(
+        self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool
+    ) -> Slices[Explanation]:
         """Search at the present estimate, and at the end of the session again at the resulting one."""
         if final and self._concluded is not None:
             return replace(self._concluded, problem=problem, estimate=estimate)
@@ -120,12 +139,14 @@ class Joint(Method):
         for _ in range(ROUNDS if final else 1):
             bounds = self._bounds(base)
             first = self._first_places(estimate)
-            evidence = landmark_evidence(base, first, noise, self._calibration, bounds, self._fewest, sized=in_map)
+            evidence = yield from landmark_evidence(
+                base, first, noise, self._calibration, bounds, self._fewest, sized=in_map
+            )
             if len(evidence.landmark) == 0:
                 return Explanation(problem, estimate, self._current())
             before = self.verdict
-            verdict, given = self._weighed(evidence, given, len(bounds) - 1, thorough=final)
-            groups = tuple(self._timed(group, base, estimate, noise, evidence, bounds) for group in verdict.groups)
+            verdict, given = yield from self._weighed(evidence, given, len(bounds) - 1, thorough=final)
+            groups = yield from self._all_timed(verdict.groups, base, estimate, noise, evidence, bounds)
             settled = before is not None and before.map_factor == verdict.map_factor and _same(groups, self._groups)
             self.verdict, self._groups = verdict, groups
             if not in_map and not groups and len(self._landmark) == self._count:
@@ -135,13 +156,14 @@ class Joint(Method):
             problem, start, self._landmark = self._explained(base, estimate, evidence, believed, groups)
             # with the kernel that never lets go: as long as places are wrong, right detections look like outliers
             smoother = Smoother(problem, noise, heavy=True, robust=self._robust)
-            estimate = smoother.optimum(start, iterations=5, tolerance=1e-4)
+            estimate, _ = yield from smoother.solved_in_slices(start, iterations=5, tolerance=1e-4)
             if settled:
                 break
         if in_map:
             self._given = given
         if not heavy:
-            estimate = smoother.under(noise, heavy=False).optimum(estimate, iterations=5, tolerance=1e-4)
+            lighter = smoother.under(noise, heavy=False)
+            estimate, _ = yield from lighter.solved_in_slices(estimate, iterations=5, tolerance=1e-4)
         changes = self._changes(self._groups, verdict.probability, base)
         revision = Explanation(problem, estimate, self._current(), changes)
         if final:
@@ -188,7 +210,7 @@ class Joint(Method):
         for found, probability in self.verdict.alternatives[: self._prior.most_rivals]:
             if probability < self.verdict.probability * math.exp(-self._prior.rival_nats):
                 break
-            groups = tuple(self._timed(group, base, estimate, noise, evidence, bounds) for group in found)
+            groups = exhausted(self._all_timed(found, base, estimate, noise, evidence, bounds))
             problem, start, landmark = self._explained(base, estimate, evidence, believed, groups)
             smoother = Smoother(problem, noise, robust=self._robust)
             solved = smoother.optimum(start, iterations=5, tolerance=1e-4)
@@ -205,18 +227,21 @@ class Joint(Method):
 
     def _weighed(
         self, evidence: WindowEvidence, given: GivenMap, n_windows: int, *, thorough: bool
-    ) -> tuple[Verdict, GivenMap]:
+    ) -> Slices[tuple[Verdict, GivenMap]]:
         """The verdict, and the map with the landmarks that carry each other's identity at each other's place."""
-        verdict = weigh(evidence, given, self._prior, n_windows, before=self.verdict, thorough=thorough)
+        verdict = yield from weigh(evidence, given, self._prior, n_windows, before=self.verdict, thorough=thorough)
         soft = evidence.softened(self._prior.usual_softness_m)
+        yield dense_ms(len(soft.pull))
         while given.given.any():
             comparison = compare(soft, given.mean, given.covariance, given.given)
+            yield dense_ms(len(soft.pull))
             swap = likeliest_swap(soft, comparison, given, self._prior.p_swapped)
+            yield dense_ms(len(soft.pull))
             if swap is None:
                 break
             other = with_swap(given, swap.first, swap.second)
             # the same copies for both: what is left out costs nothing, and must not be what decides
-            rival = weigh(
+            rival = yield from weigh(
                 verdict.evidence, other, self._prior, n_windows, before=verdict, thorough=thorough, spared=True
             )
             log_odds = rival.score + swap.log_prior - verdict.score
@@ -239,6 +264,22 @@ class Joint(Method):
         """(L,) the last place of every landmark."""
         return _current(self._landmark, self._count)
 
+    def _all_timed(
+        self,
+        groups: Groups,
+        base: Problem,
+        estimate: Estimate,
+        noise: Noise,
+        evidence: WindowEvidence,
+        bounds: IntArray,
+    ) -> Slices[Groups]:
+        """Return the groups, each `_timed`."""
+        timed: Groups = ()
+        for group in groups:
+            one = yield from self._timed(group, base, estimate, noise, evidence, bounds)
+            timed = (*timed, one)
+        return timed
+
     def _timed(
         self,
         group: MovedGroup,
@@ -247,7 +288,7 @@ class Joint(Method):
         noise: Noise,
         evidence: WindowEvidence,
         bounds: IntArray,
-    ) -> MovedGroup:
+    ) -> Slices[MovedGroup]:
         """Return the group with the time of its change, if that was within the session.
 
         The search, for which no pose is certain, says between which windows. Within those every detection tells, once
@@ -264,9 +305,10 @@ class Joint(Method):
         if not solved:  # the poses are those of another time, and would vote for it
             return replace(group, since_s=float(stamps[1]), between_s=within_s)
         old = estimate.landmark[: self._count]
+        free = yield from unswayed(base, estimate, noise, group.members)
         since_s, between_s = parting_time(
             base,
-            unswayed(base, estimate, noise, group.members),
+            free,
             noise,
             group.members,
             old[group.members],
@@ -357,7 +399,7 @@ def likeliest_swap(evidence: WindowEvidence, comparison: Comparison, given: Give
     count = len(candidates)
     if count < 2:
         return None
-    quadratic, linear = item_columns(evidence, comparison, given.mean, 1, candidates)
+    quadratic, linear = exhausted(item_columns(evidence, comparison, given.mean, 1, candidates))
     precision = quadratic.reshape(count, 4, count, 4)[:, :2, :, :2]
     pull = linear.reshape(count, 4)[:, :2]
     place = given.mean[candidates]

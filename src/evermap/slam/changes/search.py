@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.config import ChangesConfig
+from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence
 from evermap.slam.changes.gain import Tables, hypothesis_gain, log_onset, log_prior
@@ -18,6 +19,8 @@ NEAR = 5.0
 """
 MOST_WIDENED = 30
 """so many of them at most."""
+MS_OF_CLIMB, MS_OF_CANDIDATE, MS_OF_NUMBER = 0.5, 0.01, 2e-6
+"""Milliseconds of a usual core: of a climb, about, of a landmark by itself, and of a pass over a number of a table."""
 
 
 class Hypotheses(NamedTuple):
@@ -46,14 +49,15 @@ def find_changes(
     prior: ChangesConfig,
     *,
     start: Hypotheses | None = None,
-) -> Hypotheses:
-    """Return the most probable sets of changes, and all that were weighed on the way.
+) -> Slices[Hypotheses]:
+    """Return the most probable sets of changes, and all that were weighed on the way, in slices.
 
     Groups turn about the centroid of mapped positions (L, 2); the first hypothesis of `start` is one start of the
     search.
     """
     candidates = _candidates(evidence, comparison, len(position), prior, start)
-    quadratic, linear = item_columns(evidence, comparison, position, n_windows, candidates)
+    yield MS_OF_CANDIDATE * len(position)
+    quadratic, linear = yield from item_columns(evidence, comparison, position, n_windows, candidates)
     count = len(candidates)
     label, onset = np.zeros(count, np.int64), np.zeros(prior.most_groups + 1, np.int64)
     turns = np.zeros(prior.most_groups + 1, bool)
@@ -68,10 +72,11 @@ def find_changes(
         log_onset(n_windows),
     )
     may_turn, weighed = prior.p_rotated > 0.0, Weighed.nothing(count, prior.most_groups)
-    _climb_from_many_starts((label, onset, turns), tables, weighed, may_turn=may_turn)
+    yield from _climb_from_many_starts((label, onset, turns), tables, weighed, may_turn=may_turn)
     near = weighed.ranked
     for k in near[weighed.gain[near] > weighed.best[0] - NEAR][:MOST_WIDENED]:
         _climb(weighed.label[k], weighed.onset[k], weighed.turns[k], may_turn, tables, weighed, False)
+        yield MS_OF_CLIMB
     ranked = weighed.ranked
     labels = np.zeros((len(ranked), len(position)), np.int64)
     labels[:, candidates] = weighed.label[ranked]
@@ -101,8 +106,8 @@ def _candidates(
 
 def item_columns(
     evidence: WindowEvidence, comparison: Comparison, position: FloatArray, n_windows: int, candidates: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return `T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'.
+) -> Slices[tuple[FloatArray, FloatArray]]:
+    """Return `T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'; in slices.
 
     With one window for all of the session's, the items are 'this candidate, always'.
     """
@@ -123,12 +128,21 @@ def item_columns(
     linear = np.cumsum(linear.reshape(size)[::-1], axis=0)[::-1]
     half = np.einsum("rkqm,qmb->rkqb", precision, columns)
     blocks = np.einsum("rka,rkqb->raqb", columns, half)
+    yield MS_OF_NUMBER * blocks.size
     quadratic = np.zeros((n_windows * len(candidates), 4, n_windows * len(candidates), 4))
-    np.add.at(quadratic.transpose(0, 2, 1, 3), (item[:, None], item[None, :]), blocks.transpose(0, 2, 1, 3))
+    if len(np.unique(item)) == len(item):
+        quadratic[item[:, None], :, item[None, :], :] = blocks.transpose(0, 2, 1, 3)
+    else:
+        np.add.at(quadratic.transpose(0, 2, 1, 3), (item[:, None], item[None, :]), blocks.transpose(0, 2, 1, 3))
+    yield MS_OF_NUMBER * (blocks.size + quadratic.size)
     quadratic = quadratic.reshape(*size, *size)
-    for axis in (0, 3):
-        quadratic = np.flip(np.cumsum(np.flip(quadratic, axis), axis=axis), axis)
-    return np.ascontiguousarray(quadratic.reshape(linear.size, linear.size)), linear.ravel()
+    for later in range(n_windows - 1, 0, -1):
+        quadratic[later - 1] += quadratic[later]
+    yield MS_OF_NUMBER * quadratic.size
+    for later in range(n_windows - 1, 0, -1):
+        quadratic[:, :, :, later - 1] += quadratic[:, :, :, later]
+    yield MS_OF_NUMBER * quadratic.size
+    return quadratic.reshape(linear.size, linear.size), linear.ravel()
 
 
 WORTH_KEEPING = 25.0
@@ -370,7 +384,7 @@ def _add_best_pair(
 
 def _climb_from_many_starts(
     start: tuple[IntArray, IntArray, BoolArray], tables: Tables, weighed: Weighed, *, may_turn: bool
-) -> None:
+) -> Slices[None]:
     """Climb from a start, from the best pair of every landmark, and from the best so far with each landmark changed.
 
     A static landmark changes by moving on its own, and by moving with the one that goes with it best. Not
@@ -379,11 +393,14 @@ def _climb_from_many_starts(
     label, onset, turns = start
     count, groups = len(label), len(onset) - 1
     best_gain = _climb(label, onset, turns, may_turn, tables, weighed, True)
+    yield MS_OF_CLIMB
     best = label.copy(), onset.copy(), turns.copy()
     for attempt in range(3 * count):
         landmark = attempt % count
         label[:], onset[:], turns[:] = (0, 0, False) if attempt < count else best
         free = int(label.max()) + 1
+        if count <= attempt < 2 * count and free == 1:  # as if nothing had moved: as before
+            continue
         if attempt >= 2 * count and label[landmark] > 0:
             label[landmark] = 0
         elif label[landmark] > 0 or free > groups:
@@ -393,5 +410,6 @@ def _climb_from_many_starts(
         else:
             _add_best_pair(landmark, free, may_turn, tables, label, onset, turns)
         gain = _climb(label, onset, turns, may_turn, tables, weighed, True)
+        yield MS_OF_CLIMB
         if gain > best_gain:
             best, best_gain = (label.copy(), onset.copy(), turns.copy()), gain

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.config import ChangesConfig
+from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
-from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
+from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, dense_ms
 from evermap.slam.changes.explain import GivenMap, MovedGroup
 from evermap.slam.changes.search import Hypotheses, find_changes
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -57,8 +58,8 @@ def weigh(
     before: Verdict | None = None,
     thorough: bool = True,
     spared: bool = False,
-) -> Verdict:
-    """Search for changes, and compute their probabilities.
+) -> Slices[Verdict]:
+    """Search for changes, and compute their probabilities, in slices.
 
     What was found `before` is one start of the search; if not `thorough`, its degree of belief is the only one that is
     tried. If `spared`, no copy of this evidence is displaced alone.
@@ -73,34 +74,40 @@ def weigh(
         start: Hypotheses | None,
         factor: float = factor,
         softness: float = prior.usual_softness_m,
-    ) -> tuple[Comparison, Hypotheses]:
+    ) -> Slices[tuple[Comparison, Hypotheses]]:
         soft = evidence.softened(softness)
+        yield dense_ms(len(soft.pull))
         comparison = compare(soft, given.mean, given.covariance * factor**2, given.given)
-        return comparison, find_changes(soft, comparison, position, n_windows, prior, start=start)
+        yield dense_ms(len(soft.pull))
+        found = yield from find_changes(soft, comparison, position, n_windows, prior, start=start)
+        return comparison, found
 
     if n_windows > 1 and not spared:
-        evidence = without_transients(evidence, position, prior, search)
+        evidence = yield from without_transients(evidence, position, prior, search)
     trials: dict[tuple[float, float], _Trial] = {}
 
-    def tried(factor: float, softness: float) -> float:
-        if (factor, softness) not in trials:
+    def best_of(beliefs: list[tuple[float, float]]) -> Slices[tuple[float, float]]:
+        for factor, softness in beliefs:
+            if (factor, softness) in trials:
+                continue
             best = max(trials.values(), key=lambda t: t.score, default=None)
-            comparison, found = search(evidence, None if best is None else best.hypotheses, factor, softness)
+            start = None if best is None else best.hypotheses
+            comparison, found = yield from search(evidence, start, factor, softness)
             base = comparison.log_evidence - 0.5 * (np.log(factor) / prior.map_factor_spread) ** 2
             trials[factor, softness] = _Trial(factor, softness, comparison, found, base)
-        return trials[factor, softness].score
+        return max(beliefs, key=lambda belief: trials[belief].score)
 
-    tried(factor, softness)
+    yield from best_of([(factor, softness)])
     if thorough and before is None and given.given.any():
         # a map that is believed little explains everything: the other end must have been looked at
-        factor = max(MAP_FACTORS, key=lambda f: tried(f, softness))
+        factor, _ = yield from best_of([(f, softness) for f in MAP_FACTORS])
     improved = thorough
     while improved:  # one step up or down in either, as long as that gains
         neighbours = [(factor, s) for s in _beside(prior.softness_m, softness)] if n_windows > 1 else []
         if given.given.any():
             neighbours += [(f, softness) for f in _beside(MAP_FACTORS, factor)]
-        best = max(neighbours, key=lambda trial: tried(*trial))
-        improved = tried(*best) > tried(factor, softness)
+        best = yield from best_of(neighbours)
+        improved = trials[best].score > trials[factor, softness].score
         if improved:
             factor, softness = best
     return _verdict(evidence, list(trials.values()), trials[factor, softness], _SeenWithin.of(evidence, given))
@@ -195,20 +202,21 @@ def _groups(hypotheses: Hypotheses, row: int, seen: _SeenWithin) -> tuple[_Key, 
     return key, tuple(groups)
 
 
-Search = Callable[[WindowEvidence, Hypotheses | None], tuple[Comparison, Hypotheses]]
+Search = Callable[[WindowEvidence, Hypotheses | None], Slices[tuple[Comparison, Hypotheses]]]
 """Compares an evidence with the map and finds changes, from a start."""
 
 
 def without_transients(
     evidence: WindowEvidence, position: FloatArray, prior: ChangesConfig, search: Search
-) -> WindowEvidence:
-    """Return the evidence without copies that are displaced alone, from mapped positions (L, 2)."""
-    comparison, found = search(evidence, None)
+) -> Slices[WindowEvidence]:
+    """Return the evidence without copies that are displaced alone, from mapped positions (L, 2), in slices."""
+    comparison, found = yield from search(evidence, None)
     for _ in range(len(evidence.landmark)):
         copy = np.arange(len(evidence.landmark))
         spared = np.bincount(evidence.landmark)[evidence.landmark] < 2  # their landmarks have no other
         alone = np.where(spared, 0.0, _gains(comparison, prior.move_sigma_m))
         after = _explained_away(evidence, comparison, found, position, prior)
+        yield dense_ms(len(comparison.pull))
         still = np.where(spared, 0.0, _gains(after, prior.move_sigma_m))
         candidates: list[tuple[int, float]] = []  # a copy, and what leaving it out gains over keeping it
         worst = int(np.argmax(still))
@@ -216,13 +224,13 @@ def without_transients(
             candidates.append((worst, still[worst] - prior.displaced_log_odds))
         worst = int(np.argmax(alone))
         if alone[worst] > prior.displaced_log_odds and all(worst != other for other, _ in candidates):
-            _, others = search(evidence.without(copy == worst), found)
+            _, others = yield from search(evidence.without(copy == worst), found)
             candidates.append((worst, alone[worst] - prior.displaced_log_odds + float(others.gain[0] - found.gain[0])))
         best, gain = max(candidates, key=lambda candidate: candidate[1], default=(0, 0.0))
         if gain <= 0.0:
             break
         evidence = evidence.without(copy == best)
-        comparison, found = search(evidence, found)
+        comparison, found = yield from search(evidence, found)
     return evidence
 
 
