@@ -48,7 +48,8 @@ class Check(Shown):
 
     Attributes:
         name, source: of the recording.
-        contents: numbers by table: `odometry`, `frames`, `detections`, `landmarks`; plain values, None where unknown.
+        contents: numbers by table: `odometry`, `frames`, `detections`, `landmarks`, `measurements` (rows of each kind);
+            plain values, None where unknown.
         findings: what is odd, the worst first.
         warnings: remarks of the reader.
     """
@@ -176,6 +177,7 @@ def contents(recording: AnyRecording) -> dict[str, dict[str, Any]]:
             "seen_once": int(np.sum(of_landmark == 1)),
             "median_detections": float(np.median(of_landmark)) if len(of_landmark) else None,
         },
+        "measurements": {table.kind: len(table) for table in recording.measurements},
     }
 
 

@@ -173,6 +173,7 @@ def _in_plane(recording: SpatialRecording, why: str) -> Recording:
         clock=recording.clock,
         landmark_names=recording.landmark_names,
         robot=recording.robot,
+        measurements=recording.measurements,
     )
 
 
