@@ -43,6 +43,7 @@ from evermap.types import (
     Frames,
     IntArray,
     Measurements,
+    Recording,
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
@@ -337,7 +338,7 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     detections = detections[np.flatnonzero(finite)[np.argsort(detections.frame[finite], kind="stable")]]
     truth = _odometry(path, content, settings, settings.truth, clock)
     odometry = _odometry(path, content, settings, settings.odometry, clock)
-    recording = SpatialRecording(
+    recording = Recording(
         name=path.resolve().name.split(".")[0],
         odometry=odometry,
         frames=Frames(looked, complete=messages < sum(map(len, stamps)) or messages < FEWEST_LOOKS, clock=clock),

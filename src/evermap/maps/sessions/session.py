@@ -40,6 +40,7 @@ from evermap.types import (
     Sensor,
     SlamResult,
     SpatialRecording,
+    is_in_space,
     rows_of,
 )
 from evermap.valid import check_type
@@ -80,7 +81,7 @@ def admitted(recording: RecordingT, living: LivingMap) -> tuple[RecordingT, Livi
     Raises:
         DataError: another clock than the map's, or of the plane where that is of space.
     """
-    if (living.dim == 3) != isinstance(recording, SpatialRecording):
+    if (living.dim == 3) != is_in_space(recording):
         of = {2: "the plane", 3: "space"}
         raise DataError(
             f"{recording.name}: a recording in {of[5 - living.dim]}, the map is of {of[living.dim]}",
@@ -119,7 +120,7 @@ def in_its_space(recording: AnyRecording, living: LivingMap | None, config: Conf
 def as_estimated(recording: AnyRecording, result: SlamResult) -> AnyRecording:
     """Return a recording in the space of its result: in the plane where it was estimated there."""
     flat = result.trajectory.pose_world_robot.shape[1] == 3
-    if not flat or not isinstance(recording, SpatialRecording):
+    if not flat or not is_in_space(recording):
         return recording
     return plane.in_its_space(recording, Config().slam, dim=2)
 
@@ -163,13 +164,13 @@ def opened(living: LivingMap | None, recording: AnyRecording) -> LivingMap:
 
 def _empty(recording: AnyRecording) -> LivingMap:
     """A map before its first session, in the plane or in space as a recording of it."""
-    in_space = isinstance(recording, SpatialRecording)
+    in_space = is_in_space(recording)
     return LivingMap.in_space(recording.clock) if in_space else LivingMap(clock=recording.clock)
 
 
 def repaired(recording: AnyRecording) -> AnyRecording:
     """Return a recording as it is condensed: one of the plane repaired, one of space as it is."""
-    return clean(recording) if isinstance(recording, Recording) else recording
+    return recording if is_in_space(recording) else clean(recording)
 
 
 def drive_of(recording: AnyRecording) -> tuple[FloatArray, FloatArray]:
@@ -347,7 +348,7 @@ def solved(
     progress: Progress | None = None,
 ) -> Visit:
     """Return a recording with identities solved, by itself or in a map that is given; arguments as of `run_slam`."""
-    if isinstance(recording, SpatialRecording):
+    if is_in_space(recording):
         return solve_visit(recording, config, prior_map, remarks, progress=progress)
     alone = solve(recording, config.slam, prior_map=prior_map, remarks=remarks, realtime=realtime, progress=progress)
     return PlanarVisit(alone)
