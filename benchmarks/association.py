@@ -363,7 +363,7 @@ def exchanged_line(world: Lived, column: str) -> str:
     one, other = _two_alike(world.recordings)
     living, first, called, told = world.begun, dict[int, int](), [0, 0], list[str]()
     for number, given in enumerate(world.recordings):
-        assert isinstance(given, Recording)
+        assert given.dim == 2
         true = given.detections.landmark_id.copy()
         if number >= len(world.recordings) // 2:
             true[given.detections.landmark_id == one], true[given.detections.landmark_id == other] = other, one
@@ -436,7 +436,7 @@ def _line(row: Score) -> str:
 
 def _planar(path: Path, **options: Any) -> Recording:
     recording = read_recording(path, **options)
-    assert isinstance(recording, Recording)
+    assert recording.dim == 2
     return recording
 
 

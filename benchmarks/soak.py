@@ -268,7 +268,7 @@ def _off(session: Session, recording: Recording, pose_truth_map: FloatArray) -> 
     """Frames are recognised by their readings, which no two share, whatever is stamped on them; nan where none is."""
     truth, path, used, told = recording.truth, session.slam.trajectory, session.recording, recording.detections
     assert truth is not None
-    assert isinstance(used, Recording)
+    assert used.dim == 2
     order = np.argsort(told.range_m)
     at = np.minimum(np.searchsorted(told.range_m[order], used.detections.range_m), len(order) - 1)
     same = told.range_m[order][at] == used.detections.range_m

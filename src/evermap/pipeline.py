@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from evermap.compiled import single_threaded
 from evermap.config import Config
 from evermap.errors import ConfigError, DataError, InputError
-from evermap.types import AnyRecording, Landmarks, Progress, Recording, SlamResult, SpatialRecording
+from evermap.types import AnyRecording, Landmarks, Progress, Recording, SlamResult, is_in_space
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
@@ -85,7 +85,7 @@ def run_together(
     from evermap.slam import check, estimate, together
 
     config = config or Config()
-    if len({isinstance(recording, SpatialRecording) for recording in recordings.values()}) > 1:
+    if len({is_in_space(recording) for recording in recordings.values()}) > 1:
         problem = "some of the recordings are in the plane, some in space"
         raise InputError(problem, field="recordings", hint="robots that drove together in one or the other")
     if config.slam.unknown_ids:
@@ -94,7 +94,7 @@ def run_together(
     alone, visits, results = {}, list[spatial.SpatialVisit](), {}
     for number, given in recordings.items():
         recording, remarks = check.screened(replace(given, measurements=without_frames(given.measurements)), config)
-        if isinstance(recording, SpatialRecording):
+        if is_in_space(recording):
             visits.append(spatial.solve_visit(recording, config, None, remarks, progress=progress))
             continue
         alone[number] = estimate.solve(recording, config.slam, remarks=remarks, progress=progress)
@@ -136,7 +136,7 @@ def run_session(
     recording = session.in_its_space(recording, living, config)
     living, whole = session.opened(living, recording), recording
     located: Localised[PlanarVisit] | Localised[SpatialVisit]
-    if isinstance(recording, SpatialRecording):
+    if is_in_space(recording):
         recording, remarks = check.screened(nameless.without_ids(recording, config), config)
         session.check_static(recording, config)
         recording, living = session.admitted(recording, living)
@@ -205,7 +205,7 @@ def run_localization(
     if not len(living.places):
         raise DataError("the map is empty", field="living", hint="enter a session first")
     recording = session.in_its_space(recording, living, config)
-    if isinstance(recording, SpatialRecording):
+    if is_in_space(recording):
         recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
         recording, living = session.admitted(recording, living)
         named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])

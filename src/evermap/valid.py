@@ -23,12 +23,14 @@ from evermap.types import (
     FloatArray,
     IntArray,
     Landmarks,
+    Odometry,
     Recording,
     Sensor,
     SpatialDetections,
-    SpatialRecording,
+    SpatialOdometry,
     SpatialSensor,
     Trajectory,
+    is_in_space,
 )
 
 WITHOUT_IDS = "`unknown_ids` associates detections without a landmark_id by geometry"
@@ -123,7 +125,7 @@ P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
 
 
 def validate(recording: Any) -> None:
-    """Check that something is a recording from which a session can be estimated.
+    """Check that something is a recording, in the plane or in space, from which a session can be estimated.
 
     Every reader ends with this, and every function that takes a `Recording` begins with it; only `run_session` mends
     first what a robot on duty logs.
@@ -132,45 +134,17 @@ def validate(recording: Any) -> None:
         InputError: not a `Recording`, or a value that cannot be; the message names the array and the row.
         DataError: fewer than two rows of odometry, or no detection.
     """
-    check_type(recording, (Recording,))
+    check_type(recording)
     _check_content(recording)
-    odometry, frames, detections = recording.odometry, recording.frames, recording.detections
-    _check_stamps(odometry.stamp_s, "odometry.stamp_s")
-    for quantity in (FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS):
-        quantity.check_array(getattr(odometry, quantity.name), f"odometry.{quantity.name}")
-    _check_stamps(frames.stamp_s, "frames.stamp_s")
-    for quantity in (RANGE_M, replace(BEARING_RAD, optional=True), SIGMA_RANGE_M, SIGMA_BEARING_RAD):
-        quantity.check_array(getattr(detections, quantity.name), f"detections.{quantity.name}")
-    _check_frames(detections.frame, len(frames))
-    for name in ("landmark_id", "class_id"):
-        _check_ids(getattr(detections, name), f"detections.{name}")
-    _check_features(detections)
-    check_sensor(recording.sensor)
-    if recording.truth is not None:
-        _check_trajectory(recording.truth, "truth")
-    if recording.true_landmarks is not None:
-        check_landmarks(recording.true_landmarks, "true_landmarks")
-
-
-def validate_spatial(recording: Any) -> None:
-    """Check that something is a recording in space from which a session can be estimated.
-
-    Raises:
-        InputError: not a `SpatialRecording`, or a value that cannot be; the message names the array and the row.
-        DataError: no detection, or a single row of odometry.
-    """
-    if not isinstance(recording, SpatialRecording):
-        raise InputError(f"a SpatialRecording is needed, not {type(recording).__name__}", field="recording")
-    _check_content(recording)
-    _check_stamps(recording.frames.stamp_s, "frames.stamp_s")
     if recording.odometry is not None:
-        _check_stamps(recording.odometry.stamp_s, "odometry.stamp_s")
-        _check_poses(recording.odometry.pose_world_robot, "odometry.pose_world_robot")
-        variance = recording.odometry.variance
-        _require(~(variance < 0.0).any(axis=1), variance, "odometry.variance", "is negative", "nan where unknown")
-    _check_spatial_detections(recording.detections, len(recording.frames), len(recording.sensors))
-    for sensor in recording.sensors:
-        _check_spatial_sensor(sensor)
+        _check_odometry(recording.odometry)
+    _check_stamps(recording.frames.stamp_s, "frames.stamp_s")
+    if is_in_space(recording):
+        _check_spatial_detections(recording.detections, len(recording.frames), len(recording.sensors))
+        check_rig(recording.sensors)
+    else:
+        _check_detections(recording.detections, len(recording.frames))
+        check_sensor(recording.sensor)
     if recording.truth is not None:
         _check_trajectory(recording.truth, "truth")
     if recording.true_landmarks is not None:
@@ -190,10 +164,37 @@ def check_rig(sensors: Iterable[SpatialSensor]) -> None:
 
 def _check_content(recording: AnyRecording) -> None:
     source = recording.source or None
+    odometry = Odometry if recording.dim == 2 else SpatialOdometry | None
+    if not isinstance(recording.odometry, odometry):
+        problem = f"{type(recording.odometry).__name__} and {type(recording.detections).__name__} do not go together"
+        raise InputError(problem, field="odometry", hint="both in the plane, or both in space")
+    if (recording.dim == 3) != (len(recording.sensors) > 0):
+        problem = f"{len(recording.sensors)} sensors in space with {type(recording.detections).__name__}"
+        raise InputError(problem, field="sensors", hint="sensor in the plane, one or more sensors in space")
     if recording.odometry is not None and len(recording.odometry) < 2:
         raise DataError("the odometry needs at least two rows", path=source, field="odometry")
     if len(recording.frames) == 0 or len(recording.detections) == 0:
         raise DataError("no landmark was seen in the whole recording", path=source, hint="look at the detections")
+
+
+def _check_odometry(odometry: Odometry | SpatialOdometry) -> None:
+    _check_stamps(odometry.stamp_s, "odometry.stamp_s")
+    if isinstance(odometry, Odometry):
+        for quantity in (FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS):
+            quantity.check_array(getattr(odometry, quantity.name), f"odometry.{quantity.name}")
+        return
+    _check_poses(odometry.pose_world_robot, "odometry.pose_world_robot")
+    variance = odometry.variance
+    _require(~(variance < 0.0).any(axis=1), variance, "odometry.variance", "is negative", "nan where unknown")
+
+
+def _check_detections(detections: Detections, frames: int) -> None:
+    for quantity in (RANGE_M, replace(BEARING_RAD, optional=True), SIGMA_RANGE_M, SIGMA_BEARING_RAD):
+        quantity.check_array(getattr(detections, quantity.name), f"detections.{quantity.name}")
+    _check_frames(detections.frame, frames)
+    for name in ("landmark_id", "class_id"):
+        _check_ids(getattr(detections, name), f"detections.{name}")
+    _check_features(detections)
 
 
 def _check_spatial_detections(detections: SpatialDetections, frames: int, sensors: int) -> None:
@@ -301,9 +302,9 @@ def _check_poses(pose: FloatArray, field: str) -> None:
         _require(_is_unit(pose[:, 3:]), pose, field, "does not end in a unit quaternion", "x, y, z, qx, qy, qz, qw")
 
 
-def check_type(recording: Any, kinds: tuple[type, ...] = (Recording, SpatialRecording)) -> None:
-    """Raise InputError for anything but a recording of some kinds, with the way to get one."""
-    if not isinstance(recording, kinds):
+def check_type(recording: Any) -> None:
+    """Raise InputError for anything but a recording, with the way to get one."""
+    if not isinstance(recording, Recording):
         hint = f"evermap.read_recording({str(recording)!r})" if isinstance(recording, str | Path) else "a Recording"
         raise InputError(f"a Recording is needed, not {type(recording).__name__}", field="recording", hint=hint)
 

@@ -135,6 +135,20 @@ class Ros:
             "sensor_msgs/CameraInfo", header, 480, 640, "plumb_bob", bent, k, np.eye(3).ravel(), p, 0, 0, region
         )
 
+    def fix(
+        self, stamp_s: float, at: tuple[float, float, float], variance: Any, *, status: int = 0, kind: int = 2
+    ) -> Any:
+        """A fix at latitude, longitude [deg] and altitude [m], in the frame `gps`."""
+        state = self.make("sensor_msgs/NavSatStatus", status, 1)
+        spread = np.diag(np.asarray(variance, dtype=np.float64)).ravel()
+        return self.make("sensor_msgs/NavSatFix", self.header(stamp_s, "gps"), state, *at, spread, kind)
+
+    def imu(self, stamp_s: float, force: np.ndarray, rate: np.ndarray, frame: str = "imu") -> Any:
+        """Readings of an accelerometer and a gyroscope, beside an orientation that is wrong."""
+        force, rate = (self.make("geometry_msgs/Vector3", *map(float, part)) for part in (force, rate))
+        turn, spread = self.make("geometry_msgs/Quaternion", 1.0, 0.0, 0.0, 0.0), np.zeros(9)
+        return self.make("sensor_msgs/Imu", self.header(stamp_s, frame), turn, spread, rate, spread, force, spread)
+
 
 def in_camera(k: int) -> dict[int, np.ndarray]:
     """Where the tags are in the camera, at a step."""
@@ -242,10 +256,24 @@ DETECTORS: dict[str, tuple[str, Callable[[Ros, float, int], Any]]] = {
 
 release = cache(Ros)
 """Its types are read once."""
+Further = Callable[[Ros], list[tuple[str, str, float, Any]]]
+"""More messages of a bag: topic, type without 'msg', stamp [s] and message of each."""
 
 
-def write(path: Path, detector: str, *, late_s: float = 0.0, mounted: bool = True, odometry: str = "Odometry") -> Path:
-    """A bag of the drive: of ROS 1 where its name ends in `.bag`, else of ROS 2, in SQLite where in `_sqlite`."""
+def write(
+    path: Path,
+    detector: str,
+    *,
+    late_s: float = 0.0,
+    mounted: bool = True,
+    odometry: str = "Odometry",
+    stand: int = 0,
+    further: Further | None = None,
+) -> Path:
+    """A bag of the drive: of ROS 1 where its name ends in `.bag`, else of ROS 2, in SQLite where in `_sqlite`.
+
+    At its end the robot stands for so many steps.
+    """
     from rosbags import rosbag1, rosbag2
     from rosbags.rosbag2 import StoragePlugin
 
@@ -277,8 +305,8 @@ def write(path: Path, detector: str, *, late_s: float = 0.0, mounted: bool = Tru
             rest = se3.compose(se3.inverse(half), MOUNT)
             put("/tf_static", START_S, ros.transform(START_S, "base_link", "camera", half))
             put("/tf_static", START_S, ros.transform(START_S, "/camera", "/camera_optical", rest))
-        for k in range(STEPS):
-            stamp_s = START_S + 0.1 * k
+        for step_number in range(STEPS + stand):
+            stamp_s, k = START_S + 0.1 * step_number, min(step_number, STEPS - 1)
             pose = path_of(k)
             put("/tf", stamp_s, ros.transform(stamp_s, "odom", "base_link", pose))
             step = se3.log(se3.compose(se3.inverse(pose), path_of(k + 1))) / 0.1
@@ -288,10 +316,20 @@ def write(path: Path, detector: str, *, late_s: float = 0.0, mounted: bool = Tru
                 put(topic, stamp_s, ros.make("geometry_msgs/PoseStamped", ros.header(stamp_s, "map"), ros.pose(pose)))
             put("/camera/camera_info", stamp_s, ros.camera(stamp_s))
             put("/camera/seen", stamp_s, detect(ros, stamp_s - late_s, k))
+        _put_further(bag, ros, raw, further)
     for file in path.glob("*.db3"):  # those of Humble do not hold the types of their messages
         with closing(sqlite3.connect(file)) as database, database:
             database.execute("DELETE FROM message_definitions")
     return path
+
+
+def _put_further(bag: Any, ros: Ros, raw: Callable[[Any, str], Any], further: Further | None) -> None:
+    to: dict[str, Any] = {}
+    for topic, name, stamp_s, message in further(ros) if further is not None else ():
+        full = "{}/msg/{}".format(*name.split("/"))
+        if topic not in to:
+            to[topic] = bag.add_connection(topic, full, typestore=ros.store)
+        bag.write(to[topic], round((stamp_s + 0.01) * 1e9), raw(message, full))
 
 
 TILTED = np.append([0.15, 0.0, 0.4], se3.from_angles([0.0, 0.3, 0.0])[3:])
@@ -319,6 +357,7 @@ def write_floor(
     unit: float = 1.0,
     rotation: Callable[[int, int], np.ndarray] | None = None,
     clock_s: float = 0.0,
+    further: Further | None = None,
 ) -> Path:
     """A bag of ROS 2 of a recording in the plane: points by `Detection3DArray`, or tags by `ArucoMarkers`, in a frame
     that is mounted at a pose, each landmark at a height of its own.
@@ -366,4 +405,5 @@ def write_floor(
                 name = str(seen.landmark_id[row]) if seen.landmark_id[row] >= 0 else ""
                 boxes.append(ros.make("vision_msgs/Detection3D", header, [result], box, name))
             put("/seen", stamp_s, ros.make("vision_msgs/Detection3DArray", header, boxes))
+        _put_further(bag, ros, ros.store.serialize_cdr, further)
     return path

@@ -211,7 +211,7 @@ def test_what_is_guessed_is_told_and_reads_back_the_same(tmp_path: Path, assert_
         (
             'odometry = "/odom"',
             'odometry = "/odo"',
-            r"drive\.toml:11: field 'bag\.odometry': no topic .*'/odo' \(try: /odom",
+            r"drive\.toml:12: field 'bag\.odometry': no topic .*'/odo' \(try: /odom",
         ),
         ('topic = "/camera/seen"', 'topic = "/camera/sen"', r"'camera\.camera\.topic': no topic with detections.*seen"),
         ('clock = "header"', 'clock = "wall"', r"'bag\.clock': unknown clock 'wall'"),

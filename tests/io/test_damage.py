@@ -23,7 +23,7 @@ from evermap.io import (
     write_template,
 )
 from evermap.types import Landmarks
-from evermap.valid import validate_spatial
+from evermap.valid import validate
 
 Files = dict[str, bytes]
 damage_settings = settings(
@@ -118,7 +118,7 @@ def test_damaged_in_space(
     name = data.draw(st.sampled_from(sorted(files)))
     files[name] = data.draw(damaged(files[name]))
     path = lay_out(files)
-    sound_or_one_line(lambda: read_recording(path), validate_spatial)
+    sound_or_one_line(lambda: read_recording(path), validate)
 
 
 @damage_settings

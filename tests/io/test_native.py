@@ -514,7 +514,7 @@ def test_a_condensed_session_has_the_motion_between_frames_and_the_silences(tmp_
         ),
     )
     again = read_recording(write_session(recording, tmp_path / "session.zip"))
-    assert isinstance(again, Recording)
+    assert again.dim == 2
     few = again.odometry
     assert len(few) < 0.2 * len(driven)
     assert np.isin(few.stamp_s, stamp_s).all()

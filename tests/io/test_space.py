@@ -13,6 +13,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from evermap import run_slam
 from evermap.errors import DataError, EvermapError, InputError
 from evermap.io import (
     read_landmarks,
@@ -29,8 +30,18 @@ from evermap.io import (
 from evermap.io.landmarks import write_map_csv
 from evermap.io.native_write import write_session
 from evermap.maps.store.measured import pack_recording, unpack_recording
-from evermap.types import ANY_RANGE_M2, UNKNOWN, Landmarks, Recording, SpatialRecording, landmark_id_of
-from evermap.valid import validate_spatial
+from evermap.types import (
+    ANY_RANGE_M2,
+    UNKNOWN,
+    Detections,
+    Frames,
+    Landmarks,
+    Odometry,
+    Recording,
+    SpatialRecording,
+    landmark_id_of,
+)
+from evermap.valid import validate
 
 Files = dict[str, str]
 
@@ -571,10 +582,10 @@ WRONG: dict[str, tuple[str, dict[str, Any], str]] = {
 def test_wrong_arrays_are_named(name: str, lay_out: Callable, space: Files) -> None:
     part, changed, message = WRONG[name]
     recording = read(lay_out, space)
-    validate_spatial(recording)
+    validate(recording)
     wrong = replace(recording, **{part: replace(getattr(recording, part), **changed)})
     with pytest.raises(InputError, match=message):
-        validate_spatial(wrong)
+        validate(wrong)
 
 
 @pytest.mark.parametrize(
@@ -593,12 +604,34 @@ def test_wrong_sensors_are_named(changed: dict[str, Any], message: str, lay_out:
     recording = read(lay_out, space)
     wrong = replace(recording, sensors=(replace(recording.sensors[0], **changed),))
     with pytest.raises(InputError, match=message):
-        validate_spatial(wrong)
+        validate(wrong)
 
 
-def test_what_else_is_no_recording_in_space(lay_out: Callable, native: Files, space: Files) -> None:
-    with pytest.raises(InputError, match="a SpatialRecording is needed, not Recording"):
-        validate_spatial(read_recording(lay_out(native)))
+def test_what_else_is_no_recording(lay_out: Callable, native: Files, tmp_path: Path) -> None:
+    planar, spatial = read_recording(lay_out(native)), read_recording(write_template(tmp_path / "there", in_space=True))
+    assert (planar.dim, spatial.dim) == (2, 3)
+    with pytest.raises(InputError, match="Odometry and SpatialDetections do not go together"):
+        validate(replace(spatial, odometry=planar.odometry))
+    with pytest.raises(InputError, match="NoneType and Detections do not go together"):
+        validate(replace(planar, odometry=None))
+    for wrong in (replace(spatial, sensors=()), replace(planar, sensors=spatial.sensors)):
+        with pytest.raises(InputError, match=r"'sensors': \d sensors? in space with"):
+            validate(wrong)
+    with pytest.raises(InputError, match="a Recording is needed, not str"):
+        run_slam("recording")  # type: ignore[arg-type]
+
+
+def test_the_old_name_of_a_recording_in_space_makes_and_recognises_one(tmp_path: Path) -> None:
+    given = read_recording(write_template(tmp_path / "there", in_space=True))
+    parts = given.name, given.odometry, given.frames, given.detections, given.sensors, given.truth
+    made = SpatialRecording(*parts, symmetries={"box": ("full z",)})
+    assert isinstance(made, Recording)
+    assert isinstance(made, SpatialRecording)
+    names = ("name", "odometry", "frames", "detections", "sensors", "truth")
+    assert all(getattr(made, name) is part for name, part in zip(names, parts, strict=True))
+    assert made.symmetries == {"box": ("full z",)}
+    flat = Recording("", Odometry([], [], [], []), Frames([]), Detections([], [], [], [], [], [], [], []))
+    assert not isinstance(flat, SpatialRecording)
 
 
 def test_trajectories_in_space(lay_out: Callable, space: Files, tmp_path: Path) -> None:

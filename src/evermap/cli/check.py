@@ -98,8 +98,10 @@ def content_rows(contents: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
         rows += [("ranges only", f"{detections['without_bearing']:,} detections without a bearing")]
     aside = "bearings" if "bearing_rad" in detections else "tags"
     beyond = f"{detections['beyond_range_max']:,} ranges, {detections['outside_view']:,} {aside}"
+    further = ", ".join(f"{count:,} {kind}" for kind, count in contents["measurements"].items())
     return [
         *rows,
         ("beyond limits", beyond),
         ("landmarks", f"{landmarks['count']:,}, {landmarks['seen_once']:,} of them seen once"),
+        *([("measurements", further)] if further else []),
     ]

@@ -152,7 +152,7 @@ def _recording(path: Path, robot: int | None) -> Described:
     found = contents(recording)
     truth = 0 if recording.truth is None else len(recording.truth)
     survey = 0 if recording.true_landmarks is None else len(recording.true_landmarks)
-    sensors = [one.name for one in getattr(recording, "sensors", ())]
+    sensors = [one.name for one in recording.sensors]
     facts |= {"name": recording.name, "clock": recording.clock.value, "classes": list(recording.class_names), **found}
     facts |= {"sensors": sensors, "truth_poses": truth, "true_landmarks": survey, "warnings": list(recording.warnings)}
     rows += [

@@ -150,12 +150,14 @@ def _check_needed(
 ) -> None:
     """Refuse a recording of ranges only, and files that would say what a recording in the plane says itself."""
     from evermap.slam.cleaning import of_ranges_only
-    from evermap.types import Recording
+    from evermap.types import is_in_space
 
-    if isinstance(recording, Recording) and of_ranges_only(recording.detections, config.slam.cleaning):
+    if recording is None:
+        return
+    if not is_in_space(recording) and of_ranges_only(recording.detections, config.slam.cleaning):
         problem = f"'{recording.name}' has ranges without bearings, which are located by what is seen later"
         raise ConfigError(problem, field="replay", hint="evermap slam --map")
-    if recording is not None and not isinstance(recording, Recording) and sensor is None and map_file is not None:
+    if is_in_space(recording) and sensor is None and map_file is not None:
         if connected:
             problem = f"'{recording.name}' is in space, and connections take poses in the plane"
             raise ConfigError(problem, field="replay", hint="--sensor FILE: in the plane; or without connections")
@@ -163,7 +165,7 @@ def _check_needed(
             problem = f"'{recording.name}' has no odometry; it is solved when it ends"
             raise ConfigError(problem, field="replay", hint="evermap slam --map")
     for name, path in (("sensor", sensor), ("topics", topics)):
-        if path is not None and isinstance(recording, Recording):
+        if path is not None and not is_in_space(recording):
             problem = f"'{recording.name}' describes its topics and sensors itself"
             raise ConfigError(problem, field=name, hint=f"omit --{name}; it is for messages and bags")
 
@@ -239,12 +241,12 @@ class _Drive:
 
     def _engine(self, *, mapping: bool, beside: bool) -> Engine:
         from evermap.live.engine import Engine
-        from evermap.types import Recording
+        from evermap.types import is_in_space
 
         recording = self.recording
         about: dict[str, Any] = {"name": datetime.now(UTC).strftime("live %Y-%m-%d %H:%M:%S")}
         sensor: Any = self.sensor
-        if isinstance(recording, Recording):
+        if recording is not None and not is_in_space(recording):
             about = {"clock": recording.clock, "class_names": recording.class_names, "name": recording.name}
             sensor = recording.sensor
         elif recording is not None and sensor is None:
@@ -256,9 +258,9 @@ class _Drive:
     def _readings(self, engine: Engine, shown: _Shown, *, realtime: bool) -> Iterator[Reading | None]:
         from evermap.live.feed import replayed, replayed_in_space
         from evermap.live.ros import Listener, heard, spoken
-        from evermap.types import Recording, Sensor
+        from evermap.types import Sensor, is_in_space
 
-        if isinstance(self.recording, Recording):
+        if self.recording is not None and not is_in_space(self.recording):
             return replayed(self.recording, paced=realtime)
         if not isinstance(engine.sensor, Sensor):
             assert self.recording is not None

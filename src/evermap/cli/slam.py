@@ -304,11 +304,11 @@ def _run_alone(recording: AnyRecording, prior: Landmarks | None, out: Path, aske
     from evermap.slam.changes.joint import may_search
     from evermap.slam.plane import with_prior
     from evermap.slam.space.moving import has_traffic
-    from evermap.types import SpatialRecording
+    from evermap.types import is_in_space
 
     unknown_ids = asked.config.slam.unknown_ids
     recording, prior, _ = with_prior(recording, prior, asked.config.slam)
-    in_space = isinstance(recording, SpatialRecording)
+    in_space = is_in_space(recording)
     _refuse_unread(asked, in_space=in_space, boxes=has_traffic(recording))
     if in_space:
         if asked.realtime:
@@ -547,7 +547,7 @@ def _run_in_map(
     from evermap.pipeline import run_localization
     from evermap.runs.sessions import at_time, begin_map, enter_session
     from evermap.slam.space.moving import has_traffic
-    from evermap.types import SpatialRecording
+    from evermap.types import is_in_space
 
     config, localize, map_file = asked.config, asked.localize, asked.map_file
     assert map_file is not None
@@ -565,9 +565,9 @@ def _run_in_map(
         entered: Entered | None = None
         if survey is not None and not (later and len(store.load().places)):
             begin_map(store, survey, recording, command_line())
-        if isinstance(recording, SpatialRecording):
+        if is_in_space(recording):
             recording = in_its_space(recording, store.load(), config)
-        in_space = isinstance(recording, SpatialRecording)
+        in_space = is_in_space(recording)
         _refuse_unread(asked, in_space=in_space, boxes=has_traffic(recording))
         if asked.realtime and in_space:
             raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")

@@ -145,7 +145,7 @@ def _flight(start_s: float, n_places: int = len(PLACES)) -> SpatialRecording:
         source_line=seen.source_line,
     )
     odometry = SpatialOdometry(planar.frames.stamp_s, pose, np.full((FRAMES, 6), np.nan))
-    return SpatialRecording("warm-up", odometry, planar.frames, detections, (SpatialSensor(),))
+    return Recording("warm-up", odometry, planar.frames, detections, sensors=(SpatialSensor(),))
 
 
 if __name__ == "__main__":  # the second process: what is left when the first has compiled the filter and the search

@@ -1,14 +1,14 @@
-"""What a kind of measurement is: the columns of its table and a residual, in one file of `measurements`."""
+"""What a kind of measurement is: the columns of its table, what messages say of them, and a residual, in one file."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.types import FloatArray
+from evermap.types import FloatArray, SpatialOdometry
 
 Columns = Mapping[str, FloatArray]
 """Numbers (K,) of a table by the names of its columns."""
@@ -29,6 +29,47 @@ class Linearised(NamedTuple):
     by_other: FloatArray | None = None
 
 
+class Messages(NamedTuple):
+    """Messages of one topic of a bag, in the order of their stamps, and what is known of their sensor.
+
+    Attributes:
+        stamp_s: (K,).
+        values: (K, n) numbers of each, as `MessageRows.read` returns them.
+        mount: (7,) pose of their frame in the robot's; None where no fixed transform leads there.
+        odometry: of the robot; None of one that has none.
+    """
+
+    stamp_s: FloatArray
+    values: FloatArray
+    mount: FloatArray | None
+    odometry: SpatialOdometry | None
+
+
+class TableRows(NamedTuple):
+    """Rows of a table that messages are: stamps (K,), columns by name (those left out are not said), and a remark."""
+
+    stamp_s: FloatArray
+    columns: Columns
+    remark: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MessageRows:
+    """How messages of ROS become rows of a kind of measurement.
+
+    Attributes:
+        types: names of the messages' types without their packages, such as 'NavSatFix'.
+        read: numbers that a message says, as many in each; None where it measures nothing.
+        rows: the rows of all messages of a topic; None where `read` returns the numbers of `columns` in their order.
+        derived: words in the names of topics that hold no measurement of a sensor but what was made of several.
+    """
+
+    types: tuple[str, ...]
+    read: Callable[[Any], tuple[float, ...] | None]
+    rows: Callable[[Messages], TableRows] | None = None
+    derived: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, slots=True)
 class MeasurementKind:
     """A kind of measurement.
@@ -46,6 +87,7 @@ class MeasurementKind:
         place: of a kind that sees landmarks, where (3,) one of them may be, for poses (K, 7) and columns; None where
             these do not tell.
         frame: of a kind that has a frame of its own, the motion (7,) that brings poses (K, 7) into it, by its columns.
+        messages: how it is read from bags; None of a kind for which ROS has no message.
     """
 
     name: str
@@ -58,6 +100,7 @@ class MeasurementKind:
     first_sigma: tuple[float, ...] = (1e-4,) * 6
     place: Callable[[FloatArray, Columns], FloatArray | None] | None = None
     frame: Callable[[FloatArray, Columns], FloatArray] | None = None
+    messages: MessageRows | None = None
 
 
 def stacked(columns: Columns, *names: str) -> FloatArray:

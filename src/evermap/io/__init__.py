@@ -16,7 +16,7 @@ from evermap.io.tagslam import TAGSLAM
 from evermap.io.template import write_template
 from evermap.io.tum import read_tum, write_tum
 from evermap.io.ycbv import YCBV
-from evermap.types import Recording, SpatialRecording
+from evermap.types import Recording, SpatialRecording, is_in_space
 
 __all__ = [
     "READERS",
@@ -94,7 +94,7 @@ def read_planar(path: str | Path, robot: int | None = None) -> Recording:
         DataError: well-formed, but nothing can be estimated from it.
     """
     recording = read_recording(path, robot)
-    if not isinstance(recording, Recording):
+    if is_in_space(recording):
         raise InputError("the recording is in space; this works in the plane only", path=path)
     return recording
 

@@ -26,7 +26,7 @@ from evermap.types import (
     SpatialOdometry,
     SpatialRecording,
 )
-from evermap.valid import STAMP_S, validate, validate_spatial
+from evermap.valid import STAMP_S, validate
 
 SAME_STAMP_S = 1e-6
 """Stamps closer than this are the same instant when detections are assigned to frames."""
@@ -130,10 +130,7 @@ def finish_recording(recording: _Recorded, *, warnings: list[str]) -> _Recorded:
     Raises:
         DataError: fewer than two odometry rows, no frame within the odometry's time, or no landmark seen.
     """
-    if isinstance(recording, SpatialRecording):
-        validate_spatial(recording)
-    else:
-        validate(recording)
+    validate(recording)
     odometry, source = recording.odometry, recording.source
     if odometry is not None:
         _warn_of_gaps(odometry, warnings)

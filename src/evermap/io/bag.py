@@ -10,6 +10,7 @@ with the bag from then on. ROS need not be installed.
 - Tags: `AprilTagDetectionArray` of several packages, `ArucoMarkers`, `ArucoDetection`, `FiducialTransformArray`.
 - Objects: `vision_msgs/Detection3DArray`, `Detection2DArray`; else `visualization_msgs/MarkerArray`,
   `foxglove_msgs/SceneUpdate` in a frame of the robot.
+- Other measurements: messages that a kind of `estimate.measurements` names, such as `sensor_msgs/NavSatFix` and `Imu`.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import DataError, InputError, suggestion
+from evermap.estimate.kind import Messages, TableRows
+from evermap.estimate.measurements import find_kinds
 from evermap.geometry import se3
 from evermap.io.assemble import finish_recording, looks_of
 from evermap.io.bag_messages import POSES, TWISTS, BagContent, SeenColumns, scanned
@@ -39,6 +42,8 @@ from evermap.types import (
     FloatArray,
     Frames,
     IntArray,
+    Measurements,
+    Recording,
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
@@ -97,6 +102,7 @@ class BagSettings:
         base_frame: name of the robot's frame, which the odometry moves.
         clock: 'header', the stamps of messages, or 'receive', when they were recorded.
         sensors: whose detections are read, by name.
+        measurements: topics by the names of kinds of measurements; '' where none is read.
         rig: what is stated of the tags' sizes, and how objects look the same.
     """
 
@@ -105,6 +111,7 @@ class BagSettings:
     base_frame: str = ""
     clock: str = "header"
     sensors: Mapping[str, BagSensor] = field(default_factory=dict)
+    measurements: Mapping[str, str] = field(default_factory=dict)
     rig: Rig = field(default_factory=Rig)
 
 
@@ -150,6 +157,8 @@ def bag_settings(path: str | Path) -> str:
     for name, one in settings.sensors.items():
         given: dict[str, Any] = {key: getattr(one, key) for key in _OF_SENSOR}
         sections[f"camera.{name}"] = given if one.camera_info else given | {"rectified": None}
+    if settings.measurements:
+        sections["measurements"] = dict(settings.measurements)
     listed = "\n".join(f"#   {name}  {one.text}  {one.messages}" for name, one in sorted(content.topics.items()))
     return f"{_HEAD}{toml_text(sections)}\n# All topics, with the type and number of their messages:\n{listed}\n"
 
@@ -162,6 +171,7 @@ _HEAD = """\
 # identity = "id", "class" or "none": the field that identifies a landmark.
 # A section [camera.NAME] takes all keys of a camera.toml, too, which override the bag:
 #   intrinsics = [fx, fy, cx, cy], model, distortion; [camera.NAME.mount] with x_m, y_m, z_m, roll_rad, ...
+# [measurements]: topics of further kinds of measurements, such as gnss = "/fix"; "" for none.
 # Tags need a size if the messages contain only their corners:
 # [tags]
 # size_m = 0.16
@@ -189,7 +199,23 @@ def guessed_settings(content: BagContent) -> BagSettings:
     base = base or next((content.frames.get(topic, "") for topic in plain), "")
     chosen = plain or [one for one in sighted if content.mount(base, content.frames.get(one, "")) is not None]
     sensors = {name: _sensor(content, topic) for topic, name in _short(chosen).items()}
-    return BagSettings(odometry, true[0] if true else "", base, "header", sensors)
+    return BagSettings(odometry, true[0] if true else "", base, "header", sensors, _measuring(content))
+
+
+def _measuring(content: BagContent) -> dict[str, str]:
+    """Topics by kinds of measurements: the only sensor's, '' where several sensors measure the same.
+
+    Topics of one frame are one sensor's, raw and filtered: the one with most messages is read.
+    """
+    found = {}
+    for name, kind in find_kinds().items():
+        derived = kind.messages.derived if kind.messages is not None else ()
+        some = [topic for of, topic in content.measured if of == name and content.measured[of, topic]]
+        some = [topic for topic in some if not any(word in topic.lower() for word in derived)]
+        if some:
+            one = min(some, key=lambda topic: (-len(content.measured[name, topic]), topic))
+            found[name] = one if len({content.frames.get(topic, "") for topic in some}) == 1 else ""
+    return found
 
 
 def _short(topics: list[str]) -> dict[str, str]:
@@ -227,17 +253,22 @@ def stated_settings(path: Path, content: BagContent, guessed: BagSettings, *, wh
         reader = TomlReader(path.read_bytes(), path)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path, hint="evermap slam --init-bag BAG") from None
-    reader.expect(("bag", "camera", "tags"), reader.document, section=None)
-    given = reader.section("bag", _TEXTS)
-    for key, value in given.items():
-        if not isinstance(value, str):
-            raise reader.error("bag", key, f"must be a text, not {type(value).__name__}")
+    reader.expect(("bag", "camera", "measurements", "tags"), reader.document, section=None)
+    given, measured = reader.section("bag", _TEXTS), reader.section("measurements", tuple(find_kinds()))
+    for section, values in {"bag": given, "measurements": measured}.items():
+        for key, value in values.items():
+            if not isinstance(value, str):
+                raise reader.error(section, key, f"must be a text, not {type(value).__name__}")
     if given.get("clock", "header") not in ("header", "receive"):
         raise reader.error("bag", "clock", f"unknown clock '{given['clock']}'", hint='"header" or "receive"')
     for key in ("odometry", "truth"):
         if given.get(key) and whole:
             _check_topic(reader, "bag", key, given[key], content.motion, "poses or velocities")
-    settings = replace(guessed, **given)
+    for kind, topic in measured.items():
+        if topic and whole:
+            of_kind = {one: rows for (name, one), rows in content.measured.items() if name == kind}
+            _check_topic(reader, "measurements", kind, topic, of_kind, kind)
+    settings = replace(guessed, **given, measurements={**guessed.measurements, **measured})
     if "camera" not in reader.document:
         return settings
     rig = cameras(reader, Settings(), SpatialSensor(), tuple(_OF_SENSOR))
@@ -284,7 +315,11 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     if guessed:
         read = ", ".join(one.topic for one in settings.sensors.values())
         moved = f"odometry {settings.odometry}" if settings.odometry else "no odometry"
-        warnings.append(f"topics as guessed: detections {read}; {moved} (`--init-bag` writes them for editing)")
+        more = "".join(f"; {kind} {topic}" for kind, topic in settings.measurements.items() if topic)
+        warnings.append(f"topics as guessed: detections {read}; {moved}{more} (`--init-bag` writes them for editing)")
+        for kind in (kind for kind, topic in settings.measurements.items() if not topic):
+            some = ", ".join(topic for name, topic in content.measured if name == kind)
+            warnings.append(f"{kind} of several sensors not read: {some} (`--init-bag`, then [measurements])")
     sensors = tuple(mounted_sensor(path, content, settings, name, warnings) for name in settings.sensors)
     _tell_late(content, settings, warnings)
     stamps = [stamps_of(content, one.topic, settings.clock) for one in settings.sensors.values()]
@@ -302,9 +337,10 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
         warnings.append(f"{counted(int((~finite).sum()), 'detection')} without a finite position left out")
     detections = detections[np.flatnonzero(finite)[np.argsort(detections.frame[finite], kind="stable")]]
     truth = _odometry(path, content, settings, settings.truth, clock)
-    recording = SpatialRecording(
+    odometry = _odometry(path, content, settings, settings.odometry, clock)
+    recording = Recording(
         name=path.resolve().name.split(".")[0],
-        odometry=_odometry(path, content, settings, settings.odometry, clock),
+        odometry=odometry,
         frames=Frames(looked, complete=messages < sum(map(len, stamps)) or messages < FEWEST_LOOKS, clock=clock),
         detections=detections,
         sensors=sensors,
@@ -313,8 +349,36 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
         source=str(path),
         clock=clock,
         landmark_names=names,
+        measurements=_measurements(content, settings, odometry, warnings),
     )
     return finish_recording(recording, warnings=warnings)
+
+
+def _measurements(
+    content: BagContent, settings: BagSettings, odometry: SpatialOdometry | None, warnings: list[str]
+) -> tuple[Measurements, ...]:
+    """Return the measurements of the chosen topics, in the order of their stamps; `warnings` gets remarks on them."""
+    found = []
+    for name, topic in settings.measurements.items():
+        kind, rows = find_kinds()[name], content.measured.get((name, topic), [])
+        if kind.messages is None or not rows:
+            continue
+        stamp_s = stamps_of(content, topic, settings.clock)[[look for look, _ in rows]]
+        order = np.argsort(stamp_s, kind="stable")
+        values = np.array([numbers for _, numbers in rows], dtype=np.float64)[order]
+        frame = content.frames.get(topic, "")
+        mount = content.mount(settings.base_frame, frame) if frame else None
+        if kind.messages.rows is None:
+            made = TableRows(stamp_s[order], dict(zip(kind.columns, values.T.copy(), strict=True)))
+        else:
+            made = kind.messages.rows(Messages(stamp_s[order], values, mount, odometry))
+        if made.remark:
+            warnings.append(f"{name} of {topic}: {made.remark}")
+        if len(made.stamp_s):
+            nowhere = np.full(len(made.stamp_s), UNKNOWN)
+            left_out = {key: np.full(len(nowhere), value) for key, value in kind.optional.items()}
+            found.append(Measurements(name, made.stamp_s, left_out | dict(made.columns), nowhere))
+    return tuple(found)
 
 
 def detections_of(
@@ -359,7 +423,8 @@ def stamps_of(content: BagContent, topic: str, clock: str) -> FloatArray:
 def _tell_late(content: BagContent, settings: BagSettings, warnings: list[str]) -> None:
     """Warn where stamps of two topics seem to be of different clocks."""
     late = {}
-    for topic in (*(one.topic for one in settings.sensors.values()), settings.odometry):
+    measured = tuple(topic for topic in settings.measurements.values() if topic)
+    for topic in (*(one.topic for one in settings.sensors.values()), settings.odometry, *measured):
         if settings.clock == "header" and topic in content.stamps:
             header, received = np.array(content.stamps[topic]).reshape(-1, 2).T
             late[topic] = float(np.median(np.where(header > 0.0, received - header, 0.0)))

@@ -1,4 +1,4 @@
-"""Motion, detections, cameras and frames from the messages in a bag, of types in any package.
+"""Motion, detections, measurements, cameras and frames from the messages in a bag, of types in any package.
 
 Fields decide more than types: a pose may come with a header, a covariance, or both; a detection of a tag with its pose
 or its corners; class and score of an object in the forms of three releases of `vision_msgs`.
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from evermap.estimate.measurements import find_kinds
 from evermap.geometry import se3
 from evermap.io.rosbag import MOST_HAMMING, Handler, Topic, corners_of, pose_of, scan, seconds, stamp_of
 from evermap.types import FloatArray, IntArray
@@ -86,6 +87,8 @@ class BagContent:
     frames: dict[str, str] = field(default_factory=dict)  # of a topic: the child of its poses, or where it sees things
     seen: dict[str, list[Seen]] = field(default_factory=dict)
     cameras: dict[str, Any] = field(default_factory=dict)
+    measured: dict[tuple[str, str], list[tuple[int, tuple[float, ...]]]] = field(default_factory=dict)
+    """By kind of measurement and topic: numbers of messages, and what these say."""
     edges: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
     moving: set[tuple[str, str]] = field(default_factory=set)
 
@@ -136,7 +139,8 @@ def scanned(path: Path) -> BagContent:
 
     def handlers(topics: Mapping[str, Topic]) -> dict[str, Handler]:
         content.topics = dict(topics)
-        return {topic: handler for topic in topics if (handler := handler_of(content, topic)) is not None}
+        found = {topic: handler_of(content, topic) or _measured_of(content, topic) for topic in topics}
+        return {topic: handler for topic, handler in found.items() if handler is not None}
 
     scan(path, handlers)
     return content
@@ -154,6 +158,29 @@ def handler_of(content: BagContent, topic: str) -> Handler | None:
     if kind in FRAMES:
         return lambda message, _: _edges_of(content, message)
     return None
+
+
+def _measured_of(content: BagContent, topic: str) -> Handler | None:
+    """Return what adds a message to the measurements that are made of its type; None of other types."""
+    kind = "" if content.topics[topic].encoding else content.kind(topic)
+    readers = [
+        (one.messages.read, content.measured.setdefault((name, topic), []))
+        for name, one in find_kinds().items()
+        if one.messages is not None and kind in one.messages.types
+    ]
+
+    def handle(message: Any, received_s: float) -> None:
+        stamp_s, frame = _said(message)
+        number = content.take_look(topic, stamp_s, received_s, frame)
+        for read, rows in readers:
+            numbers = read(message)
+            if numbers is not None:
+                rows.append((number, numbers))
+
+    if not readers:
+        return None
+    content.stamps.setdefault(topic, [])
+    return handle
 
 
 def _camera_of(content: BagContent, topic: str) -> Handler:

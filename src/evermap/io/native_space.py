@@ -44,6 +44,7 @@ from evermap.types import (
     Frames,
     IntArray,
     Odometry,
+    Recording,
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
@@ -106,7 +107,7 @@ def spatial_recording(
     if landmarks is not None and len(landmarks):
         landmarks.expect(AT, tuple(landmarks.columns))
     surveyed = survey_of(landmarks, class_names=class_names, clock=settings.clock, names=names)
-    recording = SpatialRecording(
+    recording = Recording(
         name=settings.name or title,
         odometry=_odometry(tables["odometry"], settings.clock, warnings) if driven is None else _in_space(driven),
         frames=frames,

@@ -29,10 +29,10 @@ from evermap.types import (
     Landmarks,
     Odometry,
     Recording,
-    Sensor,
     SpatialOdometry,
     SpatialRecording,
     Trajectory,
+    is_in_space,
 )
 
 LONGEST_S = 0.5
@@ -136,9 +136,9 @@ def _contents(recording: Recording | SpatialRecording) -> tuple[dict[str, str], 
         clock=recording.clock,
         frames_complete=recording.frames.complete,
         class_names=_class_names(recording),
-        sensor=recording.sensor if isinstance(recording, Recording) else Sensor(),
+        sensor=recording.sensor,
     )
-    if isinstance(recording, Recording):
+    if not is_in_space(recording):
         return {SENSOR_FILE: sensor_toml(settings)}, native_tables(recording)
     known = {name: said for name, said in recording.symmetries.items() if name in _class_names(recording)}
     return rig_toml(recording.sensors, settings, known), native_tables(recording)
@@ -153,7 +153,7 @@ def native_tables(recording: Recording | SpatialRecording) -> dict[str, dict[str
     tables: dict[str, dict[str, Any]] = {}
     if recording.odometry is not None:
         tables["odometry"] = _odometry(recording.odometry)
-    seen = _in_plane(recording) if isinstance(recording, Recording) else _in_space(recording)
+    seen = _in_space(recording) if is_in_space(recording) else _in_plane(recording)
     tables["detections"] = {"stamp_s": recording.frames.stamp_s[detections.frame], **seen}
     if np.any(detections.class_id != UNKNOWN):
         tables["detections"]["class_id"] = labels_of(detections.class_id, names)
@@ -168,7 +168,7 @@ def native_tables(recording: Recording | SpatialRecording) -> dict[str, dict[str
         tables["landmarks"] = _survey(recording.true_landmarks, called, names)
     if recording.robot_sightings is not None:
         tables["robot_sightings"] = _columns(recording.robot_sightings, "stamp_s", "robot_id", "range_m", "bearing_rad")
-    if isinstance(recording, Recording) and len(recording.objects):
+    if len(recording.objects):
         landmark_id = _called(recording.objects[:, 0], called)
         tables["objects"] = {"landmark_id": landmark_id, "object_id": recording.objects[:, 1]}
     for table in recording.measurements:

@@ -32,6 +32,7 @@ from evermap.types import (
     FloatArray,
     Frames,
     Landmarks,
+    Recording,
     SpatialOdometry,
     SpatialRecording,
     SpatialSensor,
@@ -155,7 +156,7 @@ def _recording(
         tag_size_m=setup.rig.size_of(seen.tag_id[order]),
         source_line=seen.line[order],
     )
-    recording = SpatialRecording(
+    recording = Recording(
         name=f"TagSLAM {files.title}",
         odometry=odometry,
         frames=Frames(looked, complete=seen.complete, clock=Clock.UNIX),

@@ -23,6 +23,7 @@ from evermap.types import (
     Frames,
     IntArray,
     Landmarks,
+    Recording,
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
@@ -54,7 +55,7 @@ def read_ycbv(path: str | Path, robot: int | None = None) -> SpatialRecording:
     rows = pose_rows(*_file(files, "odometry"), warnings)
     stamp_s, pose = poses_in_order(rows, warnings)
     truth = _trajectory(files, "camera_truth", warnings)
-    recording = SpatialRecording(
+    recording = Recording(
         name=f"YCB-Video {files.title}",
         odometry=SpatialOdometry(stamp_s, pose, np.full((len(pose), 6), np.nan)),
         frames=Frames(stamp_s.copy()),

@@ -52,6 +52,7 @@ from evermap.types import (
     SpatialRecording,
     SpatialSensor,
     Trajectory,
+    is_in_space,
     rows_of,
 )
 from evermap.valid import check_rig, check_sensor
@@ -133,7 +134,7 @@ class Engine:
         self._rig: SpatialRecording | None = None
         """Sensors and classes in space, without readings; None in the plane."""
         self._sensor: Sensor | tuple[SpatialSensor, ...]
-        if isinstance(recording, SpatialRecording):
+        if is_in_space(recording):
             self._sensor = self._config.sensor.applied_in_space(recording.sensors)
             self._rig = replace(recording, sensors=self._sensor, symmetries=symmetries or {})
             check_rig(self._sensor)

@@ -32,7 +32,6 @@ from evermap.types import (
     Recording,
     Sensor,
     SpatialOdometry,
-    SpatialRecording,
     SpatialSensor,
     landmark_id_of,
 )
@@ -361,7 +360,7 @@ def recording_of(sensor: object, name: str, clock: Clock, class_names: tuple[str
         odometry = SpatialOdometry(none, np.zeros((0, 7)), np.zeros((0, 6)), clock)
         seen = spatial_detections(no)
         frames = Frames(none, clock=clock)
-        return SpatialRecording(name, odometry, frames, seen, tuple(given), class_names=class_names, clock=clock)
+        return Recording(name, odometry, frames, seen, sensors=tuple(given), class_names=class_names, clock=clock)
     if isinstance(sensor, str | Path):
         from evermap.io.sensor_toml import parse_sensor_toml
 

@@ -16,6 +16,7 @@ from evermap.types import (
     UNKNOWN,
     FloatArray,
     Frames,
+    Recording,
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
@@ -112,9 +113,9 @@ class SpatialInbox(Inbox):
         path = SpatialOdometry(
             np.ascontiguousarray(odometry[:, 0]), odometry[:, 1:], np.full((len(odometry), 6), np.nan), clock
         )
-        return SpatialRecording(
+        return Recording(
             about.name, path, Frames(np.array([one.stamp_s for one in frames]), clock=clock),
-            detections_of(rows, frame), self._rig, class_names=classes, clock=clock, landmark_names=texts,
+            detections_of(rows, frame), sensors=self._rig, class_names=classes, clock=clock, landmark_names=texts,
             symmetries=about.symmetries,
         )  # fmt: skip
 

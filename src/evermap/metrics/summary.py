@@ -11,7 +11,7 @@ from evermap.metrics.consistency import NisSummary, share_in_band, summarise_nis
 from evermap.metrics.landmarks import MIN_SIGHTINGS, LandmarkErrors, by_recorded_identity, evaluate_landmarks
 from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory
 from evermap.show import Shown
-from evermap.types import AnyRecording, BoolArray, FloatArray, SlamResult, SpatialRecording, json_number
+from evermap.types import AnyRecording, BoolArray, FloatArray, SlamResult, is_in_space, json_number
 
 RATE_HZ = 2.0
 IN_VIEW_S = 1.0
@@ -52,14 +52,14 @@ def compare_with_truth(recording: AnyRecording, result: SlamResult, *, rate_hz: 
     if recording.truth is not None:
         # in space there may be no odometry, and then no pose where nothing was seen
         within: dict[str, Any] = {"rate_hz": rate_hz, "max_gap_s": float("inf")}
-        if isinstance(recording, SpatialRecording):
+        if is_in_space(recording):
             within |= {"max_gap_s": ONLINE_MAX_GAP_S, "looked_s": recording.frames.stamp_s}
         poses = evaluate_trajectory(result.trajectory, recording.truth, **within)
         online = evaluate_trajectory(result.online, recording.truth, **within | {"max_gap_s": ONLINE_MAX_GAP_S})
         dead_reckoning = evaluate_trajectory(result.dead_reckoning, recording.truth, rate_hz=rate_hz)
     if recording.true_landmarks is not None:
         mapped = by_recorded_identity(result.landmarks, result.innovations, recording)
-        same = recording.symmetries if isinstance(recording, SpatialRecording) else None
+        same = recording.symmetries if is_in_space(recording) else None
         own = evaluate_landmarks(mapped, recording.true_landmarks, None, symmetries=same)
         if poses is not None:
             landmarks = evaluate_landmarks(mapped, recording.true_landmarks, poses.pose_truth_estimate, symmetries=same)

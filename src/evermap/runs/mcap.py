@@ -26,8 +26,8 @@ from evermap.types import (
     MapChange,
     Odometry,
     SlamResult,
-    SpatialRecording,
     Trajectory,
+    is_in_space,
 )
 
 TOPICS = {
@@ -216,7 +216,7 @@ def ros_covariance(trajectory: Trajectory) -> FloatArray:
 
 def _mounts(recording: AnyRecording) -> list[tuple[str, FloatArray]]:
     """Name and pose (7,) of each sensor on the robot."""
-    if isinstance(recording, SpatialRecording):
+    if is_in_space(recording):
         return [(one.name, np.array(one.mount_robot_sensor)) for one in recording.sensors]
     return [("sensor", in_space(np.array([recording.sensor.mount_robot_sensor]))[0])]
 
@@ -224,7 +224,7 @@ def _mounts(recording: AnyRecording) -> list[tuple[str, FloatArray]]:
 def _detections(ros: Ros, recording: AnyRecording) -> Iterator[_Stamped]:
     """A message for every frame and sensor, also where nothing was seen."""
     stamps, mounts, names = recording.frames.stamp_s, _mounts(recording), recording.landmark_names
-    if isinstance(recording, SpatialRecording):
+    if is_in_space(recording):
         seen = recording.detections
         at, turn, size = seen.position_sensor_m, seen.rotation, np.nan_to_num(seen.size_m)
         sensor, score = seen.sensor, np.nan_to_num(seen.score, nan=1.0)

@@ -33,7 +33,7 @@ from evermap.maps.store import (
 from evermap.maps.store.content import DamagedError
 from evermap.maps.store.measured import RECORDING, TRAJECTORY, pack_recording, pack_trajectory, unpack_recording
 from evermap.show import Shown
-from evermap.types import Progress, SpatialRecording
+from evermap.types import Progress, is_in_space
 from evermap.valid import check_type
 
 if TYPE_CHECKING:
@@ -443,7 +443,7 @@ def _session_again(store: MapStore, step: _Step, living: LivingMap, config: Conf
 
 def _of_its_space(recording: AnyRecording, config: Config | None) -> Config | None:
     """Return settings by which a recording in space stays there, and one in the plane is no contradiction."""
-    stays = False if isinstance(recording, SpatialRecording) else None
+    stays = False if is_in_space(recording) else None
     if config is None and stays is None:
         return None
     config = config or Config()

@@ -24,6 +24,7 @@ from evermap.types import (
     Landmarks,
     MapChange,
     Misses,
+    Recording,
     SlamResult,
     SpatialRecording,
     SpatialSensor,
@@ -143,7 +144,7 @@ def _nothing(name: str, clock: Clock) -> SpatialRecording:
     """A recording in which nothing was seen."""
     frames = Frames(np.zeros(0), clock=clock)
     nobody = spatial_detections(np.zeros(0, dtype=np.int64))
-    return SpatialRecording(name, None, frames, nobody, (SpatialSensor(),), clock=clock)
+    return Recording(name, None, frames, nobody, sensors=(SpatialSensor(),), clock=clock)
 
 
 def _result(path: Trajectory, online: Trajectory, landmarks: Landmarks, **more: Any) -> SlamResult:

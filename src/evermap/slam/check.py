@@ -32,9 +32,10 @@ from evermap.types import (
     Recording,
     SpatialOdometry,
     SpatialRecording,
+    is_in_space,
     rows_of,
 )
-from evermap.valid import WITHOUT_IDS, check_landmarks, validate, validate_spatial
+from evermap.valid import WITHOUT_IDS, check_landmarks, validate
 
 OUTSIDE = 0.05
 """Share of the image size by which undistorted corners of tags may lie outside of the image."""
@@ -48,7 +49,8 @@ class Check(Shown):
 
     Attributes:
         name, source: of the recording.
-        contents: numbers by table: `odometry`, `frames`, `detections`, `landmarks`; plain values, None where unknown.
+        contents: numbers by table: `odometry`, `frames`, `detections`, `landmarks`, `measurements` (rows of each kind);
+            plain values, None where unknown.
         findings: what is odd, the worst first.
         warnings: remarks of the reader.
     """
@@ -169,13 +171,14 @@ def contents(recording: AnyRecording) -> dict[str, dict[str, Any]]:
         "detections": {
             "count": len(detections),
             "without_identity": int(np.sum(~known)),
-            **(_seen_in_space(recording) if isinstance(recording, SpatialRecording) else _seen(recording)),
+            **(_seen_in_space(recording) if is_in_space(recording) else _seen(recording)),
         },
         "landmarks": {
             "count": len(of_landmark),
             "seen_once": int(np.sum(of_landmark == 1)),
             "median_detections": float(np.median(of_landmark)) if len(of_landmark) else None,
         },
+        "measurements": {table.kind: len(table) for table in recording.measurements},
     }
 
 
@@ -385,7 +388,7 @@ def screened(
     from evermap.slam.votes import without_contradicted_ids
 
     settings, remarks = config.slam, tuple[str, ...]()
-    if isinstance(recording, SpatialRecording):
+    if is_in_space(recording):
         recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
         remarks = tuple(finding.message for finding in _read_wrongly_in_space(recording, settings))
     else:
@@ -423,8 +426,8 @@ def check_recording(recording: AnyRecording, config: Config | None = None) -> Ch
     config = config or Config()
     settings = config.slam
     recording = in_its_space(recording, settings)
-    if isinstance(recording, SpatialRecording):
-        validate_spatial(recording)
+    if is_in_space(recording):
+        validate(recording)
         recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
         found = findings_in_space(recording, settings)
     else:

@@ -20,7 +20,16 @@ import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
-from evermap.types import UNKNOWN, AnyRecording, FloatArray, IntArray, Odometry, Recording, SpatialRecording
+from evermap.types import (
+    UNKNOWN,
+    AnyRecording,
+    FloatArray,
+    IntArray,
+    Odometry,
+    Recording,
+    SpatialRecording,
+    is_in_space,
+)
 
 USUAL = CheckConfig()
 
@@ -244,7 +253,7 @@ def pairs_of(recording: AnyRecording, settings: CheckConfig = USUAL) -> Pairs | 
     first, second = sighting_pairs(recording, settings)
     if len(first) < settings.fewest:
         return None
-    return (SpatialPairs if isinstance(recording, SpatialRecording) else PlanarPairs)(recording, first, second)  # type: ignore[arg-type]
+    return (SpatialPairs if is_in_space(recording) else PlanarPairs)(recording, first, second)  # type: ignore[arg-type]
 
 
 def sighting_pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, IntArray]:
@@ -252,7 +261,7 @@ def sighting_pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntA
     detections = recording.detections
     stamp_s = recording.frames.stamp_s[detections.frame]
     known = detections.landmark_id != UNKNOWN
-    if isinstance(recording, SpatialRecording):
+    if is_in_space(recording):
         from evermap.slam.space.intake import positions_of, without_range
 
         known &= ~without_range(recording) & np.isfinite(positions_of(recording)).all(axis=1)

@@ -14,7 +14,7 @@ import numpy as np
 from evermap.config import CheckConfig
 from evermap.geometry import se3
 from evermap.slam.mistakes import sighting_pairs
-from evermap.types import AnyRecordingT, BoolArray, SpatialRecording
+from evermap.types import AnyRecordingT, BoolArray, SpatialRecording, is_in_space
 
 SAME = 1e-6
 """Difference between the numbers of two quaternions that are equal."""
@@ -32,7 +32,7 @@ def without_unmeasured(recording: AnyRecordingT, settings: CheckConfig) -> AnyRe
     turned; or if those of one landmark, seconds apart, turn with the robot. Boxes, tags with corners, and classes with
     symmetries are not asked.
     """
-    if not isinstance(recording, SpatialRecording):
+    if not is_in_space(recording):
         return recording
     seen = recording.detections
     warnings: list[str] = []

@@ -33,8 +33,10 @@ from evermap.types import (
     SpatialOdometry,
     SpatialRecording,
     Trajectory,
+    is_in_space,
     rows_of,
 )
+from evermap.valid import check_type
 
 LEVEL_M = 0.02
 """Difference in height of the odometry of a robot on a floor."""
@@ -61,9 +63,11 @@ def in_its_space(recording: AnyRecording, settings: SlamConfig, *, dim: int | No
         dim: 2 or 3 of the map that it goes into; None for none.
 
     Raises:
+        InputError: not a recording.
         ConfigError: `plane` is set, and the recording cannot be there.
     """
-    if not isinstance(recording, SpatialRecording):
+    check_type(recording)
+    if not is_in_space(recording):
         if settings.plane is False:
             problem = f"{recording.name}: a recording in the plane cannot be estimated in space"
             raise ConfigError(problem, field="slam.plane", hint="leave it out")
@@ -94,7 +98,7 @@ def with_prior(
     dim = None if prior_map is None else int(prior_map.position_m.shape[1])
     found = in_its_space(recording, settings, dim=dim)
     remarks = () if found is recording else found.warnings[len(recording.warnings) :]
-    if prior_map is not None and dim == 3 and isinstance(found, Recording) and settings.plane:
+    if prior_map is not None and dim == 3 and not is_in_space(found) and settings.plane:
         prior_map = landmarks_in_plane(prior_map)
     return found, prior_map, remarks
 
@@ -173,6 +177,7 @@ def _in_plane(recording: SpatialRecording, why: str) -> Recording:
         clock=recording.clock,
         landmark_names=recording.landmark_names,
         robot=recording.robot,
+        measurements=recording.measurements,
     )
 
 

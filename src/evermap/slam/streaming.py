@@ -184,7 +184,7 @@ class StreamingSlam:
             self._job = self._relinearised(learn=False)
 
     def _a_frame_ms(self) -> float:
-        """Work on a relinearisation in a frame: a few slices; all if not paced, or where no place may change meanwhile."""
+        """Work on a relinearisation in a frame: a few slices; all if not paced, or if no place may change meanwhile."""
         if self._job is None:
             return SLICES_A_FRAME
         waits = self._method.revises(self._problem) and self._method.beside() is None

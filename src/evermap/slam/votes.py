@@ -31,6 +31,7 @@ from evermap.types import (
     IntArray,
     Recording,
     SpatialRecording,
+    is_in_space,
 )
 
 FIRST_QUARTILE = {2: 0.575, 3: 1.213}
@@ -83,7 +84,7 @@ class Read(NamedTuple):
 
 
 def _read(recording: AnyRecording, settings: SlamConfig) -> tuple[IntArray, Read]:
-    return _in_space(recording, settings) if isinstance(recording, SpatialRecording) else _in_plane(recording, settings)
+    return _in_space(recording, settings) if is_in_space(recording) else _in_plane(recording, settings)
 
 
 def _in_plane(recording: Recording, settings: SlamConfig) -> tuple[IntArray, Read]:

@@ -23,7 +23,7 @@ from evermap.types import (
     IntArray,
     Landmarks,
     SlamResult,
-    SpatialRecording,
+    is_in_space,
     rows_of,
 )
 from evermap.viz.map_figure import class_names_of, moves
@@ -417,7 +417,7 @@ def _ellipses(points: Float32Array, covariance: FloatArray) -> Float32Array:
 
 def _readings(recording: AnyRecording) -> tuple[FloatArray, FloatArray]:
     """Pose of the sensor on the robot and place in the sensor's frame of each detection, nan where it has no depth."""
-    if isinstance(recording, SpatialRecording):
+    if is_in_space(recording):
         mounts = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])
         return mounts[recording.detections.sensor], recording.detections.position_sensor_m
     bearing, range_m = recording.detections.bearing_rad, recording.detections.range_m

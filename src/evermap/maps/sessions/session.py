@@ -40,6 +40,7 @@ from evermap.types import (
     Sensor,
     SlamResult,
     SpatialRecording,
+    is_in_space,
     rows_of,
 )
 from evermap.valid import check_type
@@ -111,7 +112,7 @@ def with_names_of(living: LivingMap, recording: AnyRecording) -> LivingMap:
 
 def _check_fits(recording: AnyRecording, living: LivingMap) -> None:
     """Refuse a recording of another space or on another clock than the map."""
-    if (living.dim == 3) != isinstance(recording, SpatialRecording):
+    if (living.dim == 3) != is_in_space(recording):
         of = {2: "the plane", 3: "space"}
         raise DataError(
             f"{recording.name}: a recording in {of[5 - living.dim]}, the map is of {of[living.dim]}",
@@ -144,7 +145,7 @@ def in_its_space(recording: AnyRecording, living: LivingMap | None, config: Conf
 def as_estimated(recording: AnyRecording, result: SlamResult) -> AnyRecording:
     """Return a recording in the space of its result: in the plane where it was estimated there."""
     flat = result.trajectory.pose_world_robot.shape[1] == 3
-    if not flat or not isinstance(recording, SpatialRecording):
+    if not flat or not is_in_space(recording):
         return recording
     return plane.in_its_space(recording, Config().slam, dim=2)
 
@@ -170,7 +171,7 @@ def opened(living: LivingMap | None, recording: AnyRecording) -> LivingMap:
     check_type(recording)
     if living is None:
         living = _empty(recording)
-    elif isinstance(recording, SpatialRecording) and not len(living.places):
+    elif is_in_space(recording) and not len(living.places):
         living = replace(living, places=Places.empty(3), stays=Stays.empty(3), clock=recording.clock)
     if len(recording.frames):
         start_s = float(recording.frames.stamp_s[0])
@@ -187,13 +188,13 @@ def opened(living: LivingMap | None, recording: AnyRecording) -> LivingMap:
 
 def _empty(recording: AnyRecording) -> LivingMap:
     """A map before its first session, in the plane or in space as a recording of it."""
-    in_space = isinstance(recording, SpatialRecording)
+    in_space = is_in_space(recording)
     return LivingMap.in_space(recording.clock) if in_space else LivingMap(clock=recording.clock)
 
 
 def repaired(recording: AnyRecording) -> AnyRecording:
     """Return a recording as it is condensed: one of the plane repaired, one of space as it is."""
-    return clean(recording) if isinstance(recording, Recording) else recording
+    return recording if is_in_space(recording) else clean(recording)
 
 
 def drive_of(recording: AnyRecording) -> tuple[FloatArray, FloatArray]:
@@ -369,7 +370,7 @@ def solved(
     progress: Progress | None = None,
 ) -> Visit:
     """Return a recording with identities solved, by itself or in a map that is given; arguments as of `run_slam`."""
-    if isinstance(recording, SpatialRecording):
+    if is_in_space(recording):
         return solve_visit(recording, config, prior_map, remarks, progress=progress)
     alone = solve(recording, config.slam, prior_map=prior_map, remarks=remarks, realtime=realtime, progress=progress)
     return PlanarVisit(alone)

@@ -30,9 +30,9 @@ from evermap.types import (
     SensorKind,
     SpatialDetections,
     SpatialOdometry,
-    SpatialRecording,
     SpatialSensor,
     Trajectory,
+    is_in_space,
     landmark_id_of,
 )
 
@@ -55,7 +55,7 @@ def pack_recording(recording: AnyRecording) -> bytes:
     arrays: dict[str, Any] = {}
     values: dict[str, Any] = {name: getattr(recording, name) for name in _PLAIN}
     values["landmark_texts"] = sorted(recording.landmark_names.values())
-    if isinstance(recording, SpatialRecording):
+    if is_in_space(recording):
         values["sensors"] = len(recording.sensors)
         if recording.symmetries:  # equal recordings have the bytes that they had before there were any
             values["symmetries"] = {name: list(texts) for name, texts in recording.symmetries.items()}
@@ -103,7 +103,7 @@ def unpack_recording(data: bytes) -> AnyRecording:
         }
         sensors = (_table(f"sensor {k}", SpatialSensor, arrays, values) for k in range(values["sensors"]))
         symmetries = {name: tuple(texts) for name, texts in values.get("symmetries", {}).items()}
-        return SpatialRecording(**about, **tables, sensors=tuple(sensors), symmetries=symmetries)
+        return Recording(**about, **tables, sensors=tuple(sensors), symmetries=symmetries)
     except (KeyError, ValueError, TypeError, OSError, zipfile.BadZipFile) as error:
         raise DamagedError(f"a recording that was kept cannot be read: {error}") from None
 

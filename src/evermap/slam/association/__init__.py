@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from evermap.config import SlamConfig
-from evermap.types import AnyRecording, SpatialRecording
+from evermap.types import AnyRecording, is_in_space
 
 if TYPE_CHECKING:
     from evermap.slam.association.identify import Associated
@@ -27,7 +27,7 @@ def associate(recording: AnyRecording, settings: SlamConfig, *, keep_ids: bool) 
     from evermap.slam.association.in_space import associated_in_space
     from evermap.slam.intake import beliefs
 
-    if isinstance(recording, SpatialRecording):
+    if is_in_space(recording):
         return associated_in_space(recording, settings, keep_ids=keep_ids)
     return associated(recording, *beliefs(recording.sensor, settings), keep_ids=keep_ids, settings=settings)
 

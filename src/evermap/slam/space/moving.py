@@ -38,6 +38,7 @@ from evermap.types import (
     Progress,
     SlamResult,
     SpatialRecording,
+    is_in_space,
     rows_of,
 )
 
@@ -50,7 +51,7 @@ WANDERS = 0.03, 0.003
 
 def has_traffic(recording: AnyRecording) -> TypeGuard[SpatialRecording]:
     """Return whether there are boxes without identity, and odometry."""
-    if not isinstance(recording, SpatialRecording) or recording.odometry is None:
+    if not is_in_space(recording) or recording.odometry is None:
         return False
     return len(recording.odometry) > 1 and len(boxes_of(recording)) > 0
 

@@ -15,6 +15,7 @@ from evermap.types import (
     Frames,
     IntArray,
     Landmarks,
+    Recording,
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
@@ -99,18 +100,18 @@ def patrolled(world: World, day: int, seed: int, place: IntArray, at_day: IntArr
     )
     start_s = float(world.stamp_days[day]) * DAY_S
     pose = np.hstack([at, turn.as_quat()])
-    recording = SpatialRecording(
+    recording = Recording(
         f"day {day + 1}",
         None if by_hand else _odometry(pose, stamp_s, start_s, random),
         Frames(stamp_s + start_s),
         detections,
-        sensors,
-        Trajectory(stamp_s + start_s, pose, np.zeros((len(pose), 6, 6)), frame="truth"),
-        Landmarks.in_space(
+        sensors=sensors,
+        truth=Trajectory(stamp_s + start_s, pose, np.zeros((len(pose), 6, 6)), frame="truth"),
+        true_landmarks=Landmarks.in_space(
             present, position[present], rotation=rotation[present].as_quat(), class_id=world.class_id[present],
             class_names=names,
         ),
-        names,
+        class_names=names,
         clock=Clock.UNIX,
     )  # fmt: skip
     return Patrol(recording, looked >= LOOKED, rooms)
