@@ -27,6 +27,7 @@ from evermap.slam.association.features import medians
 from evermap.slam.cleaning import clean
 from evermap.slam.estimate import solve
 from evermap.slam.mistakes import unusable
+from evermap.slam.space.up import with_known_up
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -304,8 +305,14 @@ def told(found: Judged, where: Laid | None, visit: Visit) -> Session:
     known = replace(found.living.landmarks(), frame=frame, names=names)
     landmarks, gone = rows_of(known, known.p_exists >= EXISTS), rows_of(known, known.p_exists < EXISTS)
     changes = tuple(change.named(names) for change in found.changes)
-    slam = replace(visit.concluded(), landmarks=landmarks, misses=found.misses, changes=changes, gone=gone)
-    return Session(found.living, True, visit.used, slam, changes, found.evidence)
+    concluded = visit.concluded()
+    known = replace(landmarks, up=concluded.landmarks.up)
+    slam = replace(concluded, landmarks=known, misses=found.misses, changes=changes, gone=gone)
+    living = found.living
+    if living.dim == 3:
+        slam = with_known_up(slam, living.up)
+        living = replace(living, up=slam.landmarks.up)
+    return Session(living, True, visit.used, slam, changes, found.evidence)
 
 
 def brought_in(
