@@ -522,7 +522,10 @@ class UpConfig(Section):
     )
     sway_rad: Positive = key(0.2, "greatest standard deviation about such an axis [rad]: what is carried level")
     wheels_rad: Positive = key(0.01, "the same of an odometry of wheels, which has no other turns [rad]")
-    evident: Share = key(0.5, "least cosine between an axis and the sensors' up that tells which end of it is up")
+    evident: Share = key(
+        0.5,
+        "least cosine between an axis and the sensors' up that tells which end of it is up, and of a mean direction",
+    )
 
     @field_validator("direction")
     @classmethod

@@ -144,7 +144,7 @@ def test_an_accelerometer_and_a_level_odometry_tell_it_better() -> None:
     assert all(up.source.startswith("tf") for up, _ in by_tf)
     assert 0.4 < nees(by_imu) < 1.8
     assert 0.4 < nees(by_tf) < 1.8
-    assert np.median([up.sigma_rad for up, _ in by_imu]) < 0.015
+    assert np.median([up.sigma_rad for up, _ in by_imu]) < 0.02  # the floor's slope is 0.03
 
 
 @pytest.mark.parametrize("kind", ["wave", "line", "facade", "volume", "stand"])
@@ -164,7 +164,7 @@ def test_an_accelerometer_tells_it_however_the_robot_moves(kind: str) -> None:
 
 
 def test_wheels_tell_it_by_their_turns_alone() -> None:
-    """In a yard of half a metre: no plane of motion shows there; and in an odometry whose axes are those of a camera."""
+    """In half a metre, where no plane of motion shows; and in an odometry whose axes are those of a camera."""
     found = []
     for seed in range(20):
         world = World(seed, "wheels")
@@ -225,8 +225,11 @@ def test_a_stereo_rig_says_where_up_is_in_its_map(seed: int) -> None:
     assert up.source == "plane of motion"
     assert angle(up.direction, true) < 3.0 * up.sigma_rad
     assert abs(true[2]) < 0.5  # 'from above' along z would be a vertical section
-    stated = run_slam(recording, with_overrides(Config(), ["slam.space.up.direction=[0,-1,0]"]))
-    assert stated.landmarks.up.source == "stated"
+
+
+def test_a_setting_states_it() -> None:
+    config = with_overrides(Config(), ["slam.space.up.direction=[0,-1,0]"])
+    assert run_slam(Rig(1, seconds=15.0, turns=1, gaps=0).walk(), config).landmarks.up.source == "stated"
 
 
 def test_a_map_keeps_it_over_sessions() -> None:

@@ -509,6 +509,9 @@ def _value(name: str, like: Any, found: Any) -> Any:
     if isinstance(like, Enum):
         with suppress(ValueError):
             return type(like)(found)
+    elif isinstance(like, str):
+        if isinstance(found, str):
+            return found
     elif isinstance(like, tuple):
         if isinstance(found, list) and all(isinstance(item, str) for item in found):
             return tuple(found)

@@ -40,8 +40,6 @@ AXES_OF_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Columns are ahead, left and up of a sensor that looks along its z, with y down."""
 FEWEST = 5
 """Poses of a motion."""
-LEAST_AGREEMENT = 0.5
-"""Length of a mean of unit vectors below which they have no direction."""
 ON_A_WALL = 0.7
 """Least part of a tag's own up along that of the sensors, either way: it hangs on a wall."""
 
@@ -116,7 +114,7 @@ def decide_up(
     if settings.direction is not None:
         direction = np.array(settings.direction, dtype=np.float64)
         return Up(direction / np.linalg.norm(direction), STATED_RAD, "stated"), ()
-    found = [up_by_gravity(motion, measurements), up_by_frame(motion, odometry, settings)]
+    found = [up_by_gravity(motion, measurements, settings), up_by_frame(motion, odometry, settings)]
     known = next((one for one in found if one.source), None)
     reference = motion.upright if known is None else known.direction
     reference = np.zeros(3) if known is None and _hang_upside_down(motion) else reference
@@ -165,7 +163,7 @@ def with_known_up(result: SlamResult, known: Up) -> SlamResult:
     )
 
 
-def up_by_gravity(motion: Movement, measurements: Sequence[Measurements]) -> Up:
+def up_by_gravity(motion: Movement, measurements: Sequence[Measurements], settings: UpConfig = USUAL) -> Up:
     """Return the mean direction of specific forces, of a robot at rest or whose accelerations average out."""
     rows = [table for table in measurements if table.kind == "gravity"]
     inside = [(one.stamp_s >= motion.stamp_s[0]) & (one.stamp_s <= motion.stamp_s[-1]) for one in rows]
@@ -178,7 +176,7 @@ def up_by_gravity(motion: Movement, measurements: Sequence[Measurements]) -> Up:
     )
     pose = se3.interpolate(motion.stamp_s, motion.pose, stamp_s) if len(motion.stamp_s) > 1 else motion.pose[[0]]
     read = np.einsum("nij,nj->ni", se3.rotation_of(pose), force / np.linalg.norm(force, axis=1, keepdims=True))
-    return _mean(read, "imu")
+    return _mean(read, "imu", settings)
 
 
 def up_by_frame(motion: Movement, odometry: SpatialOdometry | None, settings: UpConfig = USUAL) -> Up:
@@ -195,7 +193,7 @@ def up_by_frame(motion: Movement, odometry: SpatialOdometry | None, settings: Up
     if len(odometry) > 1:
         driven = se3.interpolate(odometry.stamp_s, odometry.pose_world_robot, motion.stamp_s[inside])
     vertical = se3.rotation_of(driven)[:, 2]  # z of the odometry's frame in the robot's
-    up = _mean(np.einsum("nij,nj->ni", se3.rotation_of(motion.pose[inside]), vertical), "tf")
+    up = _mean(np.einsum("nij,nj->ni", se3.rotation_of(motion.pose[inside]), vertical), "tf", settings)
     agree = float(up.direction @ motion.upright) if up.source else -1.0
     return up if agree > settings.evident * float(np.linalg.norm(motion.upright)) - 1e-9 else Up()
 
@@ -254,11 +252,11 @@ def count_independent(residual: FloatArray) -> float:
     return max(count / max(2.0 * total - 1.0, 1.0), 1.0)
 
 
-def _mean(direction: FloatArray, source: str) -> Up:
+def _mean(direction: FloatArray, source: str, settings: UpConfig) -> Up:
     """The mean of directions (N, 3), with the standard deviation of their scatter and of errors that last."""
     mean = direction.mean(axis=0)
     length = float(np.linalg.norm(mean))
-    if not length > LEAST_AGREEMENT:
+    if not length > settings.evident:
         return Up()
     mean /= length
     off = direction - np.outer(direction @ mean, mean)
