@@ -12,6 +12,7 @@ imported only by what really runs, never by `import evermap`.
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -517,6 +518,36 @@ class TrafficConfig(Section):
     tilt_rad: Positive = key(0.05, "boxes are upright to within this [rad]")
 
 
+class UpConfig(Section):
+    """Where up is in a map in space, which its floor, figures from above and Nav2's files need."""
+
+    direction: tuple[float, float, float] | None = key(
+        None, "direction of up in the frame of the map, as [0, 0, 1]; without: as measured, or as the robot moved"
+    )
+    spread_m: Positive = key(
+        0.5,
+        "least standard deviation of positions along the second axis of a plane of motion [m]: within the reach of "
+        "an arm, 1.7 m, a hand may move a camera in any plane",
+    )
+    flatness: Share = key(0.25, "greatest standard deviation across a plane of motion over that along its second axis")
+    turned: Share = key(
+        0.5, "least variance of the headings on the circle that shows an axis of all turns: 160 degrees evenly"
+    )
+    sway_rad: Positive = key(0.2, "greatest standard deviation about such an axis [rad]: what is carried level")
+    wheels_rad: Positive = key(0.01, "the same of an odometry of wheels, which has no other turns [rad]")
+    evident: Share = key(
+        0.5,
+        "least cosine between an axis and the sensors' up that tells which end of it is up, and of a mean direction",
+    )
+
+    @field_validator("direction")
+    @classmethod
+    def _is_direction(cls, given: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if given is not None and not 0.0 < math.hypot(*given) < math.inf:
+            raise ValueError("three numbers, not all zero, as [0, 0, 1]")
+        return given
+
+
 class SpaceConfig(Section):
     """What is believed of sensors in space, and estimated beside poses and landmarks."""
 
@@ -576,6 +607,7 @@ class SpaceConfig(Section):
     usual_range: Share = key(0.9, "share of sightings that were nearer than what a look at an empty place reaches")
     faced: Share = key(0.2, "median cosine of incidence from which landmarks are taken to have a face")
     widest_rad: float = key(1.4835298641951802, "incidence from which a face is hardly seen [rad]", gt=0, lt=1.6)
+    up: UpConfig = part(UpConfig, "where up is")
     map: MapInSpaceConfig = part(MapInSpaceConfig, "a map that is given")
     repair: RepairConfig = part(RepairConfig, "other explanations")
     traffic: TrafficConfig = part(TrafficConfig, "boxes without identity")

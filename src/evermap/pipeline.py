@@ -47,6 +47,7 @@ def run_slam(
     from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check, plane
     from evermap.slam.space.moving import has_traffic, run_in_traffic
+    from evermap.slam.space.up import with_known_up
 
     config = config or Config()
     recording, prior_map, told = plane.with_prior(recording, prior_map, config.slam)
@@ -59,7 +60,8 @@ def run_slam(
     if has_traffic(recording):
         return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
     visit = session.solved(recording, config, prior_map, remarks, realtime=realtime, progress=progress)
-    return session.existing(visit, visit.concluded(), config.living)
+    result = session.existing(visit, visit.concluded(), config.living)
+    return result if prior_map is None else with_known_up(result, prior_map.up)
 
 
 @single_threaded()

@@ -353,6 +353,50 @@ class Trajectory(_Columns):
         return draw("plot_trajectory", self)
 
 
+MOST_TILT_RAD = math.radians(10.0)
+"""Greatest standard deviation of an up that is known. At 10 degrees what is 3 m high is half a metre off in a figure
+from above or a mask of a floor, about the radius of a robot; beyond it such a figure is a section."""
+PLANE = "plane"
+"""Source of up in the plane: by definition."""
+
+
+@dataclass(frozen=True, slots=True)
+class Up(Shown):
+    """Where up is in the frame of a map.
+
+    Attributes:
+        direction: (3,) unit vector, nan where nothing tells.
+        sigma_rad: standard deviation of its tilt, about each of two horizontal axes; infinite where nothing tells.
+        source: what tells: 'imu', 'tf', 'odometry', 'plane of motion', 'stated', or several of them with commas;
+            'plane' of a map in the plane; '' where nothing does.
+    """
+
+    direction: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
+    sigma_rad: float = math.inf
+    source: str = ""
+
+    @classmethod
+    def of_plane(cls) -> Up:
+        """Return that of a map in the plane."""
+        return cls(np.array([0.0, 0.0, 1.0]), 0.0, PLANE)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it is known well enough to say what is above what."""
+        return bool(np.isfinite(self.direction).all()) and self.sigma_rad <= MOST_TILT_RAD
+
+    @property
+    def text(self) -> str:
+        """One line: the direction, its uncertainty and its source; or that it is unknown."""
+        if self.source == PLANE:
+            return "z, in the plane"
+        axes = ", ".join(f"{part:.3f}" for part in (self.direction + 0.0).tolist())
+        within = f"({axes}) within {math.degrees(self.sigma_rad):.1f} deg (1 sigma), by {self.source}"
+        if self.is_known:
+            return within
+        return f"unknown: only {within}" if np.isfinite(self.direction).all() else "unknown"
+
+
 @dataclass(frozen=True, slots=True)
 class Landmarks(_Columns):
     """Map records, one row a landmark, sorted by id. Estimates, a prior map and surveyed truth share this form.
@@ -370,6 +414,7 @@ class Landmarks(_Columns):
         rotation: (L, 4) in space, quaternions of landmarks that have an orientation, nan of points; None of points.
         rotation_covariance: (L, 3, 3) [rad^2] in the landmark's own frame; None of points.
         size_m: (L, 3) length, width and height of boxes, nan of others; None where nothing has a size.
+        up: where up is in the map's frame; in the plane it is known.
     """
 
     landmark_id: IntArray
@@ -388,6 +433,13 @@ class Landmarks(_Columns):
     rotation: FloatArray | None = None
     rotation_covariance: FloatArray | None = None
     size_m: FloatArray | None = None
+    up: Up = field(default_factory=Up)
+
+    def __post_init__(self) -> None:
+        _Columns.__post_init__(self)
+        flat = self.position_m.shape[1:] == (2,)
+        if flat != (self.up.source == PLANE):
+            object.__setattr__(self, "up", Up.of_plane() if flat else Up())
 
     def _facts(self) -> dict[str, Any]:
         return {
@@ -396,6 +448,7 @@ class Landmarks(_Columns):
             "p_exists": extent(self.p_exists),
             "classes": self.class_names,
             "frame": self.frame,
+            **({} if self.up.source == PLANE else {"up": self.up.text}),
         }
 
     def _columns(self) -> dict[str, Any]:
@@ -516,12 +569,14 @@ class SpatialOdometry(_Columns):
         pose_world_robot: (N, 7) x, y, z [m], quaternion qx, qy, qz, qw.
         variance: (N, 6) of each pose as the source states it, along and about x, y, z of the robot, [m^2], [rad^2]; nan
             where it does not.
+        z_up: whether the source states that the z axis of that frame is up, as ROS does (REP 103).
     """
 
     stamp_s: FloatArray
     pose_world_robot: FloatArray
     variance: FloatArray
     clock: Clock = Clock.RECORDING
+    z_up: bool = False
 
     def _facts(self) -> dict[str, Any]:
         return {"rows": len(self), **span(self.stamp_s), "clock": self.clock.value}

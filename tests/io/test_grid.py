@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from PIL import Image
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
 from evermap.io.nav2 import write_grid, write_speed_mask
-from evermap.types import Landmarks
+from evermap.types import Landmarks, Up
 
 
 def grid_of(path: Path) -> tuple[np.ndarray, float, np.ndarray]:
@@ -52,6 +53,7 @@ def test_discs_as_dark_as_they_exist(tmp_path: Path) -> None:
 def test_boxes_as_they_are_turned(tmp_path: Path) -> None:
     turned = se3.exp(np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.6]]))
     landmarks = Landmarks.in_space([5], [[1.0, 2.0, 0.4]], rotation=turned[:, 3:], size_m=np.array([[4.0, 1.0, 1.5]]))
+    landmarks = replace(landmarks, up=Up(np.array([0.0, 0.0, 1.0]), 0.01, "stated"))
     grid = grid_of(write_grid(landmarks, tmp_path / "site.yaml", radius_m=0.0))
     for along, across, inside in ((1.9, 0.4, True), (-1.9, -0.4, True), (2.2, 0.0, False), (0.0, 0.7, False)):
         x, y, _ = se3.transform(np.concatenate([[1.0, 2.0, 0.4], turned[0, 3:]]), np.array([along, across, 0.0]))

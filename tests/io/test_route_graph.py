@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import shapely.geometry
 from evermap.errors import InputError
 from evermap.geometry import se3
 from evermap.io.nav2 import write_route_graph
-from evermap.types import Landmarks
+from evermap.types import Landmarks, Up
 
 NODES = {0: (0.0, 0.0), 1: (10.0, 0.0), 2: (10.0, 6.0), 7: (0.0, 6.0)}
 EDGES = {10: (0, 1), 11: (1, 2), 12: (2, 7), 13: (7, 0), 14: (1, 0)}
@@ -97,6 +98,7 @@ def test_near_is_near_the_body_of_a_landmark(tmp_path: Path) -> None:
         at, size = random.uniform([-2.0, -2.0], [12.0, 8.0]), random.uniform(0.2, 3.0, 2) * random.integers(0, 2)
         sizes = np.array([[*size, 1.0]]) if size.any() else np.full((1, 3), np.nan)
         box = Landmarks.in_space([1], [[*at, 0.5]], rotation=rotation, size_m=sizes)
+        box = replace(box, up=Up(np.array([0.0, 0.0, 1.0]), 0.01, "stated"))
         inside = np.stack(np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 61)]), axis=-1).reshape(-1, 2) * size
         body = at + inside @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         for one in write_route_graph(box, path, tmp_path / "out.json", clearance_m=0.4):

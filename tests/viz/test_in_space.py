@@ -15,7 +15,7 @@ from synthetic_run import LOOKING_AHEAD, make_spatial_run, spatial_trajectory, w
 from evermap.geometry import se3
 from evermap.metrics.summary import compare_with_truth, metrics_dict
 from evermap.runs.summary import RunInfo, summary_dict, timing_dict
-from evermap.types import Landmarks, rows_of
+from evermap.types import Landmarks, Up, rows_of
 from evermap.viz.change_words import explanations
 from evermap.viz.living_map_figures import MapView, plot_living_map
 from evermap.viz.map_figure import moves
@@ -271,6 +271,7 @@ def test_no_line_crosses_where_the_robot_could_not_be_located(spatial):
 
 def test_a_map_in_space_shows_other_places_in_both_panels_and_the_floor_from_above(spatial):
     landmarks = dataclasses.replace(spatial[1].landmarks, p_exists=np.linspace(0.3, 1.0, len(spatial[1].landmarks)))
+    landmarks = dataclasses.replace(landmarks, up=Up(np.array([0.0, 0.0, 1.0]), 0.02, "imu"))
     view = MapView(
         landmarks, np.zeros(len(landmarks), dtype=bool), other_m=landmarks.position_m[:2] + [3.0, 0.0, 1.0],
         other_of=np.array([0, 1]), seen_from_m=np.array([[0.0, 0.0], [30.0, 0.0]]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
     from evermap.maps.store import Revision
     from evermap.maps.why import Answer
-    from evermap.types import Clock, Landmarks, MapChange
+    from evermap.types import Clock, Landmarks, MapChange, Up
 
 app = typer.Typer(
     name="map", help="Living maps: history, differences, reasons, edits.", no_args_is_help=True, rich_markup_mode=None
@@ -83,6 +84,7 @@ def show(
     Example:
       evermap map show site.evermap --ahead 3d --figure map.png
     """
+    from evermap.io.landmarks import up_dict
     from evermap.maps.store import open_store
     from evermap.runs.map_dicts import landmark_dicts, life_dicts, prior_dicts
     from evermap.survival.durations import parse_duration_s
@@ -98,7 +100,13 @@ def show(
     if figure is not None:
         write_picture(figure, living.plot(title=f"{Path(file).name}, revision {number}"))
     if as_json:
-        about = {"map": file, "revision": number, "stamp_s": json_number(living.stamp_s), "clock": living.clock.value}
+        about: dict[str, Any] = {
+            "map": file,
+            "revision": number,
+            "stamp_s": json_number(living.stamp_s),
+            "clock": living.clock.value,
+        }
+        about["up"] = up_dict(living.landmarks().up)
         told = {"priors": prior_dicts(living), "lifetimes": life_dicts(living)}
         print_json({**about, "ahead_s": ahead_s, "landmarks": content, **told})
         return
@@ -108,6 +116,8 @@ def show(
     head = ("landmark", "class", "P(exists)", f"in {ahead}", "place [m]", "+-", "since", "last seen", "sites", "")
     title = f"{file}, revision {number}, seen until {stamp_text(living.stamp_s, living.clock)}"
     print_table(title, [_landmark_row(item, living.clock) for item in listed], head, numbers=(0, 2, 3, 5, 8))
+    if living.dim == 3:
+        echo(f"up: {living.up.text}")
     for said in prior_dicts(living):
         of = f"of class {said['class']}" if said["class"] else "of all other classes"
         away = f", absences {said['absence']}" if said["absence"] else ""
@@ -258,6 +268,14 @@ _RouteGraph = Annotated[
     option("Write this route graph of Nav2 to --out, without blocked edges.", metavar="IN.geojson", default=False),
 ]
 _MapAge = Annotated[str, option("With --speed-mask: age of the map when it is used.")]
+_UpDirection = Annotated[
+    str | None,
+    option(
+        "Of a map in space of which it is not known: the direction of up in its frame.",
+        metavar="X,Y,Z",
+        default="as known",
+    ),
+]
 _CellM = Annotated[float, option("Edge of a cell of the grid [m].", min=1e-3, max=1e3)]
 _RadiusM = Annotated[
     float | None,
@@ -282,6 +300,7 @@ def export(
     ahead: _MapAge = "1d",
     cell_m: _CellM = 0.05,
     radius_m: _RadiusM = None,
+    up: _UpDirection = None,
     as_json: AsJson = False,
 ) -> None:
     """Write existing landmarks, or learned lifetimes, to a file.
@@ -295,8 +314,10 @@ def export(
       evermap map export site.evermap --out keepout.yaml --p-least 0.1
       evermap map export site.evermap --out speed.yaml --speed-mask --ahead 12h
       evermap map export site.evermap --out open.geojson --route-graph graph.geojson
+      evermap map export rig.evermap --out keepout.yaml --up 0,-1,0
     """
     from evermap.existence.models import save_lifetimes
+    from evermap.io.landmarks import up_dict
     from evermap.maps.learning import lifetimes_by_class
     from evermap.maps.store import open_store
     from evermap.runs.folder import check_output_file
@@ -314,6 +335,8 @@ def export(
         living = store.load(number)
     if p_least is None:
         p_least = 0.0 if speed_mask or route_graph is not None else 0.5
+    if up is not None:
+        living = replace(living, up=_stated_up(up, living))
     landmarks = living.landmarks(p_least=p_least)
     told = {"out": None if out is None else str(out), "landmarks": len(landmarks), **write(living, landmarks)}
     learned = {} if lifetimes is None else lifetimes_by_class(living)
@@ -321,7 +344,7 @@ def export(
         save_lifetimes(learned, lifetimes)
     if as_json:
         said = {"lifetimes": None if lifetimes is None else str(lifetimes), "classes": list(learned)}
-        print_json({"map": file, "revision": number, **told, **said})
+        print_json({"map": file, "revision": number, **told, "up": up_dict(landmarks.up), **said})
         return
     if out is not None:
         closed = f"; {len(told['closed'])} of {told['edges']} edges are closed" if "edges" in told else ""
@@ -403,6 +426,29 @@ def _writer(
         return {}
 
     return write
+
+
+def _stated_up(text: str, living: LivingMap) -> Up:
+    """Return the direction of up that a user states for a map in space.
+
+    Raises:
+        ConfigError: it is none, or the map is in the plane.
+    """
+    import numpy as np
+
+    from evermap.geometry.upright import STATED_RAD
+    from evermap.types import Up
+
+    if living.dim == 2:
+        raise ConfigError("the map is in the plane, where up is z", field="--up", hint="leave it out")
+    try:
+        direction = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        direction = np.zeros(0)
+    length = float(np.linalg.norm(direction))
+    if direction.shape != (3,) or not 0.0 < length < math.inf:
+        raise ConfigError(f"'{text}' is no direction", field="--up", hint="three numbers, as 0,0,1")
+    return Up(direction / length, STATED_RAD, "stated")
 
 
 def _speed_mask(

@@ -389,6 +389,7 @@ def _write(
         return
     rows = main_numbers(summary)
     files = (out / name for name in ("report.html", "summary.json"))
+    rows += [("up", summary["up"]["text"])] if result.landmarks.position_m.shape[1] == 3 else []
     rows += [(file.stem, str(file)) for file in files if file.is_file()]
     print_table(recording.name or "run", rows)
     both_readings = [pair.text for pair in result.undecided]

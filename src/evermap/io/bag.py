@@ -548,11 +548,12 @@ def _odometry(
         raise DataError(f"poses on {topic} have no orientation", path=path, hint="another topic (`--init-bag`)")
     keep = order[np.append(np.diff(stamp_s[order]) > 0.0, True)]
     stamp_s, rows = stamp_s[keep], rows[keep]
-    if content.kind(topic) in TWISTS:
-        return integrated(stamp_s, rows, clock)
-    variance = np.where(rows[:, 7:] > 0.0, rows[:, 7:], np.nan)
-    odometry = SpatialOdometry(stamp_s, se3.normalised(rows[:, :7]), variance, clock=clock)
     child = content.frames.get(topic, "")
+    z_up = "optical" not in child and "optical" not in settings.base_frame  # REP 103
+    if content.kind(topic) in TWISTS:
+        return replace(integrated(stamp_s, rows, clock), z_up=z_up)
+    variance = np.where(rows[:, 7:] > 0.0, rows[:, 7:], np.nan)
+    odometry = SpatialOdometry(stamp_s, se3.normalised(rows[:, :7]), variance, clock=clock, z_up=z_up)
     mount = content.mount(settings.base_frame, child) if child else None
     return of_rig(odometry, se3.identity() if mount is None else mount)
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,8 +29,8 @@ from evermap.io.spatial import (
 )
 from evermap.io.table import Table, csv_text, pa, parquet_bytes, parse_csv, parse_parquet, pq
 from evermap.io.tag_maps import is_wpilib, map_of_survey, tags_of_fiducials, tags_of_tagslam, tags_of_wpilib
-from evermap.io.text import parse_json
-from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks
+from evermap.io.text import is_number, parse_json
+from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, Up, json_number
 from evermap.valid import FEATURES, P_EXISTS, STAMP_S, X_M, Y_M, Quantity
 
 MAP_SCHEMA_VERSION = 1
@@ -53,6 +54,8 @@ _SIGMA_RAD = Quantity("sigma_rad", 0.0, 1e3, optional=True, hint="standard devia
 _FIRST_SEEN_S = replace(STAMP_S, name="first_seen_s", optional=True, dates=False)
 _LAST_SEEN_S = replace(_FIRST_SEEN_S, name="last_seen_s")
 _FEATURES = {quantity.name: quantity for quantity in FEATURES}
+_Z_UP = {"up": {"direction": [0.0, 0.0, 1.0], "sigma_rad": 0.01, "source": "stated"}}
+"""Of formats that say so."""
 _DESCRIPTOR, _NUMBERED = "descriptor_", re.compile(r"descriptor_(0|[1-9]\d{0,4})")
 
 
@@ -96,7 +99,7 @@ def read_landmarks(path: str | Path, *, sigma_m: float = 0.0, sigma_rad: float =
     elif ending in (".parquet", ".pq"):
         table, about = parse_parquet(data, path), parquet_about(data, path)
     elif ending in (".geojson", ".json"):
-        table, about = (tags_of_wpilib(data, path), {}) if is_wpilib(data) else parse_geojson(data, path)
+        table, about = (tags_of_wpilib(data, path), _Z_UP) if is_wpilib(data) else parse_geojson(data, path)
     elif ending in (".yaml", ".yml"):
         table = tags_of_tagslam(data, path)
     elif ending == ".txt":
@@ -104,7 +107,7 @@ def read_landmarks(path: str | Path, *, sigma_m: float = 0.0, sigma_rad: float =
     else:
         hint = ".csv, .parquet, .geojson; of tags .yaml (TagSLAM), .json (WPILib), .txt (fiducial_slam)"
         raise InputError(f"unknown map format '{ending}'", path=path, hint=hint)
-    return landmarks_from_table(
+    landmarks = landmarks_from_table(
         map_of_survey(table) if "tag_id" in table and "landmark_id" not in table else table,
         sigma_m=sigma_m,
         sigma_rad=sigma_rad,
@@ -112,6 +115,7 @@ def read_landmarks(path: str | Path, *, sigma_m: float = 0.0, sigma_rad: float =
         frame=about.get("frame", "truth"),
         clock=Clock(about.get("clock", Clock.RECORDING)),
     )
+    return replace(landmarks, up=_up_of(about))
 
 
 def landmarks_from_table(
@@ -224,7 +228,35 @@ def about_map(landmarks: Landmarks) -> dict[str, Any]:
         "frame": landmarks.frame,
         "clock": landmarks.clock.value,
         "class_names": list(landmarks.class_names),
+        **({} if landmarks.position_m.shape[1] == 2 or not landmarks.up.source else {"up": up_dict(landmarks.up)}),
     }
+
+
+def up_dict(up: Up) -> dict[str, Any]:
+    """Return where up is as plain values, null where it is not known."""
+    told = bool(np.isfinite(up.direction).all())
+    return {
+        "direction": up.direction.tolist() if told else None,
+        "sigma_rad": json_number(up.sigma_rad),
+        "source": up.source or "unknown",
+        "known": up.is_known,
+        "text": up.text,
+    }
+
+
+def _up_of(about: Mapping[str, Any]) -> Up:
+    """Return what `up_dict` gave, of a checked description."""
+    up = about.get("up")
+    return Up(np.array(up["direction"], dtype=np.float64), float(up["sigma_rad"]), up["source"]) if up else Up()
+
+
+def _is_up(up: Any) -> bool:
+    if not isinstance(up, dict) or not isinstance(up.get("source"), str) or not is_number(up.get("sigma_rad")):
+        return False
+    axes = up.get("direction")
+    if not (isinstance(axes, list) and len(axes) == 3 and all(map(is_number, axes))):
+        return False
+    return abs(math.hypot(*axes) - 1.0) < 1e-6 and up["sigma_rad"] > 0.0
 
 
 def checked_about(about: Any, path: Path) -> dict[str, Any]:
@@ -240,6 +272,7 @@ def checked_about(about: Any, path: Path) -> dict[str, Any]:
         or not all(isinstance(name, str) for name in names)
         or not isinstance(about.get("frame", ""), str)
         or about.get("clock", Clock.RECORDING.value) not in list(Clock)
+        or ("up" in about and not _is_up(about["up"]))
     ):
         raise InputError("damaged description of the map", path=path, field="evermap", hint="remove it")
     if about.get("schema_version", MAP_SCHEMA_VERSION) != MAP_SCHEMA_VERSION:
@@ -327,9 +360,9 @@ def _covariance(table: Table, sigma_m: float) -> FloatArray:
     return table.filled(_SIGMA_M, sigma_m)[:, None, None] ** 2 * np.eye(3 if "z_m" in table else 2)
 
 
-def _pose_columns(table: Table, sigma_rad: float) -> dict[str, FloatArray]:
+def _pose_columns(table: Table, sigma_rad: float) -> dict[str, Any]:
     """Orientations, their covariances and sizes, as far as a table in space has them."""
-    found: dict[str, FloatArray] = {}
+    found: dict[str, Any] = {}
     if table.has_any(QUATERNION):
         found["rotation"] = quaternions(table, optional=True)
         turn = covariances(table, TURN_COVARIANCE, optional=True)

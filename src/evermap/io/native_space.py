@@ -160,7 +160,7 @@ def _in_space(odometry: Odometry) -> SpatialOdometry:
     """The odometry of a robot on a floor, as poses in space."""
     twist = np.zeros((len(odometry), 6))
     twist[:, 0], twist[:, 1], twist[:, 5] = odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps
-    return integrated(odometry.stamp_s, twist, odometry.clock)
+    return replace(integrated(odometry.stamp_s, twist, odometry.clock), z_up=True)
 
 
 def truth_of(

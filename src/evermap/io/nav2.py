@@ -17,6 +17,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, DataError, InputError
 from evermap.geometry import se3
+from evermap.geometry.upright import level_map, level_pose
 from evermap.io.files import content_of, write_atomic
 from evermap.io.text import is_number, parse_json
 from evermap.types import FloatArray, Landmarks
@@ -24,6 +25,10 @@ from evermap.types import FloatArray, Landmarks
 MOST_CELLS = 50_000_000
 MARGIN_M = 1.0
 """Margin of free space around all landmarks."""
+WAYS_TO_UP = (
+    "`--up X,Y,Z` with the direction in the map's frame, `slam.space.up.direction` for a session, or a session with "
+    "`gravity`, with odometry of a level frame, or that moves in a plane"
+)
 LEAST_SPEED = 0.1
 """Minimum share of the maximum speed: Nav2 reads a limit of 0 as no limit."""
 
@@ -39,7 +44,8 @@ class Footprints(NamedTuple):
 
     @classmethod
     def of(cls, landmarks: Landmarks) -> Self:
-        """Return those of a map; one in space is seen from above."""
+        """Return those of a map; one in space is seen from above (`check_floor`)."""
+        landmarks = level_map(landmarks)
         at = landmarks.position_m[:, :2]
         size = np.zeros((len(landmarks), 2)) if landmarks.size_m is None else np.nan_to_num(landmarks.size_m[:, :2])
         ahead = np.tile([1.0, 0.0], (len(at), 1))
@@ -58,6 +64,17 @@ class Footprints(NamedTuple):
         return np.asarray(np.hypot(*beyond))
 
 
+def check_floor(landmarks: Landmarks, path: str | Path | None = None) -> None:
+    """Refuse a map in space of which it is not known where up is: what is above what, and where a floor is.
+
+    Raises:
+        ConfigError: names the ways to tell it.
+    """
+    if not landmarks.up.is_known:
+        problem = f"the map has no floor, since up is {landmarks.up.text}"
+        raise ConfigError(problem, path=path, field="up", hint=WAYS_TO_UP)
+
+
 def write_grid(landmarks: Landmarks, path: str | Path, *, cell_m: float = 0.05, radius_m: float = 0.25) -> Path:
     """Write `path` (.yaml) and its image (.pgm): the occupancy of a cell is P(exists) of its landmarks.
 
@@ -72,10 +89,10 @@ def write_grid(landmarks: Landmarks, path: str | Path, *, cell_m: float = 0.05, 
 
     Raises:
         DataError: there is no landmark.
-        ConfigError: the grid would have more than `MOST_CELLS` cells.
+        ConfigError: the grid would have more than `MOST_CELLS` cells, or it is not known where up is.
     """
     occupied, origin_m = _drawn(landmarks, landmarks.p_exists, Path(path), cell_m, radius_m)
-    return _written(Path(path), occupied, origin_m, cell_m, (0.01, 0.99))
+    return _written(Path(path), occupied, origin_m, cell_m, (0.01, 0.99), _frame_of(landmarks))
 
 
 def write_speed_mask(
@@ -99,7 +116,7 @@ def write_speed_mask(
     slower = np.rint(100.0 * np.minimum(p_wrong, 1.0 - LEAST_SPEED)) / 100.0
     drawn, origin_m = _drawn(landmarks, slower, Path(path), cell_m, radius_m)
     about = "Mask of Nav2's speed filter; its CostmapFilterInfo: type 1, base 100.0, multiplier -1.0"
-    return _written(Path(path), drawn, origin_m, cell_m, (0.0, 1.0), f"# {about}\n")
+    return _written(Path(path), drawn, origin_m, cell_m, (0.0, 1.0), f"# {about}\n{_frame_of(landmarks)}")
 
 
 def _drawn(
@@ -108,6 +125,7 @@ def _drawn(
     """(H, W) the greatest value (L,) of what covers each cell, from south to north, and the corner of the first."""
     if not len(landmarks):
         raise DataError("there is no landmark to draw", path=path, hint="a smaller --p-least")
+    check_floor(landmarks, path)
     feet = Footprints.of(landmarks)
     at, reach = feet.at, np.hypot(*feet.half.T) + radius_m
     low, high = (at - reach[:, None]).min(axis=0) - MARGIN_M, (at + reach[:, None]).max(axis=0) + MARGIN_M
@@ -123,6 +141,15 @@ def _drawn(
         part = drawn[first[1] : last[1], first[0] : last[0]]
         np.maximum(part, np.where(feet.distance(k, x[None], y[:, None]) <= radius_m, p, 0.0), out=part)
     return drawn, low.tolist()
+
+
+def _frame_of(landmarks: Landmarks) -> str:
+    """A comment that tells the frame of what was projected, if that is not the map's."""
+    turned = level_pose(landmarks.up)[3:].tolist()
+    if not any(turned[:3]):
+        return ""
+    axes = ", ".join(f"{part + 0.0:.6f}" for part in turned)
+    return f"# Frame: that of the map, turned so that up is z: qx, qy, qz, qw = {axes}\n"
 
 
 def _written(
@@ -184,15 +211,17 @@ def write_route_graph(
     What is left out is listed by id in the top-level member `evermap`, as the service of `DynamicEdgesScorer` takes it.
 
     Args:
-        landmarks: a map in the frame of the graph; one in space is seen from above.
+        landmarks: a map in the frame of the graph; one in space is seen from above, turned so that up is z.
         graph: the graph as it was drawn, which stays as it is.
         path: of the file to write.
         clearance_m: how far from an edge something may stand so that a robot cannot pass [m].
 
     Raises:
         InputError: no route graph; the message names the feature.
+        ConfigError: it is not known where up is in the map.
     """
     graph, path = Path(graph), Path(path)
+    check_floor(landmarks, path)
     document = _read(graph)
     nodes = _nodes(document, graph)
     edges, kept = list[RouteEdge](), list[dict[str, Any]]()
@@ -206,7 +235,11 @@ def write_route_graph(
         if not edge.closed:
             kept.append(_doubtful(feature, edge, graph, number))
     closed = [edge.number for edge in edges if edge.closed]
-    about = {"closed_edges": closed, "clearance_m": clearance_m, "blocked": {str(e.number): e.p_blocked for e in edges}}
+    blocked = {str(edge.number): edge.p_blocked for edge in edges}
+    about: dict[str, Any] = {"closed_edges": closed, "clearance_m": clearance_m, "blocked": blocked}
+    turned = level_pose(landmarks.up)
+    if turned[:6].any():
+        about["graph_from_map"] = dict(zip(("qx", "qy", "qz", "qw"), turned[3:].tolist(), strict=True))
     write_atomic(path, json.dumps({**document, "evermap": about, "features": kept}, indent=1, allow_nan=False) + "\n")
     return edges
 

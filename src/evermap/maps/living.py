@@ -27,7 +27,7 @@ from evermap.maps.lives import Lives
 from evermap.maps.shelves import Sight
 from evermap.sensing.sightlines import SightLines, Views, pair_rows
 from evermap.show import Shown, draw
-from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, Tabular, landmark_id_of
+from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, Tabular, Up, landmark_id_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -267,6 +267,7 @@ class LivingMap(Shown):
         class_names: names of the classes.
         landmark_texts: texts that landmarks were called by, for those that have no number (`types.landmark_id_of`).
         clock: of all stamps.
+        up: where up is in the frame of a map in space, by all sessions; `landmarks().up` says it in the plane, too.
         n_cliques_ever, n_sites_ever: next free ids.
     """
 
@@ -290,6 +291,7 @@ class LivingMap(Shown):
     class_names: tuple[str, ...] = ()
     landmark_texts: tuple[str, ...] = ()
     clock: Clock = Clock.RECORDING
+    up: Up = field(default_factory=Up)
     n_cliques_ever: int = 0
     n_sites_ever: int = 0
 
@@ -324,6 +326,7 @@ class LivingMap(Shown):
             class_names=landmarks.class_names,
             landmark_texts=tuple(sorted(landmarks.names.values())),
             clock=landmarks.clock,
+            up=landmarks.up if dim == 3 else Up(),
             n_cliques_ever=count,
             n_sites_ever=count,
         )
@@ -351,6 +354,7 @@ class LivingMap(Shown):
             "classes": self.class_names,
             "seen_until_s": self.stamp_s,
             "clock": str(self.clock),
+            **({"up": self.up.text} if self.dim == 3 else {}),
         }
 
     def to_pandas(self) -> Any:
@@ -495,6 +499,7 @@ class LivingMap(Shown):
             rotation=self.places.rotation[row] if oriented else None,
             rotation_covariance=self.places.rotation_covariance[row] if oriented else None,
             size_m=self.boxes.of(name) if len(self.boxes) else None,
+            up=self.up,
         )
 
     def place_covariance_m2(self, row: IntArray) -> FloatArray:

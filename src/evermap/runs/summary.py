@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from evermap import __version__
+from evermap.io.landmarks import up_dict
 from evermap.types import AnyRecording, ChangeKind, MapChange, ParameterEstimate, SlamResult, json_number, or_nan
 
 SUMMARY_SCHEMA_VERSION = "2"
@@ -124,6 +125,7 @@ def summary_dict(
             "map": _frame_text(result.landmarks.frame, size),
             "clock": f"{recording.clock.value}; seconds",
         },
+        "up": up_dict(result.landmarks.up),
         "metrics": dict(metrics),
         "accepted": info.accepted,
         "counts": {**_counts(recording, result), "landmarks_grown": info.grown},

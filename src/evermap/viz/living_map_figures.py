@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from evermap.errors import InputError, printable
+from evermap.geometry import se3
+from evermap.geometry.upright import level_pose, move_map
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, rows_of
 from evermap.viz.map_figure import GONE, LABELS_UP_TO, class_names_of, draw_ellipses, draw_gone, magnification
 from evermap.viz.panels import (
@@ -80,6 +82,8 @@ def plot_living_map(view: MapView, *, title: str) -> Figure:
     Raises:
         InputError: there is nothing to draw.
     """
+    up = view.landmarks.up
+    view = _levelled(view)
     landmarks = view.landmarks
     if not len(landmarks):
         raise InputError("nothing to draw: the map has no landmark")
@@ -93,12 +97,21 @@ def plot_living_map(view: MapView, *, title: str) -> Figure:
     size = np.maximum(high - low, 1.0)
     margin = 0.05 * float(size.max())
     with drawing(7.2, float(np.clip(6.4 * height_over_width(size), 2.4, 7.5)) + 1.5) as figure:
-        panels = lay_out(figure, low - margin, high + margin)
+        panels = lay_out(figure, low - margin, high + margin, up=up)
         (handles, *_) = [_draw_panel(axes, columns, view, float(size.max())) for axes, columns in panels]
         first = panels[0][0]
         first.set_title(", ".join(text for text in (printable(title), first.get_title(loc="left")) if text))
         _legend(figure, handles)
     return figure
+
+
+def _levelled(view: MapView) -> MapView:
+    """A view turned so that up is z; cells of the map's own x and y are then left out."""
+    pose = level_pose(view.landmarks.up)
+    if view.landmarks.position_m.shape[1] == 2 or not pose[:6].any():
+        return view
+    other = se3.transform(pose, view.other_m) if len(view.other_m) else view.other_m
+    return replace(view, landmarks=move_map(view.landmarks, pose), other_m=other, seen_from_m=np.zeros((0, 2)))
 
 
 def _draw_panel(axes: Axes, columns: View, view: MapView, reach_m: float) -> list[Any]:

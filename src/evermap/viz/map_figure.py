@@ -12,8 +12,9 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.geometry.group import group_of
+from evermap.geometry.upright import level_pose, move_map
 from evermap.metrics.summary import Evaluation
-from evermap.types import AnyRecording, BoolArray, ChangeKind, FloatArray, Landmarks, MapChange, SlamResult
+from evermap.types import AnyRecording, BoolArray, ChangeKind, FloatArray, Landmarks, MapChange, SlamResult, Up
 from evermap.viz.change_words import near_alternatives, probability, what
 from evermap.viz.panels import (
     View,
@@ -23,7 +24,6 @@ from evermap.viz.panels import (
     height_over_width,
     lay_out,
     mostly_boxes,
-    moved_map,
     outlined,
     seen,
     with_breaks,
@@ -65,6 +65,7 @@ class _Scene:
         landmarks, gone: the map.
         changed: what changed.
         followed: class and (K, D) positions of what moved, a stretch each.
+        up: where up was before all was turned so that it is z; of the plane None.
     """
 
     path_m: FloatArray
@@ -76,6 +77,7 @@ class _Scene:
     gone: Landmarks
     changed: Sequence[Move]
     followed: Sequence[tuple[str, FloatArray]] = ()
+    up: Up | None = None
 
     @property
     def street(self) -> bool:
@@ -104,7 +106,7 @@ def draw_map(recording: AnyRecording, result: SlamResult, evaluation: Evaluation
     lowest = 1.6 if scene.street else 2.6
     height_in = float(np.clip(6.6 * height_over_width(high - low), lowest, highest)) + 0.65 + 0.18 * lines
     figure = new_figure(7.2, height_in)
-    panels = lay_out(figure, low, high)
+    panels = lay_out(figure, low, high, up=scene.up)
     (moved, *_) = [_draw_panel(axes, view, scene, low, high) for axes, view in panels]
     columns = 4 if len(panels) == 1 else 3
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=columns)
@@ -119,15 +121,22 @@ def _scene(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) 
     size = group.point_dim
     tie = evaluation.landmarks_own if evaluation.poses is None else evaluation.poses
     pose_truth_map = group.identity() if tie is None else tie.pose_truth_estimate
+    level, up = group.identity(), None
+    if size == 3:  # from above is along what is up in the frame of the picture
+        up = move_map(result.landmarks, pose_truth_map).up
+        level = level_pose(up)
+        pose_truth_map = group.compose(level, pose_truth_map)
     path = group.compose(pose_truth_map, result.trajectory.pose_world_robot)[:, :size]
     truth = recording.truth
-    way = None if truth is None else with_breaks(truth.stamp_s, truth.pose_world_robot[:, :size])[1]
+    way = None
+    if truth is not None:
+        way = with_breaks(truth.stamp_s, group.transform(level, truth.pose_world_robot[:, :size]))[1]
     known = Landmarks.at([], np.zeros((0, 2))) if recording.true_landmarks is None else recording.true_landmarks
-    survey = None if recording.true_landmarks is None else known.position_m
+    survey = None if recording.true_landmarks is None else group.transform(level, known.position_m)
     if tie is None:  # nothing ties the frames together
         way = survey = None
     odometry = evaluation.dead_reckoning
-    pose_truth_odometry = pose_truth_map if odometry is None else odometry.pose_truth_estimate
+    pose_truth_odometry = pose_truth_map if odometry is None else group.compose(level, odometry.pose_truth_estimate)
     drifted = result.dead_reckoning.pose_world_robot
     if len(drifted):  # a run without odometry need not say how many coordinates it has
         drifted = group.compose(pose_truth_odometry, drifted)
@@ -137,8 +146,9 @@ def _scene(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) 
         truth_m=way,
         survey_m=survey,
         mapped=np.isin(known.landmark_id, result.landmarks.landmark_id),
-        landmarks=moved_map(result.landmarks, pose_truth_map),
-        gone=moved_map(result.gone, pose_truth_map),
+        landmarks=move_map(result.landmarks, pose_truth_map),
+        gone=move_map(result.gone, pose_truth_map),
+        up=up,
         changed=moves(result, pose_truth_map),
         followed=[
             (result.followed.table.class_names[kind], group.transform(pose_truth_map, way[:, :size]))
@@ -287,6 +297,9 @@ def draw_ellipses(axes: Axes, points: FloatArray, covariance: FloatArray, colour
 
 def _caption(recording: AnyRecording, evaluation: Evaluation, scene: _Scene) -> str:
     text = _frame_caption(recording, evaluation, scene.path_m.shape[1])
+    if scene.up is not None:
+        text += f" Up in that frame: {scene.up.text}."
+        text += " The picture is turned by it." if level_pose(scene.up)[:6].any() else ""
     if scene.landmarks.rotation is not None:
         text += " Short lines show the z axis of landmarks with an orientation; boxes have their edges."
     if scene.changed:

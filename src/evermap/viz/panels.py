@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.geometry import se3
-from evermap.geometry.group import group_of
-from evermap.metrics.trajectory import rotate_covariance
-from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
+from evermap.geometry.upright import level_pose
+from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Up
 from evermap.viz.style import MUTED
 
 if TYPE_CHECKING:
@@ -22,6 +21,9 @@ if TYPE_CHECKING:
 
 BLIND_S = 5.0
 """Minimum gap that is shown as a gap."""
+
+UP_UNKNOWN = "up unknown: along the map's z"
+"""Title in place of 'from above'."""
 
 View = list[int]
 """The two coordinates of a panel: to the right, and upwards."""
@@ -53,28 +55,39 @@ def height_over_width(size: FloatArray) -> float:
 
 
 def lay_out(
-    figure: Figure, low: FloatArray, high: FloatArray, within: SubplotSpec | None = None
+    figure: Figure,
+    low: FloatArray,
+    high: FloatArray,
+    within: SubplotSpec | None = None,
+    up: Up | None = None,
 ) -> list[tuple[Axes, View]]:
     """Add the panels for what lies between the corners `low` and `high`: (2,), in space (3,).
 
     From the side one looks along the shorter of x and y, so that the longer one is seen. `within` is the place for all
-    of them, where they are not the only ones of the figure.
+    of them, where they are not the only ones of the figure. `up` is of the map before it was levelled (`level_pose`);
+    None where nobody asks.
     """
     size = high - low
+    level = up is not None and level_pose(up)[:6].any()
+    axis_names = [f"{axis}, levelled [m]" if level else f"{axis} [m]" for axis in "xyz"]
     views = _views(size)
     width = max(size[right] for right, _ in views)
     heights: Any = {"nrows": len(views), "ncols": 1, "height_ratios": [size[up] for _, up in views]}
     grid = figure.add_gridspec(**heights) if within is None else within.subgridspec(**heights)
     rows = [figure.add_subplot(grid[k, 0]) for k in range(len(views))]
-    for axes, (right, up) in zip(rows, views, strict=True):
+    for axes, (right, upward) in zip(rows, views, strict=True):
         spare = 0.5 * (width - size[right])
         axes.set(
-            xlim=(low[right] - spare, high[right] + spare), ylim=(low[up], high[up]), aspect="equal",
-            xlabel=f"{'xyz'[right]} [m]", ylabel=f"{'xyz'[up]} [m]",
+            xlim=(low[right] - spare, high[right] + spare), ylim=(low[upward], high[upward]), aspect="equal",
+            xlabel=axis_names[right], ylabel=axis_names[upward],
         )  # fmt: skip
+    unknown = up is None or not up.is_known
     if len(views) > 1:
-        for axes, title in zip(rows, ("from above", "from the side"), strict=True):
+        titles = (UP_UNKNOWN, "across it") if unknown else ("from above", "from the side")
+        for axes, title in zip(rows, titles, strict=True):
             axes.set_title(title)
+    elif unknown and up is not None:
+        rows[0].set_title(UP_UNKNOWN)
     return list(zip(rows, views, strict=True))
 
 
@@ -90,24 +103,6 @@ def corners_of(parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
 
 def _views(size: FloatArray) -> Sequence[View]:
     return [[0, 1]] if len(size) == 2 else [[0, 1], [int(np.argmax(size[:2])), 2]]
-
-
-def moved_map(landmarks: Landmarks, pose: FloatArray) -> Landmarks:
-    """Return a map in the frame in which `pose` (3,) or (7,) is that of its own frame."""
-    if not len(landmarks):
-        return landmarks
-    group = group_of(pose)
-    rotation = landmarks.rotation
-    if rotation is not None:
-        oriented = np.isfinite(rotation).all(axis=1)
-        rotation = rotation.copy()
-        rotation[oriented] = se3.compose(pose, landmark_poses(landmarks)[oriented])[:, 3:]
-    return replace(
-        landmarks,
-        position_m=group.transform(pose, landmarks.position_m),
-        covariance_m2=rotate_covariance(landmarks.covariance_m2, group.rotation_of(pose)),
-        rotation=rotation,
-    )
 
 
 def seen(landmarks: Landmarks, view: View) -> Landmarks:

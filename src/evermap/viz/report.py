@@ -120,6 +120,7 @@ def _figures(title: str, figures: Sequence[NamedFigure], names: tuple[str, ...],
 def _frames(summary: Mapping[str, Any]) -> str:
     """Return the section on frames, and on the alignment with the truth."""
     rows = [(escape(name), escape(meaning)) for name, meaning in summary["frames"].items()]
+    rows.append(("up in the map", escape(summary["up"]["text"])))
     alignment = summary["metrics"]["alignment"]
     pose = alignment["pose_truth_estimate"]
     if pose is not None:

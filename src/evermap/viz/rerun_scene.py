@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from evermap.errors import MissingExtraError
 from evermap.geometry import se3
 from evermap.geometry.group import group_of
+from evermap.geometry.upright import move_map
 from evermap.metrics.consistency import chi2_interval, comparable_nis
 from evermap.metrics.summary import Evaluation, compare_with_truth
 from evermap.types import (
@@ -27,7 +28,7 @@ from evermap.types import (
     rows_of,
 )
 from evermap.viz.map_figure import class_names_of, moves
-from evermap.viz.panels import box_sizes, corners_of, landmark_poses, long_gaps, moved_map
+from evermap.viz.panels import box_sizes, corners_of, landmark_poses, long_gaps
 from evermap.viz.style import ALERT, DYNAMIC, ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, PAPER, STATIC, class_looks
 
 
@@ -121,7 +122,7 @@ class _RunScene:
         trajectory = result.trajectory
         self.group = group_of(trajectory.pose_world_robot)
         self.pose = self.group.identity() if evaluation.poses is None else evaluation.poses.pose_truth_estimate
-        self.landmarks = moved_map(result.landmarks, self.pose)
+        self.landmarks = move_map(result.landmarks, self.pose)
         self._way = _places(self.pose, trajectory.pose_world_robot)
         low, high = corners_of([self._way, self.landmarks.position_m])
         self.scale = float(np.clip(np.max(high - low) / _ROOM_M, 0.1, 1.0))

@@ -27,6 +27,7 @@ from evermap.slam.association.features import medians
 from evermap.slam.cleaning import clean
 from evermap.slam.estimate import solve
 from evermap.slam.mistakes import unusable
+from evermap.slam.space.up import with_known_up
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -321,7 +322,12 @@ def told(judged: Judged, living: LivingMap, where: Laid | None, visit: Visit) ->
     landmarks, gone = rows_of(known, known.p_exists >= EXISTS), rows_of(known, known.p_exists < EXISTS)
     changes = tuple(change.named(names) for change in judged.changes)
     misses = missed(judged.entry.living, judged.now.sites.p_here, judged.seen, visit)
-    slam = replace(visit.concluded(), landmarks=landmarks, misses=misses, changes=changes, gone=gone)
+    concluded = visit.concluded()
+    known = replace(landmarks, up=concluded.landmarks.up)
+    slam = replace(concluded, landmarks=known, misses=misses, changes=changes, gone=gone)
+    if living.dim == 3:
+        slam = with_known_up(slam, living.up)
+        living = replace(living, up=slam.landmarks.up)
     return Session(living, True, visit.used, slam, changes, judged.now.evidence)
 
 

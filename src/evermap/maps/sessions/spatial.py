@@ -34,6 +34,7 @@ from evermap.slam.space.problem import ANY_RAD, PlacePrior
 from evermap.slam.space.result import concluded_in_space, identities_of, located, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved, solve_space
 from evermap.slam.space.together import SolvedRobot, solve_space_together
+from evermap.slam.space.up import sensor_axes
 from evermap.types import (
     UNKNOWN,
     BoolArray,
@@ -47,8 +48,6 @@ from evermap.types import (
     landmark_id_of,
 )
 
-AXES_OF_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""Columns are ahead, left and up of a sensor that looks along its z, with y down."""
 MOST_OF_ONE_IDENTITY = 4
 """Maximum landmarks that share one identity in a map."""
 MOST_VIEWS = 2000
@@ -143,13 +142,7 @@ class SpatialVisit:
     @functools.cached_property
     def _axes(self) -> FloatArray:
         """(S, 3, 3) ahead, left and up of each sensor, by where it saw most."""
-        problem = self.optimum.smoother.problem
-        axes = np.tile(np.eye(3), (len(problem.mount), 1, 1))
-        for row, sensor in enumerate(self.recording.sensors):
-            seen = problem.measured[problem.sensor == row, :3]
-            if sensor.intrinsics is not None or (len(seen) and np.median(seen[:, 2]) > abs(np.median(seen[:, 0]))):
-                axes[row] = AXES_OF_CAMERA
-        return axes
+        return sensor_axes(self.optimum.smoother.problem, self.recording.sensors)
 
     def _directions(self, some: IntArray) -> tuple[FloatArray, FloatArray]:
         """(N, 3) unit vectors of detections by the axes of their sensors, and (N,) ranges."""

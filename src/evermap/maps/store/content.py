@@ -421,6 +421,12 @@ def _flaws_of_values(living: LivingMap) -> Iterator[str]:
         values = attrgetter(column)(living)
         if not np.all((values >= 0.0) & (values <= 1.0 + 1e-6)):
             yield f"'{column}' is not a probability"
+    if living.up.source and not (
+        living.up.direction.shape == (3,)
+        and abs(np.linalg.norm(living.up.direction) - 1.0) < 1e-6
+        and 0.0 < living.up.sigma_rad < np.inf
+    ):
+        yield "'up' is not a direction with a standard deviation"
     if not (living.log_size_information > 0.0 and np.all(living.metres.information > 0.0)):
         yield "'log_size_information' is not positive"
     if any(np.any(attrgetter(column)(living) < 0.0) for column in _COUNTS):
@@ -439,6 +445,8 @@ def _collect(value: Any, prefix: str, arrays: dict[str, NDArray[Any]], values: d
     """Arrays and plain values of a dataclass and of those within it, by their dotted names."""
     for item in fields(value):
         name, part = prefix + item.name, getattr(value, item.name)
+        if name == "up" and not np.isfinite(part.direction).all():
+            continue  # so that an older evermap reads the map
         if name in {*_NOT_STORED, *_PARTS} or part is None or (name in _NEWER and not np.size(part)):
             continue
         if name in _LIFE:
@@ -501,6 +509,9 @@ def _value(name: str, like: Any, found: Any) -> Any:
     if isinstance(like, Enum):
         with suppress(ValueError):
             return type(like)(found)
+    elif isinstance(like, str):
+        if isinstance(found, str):
+            return found
     elif isinstance(like, tuple):
         if isinstance(found, list) and all(isinstance(item, str) for item in found):
             return tuple(found)

@@ -44,7 +44,7 @@ _TABLES: dict[str, Any] = {"odometry": Odometry, "frames": Frames, "detections":
 _IN_SPACE: dict[str, Any] = {"odometry": SpatialOdometry, "frames": Frames, "detections": SpatialDetections}
 _LATER = (
     "features", "feature_names", "kind", "sigma_scale", "sigma_offset_m", "sigma_angle_rad", "sigma_position_m",
-    "sigma_odometer_scale", "sigma_askew_rad",
+    "sigma_odometer_scale", "sigma_askew_rad", "z_up",
 )  # fmt: skip
 """What is kept only where there is any: equal recordings have the bytes that they had before there was."""
 _PLAIN = ("name", "source", "class_names", "clock")
@@ -67,7 +67,7 @@ def pack_recording(recording: AnyRecording) -> bytes:
     for table, part in tables.items():
         for item in fields(part) if part is not None else ():
             value = getattr(part, item.name)
-            if item.name in _LATER and isinstance(value, tuple | None) and not value:
+            if item.name in _LATER and isinstance(value, tuple | bool | None) and not value:
                 continue
             (arrays if isinstance(value, np.ndarray) else values)[f"{table}.{item.name}"] = value
     arrays["values"] = np.frombuffer(json.dumps(values).encode(), np.uint8)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PI
 from evermap.slam.space.problem import SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear
 from evermap.slam.space.solve import SpatialSolved
+from evermap.slam.space.up import Movement, decide_up
 from evermap.types import (
     BoolArray,
     ChangeKind,
@@ -32,6 +33,7 @@ from evermap.types import (
     SlamResult,
     SpatialRecording,
     Trajectory,
+    Up,
     landmark_id_of,
 )
 
@@ -63,6 +65,7 @@ class _Told:
     frame: str
     stamp_s: FloatArray
     placed: BoolArray
+    up: Up = field(default_factory=Up)
 
 
 def concluded_in_space(
@@ -74,9 +77,12 @@ def concluded_in_space(
     found, placed = located(problem, optimum.now)
     spread = optimum.smoother.spread(optimum.now)
     told = _Told(recording, intake, solved, problem, spread, frame, intake.start_s + problem.stamp_s, placed)
+    motion = Movement.of(told.stamp_s, problem, optimum.estimate, recording.sensors, found, placed)
+    up, disagree = decide_up(motion, recording.odometry, recording.measurements, problem.settings.up)
+    told = replace(told, up=up)
     identities, names = identities_of(intake, solved)
     called = [names.get(one, str(one)) for one in identities.tolist()]
-    warnings, inlier = list(intake.warnings), problem.settings.inlier
+    warnings, inlier = [*intake.warnings, *disagree], problem.settings.inlier
     used = problem.place[optimum.now.weight > inlier]
     left_out = [called[k] for k in np.setdiff1d(used, np.flatnonzero(placed))]
     if left_out:
@@ -207,6 +213,7 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
         rotation=rotation[order] if oriented else None,
         rotation_covariance=turned[order] if oriented else None,
         size_m=_sizes(told, count)[order] if np.isfinite(recording.detections.size_m).any() else None,
+        up=told.up,
     )
 
 
