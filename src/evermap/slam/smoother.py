@@ -16,8 +16,8 @@ from evermap.estimate.robust import HEAVY_TAIL
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
 from evermap.estimate.sparse.tree import tree_of
-from evermap.slam.calibration import DELAY
-from evermap.slam.correlation import Lasting, lasting_errors
+from evermap.slam.calibration import BEARING, DELAY
+from evermap.slam.correlation import LEAST_WEIGHT, Lasting, lasting_errors
 from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES
 from evermap.slam.linearise import (
     OF_DETECTION,
@@ -30,6 +30,7 @@ from evermap.slam.linearise import (
     build_place_priors,
     detection_residuals,
 )
+from evermap.slam.misfit import build_curves, variance_by_curves
 from evermap.slam.problem import Estimate, Marginals, Noise, PlanarView, Problem
 from evermap.types import ANY_BEARING_RAD, BoolArray, FloatArray, IntArray
 
@@ -41,6 +42,8 @@ STRETCHES = 40
 """Stretches of a recording, which are taken to err independently of each other."""
 LEAST_CHANGE = 1e-3
 """Share of the changes of velocity that is no jitter, at least."""
+STANDS_OUT = 2.0
+"""Standard deviations by which an error of the sensor does."""
 POSES_A_LEAF = 8
 """Consecutive poses that are eliminated in one front: fewer make more fronts, more make larger ones."""
 ODOMETRY, DETECTIONS = 0, 1
@@ -126,8 +129,9 @@ class Smoother(Solver[Estimate]):
 
         What each stretch of the recording adds to the states is summed before it is squared, which makes no assumption
         on how errors hang together within it: White's covariance (1980), with stretches as clusters (Liang and Zeger
-        1986). Errors that are known to be `lasting` for longer are correlated by landmark. The larger variance holds;
-        1 for states that are not free, and at least.
+        1986), and once more with landmarks as clusters. Errors that are known to be `lasting` for longer are correlated
+        by landmark. The largest variance holds; 1 for states that are not free, and at least. Errors that come again
+        with a distance or a direction add to it (`misfit`).
         """
         problem, n = self.problem, len(estimate.pose)
         if not problem.prior.free.any():
@@ -149,20 +153,65 @@ class Smoother(Solver[Estimate]):
         )
         stamp = problem.stamp_s - problem.stamp_s[0]
         stretch = np.minimum((stamp / max(stamp[-1], 1e-9) * STRETCHES).astype(np.int64), STRETCHES - 1)
-        pull = np.zeros((STRETCHES, N_STATES))
-        np.add.at(pull, stretch[:-1], np.einsum("nrs,nr->ns", of_driven, driven[..., -1]))
-        np.add.at(pull, stretch[problem.pose_row], np.einsum("nrs,nr->ns", of_seen, seen[..., -1]))
-        independent = (of_driven**2).sum(axis=(0, 1)) + (of_seen**2).sum(axis=(0, 1))
-        found = (pull**2).sum(axis=0) * STRETCHES / (STRETCHES - 1.0)
+        by_driven, by_seen = (
+            np.einsum("nrs,nr->ns", of, rows[..., -1]) for of, rows in ((of_driven, driven), (of_seen, seen))
+        )
+        by_stretch, by_place = np.zeros((STRETCHES, N_STATES)), np.zeros((len(estimate.known), N_STATES))
+        np.add.at(by_stretch, stretch[:-1], by_driven)
+        np.add.at(by_stretch, stretch[problem.pose_row], by_seen)
+        np.add.at(by_place, problem.landmark_row, by_seen)
+        alone = (of_driven**2).sum(axis=(0, 1))
+        independent = alone + (of_seen**2).sum(axis=(0, 1))
         alike = self.lasting(estimate).variance_beside(of_seen, stamp[problem.pose_row], problem.landmark_row)
-        found = np.maximum(found, independent + alike)
+        found = np.maximum.reduce([of_clusters(by_stretch), independent + alike, alone + of_clusters(by_place)])
         free = problem.prior.free & (independent > 0.0)
-        worth = np.where(free, np.maximum(found / np.where(free, independent, 1.0), 1.0), 1.0)
+        independent = np.where(free, independent, 1.0)
+        worth = np.where(free, np.maximum(found / independent, 1.0), 1.0)
+        by_curves = self._variance_by_curves(estimate, marginals, worth)
+        worth += np.where(free, by_curves / np.where(free, np.diag(marginals.states), 1.0), 0.0)
         # the delay shows where the velocity changes; where it only jitters, no delay explains it
         jitter = 2.0 * (driven[..., 3:6] ** 2).sum(axis=(0, 1)) @ problem.drive.jitter
         changes = max(float((driven[..., 6] ** 2).sum()), 1e-300)
         worth[DELAY] /= max(1.0 - jitter / changes, LEAST_CHANGE)
         return worth
+
+    def _variance_by_curves(self, estimate: Estimate, marginals: Marginals, worth: FloatArray) -> FloatArray:
+        """Return (11,) what curves of ranges add to variances of the states.
+
+        They are sought where an error of the sensor stands out by its `worth` (11,).
+        """
+        problem, before = self.problem, 1.0 / self.states_sigma**2
+        asked, off = problem.prior.free[: BEARING + 1], self.off_mean(estimate)
+        posterior = 1.0 / np.where(problem.prior.free, np.diag(marginals.states), self.states_sigma**2)
+        data = np.maximum(posterior - before, 1e-9 * before) * worth
+        stands_out = (off * posterior) ** 2 > STANDS_OUT**2 * data
+        if not np.any(stands_out[: BEARING + 1] & asked):
+            return np.zeros(N_STATES)
+        curves = build_curves(problem.reading, self.inlier_probability(estimate) > LEAST_WEIGHT)
+        information, right = self.information_of_curves(estimate, curves.value)
+        fewer = float(worth[: BEARING + 1][asked].max())
+        return variance_by_curves(information, right, before, off, fewer, curves)
+
+    def information_of_curves(self, estimate: Estimate, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return (11 + K, 11 + K) information of the measurements on the states and on curves of ranges; their pull.
+
+        Curves have values (M, K) at the detections. All else is marginalised; priors of the states do not count.
+        """
+        graph, now, count = self.graph(estimate), self.linearised(estimate), value.shape[1]
+        system, where = graph.structure.system, graph.structure.values_of(DETECTIONS)
+        seen, sigma = self.detections(estimate), self.noise.of_detections(self.problem.sigma_given)
+        share = 1.0 if self.problem.share is None else self.problem.share
+        by_curve = np.zeros((len(seen), 2, count))
+        by_curve[:, 0] = -(np.sqrt(now.weights[DETECTIONS] * share) / sigma[:, 0])[:, None] * value
+        seen = np.concatenate([seen[..., :-1], by_curve, seen[..., -1:]], axis=2)
+        dim = system.tree.dim.copy()
+        dim[system.tree.border[0]] += count  # behind the states of the sensor
+        wider = System(dim, system.factors, graph.structure.coordinate, system.tree.border)
+        values = np.concatenate([now.values[: where.start], seen.ravel(), now.values[where.stop :]])
+        solved = exhausted(wider.factorised(values, extra=np.append(graph.held, np.zeros(count))))
+        behind = N_SENSOR + np.arange(count)
+        order = np.insert(np.arange(N_SENSOR), N_SENSOR, [*(N_SENSOR + count + np.arange(N_MOTION)), *behind])
+        return solved.information[np.ix_(order, order)], solved.right[order]
 
     def lasting(self, estimate: Estimate) -> Lasting:
         """Return how long errors of detections last, by the residuals there."""
@@ -264,6 +313,12 @@ class Smoother(Solver[Estimate]):
         leaf = grouped(n, POSES_A_LEAF)
         dim = np.concatenate([np.full(n, 3), np.full(count, 2), [N_SENSOR, N_MOTION]])
         return Layout(dim, n + count + np.arange(2), leaf, np.column_stack([leaf, state.pose[:, :2]]))
+
+
+def of_clusters(pull: FloatArray) -> FloatArray:
+    """Return (S,) variances of estimates by what each of some clusters pulls them (K, S)."""
+    count = max(float(np.count_nonzero(pull.any(axis=1))), 2.0)
+    return np.asarray((pull**2).sum(axis=0) * count / (count - 1.0))
 
 
 def retract(state: Estimate, step: FloatArray) -> tuple[Estimate, float]:
