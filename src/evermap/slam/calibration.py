@@ -349,6 +349,25 @@ def narrowed(
     return np.asarray(data * ((told + before) / (p_needed * told) - 1.0))
 
 
+def priced(value: float, variance: float, worth: float, sigma: float, p_needed: float = 0.5) -> tuple[float, float]:
+    """Return the probability that a state is drawn from its prior, not as stated, and the `narrowed` information.
+
+    Args:
+        value: the estimate under the prior, less what is stated.
+        variance: of the estimate under the prior, by independent errors.
+        worth: variance by the errors as they were found in that of independent ones, at least 1.
+        sigma: standard deviation of the prior.
+        p_needed: that probability beforehand.
+    """
+    before = sigma**-2
+    data = max(1.0 / variance - before, 1e-9 * before)
+    told, best = data / worth, value / (data * variance)
+    log_odds = 0.5 * (told * best) ** 2 / (told + before) - 0.5 * np.log1p(told / before)
+    log_odds += np.log(p_needed / (1.0 - p_needed))
+    p = float(1.0 / (1.0 + np.exp(-log_odds)))
+    return p, float(narrowed(p, before, data, told))
+
+
 def seated(mount: FloatArray, states: FloatArray) -> FloatArray:
     """Return the pose (3,) of the sensor on the robot, of a stated mount (3,) and calibration states (11,).
 

@@ -32,7 +32,7 @@ def a_sighting(
     place = se3.retract(se3.compose(se3.compose(pose, mount), measured), random.normal(0.0, 0.05, (1, 6)))
     if not oriented:
         place[:, 3:] = [0.0, 0.0, 0.0, 1.0]
-    width = 13 + (6 if oriented else 3)
+    width = 14 + (6 if oriented else 3)
     alike = Symmetry() if alike is None else alike
     seen = SpatialSightings(
         pose_row=np.zeros(1, dtype=np.int64),
@@ -60,7 +60,8 @@ def a_sighting(
 
 def residuals(seen, pose, place, mount, velocity, delay=0.0) -> tuple[np.ndarray, np.ndarray]:
     values, weight, residual = np.zeros(seen.first[-1]), np.zeros(1), np.zeros((1, 8))
-    linearise_sightings(pose, place, mount, -delay * velocity[None], LEVEL, seen, False, values, weight, residual)
+    back, by_delay = -delay * velocity[None], -velocity[None]
+    linearise_sightings(pose, place, mount, back, by_delay, LEVEL, seen, False, values, weight, residual)
     rows = int(ROWS[seen.kind[0]])
     return residual[0, :rows], values.reshape(rows, -1)
 
@@ -99,6 +100,8 @@ def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, alike, 
                     moved[which] = se3.retract(moved[which], by)
                 ends.append(residuals(seen, **moved, velocity=velocity, delay=delay)[0])
             columns.append((ends[0] - ends[1]) / (2.0 * STEP))
+    ends = [residuals(seen, pose, place, mount, velocity, delay + sign * STEP)[0] for sign in (1.0, -1.0)]
+    columns.append((ends[0] - ends[1]) / (2.0 * STEP))
     assert block[:, :-1] == pytest.approx(np.column_stack(columns), abs=2e-4 * max(1.0, np.abs(block).max()))
 
 

@@ -85,7 +85,7 @@ def test_frames_that_reject_what_they_see_are_located_again():
     lost[200:280] = True
     pose = true.copy()
     pose[lost] = se3.retract(true[lost], np.array([0.0, 0.0, 0.0, 0.0, np.radians(25.0), 0.0]))
-    estimate = SpatialEstimate(pose, place, np.zeros((1, 6)))
+    estimate = SpatialEstimate(pose, place, np.zeros((1, 7)))
     weight = np.where(lost[problem.pose_row], 0.0, 1.0)
     found = located_again(problem, SpatialNoise(0.03, 0.015), estimate, weight)
     assert found is not None

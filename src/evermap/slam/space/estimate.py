@@ -17,6 +17,7 @@ from evermap.slam.space.linearise import (
     POSE,
     ROTATION,
     ROWS,
+    STATES,
     TRANSLATION,
 )
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
@@ -186,7 +187,7 @@ def oriented(problem: SpatialProblem, estimate: SpatialEstimate, weight: FloatAr
 
 def first_places(problem: SpatialProblem, pose: FloatArray) -> SpatialEstimate:
     """Return places where the middle one of their detections puts them, along given poses (N, 7)."""
-    state = np.zeros((len(problem.mount), 6))
+    state = np.zeros((len(problem.mount), STATES))
     place = se3.identity(len(problem.oriented))
     estimate = SpatialEstimate(pose, place, state)
     at = as_seen(problem, estimate, np.where(np.isfinite(problem.measured), problem.measured, se3.identity()))

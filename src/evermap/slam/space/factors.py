@@ -68,12 +68,11 @@ class SpatialOdometryFactors(NamedTuple):
 
 
 class SightingFactors(NamedTuple):
-    """Detections of places, with the mounts of the sensors.
+    """Detections of places, with the mounts of the sensors and the delays of their stamps.
 
     Attributes:
         problem: the measurements.
         seen: its detections, as the kernel reads them.
-        back: (S, N, 6) twists from each pose to where the robot was a delay before.
         level: (6,) noise levels.
         heavy: tails that never let go.
         places, sensors: variables of the first place and of the first sensor.
@@ -81,7 +80,6 @@ class SightingFactors(NamedTuple):
 
     problem: SpatialProblem
     seen: SpatialSightings
-    back: FloatArray
     level: FloatArray
     heavy: bool
     places: int
@@ -105,13 +103,15 @@ class SightingFactors(NamedTuple):
     def linearise(self, state: SpatialEstimate, out: Room) -> Slices[float]:
         """Fill in `linearise_sightings`."""
         mount, residual = state.mount(self.problem), np.zeros((len(out.weights), 8))
+        back, by_delay = self.problem.earlier(state.delay_s)
         yield len(out.weights) / FACTORS_A_SLICE
         return float(
             linearise_sightings(
                 state.pose,
                 state.place,
                 mount,
-                self.back,
+                back,
+                by_delay,
                 self.level,
                 self.seen,
                 self.heavy,

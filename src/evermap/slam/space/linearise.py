@@ -25,8 +25,10 @@ POINT, POSE, CORNERS = 0, 1, 2
 """What a detection gives: a position, a position and an orientation, or the corners of a tag in an image."""
 ROWS = np.array([3, 6, 8])
 """Residuals of each."""
-STATES = 6
-"""Numbers of a sensor's calibration: a twist of its mount."""
+MOUNT, STATES = 6, 7
+"""Numbers of a sensor's calibration: a twist of its mount; and by how much its stamps are late."""
+OF_SIGHTING = 14
+"""Numbers of a row of a detection beside those by its place: by its pose, its sensor, and the right side."""
 OF_STEP = 14
 """Numbers of a row of an odometry factor: by two poses, its scale and the right side."""
 TRANSLATION, ROTATION, ACROSS, ALONG, ORIENTATION, PIXEL = range(6)
@@ -131,7 +133,7 @@ def linearise_odometry(
 
 @kernel
 def linearise_sightings(
-    pose: FloatArray, place: FloatArray, mount: FloatArray, back: FloatArray, level: FloatArray,
+    pose: FloatArray, place: FloatArray, mount: FloatArray, back: FloatArray, by_delay: FloatArray, level: FloatArray,
     seen: SpatialSightings, heavy: bool, values: FloatArray, weight: FloatArray, residual: FloatArray,
 ) -> float:  # fmt: skip
     """Linearise the detections.
@@ -141,6 +143,7 @@ def linearise_sightings(
         place: (P, 7) places; of points the orientation is not looked at.
         mount: (S, 7) poses of the sensors on the robot.
         back: (S, N, 6) twist from each pose to that at which a detection was made, before its stamp.
+        by_delay: (S, N, 6) derivative of the latter, a twist there, by how late the stamp is.
         level: (6,) noise levels.
         seen: the detections.
         heavy: tails that never let go, while the estimate may be far off.
@@ -176,6 +179,9 @@ def linearise_sightings(
         cost += seen.share[m] * loss
         scale, at = math.sqrt(weight[m] * seen.share[m]), seen.first[m]
         for a in range(rows):
+            of_delay = 0.0
+            for b in range(6):
+                of_delay += jx[a, b] * by_delay[s, i, b]
             if late:
                 _before_moving(jx[a], moved)
             for b in range(6):
@@ -183,8 +189,9 @@ def linearise_sightings(
                 values[at + 6 + dim + b] = scale * jm[a, b]
             for b in range(dim):
                 values[at + 6 + b] = scale * jl[a, b]
-            values[at + 12 + dim] = -scale * e[a]
-            at += 13 + dim
+            values[at + 12 + dim] = scale * of_delay
+            values[at + 13 + dim] = -scale * e[a]
+            at += 14 + dim
     return cost
 
 

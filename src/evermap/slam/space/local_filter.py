@@ -33,7 +33,16 @@ from evermap.slam.filter_kernels import (
     UNSURE,
 )
 from evermap.slam.nearby_places import MOST_ACTIVE, NearbyPlaces
-from evermap.slam.space.linearise import ACROSS, ALONG, POINT, ROWS, STATES, SpatialSightings, linearise_sightings
+from evermap.slam.space.linearise import (
+    ACROSS,
+    ALONG,
+    MOUNT,
+    OF_SIGHTING,
+    POINT,
+    ROWS,
+    SpatialSightings,
+    linearise_sightings,
+)
 from evermap.slam.space.online_noise import OnlineNoise
 from evermap.slam.space.problem import OdometryPath, SpatialNoise
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -252,7 +261,7 @@ class SpatialFilter(NearbyPlaces):
         eye = se3.compose(self.pose, mount)
         place, by_own = se3.compose(eye, seen_at), np.zeros((OF_PLACE, self.own))
         inverse = np.linalg.inv(seen.root[which]) * self.levels[[ACROSS, ACROSS, ALONG]]
-        spread, of_sensor = np.zeros((6, 6)), slice(6 + STATES * sensor, 6 + STATES * (sensor + 1))
+        spread, of_sensor = np.zeros((6, 6)), slice(6 + MOUNT * sensor, 6 + MOUNT * (sensor + 1))
         if oriented:
             onto = se3.rotation_of(seen_at).T
             by_own[:, :6] = se3.adjoint(se3.inverse(se3.compose(mount, seen_at)))
@@ -267,7 +276,7 @@ class SpatialFilter(NearbyPlaces):
         return place, by_own, spread
 
     def _mount_at(self, states: FloatArray) -> FloatArray:
-        return se3.retract(self._mount, states[:-1].reshape(-1, STATES))
+        return se3.retract(self._mount, states[:-1].reshape(-1, MOUNT))
 
     def _to_start(
         self,
@@ -341,7 +350,7 @@ class _Frame:
         dim = np.where(self.turned, 6, 3)
         self.n_rows = ROWS[kind]
         self._sensor = seen.sensor
-        first = np.append(0, np.cumsum(self.n_rows * (13 + dim)))
+        first = np.append(0, np.cumsum(self.n_rows * (OF_SIGHTING + dim)))
         self._seen = SpatialSightings(
             np.zeros(count, dtype=np.int64), np.arange(count), seen.sensor, kind, self.turned.astype(np.int64),
             seen.either[0], seen.root, seen.sigma_rad, seen.corner, seen.corner_root, seen.half_m, first,
@@ -352,7 +361,7 @@ class _Frame:
         for key in np.unique(100 * self.n_rows + dim).tolist():
             n_rows, width = key // 100, key % 100
             some = np.flatnonzero((self.n_rows == n_rows) & (dim == width))
-            at = first[some][:, None] + np.arange(n_rows * (13 + width))
+            at = first[some][:, None] + np.arange(n_rows * (OF_SIGHTING + width))
             self._groups.append((some, at, n_rows, width))
 
     def linearise(self, pose: FloatArray, states: FloatArray, place: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -363,15 +372,16 @@ class _Frame:
         place = np.where(self.turned[:, None] | (np.arange(7) < 3), place, np.append(np.zeros(3), se3.NO_TURN))
         values, weight, residual = np.zeros(int(seen.first[-1])), np.zeros(count), np.zeros((count, 8))
         linearise_sightings(
-            pose[None], place, of._mount_at(states), of._back, of.levels, seen, False, values, weight, residual
-        )
+            pose[None], place, of._mount_at(states), of._back, of._back, of.levels, seen, False, values, weight,
+            residual,
+        )  # fmt: skip
         most = int(self.n_rows.max())
         jacobian = np.zeros((count, most, of.own + OF_PLACE))
         for some, at, n_rows, dim in self._groups:
-            block = values[at].reshape(len(some), n_rows, 13 + dim)
+            block = values[at].reshape(len(some), n_rows, OF_SIGHTING + dim)
             jacobian[some, :n_rows, :6] = block[..., :6]
             jacobian[some, :n_rows, of.own : of.own + dim] = block[..., 6 : 6 + dim]
-            columns = 6 + STATES * self._sensor[some][:, None, None] + np.arange(STATES)
+            columns = 6 + MOUNT * self._sensor[some][:, None, None] + np.arange(MOUNT)
             jacobian[some[:, None, None], np.arange(n_rows)[:, None], columns] = block[..., 6 + dim : 12 + dim]
         return residual[:, :most], jacobian
 

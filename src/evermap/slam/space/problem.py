@@ -11,12 +11,14 @@ from evermap.config import SpaceConfig
 from evermap.estimate.measurement import Tied
 from evermap.geometry import se3
 from evermap.geometry.symmetry import Symmetries
-from evermap.slam.space.linearise import POINT, POSE, ROWS, SpatialSightings
+from evermap.slam.space.linearise import MOUNT, OF_SIGHTING, POINT, POSE, ROWS, SpatialSightings
 from evermap.types import BoolArray, FloatArray, IntArray
 
 NO_JUMP_LOG_ODDS = 1e3
 """Without odometry nothing takes a camera to somewhere else between two frames."""
 USUAL = SpaceConfig()
+MEDIAN_SQUARE = 0.455
+"""Median of the square of a normal number of variance 1."""
 LEAST_WEIGHT = 1e-6
 """Of a map's word on a landmark that is elsewhere."""
 ANY_RAD = np.pi
@@ -77,10 +79,50 @@ class PlacePrior:
 
 
 class OdometryPath(NamedTuple):
-    """Poses (K, 7) of the odometry at stamps (K,)."""
+    """Poses (K, 7) of the odometry at stamps (K,).
+
+    Between two stamps poses are interpolated, and so less noisy: a delay that is no whole number of steps would fit
+    better for that alone. So the whole steps are taken back along the path, and the rest by the velocity, which jitters
+    the less the longer the time that it is of.
+    """
 
     stamp_s: FloatArray
     pose: FloatArray
+
+    @property
+    def step_s(self) -> float:
+        """Return the usual time between two stamps."""
+        return float(np.median(np.diff(self.stamp_s)))
+
+    @property
+    def jitter(self) -> FloatArray:
+        """Return (6,) how fast the variance of what the odometry adds at random grows, for each second.
+
+        By second differences of its motions, medians of them: a robot that starts or stops does not jitter.
+        """
+        motion = se3.local(self.pose[:-1], self.pose[1:])[1:-1]  # without what leads on at both ends
+        if len(motion) < 3:
+            return np.zeros(6)
+        return np.asarray(np.median(np.diff(motion, 2, axis=0) ** 2, axis=0) / (6.0 * MEDIAN_SQUARE * self.step_s))
+
+    def at(self, stamp_s: FloatArray) -> FloatArray:
+        """Return poses (N, 7) at stamps (N,); before and after its own the end poses."""
+        return se3.interpolate(self.stamp_s, self.pose, stamp_s)
+
+    def velocity(self, stamp_s: FloatArray, within_s: float) -> FloatArray:
+        """Return twists (N, 6) for each second at stamps (N,), on average from `within_s` before to after."""
+        since_s, until_s = (np.clip(stamp_s + by, *self.stamp_s[[0, -1]]) for by in (-within_s, within_s))
+        return se3.local(self.at(since_s), self.at(until_s)) / np.maximum(until_s - since_s, 1e-9)[:, None]
+
+    def earlier(
+        self, stamp_s: FloatArray, delay_s: float, whole_s: float, within_s: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return twists (N, 6) from where the robot is at stamps (N,) to where it was a delay before, and their
+        derivatives (N, 6), twists there; `whole_s` of the delay are whole steps, velocities are averaged `within_s`.
+        """
+        velocity = self.velocity(stamp_s - whole_s, within_s)
+        then = se3.retract(self.at(stamp_s - whole_s), (whole_s - delay_s) * velocity)
+        return se3.local(self.at(stamp_s), then), -velocity
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +149,7 @@ class SpatialProblem:
         symmetries: (P,) turns after which places look the same.
         mount: (S, 7) nominal poses of the sensors on the robot.
         mount_sigma: (S, 6) standard deviations of their twists; 0 where exact.
-        delay_s: (S,) by which the stamps of the sensors are late.
+        delay_sigma_s: (S,) standard deviations of how late the stamps of the sensors are; 0 where they are right.
         scale_sigma: standard deviation of the logarithm of the odometry's scale; 0 where it is exact.
         ranges_share: of what ranges and odometer show together, that is the ranges'; see `in_shared_metre`.
         ranges_log: logarithm of ranges over true distances, that was taken off the measurements.
@@ -115,6 +157,8 @@ class SpatialProblem:
         prior: on places.
         start_sigma: (6,) how firmly the first pose is held where it is.
         path: the odometry, in the time of the poses, from which delays are estimated; None without.
+        velocity_s: time before and after an instant over which its velocity is averaged.
+        whole_s: (S,) what of each delay are whole steps of the odometry; see `OdometryPath`.
         measurements: of other kinds than odometry and detections.
         robust: whether outliers are down-weighted.
         estimate_noise: whether noise levels are learned.
@@ -143,7 +187,7 @@ class SpatialProblem:
     symmetries: Symmetries
     mount: FloatArray
     mount_sigma: FloatArray
-    delay_s: FloatArray
+    delay_sigma_s: FloatArray
     prior: PlacePrior = field(default_factory=PlacePrior.none)
     steady: bool = False
     scale_sigma: float = 0.0
@@ -152,21 +196,24 @@ class SpatialProblem:
     odometry_log: float = 0.0
     start_sigma: FloatArray = field(default_factory=lambda: np.full(6, 1e-4))
     path: OdometryPath | None = None
+    velocity_s: float = 1.0
+    whole_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     measurements: tuple[Tied, ...] = ()
     robust: bool = True
     estimate_noise: bool = True
     settings: SpaceConfig = USUAL
 
-    def earlier(self) -> FloatArray:
-        """Return (S, N, 6) twists by the odometry from each pose to where the robot was a delay before."""
-        back = np.zeros((len(self.delay_s), len(self.stamp_s), 6))
-        for row in np.flatnonzero(self.delay_s):
+    def earlier(self, delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return (S, N, 6) twists by the odometry from each pose to where the robot was delays (S,) before, and
+        (S, N, 6) their derivatives, twists there; zero for sensors whose stamps are right.
+        """
+        back, by_delay = np.zeros((2, len(delay_s), len(self.stamp_s), 6))
+        for row in np.flatnonzero(self.delay_sigma_s):
             assert self.path is not None
-            now_s, then_s = (
-                np.clip(self.stamp_s - delay_s, *self.path.stamp_s[[0, -1]]) for delay_s in (0.0, self.delay_s[row])
+            back[row], by_delay[row] = self.path.earlier(
+                self.stamp_s, float(delay_s[row]), float(self.whole_s[row]), self.velocity_s
             )
-            back[row] = se3.local(se3.interpolate(*self.path, now_s), se3.interpolate(*self.path, then_s))
-        return back
+        return back, by_delay
 
     @property
     def either(self) -> FloatArray:
@@ -206,7 +253,7 @@ class SpatialProblem:
         """Return the detections as the kernel reads them."""
         kinds = self.symmetries.kinds
         oriented = self.oriented[self.place].astype(np.int64)
-        width = 13 + np.where(oriented, 6, 3)
+        width = OF_SIGHTING + np.where(oriented, 6, 3)
         first = np.append(0, np.cumsum(ROWS[self.kind] * width))
         return SpatialSightings(
             self.pose_row, self.place, self.sensor, self.kind, oriented, self.measured, self.measured_root,
@@ -251,7 +298,7 @@ class SpatialEstimate:
     Attributes:
         pose: (N, 7) of the robot.
         place: (P, 7) of places; of points the orientation is the identity.
-        state: (S, 6) twist of each sensor's mount.
+        state: (S, 7) twist of each sensor's mount, and by how much its stamps are late [s].
         log_scale: logarithm of true distances over those of the odometry.
     """
 
@@ -262,11 +309,16 @@ class SpatialEstimate:
 
     def mount(self, problem: SpatialProblem) -> FloatArray:
         """Return (S, 7) the sensors' poses on the robot."""
-        return se3.retract(problem.mount, self.state)
+        return se3.retract(problem.mount, self.state[:, :MOUNT])
+
+    @property
+    def delay_s(self) -> FloatArray:
+        """Return (S,) by how much the stamps of the sensors are late."""
+        return self.state[:, MOUNT]
 
     def seen_from(self, problem: SpatialProblem) -> tuple[FloatArray, FloatArray]:
         """Return (M, 7) the robot's pose when each detection was made, and (M, 6) the twist there from its stamp's."""
-        back = problem.earlier()[problem.sensor, problem.pose_row]
+        back = problem.earlier(self.delay_s)[0][problem.sensor, problem.pose_row]
         pose = self.pose[problem.pose_row]
         return se3.retract(pose, back) if back.any() else pose, back
 

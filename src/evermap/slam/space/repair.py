@@ -194,7 +194,7 @@ def _cost_of_frames(problem: SpatialProblem, estimate: SpatialEstimate, noise: S
     values, weight = np.empty(int(seen.first[-1])), np.empty(len(seen.kind))
     residual = np.zeros((len(seen.kind), 8))
     linearise_sightings(
-        estimate.pose, estimate.place, estimate.mount(problem), problem.earlier(), noise.levels, seen,
+        estimate.pose, estimate.place, estimate.mount(problem), *problem.earlier(estimate.delay_s), noise.levels, seen,
         False, values, weight, residual,
     )  # fmt: skip
     squared = (residual**2).sum(axis=1)

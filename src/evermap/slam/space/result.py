@@ -15,7 +15,19 @@ from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.calibration import OF_SCALE
 from evermap.slam.space.intake import SpatialIntake, most_of
-from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PIXEL, POSE, ROTATION, ROWS, TRANSLATION
+from evermap.slam.space.linearise import (
+    ACROSS,
+    ALONG,
+    CORNERS,
+    MOUNT,
+    ORIENTATION,
+    PIXEL,
+    POSE,
+    ROTATION,
+    ROWS,
+    STATES,
+    TRANSLATION,
+)
 from evermap.slam.space.problem import SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear
 from evermap.slam.space.solve import SpatialSolved
@@ -37,7 +49,8 @@ from evermap.types import (
     landmark_id_of,
 )
 
-MOUNT = "correction of the sensor's stated mount, in the sensor's axes, or seconds by which its stamps are late"
+OF_MOUNT = "correction of the sensor's stated mount, in the sensor's axes"
+DELAY = "seconds by which the sensor's stamps are late"
 SCALE = "true distances over those of the odometry, by the sizes of tags"
 DIVIDED = (
     "true distances over those of the odometry, or ranges over true distances: only their product shows; divided by "
@@ -233,13 +246,19 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
     found = noise_parameters(optimum.noise, problem.kind, problem.ray, driven=problem.driven)
     border = optimum.smoother.factorised(optimum.now).border_covariance()
     *of_sensors, of_scale = np.sqrt(np.diag(border))
-    sigma = np.reshape(of_sensors, (-1, 6))
+    sigma = np.reshape(of_sensors, (-1, STATES))
     for row, sensor in enumerate(told.recording.sensors):
-        found += mount_parameters(sensor.name, optimum.estimate.state[row], sigma[row], problem.mount_sigma[row])
-        if np.isfinite(told.solved.delay_sigma_s[row]):
-            value, spread = float(problem.delay_s[row]), float(told.solved.delay_sigma_s[row])
-            prior, name = problem.settings.delay_sigma_s, f"{sensor.name}_delay_s"
-            found.append(ParameterEstimate(name, value, spread, 0.0, prior, "s", meaning=MOUNT))
+        found += mount_parameters(
+            sensor.name, optimum.estimate.state[row, :MOUNT], sigma[row], problem.mount_sigma[row]
+        )
+        if (delays := told.solved.delays) is not None:
+            value, spread = float(optimum.estimate.delay_s[row]), float(delays.sigma_s[row])
+            prior, name, p_needed = (
+                problem.settings.delay_sigma_s,
+                f"{sensor.name}_delay_s",
+                float(delays.p_needed[row]),
+            )
+            found.append(ParameterEstimate(name, value, spread, 0.0, prior, "s", meaning=DELAY, p_needed=p_needed))
     if problem.scale_sigma > 0.0:
         found += _scales(told, float(of_scale))
     return tuple(found)
@@ -266,7 +285,9 @@ def mount_parameters(name: str, value: FloatArray, sigma: FloatArray, prior: Flo
     """Return what is estimated of the mount of a sensor: twists (6,), their standard deviations, and those before."""
     parts = [*((f"mount_{axis}_m", "m") for axis in "xyz"), *((f"mount_r{axis}_rad", "rad") for axis in "xyz")]
     return [
-        ParameterEstimate(f"{name}_{part}", float(value[k]), float(sigma[k]), 0.0, float(prior[k]), unit, meaning=MOUNT)
+        ParameterEstimate(
+            f"{name}_{part}", float(value[k]), float(sigma[k]), 0.0, float(prior[k]), unit, meaning=OF_MOUNT
+        )
         for k, (part, unit) in enumerate(parts)
         if prior[k] > 0.0
     ]

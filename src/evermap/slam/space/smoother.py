@@ -1,6 +1,7 @@
 """Batch smoothing in space: a `SpatialProblem` as a graph of poses, places and sensors, and the covariances there.
 
-The border of the elimination tree are the sensors' mounts, which all detections share, and the scale of the odometry.
+The border of the elimination tree are the mounts of the sensors and the delays of their stamps, which all detections
+share, and the scale of the odometry.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from evermap.geometry import se3
 from evermap.slam.correlation import Lasting, lasting_errors
 from evermap.slam.space.drift import STRETCHES
 from evermap.slam.space.factors import MapFactors, SightingFactors, SpatialOdometryFactors, SpatialStartFactor
-from evermap.slam.space.linearise import OF_STEP, POINT, ROWS, STATES
+from evermap.slam.space.linearise import MOUNT, OF_SIGHTING, OF_STEP, POINT, ROWS, STATES
 from evermap.slam.space.problem import NO_JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem, SpatialView
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -84,8 +85,8 @@ class SpatialSmoother:
 
     def __init__(self, problem: SpatialProblem, around: FloatArray) -> None:
         self.problem = problem
-        self._seen, self._back = problem.sightings, problem.earlier()
-        sigma = np.append(problem.mount_sigma, problem.scale_sigma)
+        self._seen = problem.sightings
+        sigma = np.append(np.column_stack([problem.mount_sigma, problem.delay_sigma_s]), problem.scale_sigma)
         self._border = Border(np.where(sigma > 0.0, 1.0 / np.maximum(sigma, 1e-12) ** 2, FIXED), _states)
         self._start = np.array(around[0])
         n, count = len(problem.stamp_s), len(problem.oriented)
@@ -104,7 +105,7 @@ class SpatialSmoother:
 
     @property
     def states_information(self) -> FloatArray:
-        """(6 S + 1,) information of the priors of mounts and scale."""
+        """(7 S + 1,) information of the priors of mounts, delays and scale."""
         return self._border.information
 
     def hold(self, held: FloatArray, begin: IntArray) -> None:
@@ -159,6 +160,17 @@ class SpatialSmoother:
             found[some, k] = -values[seen.first[some] + (k + 1) * width[some] - 1] / scale[some]
         return found
 
+    @cached_property
+    def sensor_of_pose(self) -> IntArray:
+        """(N,) the sensor that saw something from each pose, or from the one before; the first where none did yet."""
+        row, first = np.unique(self.problem.pose_row, return_index=True)
+        last = np.searchsorted(row, np.arange(len(self.problem.stamp_s)), side="right") - 1
+        return self.problem.sensor[first[np.maximum(last, 0)]]
+
+    def driven(self, now: SpatialLinear) -> FloatArray:
+        """Return (N - 1, 6, 14) odometry, linearised and whitened: by both poses, its scale, and the right side."""
+        return now.values[self.structure.values_of(ODOMETRY)].reshape(-1, 6, OF_STEP)
+
     def lasting(self, now: SpatialLinear) -> Lasting:
         """Return how long errors of detections last, by their residuals there."""
         problem = self.problem
@@ -181,29 +193,30 @@ class SpatialSmoother:
             share = lasting.information(problem.stamp_s[problem.pose_row], problem.place)
         return self if share is None else SpatialSmoother(replace(problem, share=share), estimate.pose)
 
-    def scale_by_stretches(self, now: SpatialLinear) -> tuple[float, float]:
-        """Return the variance of the odometry's scale, and what one with correlated residuals has over it, at least 1.
+    def worth_by_stretches(self, now: SpatialLinear, state: int) -> tuple[float, float]:
+        """Return the variance of one of the border's numbers, and what one with correlated residuals has over it, at
+        least 1.
 
         As of the states in the plane (`slam.smoother.Smoother.worth`): what each stretch of the drive adds is summed
         before it is squared.
         """
         problem, structure, seen = self.problem, self.structure, self._seen
-        n, with_scale = len(problem.stamp_s), self.spread(now).with_border[:, -1]
+        n, with_it = len(problem.stamp_s), self.spread(now).with_border[:, state]
         begin, odometry = structure.system.tree.begin, structure.values_of(ODOMETRY).stop
         share = problem.stamp_s / max(problem.stamp_s[-1], 1e-9)
         stretch = np.minimum((STRETCHES * share).astype(np.int64), STRETCHES - 1)
-        pose, scale = with_scale[: 6 * n].reshape(n, 6), with_scale[-1:]
+        pose, scale = with_it[: 6 * n].reshape(n, 6), with_it[-1:]
         by = np.hstack([pose[:-1], pose[1:], np.tile(scale, (n - 1, 1))])
         driven, nothing = now.values[:odometry].reshape(n - 1, 6, OF_STEP), np.zeros(0, dtype=np.int64)
         parts = [(stretch[:-1], driven, by, nothing)]
         for kind, n_rows in enumerate(ROWS.tolist()):
             for dim in (3, 6):
                 some = np.flatnonzero((seen.kind == kind) & (seen.oriented == (dim == 6)))
-                at = odometry + seen.first[some][:, None] + np.arange(n_rows * (13 + dim))
+                at = odometry + seen.first[some][:, None] + np.arange(n_rows * (OF_SIGHTING + dim))
                 place = begin[n + seen.place[some]][:, None] + np.arange(dim)
                 sensor = begin[n + len(problem.oriented) + seen.sensor[some]][:, None] + np.arange(STATES)
-                by = np.hstack([pose[seen.pose_row[some]], with_scale[place], with_scale[sensor]])
-                rows = now.values[at].reshape(len(some), n_rows, 13 + dim)
+                by = np.hstack([pose[seen.pose_row[some]], with_it[place], with_it[sensor]])
+                rows = now.values[at].reshape(len(some), n_rows, OF_SIGHTING + dim)
                 parts.append((stretch[seen.pose_row[some]], rows, by, some))
         pull, independent, influence = np.zeros(STRETCHES), 0.0, np.zeros((len(seen.kind), 8, 1))
         for of, rows, by, some in parts:
@@ -214,7 +227,8 @@ class SpatialSmoother:
         found = (pull**2).sum() * STRETCHES / (STRETCHES - 1.0)
         alike = self.lasting(now).variance_beside(influence, problem.stamp_s[seen.pose_row], seen.place)
         found = max(found, independent + float(alike[0]))
-        return float(scale[0]), max(float(found / max(independent, 1e-300)), 1.0)
+        own = with_it[len(with_it) - len(self.states_information) :]
+        return float(own[state]), max(float(found / max(independent, 1e-300)), 1.0)
 
     def _blocks(self, noise: SpatialNoise, *, heavy: bool) -> tuple[FactorBlock[SpatialEstimate], ...]:
         problem = self.problem
@@ -229,7 +243,7 @@ class SpatialSmoother:
         prior = problem.prior.place
         return (
             SpatialOdometryFactors(problem.increment, sigma, jump, heavy, sensor + len(problem.mount)),
-            SightingFactors(problem, self._seen, self._back, noise.levels, heavy, n, sensor),
+            SightingFactors(problem, self._seen, noise.levels, heavy, n, sensor),
             SpatialStartFactor(self._start, problem.start_sigma),
             MapFactors(problem, n + prior, first_seen[prior]),
             *(self._measured(tied, heavy) for tied in problem.measurements),
@@ -253,7 +267,24 @@ class SpatialSmoother:
         place[~on, :3] += share * turned[~on, :3]
         state = estimate.state + share * step[tree.begin[n + count] : -1].reshape(-1, STATES)
         log_scale = estimate.log_scale + share * float(step[-1])
-        return SpatialEstimate(se3.retract(estimate.pose, share * by), place, state, log_scale), size
+        pose = self._retract_poses(estimate, share * by, state[:, MOUNT])
+        return SpatialEstimate(pose, place, state, log_scale), size
+
+    def _retract_poses(self, estimate: SpatialEstimate, by: FloatArray, delay_s: FloatArray) -> FloatArray:
+        """Return poses (N, 7) after twists (N, 6), with delays (S,) after the same step.
+
+        Where a sensor was when it saw something moves as linearised, and the robot is ahead of that by the odometry:
+        else no long step of a delay is an improvement where detections are exact.
+        """
+        if np.array_equal(delay_s, estimate.delay_s):
+            return se3.retract(estimate.pose, by)
+        of, row = self.sensor_of_pose, np.arange(len(by))
+        (back, by_delay), (after, _) = (self.problem.earlier(late_s) for late_s in (estimate.delay_s, delay_s))
+        moved = se3.exp(-back[of, row])
+        twist = np.einsum("nij,nj->ni", se3.adjoint(moved), by)
+        twist += by_delay[of, row] * (delay_s - estimate.delay_s)[of, None]
+        here = se3.retract(se3.retract(estimate.pose, back[of, row]), twist)
+        return se3.retract(here, -after[of, row])
 
 
 def limit_turns(
@@ -277,5 +308,5 @@ def limit_turns(
 
 
 def _states(estimate: SpatialEstimate) -> FloatArray:
-    """Return the numbers of the border, whose means are zero: twists of the mounts, and the scale."""
+    """Return the numbers of the border, whose means are zero: twists of the mounts, delays, and the scale."""
     return np.append(estimate.state, estimate.log_scale)

@@ -17,12 +17,13 @@ from evermap.estimate.measurement import Tied
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
-from evermap.slam.calibration import narrowed
+from evermap.slam.calibration import priced
 from evermap.slam.space.against_map import MapComparison, compared
+from evermap.slam.space.delays import Delays, with_delays
 from evermap.slam.space.drift import Drift, drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, start_noise
-from evermap.slam.space.linearise import CORNERS, POINT
+from evermap.slam.space.linearise import CORNERS, POINT, STATES
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.repair import rejoined, repaired, split, unjumped
 from evermap.slam.space.smoother import SpatialSmoother
@@ -64,7 +65,7 @@ class SpatialSolved:
         identity: (P,) rows of `SpatialIntake.landmark_id` that the places are of.
         number: (P,) which of the landmarks with that identity each is, from 1.
         from_map: what of the given map stands; None without a map.
-        delay_sigma_s: (S,) standard deviation of the delay of each sensor's stamps; nan where they are trusted.
+        delays: how well it is known how late each sensor's stamps are; None where they are trusted.
         online_pose: (N, 7) poses as each frame had them.
         online_spread: (N, 2) roughly how far off these may be [m, rad].
         step_s: (N,) seconds that each frame took.
@@ -74,7 +75,7 @@ class SpatialSolved:
     identity: IntArray
     number: IntArray
     from_map: MapComparison | None
-    delay_sigma_s: FloatArray
+    delays: Delays | None
     online_pose: FloatArray
     online_spread: FloatArray
     step_s: FloatArray
@@ -112,7 +113,7 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     elif of_points:
         estimate = _likeliest(problem, noise, [stepwise, *by_constellations(problem, noise, SEEDS)])
     problem, estimate = _in_measured_frame(problem, estimate, framed)
-    optimum, delay_sigma_s = _with_delays(converged(problem, estimate, noise))
+    optimum, delays = with_delays(converged(problem, estimate, noise))
     optimum = repaired(optimum)
     problem = optimum.smoother.problem
     if problem.scale_sigma > 0.0:
@@ -144,7 +145,7 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     optimum = replace(
         optimum, smoother=smoother, now=now, fitted=fitted
     )  # for covariances, which are no better than all this
-    return SpatialSolved(optimum, identity, times_of(identity), from_map, delay_sigma_s, stepwise.pose, spread, step_s)
+    return SpatialSolved(optimum, identity, times_of(identity), from_map, delays, stepwise.pose, spread, step_s)
 
 
 def _without_frames(problem: SpatialProblem) -> tuple[SpatialProblem, tuple[Tied, ...]]:
@@ -224,57 +225,6 @@ def _is_of_one_metre(pose: FloatArray, driven: FloatArray) -> bool:
     return bool(abs(np.median(ratio[by_odometry > np.median(by_odometry)]) - 1.0) < SAME_METRE)
 
 
-def _with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, FloatArray]:
-    """Return the optimum with the delays of the sensors' stamps, and their (S,) standard deviations."""
-    problem = optimum.smoother.problem
-    sigma_s = np.full(len(problem.mount), np.nan)
-    if problem.path is None or problem.settings.delay_sigma_s == 0.0:
-        return optimum, sigma_s
-    for row in [*range(len(sigma_s))] * 2:  # the noise levels of the first round are those without a delay
-        delay_s, sigma_s[row] = _delay_of(optimum, row)
-        problem = optimum.smoother.problem
-        late = np.where(np.arange(len(sigma_s)) == row, delay_s, problem.delay_s)
-        optimum = converged(replace(problem, delay_s=late), optimum.estimate, optimum.noise, heavy_rounds=0)
-    return optimum, sigma_s
-
-
-def _delay_of(optimum: SpatialOptimum, row: int) -> tuple[float, float]:
-    """Return the delay of a sensor's stamps and its standard deviation, by the parabola through the best of the delays
-    that were tried.
-
-    These differ by whole steps of the odometry. Half a step off it is interpolated, so less noisy, and fits better.
-    """
-    problem, estimate = optimum.smoother.problem, optimum.estimate
-    assert problem.path is not None
-    step_s, begun_s = float(np.median(np.diff(problem.path.stamp_s))), float(problem.delay_s[row])
-    before, found = problem.settings.delay_sigma_s, dict[int, float]()
-    stride = max(1, round(before / (6.0 * step_s)))  # coarse at first, at last two standard deviations or one step
-    eye = se3.retract(estimate.pose, problem.earlier()[row])
-
-    def cost(steps: int) -> float:
-        if steps not in found:
-            delay_s = problem.delay_s.copy()
-            delay_s[row] += steps * step_s
-            tried = replace(problem, delay_s=delay_s)
-            start = replace(estimate, pose=se3.retract(eye, -tried.earlier()[row]))
-            fit = SpatialSmoother(tried, start.pose).optimum(start, optimum.noise, heavy=True)[1].cost
-            found[steps] = fit + 0.5 * (delay_s[row] / before) ** 2
-        return found[steps]
-
-    best = 0
-    while True:
-        below, above = cost(best - stride), cost(best + stride)
-        if min(below, above) < cost(best):
-            best += stride if above < below else -stride
-            continue
-        information = max((below - 2.0 * cost(best) + above) / (stride * step_s) ** 2, before**-2)
-        if stride == 1 or information * (stride * step_s) ** 2 < 4.0:
-            break
-        stride = max(1, stride // 2)
-    off_s = 0.5 * (below - above) / (information * stride * step_s)
-    return begun_s + best * step_s + off_s, float(information**-0.5)
-
-
 def times_of(identity: IntArray) -> IntArray:
     """Return (P,) which of those with its identity (P,) each is, from 1."""
     return np.array([np.count_nonzero(identity[: k + 1] == one) for k, one in enumerate(identity)], dtype=np.int64)
@@ -285,12 +235,9 @@ def _with_averaged_scale(optimum: SpatialOptimum) -> SpatialOptimum:
 
     Both are as probable beforehand; see `slam.calibration.narrowed`.
     """
-    problem, before = optimum.smoother.problem, optimum.smoother.problem.scale_sigma**-2
-    variance, worth = optimum.smoother.scale_by_stretches(optimum.now)
-    data = max(1.0 / variance - before, 1e-9 * before)
-    told, best = data / worth, optimum.estimate.log_scale / (data * variance)
-    log_odds = 0.5 * (told * best) ** 2 / (told + before) - 0.5 * np.log1p(told / before)
-    information = narrowed(1.0 / (1.0 + np.exp(-log_odds)), before, data, told)
+    problem, smoother = optimum.smoother.problem, optimum.smoother
+    variance, worth = smoother.worth_by_stretches(optimum.now, -1)
+    _, information = priced(optimum.estimate.log_scale, variance, worth, problem.scale_sigma)
     sober = replace(problem, scale_sigma=float(information**-0.5))
     return converged(sober, optimum.estimate, optimum.noise, heavy_rounds=0)
 
@@ -432,7 +379,7 @@ def incremental(
         if progress is not None:
             progress(float(problem.stamp_s[row]), float(problem.stamp_s[-1]))
     place[~problem.oriented, 3:] = se3.NO_TURN
-    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), 6))), spread, step_s
+    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), STATES))), spread, step_s
 
 
 def _sigma_m(root: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ import numpy as np
 
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
+from evermap.slam.space.linearise import STATES
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -233,7 +234,7 @@ def _grown(problem: SpatialProblem, noise: SpatialNoise, seed: int | None) -> Sp
         back = se3.inverse(pose[0])
         pose, place = se3.compose(back, pose), se3.compose(back, place)
     place[~problem.oriented, 3:] = se3.NO_TURN
-    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), 6)))
+    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), STATES)))
 
 
 def located_again(

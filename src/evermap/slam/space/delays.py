@@ -1,0 +1,148 @@
+"""How late the stamps of the sensors are against the odometry: as stated, or estimated with everything else.
+
+Each delay is a state of the problem (`SpatialProblem.delay_sigma_s`), with the velocity by the odometry for Jacobian. A
+step from the optimum with right stamps shows whether any sensor's are late, before anything is solved again; only those
+that may be are freed. As for the states in the plane (`slam.calibration`), 'as stated' and 'drawn from the prior' are
+weighed by their evidence, under the number of observations that the data are worth, and the estimate is the mean.
+
+A delay shows where the velocity changes. Odometry that jitters seems to change its velocity all the time, which shows
+no delay: the velocity is averaged over the time that shows most, and what jitter is left in it does not count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.config import CalibrationConfig
+from evermap.geometry import se3
+from evermap.slam.calibration import priced
+from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.space.linearise import MOUNT, STATES
+from evermap.slam.space.problem import SpatialEstimate, SpatialProblem
+from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
+from evermap.types import BoolArray, FloatArray
+
+LEAST_SHOWN = 1e-3
+"""Share of the changes of velocity that is no jitter, at least."""
+LONGEST_S = 2.0
+"""Time before and after an instant over which the velocity there is averaged, at most."""
+MOST_ROUNDS, SETTLED = 4, 0.75
+"""Times that delays are freed, until the whole steps in them are right to within so many."""
+USUAL = CalibrationConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class Delays:
+    """What is known of how late stamps are, beside the values.
+
+    Attributes:
+        sigma_s: (S,) standard deviations.
+        p_needed: (S,) probability that the stamps are not as stated.
+    """
+
+    sigma_s: FloatArray
+    p_needed: FloatArray
+
+
+def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]:
+    """Return the optimum with the delays of the sensors' stamps; the same one where all are as stated."""
+    problem, sigma_s = optimum.smoother.problem, optimum.smoother.problem.settings.delay_sigma_s
+    if problem.path is None or sigma_s == 0.0 or not problem.driven:
+        return optimum, None
+    count = len(problem.mount)
+    free = _freed(problem, optimum, np.full(count, sigma_s), np.zeros(count))
+    smoother = SpatialSmoother(free, optimum.estimate.pose)
+    now = smoother.linearised(optimum.estimate, optimum.noise, heavy=False)
+    factorised = smoother.factorised(now)
+    step = np.linalg.solve(factorised.information, factorised.right)
+    off_s = np.asarray(step[MOUNT:-1:STATES])
+    found, information = _priced(smoother, now, off_s, sigma_s)
+    # of those that stay as stated the deviation is from there
+    found = replace(found, sigma_s=np.hypot(found.sigma_s, found.p_needed * off_s))
+    least = USUAL.p_needed  # clocks that may as well be right are left as stated
+    for _ in range(MOST_ROUNDS):
+        asked = found.p_needed > least
+        free = _freed(problem, optimum, np.where(asked, sigma_s, 0.0), optimum.estimate.delay_s)
+        if not asked.any():
+            if not optimum.estimate.delay_s.any():
+                return optimum, found
+            return converged(problem, _moved(optimum, problem, asked), optimum.noise), found
+        optimum = converged(free, _moved(optimum, free, asked), optimum.noise)
+        again, information = _priced(optimum.smoother, optimum.now, optimum.estimate.delay_s, sigma_s)
+        found = Delays(np.where(asked, again.sigma_s, found.sigma_s), np.where(asked, again.p_needed, found.p_needed))
+        least = USUAL.p_spare
+        if np.abs(optimum.estimate.delay_s - free.whole_s).max() < SETTLED * problem.path.step_s:
+            break
+    sober = replace(free, delay_sigma_s=np.where(asked, information**-0.5, 0.0))
+    return converged(sober, optimum.estimate, optimum.noise, heavy_rounds=0), found
+
+
+def _freed(
+    problem: SpatialProblem, optimum: SpatialOptimum, sigma_s: FloatArray, delay_s: FloatArray
+) -> SpatialProblem:
+    """Return the problem with delays of standard deviations (S,), near those (S,)."""
+    assert problem.path is not None
+    velocity_s = _averaged_over(problem, optimum.smoother.driven(optimum.now))
+    whole_s = problem.path.step_s * np.round(delay_s / problem.path.step_s)
+    return replace(problem, velocity_s=velocity_s, whole_s=whole_s, delay_sigma_s=sigma_s)
+
+
+def _moved(optimum: SpatialOptimum, problem: SpatialProblem, asked: BoolArray) -> SpatialEstimate:
+    """Return the values, of a problem with other whole steps, at which the sensors were where they were."""
+    estimate, of = optimum.estimate, optimum.smoother.sensor_of_pose
+    row, state = np.arange(len(of)), estimate.state.copy()
+    state[~asked, MOUNT] = 0.0
+    back, after = optimum.smoother.problem.earlier(estimate.delay_s)[0], problem.earlier(state[:, MOUNT])[0]
+    pose = se3.retract(se3.retract(estimate.pose, back[of, row]), -after[of, row])
+    return replace(estimate, pose=pose, state=state)
+
+
+def _priced(
+    smoother: SpatialSmoother, now: SpatialLinear, delay_s: FloatArray, sigma_s: float
+) -> tuple[Delays, FloatArray]:
+    """Return what delays (S,) under the prior say, and (S,) the information of the narrower one with their means."""
+    problem, count = smoother.problem, len(delay_s)
+    sigma, p_needed, information = np.zeros(count), np.zeros(count), np.ones(count)
+    for row in np.flatnonzero(problem.delay_sigma_s):
+        variance, worth = smoother.worth_by_stretches(now, STATES * int(row) + MOUNT)
+        real, changes = _shown(problem, smoother.driven(now), float(delay_s[row]))
+        worth = max(worth * (changes / real) ** 2, 1.0)
+        p_needed[row], information[row] = priced(float(delay_s[row]), variance, worth, sigma_s)
+        own = worth * variance * sigma_s**2 / (worth * variance + sigma_s**2)
+        sigma[row] = np.sqrt(p_needed[row] * (own + (1.0 - p_needed[row]) * delay_s[row] ** 2))
+    return Delays(sigma, p_needed), information
+
+
+def _averaged_over(problem: SpatialProblem, driven: FloatArray) -> float:
+    """Return the time over which averaged velocities show most of a delay."""
+    assert problem.path is not None
+    step_s = problem.path.step_s
+    tried_s = step_s * 2.0 ** np.arange(max(1, int(np.log2(LONGEST_S / step_s)) + 1))
+    found = [_shown(replace(problem, velocity_s=float(each_s)), driven, 0.0) for each_s in tried_s]
+    return float(tried_s[int(np.argmax([real**2 / changes for real, changes in found]))])
+
+
+def _shown(problem: SpatialProblem, driven: FloatArray, delay_s: float) -> tuple[float, float]:
+    """Return the information on a delay that the changes of the velocity hold, without jitter and as they are.
+
+    The former by their product with those of the velocity from one stamp of the odometry to the next but one.
+
+    Args:
+        problem: the measurements.
+        driven: (N - 1, 6, 14) odometry, linearised and whitened.
+        delay_s: the delay.
+    """
+    path, within_s = problem.path, problem.velocity_s
+    assert path is not None
+    told, at_once = (
+        np.einsum("nra,na->nr", driven[..., :6], velocity[:-1])
+        + np.einsum("nra,na->nr", driven[..., 6:12], velocity[1:])
+        for velocity in (path.velocity(problem.stamp_s - delay_s, each_s) for each_s in (within_s, path.step_s))
+    )
+    changes = max(float((told**2).sum()), 1e-300)
+    alike = np.clip((within_s + path.step_s - np.diff(problem.stamp_s)) / (2.0 * path.step_s), 0.0, 1.0)
+    squares = (driven[..., 6:12] ** 2).sum(axis=1) @ path.jitter
+    jitter = float((squares * (1.0 - alike)).sum()) / within_s
+    return max(float((told * at_once).sum()) - jitter, LEAST_SHOWN * changes), changes
