@@ -115,7 +115,7 @@ def second_session(folder: Path) -> CodePath:
         em.write_native(recording, written[-1])
 
     def slam(recording: Path) -> None:
-        words = ["slam", str(recording), "--map", str(folder / "map.evermap"), "--out", str(folder / "out"), "--force"]
+        words = ["slam", str(recording), "--map", str(folder / "map.evermap"), "--out", f"{recording}-out"]
         for text in OVERRIDES:
             words += ["--set", text]
         said = StringIO()

@@ -283,13 +283,25 @@ def _each(paths: Sequence[Path], out: Path | None, asked: _Asked) -> None:
 
 
 def _read_inputs(path: Path, out: Path | None, asked: _Asked) -> tuple[AnyRecording, Landmarks | None, Path]:
-    """Return the recording, the landmarks to start from, and the folder of the run, which may be written to."""
-    from evermap.io import shifted
+    """Return the recording, the landmarks to start from, and the folder of the run, which may be written to.
+
+    The recording is written condensed where that is asked for: repaired first, as before it enters a map.
+    """
+    from evermap.io import read_recording, shifted
     from evermap.runs.folder import check_replaceable
 
     if out is not None:  # better now than after the run
         check_replaceable(out, force=asked.force, inputs=asked.inputs)
-    recording = _read(path, asked)
+    session = asked.offline_session
+    if session is not None and session.exists() and not asked.force:
+        raise ConfigError(f"{session} is there already", field="offline_session", hint="another name, or --force")
+    recording = read_recording(path, robot=asked.robot, topics=asked.topics)
+    if session is not None:
+        from evermap.io.native_write import write_session
+        from evermap.maps.sessions.session import repaired
+
+        write_session(repaired(recording), session)
+        say(f"wrote the session for a map to {session} ({session.stat().st_size / 1e3:.0f} kB)")
     if out is None:
         out = default_out(recording.name)
         check_replaceable(out, force=asked.force, inputs=asked.inputs)
@@ -463,23 +475,6 @@ def _refuse_unread(asked: _Asked, *, in_space: bool, boxes: bool = False) -> Non
         "without --unknown-ids": () if in_map or asked.config.slam.unknown_ids else ("slam.association",),
     }
     config.refuse_unread(asked.set_here, unread, within="slam")
-
-
-def _read(path: Path, asked: _Asked) -> AnyRecording:
-    """Read a recording, and write it condensed where that is asked for: repaired first, as before it enters a map."""
-    from evermap.io import read_recording
-
-    session = asked.offline_session
-    if session is not None and session.exists() and not asked.force:
-        raise ConfigError(f"{session} is there already", field="offline_session", hint="another name, or --force")
-    recording = read_recording(path, robot=asked.robot, topics=asked.topics)
-    if session is not None:
-        from evermap.io.native_write import write_session
-        from evermap.maps.sessions.session import repaired
-
-        write_session(repaired(recording), session)
-        say(f"wrote the session for a map to {session} ({session.stat().st_size / 1e3:.0f} kB)")
-    return recording
 
 
 def _write_what_is_to_edit(folder: Path | None, bag: Path | None, *, in_space: bool) -> None:

@@ -118,7 +118,9 @@ def believed(
         counted = replace(counted, stamp_s=np.maximum(counted.stamp_s, from_s))
         after = _followed(living, entry.p_start, counted, seen.lines, config, from_s, until_s, p_false)
         sites = _with_beliefs(sites, entry.p_start, after)
-        log_evidence = _log_odds(row, after.p_here, len(cliques)) - _log_odds(row, after.p_before, len(cliques))
+        both = [np.bincount(row, p_site, minlength=len(cliques)) for p_site in (after.p_here, after.p_before)]
+        p = np.clip(np.array(both, dtype=np.float64), 1e-12, 1.0 - 1e-12)
+        log_evidence = np.subtract(*np.log(p / (1.0 - p)))
         evidence = replace(after.trace, clique_id=cliques[after.trace.clique_id])
     else:
         sites = replace(sites, p_here=_as_seen(living, rows.site[hit], last))
@@ -127,12 +129,6 @@ def believed(
     since_s = np.where(arrived & ~entry.is_new, first, sites.since_s)
     sites = replace(sites, since_s=since_s, seen_s=np.maximum(sites.seen_s, last))
     return Believed(until_s, places, sites, log_evidence, evidence)
-
-
-def _log_odds(clique: IntArray, p_here: FloatArray, n: int) -> FloatArray:
-    """(n,) log odds that a clique stands at one of its sites, by the row of the clique of each (S,)."""
-    p = np.clip(np.bincount(clique, p_here, minlength=n), 1e-12, 1.0 - 1e-12)
-    return np.asarray(np.log(p / (1.0 - p)))
 
 
 def _as_seen(living: LivingMap, hit_site: IntArray, last_s: FloatArray) -> FloatArray:

@@ -53,14 +53,9 @@ class PlanarVisit:
         return self.recording
 
     @property
-    def start_s(self) -> float:
-        """Stamp of the first frame that has a pose."""
-        return self.solved.start_s
-
-    @property
-    def end_s(self) -> float:
-        """Stamp of the last frame that was processed."""
-        return self.solved.end_s
+    def span_s(self) -> tuple[float, float]:
+        """Stamps of the first frame that has a pose, and of the last one that was processed."""
+        return self.solved.start_s, self.solved.end_s
 
     @property
     def floor_sensor(self) -> Sensor:

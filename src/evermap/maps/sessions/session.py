@@ -264,20 +264,20 @@ def judged(
     What was found goes into the map, then hits and misses into beliefs, and those into decisions. A map's first session
     lies nowhere. When it is judged for the second time, what it teaches of lifetimes and what was found are `known`.
     """
-    start_s, end_s, sensor = visit.start_s, visit.end_s, visit.floor_sensor
-    aged = believe.aged(living, config, start_s)
+    span_s, sensor = visit.span_s, visit.floor_sensor
+    aged = believe.aged(living, config, span_s[0])
     found = visit.found(where, living, config) if known is None else known.found
     living, drift_m = (visit.begun(living), 0.0) if where is None else (living, where.drift_m)
     entry = extended(living, aged, found, config, drift_m)
     watch = known.watch if known is not None and known.entry.has_places_of(entry) else visit.watched(entry, config)
     seen = looked_at(entry.living, entry.p_start, watch, config)
-    now = believe.believed(entry, seen, sensor, (start_s, end_s), config)
+    now = believe.believed(entry, seen, sensor, span_s, config)
     came = arrivals(entry.before, entry.living, now.until_s, seen, sensor, config.looks)
     if len(visit.witnessed.landmark_id):
         came = arrived(came, visit.witnessed, entry)
         now, seen = departed(now, seen, visit.witnessed, entry)
     after, changes = decide.decided(
-        entry.before, entry.living, now, seen, came, start_s, classes, settings=config.decisions
+        entry.before, entry.living, now, seen, came, span_s[0], classes, settings=config.decisions
     )
     if config.cliques and config.existence and config.misses:
         after = without_missed(entry.before, after, config.grouping)
@@ -408,7 +408,7 @@ def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult
     empty = replace(empty, class_names=visit.recording.class_names, sightlines=lines)
     entry = extended(empty, empty.sites, found, config, 0.0)
     seen = looked_at(entry.living, entry.p_start, visit.watched(entry, config), config)
-    now = believe.believed(entry, seen, visit.floor_sensor, (visit.start_s, visit.end_s), config)
+    now = believe.believed(entry, seen, visit.floor_sensor, visit.span_s, config)
     living = replace(entry.living, stamp_s=now.until_s, places=now.places, sites=now.sites)
     judged_now = living.landmarks(p_least=0.0)
     row = np.searchsorted(judged_now.landmark_id, mapped.landmark_id)

@@ -84,14 +84,10 @@ class SpatialVisit:
         return living
 
     @property
-    def start_s(self) -> float:
-        """Stamp of the first frame that has a pose."""
-        return self.intake.start_s
-
-    @property
-    def end_s(self) -> float:
-        """Stamp of the last frame that has a pose."""
-        return self.intake.start_s + float(self.solved.optimum.smoother.problem.stamp_s[-1])
+    def span_s(self) -> tuple[float, float]:
+        """Stamps of the first and of the last frame that have a pose."""
+        start_s = self.intake.start_s
+        return start_s, start_s + float(self.solved.optimum.smoother.problem.stamp_s[-1])
 
     @property
     def optimum(self) -> SpatialOptimum:
