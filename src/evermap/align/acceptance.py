@@ -26,6 +26,8 @@ LOG_TURNS = {2: math.log(2.0 * math.pi), 3: math.log(8.0 * math.pi**2)}
 """Logarithm of the volume of all rotations, of the plane and of space."""
 LEAST = 1e-9
 """Information on a motion that rounding may take for less than none."""
+CLEARLY = 0.75
+"""Share of landmarks that agree, from which the mirrored map need not be asked."""
 NOTHING = "no two landmarks stand to each other as in the map"
 
 
@@ -95,19 +97,22 @@ def accept_alignment(
     elif most - rival < rules.lead_nats:
         other = int(np.count_nonzero(ranked[order[1]][1]))
         reason = f"two places in the map fit about as well, with {standing} and {other} of {count} landmarks"
-    elif (other := _mirrored(matches, most + rules.lead_nats, rules, covariance_m2)) > 0:
+    elif (other := _mirrored(matches, standing, most + rules.lead_nats, rules, covariance_m2)) > 0:
         reason = (
             f"{other} of {count} landmarks fit the mirrored map, {standing} this one: bearings or an axis are reversed"
         )
     return Acceptance(motion, agree, most, most - rival, reason)
 
 
-def _mirrored(matches: Matches, least: float, rules: LocalizeConfig, covariance_m2: FloatArray | None) -> int:
+def _mirrored(
+    matches: Matches, standing: int, least: float, rules: LocalizeConfig, covariance_m2: FloatArray | None
+) -> int:
     """How many landmarks agree with a mirrored map, where that has at least these log odds; else 0.
 
-    What lies near a line, or a plane, fits either way; what has an orientation is asked for that.
+    It is not asked where nearly all are `standing`. What lies near a line, or a plane, fits either
+    way; what has an orientation is asked for that.
     """
-    if matches.oriented.any():
+    if matches.oriented.any() or standing >= CLEARLY * len(np.unique(matches.landmark)):
         return 0
     source = matches.points[0] * np.append(-1.0, np.ones(matches.group.point_dim - 1))
     mirrored = replace(matches, source=source)
