@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from evermap.align.acceptance import accept_alignment, log_density_of, log_odds_of
+from evermap.align.acceptance import SIGMA_M, accept_alignment, log_density_of, log_odds_of
 from evermap.align.candidates import Matches
 from evermap.config import LocalizeConfig
 from evermap.geometry import se2, se3
@@ -187,3 +187,14 @@ def test_the_density_with_a_gaussian_motion_is_that_of_scipy(group) -> None:
     expected = stats.multivariate_normal(np.zeros(size), covariance + freedom @ freedom.T).logpdf(error)
     assert log_density_of(error, np.linalg.cholesky(covariance), freedom, None) == pytest.approx(expected, abs=1e-8)
     assert group_of(group.identity()) is group
+
+
+def test_standard_deviations_and_the_covariance_that_they_stand_for_give_the_same_odds() -> None:
+    place = se3.exp(np.random.default_rng(12).normal(0.0, 2.0, (6, 6)))
+    seen = se3.compose(se3.inverse(se3.exp(np.array([3.0, -2.0, 0.5, 0.2, 0.1, -1.0]))), place)
+    place[:, :3] += np.random.default_rng(13).normal(0.0, 0.05, (6, 3))
+    seen[3:, 3:] = np.nan
+    alone = accept_alignment(Matches.of(seen, place), RULES)
+    dense = accept_alignment(Matches.of(seen, place), RULES, covariance_m2=SIGMA_M**2 * np.eye(18))
+    assert alone, alone.reason
+    assert dense.log_odds == pytest.approx(alone.log_odds, abs=1e-9)

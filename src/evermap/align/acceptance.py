@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 
 from evermap.align.candidates import AGREE_M, AGREE_RAD, Matches, rank_motions
 from evermap.config import LocalizeConfig, RoomConfig
@@ -26,6 +26,8 @@ LOG_TURNS = {2: math.log(2.0 * math.pi), 3: math.log(8.0 * math.pi**2)}
 """Logarithm of the volume of all rotations, of the plane and of space."""
 LEAST = 1e-9
 """Information on a motion that rounding may take for less than none."""
+CLEARLY = 0.75
+"""Share of landmarks that agree, from which the mirrored map need not be asked."""
 NOTHING = "no two landmarks stand to each other as in the map"
 
 
@@ -95,19 +97,22 @@ def accept_alignment(
     elif most - rival < rules.lead_nats:
         other = int(np.count_nonzero(ranked[order[1]][1]))
         reason = f"two places in the map fit about as well, with {standing} and {other} of {count} landmarks"
-    elif (other := _mirrored(matches, most + rules.lead_nats, rules, covariance_m2)) > 0:
+    elif (other := _mirrored(matches, standing, most + rules.lead_nats, rules, covariance_m2)) > 0:
         reason = (
             f"{other} of {count} landmarks fit the mirrored map, {standing} this one: bearings or an axis are reversed"
         )
     return Acceptance(motion, agree, most, most - rival, reason)
 
 
-def _mirrored(matches: Matches, least: float, rules: LocalizeConfig, covariance_m2: FloatArray | None) -> int:
+def _mirrored(
+    matches: Matches, standing: int, least: float, rules: LocalizeConfig, covariance_m2: FloatArray | None
+) -> int:
     """How many landmarks agree with a mirrored map, where that has at least these log odds; else 0.
 
-    What lies near a line, or a plane, fits either way; what has an orientation is asked for that.
+    It is not asked where nearly all are `standing`. What lies near a line, or a plane, fits either
+    way; what has an orientation is asked for that.
     """
-    if matches.oriented.any():
+    if matches.oriented.any() or standing >= CLEARLY * len(np.unique(matches.landmark)):
         return 0
     source = matches.points[0] * np.append(-1.0, np.ones(matches.group.point_dim - 1))
     mirrored = replace(matches, source=source)
@@ -134,10 +139,10 @@ def log_odds_of(
     group, moved = matches.group, matches.group.transform(motion, source)
     dim = source.shape[1]
     error, freedom = [(moved[some] - target[some]).ravel()], [group.rigid_directions(moved[some] - moved.mean(axis=0))]
-    spread = SIGMA_M**2 * np.eye(dim * len(some))
+    factor = np.full(dim * len(some), SIGMA_M)
     if covariance_m2 is not None:
         rows = se2.xy_rows(some, dim)
-        spread = covariance_m2[np.ix_(rows, rows)]
+        factor = np.asarray(np.linalg.cholesky(covariance_m2[np.ix_(rows, rows)]), dtype=np.float64)
     log_chance = len(some) * log_room(moved, target, rules)
     turned = some[matches.oriented[some]]
     if len(turned):
@@ -145,10 +150,10 @@ def log_odds_of(
         off = se3.local(placed, se3.compose(motion, matches.source[turned]))[:, 3:]
         error.append((se3.rotation_of(placed) @ off[..., None]).ravel())
         freedom.append(np.tile(np.hstack([np.zeros((3, 3)), np.eye(3)]), (len(turned), 1)))
-        spread = _with_block(spread, SIGMA_RAD**2 * np.eye(3 * len(turned)))
+        sigma_rad = np.full(3 * len(turned), SIGMA_RAD)
+        factor = np.append(factor, sigma_rad) if factor.ndim == 1 else block_diag(factor, np.diag(sigma_rad))
         log_chance += len(turned) * LOG_TURNS[SPACE.point_dim]
     log_motion = -log_room(moved, target, rules) - LOG_TURNS[dim]
-    factor = np.asarray(np.linalg.cholesky(spread), dtype=np.float64)
     log_density = log_density_of(np.concatenate(error), factor, np.vstack(freedom), log_motion)
     log_prior = _log_prior_of(matches, agree, rules) + float(matches.log_prior[some].sum())
     return log_density + log_chance + log_prior - math.log(rules.p_another_place)
@@ -159,12 +164,13 @@ def log_density_of(error: FloatArray, factor: FloatArray, freedom: FloatArray, l
 
     Args:
         error: (M,) the differences.
-        factor: (M, M) lower Cholesky factor of their covariance for a known motion.
+        factor: (M, M) lower Cholesky factor of their covariance for a known motion, or (M,) standard deviations.
         freedom: (M, F) how they change with the motion.
         log_motion: log density of the motion, which is the same for all; None where `freedom` is in its standard
             deviations, and it is Gaussian.
     """
-    white = solve_triangular(factor, np.column_stack([error, freedom]), lower=True)
+    both, scale = np.column_stack([error, freedom]), factor if factor.ndim == 1 else np.diagonal(factor)
+    white = both / factor[:, None] if factor.ndim == 1 else solve_triangular(factor, both, lower=True)
     error, freedom = white[:, 0], white[:, 1:]
     prior = 0.0 if log_motion is not None else 1.0
     root = np.linalg.cholesky(freedom.T @ freedom + max(prior, LEAST) * np.eye(freedom.shape[1]))
@@ -173,7 +179,7 @@ def log_density_of(error: FloatArray, factor: FloatArray, freedom: FloatArray, l
     if prior:  # the difference of two numbers that are nearly equal has no digits left
         by = solve_triangular(root, pulled, lower=True, trans="T")
         squared = float(((error - freedom @ by) ** 2).sum() + by @ by)
-    log_volume = 2.0 * float(np.log(np.diagonal(factor)).sum() + np.log(np.diagonal(root)).sum())
+    log_volume = 2.0 * float(np.log(scale).sum() + np.log(np.diagonal(root)).sum())
     of_motion = 0.0 if log_motion is None else log_motion + 0.5 * freedom.shape[1] * math.log(2.0 * math.pi)
     return -0.5 * (log_volume + squared + len(error) * math.log(2.0 * math.pi)) + of_motion
 
@@ -202,10 +208,3 @@ def _log_prior_of(matches: Matches, agree: BoolArray, rules: LocalizeConfig) -> 
     p_any = np.minimum(np.bincount(name, p), rules.p_stands)
     stands = np.bincount(name[agree], minlength=len(p_any)) > 0
     return float(np.log(np.maximum(p[agree], 1e-12)).sum() + np.log1p(-p_any[~stands]).sum())
-
-
-def _with_block(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Block diagonal matrix of two."""
-    both = np.zeros((len(one) + len(other), len(one) + len(other)))
-    both[: len(one), : len(one)], both[len(one) :, len(one) :] = one, other
-    return both

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from evermap.align.acceptance import Acceptance, accept_alignment
 from evermap.align.candidates import Matches, find_consensus
-from evermap.config import SlamConfig
+from evermap.config import LocalizeConfig, SlamConfig
 from evermap.errors import NumericalError
 from evermap.estimate.measurement import Tied
 from evermap.estimate.sparse.system import Slices, exhausted
@@ -190,8 +191,8 @@ class Batch:
         """
         problem, estimate, noise, _ = part
         estimate = _with_measured_places(problem, estimate)
-        if prior_map is not None and np.count_nonzero(agreeing(prior_map, estimate.landmark)[1]) >= 2:
-            problem, estimate, _ = entered(problem, estimate, prior_map, self._prior)
+        if prior_map is not None and (laid := lay_over(prior_map, estimate.landmark, self._settings.localize)):
+            problem, estimate = entered(problem, estimate, prior_map, self._prior, laid.motion)
             return self.finished(problem, estimate, noise, aligned=True)
         if framed:
             problem, estimate = _in_measured_frame(problem, estimate, framed, self._prior)
@@ -360,33 +361,34 @@ def _in_measured_frame(
     return replace(held, measurements=(*problem.measurements, *framed)), estimate
 
 
-def agreeing(prior_map: PriorMap, landmark: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return places (k, 2) of the map's landmarks that were seen, and (k,) which have the relative positions of it.
+def lay_over(
+    prior_map: PriorMap, landmark: FloatArray, rules: LocalizeConfig, *, fewest: int = 2, spread_m: float = 0.0
+) -> Acceptance:
+    """Return how the landmarks that were seen lie over a prior map, and whether that is accepted.
 
     Args:
         prior_map: the map.
         landmark: (L, 2) positions of the landmarks, nan where never seen; those of further places are not asked.
+        rules: when an alignment is accepted.
+        fewest: landmarks that must agree.
+        spread_m: how far apart these must be.
     """
     landmark = landmark[: len(prior_map.given)]
     both = prior_map.given & np.isfinite(landmark[:, 0])
-    if np.count_nonzero(both) < 2:
-        return prior_map.mean[both], np.zeros(np.count_nonzero(both), dtype=np.bool_)
-    return prior_map.mean[both], find_consensus(Matches.of(landmark[both], prior_map.mean[both]))[1]
+    matches = Matches.of(landmark[both], prior_map.mean[both])
+    return accept_alignment(matches, rules, fewest=fewest, spread_m=spread_m)
 
 
 def entered(
-    problem: Problem, estimate: Estimate, prior_map: PriorMap, prior: CalibrationPrior
-) -> tuple[Problem, Estimate, FloatArray]:
-    """Move an estimate from the first pose's frame into a prior map's, and constrain it by the map.
+    problem: Problem, estimate: Estimate, prior_map: PriorMap, prior: CalibrationPrior, pose_map_world: FloatArray
+) -> tuple[Problem, Estimate]:
+    """Move an estimate from the first pose's frame, at a pose (3,) in a prior map, into that map, constrained by it.
 
-    Returns:
-        The problem with the map, with calibration priors as the user means them; values in its frame; and the (3,) pose
-        of the old frame in the map.
+    Returns the problem with the map, with calibration priors as the user means them, and values in its frame.
     """
     new = len(estimate.landmark) - len(prior_map.given)  # places that landmarks have besides their own
     mean, given = np.pad(prior_map.mean, ((0, new), (0, 0))), np.pad(prior_map.given, (0, new))
     both = given & estimate.known
-    pose_map_world, _ = find_consensus(Matches.of(estimate.landmark[both], mean[both]))
     moved = estimate.moved(pose_map_world)
     moved = replace(moved, landmark=np.where(both[:, None], mean, moved.landmark))
     problem = replace(
@@ -397,7 +399,7 @@ def entered(
         landmark_mean=np.where(given[:, None], mean, 0.0),
         landmark_information=independent(np.pad(prior_map.information, ((0, new), (0, 0), (0, 0)))),
     )
-    return problem, moved, pose_map_world
+    return problem, moved
 
 
 def divided(

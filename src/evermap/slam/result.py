@@ -9,7 +9,7 @@ import numpy as np
 
 from evermap.estimate.measurement import frame_of
 from evermap.geometry import se2
-from evermap.slam.batch import Outcome
+from evermap.slam.batch import Outcome, lay_over
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import BEARING, FORWARD, OF_ANGLE, OF_SCALE, SLOPE, SPECS, CalibrationPrior, from_front
 from evermap.slam.check import far_off
@@ -64,10 +64,9 @@ def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
         done_s, all_s = (float(np.ptp(s)) for s in (path.stamp_s, recording.frames.stamp_s))
         warnings.append(f"interrupted after {done_s:.0f} of {all_s:.0f} s of the recording")
     if prepared.prior_map is not None and frame != "prior_map":
-        warnings.append(
-            "cannot localise in the prior map: too few of the detected landmarks have the relative positions of the "
-            "map; the result is in the frame of the first pose"
-        )
+        laid = lay_over(prepared.prior_map, outcome.estimate.landmark, solved.settings.localize)
+        why = laid.reason or "too few of the detected landmarks have the relative positions of the map"
+        warnings.append(f"cannot localise in the prior map: {why}; the result is in the frame of the first pose")
     place, spread = outcome.graph_estimate.landmark[revision.current], outcome.graph_marginals.landmark
     return SlamResult(
         trajectory=path,

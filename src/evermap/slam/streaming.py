@@ -26,8 +26,8 @@ from evermap.slam.batch import (
     Outcome,
     PriorMap,
     SolvedPart,
-    agreeing,
     entered,
+    lay_over,
     sighted_at,
     voted,
 )
@@ -38,7 +38,7 @@ from evermap.slam.local_filter import Motion, SessionFilter
 from evermap.slam.method import Method, Static
 from evermap.slam.nearby_places import grown
 from evermap.slam.noise import refine_noise
-from evermap.slam.problem import Drive, Noise, Problem
+from evermap.slam.problem import Drive, Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.types import FloatArray, IntArray
 
@@ -125,8 +125,8 @@ class StreamingSlam:
         self._owed_ms = self._a_frame_ms()
         if not later:
             self.work()
-        if self._prior_map is not None and not self._aligned and self._can_align():
-            self._enter_map()
+        if self._prior_map is not None and not self._aligned:
+            self._lay_over_map()
         self.online_pose[row], self.online_covariance[row] = self._told(self._filter.pose, self._filter.covariance)
 
     def _told(self, pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -203,8 +203,8 @@ class StreamingSlam:
     def finish(self) -> Outcome:
         """Smooth everything processed so far, with noise levels iterated to convergence, and divide the scale."""
         self.work()
-        if self._prior_map is not None and not self._aligned and self._can_align(final=True):
-            self._enter_map()
+        if self._prior_map is not None and not self._aligned:
+            self._lay_over_map(final=True)
         self._job = None
         problem, estimate = self._problem.until(self._n_poses), self._filter.estimate()
         batch = Batch(self._prior, self._start_noise, self._method, self._settings)
@@ -343,28 +343,24 @@ class StreamingSlam:
             self._adopt(revised, landmark)
         self._method, self._filter, self._landmark = method, following, landmark
 
-    def _can_align(self, *, final: bool = False) -> bool:
-        """Return whether most landmarks of the map seen so far have its relative positions; two at the end."""
+    def _lay_over_map(self, *, final: bool = False) -> None:
+        """Enter the map where the landmarks of the map seen so far lie over it; two are enough at the end."""
         assert self._prior_map is not None
         given, settings = self._prior_map.given, self._settings.localize
         count = int(np.count_nonzero(given & np.isfinite(self._landmark[: len(given), 0])))
-        if count < (2 if final else settings.fewest):
-            return False
-        if count == self._align_tried and not final:  # nothing new has been seen since
-            return False
+        fewest, spread_m = (2, 0.0) if final else (settings.fewest, settings.spread_m)
+        if count < fewest or (count == self._align_tried and not final):  # nothing new has been seen since
+            return
         self._align_tried = count
-        at, agree = agreeing(self._prior_map, self._filter.estimate().landmark)
-        if final:
-            return bool(agree.sum() >= 2)
-        enough = agree.sum() >= settings.fewest and 2 * agree.sum() > count
-        return bool(enough and np.ptp(at[agree], axis=0).max() >= settings.spread_m)
+        estimate = self._filter.estimate()
+        laid = lay_over(self._prior_map, estimate.landmark, settings, fewest=fewest, spread_m=spread_m)
+        if laid:
+            self._enter_map(estimate, laid.motion)
 
-    def _enter_map(self) -> None:
+    def _enter_map(self, estimate: Estimate, pose_map_world: FloatArray) -> None:
         """Move the estimate from the first pose's frame into the prior map's, then constrain it by the map."""
         assert self._prior_map is not None
-        self._problem, moved, pose_map_world = entered(
-            self._problem, self._filter.estimate(), self._prior_map, self._prior
-        )
+        self._problem, moved = entered(self._problem, estimate, self._prior_map, self._prior, pose_map_world)
         self._aligned, self._scale = True, 1.0
         done = self._n_poses
         self.online_pose[:done] = se2.compose(pose_map_world, self.online_pose[:done])

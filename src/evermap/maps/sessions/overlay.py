@@ -14,9 +14,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
 from scipy.linalg.lapack import dpotri
 
+from evermap.align.acceptance import is_this_place, log_density_of, log_room
 from evermap.align.candidates import AGREE_M, Matches, find_consensus
 from evermap.config import OverlayConfig
 from evermap.geometry import se2
@@ -136,9 +136,8 @@ def lay_over(
             landmark=known.landmark,
             weight=np.maximum(weight, 1e-3),
         )
-        motion, _ = find_consensus(matches)
-        gap = np.linalg.norm(se2.transform(motion, sighted.position_m[known.landmark]) - known.position_m, axis=1)
-        if len(np.unique(known.landmark[gap < AGREE_M])) < 2:
+        motion, agree = find_consensus(matches)
+        if np.count_nonzero(agree) < 2:
             return None
     options = _Options(sighted, known, motion, settings)
     if search == "none":
@@ -257,9 +256,7 @@ class _Options:
         self._freedom = directions * free
         self._turned_m2 = np.where(np.arange(len(known.site)) < self.n_places, 0.0, settings.turned_m**2)
         self.drift_m = settings.drifts_m[0]
-        spread = np.ptp(np.vstack([self.landmark_m, known.position_m]), axis=0)
-        height_m = float(np.prod(np.maximum(spread[2:], settings.lowest_room_m)))
-        self._log_room = -math.log(max(float(np.prod(spread[:2])), settings.smallest_room_m2) * height_m)
+        self._log_room = log_room(self.landmark_m, known.position_m, settings)
         self._log_site = known.log_p_site + np.bincount(known.site, known.log_turned, len(known.log_p_site))
         self.sites: list[list[int]] = [[] for _ in known.log_p_elsewhere]
         order = np.argsort(known.site, kind="stable")
@@ -349,12 +346,8 @@ class _Options:
         return total
 
     def is_this_place(self, chosen: IntArray) -> bool:
-        """Return whether the unmoved cliques outweigh the improbability that all others moved.
-
-        In another place where the map's identities are used again, all landmarks stand anywhere: some agree by chance.
-        """
-        here, count = self._log_standing(chosen)
-        return here > math.log(self.settings.p_another_place) + count * self._log_room
+        """Return whether the unmoved cliques outweigh the improbability that all others moved."""
+        return is_this_place(*self._log_standing(chosen), self._log_room, self.settings.p_another_place)
 
     def outweighs_the_rest(self, chosen: IntArray) -> bool:
         """Return False if a single body determines the pose, and is less likely to be unmoved than the bodies that it
@@ -376,14 +369,7 @@ class _Options:
         rows = self._chosen_rows(chosen)
         total = 0.0
         if len(rows):
-            error, factor = self._factored(rows)
-            both = np.column_stack([error, self._free(rows)])
-            error, freedom = (white := solve_triangular(factor, both, lower=True))[:, 0], white[:, 1:]
-            root = np.linalg.cholesky(np.eye(freedom.shape[1]) + freedom.T @ freedom)
-            motion = cho_solve((root, True), freedom.T @ error)
-            squared = float(((error - freedom @ motion) ** 2).sum() + motion @ motion)
-            log_volume = 2.0 * float(np.log(np.diagonal(factor)).sum() + np.log(np.diagonal(root)).sum())
-            total = -0.5 * (log_volume + squared + len(error) * math.log(2.0 * math.pi))
+            total = log_density_of(*self._factored(rows), self._free(rows), None)
         for clique, sites in enumerate(self.sites):
             if sites:
                 site = int(chosen[clique])
@@ -491,7 +477,7 @@ class _Options:
         share, nudge_m, turn_m = float(self.settings.share_nudged), self.settings.nudge_m, self.settings.turn_m
         log_volume = 0.5 * self.dim * math.log(2.0 * math.pi * nudge_m**2)
         near = math.log(share) - log_volume - 0.5 * float(middle @ middle) / nudge_m**2
-        log_density = float(np.logaddexp(near, math.log(1.0 - share) + self._log_room))
+        log_density = float(np.logaddexp(near, math.log(1.0 - share) - self._log_room))
         rest = step - middle
         count = self.dim * (len(of) - 1)
         still = 0.5 * float((rest**2).sum()) / turn_m**2 + 0.5 * count * math.log(2 * math.pi * turn_m**2)
