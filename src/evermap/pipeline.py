@@ -206,9 +206,8 @@ def run_localization(
         raise ConfigError(problem, field="slam.unknown_ids", hint="leave it out, or enter the session")
     if not len(living.places):
         raise DataError("the map is empty", field="living", hint="enter a session first")
-    recording = session.in_its_space(recording, living, config)
+    recording = check.valid(session.in_its_space(recording, living, config), config.sensor)  # type: ignore[type-var]
     if is_in_space(recording):
-        recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
         recording, living = session.admitted(recording, living)
         named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])
         if has_traffic(recording):  # boxes at rest are told from those that move by what comes later
@@ -216,9 +215,9 @@ def run_localization(
             return run_slam(recording, config, prior_map=spatial.standing(living, p_site), progress=progress)
         places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))
         joint = living.covariance_m2
-        return localize_in_space(recording, places, config, joint_m2=joint, realtime=realtime, progress=progress)
-    recording = check.valid(recording, config.sensor)
-    remarks = check.odd(recording, settings=config.slam.check)
+        result = localize_in_space(recording, places, config, joint_m2=joint, realtime=realtime, progress=progress)
+        return replace(result, warnings=(*check.odd(recording, config.slam), *result.warnings))
+    remarks = check.odd(recording, config.slam)
     recording, living = session.admitted(recording, living)
     named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])
     places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))

@@ -164,8 +164,7 @@ def check_rig(sensors: Iterable[SpatialSensor]) -> None:
 
 def _check_content(recording: AnyRecording) -> None:
     source = recording.source or None
-    odometry = Odometry if recording.dim == 2 else SpatialOdometry | None
-    if not isinstance(recording.odometry, odometry):
+    if type(recording.odometry) not in ((Odometry,) if recording.dim == 2 else (SpatialOdometry, type(None))):
         problem = f"{type(recording.odometry).__name__} and {type(recording.detections).__name__} do not go together"
         raise InputError(problem, field="odometry", hint="both in the plane, or both in space")
     if (recording.dim == 3) != (len(recording.sensors) > 0):

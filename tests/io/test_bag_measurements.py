@@ -19,6 +19,7 @@ from evermap.estimate.measurements import _ADDED, add_kind, find_kinds
 from evermap.geometry import se2, se3
 from evermap.io import read_native, write_native
 from evermap.io.bag import bag_settings, read_bag, settings_path
+from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.types import UNKNOWN, Measurements, SpatialRecording
 from evermap_studies.sim import BuildingConfig, simulate_building
@@ -228,6 +229,19 @@ def test_fixes_of_unknown_covariance_have_that_of_the_table(tmp_path: Path) -> N
     assert gnss.columns["sigma_z_m"] == pytest.approx([usual["sigma_z_m"], 5.0])
     assert np.isnan(gnss.columns["z_m"]).tolist() == [True, False]
     assert gnss.columns["x_m"] == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+def test_a_map_keeps_the_measurements_of_a_session(tmp_path: Path) -> None:
+    read = read_bag(bag(tmp_path))
+    kept = unpack_recording(pack_recording(read))
+    assert [table.kind for table in kept.measurements] == ["gnss", "gravity"]
+    for found, wanted in zip(kept.measurements, read.measurements, strict=True):
+        np.testing.assert_array_equal(found.stamp_s, wanted.stamp_s)
+        np.testing.assert_array_equal(found.landmark_id, wanted.landmark_id)
+        assert found.columns.keys() == wanted.columns.keys()
+        assert all(np.array_equal(found.columns[name], wanted.columns[name]) for name in wanted.columns)
+    plain = replace(read, measurements=())
+    assert unpack_recording(pack_recording(plain)).measurements == ()
 
 
 def test_a_check_of_a_bag_counts_its_measurements(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from evermap.slam.mistakes import USUAL, Finding, find_motion
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
+    AnyRecordingT,
     BoolArray,
     FloatArray,
     Landmarks,
@@ -37,6 +38,7 @@ from evermap.types import (
 )
 from evermap.valid import WITHOUT_IDS, check_landmarks, validate
 
+DEFAULTS = SlamConfig()
 OUTSIDE = 0.05
 """Share of the image size by which undistorted corners of tags may lie outside of the image."""
 _OTHER_UNIT = "another unit than metres, or a wrong limit"
@@ -77,40 +79,35 @@ class Check(Shown):
         }
 
 
-def findings(recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> tuple[Finding, ...]:
+def findings(recording: AnyRecording, settings: SlamConfig = DEFAULTS) -> tuple[Finding, ...]:
     """Return everything that is odd about a valid recording, the worst first; its truth is not looked at.
 
-    The sensor's limits are in force; `identities` is False where those of its detections are not used.
+    The limits of its sensors are in force.
     """
-    found = [*find_motion(recording, settings), *_limits(recording)]
-    if identities:
-        found += _identities(recording, settings)
+    found = _read_wrongly(recording, settings)
+    if is_in_space(recording):
+        found = [*_left_out(recording, settings), *found]
     return tuple(sorted(found, key=lambda finding: finding.usable))
 
 
-def findings_in_space(recording: SpatialRecording, settings: SlamConfig) -> tuple[Finding, ...]:
-    """Return everything that is odd about a valid recording in space, the worst first; its truth is not looked at."""
-    found = [*_left_out(recording, settings), *_read_wrongly_in_space(recording, settings)]
-    return tuple(sorted(found, key=lambda finding: finding.usable))
-
-
-def _read_wrongly_in_space(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:
+def _read_wrongly(recording: AnyRecording, settings: SlamConfig) -> list[Finding]:
     """Units, axes, clocks, limits, identities and jumps: all but what the estimator leaves out, and says so itself."""
-    found = [*find_motion(recording, settings.check), *_limits_in_space(recording)]
+    found = [*find_motion(recording, settings.check)]
+    found += _limits_in_space(recording) if is_in_space(recording) else _limits(recording)
     if settings.unknown_ids is not True:
         found += _identities(recording, settings.check)
-    if recording.odometry is not None and all(finding.usable for finding in found):
+    if is_in_space(recording) and recording.odometry is not None and all(finding.usable for finding in found):
         found += _jumps(recording.odometry, settings.cleaning)
-    return found
+    return sorted(found, key=lambda finding: finding.usable)
 
 
-def odd(recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> tuple[str, ...]:
-    """Return the `findings` as warnings of a run.
+def odd(recording: AnyRecording, settings: SlamConfig) -> tuple[str, ...]:
+    """Return what was read wrongly as warnings of a run.
 
     Raises:
         DataError: identities that would cost gigabytes and tell nothing.
     """
-    found = findings(recording, identities=identities, settings=settings)
+    found = _read_wrongly(recording, settings)
     for finding in found:
         if finding.code == "own-identities" and not finding.usable:
             raise DataError(f"{recording.name}: {finding.message}", hint="leave landmark_id empty, and `unknown_ids`")
@@ -350,8 +347,8 @@ def _identities(recording: AnyRecording, settings: CheckConfig) -> list[Finding]
     return [Finding("own-identities", message, usable=count < settings.own_ids)]
 
 
-def valid(recording: Recording, sensor: SensorConfig, prior_map: Landmarks | None = None) -> Recording:
-    """Return the recording with the sensor that the configuration states.
+def valid(recording: AnyRecordingT, sensor: SensorConfig, prior_map: Landmarks | None = None) -> AnyRecordingT:
+    """Return the recording with the sensors that the configuration states.
 
     Raises:
         InputError: no `Recording`, or values that cannot be, in it or in the prior map.
@@ -360,6 +357,12 @@ def valid(recording: Recording, sensor: SensorConfig, prior_map: Landmarks | Non
     validate(recording)
     if prior_map is not None:
         check_landmarks(prior_map, "prior_map")
+    return _with_sensors(recording, sensor)
+
+
+def _with_sensors(recording: AnyRecordingT, sensor: SensorConfig) -> AnyRecordingT:
+    if recording.dim == 3:
+        return replace(recording, sensors=sensor.applied_in_space(recording.sensors))
     return replace(recording, sensor=sensor.applied_to(recording.sensor))
 
 
@@ -387,17 +390,13 @@ def screened(
     from evermap.slam.space.moving import has_traffic
     from evermap.slam.votes import without_contradicted_ids
 
-    settings, remarks = config.slam, tuple[str, ...]()
-    if is_in_space(recording):
-        recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
-        remarks = tuple(finding.message for finding in _read_wrongly_in_space(recording, settings))
+    settings = config.slam
+    if repair and not is_in_space(recording):
+        recording = clean(_with_sensors(recording, config.sensor), settings.cleaning)
     else:
-        if repair:
-            recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
-            recording = clean(recording, settings.cleaning)
-        else:
-            recording = valid(recording, config.sensor, prior_map)
-        remarks = odd(recording, identities=settings.unknown_ids is not True, settings=settings.check)
+        recording = valid(recording, config.sensor, prior_map)
+    remarks = odd(recording, settings)
+    if not is_in_space(recording):
         recording, told = with_bearings(recording, settings)
         remarks = (*remarks, *told)
     if settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording):  # the tracker assigns ids
@@ -426,13 +425,8 @@ def check_recording(recording: AnyRecording, config: Config | None = None) -> Ch
     config = config or Config()
     settings = config.slam
     recording = in_its_space(recording, settings)
-    if is_in_space(recording):
-        validate(recording)
-        recording = replace(recording, sensors=config.sensor.applied_in_space(recording.sensors))
-        found = findings_in_space(recording, settings)
-    else:
-        recording = valid(recording, config.sensor)
-        found = findings(recording, identities=settings.unknown_ids is not True, settings=settings.check)
+    recording = valid(recording, config.sensor)  # type: ignore[type-var]
+    found = findings(recording, settings)
     anonymous = (recording.detections.landmark_id == UNKNOWN).all()
     if anonymous and not (settings.unknown_ids or has_traffic(recording)):
         found = (*found, Finding("no-identities", f"no detection has a landmark_id: {WITHOUT_IDS}"))

@@ -1,4 +1,4 @@
-"""Input of the estimator: the usable part of a recording, and the priors before its first frame."""
+"""Input of the estimator: the usable part of a recording, in the plane and in space, and the priors of the plane."""
 
 from __future__ import annotations
 
@@ -18,7 +18,17 @@ from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.noise import start_noise
 from evermap.slam.problem import USUAL, Drive, Noise, Problem
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Landmarks, Recording, Sensor
+from evermap.types import (
+    UNKNOWN,
+    AnyRecording,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Landmarks,
+    Recording,
+    Sensor,
+    is_in_space,
+)
 from evermap.valid import WITHOUT_IDS
 
 FIRST_POSE_INFORMATION = 1e8
@@ -73,23 +83,9 @@ def prepare(
     """
     drive, odometry_s, detections = Drive.of(recording, settings), recording.odometry.stamp_s, recording.detections
     stamps = recording.frames.stamp_s
-    warnings = list(remarks)
-    anonymous = detections.landmark_id == UNKNOWN
-    if anonymous.any():
-        warnings.append(f"{int(anonymous.sum())} detections without identity not used")
-    moving = (stamps >= odometry_s[0]) & (stamps <= odometry_s[-1])
-    outside = ~anonymous & ~moving[detections.frame]
-    if outside.any():
-        warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
-    used = np.flatnonzero(~anonymous & ~outside)
-    seen_in = np.unique(detections.frame[used])
-    if len(seen_in) < 2:
-        seen = f"landmarks of known identity were seen in {len(seen_in)} frames, at least 2 needed"
-        hint = "check landmark ids, and that detections and odometry share one clock"
-        raise DataError(f"{recording.name}: {seen}", hint=WITHOUT_IDS if anonymous.all() else hint)
-    pose_frame = _frames_with_pose(recording, seen_in, moving)
-    measured_id = [table.landmark_id[table.landmark_id != UNKNOWN] for table in recording.measurements]
-    landmark_id = np.unique(np.concatenate([detections.landmark_id[used], *measured_id]))
+    usable, moving, warnings = usable_detections(recording, remarks)
+    used, seen_in = np.flatnonzero(usable), frames_of_usable(recording, usable, fewest=2)
+    pose_frame, landmark_id = _frames_with_pose(recording, seen_in, moving), landmark_ids(recording, used)
     start_s = float(odometry_s[0])
     tied, left_out = tie_measurements(
         recording.measurements, stamps[pose_frame], partial(_driven, drive, start_s), landmark_id
@@ -113,6 +109,50 @@ def prepare(
     in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
     framed = tuple(of for of in tied if of.kind.frame is not None)
     return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings), framed)
+
+
+def usable_detections(recording: AnyRecording, remarks: tuple[str, ...]) -> tuple[BoolArray, BoolArray, list[str]]:
+    """Return detections (M,) of known identity during the odometry, frames (F,) during it, and remarks on the others.
+
+    Without odometry every frame counts; the `remarks` come first.
+    """
+    detections, stamps, warnings = recording.detections, recording.frames.stamp_s, list(remarks)
+    usable = detections.landmark_id != UNKNOWN
+    if not usable.all():
+        warnings.append(f"{int((~usable).sum())} detections without identity not used")
+    moving = np.ones(len(stamps), dtype=np.bool_)
+    if recording.odometry is not None:
+        driven_s = recording.odometry.stamp_s
+        moving = (stamps >= driven_s[0]) & (stamps <= driven_s[-1])
+        outside = usable & ~moving[detections.frame]
+        if outside.any():
+            warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
+        usable &= ~outside
+    return usable, moving, warnings
+
+
+def frames_of_usable(recording: AnyRecording, usable: BoolArray, *, fewest: int) -> IntArray:
+    """Return the frames of usable detections (M,).
+
+    Raises:
+        DataError: there are less than `fewest`.
+    """
+    seen_in = np.unique(recording.detections.frame[usable])
+    if len(seen_in) >= fewest:
+        return seen_in
+    hint = "check landmark ids, and that detections and odometry share one clock"
+    if (recording.detections.landmark_id == UNKNOWN).all():
+        hint = WITHOUT_IDS
+    if is_in_space(recording) and np.isfinite(recording.detections.size_m).any():
+        hint = "boxes without identities need `odometry`"
+    seen = f"landmarks of known identity were seen in {len(seen_in)} frames, at least {fewest} needed"
+    raise DataError(f"{recording.name}: {seen}", hint=hint)
+
+
+def landmark_ids(recording: AnyRecording, used: IntArray) -> IntArray:
+    """Return the sorted ids of landmarks in the `used` detections and in further measurements."""
+    measured = [table.landmark_id[table.landmark_id != UNKNOWN] for table in recording.measurements]
+    return np.unique(np.concatenate([recording.detections.landmark_id[used], *measured]))
 
 
 def _frames_with_pose(recording: Recording, seen_in: IntArray, moving: BoolArray) -> IntArray:

@@ -15,12 +15,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from evermap import check_recording, run_slam
+from evermap import check_recording, run_localization, run_session, run_slam
 from evermap.cli.main import app
 from evermap.config import Config
 from evermap.errors import InputError
 from evermap.io import read_recording, write_native
 from evermap.io.spatial import with_tag_poses
+from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store
 from evermap.types import SpatialRecording
 
@@ -107,6 +108,27 @@ def test_honest_recordings_raise_no_alarm(seed: int) -> None:
         check = check_recording(recording)
         assert check.findings == ()
         assert check.usable
+
+
+def test_values_that_cannot_be_are_refused_before_anything_is_estimated() -> None:
+    def negative(covariance: np.ndarray) -> np.ndarray:
+        return np.tile(-np.eye(3), (len(covariance), 1, 1))
+
+    wrong = seen(covariance_sensor_m2=negative)(room())
+    survey = room().true_landmarks
+    assert survey is not None
+    living = replace(LivingMap.begun(survey.as_prior(0.01)), clock=room().clock)
+    for run in (run_slam, run_session, lambda given: run_localization(given, living)):
+        with pytest.raises(InputError, match=r"'detections\.covariance_sensor_m2'"):
+            run(wrong)
+    twice = replace(survey.as_prior(0.01), landmark_id=np.zeros_like(survey.landmark_id))
+    with pytest.raises(InputError, match=r"'prior_map\.landmark_id'"):
+        run_slam(room(), prior_map=twice)
+
+
+def test_localization_tells_what_a_check_tells() -> None:
+    recording, living = driven(pose_world_robot=jumping)(room()), run_session(room()).living
+    assert "odometry jumps 2 times" in " ".join(run_localization(recording, living).warnings)
 
 
 @pytest.mark.slow

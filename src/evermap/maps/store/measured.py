@@ -1,7 +1,7 @@
 """Stored recordings of sessions, for replays, where their robots drove, and the evidence of every clique, as bytes.
 
-Of a recording is kept what the estimate may see: odometry, frames, detections, sensor and objects, bit by bit, and no
-truth. Evidence is one chunk a clique, some ten bytes a look, and an index of them.
+Of a recording is kept what the estimate may see: odometry, frames, detections, measurements, sensor and objects, bit
+by bit, and no truth. Evidence is one chunk a clique, some ten bytes a look, and an index of them.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from evermap.estimate.measurements import find_kinds
 from evermap.existence.sites import Evidence
 from evermap.geometry import se3
 from evermap.maps.store.content import Chunk, DamagedError, name_of, text_chunk
@@ -24,6 +25,7 @@ from evermap.types import (
     Detections,
     FloatArray,
     Frames,
+    Measurements,
     Odometry,
     Recording,
     Sensor,
@@ -70,6 +72,11 @@ def pack_recording(recording: AnyRecording) -> bytes:
             if item.name in _LATER and isinstance(value, tuple | bool | None) and not value:
                 continue
             (arrays if isinstance(value, np.ndarray) else values)[f"{table}.{item.name}"] = value
+    if recording.measurements:  # as above
+        values["measurements"] = {table.kind: list(table.columns) for table in recording.measurements}
+    for measured in recording.measurements:
+        own = {"stamp_s": measured.stamp_s, "landmark_id": measured.landmark_id, **measured.columns}
+        arrays |= {f"{measured.kind}.{name}": column for name, column in own.items()}
     arrays["values"] = np.frombuffer(json.dumps(values).encode(), np.uint8)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
@@ -92,6 +99,15 @@ def unpack_recording(data: bytes) -> AnyRecording:
             "class_names": tuple(values["class_names"]),
             "clock": Clock(values["clock"]),
             "landmark_names": {landmark_id_of(text): text for text in values["landmark_texts"]},
+            "measurements": tuple(
+                Measurements(
+                    find_kinds()[kind].name,
+                    arrays[f"{kind}.stamp_s"],
+                    {name: arrays[f"{kind}.{name}"] for name in columns},
+                    arrays[f"{kind}.landmark_id"],
+                )
+                for kind, columns in values.get("measurements", {}).items()
+            ),
         }
         if "sensors" not in values:
             tables = {table: _table(table, kind, arrays, values) for table, kind in _TABLES.items()}

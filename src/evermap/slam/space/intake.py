@@ -15,6 +15,7 @@ from evermap.geometry import se3
 from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries, Symmetry
+from evermap.slam.intake import frames_of_usable, landmark_ids, usable_detections
 from evermap.slam.space.linearise import CORNERS, POINT, POSE
 from evermap.slam.space.local_filter import SpatialFrame
 from evermap.slam.space.problem import USUAL, OdometryPath, SpatialNoise, SpatialProblem
@@ -29,7 +30,6 @@ from evermap.types import (
     SpatialSensor,
     rows_of,
 )
-from evermap.valid import WITHOUT_IDS
 
 HARDLY = 1.0
 """Standard deviation with which it counts, as a share of the range: as good as nothing."""
@@ -86,12 +86,9 @@ def prepare_space(
     """
     detections, stamps = recording.detections, recording.frames.stamp_s
     where, usable, moving, warnings = _said(recording, settings, remarks)
-    seen_in = np.unique(detections.frame[usable])
-    if len(seen_in) < fewest:
-        raise _too_little(recording, len(seen_in), fewest)
+    seen_in = frames_of_usable(recording, usable, fewest=fewest)
     pose_frame, used = seen_in if recording.odometry is None else np.flatnonzero(moving), np.flatnonzero(usable)
-    measured_id = [table.landmark_id[table.landmark_id != UNKNOWN] for table in recording.measurements]
-    landmark_id = np.unique(np.concatenate([detections.landmark_id[used], *measured_id]))
+    landmark_id = landmark_ids(recording, used)
     place = np.searchsorted(landmark_id, detections.landmark_id[used])
     some = rows_of(where, used)
     symmetries = _symmetries(recording, place, used, some.kind, len(landmark_id))
@@ -218,22 +215,11 @@ def _symmetries(recording: SpatialRecording, place: IntArray, used: IntArray, ki
     return found
 
 
-def _too_little(recording: SpatialRecording, seen: int, fewest: int) -> DataError:
-    hint = "check landmark ids, and that detections and odometry share one clock"
-    if (recording.detections.landmark_id == UNKNOWN).all():
-        hint = WITHOUT_IDS
-    if np.isfinite(recording.detections.size_m).any():
-        hint = "boxes without identities need `odometry`"
-    return DataError(
-        f"{recording.name}: landmarks of known identity were seen in {seen} frames, at least {fewest} needed", hint=hint
-    )
-
-
 def _said(
     recording: SpatialRecording, settings: SpaceConfig, remarks: tuple[str, ...]
 ) -> tuple[_Where, BoolArray, BoolArray, list[str]]:
     """Return the measurements, usable detections (M,), frames (F,) during the odometry, and remarks on dropped ones."""
-    usable, moving, warnings = _usable(recording, remarks)
+    usable, moving, warnings = usable_detections(recording, remarks)
     where, broken = _where(recording, usable, settings)
     if broken.any():
         warnings.append(f"{int(broken.sum())} detections from which no position follows not used")
@@ -243,23 +229,6 @@ def _said(
         warnings.append(f"{int(blind.sum())} detections without a range, seen from too few directions, not used")
         usable &= ~blind
     return where, usable, moving, warnings
-
-
-def _usable(recording: SpatialRecording, remarks: tuple[str, ...]) -> tuple[BoolArray, BoolArray, list[str]]:
-    """Return detections (M,) of known identity and frames (F,) during the odometry, and remarks."""
-    detections, stamps, warnings = recording.detections, recording.frames.stamp_s, list(remarks)
-    usable = detections.landmark_id != UNKNOWN
-    if not usable.all():
-        warnings.append(f"{int((~usable).sum())} detections without identity not used")
-    moving = np.ones(len(stamps), dtype=np.bool_)
-    if recording.odometry is not None:
-        driven_s = recording.odometry.stamp_s
-        moving = (stamps >= driven_s[0]) & (stamps <= driven_s[-1])
-        outside = usable & ~moving[detections.frame]
-        if outside.any():
-            warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
-        usable &= ~outside
-    return usable, moving, warnings
 
 
 @dataclass(frozen=True, slots=True)
