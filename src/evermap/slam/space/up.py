@@ -44,8 +44,6 @@ FEWEST = 5
 """Poses of a motion."""
 UPRIGHT = 0.7
 """Cosine between two axes that are taken for the same, about that of 45 degrees."""
-FEWEST_TAGS, MOST_OF_TAGS = 3, 0.8
-"""Tags on walls, and the share of them that must hang as a camera has up, to show that it is not upside down."""
 
 
 class Movement(NamedTuple):
@@ -124,7 +122,7 @@ def decide_up(
     found = [up_by_gravity(motion, measurements, settings), up_by_frame(motion, odometry, settings)]
     known = next((one for one in found if one.source), None)
     reference = motion.upright if known is None else known.direction
-    reference = np.zeros(3) if known is None and not _has_sign(motion) else reference
+    reference = np.zeros(3) if known is None and not _has_sign(motion, settings) else reference
     by_turns = turn_axis(motion.pose, settings)
     wheels = odometry is not None and sway_of(odometry.pose_world_robot) < settings.wheels_rad
     found.append(_signed(by_turns, reference, "odometry" if wheels else "plane of motion", settings))
@@ -135,8 +133,8 @@ def decide_up(
     if not any(one.source for one in found) and axis.sigma_rad < MOST_TILT_RAD:
         text = ", ".join(f"{part:.3f}" for part in axis.direction.tolist())
         remarks.append(
-            f"up is along ({text}) or its opposite, by the plane of motion: nothing tells which, as of a camera that may "
-            "be upside down; slam.space.up.direction states it"
+            f"up is along ({text}) or its opposite, by the plane of motion: nothing tells which, as of a camera that "
+            "may be upside down; slam.space.up.direction states it"
         )
     for one in found:
         if up.source and is_contradiction(up, one):
@@ -286,9 +284,9 @@ def _signed(axis: Axis, reference: FloatArray, source: str, settings: UpConfig) 
     return Up(np.sign(part) * axis.direction, float(np.hypot(axis.sigma_rad, LEAST_RAD[source])), source)
 
 
-def _has_sign(motion: Movement) -> bool:
+def _has_sign(motion: Movement, settings: UpConfig) -> bool:
     """Judge whether conventions tell which end of an axis is up: tags do not contradict, and of a camera they agree."""
     share = float(np.mean(motion.tags_up @ motion.upright > 0.0)) if len(motion.tags_up) else 0.5
     if motion.is_camera:
-        return len(motion.tags_up) >= FEWEST_TAGS and share >= MOST_OF_TAGS
+        return len(motion.tags_up) >= settings.tags and share >= settings.tags_agree
     return share >= 0.5
