@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from evermap import run_session, run_slam
+from evermap import read_recording, run_session, run_slam
 from evermap.config import Config, UpConfig, with_overrides
 from evermap.geometry import se3
+from evermap.metrics.summary import compare_with_truth
 from evermap.slam.space.up import Movement, decide_up, plane_axis, turn_axis
 from evermap.types import UNKNOWN, Measurements, SpatialOdometry, SpatialRecording, Up
 
@@ -232,7 +234,7 @@ def on_robot(recording: SpatialRecording, mount: Rotation) -> SpatialRecording:
 
 def test_a_rig_says_where_up_is_in_its_map() -> None:
     """From detections to the map, which is in the frame of the first pose."""
-    recording = on_robot(Rig(0).walk(), AHEAD)
+    recording = on_robot(Rig(0, seconds=30.0, turns=2, gaps=1).walk(), AHEAD)
     result = run_slam(recording)
     true = se3.rotation_of(recording.truth.pose_world_robot[0]).T @ [0.0, 0.0, 1.0]
     up = result.landmarks.up
@@ -243,7 +245,7 @@ def test_a_rig_says_where_up_is_in_its_map() -> None:
 
 def test_a_camera_alone_says_that_it_is_no_robot() -> None:
     """Of its map, with z ahead, a mask for Nav2 would be a vertical section."""
-    recording = Rig(1).walk()
+    recording = Rig(1, seconds=30.0, turns=2, gaps=1).walk()
     result = run_slam(recording)
     assert not result.landmarks.up.is_known
     true = se3.rotation_of(recording.truth.pose_world_robot[0]).T @ [0.0, 0.0, 1.0]
@@ -258,7 +260,7 @@ def test_a_setting_states_it() -> None:
 
 
 def test_a_map_keeps_it_over_sessions() -> None:
-    first = on_robot(Rig(3).walk(), AHEAD)
+    first = on_robot(Rig(3, seconds=30.0, turns=2, gaps=1).walk(), AHEAD)
     mapped = run_session(first)
     known = mapped.living.up
     assert known.is_known
@@ -280,3 +282,17 @@ def test_a_drive_with_gravity_has_z_up() -> None:
     up = run_slam(replace(recording, measurements=(table,))).landmarks.up
     assert up.source.startswith("imu")
     assert angle(up.direction, np.array([0.0, 0.0, 1.0])) < 2.0 * up.sigma_rad
+
+
+@pytest.mark.data
+def test_the_hall_of_tags_is_level(shared_data: Path) -> None:
+    recording = read_recording(shared_data / "tagslam" / "test_13")
+    result = run_slam(recording)
+    up, pose = result.landmarks.up, compare_with_truth(recording, result).poses.pose_truth_estimate
+    assert up.is_known
+    assert angle(se3.rotation_of(pose) @ up.direction, np.array([0.0, 0.0, 1.0])) < 3.0 * up.sigma_rad
+
+
+@pytest.mark.data
+def test_a_camera_around_objects_on_a_table_leaves_up_unknown(shared_data: Path) -> None:
+    assert not run_slam(read_recording(shared_data / "ycbv" / "0014")).landmarks.up.is_known
