@@ -214,7 +214,7 @@ def turn_axis(pose: FloatArray, settings: UpConfig = USUAL) -> Axis:
     """Return the axis in the map about which poses (N, 7) turn: in it and in the robot it keeps its direction.
 
     Its standard deviation is that of a regression on the headings: of N independent tilts of the robot by s about it,
-    whose mean resultant is r, it is s / sqrt(N (1 - r^2)).
+    whose mean resultant is r, it is s / sqrt((N - 2) (1 - r^2)), since s is of residuals of two fitted numbers each.
     """
     if len(pose) < FEWEST:
         return NO_AXIS
@@ -223,9 +223,10 @@ def turn_axis(pose: FloatArray, settings: UpConfig = USUAL) -> Axis:
     spread = 1.0 - min(float(value[1]), 1.0) ** 2
     tilt = np.einsum("nij,j->ni", rotation, of_robot[0]) @ of_map[:, 1:]
     sway = float(np.sqrt(np.mean(tilt**2)))
-    if spread < settings.turned or sway > settings.sway_rad:
+    free = count_independent(tilt) - 2.0
+    if spread < settings.turned or sway > settings.sway_rad or free < 1.0:
         return NO_AXIS
-    return Axis(of_map[:, 0], sway / float(np.sqrt(count_independent(tilt) * spread)))
+    return Axis(of_map[:, 0], sway / float(np.sqrt(free * spread)))
 
 
 def sway_of(pose: FloatArray) -> float:
@@ -244,7 +245,8 @@ def plane_axis(position_m: FloatArray, settings: UpConfig = USUAL) -> Axis:
     _, second, across = (value / np.sqrt(len(away))).tolist()
     if second < settings.spread_m or across > settings.flatness * second:
         return NO_AXIS
-    return Axis(axes[2], across / (second * float(np.sqrt(count_independent(away @ axes[2:].T)))))
+    free = count_independent(away @ axes[2:].T) - 3.0  # three numbers are fitted
+    return Axis(axes[2], across / (second * float(np.sqrt(free)))) if free >= 1.0 else NO_AXIS
 
 
 def count_independent(residual: FloatArray) -> float:
@@ -289,4 +291,4 @@ def _has_sign(motion: Movement, settings: UpConfig) -> bool:
     share = float(np.mean(motion.tags_up @ motion.upright > 0.0)) if len(motion.tags_up) else 0.5
     if motion.is_camera:
         return len(motion.tags_up) >= settings.tags and share >= settings.tags_agree
-    return share >= 0.5
+    return bool(share >= 0.5)
