@@ -535,6 +535,8 @@ class UpConfig(Section):
     )
     sway_rad: Positive = key(0.2, "greatest standard deviation about such an axis [rad]: what is carried level")
     wheels_rad: Positive = key(0.01, "the same of an odometry of wheels, which has no other turns [rad]")
+    tags: Count = key(3, "fewest tags on walls that show that a camera is not upside down ...")
+    tags_agree: Share = key(0.8, "... if at least this share of them hang upright in it")
     evident: Share = key(
         0.5,
         "least cosine between an axis and the sensors' up that tells which end of it is up, and of a mean direction",

@@ -12,7 +12,7 @@ from evermap.types import FloatArray, Landmarks, Up
 
 LEAST_RAD = {"stated": 0.0, "imu": 0.01, "tf": 0.03, "odometry": 0.03, "plane of motion": 0.03}
 """Standard deviation of up by each source however often it was measured: errors that last. Of accelerometers their
-bias (1 % of gravity); of all that moves on a floor the slope of that floor, of which nobody measured how level it is:
+bias (1 % of gravity); of all that moves on a floor the slope of that floor, which is not measured:
 3 % is that of a drained floor or a road (ramps have 5 to 12)."""
 STATED_RAD = 0.01
 """Standard deviation of an up that a user states."""

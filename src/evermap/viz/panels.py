@@ -65,7 +65,7 @@ def lay_out(
 
     From the side one looks along the shorter of x and y, so that the longer one is seen. `within` is the place for all
     of them, where they are not the only ones of the figure. `up` is of the map before it was levelled (`level_pose`);
-    None where nobody asks.
+    None where that is not asked.
     """
     size = high - low
     level = up is not None and level_pose(up)[:6].any()

@@ -7,7 +7,8 @@ Sources, combined by their information (`geometry.upright`):
 - **odometry**, **plane of motion**: wheels and feet move in a plane and turn about its normal. The axis that all turns
   have in common is that of the mean rotation, whose singular value is 1 (both robot and map keep it); the normal of the
   plane is the axis of the least spread of the positions. Neither has a sign: that is where gravity, tf, or else the
-  sensors, by the convention of their axes, have up. Tags that hang upside down contradict the latter: no sign.
+  robot's frame has up, by the convention of its axes (z, REP 103). Where the robot's frame is that of a camera, which
+  may be mounted upside down, tags on walls must agree. Without a sign up is unknown, and a remark tells the axis.
 
 What moves freely, in a straight line, or not at all, has no such plane, and up remains unknown.
 """
@@ -26,6 +27,7 @@ from evermap.geometry.upright import LEAST_RAD, STATED_RAD, angle_between_ups, c
 from evermap.slam.space.linearise import CORNERS
 from evermap.slam.space.problem import SpatialEstimate, SpatialProblem
 from evermap.types import (
+    MOST_TILT_RAD,
     PLANE,
     BoolArray,
     FloatArray,
@@ -40,8 +42,8 @@ AXES_OF_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Columns are ahead, left and up of a sensor that looks along its z, with y down."""
 FEWEST = 5
 """Poses of a motion."""
-ON_A_WALL = 0.7
-"""Least part of a tag's own up along that of the sensors, either way: it hangs on a wall."""
+UPRIGHT = 0.7
+"""Cosine between two axes that are taken for the same, about that of 45 degrees."""
 
 
 class Movement(NamedTuple):
@@ -50,15 +52,17 @@ class Movement(NamedTuple):
     Attributes:
         stamp_s: (N,) of poses, on the clock of the measurements.
         pose: (N, 7) of the robot.
-        upright: (3,) mean over all poses and sensors of what is up by the convention of the sensor's axes; shorter than
-            1 the less they agree.
+        upright: (3,) mean over all poses of what is up by the convention of the robot's axes or, where its frame is
+            that of a camera, of the camera's; shorter than 1 the less they agree, 0 where conventions contradict.
         tags_up: (K, 3) directions that are up on tags that hang on walls.
+        is_camera: whether the robot's frame is that of a camera, z ahead.
     """
 
     stamp_s: FloatArray
     pose: FloatArray
     upright: FloatArray
     tags_up: FloatArray
+    is_camera: bool = False
 
     @classmethod
     def of(
@@ -72,17 +76,18 @@ class Movement(NamedTuple):
     ) -> Movement:
         """Return that of a solution: stamps (N,) of its poses, of which some are `found`, and `placed` places (P,)."""
         pose = estimate.pose[found]
-        axes = sensor_axes(problem, sensors)
-        up = np.einsum("sij,sj->si", se3.rotation_of(estimate.mount(problem)), axes[:, :, 2])
-        used = np.unique(problem.sensor)
-        mean = se3.rotation_of(pose).mean(axis=0) if len(pose) else np.zeros((3, 3))
-        upright = mean @ (up[used].mean(axis=0) if len(used) else np.zeros(3))
+        axes = (se3.rotation_of(estimate.mount(problem)) @ sensor_axes(problem, sensors))[np.unique(problem.sensor)]
+        ahead, _, up = axes.mean(axis=0).T if len(axes) else np.zeros((3, 3))
+        is_camera = bool(ahead[2] > UPRIGHT)
+        if not is_camera:  # of a camera upside down, or of a robot whose z is down
+            up = np.array([0.0, 0.0, float(up[2] > UPRIGHT or ahead[2] < -UPRIGHT)])
+        upright = se3.rotation_of(pose).mean(axis=0) @ up if len(pose) else np.zeros(3)
         tag = np.unique(problem.place[problem.kind == CORNERS])
         tag = tag[placed[tag] & problem.oriented[tag]]
         tags_up = se3.rotation_of(estimate.place[tag])[:, :, 1]
         length = float(np.linalg.norm(upright))
-        on_wall = np.abs(tags_up @ upright) > ON_A_WALL * max(length, 1e-9)
-        return cls(stamp_s[found], pose, upright, tags_up[on_wall])
+        on_wall = np.abs(tags_up @ upright) > UPRIGHT * max(length, 1e-9)
+        return cls(stamp_s[found], pose, upright, tags_up[on_wall], is_camera)
 
 
 class Axis(NamedTuple):
@@ -117,13 +122,20 @@ def decide_up(
     found = [up_by_gravity(motion, measurements, settings), up_by_frame(motion, odometry, settings)]
     known = next((one for one in found if one.source), None)
     reference = motion.upright if known is None else known.direction
-    reference = np.zeros(3) if known is None and _hang_upside_down(motion) else reference
+    reference = np.zeros(3) if known is None and not _has_sign(motion, settings) else reference
     by_turns = turn_axis(motion.pose, settings)
     wheels = odometry is not None and sway_of(odometry.pose_world_robot) < settings.wheels_rad
     found.append(_signed(by_turns, reference, "odometry" if wheels else "plane of motion", settings))
     by_plane = plane_axis(motion.pose[:, :3], settings)
     found.append(_signed(by_plane, reference, "plane of motion", settings))
     up, remarks = Up(), []
+    axis = min(by_plane, by_turns, key=lambda one: one.sigma_rad)
+    if not any(one.source for one in found) and axis.sigma_rad < MOST_TILT_RAD:
+        text = ", ".join(f"{part:.3f}" for part in axis.direction.tolist())
+        remarks.append(
+            f"up is along ({text}) or its opposite, by the plane of motion: nothing tells which, as of a camera that "
+            "may be upside down; slam.space.up.direction states it"
+        )
     for one in found:
         if up.source and is_contradiction(up, one):
             degrees = np.degrees([angle_between_ups(up, one), np.hypot(up.sigma_rad, one.sigma_rad)])
@@ -202,7 +214,7 @@ def turn_axis(pose: FloatArray, settings: UpConfig = USUAL) -> Axis:
     """Return the axis in the map about which poses (N, 7) turn: in it and in the robot it keeps its direction.
 
     Its standard deviation is that of a regression on the headings: of N independent tilts of the robot by s about it,
-    whose mean resultant is r, it is s / sqrt(N (1 - r^2)).
+    whose mean resultant is r, it is s / sqrt((N - 2) (1 - r^2)), since s is of residuals of two fitted numbers each.
     """
     if len(pose) < FEWEST:
         return NO_AXIS
@@ -211,9 +223,10 @@ def turn_axis(pose: FloatArray, settings: UpConfig = USUAL) -> Axis:
     spread = 1.0 - min(float(value[1]), 1.0) ** 2
     tilt = np.einsum("nij,j->ni", rotation, of_robot[0]) @ of_map[:, 1:]
     sway = float(np.sqrt(np.mean(tilt**2)))
-    if spread < settings.turned or sway > settings.sway_rad:
+    free = count_independent(tilt) - 2.0
+    if spread < settings.turned or sway > settings.sway_rad or free < 1.0:
         return NO_AXIS
-    return Axis(of_map[:, 0], sway / float(np.sqrt(count_independent(tilt) * spread)))
+    return Axis(of_map[:, 0], sway / float(np.sqrt(free * spread)))
 
 
 def sway_of(pose: FloatArray) -> float:
@@ -232,7 +245,8 @@ def plane_axis(position_m: FloatArray, settings: UpConfig = USUAL) -> Axis:
     _, second, across = (value / np.sqrt(len(away))).tolist()
     if second < settings.spread_m or across > settings.flatness * second:
         return NO_AXIS
-    return Axis(axes[2], across / (second * float(np.sqrt(count_independent(away @ axes[2:].T)))))
+    free = count_independent(away @ axes[2:].T) - 3.0  # three numbers are fitted
+    return Axis(axes[2], across / (second * float(np.sqrt(free)))) if free >= 1.0 else NO_AXIS
 
 
 def count_independent(residual: FloatArray) -> float:
@@ -272,8 +286,9 @@ def _signed(axis: Axis, reference: FloatArray, source: str, settings: UpConfig) 
     return Up(np.sign(part) * axis.direction, float(np.hypot(axis.sigma_rad, LEAST_RAD[source])), source)
 
 
-def _hang_upside_down(motion: Movement) -> bool:
-    """Judge whether most tags on walls have down where the sensors have up."""
-    if not len(motion.tags_up):
-        return False
-    return bool(np.mean(motion.tags_up @ motion.upright < 0.0) > 0.5)
+def _has_sign(motion: Movement, settings: UpConfig) -> bool:
+    """Judge whether conventions tell which end of an axis is up: tags do not contradict, and of a camera they agree."""
+    share = float(np.mean(motion.tags_up @ motion.upright > 0.0)) if len(motion.tags_up) else 0.5
+    if motion.is_camera:
+        return len(motion.tags_up) >= settings.tags and share >= settings.tags_agree
+    return bool(share >= 0.5)
