@@ -30,7 +30,7 @@ from evermap.maps.living import Members, Places, Sites, Stays
 from evermap.maps.store import Provenance, RevisionKind
 from evermap.maps.vicinity import in_chunks
 from evermap.sensing.sightlines import SightLines, Views
-from evermap.slam.association.associator import density_of_unmet
+from evermap.slam.association.assignment import density_of_unmet
 from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.types import UNKNOWN, FloatArray, IntArray, Recording, rows_of

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from bits import bits
 from identity_scores import identity_scores
+from orchards import orchard
 from problems import World, make_world
 from recordings import building
 
@@ -204,6 +205,17 @@ def test_wheels_that_did_not_slip_leave_the_filter_as_it_was(monkeypatch: pytest
     monkeypatch.setattr(Associator, "_after_driving", never)
     without = driven(made, NAMELESS.model_copy(update={"association": rules}))
     assert bits(asked) == bits(without)
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_trees_in_rows_are_kept(seed: int) -> None:
+    """The noise of a merge that was rejected, taken over all the same, left 4 of the 60 trees of an orchard (4)."""
+    recording = orchard(seed)
+    found, true = with_identities(recording, NAMELESS), recording.detections.landmark_id
+    scores = identity_scores(found.detections.landmark_id, true)
+    assert (scores.n_landmarks, scores.n_identities) == (60, 60)
+    assert scores.purity > 0.99
+    assert scores.completeness > 0.98
 
 
 def test_a_detection_of_nothing_is_nobodys() -> None:

@@ -153,6 +153,39 @@ def _seen_in(frame: IntArray, landmark_row: IntArray, shape: tuple[int, int]) ->
     return found
 
 
+def density_of_unmet(place: FloatArray, settings: SlamConfig = USUAL) -> float:
+    """Return the density of unmapped landmarks in what those at `place` span; units as of `landmark_density`."""
+    return settings.association.least_landmarks / _extent(place, settings)
+
+
+def landmark_density(place: FloatArray, sightings: IntArray, settings: SlamConfig = USUAL) -> float:
+    """Return the density of landmarks: their effective number over the area, in space the volume, that they span.
+
+    The effective number is `(sum s)^2 / sum s^2`, so that a duplicate with few sightings counts little; landmarks with
+    equal sightings count one each.
+
+    Args:
+        place: (L, 2), or (L, 3) in space.
+        sightings: (L,) numbers `s` of detections.
+        settings: of the estimator.
+
+    Returns:
+        [1/m^2], in space [1/m^3].
+    """
+    squares = float((sightings.astype(float) ** 2).sum())
+    number = float(sightings.sum()) ** 2 / max(squares, 1.0)
+    return max(number, settings.association.least_landmarks) / _extent(place, settings)
+
+
+def _extent(place: FloatArray, settings: SlamConfig) -> float:
+    """Area [m^2], in space volume [m^3], of the box around places; those on a wall span none, hence a least extent."""
+    rules = settings.association
+    side_m, least = 0.0, rules.least_area_m2
+    if place.shape[1] == 3:
+        side_m, least = rules.space.least_extent_m, rules.space.least_volume_m3
+    return max(float(np.prod(np.maximum(np.ptp(place, axis=0), side_m))) if len(place) else 0.0, least)
+
+
 def merged_rows(pairs: list[tuple[int, int]], n_landmarks: int) -> IntArray:
     """Return (L,) the landmark that each becomes if pairs (younger, older) are merged."""
     becomes = np.arange(n_landmarks)

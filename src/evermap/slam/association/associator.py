@@ -17,12 +17,27 @@ import numpy as np
 from evermap.config import AssociationConfig, SlamConfig
 from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se2
-from evermap.slam.association.assignment import NOBODY, Assignment, alike, same_name, seen_together
+from evermap.slam.association.assignment import (
+    NOBODY,
+    Assignment,
+    alike,
+    density_of_unmet,
+    landmark_density,
+    same_name,
+    seen_together,
+)
 from evermap.slam.association.constellation import LoosePart, agreed_pairs, overlays
 from evermap.slam.association.features import Traits
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
-from evermap.slam.association.merging import Differences, Solution, accepted_rise, propose_merges, tried_by_halves
-from evermap.slam.association.revise import likely_real, reassigned, unseen_nats, with_overlooked
+from evermap.slam.association.merging import (
+    Differences,
+    Solution,
+    accepted_rise,
+    merge_while_any,
+    propose_merges,
+    tried_by_halves,
+)
+from evermap.slam.association.revise import LAST_ROUNDS, likely_real, reassigned, unseen_nats, with_overlooked
 from evermap.slam.association.wrong_associations import displaced_stretches, laid, weighed_visits
 from evermap.slam.batch import USUAL, sighted_at
 from evermap.slam.filter_kernels import BY_PLACE, GATED, WIDTH, spread_of_frame
@@ -40,8 +55,6 @@ RECENT = 48
 """Number of landmarks, those seen last, whose duplicates are searched at a batch solution: bounds the work."""
 MOST_COMPARED = 96
 """Number of nearest landmarks that a frame is compared with: bounds the work."""
-MERGE_ROUNDS = 8
-"""Maximum number of rounds of merging per solution: each makes the map stiffer."""
 REALIGNED, STRETCHES = 8, 2
 """Maximum number of realigned stretches, also of ways to align a loose part, and of those that are tried each time, the
 longest first: bound the work."""
@@ -53,8 +66,6 @@ NOISE_ROUNDS = 6
 """Rounds of learning the odometry noise; extrapolated, they converge within these."""
 SAME_NATS = 0.5
 """Least fall of the cost for as many landmarks: the tolerance of the optimum."""
-LAST_ROUNDS = 5
-"""Maximum number of comparisons of every detection with the whole map at the end."""
 SAME_SHARE = 0.002
 """Share of detections that change their landmark in the last of these: a tolerance."""
 
@@ -400,13 +411,8 @@ class Associator:
             within: only landmarks from the first number on, except the second number of youngest ones.
         """
         settings, p_merge = self._settings, self._rules.p_merge
-        refused: set[tuple[int, int]] = set()
 
-        def merge(pairs: list[tuple[int, int]]) -> _Solved | None:
-            trial = self._solved(now.merged(pairs))
-            return trial if trial.cost - solved.cost <= accepted_rise(pairs, now.sightings, 2, self._rules) else None
-
-        for _ in range(MERGE_ROUNDS):
+        def propose(solved: _Solved, refused: set[tuple[int, int]]) -> list[tuple[int, int]]:
             now, density = solved.assignment, solved.density_m2
             among, known = _latest(now, recent), np.ones(now.n_landmarks, dtype=bool)
             if within is not None:
@@ -417,18 +423,19 @@ class Associator:
                 among=among, known=known, last=recent is None, refused=refused,
             )  # fmt: skip
             part = LoosePart.of(now, solved.marginals, refused) if not pairs and within is None else None
-            if part is not None:
-                sure = agreed_pairs(
-                    part.source, part.target, part.allowed, density=density, probability=p_merge, settings=settings
-                )
-                pairs = part.rows(sure)
-            if not pairs:
-                break
-            merged = tried_by_halves(pairs, merge, refused.add)
-            if merged is not None:
-                refused.clear()
-                solved = merged
-        return solved
+            if part is None:
+                return pairs
+            sure = agreed_pairs(
+                part.source, part.target, part.allowed, density=density, probability=p_merge, settings=settings
+            )
+            return part.rows(sure)
+
+        def merge(solved: _Solved, pairs: list[tuple[int, int]]) -> _Solved | None:
+            now = solved.assignment
+            trial = self._solved(now.merged(pairs))
+            return trial if trial.cost - solved.cost <= accepted_rise(pairs, now.sightings, 2, self._rules) else None
+
+        return merge_while_any(solved, propose, merge)
 
     def _attached(self, solved: _Solved) -> _Solved:
         """Align a loose part with the rest in the best of its ways, if that explains detections of removed ghosts.
@@ -668,39 +675,6 @@ def pairings_of_frame(
     new = np.log(np.where(followed, settings.unmet_share, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))
     new -= settings.name_nats * same_name(kind[0][source], kind[1][target])
     return Pairings(source, target, innovation[inside], joint, new, len(detections)), followed
-
-
-def density_of_unmet(place: FloatArray, settings: SlamConfig = USUAL) -> float:
-    """Return the density of unmapped landmarks in what those at `place` span; units as of `landmark_density`."""
-    return settings.association.least_landmarks / _extent(place, settings)
-
-
-def landmark_density(place: FloatArray, sightings: IntArray, settings: SlamConfig = USUAL) -> float:
-    """Return the density of landmarks: their effective number over the area, in space the volume, that they span.
-
-    The effective number is `(sum s)^2 / sum s^2`, so that a duplicate with few sightings counts little; landmarks with
-    equal sightings count one each.
-
-    Args:
-        place: (L, 2), or (L, 3) in space.
-        sightings: (L,) numbers `s` of detections.
-        settings: of the estimator.
-
-    Returns:
-        [1/m^2], in space [1/m^3].
-    """
-    squares = float((sightings.astype(float) ** 2).sum())
-    number = float(sightings.sum()) ** 2 / max(squares, 1.0)
-    return max(number, settings.association.least_landmarks) / _extent(place, settings)
-
-
-def _extent(place: FloatArray, settings: SlamConfig) -> float:
-    """Area [m^2], in space volume [m^3], of the box around places; those on a wall span none, hence a least extent."""
-    rules = settings.association
-    side_m, least = 0.0, rules.least_area_m2
-    if place.shape[1] == 3:
-        side_m, least = rules.space.least_extent_m, rules.space.least_volume_m3
-    return max(float(np.prod(np.maximum(np.ptp(place, axis=0), side_m))) if len(place) else 0.0, least)
 
 
 LEAST_LEFT = 0.1

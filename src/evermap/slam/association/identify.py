@@ -16,8 +16,8 @@ import numpy as np
 from scipy import sparse
 
 from evermap.config import SlamConfig
-from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetections, names_of
-from evermap.slam.association.associator import Associator, density_of_unmet
+from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetections, density_of_unmet, names_of
+from evermap.slam.association.associator import Associator
 from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.features import Traits, best_with_traits, learned
 from evermap.slam.association.particles import drawn

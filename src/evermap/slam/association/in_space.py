@@ -27,14 +27,15 @@ from evermap.slam.association.assignment import (
     NOBODY,
     LooseDetections,
     alike,
+    density_of_unmet,
     labels_of,
+    landmark_density,
     merged_rows,
     same_name,
     seen_together,
     shared_variance,
     visits_of,
 )
-from evermap.slam.association.associator import LAST_ROUNDS, MERGE_ROUNDS, density_of_unmet, landmark_density
 from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.features import Likeness, Traits, best_with_traits, learned
 from evermap.slam.association.identify import Associated
@@ -44,10 +45,10 @@ from evermap.slam.association.merging import (
     Solution,
     accepted_rise,
     in_reach,
+    merge_while_any,
     propose_merges,
-    tried_by_halves,
 )
-from evermap.slam.association.revise import lying_together, may_be_of, most_probable
+from evermap.slam.association.revise import LAST_ROUNDS, lying_together, may_be_of, most_probable
 from evermap.slam.space.estimate import as_seen, converged, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, prepare_space, without_range
 from evermap.slam.space.linearise import POINT, POSE
@@ -427,25 +428,22 @@ class SpatialAssociator:
 
     def _merged(self, solved: _Solved) -> _Solved:
         """Merge duplicates while there are any."""
-        refused: set[tuple[int, int]] = set()
 
-        def merge(pairs: list[tuple[int, int]]) -> _Solved | None:
-            row = np.where(solved.row >= 0, merged_rows(pairs, len(among))[solved.row], NOBODY)
-            trial = self._solved(_without(row, ~among), solved.estimate.pose, solved.noise)
+        def propose(solved: _Solved, refused: set[tuple[int, int]]) -> list[tuple[int, int]]:
+            every = np.ones(len(solved.estimate.place), dtype=np.bool_)
+            solution, p_merge = self._compared(solved), self._rules.p_merge
+            return propose_merges(solution, probability=p_merge, among=every, last=True, refused=refused)
+
+        def merge(solved: _Solved, pairs: list[tuple[int, int]]) -> _Solved | None:
+            count = len(solved.estimate.place)
+            row = np.where(solved.row >= 0, merged_rows(pairs, count)[solved.row], NOBODY)
+            trial = self._solved(_without(row, np.zeros(count, dtype=np.bool_)), solved.estimate.pose, solved.noise)
             numbers = np.where(solved.smoother.problem.oriented[[u for u, _ in pairs]], 6, 3)
-            rise = accepted_rise(pairs, solution.sightings, numbers, self._rules)
+            sightings = np.bincount(solved.row[solved.row >= 0], minlength=count)
+            rise = accepted_rise(pairs, sightings, numbers, self._rules)
             return trial if trial.cost - solved.cost <= rise else None
 
-        for _ in range(MERGE_ROUNDS):
-            among = np.ones(len(solved.estimate.place), dtype=np.bool_)
-            solution = self._compared(solved)
-            pairs = propose_merges(solution, probability=self._rules.p_merge, among=among, last=True, refused=refused)
-            following = tried_by_halves(pairs, merge, refused.add)
-            if following is None:
-                break
-            solved = following
-            refused.clear()
-        return solved
+        return merge_while_any(solved, propose, merge)
 
     def _compared(self, solved: _Solved) -> Solution:
         """The landmarks for `propose_merges`."""

@@ -6,6 +6,7 @@ only. `consensus` weighs the candidates of a group of landmarks jointly.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 _Part = TypeVar("_Part")
 _Result = TypeVar("_Result")
 
+MERGE_ROUNDS = 8
+"""Maximum number of rounds of merging per solution: each makes the map stiffer."""
 GROUP = 24
 """Number of consecutive landmarks that are weighed jointly with the rest of the map: bounds the work."""
 MOST_TOGETHER = 200
@@ -143,6 +146,33 @@ def accepted_rise(
     lesser = np.array([min(sightings[u], sightings[o]) for u, o in pairs])
     rise = np.minimum(settings.rise_nats + settings.rise_per_sighting * lesser, settings.most_rise_nats)
     return float((0.5 * numbers * rise).sum())
+
+
+def merge_while_any(
+    solved: _Result,
+    propose: Callable[[_Result, set[tuple[int, int]]], list[tuple[int, int]]],
+    merge: Callable[[_Result, list[tuple[int, int]]], _Result | None],
+) -> _Result:
+    """Merge pairs of landmarks that are the same while there are any: propose, solve on trial, accept.
+
+    Args:
+        solved: the solution to begin with.
+        propose: returns pairs (younger, older) of a solution, without those that were refused in it.
+        merge: returns a solution with pairs merged; None if it is not accepted, of which nothing is kept.
+
+    Returns:
+        The last solution that was accepted.
+    """
+    refused: set[tuple[int, int]] = set()
+    for _ in range(MERGE_ROUNDS):
+        pairs = propose(solved, refused)
+        if not pairs:
+            break
+        merged = tried_by_halves(pairs, functools.partial(merge, solved), refused.add)
+        if merged is not None:
+            refused.clear()
+            solved = merged
+    return solved
 
 
 def tried_by_halves(

@@ -22,6 +22,8 @@ from evermap.slam.kernels import kernel
 from evermap.slam.linearise import detection_residuals
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
+LAST_ROUNDS = 5
+"""Maximum number of comparisons of every detection with the whole map at the end."""
 LOOK_BINS = 12
 """Number of bins of range, with equal numbers of detections, in which the usual rate of sightings is estimated."""
 ROUNDS = 20
