@@ -220,6 +220,7 @@ class Batch:
         if self._robust:
             rejoined = _rejoined(found.smoother, found.estimate, self._settings)
             found = self._readmitted(found, rejoined)
+            tried = found.smoother.inlier_probability(found.estimate) < 0.5
         problem, estimate = self._ahead(problem, found.estimate, aligned=aligned)
         for _ in range(FINAL_REVISIONS):
             revision = self._method.revise(problem, estimate, found.noise.noise, heavy=False, final=True)
@@ -238,7 +239,7 @@ class Batch:
         problem, estimate = self._ahead(problem, estimate, aligned=aligned)
         found = self._settled(found.smoother, problem, estimate, found.noise.noise, ahead=found.ahead, final=True)
         if self._robust:  # means may lie so far from the estimate that true sightings are rejected on the way
-            found = self._readmitted(found, found.estimate, final=True)
+            found = self._readmitted(found, found.estimate, tried, final=True)
         solved = found.smoother, found.estimate, found.marginals
         ahead, estimate = self._ahead(found.smoother.problem, found.estimate, aligned=aligned)
         if ahead is not found.smoother.problem:
@@ -246,9 +247,11 @@ class Batch:
             solved = smoother, estimate, smoother.marginals(estimate)
         return divided(solved, self._prior, p_needed, found.noise, revision, aligned=aligned)
 
-    def _readmitted(self, found: FoundOptimum, estimate: Estimate, *, final: bool = False) -> FoundOptimum:
+    def _readmitted(
+        self, found: FoundOptimum, estimate: Estimate, tried: BoolArray | None = None, *, final: bool = False
+    ) -> FoundOptimum:
         """What was found, or what is from these values or where sightings that were rejected lead (`_readmitted`)."""
-        better = _readmitted(found.smoother, estimate, self._settings)
+        better = _readmitted(found.smoother, estimate, self._settings, tried)
         if better is found.estimate:
             return found
         smoother = found.smoother
@@ -502,15 +505,21 @@ def _rejoined(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> E
     return estimate
 
 
-def _readmitted(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> Estimate:
+def _readmitted(
+    smoother: Smoother, estimate: Estimate, settings: SlamConfig, tried: BoolArray | None = None
+) -> Estimate:
     """Return a better optimum where a landmark was rejected several times in a row, if narrowing noise leads to one.
 
     Where odometry alone led astray, the sightings that contradict it are rejected together, and none of them can pull
     back. To noise that is many times wider few of them are outliers; it narrows to what it is (graduated
-    non-convexity: Yang et al. 2020, "Graduated Non-Convexity for Robust Spatial Perception").
+    non-convexity: Yang et al. 2020, "Graduated Non-Convexity for Robust Spatial Perception"). Those (M,) that were
+    `tried` before, and are rejected all the same, are no reason to try again.
     """
     problem = smoother.problem
-    if not _in_a_row(problem, smoother.inlier_probability(estimate) < 0.5, settings.rejected_in_a_row):
+    rejected = smoother.inlier_probability(estimate) < 0.5
+    if tried is not None:
+        rejected &= ~tried
+    if not _in_a_row(problem, rejected, settings.rejected_in_a_row):
         return estimate
     cost, other = smoother.cost(estimate), estimate
     try:

@@ -159,7 +159,7 @@ def landmark_evidence(
     if sized:
         yield dense_ms(len(right))
         held_somewhere = information + TINY_INFORMATION * np.eye(len(right))
-        covariance = np.linalg.solve(held_somewhere, np.eye(len(right))[:, states])[states]
+        covariance: FloatArray = np.asarray(np.linalg.solve(held_somewhere, np.eye(len(right))[:, states])[states])
         _, _, scale, log_sigma = prior.split_scale(estimate.states, covariance)
     yield dense_ms(len(right))
     centre = estimate.landmark[estimate.known].mean(axis=0)

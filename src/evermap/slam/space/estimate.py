@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evermap.estimate.noise import restricted_level
 from evermap.geometry import se3
 from evermap.slam.space.linearise import (
     ACROSS,
@@ -76,22 +77,29 @@ def converged(
 
 
 def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, begun: SpatialNoise) -> SpatialNoise:
-    """Return noise levels by expectation-maximisation: residuals and their uncertainties, by inlier weight."""
+    """Return noise levels after a step towards those of restricted likelihood, by inlier weight.
+
+    What the fit absorbed is taken as it was under the levels before (expectation-maximisation: Dempster, Laird and
+    Rubin 1977). Steps end at the same levels as whole ones, which where residuals are correlated in time are too sure
+    of the odometry; but they are shorter, and `converged` stops before.
+    """
     problem, kind = smoother.problem, smoother.problem.kind
     if not problem.estimate_noise:
         return noise
     n_steps, spread, worth = len(problem.increment), smoother.spread(now), problem.settings.pseudo_count
-    trace = _traces(smoother, spread.of_factors, spread.of_factors_first)
-    levels, before, start = noise.levels.copy(), noise.levels, begun.levels
+    of_steps, of_detections = _leverages(smoother, spread.of_factors, spread.of_factors_first)
+    levels = noise.levels.copy()
+
+    def learn(level: int, squares: float, numbers: float, leverage: float) -> None:
+        expected = (squares + leverage) * float(noise.levels[level]) ** 2  # whitened as they are
+        levels[level] = restricted_level(expected, numbers, begun.levels[level], worth)
+
     # odometry: its whitened residuals are in the right sides of its rows, with the root of their weights
     block = now.values[: 6 * OF_STEP * n_steps].reshape(n_steps, 6, OF_STEP)
-    weight = now.odometry_weight
     if problem.driven and not problem.steady:  # how fast a robot may move is no noise that shows in how it did
         for level, rows in ((TRANSLATION, slice(0, 3)), (ROTATION, slice(3, 6))):
-            total = float((block[:, rows, 13] ** 2).sum() + trace[0][:, rows].sum())
-            count = 3.0 * float(weight.sum())
-            levels[level] = _level(before[level], start[level], total, count, worth)
-    of_detection = trace[1]
+            numbers = 3.0 * float(now.odometry_weight.sum())
+            learn(level, float((block[:, rows, 13] ** 2).sum()), numbers, float(of_steps[:, rows].sum()))
     for level, some, rows in (
         (ACROSS, kind != CORNERS, slice(0, 2)),
         (ALONG, (kind != CORNERS) & ~problem.ray, slice(2, 3)),  # ranges that nobody measured fit
@@ -100,12 +108,11 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
     ):
         if some.any():
             w = now.weight[some]
-            squares = (now.residual[some, rows] ** 2).sum(axis=1)
-            total = float(w @ squares + of_detection[some, rows].sum())
-            count = float(w.sum()) * (rows.stop - rows.start)
+            numbers = float(w.sum()) * (rows.stop - rows.start)
             if level == ORIENTATION:
-                count -= float(w @ problem.about_axis[some])
-            levels[level] = _level(before[level], start[level], total, count, worth)
+                numbers -= float(w @ problem.about_axis[some])
+            squares = float(w @ (now.residual[some, rows] ** 2).sum(axis=1))
+            learn(level, squares, numbers, float(of_detections[some, rows].sum()))
     return SpatialNoise(*np.maximum(levels, problem.settings.least_noise).tolist())
 
 
@@ -123,12 +130,7 @@ def correlation(optimum: SpatialOptimum) -> float:
     return float((before * after).sum()) / total if total > 0.0 else 0.0
 
 
-def _level(before: float, start: float, total: float, count: float, worth: float) -> float:
-    """A standard deviation: `total` are squares by the one before, `start` counts for `worth` numbers."""
-    return float(np.sqrt((total * before**2 + worth * start**2) / (count + worth)))
-
-
-def _traces(smoother: SpatialSmoother, of_factors: FloatArray, first: IntArray) -> tuple[FloatArray, FloatArray]:
+def _leverages(smoother: SpatialSmoother, of_factors: FloatArray, first: IntArray) -> tuple[FloatArray, FloatArray]:
     """Diagonals of `A S A'` of odometry (N - 1, 6) and detections (M, 8); weighted, as the Jacobians are: leverages,
     which are in [0, 1] but for rounding.
     """

@@ -199,7 +199,7 @@ def _with_drift(
         if share.min() < 1.0 and settings.delay_sigma_s == 0.0:  # a delay that is not known yet is in all residuals
             free = replace(problem.as_points(), prior=PlacePrior.none(), start_sigma=HELD)
             alone = converged(free, first_places(free, driven), noise)
-            if _are_independent(alone, drift.translation) and _is_of_one_metre(alone.estimate.pose, driven):
+            if _are_independent(alone, drift.translation) and _is_of_one_metre(alone.estimate, driven):
                 return problem, replace(alone.noise, pixel=noise.pixel), None, None
         noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
     return replace(problem, share=share), noise, drift, None
@@ -217,8 +217,12 @@ def _are_independent(optimum: SpatialOptimum, drift_m: float) -> bool:
     return drifts and correlation(optimum) < INDEPENDENT
 
 
-def _is_of_one_metre(pose: FloatArray, driven: FloatArray) -> bool:
-    """Tell whether ways are as long as by the odometry, whose metre holds where nothing is stated of the ranges."""
+def _is_of_one_metre(estimate: SpatialEstimate, driven: FloatArray) -> bool:
+    """Tell whether ways are as long as by the odometry, whose metre holds where nothing is stated of the ranges.
+
+    Where its scale is a state, in the metre that was found: a wrong one is no error that persists.
+    """
+    pose, driven = estimate.pose, se3.scaled(driven, float(np.exp(estimate.log_scale)))
     stride = max(1, len(pose) // STRIDES)
     way, by_odometry = (np.linalg.norm(of[stride:, :3] - of[:-stride, :3], axis=1) for of in (pose, driven))
     ratio = way / np.maximum(by_odometry, 1e-9)
