@@ -178,6 +178,7 @@ class CalibrationConfig(Section):
     )
     sigma_askew_rad: Positive = key(0.03, "of the direction in which a robot drives, from its front, if unstated [rad]")
     p_needed: Share = key(0.5, "prior probability that a state is not as stated")
+    p_needed_sensor: Share = key(0.1, "the same of errors of ranges, for a laser or a sensor of no stated kind")
     p_needed_known: Share = key(0.9, "the same of a sensor that is stated to be of another kind than a laser")
     p_needed_mount: Share = key(
         0.1, "the same of each coordinate of the mount, which one measures, if it has no data sheet"

@@ -78,8 +78,8 @@ class CalibrationPrior:
         slope_share: of what range slope and odometer scale show together, that is the sensor's; None: by their sigmas.
         angle_share: of what bearing bias and driving askew show together, that is the sensor's.
         askew_sigma: standard deviation of the latter [rad].
-        p_sensor: probability of each of the first five states to be another than stated; p_mount: of each coordinate of
-            the mount.
+        p_sensor: probability of each of the first five states to be another than stated, of the bearing bias at least
+            that of a state of the robot; p_mount: of each coordinate of the mount.
         settings: that it is of.
     """
 
@@ -142,7 +142,7 @@ class CalibrationPrior:
             angle_share = sigma[BEARING] ** 2 / (sigma[BEARING] ** 2 + askew**2)
         sigma[BEARING] = np.hypot(sigma[BEARING], askew)
         known = sensor.kind not in (None, SensorKind.LASER)
-        p_needed = self.settings.p_needed_known if known else self.settings.p_needed
+        p_needed = self.settings.p_needed_known if known else self.settings.p_needed_sensor
         scale_as_stated = sensor.kind is None and sheet[SLOPE] is None and sheet[FORWARD] is None
         return replace(
             self,
@@ -213,7 +213,8 @@ class CalibrationPrior:
     def p_needed(self) -> FloatArray:
         """(11,) prior probability of each state to be another than stated."""
         p = np.full(N_STATES, self.settings.p_needed)
-        p[: BEARING + 1], p[AHEAD : ASIDE + 1] = self.p_sensor, self.p_mount
+        p[:BEARING], p[AHEAD : ASIDE + 1] = self.p_sensor, self.p_mount
+        p[BEARING] = max(self.p_sensor, self.settings.p_needed)  # the robot's driving askew as much as the sensor's
         return p
 
     def gaussian(self) -> CalibrationPrior:

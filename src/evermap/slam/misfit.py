@@ -5,8 +5,8 @@ a scan. Such an error is the same wherever its distance comes again, so no numbe
 that it resembles: the offset of a curve that bends is known as well as the bend goes on, however many readings there
 are.
 
-Curves are polynomials (Legendre) with random coefficients, of a variance that residuals tell by marginal likelihood
-(empirical Bayes). What they may have moved the states by adds to the variances of these.
+Curves are polynomials (Legendre) with random coefficients, of a variance and a smoothness that residuals tell by
+marginal likelihood (empirical Bayes). What they may have moved the states by adds to the variances of these.
 """
 
 from __future__ import annotations
@@ -25,8 +25,11 @@ DEGREES = ((2, 5), (1, 4))
 by range is that and the size of the map."""
 SIGMAS_M = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)
 """Standard deviations of a straight line's coefficient that are tried [m]."""
-CURVED = 2.0
-"""Nats by which residuals must tell that there are curves: of two numbers more (Akaike 1974)."""
+FALLS = (0, 2)
+"""Powers of the degree by which these fall, that are tried: 2 as of a curve whose second derivative is white (Wahba
+1978), which goes on as it bends, or 0 of one that is as rough as there are degrees."""
+CURVED = 3.0
+"""Nats by which residuals must tell that there are curves: of three numbers more (Akaike 1974)."""
 EDGE = 0.005
 """Share of the readings beyond either end of the interval on which the polynomials are orthogonal."""
 
@@ -37,15 +40,14 @@ class Curves(NamedTuple):
     Attributes:
         value: (M, K) values at the readings.
         argument: (K,) of each: `RANGE` or `BEARING`.
-        sigma: (K,) standard deviation of each coefficient, over that of a straight line's: they fall with the square of
-            the degree, as those of a curve whose second derivative is white (Wahba 1978).
+        degree: (K,) of each polynomial.
         straight: (2,) offset and slope of the straight line by range that belongs to them, which no reading tells from
             an offset and the size of the map.
     """
 
     value: FloatArray
     argument: IntArray
-    sigma: FloatArray
+    degree: FloatArray
     straight: FloatArray
 
 
@@ -63,9 +65,8 @@ def build_curves(reading: FloatArray, used: BoolArray) -> Curves:
         degree += range(first, last + 1)
         if axis == RANGE:
             straight = np.array([-(high + low), 2.0]) / (high - low)
-    falls = 1.0 / np.array(degree, dtype=np.float64) ** 2
     whole = np.hstack(value) if value else np.zeros((len(reading), 0))
-    return Curves(whole, np.array(argument, dtype=np.int64), falls, straight)
+    return Curves(whole, np.array(argument, dtype=np.int64), np.array(degree, dtype=np.float64), straight)
 
 
 def variance_by_curves(
@@ -87,8 +88,8 @@ def variance_by_curves(
     own = (information[n:, n:] - cross.T @ moved) / worth
     pull = (right[n:] - moved.T @ (right[:n] - prior * off)) / worth
     best, straight, mean, spread = CURVED, 0.0, np.zeros(count), np.zeros((count, count))
-    for sigma in product(SIGMAS_M, repeat=len(DEGREES)):
-        each = np.array(sigma)[curves.argument] * curves.sigma
+    for falls, *sigma in product(FALLS, *[SIGMAS_M] * len(DEGREES)):
+        each = np.array(sigma)[curves.argument] / curves.degree**falls
         whole = np.eye(count) + each[:, None] * own * each
         estimate = each * np.linalg.solve(whole, each * pull)
         gain = 0.5 * float(estimate @ pull) - 0.5 * float(np.linalg.slogdet(whole)[1])

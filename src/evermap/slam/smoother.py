@@ -178,14 +178,15 @@ class Smoother(Solver[Estimate]):
     def _variance_by_curves(self, estimate: Estimate, marginals: Marginals, worth: FloatArray) -> FloatArray:
         """Return (11,) what curves of ranges add to variances of the states.
 
-        They are sought where an error of the sensor stands out by its `worth` (11,).
+        They are sought where an error of the sensor stands out by its `worth` (11,), though none is expected.
         """
         problem, before = self.problem, 1.0 / self.states_sigma**2
         asked, off = problem.prior.free[: BEARING + 1], self.off_mean(estimate)
         posterior = 1.0 / np.where(problem.prior.free, np.diag(marginals.states), self.states_sigma**2)
         data = np.maximum(posterior - before, 1e-9 * before) * worth
         stands_out = (off * posterior) ** 2 > STANDS_OUT**2 * data
-        if not np.any(stands_out[: BEARING + 1] & asked):
+        expected = problem.prior.p_sensor > problem.prior.settings.p_needed
+        if expected or not np.any(stands_out[: BEARING + 1] & asked):
             return np.zeros(N_STATES)
         curves = build_curves(problem.reading, self.inlier_probability(estimate) > LEAST_WEIGHT)
         information, right = self.information_of_curves(estimate, curves.value)
