@@ -564,7 +564,7 @@ class SpaceConfig(Section):
         0.005, "standard deviation of the odometry's scale, where tags of known sizes tell it; 0: exact", ge=0, le=1
     )
     delay_sigma_s: float = key(
-        0.0, "standard deviation of the delay of the sensors' stamps [s]; 0: no delay", ge=0, le=10
+        0.3, "standard deviation of the delay of the sensors' stamps [s]; 0: no delay", ge=0, le=10
     )
     range_scale: float | None = key(
         None,

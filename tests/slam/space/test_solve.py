@@ -336,6 +336,23 @@ def test_a_delay_is_as_uncertain_as_it_says_where_the_odometry_is_noisy(late_s):
     assert np.abs(np.mean(off)) < 1.5
 
 
+def test_a_late_camera_is_found_by_default_and_a_right_one_is_left_alone():
+    recording = hall(20, n_points=40, n_frames=400, step_s=0.1, drift=0.01)
+    trusted = Config(slam={"space": {"delay_sigma_s": 0.0}})
+    for late_s in (0.0, 0.12):
+        late = replace(recording, frames=Frames(recording.frames.stamp_s + late_s))
+        found, without = run_slam(late), run_slam(late, trusted)
+        delay = next(each for each in found.parameters if each.name.endswith("delay_s"))
+        assert abs(delay.value - late_s) < 3.0 * delay.sigma < 0.05
+        off = [evaluate_trajectory(each.trajectory, recording.truth).rmse_m for each in (found, without)]
+        if late_s:
+            assert delay.p_needed > 0.99
+            assert off[0] < 0.5 * off[1]
+        else:
+            assert delay.p_needed < 0.1
+            assert np.array_equal(found.trajectory.pose_world_robot, without.trajectory.pose_world_robot)
+
+
 @pytest.mark.parametrize("late_s", [0.15, -0.3])
 def test_stamps_that_are_late_are_found(late_s):
     """From the changes of speed of a drive around a hall, with points; and the path is that of the right stamps."""

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.config import CalibrationConfig
+from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se3
 from evermap.slam.calibration import priced
 from evermap.slam.space.estimate import SpatialOptimum, converged
@@ -51,31 +52,39 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
     problem, sigma_s = optimum.smoother.problem, optimum.smoother.problem.settings.delay_sigma_s
     if problem.path is None or sigma_s == 0.0 or not problem.driven:
         return optimum, None
-    count = len(problem.mount)
+    count, start = len(problem.mount), optimum.estimate
     free = _freed(problem, optimum, np.full(count, sigma_s), np.zeros(count))
-    smoother = SpatialSmoother(free, optimum.estimate.pose)
-    now = smoother.linearised(optimum.estimate, optimum.noise, heavy=False)
+    smoother = SpatialSmoother(free, start.pose)
+    now = smoother.linearised(start, optimum.noise, heavy=False)
     factorised = smoother.factorised(now)
-    step = np.linalg.solve(factorised.information, factorised.right)
-    off_s = np.asarray(step[MOUNT:-1:STATES])
-    found, information = _priced(smoother, now, off_s, sigma_s)
-    # of those that stay as stated the deviation is from there
-    found = replace(found, sigma_s=np.hypot(found.sigma_s, found.p_needed * off_s))
+    now, delay = smoother.after(now, exhausted(factorised.solution())), np.arange(MOUNT, STATES * count, STATES)
+    jitter = _jitter(smoother, now, np.diag(factorised.border_covariance())[delay], sigma_s)
+    information, jitters = factorised.information.copy(), np.zeros(len(factorised.right))
+    jitters[delay] = jitter
+    off_s = np.asarray(np.linalg.solve(information - np.diag(jitters), factorised.right)[delay])
+    found, _ = _priced(smoother, now, off_s, sigma_s, jitter)
+    # of a clock that is left as stated it is told how late it is if it is not
+    found = replace(found, sigma_s=found.sigma_s / np.sqrt(np.maximum(found.p_needed, 1e-12)))
+    narrow = np.zeros(count)
     least = USUAL.p_needed  # clocks that may as well be right are left as stated
     for _ in range(MOST_ROUNDS):
         asked = found.p_needed > least
         free = _freed(problem, optimum, np.where(asked, sigma_s, 0.0), optimum.estimate.delay_s)
+        free = replace(free, delay_jitter=np.where(asked, jitter, 0.0))
         if not asked.any():
             if not optimum.estimate.delay_s.any():
                 return optimum, found
             return converged(problem, _moved(optimum, problem, asked), optimum.noise), found
         optimum = converged(free, _moved(optimum, free, asked), optimum.noise)
-        again, information = _priced(optimum.smoother, optimum.now, optimum.estimate.delay_s, sigma_s)
+        smoother, now = optimum.smoother, optimum.now
+        again, narrow = _priced(smoother, now, optimum.estimate.delay_s, sigma_s, np.zeros(count))
         found = Delays(np.where(asked, again.sigma_s, found.sigma_s), np.where(asked, again.p_needed, found.p_needed))
         least = USUAL.p_spare
         if np.abs(optimum.estimate.delay_s - free.whole_s).max() < SETTLED * problem.path.step_s:
             break
-    sober = replace(free, delay_sigma_s=np.where(asked, information**-0.5, 0.0))
+        variance = np.diag(smoother.factorised(now).border_covariance())[delay]
+        jitter = _jitter(smoother, now, 1.0 / (1.0 / variance + free.delay_jitter), sigma_s)
+    sober = replace(free, delay_sigma_s=np.where(asked, narrow**-0.5, 0.0))
     return converged(sober, optimum.estimate, optimum.noise, heavy_rounds=0), found
 
 
@@ -99,16 +108,26 @@ def _moved(optimum: SpatialOptimum, problem: SpatialProblem, asked: BoolArray) -
     return replace(estimate, pose=pose, state=state)
 
 
+def _jitter(smoother: SpatialSmoother, now: SpatialLinear, variance: FloatArray, sigma_s: float) -> FloatArray:
+    """Return (S,) what of the information on delays of variances (S,) is jitter of the velocity."""
+    real, changes = _shown(smoother.problem, smoother.driven(now), 0.0)
+    return np.maximum(1.0 / variance - sigma_s**-2, 0.0) * (1.0 - min(real / changes, 1.0))
+
+
 def _priced(
-    smoother: SpatialSmoother, now: SpatialLinear, delay_s: FloatArray, sigma_s: float
+    smoother: SpatialSmoother, now: SpatialLinear, delay_s: FloatArray, sigma_s: float, jitter: FloatArray
 ) -> tuple[Delays, FloatArray]:
-    """Return what delays (S,) under the prior say, and (S,) the information of the narrower one with their means."""
+    """Return what delays (S,) under the prior say, and (S,) the information of the narrower one with their means.
+
+    Of the information on them `jitter` (S,) is none, beside what the problem knows of.
+    """
     problem, count = smoother.problem, len(delay_s)
     sigma, p_needed, information = np.zeros(count), np.zeros(count), np.ones(count)
     for row in np.flatnonzero(problem.delay_sigma_s):
         variance, worth = smoother.worth_by_stretches(now, STATES * int(row) + MOUNT)
+        variance = 1.0 / (1.0 / variance - jitter[row])
         real, changes = _shown(problem, smoother.driven(now), float(delay_s[row]))
-        worth = max(worth * (changes / real) ** 2, 1.0)
+        worth *= max(changes / real, 1.0)
         p_needed[row], information[row] = priced(float(delay_s[row]), variance, worth, sigma_s)
         own = worth * variance * sigma_s**2 / (worth * variance + sigma_s**2)
         sigma[row] = np.sqrt(p_needed[row] * (own + (1.0 - p_needed[row]) * delay_s[row] ** 2))

@@ -124,6 +124,8 @@ def prepare_space(
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
         mount_sigma=_mount_sigma(recording.sensors, settings),
         delay_sigma_s=np.zeros(len(recording.sensors)),
+        whole_s=np.zeros(len(recording.sensors)),
+        delay_jitter=np.zeros(len(recording.sensors)),
         scale_sigma=scale[0] if driven else 0.0,
         ranges_share=scale[1],
         path=_path(recording, stamps[pose_frame[0]], settings.delay_sigma_s),

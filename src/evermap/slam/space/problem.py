@@ -159,6 +159,8 @@ class SpatialProblem:
         path: the odometry, in the time of the poses, from which delays are estimated; None without.
         velocity_s: time before and after an instant over which its velocity is averaged.
         whole_s: (S,) what of each delay are whole steps of the odometry; see `OdometryPath`.
+        delay_jitter: (S,) information that detections seem to hold on the rest of each delay, since the velocity
+            jitters: it pulls to whole steps, and is taken off (errors in variables).
         measurements: of other kinds than odometry and detections.
         robust: whether outliers are down-weighted.
         estimate_noise: whether noise levels are learned.
@@ -198,6 +200,7 @@ class SpatialProblem:
     path: OdometryPath | None = None
     velocity_s: float = 1.0
     whole_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    delay_jitter: FloatArray = field(default_factory=lambda: np.zeros(0))
     measurements: tuple[Tied, ...] = ()
     robust: bool = True
     estimate_noise: bool = True

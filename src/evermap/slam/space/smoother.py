@@ -6,6 +6,7 @@ share, and the scale of the odometry.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -87,7 +88,12 @@ class SpatialSmoother:
         self.problem = problem
         self._seen = problem.sightings
         sigma = np.append(np.column_stack([problem.mount_sigma, problem.delay_sigma_s]), problem.scale_sigma)
-        self._border = Border(np.where(sigma > 0.0, 1.0 / np.maximum(sigma, 1e-12) ** 2, FIXED), _states)
+        information = np.where(sigma > 0.0, 1.0 / np.maximum(sigma, 1e-12) ** 2, FIXED)
+        self._mean = np.zeros(len(sigma))
+        delay = np.arange(MOUNT, len(sigma) - 1, STATES)
+        information[delay] -= problem.delay_jitter
+        self._mean[delay] = -problem.delay_jitter * problem.whole_s / information[delay]
+        self._border = Border(information, self._off_mean)
         self._start = np.array(around[0])
         n, count = len(problem.stamp_s), len(problem.oriented)
         dim = np.concatenate(
@@ -107,6 +113,10 @@ class SpatialSmoother:
     def states_information(self) -> FloatArray:
         """(7 S + 1,) information of the priors of mounts, delays and scale."""
         return self._border.information
+
+    def _off_mean(self, estimate: SpatialEstimate) -> FloatArray:
+        """Return the numbers of the border less their means: twists of the mounts, delays, and the scale."""
+        return np.append(estimate.state, estimate.log_scale) - self._mean
 
     def hold(self, held: FloatArray, begin: IntArray) -> None:
         """Write what holds turns that no detection shows to the numbers of all variables, which begin there (V,)."""
@@ -200,35 +210,54 @@ class SpatialSmoother:
         As of the states in the plane (`slam.smoother.Smoother.worth`): what each stretch of the drive adds is summed
         before it is squared.
         """
-        problem, structure, seen = self.problem, self.structure, self._seen
-        n, with_it = len(problem.stamp_s), self.spread(now).with_border[:, state]
-        begin, odometry = structure.system.tree.begin, structure.values_of(ODOMETRY).stop
+        problem = self.problem
+        with_it = self.spread(now).with_border[:, state]
         share = problem.stamp_s / max(problem.stamp_s[-1], 1e-9)
         stretch = np.minimum((STRETCHES * share).astype(np.int64), STRETCHES - 1)
-        pose, scale = with_it[: 6 * n].reshape(n, 6), with_it[-1:]
-        by = np.hstack([pose[:-1], pose[1:], np.tile(scale, (n - 1, 1))])
-        driven, nothing = now.values[:odometry].reshape(n - 1, 6, OF_STEP), np.zeros(0, dtype=np.int64)
-        parts = [(stretch[:-1], driven, by, nothing)]
+        pull, independent, influence = np.zeros(STRETCHES), 0.0, np.zeros((len(self._seen.kind), 8, 1))
+        for pose_row, rows, _, told, some in self._told(now.values, with_it):
+            pull += np.bincount(stretch[pose_row], (told * rows[..., -1]).sum(axis=1), STRETCHES)
+            independent += float((told**2).sum())
+            influence[some, : told.shape[1], 0] = told[: len(some)]
+        found = (pull**2).sum() * STRETCHES / (STRETCHES - 1.0)
+        alike = self.lasting(now).variance_beside(influence, problem.stamp_s[problem.pose_row], problem.place)
+        found = max(found, independent + float(alike[0]))
+        own = with_it[len(with_it) - len(self.states_information) :]
+        return float(own[state]), max(float(found / max(independent, 1e-300)), 1.0)
+
+    def after(self, now: SpatialLinear, step: FloatArray) -> SpatialLinear:
+        """Return the problem with the residuals of odometry and detections as they are after a step, by what is linear
+        in it.
+        """
+        values = now.values.copy()
+        for _, _, at, told, _ in self._told(now.values, step):
+            values[at[..., -1]] -= told
+        return SpatialLinear(replace(now.now, values=values), self)
+
+    def _told(
+        self, values: FloatArray, numbers: FloatArray
+    ) -> Iterator[tuple[IntArray, FloatArray, IntArray, FloatArray, IntArray]]:
+        """Yield odometry, and detections of each kind, times numbers of all variables.
+
+        That is their poses (m,), rows (m, r, width), where these are among the values, rows times numbers (m, r), and
+        which detections they are: none of odometry.
+        """
+        problem, structure, seen = self.problem, self.structure, self._seen
+        n, begin, odometry = len(problem.stamp_s), structure.system.tree.begin, structure.values_of(ODOMETRY).stop
+        pose, scale = numbers[: 6 * n].reshape(n, 6), numbers[-1:]
+        by, at = np.hstack([pose[:-1], pose[1:], np.tile(scale, (n - 1, 1))]), np.arange(odometry)
+        parts = [(np.arange(n - 1), at.reshape(n - 1, 6, OF_STEP), by, np.zeros(0, dtype=np.int64))]
         for kind, n_rows in enumerate(ROWS.tolist()):
             for dim in (3, 6):
                 some = np.flatnonzero((seen.kind == kind) & (seen.oriented == (dim == 6)))
                 at = odometry + seen.first[some][:, None] + np.arange(n_rows * (OF_SIGHTING + dim))
                 place = begin[n + seen.place[some]][:, None] + np.arange(dim)
                 sensor = begin[n + len(problem.oriented) + seen.sensor[some]][:, None] + np.arange(STATES)
-                by = np.hstack([pose[seen.pose_row[some]], with_it[place], with_it[sensor]])
-                rows = now.values[at].reshape(len(some), n_rows, OF_SIGHTING + dim)
-                parts.append((stretch[seen.pose_row[some]], rows, by, some))
-        pull, independent, influence = np.zeros(STRETCHES), 0.0, np.zeros((len(seen.kind), 8, 1))
-        for of, rows, by, some in parts:
-            told = np.einsum("mra,ma->mr", rows[..., :-1], by)
-            pull += np.bincount(of, (told * rows[..., -1]).sum(axis=1), STRETCHES)
-            independent += float((told**2).sum())
-            influence[some, : told.shape[1], 0] = told[: len(some)]
-        found = (pull**2).sum() * STRETCHES / (STRETCHES - 1.0)
-        alike = self.lasting(now).variance_beside(influence, problem.stamp_s[seen.pose_row], seen.place)
-        found = max(found, independent + float(alike[0]))
-        own = with_it[len(with_it) - len(self.states_information) :]
-        return float(own[state]), max(float(found / max(independent, 1e-300)), 1.0)
+                by = np.hstack([pose[seen.pose_row[some]], numbers[place], numbers[sensor]])
+                parts.append((seen.pose_row[some], at.reshape(len(some), n_rows, OF_SIGHTING + dim), by, some))
+        for pose_row, at, by, some in parts:
+            rows = values[at]
+            yield pose_row, rows, at, np.einsum("mra,ma->mr", rows[..., :-1], by), some
 
     def _blocks(self, noise: SpatialNoise, *, heavy: bool) -> tuple[FactorBlock[SpatialEstimate], ...]:
         problem = self.problem
@@ -305,8 +334,3 @@ def limit_turns(
     size = float(max(np.abs(by).max(), np.abs(turned).max(initial=0.0)))
     most = max(np.abs(by[:, 3:]).max(), np.abs(turned[:, 3:]).max(initial=0.0))
     return by, turned, min(1.0, LARGEST_TURN / max(float(most), 1e-12)), size
-
-
-def _states(estimate: SpatialEstimate) -> FloatArray:
-    """Return the numbers of the border, whose means are zero: twists of the mounts, delays, and the scale."""
-    return np.append(estimate.state, estimate.log_scale)

@@ -196,7 +196,7 @@ def _with_drift(
     if problem.steady:
         noise = replace(noise, translation=settings.steady_m, rotation=settings.steady_rad)
     elif drift.translation is not None and drift.rotation is not None:
-        if share.min() < 1.0 and settings.delay_sigma_s == 0.0:  # a delay that is not known yet is in all residuals
+        if share.min() < 1.0:
             free = replace(problem.as_points(), prior=PlacePrior.none(), start_sigma=HELD)
             alone = converged(free, first_places(free, driven), noise)
             if _are_independent(alone, drift.translation) and _is_of_one_metre(alone.estimate, driven):

@@ -169,7 +169,8 @@ def _lay_together(members: Sequence[SolvedRobot], motion: FloatArray) -> tuple[S
     robots = []
     for r, (member, by, row, estimate) in enumerate(zip(members, motion, places, estimates, strict=True)):
         sigma = member.problem.start_sigma if r == 0 else FREE
-        problem = replace(member.problem, oriented=oriented[row], start_sigma=sigma)
+        trusted = np.zeros(len(member.problem.mount))
+        problem = replace(member.problem, oriented=oriented[row], start_sigma=sigma, delay_jitter=trusted)
         robots.append(_Member(problem, se3.compose(by, estimate.pose)))
     start = JointEstimate(
         np.concatenate([se3.compose(by, estimate.pose) for by, estimate in zip(motion, estimates, strict=True)]),
