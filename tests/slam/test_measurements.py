@@ -87,6 +87,16 @@ def test_fixes_put_the_drive_where_it_was(p_wrong, online):
     assert absolute_error(result) < 0.1
 
 
+def test_heights_of_fixes_are_no_measurement_in_the_plane():
+    """An antenna on a mast above a hill, whose heights are far beyond their stated deviation: the fixes stay inliers."""
+    random, stamp_s = np.random.default_rng(3), drive().frames.stamp_s[5::5]
+    fix = se2.transform(true_pose(stamp_s), np.array([0.3, -0.1])) + random.normal(0.0, 0.02, (len(stamp_s), 2))
+    said = {"x_m": fix[:, 0], "y_m": fix[:, 1], "z_m": 35.0 + random.normal(0.0, 1.0, len(fix))}
+    said |= {"lever_x_m": 0.3, "lever_y_m": -0.1, "lever_z_m": 1.2, "sigma_xy_m": 0.02, "sigma_z_m": 0.02}
+    columns = {name: np.broadcast_to(value, len(fix)) for name, value in said.items()}
+    assert absolute_error(run_slam(measured("gnss", stamp_s, **columns))) < 0.03
+
+
 @pytest.mark.parametrize("kind", ["ranges", "bearings"])
 def test_landmarks_that_are_only_measured_are_mapped_and_hold_the_drive(kind):
     random, truth = np.random.default_rng(4), drive().truth

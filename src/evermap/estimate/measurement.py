@@ -141,7 +141,11 @@ class MeasurementFactors(Generic[State]):
         return self.tied.row
 
     def residuals(self, state: State) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
-        """Return whitened residuals (K, r); derivatives by the pose (K, r, d), and by the other (r, d)."""
+        """Return whitened residuals (K, r); derivatives by the pose (K, r, d), and by the other (r, d).
+
+        A number that no variable moves, as a height where poses are in the plane, is 0: it is no measurement there, and
+        would make an outlier of what is measured beside it.
+        """
         tied, poses, view = self.tied, self.view.poses(state), self.view
         pose, other = se3.compose(poses[tied.row], tied.after), np.zeros((len(tied.row), 0))
         if tied.kind.ties == "pose_pose":
@@ -154,12 +158,15 @@ class MeasurementFactors(Generic[State]):
         weight = np.where(measured, weight, 0.0)[..., None]
         residual = np.where(measured, found.residual, 0.0) * weight[..., 0]
         by_pose = view.by_pose(weight * found.by_pose @ se3.adjoint(se3.inverse(tied.after)))
-        if found.by_other is None:
-            return residual, by_pose, []
-        by_other = weight * found.by_other
-        if tied.kind.ties == "pose_pose":
-            return residual, by_pose, list(view.by_pose(by_other @ se3.adjoint(se3.inverse(tied.other_after))))
-        return residual, by_pose, view.by_place(state, tied.other, by_other)
+        by_others = list[FloatArray]()
+        if found.by_other is not None and tied.kind.ties == "pose_pose":
+            by_others = list(view.by_pose(weight * found.by_other @ se3.adjoint(se3.inverse(tied.other_after))))
+        elif found.by_other is not None:
+            by_others = view.by_place(state, tied.other, weight * found.by_other)
+        moved = np.any(by_pose != 0.0, axis=2)
+        if by_others:
+            moved |= np.array([np.any(by_other != 0.0, axis=1) for by_other in by_others])
+        return np.where(moved, residual, 0.0), by_pose, by_others
 
     def linearise(self, state: State, out: Room) -> Slices[float]:
         """Fill in the factors; each is an outlier or not as a whole."""
