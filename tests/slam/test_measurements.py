@@ -40,6 +40,17 @@ def position_error(result: SlamResult) -> float:
     return float(np.sqrt(np.mean(found.poses.position_error_m**2)))
 
 
+def shape_error(result: SlamResult) -> float:
+    """RMSE of positions after the best similarity transform (Umeyama 1991), as complex numbers."""
+    found, true = (
+        pose[:, 0] + 1j * pose[:, 1]
+        for pose in (result.trajectory.pose_world_robot, true_pose(result.trajectory.stamp_s))
+    )
+    found, true = found - found.mean(), true - true.mean()
+    motion = np.vdot(found, true) / np.vdot(found, found)
+    return float(np.sqrt(np.mean(np.abs(motion * found - true) ** 2)))
+
+
 @cache
 def error_without() -> float:
     return position_error(run_slam(drive()))
@@ -114,6 +125,9 @@ def test_landmarks_that_are_only_measured_are_mapped_and_hold_the_drive(kind):
         columns = {"azimuth_rad": np.arctan2(seen[:, 1], seen[:, 0]) + random.normal(0.0, 0.01, len(seen))}
         columns["sigma_rad"] = np.full(len(seen), 0.01)
     result = run_slam(measured(kind, stamp_s, 100_000 + which, **columns))
-    assert position_error(result) < 0.5 * error_without()
+    if kind == "ranges":
+        assert position_error(result) < 0.5 * error_without()
+    # what a metre is bearings cannot tell: it is that of the odometry, which is 2 % off
+    assert shape_error(result) < 0.25 * shape_error(run_slam(drive()))
     mine = result.landmarks.landmark_id >= 100_000
     assert result.landmarks.n_hits[mine].tolist() == [len(when)] * 4
