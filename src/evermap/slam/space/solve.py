@@ -52,6 +52,10 @@ STRIDES, SAME_METRE = 20, 0.03
 """Shares of a drive whose ways are compared, the longer half, and by which these differ at most, in the median."""
 SEEDS = 3
 """Frames from which constellations are begun."""
+LOOSE = 1.5
+"""Numbers measured for each that is sought, up to which views are loosely tied."""
+WIDER, STEPS_OF_WIDER = (30.0, 10.0, 3.0), 20
+"""Times that the noise of detections is wider, in turn, and steps at each, at most."""
 WORTH = 3.0
 """Nats by which a candidate must beat the predicted pose."""
 
@@ -112,6 +116,9 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
         estimate = replace(estimate, place=voted)
     elif of_points:
         estimate = _likeliest(problem, noise, [stepwise, *by_constellations(problem, noise, SEEDS)])
+        if _is_loosely_tied(problem):
+            begun = converged(problem, estimate, noise)
+            estimate = _or_better(begun, [_graduated(problem, noise, estimate)]).estimate
     problem, estimate = _in_measured_frame(problem, estimate, framed)
     optimum, delays = with_delays(converged(problem, estimate, noise))
     optimum = repaired(optimum)
@@ -308,6 +315,25 @@ def _likeliest(problem: SpatialProblem, noise: SpatialNoise, starts: list[Spatia
         smoother = SpatialSmoother(problem, start.pose)
         cost.append(smoother.optimum(start, noise, heavy=True, iterations=10)[1].cost)
     return starts[len(starts) - 1 - int(np.argmin(cost[::-1]))]  # of equal ones the last
+
+
+def _is_loosely_tied(problem: SpatialProblem) -> bool:
+    """Tell whether hardly more numbers were measured than are sought, of points without odometry."""
+    return 3 * len(problem.kind) < LOOSE * (6 * len(problem.stamp_s) + 3 * len(problem.oriented))
+
+
+def _graduated(problem: SpatialProblem, noise: SpatialNoise, start: SpatialEstimate) -> SpatialEstimate:
+    """Return values that are led from a start to the optimum by detections with less and less noise.
+
+    Where views are loosely tied, each fits what the start has of the others, and none can move without the rest. Under
+    noise that is many times wider they move together (graduated non-convexity: Yang et al. 2020).
+    """
+    estimate = start
+    for times in WIDER:
+        wider = replace(noise, across=times * noise.across, along=times * noise.along, pixel=times * noise.pixel)
+        smoother = SpatialSmoother(problem, estimate.pose)
+        estimate, _ = smoother.optimum(estimate, wider, heavy=True, iterations=STEPS_OF_WIDER)
+    return estimate
 
 
 def _along(problem: SpatialProblem, driven: FloatArray, known: BoolArray, place: FloatArray) -> SpatialEstimate:
