@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import pytest
 from evermap import check_recording, run_session, run_slam
 from evermap.errors import DataError, InputError
 from evermap.io import list_robots, read_mrclam, read_recording, write_template
+from evermap.slam import mistakes as mistakes_of
 from evermap.slam.calibration import SPECS
 from evermap.slam.check import far_off
 from evermap.slam.mistakes import USUAL
@@ -81,6 +83,23 @@ def test_one_mistake_is_told_by_its_name(
     assert len(found) == 1
     assert found[0] in codes.split()
     assert re.search(words, messages), messages
+
+
+@pytest.mark.parametrize("name", [None, *MISTAKES])
+def test_what_a_share_of_the_pairs_rules_out_would_not_have_been_told(
+    name: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = patrol() if name is None else MISTAKES[name][0](patrol())
+    ruled_out = []
+
+    def everything(pairs: Any, candidates: list[Any], *given: Any) -> list[Any]:
+        ruled_out.append(len(candidates) - len(possible(pairs, candidates, *given)))
+        return candidates
+
+    fast, possible = raw_check(recording), mistakes_of._possible
+    monkeypatch.setattr(mistakes_of, "_possible", everything)
+    assert raw_check(recording) == fast
+    assert name is not None or max(ruled_out) > 50
 
 
 def test_two_mistakes_are_told_both() -> None:

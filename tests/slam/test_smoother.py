@@ -14,7 +14,7 @@ from evermap.errors import DataError
 from evermap.estimate.sparse import system
 from evermap.geometry import se2
 from evermap.slam.problem import Estimate
-from evermap.slam.smoother import Smoother
+from evermap.slam.smoother import POSES_A_LEAF, Smoother
 
 SMALL = 1e-4
 """Parts of a standard deviation."""
@@ -101,6 +101,12 @@ def tied(world: World) -> World:
     return World(problem, world.noise, replace(world.truth, landmark=landmark))
 
 
+def blind(world: World) -> World:
+    """For two leaves of the elimination nothing is seen, so that their fronts hold no state of the sensor."""
+    seen = (world.problem.pose_row < POSES_A_LEAF) | (world.problem.pose_row >= 3 * POSES_A_LEAF)
+    return replace(world, problem=world.problem.seeing(seen))
+
+
 CASES = {
     "free": lambda: make_world(1),
     # nothing straight behind the robot, where the range law jumps
@@ -113,6 +119,7 @@ CASES = {
     "never seen": lambda: with_unknown_landmark(make_world(6)),
     "duplicates": lambda: with_duplicates(make_world(7)),
     "tied": lambda: elsewhere(tied(make_world(9, n_mapped=5))),
+    "blind": lambda: blind(make_world(1, n_poses=40)),
     "own sigmas": lambda: with_own_sigmas(make_world(8, p_outlier=0.05)),
 }
 
@@ -195,6 +202,17 @@ def test_all_marginals_are_blocks_of_the_dense_inverse(solved, dense):
     for j, k in enumerate(at):
         compare(marginals.landmark[j], [k, k + 1], [k, k + 1])
     compare(marginals.states, shared[-11:], shared[-11:])
+    known = np.append(np.repeat(optimum.known, 2), np.ones(11, dtype=bool))
+    compare(marginals.with_states, np.append(np.arange(3 * n), shared[known]), shared[-11:])
+
+
+def test_some_fronts_hold_no_sensor_where_nothing_is_seen():
+    whole, some = (CASES[name]() for name in ("free", "blind"))
+    held = [
+        Smoother(world.problem, world.noise).graph(world.truth).structure.system.has_border_throughout
+        for world in (whole, some)
+    ]
+    assert held == [True, False]
 
 
 def test_fixed_states_stay():
