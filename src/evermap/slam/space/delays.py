@@ -25,7 +25,7 @@ from evermap.slam.space.problem import OdometryPath, SpatialEstimate, SpatialPro
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
 from evermap.types import BoolArray, FloatArray
 
-LEAST_SHOWN = 1e-3
+LEAST_SHARE = 1e-3
 """Share of the changes of velocity that is no jitter, at least."""
 LONGEST_S = 2.0
 """Time before and after an instant over which the velocity there is averaged, at most."""
@@ -177,4 +177,4 @@ def _shown(problem: SpatialProblem, driven: FloatArray, delay_s: float) -> tuple
     alike = np.clip((within_s + path.step_s - np.diff(problem.stamp_s)) / (2.0 * path.step_s), 0.0, 1.0)
     squares = (driven[..., 6:12] ** 2).sum(axis=1) @ path.jitter
     jitter = float((squares * (1.0 - alike)).sum()) / within_s
-    return max(float((told * at_once).sum()) - jitter, LEAST_SHOWN * changes), changes
+    return max(float((told * at_once).sum()) - jitter, LEAST_SHARE * changes), changes
