@@ -337,7 +337,14 @@ def test_a_delay_is_as_uncertain_as_it_says_where_the_odometry_is_noisy(late_s):
 
 
 def test_a_late_camera_is_found_by_default_and_a_right_one_is_left_alone():
-    recording = hall(20, n_points=40, n_frames=400, step_s=0.1, drift=0.01)
+    whole = hall(20, n_points=40, n_frames=400, step_s=0.1, drift=0.01)
+    odometry = whole.odometry
+    stamp_s = np.append(odometry.stamp_s, odometry.stamp_s[:-1] + 0.04)  # other stamps than the frames, too
+    pose = se3.interpolate(odometry.stamp_s, odometry.pose_world_robot, stamp_s)
+    order = np.argsort(stamp_s)
+    variance = np.vstack([odometry.variance, odometry.variance[:-1]])[order]
+    denser = replace(odometry, stamp_s=stamp_s[order], pose_world_robot=pose[order], variance=variance)
+    recording = replace(whole, odometry=denser)
     trusted = Config(slam={"space": {"delay_sigma_s": 0.0}})
     for late_s in (0.0, 0.12):
         late = replace(recording, frames=Frames(recording.frames.stamp_s + late_s))
@@ -351,6 +358,8 @@ def test_a_late_camera_is_found_by_default_and_a_right_one_is_left_alone():
         else:
             assert delay.p_needed < 0.1
             assert np.array_equal(found.trajectory.pose_world_robot, without.trajectory.pose_world_robot)
+    of_frames = run_slam(whole)  # as visual odometry, which has the clock of the camera
+    assert not any(each.name.endswith("delay_s") for each in of_frames.parameters)
 
 
 @pytest.mark.parametrize("late_s", [0.15, -0.3])
