@@ -70,6 +70,10 @@ class MessageRows:
     derived: tuple[str, ...] = ()
 
 
+LEVEL_RAD = 0.1
+"""Tilt of the first pose that a kind leaves open, beyond which it is the kind that says what is level."""
+
+
 @dataclass(frozen=True, slots=True)
 class MeasurementKind:
     """A kind of measurement.
@@ -101,6 +105,11 @@ class MeasurementKind:
     place: Callable[[FloatArray, Columns], FloatArray | None] | None = None
     frame: Callable[[FloatArray, Columns], FloatArray] | None = None
     messages: MessageRows | None = None
+
+    @property
+    def is_upright(self) -> bool:
+        """Whether it says where up is in a frame whose z axis is up, but not where that frame is."""
+        return self.frame is None and max(self.first_sigma[3:5]) > LEVEL_RAD
 
 
 def stacked(columns: Columns, *names: str) -> FloatArray:

@@ -58,15 +58,21 @@ def level_pose(up: Up) -> FloatArray:
 
     It is the identity where z is up within the uncertainty, or up is unknown.
     """
-    pose = se3.identity()
-    if not up.is_known:
-        return pose
-    x, y, z = up.direction.tolist()
-    angle = float(np.arctan2(np.hypot(x, y), z))
-    if angle <= _LEVEL_SIGMAS * up.sigma_rad:
-        return pose
+    if not up.is_known or is_level(up):
+        return se3.identity()
+    x, y, _ = up.direction.tolist()
     axis = np.array([y, -x, 0.0]) if np.hypot(x, y) > 1e-9 else np.array([1.0, 0.0, 0.0])
-    return se3.exp(np.concatenate([np.zeros(3), angle * axis / np.linalg.norm(axis)]))
+    return se3.exp(np.concatenate([np.zeros(3), _tilt(up) * axis / np.linalg.norm(axis)]))
+
+
+def is_level(up: Up) -> bool:
+    """Return whether the z axis is known to be up, within the uncertainty of that."""
+    return up.is_known and _tilt(up) <= _LEVEL_SIGMAS * up.sigma_rad
+
+
+def _tilt(up: Up) -> float:
+    x, y, z = up.direction.tolist()
+    return float(np.arctan2(np.hypot(x, y), z))
 
 
 def move_map(landmarks: Landmarks, pose: FloatArray) -> Landmarks:

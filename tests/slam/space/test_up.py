@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from evermap import read_recording, run_session, run_slam
 from evermap.config import Config, UpConfig, with_overrides
 from evermap.geometry import se3
+from evermap.geometry.upright import move_map
 from evermap.metrics.summary import compare_with_truth
 from evermap.slam.space.up import Movement, decide_up, plane_axis, turn_axis
 from evermap.types import UNKNOWN, Measurements, SlamResult, SpatialOdometry, SpatialRecording, Up
@@ -300,3 +301,23 @@ def test_the_hall_of_tags_is_level(shared_data: Path) -> None:
 @pytest.mark.data
 def test_a_camera_around_objects_on_a_table_leaves_up_unknown(shared_data: Path) -> None:
     assert not run_slam(read_recording(shared_data / "ycbv" / "0014")).landmarks.up.is_known
+
+
+def test_gravity_bends_no_map_whose_z_is_not_up() -> None:
+    """A map that is 2 degrees off level, from a drive without an accelerometer; the next drive has one."""
+
+    recording = hall(3, n_points=40, n_frames=200, drift=0.05)
+    read = se3.rotation_of(recording.truth.pose_world_robot)[:, 2] * 9.81
+    columns = dict(zip(("ax_mps2", "ay_mps2", "az_mps2"), read.T, strict=True))
+    table = Measurements("gravity", recording.frames.stamp_s, columns, np.full(len(read), UNKNOWN))
+    leans = se3.exp(np.array([0.0, 0.0, 0.0, 0.035, 0.0, 0.0]))
+    tilted = move_map(recording.true_landmarks.as_prior(0.01), leans)
+    plain, measured = (
+        run_slam(recording, prior_map=tilted),
+        run_slam(replace(recording, measurements=(table,)), prior_map=tilted),
+    )
+    assert any("'gravity' left out in the map" in line for line in measured.warnings)
+    np.testing.assert_array_equal(measured.trajectory.pose_world_robot, plain.trajectory.pose_world_robot)
+    level = replace(recording.true_landmarks.as_prior(0.01), up=Up(np.array([0.0, 0.0, 1.0]), 0.01, "stated"))
+    used = run_slam(replace(recording, measurements=(table,)), prior_map=level)
+    assert not any("left out in the map" in line for line in used.warnings)

@@ -32,7 +32,7 @@ from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.intake import SpatialIntake, most_of, prepare_space
 from evermap.slam.space.problem import ANY_RAD, PlacePrior
 from evermap.slam.space.result import concluded_in_space, identities_of, located, numbered
-from evermap.slam.space.solve import FREE, SpatialSolved, solve_space
+from evermap.slam.space.solve import FREE, SpatialSolved, fit_to_map, solve_space
 from evermap.slam.space.together import SolvedRobot, solve_space_together
 from evermap.slam.space.up import sensor_axes
 from evermap.types import (
@@ -291,6 +291,7 @@ def solve_visit(
     intake = prepare_space(
         recording, of_slam.space, remarks, robust=of_slam.robust, estimate_noise=of_slam.estimate_noise
     )
+    intake = fit_to_map(intake, prior_map)
     return SpatialVisit(recording, intake, solve_space(intake, prior_map, progress=progress))
 
 
@@ -332,7 +333,9 @@ def localised_in_space(
     if not len(part.places):
         visit = SpatialVisit(recording, intake, solve_space(intake, None, progress=progress))
         return Localised.lost(visit, living, NOT_FOUND) if large else Localised(visit, visit.named(part))
-    solved = solve_space(intake, standing(part, p_site), progress=progress)
+    stands = standing(part, p_site)
+    intake = fit_to_map(intake, stands)
+    solved = solve_space(intake, stands, progress=progress)
     visit = SpatialVisit(recording, intake, _numbered(intake, solved, part))
     where = _laid(visit, part, p_site, settings)
     if where is None or np.count_nonzero(where.place >= 0) < 2:

@@ -17,6 +17,7 @@ from evermap.estimate.measurement import Tied
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
+from evermap.geometry.upright import is_level
 from evermap.slam.calibration import priced
 from evermap.slam.space.against_map import MapComparison, compared
 from evermap.slam.space.delays import Delays, with_delays
@@ -155,17 +156,33 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     return SpatialSolved(optimum, identity, times_of(identity), from_map, delays, stepwise.pose, spread, step_s)
 
 
-def _without_frames(problem: SpatialProblem) -> tuple[SpatialProblem, tuple[Tied, ...]]:
-    """Return the problem without measurements that have a frame of their own, such as GNSS fixes, and these.
+def fit_to_map(intake: SpatialIntake, prior_map: Landmarks | None) -> SpatialIntake:
+    """Return a recording for a solution in a map: without measurements that hold in another frame, with a warning each.
 
-    Where there is a map, which has another frame, they are left out.
+    Fixes have a frame of their own. What says where up is holds in a map whose z axis is known to be up.
     """
+    if prior_map is None or not np.isin(intake.landmark_id, prior_map.landmark_id).any():
+        return intake
+    kept, told = list[Tied](), list[str]()
+    for tied in intake.problem.measurements:
+        why = "" if tied.kind.frame is None else "it has a frame of its own"
+        if tied.kind.is_upright and not is_level(prior_map.up):
+            why = "the z axis of the map is not known to be up"
+        if why:
+            told.append(f"measurements '{tied.kind.name}' left out in the map: {why}")
+        else:
+            kept.append(tied)
+    problem = replace(intake.problem, measurements=tuple(kept))
+    return replace(intake, problem=problem, warnings=(*intake.warnings, *told))
+
+
+def _without_frames(problem: SpatialProblem) -> tuple[SpatialProblem, tuple[Tied, ...]]:
+    """Return the problem without measurements that have a frame of their own, such as GNSS fixes, and these."""
     framed = tuple(tied for tied in problem.measurements if tied.kind.frame is not None)
     if not framed:
         return problem, ()
     rest = tuple(tied for tied in problem.measurements if tied.kind.frame is None)
-    alone = replace(problem, measurements=rest, start_sigma=np.full(6, 1e-4))
-    return (replace(problem, measurements=rest), ()) if len(problem.prior.place) else (alone, framed)
+    return replace(problem, measurements=rest, start_sigma=np.full(6, 1e-4)), framed
 
 
 def _in_measured_frame(
