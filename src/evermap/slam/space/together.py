@@ -42,8 +42,6 @@ from evermap.slam.space.smoother import (
 from evermap.slam.space.solve import FREE, SpatialSolved
 from evermap.types import BoolArray, FloatArray, IntArray
 
-USUAL = LocalizeConfig()
-
 
 class JointEstimate(NamedTuple):
     """Values of all variables of several robots: their poses (N, 7), one robot after the other; the places (P, 7) of
@@ -74,18 +72,21 @@ class SolvedRobot:
         return np.where(self.solved.number == 1, self.intake.landmark_id[self.solved.identity], -1)
 
 
-def solve_space_together(members: Sequence[SolvedRobot], names: Sequence[str]) -> list[SpatialSolved]:
+def solve_space_together(
+    members: Sequence[SolvedRobot], names: Sequence[str], rules: LocalizeConfig
+) -> list[SpatialSolved]:
     """Return robots solved together, in the frame of the first one's first pose.
 
     Args:
         members: each by itself.
         names: what they are called in messages.
+        rules: when the frame of one is known in those of others.
 
     Raises:
         DataError: nothing ties one of them to the others.
         NumericalError: no finite optimum.
     """
-    motion = align_robots(members, names)
+    motion = align_robots(members, names, rules)
     joint, start = _lay_together(members, motion)
     noise = [member.solved.optimum.noise for member in members]
     begun = list(noise)
@@ -108,7 +109,7 @@ def solve_space_together(members: Sequence[SolvedRobot], names: Sequence[str]) -
     return found
 
 
-def align_robots(members: Sequence[SolvedRobot], names: Sequence[str], rules: LocalizeConfig = USUAL) -> FloatArray:
+def align_robots(members: Sequence[SolvedRobot], names: Sequence[str], rules: LocalizeConfig) -> FloatArray:
     """Return the motions (R, 7) of each robot's frame into that of the first, by landmarks that agree.
 
     Raises:
