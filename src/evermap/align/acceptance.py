@@ -29,6 +29,8 @@ LEAST = 1e-9
 CLEARLY = 0.75
 """Share of landmarks that agree, from which the mirrored map need not be asked."""
 NOTHING = "no two landmarks stand to each other as in the map"
+TWO_PLACES = "two places in the map fit about as well, with {} and {} of {} landmarks"
+"""Reasons against an alignment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +98,7 @@ def accept_alignment(
         reason = f"{standing} of {count} landmarks agree with the map, which may be by chance"
     elif most - rival < rules.lead_nats:
         other = int(np.count_nonzero(ranked[order[1]][1]))
-        reason = f"two places in the map fit about as well, with {standing} and {other} of {count} landmarks"
+        reason = TWO_PLACES.format(standing, other, count)
     elif (other := _mirrored(matches, standing, most + rules.lead_nats, rules, covariance_m2)) > 0:
         reason = (
             f"{other} of {count} landmarks fit the mirrored map, {standing} this one: bearings or an axis are reversed"

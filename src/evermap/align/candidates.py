@@ -132,12 +132,12 @@ def rank_motions(matches: Matches, *, most: int = 2, agree_m: float = AGREE_M) -
         if not _determine(table, some):
             break
         best = _refitted(motion[first], table, some)
-        if all(_are_apart(best[None], other, table, agree_m)[0] for other, _ in found):
+        if all(are_apart(best[None], other, table, agree_m)[0] for other, _ in found):
             agree = np.zeros(len(table), dtype=np.bool_)
             agree[order[some]] = True
             found.append((best, agree))
         if len(found) < most:
-            left = left[_are_apart(motion[left], best, table, agree_m) & (left != first)]
+            left = left[are_apart(motion[left], best, table, agree_m) & (left != first)]
     return found
 
 
@@ -161,8 +161,8 @@ def propose_motions(matches: Matches, agree_m: float = AGREE_M) -> tuple[FloatAr
     return np.vstack([by_tags, by_points]), np.append(matches.log_prior[tag], np.zeros(len(triple)))
 
 
-def _are_apart(motion: FloatArray, other: FloatArray, matches: Matches, agree_m: float) -> BoolArray:
-    """(C,) which motions take an outermost landmark, or an orientation, elsewhere than another motion does."""
+def are_apart(motion: FloatArray, other: FloatArray, matches: Matches, agree_m: float = AGREE_M) -> BoolArray:
+    """Return (C,) which motions take an outermost landmark, or an orientation, elsewhere than another motion does."""
     source, group = matches.points[0], matches.group
     outermost = source[np.unique(np.append(source.argmin(axis=0), source.argmax(axis=0)))]
     step = group.transform(motion[:, None], outermost) - group.transform(other, outermost)
