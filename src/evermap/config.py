@@ -240,6 +240,9 @@ class RoomConfig(Section):
     p_another_place: Share = key(1e-3, "probability that a session is from another place")
     smallest_room_m2: Positive = key(50.0, "minimum area in which moved landmarks may be found [m^2]")
     lowest_room_m: Positive = key(1.0, "height of a room in space, at least [m]")
+    lead_nats: NotNegative = key(
+        3.0, "log odds of an alignment over the next best one, from which it is accepted [nats]"
+    )
 
 
 class LocalizeConfig(RoomConfig):
@@ -250,7 +253,6 @@ class LocalizeConfig(RoomConfig):
     certain_nats: NotNegative = key(
         6.0, "log odds of an alignment over another place, from which it is accepted [nats]"
     )
-    lead_nats: NotNegative = key(3.0, "the same over the next best alignment [nats]")
     enough: Count = key(5, "landmarks of the map that a live session has met when it is entered")
     alone_s: NotNegative = key(10.0, "where no third landmark comes into view for so long, two are enough [s]")
     spread_m: Positive = key(1.0, "how far apart they must be, for a recording that is smoothed afterwards [m]")

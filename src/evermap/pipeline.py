@@ -104,7 +104,8 @@ def run_together(
             raise KeyboardInterrupt
     if visits:
         frames = ["first_pose", *["first_robot"] * (len(visits) - 1)]
-        for number, one, frame in zip(recordings, spatial.solve_visits_together(visits), frames, strict=True):
+        joint = spatial.solve_visits_together(visits, config.slam.localize)
+        for number, one, frame in zip(recordings, joint, frames, strict=True):
             results[number] = session.existing(one, one.concluded(frame), config.living)
         return results
     for number, solved, online in zip(alone, *together.solve_together(alone), strict=True):

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from evermap.align.acceptance import SIGMA_M, accept_alignment, log_density_of, log_odds_of
+from evermap.align.acceptance import MOST_JOINT, SIGMA_M, accept_alignment, log_density_of, log_odds_of
 from evermap.align.candidates import Matches
 from evermap.config import LocalizeConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.group import PLANE, SPACE, Group, group_of
+from evermap.slam.batch import PriorMap, lay_over
+from evermap.slam.kernels import N_STATES
+from evermap.slam.known_places import FrameSightings, KnownPlaces, LocalTrack
 
 RULES = LocalizeConfig()
 GROUPS = pytest.mark.parametrize("group", [PLANE, SPACE], ids=["plane", "space"])
@@ -198,3 +201,49 @@ def test_standard_deviations_and_the_covariance_that_they_stand_for_give_the_sam
     dense = accept_alignment(Matches.of(seen, place), RULES, covariance_m2=SIGMA_M**2 * np.eye(18))
     assert alone, alone.reason
     assert dense.log_odds == pytest.approx(alone.log_odds, abs=1e-9)
+
+
+@GROUPS
+def test_errors_of_the_landmarks_turn_with_them_and_blocks_are_independent(group) -> None:
+    source, target, motion, _ = session(group, 5, count=6, moved=0)
+    matches, agree, dim = Matches.of(source, target), np.ones(6, dtype=np.bool_), group.point_dim
+    root = np.kron(np.eye(6), np.diag([0.5, 0.02, 0.02][:dim])) + np.random.default_rng(0).normal(
+        0.0, 0.01, (6 * dim, 6 * dim)
+    )
+    own, there = root @ root.T, 0.04 * np.eye(6 * dim)
+    turn = np.kron(np.eye(6), group.rotation_of(motion))
+    expected = log_odds_of(motion, matches, agree, RULES, there + turn @ own @ turn.T)
+    assert log_odds_of(motion, matches, agree, RULES, there, own) == pytest.approx(expected, abs=1e-8)
+    unturned = log_odds_of(motion, matches, agree, RULES, there + own)
+    assert abs(unturned - expected) > 1e-3
+    by_blocks = log_odds_of(motion, matches, agree, RULES, np.tile(0.04 * np.eye(dim), (6, 1, 1)), own)
+    assert by_blocks == pytest.approx(expected, abs=1e-8)
+    alone = log_odds_of(motion, matches, agree, RULES, None, own)
+    assert alone == pytest.approx(
+        log_odds_of(motion, matches, agree, RULES, SIGMA_M**2 * np.eye(6 * dim) + turn @ own @ turn.T), abs=1e-8
+    )
+
+
+def test_of_very_many_landmarks_the_errors_of_each_are_enough() -> None:
+    """Round and independent errors are the same, joint or each by itself."""
+    source, target, motion, _ = session(PLANE, 6, count=MOST_JOINT + 1, moved=0)
+    matches, agree = Matches.of(source, target), np.ones(MOST_JOINT + 1, dtype=np.bool_)
+    own, there = 0.01 * np.eye(2 * len(agree)), np.tile(0.05 * np.eye(2), (len(agree), 1, 1))
+    round_ = log_odds_of(motion, matches, agree, RULES, 0.06 * np.eye(2 * len(agree)))
+    assert log_odds_of(motion, matches, agree, RULES, there, own) == pytest.approx(round_, abs=1e-6)
+
+
+@pytest.mark.parametrize(("sigma_m", "is_found"), [(0.02, True), (6.0, False)])
+def test_places_that_a_map_hardly_knows_are_no_evidence(sigma_m: float, *, is_found: bool) -> None:
+    """Three of them agree; a localiser and a session in a prior map wait for more where each may be anywhere."""
+    place, robot = np.array([[2.0, 1.0], [-3.0, 4.0], [4.0, -3.0]]), np.array([0.5, 0.2, 0.7])
+    seen = se2.transform(se2.inverse(robot), place)
+    places = KnownPlaces.of(np.arange(3), place, np.tile(sigma_m**2 * np.eye(2), (3, 1, 1)), np.ones(3))
+    track = LocalTrack(np.zeros(3), RULES)
+    reading = np.column_stack([np.hypot(*seen.T), np.arctan2(seen[:, 1], seen[:, 0])])
+    track.see(0.0, FrameSightings(np.arange(3), reading, np.full((3, 2), np.nan)), np.arange(3), np.zeros(N_STATES))
+    assert (track.placed(0.0, places) is not None) == is_found
+    prior_map = PriorMap(place, np.tile(np.eye(2) / sigma_m**2, (3, 1, 1)), np.ones(3, dtype=np.bool_))
+    found = lay_over(prior_map, seen, RULES)
+    assert bool(found) == is_found
+    assert found.reason == ("" if is_found else "3 of 3 landmarks agree with the map, which may be by chance")

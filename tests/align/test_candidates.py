@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from evermap.align import candidates
 from evermap.align.candidates import AGREE_M, Matches, find_consensus, rank_motions, score_motions
 from evermap.geometry import se2, se3
 from evermap.geometry.rigid import rigid
@@ -156,3 +157,40 @@ def test_different_motions_are_ranked_by_who_agrees() -> None:
     assert second == pytest.approx(other, abs=0.05)
     assert stand.tolist() == [True] * 7 + [False] * 5
     assert moved[7:].all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_large_map_is_found_by_the_few_that_stand(seed) -> None:
+    """One of 25 of 3,000 landmarks stands: the samples of pairs and of landmarks still have enough of them."""
+    rng = np.random.default_rng(seed)
+    target, motion = rng.uniform(-80, 80, (3000, 2)), np.array([30.0, -20.0, 2.0])
+    source, stand = se2.transform(se2.inverse(motion), target), rng.random(3000) < 0.04
+    source[~stand] = rng.uniform(-80, 80, (int((~stand).sum()), 2))
+    found, agree = find_consensus(Matches.of(source, target))
+    assert found == pytest.approx(motion, abs=0.05)
+    assert agree[stand].mean() > 0.95
+
+
+def test_the_search_for_the_motion_grows_in_proportion_to_the_map(monkeypatch) -> None:
+    """Distances and comparisons for a map of four times the landmarks: four times as many, not sixteen."""
+    worked = 0
+    distances, fit = candidates._distances, candidates._fit
+
+    def measured(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        nonlocal worked
+        worked += len(a) * len(b)
+        return distances(a, b)
+
+    def compared(motion: np.ndarray, matches: Matches, agree_m: float) -> np.ndarray:
+        nonlocal worked
+        worked += len(motion) * len(matches)
+        return fit(motion, matches, agree_m)
+
+    monkeypatch.setattr(candidates, "_distances", measured)
+    monkeypatch.setattr(candidates, "_fit", compared)
+    work, rng = [], np.random.default_rng(0)
+    for count in (2000, 8000):
+        worked, target = 0, rng.uniform(-80, 80, (count, 2))
+        rank_motions(Matches.of(target + rng.normal(0.0, 0.05, target.shape), target))
+        work.append(worked)
+    assert work[1] < 5 * work[0]

@@ -11,11 +11,14 @@ from drives import NOISE, driven, nees, seen_from
 from problems import QUIET, World, default_prior, make_world, slow_detection
 from recordings import with_ids
 
-from evermap.config import Config, SlamConfig
+from evermap.align.acceptance import SIGMA_M, Acceptance, accept_alignment
+from evermap.align.candidates import Matches
+from evermap.config import Config, LocalizeConfig, SlamConfig
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se2
 from evermap.metrics.trajectory import interpolate
 from evermap.pipeline import run_slam, run_together
+from evermap.slam import together
 from evermap.slam.encounters import Encounters, Together
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
@@ -292,6 +295,28 @@ def test_nothing_ties_robots() -> None:
     met = drives_together(2, n_robots=2)
     results = run_together({1: met[0], 2: with_ids(met[1], lambda ids: ids + 100)})
     assert scored(met, list(results.values()), 0)[:, 0].max() < 0.3
+
+
+def test_robots_are_laid_together_by_their_own_covariances(monkeypatch) -> None:
+    """The differences of common landmarks are as large as these say, beyond what an alignment allows in any case."""
+    asked = []
+
+    def accepting(matches: Matches, rules: LocalizeConfig, **given: np.ndarray) -> Acceptance:
+        asked.append((matches, given, accept_alignment(matches, rules, **given)))
+        return asked[-1][-1]
+
+    monkeypatch.setattr(together, "accept_alignment", accepting)
+    run_together({k: replace(one, robot_sightings=None) for k, one in enumerate(drives_together(2, n_robots=2), 1)})
+    matches, given, found = asked[0]
+    count, (source, target) = len(matches), matches.points
+    assert count > 5
+    assert found.agree.all()
+    turn, at = np.kron(np.eye(count), se2.rotation(found.motion[2])), se2.transform(found.motion, source)
+    spread = given["covariance_m2"] - SIGMA_M**2 * np.eye(2 * count) + turn @ given["source_m2"] @ turn.T
+    white = np.linalg.inv(np.linalg.cholesky(spread))
+    freedom, error = white @ se2.rigid_directions(at - at.mean(axis=0)), white @ (at - target).ravel()
+    off = error - freedom @ np.linalg.lstsq(freedom, error)[0]
+    assert 0.3 < float(off @ off) / (2 * count - 3) < 3.0
 
 
 def test_a_landmark_that_moves_is_each_robots_own() -> None:

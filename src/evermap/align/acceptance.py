@@ -17,18 +17,22 @@ from scipy.linalg import block_diag, solve_triangular
 from evermap.align.candidates import AGREE_M, AGREE_RAD, Matches, rank_motions
 from evermap.config import LocalizeConfig, RoomConfig
 from evermap.geometry import se2, se3
-from evermap.geometry.group import SPACE
-from evermap.types import BoolArray, FloatArray
+from evermap.geometry.group import SPACE, Group
+from evermap.types import BoolArray, FloatArray, IntArray
 
 SIGMA_M, SIGMA_RAD = 0.5 * AGREE_M, 0.4 * AGREE_RAD
 """Standard deviations of a landmark laid over a map, where nothing better is known."""
 LOG_TURNS = {2: math.log(2.0 * math.pi), 3: math.log(8.0 * math.pi**2)}
 """Logarithm of the volume of all rotations, of the plane and of space."""
+MOST_JOINT = 300
+"""Landmarks that agree whose joint covariance is used; of more, that of each: their evidence is beyond doubt."""
 LEAST = 1e-9
 """Information on a motion that rounding may take for less than none."""
 CLEARLY = 0.75
 """Share of landmarks that agree, from which the mirrored map need not be asked."""
 NOTHING = "no two landmarks stand to each other as in the map"
+TWO_PLACES = "two places in the map fit about as well, with {} and {} of {} landmarks"
+"""Reasons against an alignment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +69,7 @@ def accept_alignment(
     fewest: int | None = None,
     spread_m: float = 0.0,
     covariance_m2: FloatArray | None = None,
+    source_m2: FloatArray | None = None,
 ) -> Acceptance:
     """Return the most probable motion that lays landmarks over their places, and whether it is accepted.
 
@@ -73,14 +78,15 @@ def accept_alignment(
         rules: what is believed of landmarks, and when an alignment is certain.
         fewest: landmarks that must agree, unless it is those of the rules; one with an orientation counts as three.
         spread_m: how far apart these must be, at least.
-        covariance_m2: (D K, D K) of the differences between landmarks and places for a known motion: the sum of the
-            covariances of both maps. None for errors of `SIGMA_M`.
+        covariance_m2: (D K, D K) of the places, and of what landmarks that stand may be off, in the frame of the map;
+            (K, D, D) where they are independent. None for errors of `SIGMA_M`.
+        source_m2: the same of the landmarks, in their own frame; None where it is counted in the former.
     """
     count = len(np.unique(matches.landmark))
     ranked = rank_motions(matches)
     if not ranked:
         return Acceptance(matches.group.identity(), np.zeros(len(matches), dtype=np.bool_), -math.inf, 0.0, NOTHING)
-    odds = [log_odds_of(motion, matches, agree, rules, covariance_m2) for motion, agree in ranked]
+    odds = [log_odds_of(motion, matches, agree, rules, covariance_m2, source_m2) for motion, agree in ranked]
     order = np.argsort(-np.array(odds), kind="stable")
     (motion, agree), most = ranked[order[0]], odds[order[0]]
     rival = odds[order[1]] if len(order) > 1 else -math.inf
@@ -96,8 +102,8 @@ def accept_alignment(
         reason = f"{standing} of {count} landmarks agree with the map, which may be by chance"
     elif most - rival < rules.lead_nats:
         other = int(np.count_nonzero(ranked[order[1]][1]))
-        reason = f"two places in the map fit about as well, with {standing} and {other} of {count} landmarks"
-    elif (other := _mirrored(matches, standing, most + rules.lead_nats, rules, covariance_m2)) > 0:
+        reason = TWO_PLACES.format(standing, other, count)
+    elif (other := _mirrored(matches, standing, most + rules.lead_nats, rules, covariance_m2, source_m2)) > 0:
         reason = (
             f"{other} of {count} landmarks fit the mirrored map, {standing} this one: bearings or an axis are reversed"
         )
@@ -105,7 +111,12 @@ def accept_alignment(
 
 
 def _mirrored(
-    matches: Matches, standing: int, least: float, rules: LocalizeConfig, covariance_m2: FloatArray | None
+    matches: Matches,
+    standing: int,
+    least: float,
+    rules: LocalizeConfig,
+    covariance_m2: FloatArray | None,
+    source_m2: FloatArray | None,
 ) -> int:
     """How many landmarks agree with a mirrored map, where that has at least these log odds; else 0.
 
@@ -114,10 +125,13 @@ def _mirrored(
     """
     if matches.oriented.any() or standing >= CLEARLY * len(np.unique(matches.landmark)):
         return 0
-    source = matches.points[0] * np.append(-1.0, np.ones(matches.group.point_dim - 1))
-    mirrored = replace(matches, source=source)
+    sign = np.append(-1.0, np.ones(matches.group.point_dim - 1))
+    mirrored = replace(matches, source=matches.points[0] * sign)
+    if source_m2 is not None:
+        every = sign if source_m2.ndim == 3 else np.tile(sign, len(matches))
+        source_m2 = source_m2 * every * every[:, None]
     for motion, agree in rank_motions(mirrored, most=1):
-        if log_odds_of(motion, mirrored, agree, rules, covariance_m2) > least:
+        if log_odds_of(motion, mirrored, agree, rules, covariance_m2, source_m2) > least:
             return int(np.count_nonzero(agree))
     return 0
 
@@ -128,6 +142,7 @@ def log_odds_of(
     agree: BoolArray,
     rules: LocalizeConfig,
     covariance_m2: FloatArray | None = None,
+    source_m2: FloatArray | None = None,
 ) -> float:
     """Return the log odds that landmarks are where a motion lays them, over being anywhere [nats]; as of
     `accept_alignment`.
@@ -140,9 +155,8 @@ def log_odds_of(
     dim = source.shape[1]
     error, freedom = [(moved[some] - target[some]).ravel()], [group.rigid_directions(moved[some] - moved.mean(axis=0))]
     factor = np.full(dim * len(some), SIGMA_M)
-    if covariance_m2 is not None:
-        rows = se2.xy_rows(some, dim)
-        factor = np.asarray(np.linalg.cholesky(covariance_m2[np.ix_(rows, rows)]), dtype=np.float64)
+    if covariance_m2 is not None or source_m2 is not None:
+        factor = _factor_of(motion, some, group, covariance_m2, source_m2)
     log_chance = len(some) * log_room(moved, target, rules)
     turned = some[matches.oriented[some]]
     if len(turned):
@@ -157,6 +171,44 @@ def log_odds_of(
     log_density = log_density_of(np.concatenate(error), factor, np.vstack(freedom), log_motion)
     log_prior = _log_prior_of(matches, agree, rules) + float(matches.log_prior[some].sum())
     return log_density + log_chance + log_prior - math.log(rules.p_another_place)
+
+
+def _factor_of(
+    motion: FloatArray, some: IntArray, group: Group, covariance_m2: FloatArray | None, source_m2: FloatArray | None
+) -> FloatArray:
+    """Lower Cholesky factor of the covariance of the differences of `some` landmarks; of more than `MOST_JOINT` the
+    standard deviations of each.
+    """
+    dim, turn = group.point_dim, group.rotation_of(motion)
+    if len(some) > MOST_JOINT:
+        each = SIGMA_M**2 * np.ones((len(some), 1)) * np.ones(dim)
+        if covariance_m2 is not None:
+            each = np.diagonal(_blocks(covariance_m2, some, dim), axis1=1, axis2=2)
+        if source_m2 is not None:
+            own = turn @ _blocks(source_m2, some, dim) @ turn.T
+            each = each + np.diagonal(own, axis1=1, axis2=2)
+        return np.asarray(np.sqrt(each).ravel())
+    total = SIGMA_M**2 * np.eye(dim * len(some)) if covariance_m2 is None else _joint(covariance_m2, some, dim)
+    if source_m2 is not None:
+        own = _joint(source_m2, some, dim).reshape(len(some), dim, len(some), dim)
+        total = total + np.einsum("ab,ibjc,dc->iajd", turn, own, turn, optimize=True).reshape(total.shape)
+    return np.asarray(np.linalg.cholesky(total), dtype=np.float64)
+
+
+def _joint(covariance_m2: FloatArray, some: IntArray, dim: int) -> FloatArray:
+    """(D N, D N) joint covariance of some landmarks."""
+    if covariance_m2.ndim == 3:
+        return np.asarray(block_diag(*covariance_m2[some]), dtype=np.float64)
+    rows = se2.xy_rows(some, dim)
+    return np.asarray(covariance_m2[np.ix_(rows, rows)])
+
+
+def _blocks(covariance_m2: FloatArray, some: IntArray, dim: int) -> FloatArray:
+    """(N, D, D) covariances of some landmarks, each by itself."""
+    if covariance_m2.ndim == 3:
+        return covariance_m2[some]
+    at = dim * some[:, None] + np.arange(dim)
+    return np.asarray(covariance_m2[at[:, :, None], at[:, None, :]])
 
 
 def log_density_of(error: FloatArray, factor: FloatArray, freedom: FloatArray, log_motion: float | None) -> float:

@@ -20,6 +20,12 @@ AGREE_M, AGREE_RAD = 0.5, 0.5
 """Landmarks agree with a map where they lie this close to its places, and are turned by no more."""
 N_PAIRS = 5000
 """Pairs that are tried, about: all of them up to 70 points, else every point with those that are farthest from it."""
+PARTNERS = 512
+"""Landmarks with which every other one may be paired, at most: a random sample of large maps."""
+SAMPLE, BEST_OF_SAMPLE = 512, 128
+"""Landmarks by which motions are compared first, at most, and motions that are compared by all landmarks then."""
+SEED = 0
+"""Of the samples, which are the same for the same number of landmarks."""
 OF_TRIPLES, MOST_TRIPLES = 14, 300
 """Landmarks whose triples are tried, and triples."""
 FLAT_M = 0.3
@@ -115,21 +121,23 @@ def rank_motions(matches: Matches, *, most: int = 2, agree_m: float = AGREE_M) -
     order = np.argsort(matches.landmark, kind="stable")
     table = matches.rows(order)
     motion, log_prior = propose_motions(table, agree_m)
-    score = _scores(motion, table, agree_m) + BY_EXPLANATION * log_prior
-    left, found = np.argsort(-score, kind="stable"), list[tuple[FloatArray, BoolArray]]()
+    prior = BY_EXPLANATION * log_prior
+    sample = _sample_landmarks(table)
+    left = np.argsort(-_scores(motion, sample, agree_m) - prior, kind="stable")
+    found = list[tuple[FloatArray, BoolArray]]()
     while len(left) and len(found) < most:
-        some = _agreeing(motion[left[0]], table, agree_m)
+        first = left[: BEST_OF_SAMPLE if len(sample) < len(table) else 1]
+        first = first[np.argmax(_scores(motion[first], table, agree_m) + prior[first])]
+        some = _agreeing(motion[first], table, agree_m)
         if not _determine(table, some):
             break
-        best = _refitted(motion[left[0]], table, some)
-        if all(_are_apart(best[None], other, table, agree_m)[0] for other, _ in found):
+        best = _refitted(motion[first], table, some)
+        if all(are_apart(best[None], other, table, agree_m)[0] for other, _ in found):
             agree = np.zeros(len(table), dtype=np.bool_)
             agree[order[some]] = True
             found.append((best, agree))
         if len(found) < most:
-            apart = _are_apart(motion[left], best, table, agree_m)
-            apart[0] = False
-            left = left[apart]
+            left = left[are_apart(motion[left], best, table, agree_m) & (left != first)]
     return found
 
 
@@ -153,8 +161,8 @@ def propose_motions(matches: Matches, agree_m: float = AGREE_M) -> tuple[FloatAr
     return np.vstack([by_tags, by_points]), np.append(matches.log_prior[tag], np.zeros(len(triple)))
 
 
-def _are_apart(motion: FloatArray, other: FloatArray, matches: Matches, agree_m: float) -> BoolArray:
-    """(C,) which motions take an outermost landmark, or an orientation, elsewhere than another motion does."""
+def are_apart(motion: FloatArray, other: FloatArray, matches: Matches, agree_m: float = AGREE_M) -> BoolArray:
+    """Return (C,) which motions take an outermost landmark, or an orientation, elsewhere than another motion does."""
     source, group = matches.points[0], matches.group
     outermost = source[np.unique(np.append(source.argmin(axis=0), source.argmax(axis=0)))]
     step = group.transform(motion[:, None], outermost) - group.transform(other, outermost)
@@ -183,6 +191,19 @@ def _refitted(motion: FloatArray, matches: Matches, some: IntArray) -> FloatArra
     if matches.group is SPACE and (len(some) < 3 or _height(source) <= FLAT_M):
         return motion
     return rigid(source, target)
+
+
+def _sample_landmarks(matches: Matches) -> Matches:
+    """Return the rows of a random sample of landmarks, all of them where these are few."""
+    name = np.unique(matches.landmark)
+    if len(name) <= SAMPLE:
+        return matches
+    return matches.rows(np.flatnonzero(np.isin(matches.landmark, _some_of(name, SAMPLE))))
+
+
+def _some_of(rows: IntArray, most: int) -> IntArray:
+    """Return a random sample of rows, sorted as they are: the same ones each time."""
+    return rows[np.sort(np.random.default_rng(SEED).permutation(len(rows))[:most])]
 
 
 def _scores(motion: FloatArray, matches: Matches, agree_m: float) -> FloatArray:
@@ -220,16 +241,17 @@ def _pairs_of_one_length(
     """
     count = len(source)
     partners = max(2, N_PAIRS // max(count, 1))
-    found = []
-    for first in range(0, count, max(1, AT_ONCE // max(count, 1))):
-        rows = np.arange(first, min(first + max(1, AT_ONCE // count), count))
-        span = _distances(target[rows], target)
-        mismatch = np.abs(span - _distances(source[rows], source))
-        span[(span < agree_m) | (mismatch > agree_m) | (name[rows][:, None] == name)] = -1.0
+    other = _some_of(np.arange(count), PARTNERS)
+    found, step = [], max(1, AT_ONCE // max(len(other), 1))
+    for first in range(0, count, step):
+        rows = np.arange(first, min(first + step, count))
+        span = _distances(target[rows], target[other])
+        mismatch = np.abs(span - _distances(source[rows], source[other]))
+        span[(span < agree_m) | (mismatch > agree_m) | (name[rows][:, None] == name[other])] = -1.0
         if partners < count:
             far = np.argsort(-span, axis=1, kind="stable")[:, :partners]
             row, rank = np.nonzero(np.take_along_axis(span, far, axis=1) > 0.0)
-            found.append(np.column_stack([rows[row], far[row, rank]]))
+            found.append(np.column_stack([rows[row], other[far[row, rank]]]))
         else:
             found.append(np.argwhere(span > 0.0) + [first, 0])
     pairs = np.sort(np.vstack([np.zeros((0, 2), dtype=np.int64), *found]), axis=1)
@@ -266,7 +288,8 @@ def _height(points: FloatArray) -> float:
 
 def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
     """(m, n) from points (m, 2) to points (n, 2)."""
-    return np.asarray(np.hypot(a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1]), dtype=np.float64)
+    x, y = a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1]
+    return np.asarray(np.sqrt(x * x + y * y), dtype=np.float64)
 
 
 def _rigid_pairs(a: FloatArray, b: FloatArray, to_a: FloatArray, to_b: FloatArray) -> FloatArray:

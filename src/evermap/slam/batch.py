@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from evermap.align.acceptance import Acceptance, accept_alignment
+from evermap.align.acceptance import SIGMA_M, Acceptance, accept_alignment
 from evermap.align.candidates import Matches, find_consensus
 from evermap.config import LocalizeConfig, SlamConfig
 from evermap.errors import NumericalError
@@ -379,7 +379,8 @@ def lay_over(
     landmark = landmark[: len(prior_map.given)]
     both = prior_map.given & np.isfinite(landmark[:, 0])
     matches = Matches.of(landmark[both], prior_map.mean[both])
-    return accept_alignment(matches, rules, fewest=fewest, spread_m=spread_m)
+    spread = np.linalg.inv(prior_map.information[both]) + SIGMA_M**2 * np.eye(2)
+    return accept_alignment(matches, rules, fewest=fewest, spread_m=spread_m, covariance_m2=spread)
 
 
 def entered(

@@ -94,6 +94,12 @@ class KnownPlaces:
         dim = self.position_m.shape[1]
         return of_places(self.joint_m2, self.joint_row[rows], dim) + LEAST_VARIANCE * np.eye(dim * len(rows))
 
+    def errors_at(self, rows: IntArray) -> FloatArray:
+        """Return (D K, D K) covariance of how far landmarks that stand may lie off places (K,) for a known motion."""
+        dim = self.position_m.shape[1]
+        spread = np.zeros((0, 0)) if not len(rows) else KnownPlaces.joint_of(self, rows)
+        return spread + SIGMA_M**2 * np.eye(dim * len(rows))
+
     def rows_of(self, landmark_id: IntArray) -> tuple[IntArray, IntArray]:
         """Return the first row of (M,) landmarks, and the one after the last; both equal where the map lacks one."""
         return (
@@ -189,7 +195,10 @@ class LocalTrack:
         landmark = places.landmark_id[row]
         belief = np.maximum(places.p_here[row], settings.least_belief)
         matches = Matches.of(local, places.position_m[row], landmark=landmark, weight=belief)
-        found = accept_alignment(matches, settings, fewest=least, spread_m=settings.spread_online_m)
+        spread = places.errors_at(row)
+        found = accept_alignment(
+            matches, settings, fewest=least, spread_m=settings.spread_online_m, covariance_m2=spread
+        )
         if not found:
             return None
         motion, agree = found.motion, found.agree

@@ -13,8 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import block_diag
 
-from evermap.align.acceptance import accept_alignment
+from evermap.align.acceptance import MOST_JOINT, SIGMA_M, accept_alignment
 from evermap.align.candidates import Matches
 from evermap.errors import DataError
 from evermap.estimate.gauss_newton import Steps
@@ -169,8 +170,8 @@ def _placed(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], 
         sighted[mine] = sighted_at(pose[met.observer[mine]], met.reading[mine], estimate.states, problem.mount)
     names = [member.prepared.landmark_id for member in members]
 
-    def ties(a: int, b: int) -> tuple[FloatArray, FloatArray]:
-        """Return the same points in the frames of robots a and b."""
+    def ties(a: int, b: int) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return the same points in the frames of robots a and b, and which landmarks of each they are, -1 for none."""
         _, of_a, of_b = np.intersect1d(names[a], names[b], return_indices=True)
         points = [np.hstack([own[a][1].landmark[of_a], own[b][1].landmark[of_b]])]
         for x, y in ((a, b), (b, a)):
@@ -178,18 +179,24 @@ def _placed(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], 
             some = some[:: 1 + len(some) // MOST_TIES]
             seen = [sighted[some], pose[met.observed[some], :2]]
             points.append(np.hstack(seen if x == a else seen[::-1]))
-        both = np.concatenate(points)
-        both = both[np.isfinite(both).all(axis=1)]
-        return both[:, :2], both[:, 2:]
+        both, row = np.concatenate(points), np.column_stack([of_a, of_b])
+        row = np.pad(row, ((0, len(both) - len(row)), (0, 0)), constant_values=-1)
+        known = np.isfinite(both).all(axis=1)
+        return both[known, :2], both[known, 2:], row[known]
 
     motion, placed = np.zeros((len(own), 3)), {0}
     while len(placed) < len(own):
         best, found, reason = -np.inf, None, "no common landmarks"
         for b in set(range(len(own))) - placed:
-            theirs, mine = zip(*(ties(a, b) for a in placed), strict=True)
+            theirs, mine, row = zip(*(ties(a, b) for a in placed), strict=True)
             there = [se2.transform(motion[a], at) for a, at in zip(placed, theirs, strict=True)]
+            spread = [_errors(members[a], rows[:, 0], motion[a]) for a, rows in zip(placed, row, strict=True)]
+            joint = np.asarray(block_diag(*spread), dtype=np.float64)
             laid = accept_alignment(
-                Matches.of(np.concatenate(mine), np.concatenate(there)), members[0].settings.localize
+                Matches.of(np.concatenate(mine), np.concatenate(there)),
+                members[0].settings.localize,
+                covariance_m2=joint + SIGMA_M**2 * np.eye(len(joint)),
+                source_m2=_errors(members[b], np.concatenate(row)[:, 1], np.zeros(3)),
             )
             if laid and laid.log_odds > best:
                 best, found = laid.log_odds, (b, laid.motion)
@@ -201,6 +208,21 @@ def _placed(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], 
         motion[found[0]] = found[1]
         placed.add(found[0])
     return motion
+
+
+def _errors(member: Solved, row: IntArray, motion: FloatArray) -> FloatArray:
+    """(2 K, 2 K) covariance of landmarks (K,) of a robot that solved alone, in the frame that a motion leads to; zero
+    for those that are -1, and for very many, of which none matters.
+    """
+    name = np.unique(row[row >= 0])
+    spread = np.zeros((len(row), 2, len(row), 2))
+    if 0 < len(name) <= MOST_JOINT:
+        own = member.outcome.graph_marginals.joint(name) * member.outcome.scale**2
+        some, turn = np.flatnonzero(row >= 0), se2.rotation(motion[2])
+        at = np.searchsorted(name, row[some])
+        own = own.reshape(len(name), 2, len(name), 2)[at[:, None], :, at[None]]
+        spread[some[:, None], :, some[None]] = turn @ own @ turn.T
+    return spread.reshape(2 * len(row), 2 * len(row))
 
 
 def _shared(members: Sequence[Solved]) -> list[IntArray]:

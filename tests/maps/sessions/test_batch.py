@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -10,7 +12,7 @@ from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, blocks, of_places
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.gaussian import anchored, own_landmarks
-from evermap.maps.sessions.planar import laid
+from evermap.maps.sessions.planar import laid, localised
 from evermap.pipeline import bring_in, solve_alone
 from evermap.slam.estimate import Solved
 from evermap.types import FloatArray, IntArray
@@ -102,3 +104,20 @@ def test_a_large_map_begins_in_chunks_without_the_joint_covariance_of_all() -> N
     for c in range(len(chunked.parent)):
         mine = np.flatnonzero(chunked.chunk == c)
         np.testing.assert_allclose(chunked.of(mine), of_places(dense, mine), rtol=1e-6, atol=1e-12)
+
+
+def test_a_session_that_fits_a_map_in_two_ways_is_not_entered_and_says_so() -> None:
+    """Half of what the map has stands elsewhere, moved as one: which half is right is less sure than is asked for."""
+    world, usual = building(1, days=2, change_rate=0.0), settings()
+    first, second = (solve_alone(one, LivingMap(clock=one.clock), usual) for one in world.sessions)
+    begun = bring_in(first, LivingMap(clock=world.sessions[0].clock), usual).living
+    position = begun.places.position_m.copy()
+    position[::2] = se2.transform(np.array([30.0, 4.0, 1.0]), position[::2])
+    halved = replace(begun, places=replace(begun.places, position_m=position))
+    overlay = usual.living.overlay.model_copy(update={"lead_nats": 200.0})
+    strict = usual.model_copy(update={"living": usual.living.model_copy(update={"overlay": overlay})})
+    assert localised(second, begun, strict).where is not None
+    assert localised(second, halved, usual).where is not None
+    found = localised(second, halved, strict)
+    assert found.where is None
+    assert found.reason[0].startswith("two places in the map fit about as well")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -234,6 +236,31 @@ def test_a_place_in_which_two_agree_by_chance_is_not_taken_for_this_one() -> Non
     most = world(np.random.default_rng(1), [1] * 12, [1] * 12, [0] * 5 + [ELSEWHERE] * 7, p_site=[0.6] * 12)
     found = laid(most)
     assert np.flatnonzero(found.place >= 0).tolist() == [0, 1, 2, 3, 4]
+
+
+def moved_as_one(count: int, stand: int, seed: int = 0) -> World:
+    """Singles of which all but `stand` were moved by one and the same motion."""
+    one = world(np.random.default_rng(seed), [1] * count, [1] * count, [0] * count)
+    together = se2.transform(np.array([5.0, -3.0, 1.2]), one.sighted.position_m[stand:])
+    seen = np.vstack([one.sighted.position_m[:stand], together])
+    return World(replace(one.sighted, position_m=seen), one.known, one.pose_map_session, one.site)
+
+
+def test_a_layout_that_fits_in_two_ways_is_not_accepted_and_says_so() -> None:
+    even = laid(moved_as_one(8, 4))
+    assert even.reason == "two places in the map fit about as well, with 4 and 4 of 8 landmarks"
+    # one landmark more, or one half that is believed less, and it is clear again
+    more = laid(moved_as_one(9, 5))
+    assert not more.reason
+    assert np.flatnonzero(more.place >= 0).tolist() == [0, 1, 2, 3, 4]
+    believed = moved_as_one(8, 4)
+    p = np.repeat([0.5, 0.95], 4)
+    surer = replace(believed.known, log_p_site=np.log(p), log_p_elsewhere=np.log(1.0 - p))
+    found = lay_over(believed.sighted, surer)
+    assert found is not None
+    assert not found.reason
+    assert np.flatnonzero(found.place >= 0).tolist() == [4, 5, 6, 7]
+    assert not laid(moved_as_one(8, 4), "gate").reason
 
 
 @pytest.mark.parametrize(("p_body", "p_single", "is_found"), [(0.65, 0.98, False), (0.98, 0.65, True)])

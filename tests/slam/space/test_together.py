@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from evermap import Config, run_slam, run_together
+from evermap.config import LocalizeConfig
 from evermap.errors import DataError, InputError
 from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se3
@@ -69,7 +70,7 @@ def test_covariances_are_those_of_a_dense_inverse():
     recordings = [tagged_corridor(seed, n_frames=12, n_tags=6).recording for seed in (1, 1)]
     visits = [solve_visit(one, Config(), None, ()) for one in recordings]
     members = [SolvedRobot(visit.intake, visit.solved) for visit in visits]
-    joint, start = _lay_together(members, align_robots(members, ["a", "b"]))
+    joint, start = _lay_together(members, align_robots(members, ["a", "b"], LocalizeConfig()))
     noise = [member.solved.optimum.noise for member in members]
     solution = joint.minimise(start, noise, most=10)
     system, values = joint.structure.system, solution.now.values
@@ -105,6 +106,12 @@ def test_robots_without_a_common_landmark_are_not_laid_together():
     recordings[2] = replace(recordings[2], detections=replace(seen, landmark_id=seen.landmark_id + 1000))
     with pytest.raises(DataError, match="nothing connects other to hall 3"):
         run_together(recordings)
+
+
+def test_robots_are_laid_together_by_the_rules_of_the_user():
+    strict = Config.model_validate({"slam": {"localize": {"certain_nats": 1e6}}})
+    with pytest.raises(DataError, match=r"nothing connects other to hall 1: .* which may be by chance"):
+        run_together(pair(1), config=strict)
 
 
 def test_robots_in_the_plane_and_in_space_are_refused(tmp_path):

@@ -11,13 +11,13 @@ exact coordinate ascent, one change at a time, from what most landmarks agree on
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg.lapack import dpotri
 
-from evermap.align.acceptance import is_this_place, log_density_of, log_room
-from evermap.align.candidates import AGREE_M, Matches, find_consensus
+from evermap.align.acceptance import TWO_PLACES, is_this_place, log_density_of, log_room
+from evermap.align.candidates import AGREE_M, Matches, are_apart, rank_motions
 from evermap.config import OverlayConfig
 from evermap.geometry import se2
 from evermap.geometry.group import PLANE, SPACE
@@ -97,12 +97,14 @@ class Overlay:
         place: (L,) row of the place of each landmark, `ELSEWHERE` if it is at none.
         probability: (L,) of that, given the assignments of the others.
         drift_m: standard deviation of unmoved landmarks between sessions.
+        reason: why it isn't accepted, empty where it is.
     """
 
     pose_map_session: FloatArray
     place: IntArray
     probability: FloatArray
     drift_m: float
+    reason: str = ""
 
 
 def lay_over(
@@ -124,10 +126,12 @@ def lay_over(
         motion: where the session lies about; None for where most landmarks agree, in the plane.
 
     Returns:
-        None where no two landmarks stand to each other as in the map, or where another place explains all better.
+        None where no two landmarks stand to each other as in the map, or where another place explains all better. The
+        joint search doesn't accept an alignment if another motion is about as probable.
     """
     if len(known.landmark) < 2:
         return None
+    rivals, matches = list[FloatArray](), None
     if motion is None:
         weight = np.exp(known.log_p_site[known.site])
         matches = Matches.of(
@@ -136,25 +140,40 @@ def lay_over(
             landmark=known.landmark,
             weight=np.maximum(weight, 1e-3),
         )
-        motion, agree = find_consensus(matches)
-        if np.count_nonzero(agree) < 2:
+        ranked = rank_motions(matches)
+        if not ranked:
             return None
+        motion, agree = ranked[0]
+        rivals = [
+            other for other, some in ranked[1:] if matches.weight[some].sum() >= 0.5 * matches.weight[agree].sum()
+        ]
     options = _Options(sighted, known, motion, settings)
     if search == "none":
         chosen = options.likeliest_sites()
     elif search == "gate":
         chosen = options.gated(options.agreeing())
     else:
-        chosen = _joint(options)
+        chosen, score = _joint(options)
     if options.n_standing(chosen) < 2:
         return None
     if search == "joint" and not (options.is_this_place(chosen) and options.outweighs_the_rest(chosen)):
         return None
-    return options.concluded(chosen, split=search == "joint")
+    found = options.concluded(chosen, split=search == "joint")
+    if search != "joint" or matches is None:
+        return found
+    for other in (_Options(sighted, known, rival, settings, options) for rival in rivals):
+        assignment, by_other = _joint(other)
+        if other.n_standing(assignment) < 2 or by_other <= score - settings.lead_nats:
+            continue
+        rest = other.concluded(assignment, split=False)
+        if are_apart(rest.pose_map_session[None], found.pose_map_session, matches)[0]:
+            standing, count = (options.n_standing(chosen), other.n_standing(assignment)), len(np.unique(known.landmark))
+            return replace(found, reason=TWO_PLACES.format(*standing, count))
+    return found
 
 
-def _joint(options: _Options) -> IntArray:
-    """The most probable assignment, and with it how well sessions agree at all."""
+def _joint(options: _Options) -> tuple[IntArray, float]:
+    """The most probable assignment, and with it how well sessions agree at all; and its log probability."""
     settings = options.settings
     best, highest, drift_m = options.agreeing(), -math.inf, settings.drifts_m[0]
     more = settings.drifts_in_space_m if options.dim == SPACE.point_dim else ()
@@ -169,7 +188,7 @@ def _joint(options: _Options) -> IntArray:
         if score > highest:  # the next may still be better: with more drift other bodies stay
             best, highest, drift_m = chosen, score, options.drift_m
     options.drift_m = drift_m
-    return best
+    return best, highest
 
 
 class _Field:
@@ -237,9 +256,11 @@ def _log_density(off: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 class _Options:
-    """Cliques with their options, linearised at one motion."""
+    """Cliques with their options, linearised at one motion; to be compared with others in the same room."""
 
-    def __init__(self, sighted: Sighted, known: Known, motion: FloatArray, settings: OverlayConfig) -> None:
+    def __init__(
+        self, sighted: Sighted, known: Known, motion: FloatArray, settings: OverlayConfig, like: _Options | None = None
+    ) -> None:
         self.n_places, self.n_sites = len(known.site), len(known.log_p_site)
         known = known.with_turned(sighted.clique, settings)
         self.settings = settings
@@ -256,7 +277,8 @@ class _Options:
         self._freedom = directions * free
         self._turned_m2 = np.where(np.arange(len(known.site)) < self.n_places, 0.0, settings.turned_m**2)
         self.drift_m = settings.drifts_m[0]
-        self._log_room = log_room(self.landmark_m, known.position_m, settings)
+        room = log_room(self.landmark_m, known.position_m, settings)
+        self._log_room: float = room if like is None else like._log_room
         self._log_site = known.log_p_site + np.bincount(known.site, known.log_turned, len(known.log_p_site))
         self.sites: list[list[int]] = [[] for _ in known.log_p_elsewhere]
         order = np.argsort(known.site, kind="stable")

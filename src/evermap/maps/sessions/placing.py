@@ -57,6 +57,7 @@ class Laid:
         probability: (K,) of that.
         drift_m: standard deviation of unmoved landmarks between sessions.
         assumed: (K,) those that seem to have moved and are taken to stand, since the session seems bent; see `unbent`.
+        reason: why the alignment isn't accepted, empty where it is.
     """
 
     landmark_id: IntArray
@@ -65,6 +66,7 @@ class Laid:
     probability: FloatArray
     drift_m: float
     assumed: BoolArray
+    reason: str = ""
 
 
 def places_in(where: Laid | None, landmark_id: IntArray) -> tuple[IntArray, FloatArray]:
@@ -187,7 +189,7 @@ def laid_over(
     probability = np.ones(len(landmark_id))
     probability[seen] = found.probability
     assumed = np.zeros(len(place), dtype=np.bool_)
-    return Laid(landmark_id, found.pose_map_session, place, probability, found.drift_m, assumed)
+    return Laid(landmark_id, found.pose_map_session, place, probability, found.drift_m, assumed, found.reason)
 
 
 def unbent(

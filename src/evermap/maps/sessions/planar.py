@@ -144,6 +144,8 @@ def localised(alone: Solved, living: LivingMap, config: Config, *, cut: bool = T
     where = where if large else laid(part, p_site, alone, own, settings)
     if where is None and len(part.places):
         return lost(placing.NOT_FOUND)
+    if where is not None and where.reason:
+        return lost((where.reason, placing.ANYWAY))
     if where is not None:
         in_part = vicinity is not None
         part, where, visit = refit(part, p_site, where, alone, own, settings, robust=config.slam.robust, part=in_part)
@@ -171,6 +173,8 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Solved, own: OwnLandmarks
     where = placing.laid_over(living, p_site, names, own.position_m, gaussian.of_unknown_size(own, log_sigma), config)
     if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
         return None
+    if where.reason:
+        return where
     if config.search == "joint":
         together = _seen_together(alone, own.row, config.fit.inlier)
         where = placing.unbent(living, p_site, where, own.position_m, together, config.fit)
@@ -201,8 +205,8 @@ def near_session(
     named = cliques_of(living, alone.prepared.landmark_id[own.row])
     seen = Vicinity.of(living, named, config)
     where = laid(seen.part, believe.aged(seen.part, config, alone.start_s).p_here, alone, own, config)
-    if where is None:
-        return seen, None
+    if where is None or where.reason:
+        return seen, where
     path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
     return placing.widened(living, seen.part, named, where, path, alone.recording.sensor, config)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from evermap.config import Config, LivingConfig
+from evermap.config import Config, LivingConfig, LocalizeConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.maps.living import EXISTS, Dated, LivingMap
@@ -295,14 +295,14 @@ def solve_visit(
     return SpatialVisit(recording, intake, solve_space(intake, prior_map, progress=progress))
 
 
-def solve_visits_together(visits: Sequence[SpatialVisit]) -> list[SpatialVisit]:
+def solve_visits_together(visits: Sequence[SpatialVisit], rules: LocalizeConfig) -> list[SpatialVisit]:
     """Return robots that were solved alone solved as one problem: `slam.space.together`.
 
     Raises:
         DataError: nothing ties one of them to the others.
     """
     members = [SolvedRobot(visit.intake, visit.solved) for visit in visits]
-    solved = solve_space_together(members, [visit.recording.name for visit in visits])
+    solved = solve_space_together(members, [visit.recording.name for visit in visits], rules)
     return [replace(visit, solved=own) for visit, own in zip(visits, solved, strict=True)]
 
 

@@ -132,7 +132,7 @@ class SpatialTrack:
         self._tried = (stamp_s, names)
         alone = not self._driven or stamp_s - self._began_s >= settings.alone_s
         matches, row = self._candidates(places)
-        found = accept_alignment(matches, settings)
+        found = accept_alignment(matches, settings, covariance_m2=places.errors_at(row))
         some = np.flatnonzero(found.agree)
         turned = matches.oriented[some]
         numbers = int(np.where(turned, OF_TAG, OF_POINT).sum())

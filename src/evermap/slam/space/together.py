@@ -13,8 +13,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from evermap.align.acceptance import Acceptance, accept_alignment
+from evermap.align.acceptance import MOST_JOINT, SIGMA_M, Acceptance, accept_alignment
 from evermap.align.candidates import Matches
 from evermap.config import LocalizeConfig
 from evermap.errors import DataError
@@ -22,7 +23,8 @@ from evermap.estimate.gauss_newton import Minimum, Steps, minimised
 from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, SharedBlock, build_structure, grouped
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
-from evermap.geometry import se3
+from evermap.geometry import se2, se3
+from evermap.slam.space.against_map import by_itself
 from evermap.slam.space.estimate import CONVERGED, ROUNDS, SpatialOptimum, refined
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.linearise import STATES
@@ -41,8 +43,6 @@ from evermap.slam.space.smoother import (
 )
 from evermap.slam.space.solve import FREE, SpatialSolved
 from evermap.types import BoolArray, FloatArray, IntArray
-
-USUAL = LocalizeConfig()
 
 
 class JointEstimate(NamedTuple):
@@ -74,18 +74,21 @@ class SolvedRobot:
         return np.where(self.solved.number == 1, self.intake.landmark_id[self.solved.identity], -1)
 
 
-def solve_space_together(members: Sequence[SolvedRobot], names: Sequence[str]) -> list[SpatialSolved]:
+def solve_space_together(
+    members: Sequence[SolvedRobot], names: Sequence[str], rules: LocalizeConfig
+) -> list[SpatialSolved]:
     """Return robots solved together, in the frame of the first one's first pose.
 
     Args:
         members: each by itself.
         names: what they are called in messages.
+        rules: when the frame of one is known in those of others.
 
     Raises:
         DataError: nothing ties one of them to the others.
         NumericalError: no finite optimum.
     """
-    motion = align_robots(members, names)
+    motion = align_robots(members, names, rules)
     joint, start = _lay_together(members, motion)
     noise = [member.solved.optimum.noise for member in members]
     begun = list(noise)
@@ -108,20 +111,22 @@ def solve_space_together(members: Sequence[SolvedRobot], names: Sequence[str]) -
     return found
 
 
-def align_robots(members: Sequence[SolvedRobot], names: Sequence[str], rules: LocalizeConfig = USUAL) -> FloatArray:
+def align_robots(members: Sequence[SolvedRobot], names: Sequence[str], rules: LocalizeConfig) -> FloatArray:
     """Return the motions (R, 7) of each robot's frame into that of the first, by landmarks that agree.
 
     Raises:
         DataError: nothing ties one of them to the others.
     """
-    motion, placed = se3.identity(len(members)), [0]
+    motion, placed, alone = se3.identity(len(members)), [0], [_errors(member) for member in members]
     while len(placed) < len(members):
         best, found, reason = -np.inf, None, "no common landmarks"
         for b in (b for b in range(len(members)) if b not in placed):
             place = [se3.compose(motion[a], members[a].solved.optimum.estimate.place) for a in placed]
             theirs, oriented = np.concatenate(place), np.concatenate([members[a].problem.oriented for a in placed])
             name = np.concatenate([members[a].identity for a in placed])
-            laid = _align(members[b], name, theirs, oriented, rules)
+            turn = [se3.rotation_of(motion[a]) for a in placed]
+            spread = [_turned(alone[a], by) for a, by in zip(placed, turn, strict=True)]
+            laid = _align(members[b], alone[b], name, theirs, oriented, spread, rules)
             if laid and laid.log_odds > best:
                 best, found = laid.log_odds, (b, laid.motion)
             reason = laid.reason if len(laid.agree) else reason
@@ -134,8 +139,28 @@ def align_robots(members: Sequence[SolvedRobot], names: Sequence[str], rules: Lo
     return motion
 
 
+def _errors(member: SolvedRobot) -> FloatArray:
+    """(3 P, 3 P) covariance of the places of a robot that was solved alone; of very many none matters."""
+    count = len(member.solved.optimum.estimate.place)
+    if count > MOST_JOINT:
+        return np.zeros((3 * count, 3 * count))
+    return by_itself(member.solved.optimum).covariance_m2
+
+
+def _turned(covariance_m2: FloatArray, turn: FloatArray) -> FloatArray:
+    """(3 P, 3 P) covariance in axes that are turned."""
+    every = covariance_m2.reshape(len(covariance_m2) // 3, 3, -1, 3)
+    return np.asarray(np.einsum("ab,ibjc,dc->iajd", turn, every, turn, optimize=True).reshape(covariance_m2.shape))
+
+
 def _align(
-    member: SolvedRobot, name: IntArray, theirs: FloatArray, oriented: BoolArray, rules: LocalizeConfig
+    member: SolvedRobot,
+    alone_m2: FloatArray,
+    name: IntArray,
+    theirs: FloatArray,
+    oriented: BoolArray,
+    spread_m2: list[FloatArray],
+    rules: LocalizeConfig,
 ) -> Acceptance:
     """The motion of a robot's frame that brings most of its places to those of others, if it is accepted."""
     own_name, own = member.identity, member.solved.optimum.estimate.place
@@ -143,7 +168,10 @@ def _align(
     mine, there = own[row].copy(), theirs[other].copy()
     mine[~member.problem.oriented[row], 3:] = np.nan
     there[~oriented[other], 3:] = np.nan
-    return accept_alignment(Matches.of(mine, there, landmark=row), rules)
+    at, to, joint = se2.xy_rows(row, 3), se2.xy_rows(other, 3), np.asarray(block_diag(*spread_m2), dtype=np.float64)
+    known = joint[np.ix_(to, to)] + SIGMA_M**2 * np.eye(len(to))
+    matches, own = Matches.of(mine, there, landmark=row), alone_m2[np.ix_(at, at)]
+    return accept_alignment(matches, rules, covariance_m2=known, source_m2=own)
 
 
 def _lay_together(members: Sequence[SolvedRobot], motion: FloatArray) -> tuple[SpatialTogether, JointEstimate]:
