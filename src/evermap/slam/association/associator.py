@@ -99,8 +99,9 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
     """Number of powers of `slam.association.slip` that are tried as the factor on the odometry noise: bounds the
     work."""
 
-    is_exact: ClassVar[bool]
-    """Whether the search ends where a comparison with the whole map changes nothing at all; else nearly nothing."""
+    has_own_noise: ClassVar[bool]
+    """Whether a solution has the noise of its own residuals, not of the one before: then the same detections of the
+    same landmarks have the same solution."""
 
     def __init__(
         self,
@@ -188,13 +189,15 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         for left in reversed(range(LAST_ROUNDS)):
             before = solved
             again = self._reassigned(before)
-            if self.is_exact and np.array_equal(again.landmark_row, before.landmark_row):
+            if self.has_own_noise and np.array_equal(again.landmark_row, before.landmark_row):
                 break
             solved = self._corrected(self._merged(self._learned(again)), refused)
-            total, last = self._total(solved), total
-            hopeless = total - left * (last - total) > goal
-            if hopeless or (not self.is_exact and _are_same(before, again, solved)):
+            if _are_same(before, again, solved):
                 break
+            if goal < math.inf:
+                total, last = self._total(solved), total
+                if total - left * (last - total) > goal:  # hopeless
+                    break
         return self._result(solved)
 
     def against(self, found: FoundT) -> float:

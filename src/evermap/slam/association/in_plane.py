@@ -125,7 +125,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalF
     """
 
     slips = 1
-    is_exact = False
+    has_own_noise = False
 
     def __init__(
         self,

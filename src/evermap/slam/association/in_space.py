@@ -227,7 +227,7 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
     """
 
     slips = SLIPS
-    is_exact = True
+    has_own_noise = True
 
     def __init__(
         self,
