@@ -28,6 +28,8 @@ from evermap.slam.association.merging import Solution, accepted_rise, merge_whil
 from evermap.slam.association.revise import LAST_ROUNDS
 from evermap.types import BoolArray, FloatArray, IntArray
 
+SLIPS = 3
+"""Number of powers of `slam.association.slip` that are tried as the factor on the odometry noise: bounds the work."""
 SAME_SHARE = 0.002
 """Share of detections that change their landmark in the last comparison with the whole map: a tolerance."""
 
@@ -95,10 +97,6 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         settings: of the estimator.
     """
 
-    slips: ClassVar[int]
-    """Number of powers of `slam.association.slip` that are tried as the factor on the odometry noise: bounds the
-    work."""
-
     has_own_noise: ClassVar[bool]
     """Whether a solution has the noise of its own residuals, not of the one before: then the same detections of the
     same landmarks have the same solution."""
@@ -140,7 +138,7 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         if len(match.certain):
             return match
         # did the wheels slip, or stamps jitter in a turn?
-        for times in range(1, self.slips + 1):
+        for times in range(1, SLIPS + 1):
             slipped = self._driven(before, self._rules.slip**times)
             other = self._match(slipped, view)
             if len(other.certain) and other.evidence >= match.evidence + times * self._rules.slip_nats:

@@ -124,7 +124,6 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalF
         settings: of the estimator.
     """
 
-    slips = 1
     has_own_noise = False
 
     def __init__(

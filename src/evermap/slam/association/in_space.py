@@ -54,8 +54,6 @@ from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialPro
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
 
-SLIPS = 3
-"""Number of powers of `slam.association.slip` that are tried as the factor on the odometry noise: bounds the work."""
 FAR_M = 1e3
 """Standard deviation of the position of a landmark before its first detection: uninformative."""
 ROUNDS = 2
@@ -226,7 +224,6 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         known: a solution of the same recording, to begin with its noise and its density.
     """
 
-    slips = SLIPS
     has_own_noise = True
 
     def __init__(
