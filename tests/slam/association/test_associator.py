@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from dataclasses import replace
 from typing import Any
@@ -18,11 +19,13 @@ from evermap.config import Config, SlamConfig
 from evermap.geometry import se2
 from evermap.maps.sessions.nameless import numbered_in
 from evermap.slam import linearise, preintegration
-from evermap.slam.association import with_identities
+from evermap.slam.association import in_plane, in_space, with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment
-from evermap.slam.association.associator import Associator, compared, correlated, fit_sighting_noise
+from evermap.slam.association.associator import Associator
 from evermap.slam.association.features import Traits
 from evermap.slam.association.identify import _by_names
+from evermap.slam.association.in_plane import PlanarAssociator, compared, correlated, fit_sighting_noise
+from evermap.slam.association.in_space import SpatialAssociator
 from evermap.slam.association.merging import propose_merges
 from evermap.slam.association.particles import drawn
 from evermap.slam.association.revise import (
@@ -34,7 +37,6 @@ from evermap.slam.association.revise import (
     with_overlooked,
 )
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.local_filter import Motion
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, Landmarks
@@ -50,7 +52,7 @@ def world(seed: int, **settings: float) -> World:
 
 def associated(world: World) -> Assignment:
     hidden = replace(world.problem, landmark_row=np.full_like(world.problem.landmark_row, -99))
-    associator = Associator(hidden, world.noise)
+    associator = PlanarAssociator(hidden, world.noise)
     for _ in hidden.stamp_s:
         associator.step()
     return associator.finish()
@@ -69,7 +71,9 @@ def test_a_small_world_is_sorted_out(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_of_the_odometry_is_learned_from_far_too_much(seed: int) -> None:
     made = make_world(seed, n_poses=400, n_landmarks=8, prior=KNOWN_SENSORS)
-    associator = Associator(made.problem, replace(made.noise, odometry=4.0 * made.noise.odometry, pseudo_count=1.0))
+    associator = PlanarAssociator(
+        made.problem, replace(made.noise, odometry=4.0 * made.noise.odometry, pseudo_count=1.0)
+    )
     for _ in made.problem.stamp_s:
         associator.step()
     learned = associator.learned_odometry(associator.finish())
@@ -83,7 +87,7 @@ def test_noise_of_the_odometry_is_learned_from_far_too_much(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_true_association_explains_most(seed: int) -> None:
     made = world(seed)
-    associator = Associator(made.problem, made.noise)
+    associator = PlanarAssociator(made.problem, made.noise)
     for _ in made.problem.stamp_s:
         associator.step()
     found, rng = associator.finish(), np.random.default_rng(seed)
@@ -103,7 +107,7 @@ def test_the_true_association_explains_most(seed: int) -> None:
 def test_one_landmark_that_is_five_becomes_one_again() -> None:
     """Any two of the five pairs that say so follow from others: none of them is a rival to the rest."""
     made = world(0)
-    associator = Associator(made.problem, made.noise)
+    associator = PlanarAssociator(made.problem, made.noise)
     for _ in made.problem.stamp_s:
         associator.step()
     found = associator.finish()
@@ -148,9 +152,27 @@ def test_how_the_work_is_cut_changes_no_bit(seed: int, monkeypatch: pytest.Monke
     np.testing.assert_array_equal(poses[0], poses[1])
 
 
-def driven(world: World, settings: SlamConfig = NAMELESS) -> Associator:
+def test_plane_and_space_share_all_but_what_depends_on_the_group() -> None:
+    """One loop of each kind: both define the abstract methods, and nothing else of the same name."""
+    left = {"_solved"}  # two optima, with different arguments
+    planar, spatial = (
+        {name for name, value in vars(one).items() if inspect.isfunction(value) and not name.startswith("__")}
+        for one in (PlanarAssociator, SpatialAssociator)
+    )
+    assert planar & spatial == set(Associator.__abstractmethods__) | left
+    shared = {name for name, value in vars(Associator).items() if inspect.isfunction(value)}
+    assert {"finish", "against", "_after_driving", "_match", "_use", "_merged"} <= shared - planar - spatial
+    assert "step" not in spatial
+    modules = [
+        {name for name, value in vars(one).items() if getattr(value, "__module__", "") == one.__name__}
+        for one in (in_plane, in_space)
+    ]
+    assert modules[0] & modules[1] == set()
+
+
+def driven(world: World, settings: SlamConfig = NAMELESS) -> PlanarAssociator:
     hidden = replace(world.problem, landmark_row=np.full_like(world.problem.landmark_row, -99))
-    associator = Associator(hidden, world.noise, settings=settings)
+    associator = PlanarAssociator(hidden, world.noise, settings=settings)
     for _ in hidden.stamp_s:
         associator.step()
     return associator
@@ -175,11 +197,11 @@ def test_rejected_trials_change_nothing(seed: int, monkeypatch: pytest.MonkeyPat
 
     with monkeypatch.context() as no:
         no.setattr("evermap.slam.association.associator.accepted_rise", rejected)
-        no.setattr("evermap.slam.association.associator._is_better", lambda *_: rejected() > 0.0)
-        assert associator._all_merged(solved) is solved
+        no.setattr("evermap.slam.association.in_plane._is_better", lambda *_: rejected() > 0.0)
+        assert associator._merged(solved) is solved
         assert len(trials) > 1
         count = len(trials)
-        assert associator._contradictions_split(twisted, set()) is twisted
+        assert associator._corrected(twisted, set()) is twisted
         assert len(trials) > count
     assert (bits(solved), bits(twisted)) == (value, other)
     associator.finish(broken)
@@ -193,16 +215,19 @@ def test_wheels_that_did_not_slip_leave_the_filter_as_it_was(monkeypatch: pytest
     """A frame that no landmark matches is asked whether the wheels slipped: a trial in a filter of its own."""
     made = world(1, p_seen=0.3, p_outlier=0.3)
     rules = NAMELESS.association.model_copy(update={"slip_nats": math.inf})
-    asked = driven(made, NAMELESS.model_copy(update={"association": rules}))
+    tried, drive = set[float](), PlanarAssociator._driven
+    with monkeypatch.context() as watched:
+        watched.setattr(
+            PlanarAssociator, "_driven", lambda self, near, times: tried.add(times) or drive(self, near, times)
+        )
+        asked = driven(made, NAMELESS.model_copy(update={"association": rules}))
+    assert tried == {1.0, 3.0, 9.0, 27.0}  # a jump may be far beyond the noise
 
-    def never(self: Associator, row: int, detections: np.ndarray) -> Any:
-        local = self._filter
-        motion = Motion.between(self._problem, self.noise, row, local.states)
-        self._have_near(se2.compose(local.pose, motion.increment))
-        local.drive(motion)
-        return self._match(local, detections)
+    def never(self: PlanarAssociator, view: np.ndarray) -> Any:
+        self._near = self._driven(self._near, 1.0)
+        return self._match(self._near, view)
 
-    monkeypatch.setattr(Associator, "_after_driving", never)
+    monkeypatch.setattr(PlanarAssociator, "_after_driving", never)
     without = driven(made, NAMELESS.model_copy(update={"association": rules}))
     assert bits(asked) == bits(without)
 
@@ -401,7 +426,7 @@ def test_landmarks_of_two_classes_are_two_wherever_they_are() -> None:
     true, pose = made.problem.landmark_row, made.problem.pose_row
     kind = (true == 3) & (pose % 2 == 1)  # as of two at one place
     labels = np.column_stack([kind.astype(np.int64), np.full(len(kind), UNKNOWN)])
-    associator = Associator(replace(made.problem, landmark_row=np.zeros_like(true)), made.noise, labels)
+    associator = PlanarAssociator(replace(made.problem, landmark_row=np.zeros_like(true)), made.noise, labels)
     for _ in made.problem.stamp_s:
         associator.step()
     row = associator.finish().landmark_row

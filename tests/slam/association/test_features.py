@@ -14,8 +14,8 @@ from scipy.stats import multivariate_normal, norm
 from evermap.config import Config, SlamConfig
 from evermap.slam.association import with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment
-from evermap.slam.association.associator import Associator
 from evermap.slam.association.features import Likeness, Traits, Variances, learned, medians
+from evermap.slam.association.in_plane import PlanarAssociator
 from evermap.slam.association.particles import drawn as drawn_anew
 from evermap.slam.association.wrong_associations import traits_against_others
 from evermap.slam.calibration import CalibrationPrior
@@ -167,7 +167,7 @@ def radii(rng: np.random.Generator, row: np.ndarray) -> Traits:
 def test_misread_radii_split_nothing(seed: int) -> None:
     made = make_world(seed, n_poses=60, n_landmarks=8, prior=CalibrationPrior.from_settings(calibrated=False))
     true = made.problem.landmark_row
-    associator = Associator(made.problem, made.noise, traits=radii(np.random.default_rng(seed), true))
+    associator = PlanarAssociator(made.problem, made.noise, traits=radii(np.random.default_rng(seed), true))
     for _ in made.problem.stamp_s:
         associator.step()
     found = associator.finish()

@@ -13,9 +13,9 @@ from scipy.stats import multivariate_normal
 from evermap.config import Config
 from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
-from evermap.slam.association.associator import Associator
 from evermap.slam.association.features import Traits
 from evermap.slam.association.identify import searched
+from evermap.slam.association.in_plane import PlanarAssociator
 from evermap.slam.association.particles import drawn
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.linearise import detection_residuals
@@ -27,10 +27,10 @@ def world(seed: int) -> World:
     return make_world(seed, n_poses=60, n_landmarks=8, prior=KNOWN_SENSORS)
 
 
-def finished(seed: int) -> tuple[Associator, Assignment]:
+def finished(seed: int) -> tuple[PlanarAssociator, Assignment]:
     made = world(seed)
     hidden = replace(made.problem, landmark_row=np.full_like(made.problem.landmark_row, -99))
-    associator = Associator(hidden, made.noise)
+    associator = PlanarAssociator(hidden, made.noise)
     for _ in hidden.stamp_s:
         associator.step()
     return associator, associator.finish()

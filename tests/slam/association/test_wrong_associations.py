@@ -12,8 +12,8 @@ from evermap.config import Config
 from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
-from evermap.slam.association.associator import BEFORE
 from evermap.slam.association.features import Traits
+from evermap.slam.association.in_plane import BEFORE
 from evermap.slam.association.wrong_associations import Visits, displaced_stretches, laid, weighed_visits
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare

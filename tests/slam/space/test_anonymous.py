@@ -18,7 +18,7 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.nameless import numbered_in
 from evermap.maps.sessions.session import Session
 from evermap.slam.association import with_identities
-from evermap.slam.association.in_space import SpatialAssociator
+from evermap.slam.association.in_space import SpatialAssignment, SpatialAssociator
 from evermap.slam.space.intake import prepare_space
 from evermap.types import UNKNOWN, ChangeKind, Landmarks, SpatialRecording, rows_of
 
@@ -93,10 +93,13 @@ def test_rejected_trials_in_space_change_nothing(monkeypatch):
     intake = prepare_space(recording, NAMELESS.slam.space)
     none = np.full((len(intake.used), 2), UNKNOWN)
     associator = SpatialAssociator(intake, none, NAMELESS.slam)
+    for _ in associator.stamp_s:
+        associator.step()
     found = associator.finish()
     late = associator._problem.pose_row > np.median(associator._problem.pose_row)
-    twice = np.where(late & (found.row == 2), found.row.max() + 1, found.row)
-    solved, trials = associator._solved(twice, found.estimate.pose, found.noise), list[int]()
+    twice = np.where(late & (found.landmark_row == 2), found.landmark_row.max() + 1, found.landmark_row)
+    start = SpatialAssignment(twice, found.estimate.pose, found.noise, found.traits)
+    solved, trials = associator._solved(start), list[int]()
     before, value = bits(associator), bits(solved)
 
     def rejected(*_: object) -> float:
@@ -104,11 +107,11 @@ def test_rejected_trials_in_space_change_nothing(monkeypatch):
         return -math.inf
 
     with monkeypatch.context() as no:
-        no.setattr("evermap.slam.association.in_space.accepted_rise", rejected)
+        no.setattr("evermap.slam.association.associator.accepted_rise", rejected)
         assert associator._merged(solved) is solved
     assert trials
     assert len(associator._merged(solved).estimate.place) == len(found.estimate.place)
-    associator.against(solved, None, found)
+    associator.against(solved)
     associator.finish(solved)
     associator.finish()
     assert (bits(associator), bits(solved)) == (before, value)

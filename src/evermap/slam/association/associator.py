@@ -1,408 +1,229 @@
-"""Association frame by frame, and detection of duplicate landmarks at intervals.
+"""One associator, in the plane and in space.
 
-A detection is assigned to a landmark only if no other explanation is nearly as probable; otherwise it starts its own
-landmark, which can be merged later, after a batch solution (`merging`). No decision is final: at the end every
-detection is compared again with the whole map (`revise`).
+Frame by frame, a detection is assigned to a landmark only if no other explanation is nearly as probable; otherwise it
+starts its own landmark, which can be merged later, after a solution of everything (`merging`). No decision is final: at
+the end every detection is compared again with the whole map (`revise`), and duplicates are merged once more.
+
+What depends on the group are the abstract methods, in `in_plane` and `in_space`: how landmarks are predicted, which
+detections pass their gates, how an assignment is solved, and how far its landmarks differ. A solution is a value: a
+trial, until something goes on from it.
 """
 
 from __future__ import annotations
 
 import copy
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
-from evermap.config import AssociationConfig, SlamConfig
-from evermap.estimate.sparse.system import exhausted
-from evermap.geometry import se2
-from evermap.slam.association.assignment import (
-    NOBODY,
-    Assignment,
-    alike,
-    density_of_unmet,
-    landmark_density,
-    same_name,
-    seen_together,
-)
-from evermap.slam.association.constellation import LoosePart, agreed_pairs, overlays
-from evermap.slam.association.features import Traits
-from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
-from evermap.slam.association.merging import (
-    Differences,
-    Solution,
-    accepted_rise,
-    merge_while_any,
-    propose_merges,
-    tried_by_halves,
-)
-from evermap.slam.association.revise import LAST_ROUNDS, likely_real, reassigned, unseen_nats, with_overlooked
-from evermap.slam.association.wrong_associations import displaced_stretches, laid, weighed_visits
-from evermap.slam.batch import USUAL, sighted_at
-from evermap.slam.filter_kernels import BY_PLACE, GATED, WIDTH, spread_of_frame
-from evermap.slam.linearise import detection_residuals
-from evermap.slam.local_filter import LocalFilter, Motion
-from evermap.slam.nearby_places import NO_PLACES
-from evermap.slam.noise import Extrapolation, refine_noise
-from evermap.slam.problem import Estimate, Marginals, Noise, Problem
-from evermap.slam.smoother import Smoother
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+from evermap.config import SlamConfig
+from evermap.slam.association.assignment import NOBODY, same_name, visits_of
+from evermap.slam.association.features import Traits, best_with_traits, learned
+from evermap.slam.association.jcbb import Pairings, pairing_probability
+from evermap.slam.association.merging import Solution, accepted_rise, merge_while_any, propose_merges
+from evermap.slam.association.revise import LAST_ROUNDS
+from evermap.types import BoolArray, FloatArray, IntArray
 
-FIRST_BATCH, BATCH_SHARE = 40, 0.05
-"""Poses before the first batch solution; then as many, or this share of all, before the next: bounds the work."""
-RECENT = 48
-"""Number of landmarks, those seen last, whose duplicates are searched at a batch solution: bounds the work."""
-MOST_COMPARED = 96
-"""Number of nearest landmarks that a frame is compared with: bounds the work."""
-REALIGNED, STRETCHES = 8, 2
-"""Maximum number of realigned stretches, also of ways to align a loose part, and of those that are tried each time, the
-longest first: bound the work."""
-BEFORE = (8.0, 2.0, 0.0)
-"""Grid of the time before a stretch in which revisits may be wrong, relative to its length; tried in this order."""
-SPLIT_ROUNDS = 5
-"""Maximum number of rounds of splitting."""
-NOISE_ROUNDS = 6
-"""Rounds of learning the odometry noise; extrapolated, they converge within these."""
-SAME_NATS = 0.5
-"""Least fall of the cost for as many landmarks: the tolerance of the optimum."""
+SLIPS = 3
+"""Number of powers of `slam.association.slip` that are tried as the factor on the odometry noise: bounds the work."""
 SAME_SHARE = 0.002
-"""Share of detections that change their landmark in the last of these: a tolerance."""
+"""Share of detections that change their landmark in the last comparison with the whole map: a tolerance."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Solved:
-    """An assignment at its optimum, with covariances, cost and smoother: a trial, until something goes on from it.
-
-    Attributes:
-        sigma: (M, 2) standard deviations of all detections of the recording, learned from its residuals: those of the
-            solution that follows, if this one is accepted.
-    """
-
-    assignment: Assignment
-    marginals: Marginals
-    cost: float
-    smoother: Smoother
-    sigma: FloatArray
+class AnyAssignment(Protocol):
+    """Detections, each of at most one landmark."""
 
     @property
-    def density_m2(self) -> float:
-        """Density of the landmarks [1/m^2]."""
-        now = self.assignment
-        return landmark_density(now.estimate.landmark, now.sightings, now.settings)
+    def landmark_row(self) -> IntArray:
+        """(M,) landmark of each, `NOBODY` for none."""
+
+    @property
+    def traits(self) -> Traits:
+        """Readings of the landmarks themselves."""
+
+    @property
+    def n_landmarks(self) -> int:
+        """Number of landmarks."""
+
+
+class AnySolution(AnyAssignment, Protocol):
+    """The same at their optimum."""
+
+    @property
+    def cost(self) -> float:
+        """Cost of the optimum [nats], with the evidence of traits."""
+
+    @property
+    def sightings(self) -> IntArray:
+        """(L,) number of detections of each landmark."""
+
+    @property
+    def numbers(self) -> IntArray:
+        """(L,) numbers that each landmark has: of a point as many as coordinates, of a pose six."""
+
+
+AssignmentT = TypeVar("AssignmentT", bound=AnyAssignment)
+FoundT = TypeVar("FoundT", bound=AnyAssignment)
+SolvedT = TypeVar("SolvedT", bound=AnySolution)
+NearT = TypeVar("NearT")
 
 
 @dataclass(frozen=True, slots=True)
-class _Frame:
-    """A frame compared with the map: rows of `pairings` that are certain, p (n,) of each detection to be new, and the
-    evidence over only new landmarks [nats].
+class FrameMatch:
+    """Detections compared with the map: rows of `pairings` that are certain, p (n,) of each detection to be new, and
+    the evidence over only new landmarks [nats].
     """
 
     pairings: Pairings
-    taken: IntArray
+    certain: IntArray
     p_new: FloatArray
     evidence: float
 
 
-class Associator:
+class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
     """Feed frames in order with `step`, then `finish`.
 
     Args:
-        problem: the measurements; its `landmark_row` is ignored.
-        noise: initial noise levels.
-        kind: (M, 2) class and name of every detection, `UNKNOWN` for none; None if there are none.
-        odometry: (5,) noise levels of the odometry, if known; None for a multiple of those of `noise`
-            (`slam.association.odometry_caution`).
+        stamp_s: (N,) of frames.
+        pose_row: (M,) frame of every detection.
+        kind: (M, 2) class and name of every detection, `UNKNOWN` for none: different ones exclude each other.
+        near: landmarks near the robot before the first frame.
+        density: of unmapped landmarks.
         traits: readings of the landmarks themselves; None if they give no evidence.
         settings: of the estimator.
     """
 
+    has_own_noise: ClassVar[bool]
+    """Whether a solution has the noise of its own residuals, not of the one before: then the same detections of the
+    same landmarks have the same solution."""
+
     def __init__(
         self,
-        problem: Problem,
-        noise: Noise,
-        kind: IntArray | None = None,
-        odometry: FloatArray | None = None,
-        traits: Traits | None = None,
-        settings: SlamConfig = USUAL,
+        stamp_s: FloatArray,
+        pose_row: IntArray,
+        kind: IntArray,
+        near: NearT,
+        density: float,
+        traits: Traits | None,
+        settings: SlamConfig,
     ) -> None:
-        self._problem, self._settings = problem, settings
-        rules = self._rules = settings.association
-        self._kind = np.full((len(problem.pose_row), 2), UNKNOWN) if kind is None else kind
-        self._of_kind: IntArray = np.zeros((0, 2), dtype=np.int64)
-        self._traits = Traits.none(len(problem.pose_row), settings) if traits is None else traits
-        self._like = self._traits.nothing(0)
-        self._seen_s = np.zeros(0)
-        self._start_noise = noise
-        if odometry is None:
-            odometry = rules.odometry_caution * noise.odometry
-        self.noise = replace(noise, odometry=odometry)
-        """Noise levels of all solutions; detections have their own."""
-        self._slipping = replace(noise, odometry=rules.slip * self.noise.odometry)
-        self._first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
-        self._pose = np.zeros((len(problem.stamp_s), 3))
-        self._row: IntArray = np.full(len(problem.pose_row), NOBODY, dtype=np.int64)
-        self._sigma = rules.noise_caution * noise.of_detections(problem.sigma_given)
-        self._filter = LocalFilter(problem.mount, problem.prior, most=MOST_COMPARED)
+        self._kind, self._settings, self._rules = kind, settings, settings.association
+        self._traits = Traits.none(len(pose_row), settings) if traits is None else traits
+        self.stamp_s, self._detected_s = stamp_s, stamp_s[pose_row]
+        self._first = np.searchsorted(pose_row, np.arange(len(stamp_s) + 1))
+        self._near, self._density = near, density
         self._done, self._doubted = 0, 0
-        self.worth = 1.0
-        """Detections whose residuals count as one; learned by the first `finish`."""
-        self._next_batch = FIRST_BATCH
-        self._density_m2 = density_of_unmet(np.zeros((0, 2)), settings)
+        self._row: IntArray = np.full(len(pose_row), NOBODY, dtype=np.int64)
+        self._of_kind: IntArray = np.zeros((0, 2), dtype=np.int64)
+        self._seen_s = np.zeros(0)
+        self._like = self._traits.nothing(0)
 
     def step(self) -> None:
-        """Associate the next frame; at intervals solve everything so far, merge duplicates, and continue from there."""
-        row, local = self._done, self._filter
-        detections = np.arange(self._first[row], self._first[row + 1])
-        if row == 0:
-            covariance = local.covariance.copy()
-            covariance[:3, :3] = np.eye(3) / self._problem.start_information
-            local.hold(self._problem.start_pose, local.states, covariance, NO_PLACES, local.position)
-            frame = self._match(local, detections)
-        else:
-            frame = self._after_driving(row, detections)
-        self._use(frame, detections)
-        self._pose[row] = self._filter.pose
+        """Associate the next frame."""
+        detections = np.arange(self._first[self._done], self._first[self._done + 1])
+        for k, view in enumerate(self._views(detections)):
+            match = self._match(self._near, view) if k or not self._done else self._after_driving(view)
+            self._use(match, view)
         self._done += 1
-        if self._done == self._next_batch:
-            self._go_on_from(self._settled(self._without_chance(self._assignment()), self._sigma, RECENT))
-            self._next_batch = self._done + max(FIRST_BATCH, int(BATCH_SHARE * self._done))
 
-    def _after_driving(self, row: int, detections: IntArray) -> _Frame:
-        """Compare the next frame with the map; if no landmark matches, once more with the noise of slipping wheels."""
-        local, problem = self._filter, self._problem
-        motion = Motion.between(problem, self.noise, row, local.states)
-        self._have_near(se2.compose(local.pose, motion.increment))
-        trial = local.copied()
-        local.drive(motion)
-        frame = self._match(local, detections)
-        if len(frame.taken):
-            return frame
+    def _after_driving(self, view: IntArray) -> FrameMatch:
+        """Compare the next frame with the map; if no landmark matches, again with the noise of slipping wheels."""
+        before = self._near
+        self._near = self._driven(before, 1.0)
+        match = self._match(self._near, view)
+        if len(match.certain):
+            return match
         # did the wheels slip, or stamps jitter in a turn?
-        trial.drive(Motion.between(problem, self._slipping, row, trial.states))
-        slipped = self._match(trial, detections)
-        if len(slipped.taken) and slipped.evidence >= frame.evidence + self._rules.slip_nats:
-            self._filter = trial
-            return slipped
-        return frame
+        for times in range(1, SLIPS + 1):
+            slipped = self._driven(before, self._rules.slip**times)
+            other = self._match(slipped, view)
+            if len(other.certain) and other.evidence >= match.evidence + times * self._rules.slip_nats:
+                self._near = slipped
+                return other
+        return match
 
-    def _have_near(self, pose: FloatArray) -> None:
-        """Bring the nearest landmarks around a pose into the filter."""
-        away = np.hypot(*(self._filter.position - pose[:2]).T)
-        self._filter.bring(np.argsort(away, kind="stable")[:MOST_COMPARED])
+    def _match(self, near: NearT, view: IntArray) -> FrameMatch:
+        """Weigh the detections of a view against the landmarks nearby."""
+        pairings, followed = self._gated(near, view)
+        source, target = view[pairings.source], pairings.target
+        new = pairings.log_density_new - self._rules.name_nats * same_name(self._kind[source], self._of_kind[target])
+        new -= self._traits.same(self._traits.singly(source), self._like.part(target))
+        pairings = replace(pairings, log_density_new=new)
+        probability, evidence = pairing_probability(pairings, confidence=self._rules.gate_confidence)
+        known = np.zeros(len(view))
+        np.add.at(known, pairings.source, probability)
+        certain = np.flatnonzero(self._certain(near, pairings, followed, probability, known))
+        return FrameMatch(pairings, certain, 1.0 - known, evidence)
 
-    def having(self, traits: Traits) -> Associator:
-        """Return a copy, with the same frames processed, that also uses traits."""
-        other = copy.copy(self)
-        other._traits, other._filter = traits, self._filter.copied()
-        other._row, other._pose = self._row.copy(), self._pose.copy()
-        return other
+    def _use(self, match: FrameMatch, view: IntArray) -> None:
+        """Update with the certain pairings, and start landmarks from detections without candidates."""
+        now_s = self.stamp_s[self._done]
+        known, target = view[match.pairings.source[match.certain]], match.pairings.target[match.certain]
+        new = view[match.p_new >= self._rules.p_new]
+        self._doubted += len(view) - len(known) - len(new)
+        self._row[known], self._row[new] = target, len(self._of_kind) + np.arange(len(new))
+        self._of_kind[target] = np.maximum(self._of_kind[target], self._kind[known])
+        self._of_kind = np.vstack([self._of_kind, self._kind[new]])
+        self._seen_s[target] = now_s
+        self._seen_s = np.append(self._seen_s, np.full(len(new), now_s))
+        seen = np.append(known, new)
+        self._like = self._traits.followed(self._like, self._row[seen], seen)
+        self._update(known, new)
 
-    def heed_names(self, pose: Callable[[], FloatArray]) -> None:
-        """Restart from poses estimated from names alone, if several landmarks have one name and the result is better.
-
-        Wrong matches between two named detections distort the map until the loop between these stays open.
-
-        Args:
-            pose: returns these poses (N, 3); called only if needed.
-        """
-        solved = self._settled(self._assignment(), self._sigma)
-        self._go_on_from(solved)
-        now = solved.assignment
-        if not len(_twice(now)):
-            return
-        begun = replace(now, estimate=replace(now.estimate, pose=pose()))
-        row, points = begun.in_visits(), begun.points()
-        seen = row >= 0
-        each = np.bincount(row[seen])
-        place: FloatArray = np.column_stack([np.bincount(row[seen], x) / each for x in points[seen].T])
-        begun = replace(begun, landmark_row=row, estimate=replace(begun.estimate, landmark=place))
-        again, first = self._solved(begun), 0
-        while (later := again.assignment.n_landmarks - first) > 0:
-            again = self._all_merged(again, within=(first, later - RECENT))
-            first = again.assignment.n_landmarks - (later - RECENT)
-        # each landmark not yet merged has two more parameters, a nat on average
-        gained = solved.cost - again.cost - (again.assignment.n_landmarks - now.n_landmarks)
-        if gained + _twice(now).sum() > _twice(again.assignment).sum():
-            self._go_on_from(again)
-
-    def finish(self, begun: Assignment | None = None, *, goal: float = math.inf) -> Assignment:
+    def finish(self, begun: FoundT | None = None, *, goal: float = math.inf) -> FoundT:
         """Solve and merge everything processed so far, and correct wrong associations.
 
         Args:
-            begun: initial assignment of the same detections; None for that of `step`.
+            begun: initial association of the same detections; None for that of `step`.
             goal: a cost, as of `against`; the search ends early if it cannot be reached.
         """
         refused: set[tuple[int, int]] = set()
         total = math.inf
-        first, sigma = begun is None, self._sigma if begun is None else begun.measured.sigma_given
-        if begun is None:
-            begun = self._assignment()
-        solved = self._realigned(self._contradictions_split(self._settled(begun, sigma), refused))
+        solved = self._realigned(self._corrected(self._merged(self._begun(begun)), refused))
         for left in reversed(range(LAST_ROUNDS)):
-            before = solved.assignment
-            again = reassigned(before, solved.marginals.explained_detections, density=solved.density_m2)
-            again = with_overlooked(again)
-            again = again.without(_seldom(again))
-            count = min(before.n_landmarks, again.n_landmarks)
-            changed = np.mean(_partners(before.landmark_row) != _partners(again.landmark_row))
-            solved = self._contradictions_split(self._settled(again, solved.sigma), refused)
-            total, last = self._total(solved), total
-            hopeless = total - left * (last - total) > goal
-            same = changed <= SAME_SHARE and solved.assignment.n_landmarks == before.n_landmarks == count
-            if hopeless or same:
+            before = solved
+            again = self._reassigned(before)
+            if self.has_own_noise and np.array_equal(again.landmark_row, before.landmark_row):
                 break
-        if first:
-            self.worth = correlated(solved.assignment)
-        return without_ghosts(self._attached(solved).assignment)
+            solved = self._corrected(self._merged(self._learned(again)), refused)
+            if _are_same(before, again, solved):
+                break
+            if goal < math.inf:
+                total, last = self._total(solved), total
+                if total - left * (last - total) > goal:  # hopeless
+                    break
+        return self._result(solved)
+
+    def against(self, found: FoundT) -> float:
+        """Return the negative log likelihood [nats] of all detections under an association, up to a constant.
+
+        Comparable between associations of one recording; `FoundT` as `finish` returns it, of this associator or another
+        one of the same recording.
+        """
+        return self._total(self._judged(found))
+
+    def of_visits(self, found: AnyAssignment) -> tuple[IntArray, IntArray]:
+        """Return `visits_of` these landmarks."""
+        row = found.landmark_row
+        return visits_of(self._detected_s[: len(row)], row, self._rules.forget_s)
+
+    def having(self, traits: Traits) -> Self:
+        """Return a copy, with the same frames processed, that also uses traits."""
+        other = copy.copy(self)
+        other._traits = traits
+        other._row, other._of_kind, other._seen_s = self._row.copy(), self._of_kind.copy(), self._seen_s.copy()
+        return other
 
     @property
     def doubtful(self) -> float:
         """Share of the detections so far that were ambiguous between landmarks in their frame."""
         return self._doubted / max(int(self._first[self._done]), 1)
 
-    def learned_odometry(self, assignment: Assignment) -> FloatArray:
-        """Return (5,) noise levels of the odometry by restricted likelihood, given all associations.
-
-        Args:
-            assignment: as `finish` returns it.
-        """
-        noise, ahead = self.noise, Extrapolation()
-        for _ in range(NOISE_ROUNDS):
-            solved = self._solved(assignment, noise)
-            assignment, smoother = solved.assignment, solved.smoother
-            inlier = smoother.inlier_probability(assignment.estimate)
-            fit = refine_noise(
-                assignment.problem(), assignment.estimate, solved.marginals, inlier, noise, self._start_noise
-            )
-            noise = replace(noise, odometry=ahead.ahead(noise, fit.noise).odometry)
-        return noise.odometry
-
-    def against(self, assignment: Assignment) -> float:
-        """Return the negative log likelihood [nats] of all detections and misses under an assignment, up to a constant.
-
-        An unassigned detection is as likely as an outlier. Residuals are correlated: `worth` of them count as one.
-        Comparable between assignments of one recording.
-
-        Args:
-            assignment: as `finish` returns it, of this associator or another one of the same recording.
-        """
-        solved = self._solved(assignment)
-        return self._total(self._solved(_with_sigma(solved.assignment, solved.sigma)))  # its own noise
-
-    def _total(self, solved: _Solved) -> float:
-        """`against` under the noise of the solution."""
-        assignment = solved.assignment
-        nobody = np.count_nonzero(assignment.landmark_row == NOBODY)
-        fit = solved.cost + float(np.log(assignment.measured.sigma_given).sum())
-        landmarks = float(_twice(assignment).sum()) + self._rules.landmark_nats * assignment.n_landmarks
-        explained = fit + self.noise.outlier_log_odds * nobody
-        return explained / self.worth + landmarks + unseen_nats(assignment)
-
-    def _match(self, local: LocalFilter, detections: IntArray) -> _Frame:
-        """Weigh the detections of the frame against the landmarks so far, as the filter has them."""
-        kind = self._kind[detections], self._of_kind
-        pairings, followed = pairings_of_frame(
-            local, self._problem, self._sigma, detections,
-            density=self._density_m2, kind=kind, settings=self._rules,
-        )  # fmt: skip
-        read = self._traits.singly(detections[pairings.source])
-        by_traits = self._traits.same(read, self._like.part(pairings.target))
-        pairings = replace(pairings, log_density_new=pairings.log_density_new - by_traits)
-        probability, evidence = pairing_probability(pairings, confidence=self._rules.gate_confidence)
-        known = np.zeros(len(detections))
-        np.add.at(known, pairings.source, probability)
-        away = self._problem.stamp_s[self._done] - self._seen_s[pairings.target] > self._rules.forget_s
-        least = np.where(away & ~followed, self._rules.p_return, self._rules.p_match)
-        harmless = self._harmless(local, pairings, probability, known, least)
-        taken = np.flatnonzero((probability >= least) | harmless)
-        return _Frame(pairings, taken, 1.0 - known, evidence)
-
-    def _harmless(
-        self, local: LocalFilter, pairings: Pairings, probability: FloatArray, known: FloatArray, least: FloatArray
-    ) -> BoolArray:
-        """(K,) the best pairing of a detection if a wrong choice does no harm, and is corrected later.
-
-        That is so if the gate is small, or if the rivals are probably the same landmark.
-        """
-        p_match = self._rules.p_match
-        best = np.zeros(len(probability), dtype=bool)
-        for s in np.flatnonzero(known >= p_match):
-            rows = np.flatnonzero(pairings.source == s)
-            first = rows[probability[rows].argmax()]
-            if probability[first] >= least[first]:
-                continue  # taken anyway
-            rivals = rows[(probability[rows] > 1.0 - p_match) & (rows != first)]
-            own = pairings.covariance[2 * first : 2 * first + 2, 2 * first : 2 * first + 2]
-            area_m2 = math.sqrt(np.linalg.det(own)) * math.exp(pairings.log_density_new[first]) / self._density_m2
-            if area_m2 < self._rules.tight_m2:
-                best[first] = True
-            elif known[s] >= least[first]:
-                best[first] = all(self._may_be_one(local, pairings.target[first], pairings.target[k]) for k in rivals)
-        return best
-
-    def _may_be_one(self, local: LocalFilter, a: int, b: int) -> bool:
-        """True if the difference of two landmarks is insignificant."""
-        at = local.columns(local.bring(np.array([a, b])))
-        by = np.hstack([np.eye(2), -np.eye(2)])
-        spread = by @ local.covariance[np.ix_(at, at)] @ by.T + 1e-12 * np.eye(2)
-        gap = local.position[a] - local.position[b]
-        return bool(gap @ np.linalg.solve(spread, gap) < gates(1, self._rules.gate_confidence)[1])
-
-    def _use(self, frame: _Frame, detections: IntArray) -> None:
-        """Update with the certain pairings, and start landmarks from detections without candidates."""
-        problem, local, pairings = self._problem, self._filter, frame.pairings
-        known, target = detections[pairings.source[frame.taken]], pairings.target[frame.taken]
-        self._row[known] = target
-        local.update(target, problem.reading[known], self._sigma[known], weighing=GATED)
-        new = detections[frame.p_new >= self._rules.p_new]
-        self._doubted += len(detections) - len(known) - len(new)
-        self._of_kind[target] = np.maximum(self._of_kind[target], self._kind[known])
-        self._seen_s[target] = problem.stamp_s[self._done]
-        self._row[new] = len(local.position) + np.arange(len(new))
-        seen = np.append(known, new)
-        self._like = self._traits.followed(self._like, self._row[seen], seen)
-        if not len(new):
-            return
-        self._of_kind = np.vstack([self._of_kind, self._kind[new]])
-        self._seen_s = np.append(self._seen_s, np.full(len(new), problem.stamp_s[self._done]))
-        at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
-        for row, place in zip(self._row[new].tolist(), at, strict=True):
-            local.meet(row, place)
-        local.update(self._row[new], problem.reading[new], self._sigma[new], weighing=GATED)
-
-    def _go_on_from(self, solved: _Solved) -> None:
-        """Accept a solution: all that was learned with it is that of the frames to come."""
-        assignment = solved.assignment
-        self._sigma, self._density_m2 = solved.sigma, solved.density_m2
-        self._row[: len(assignment.landmark_row)] = assignment.landmark_row
-        self._pose[: self._done] = assignment.estimate.pose
-        self._of_kind, self._seen_s, self._like = assignment.of_kind, assignment.last_seen_s, assignment.like()
-        place = assignment.estimate.landmark
-        near = np.argsort(np.hypot(*(place - assignment.estimate.pose[-1, :2]).T), kind="stable")[:MOST_COMPARED]
-        self._filter.begin(assignment.estimate, solved.marginals, self._done - 1, near)
-
-    def _assignment(self) -> Assignment:
-        measured = self._problem.until(self._done)
-        estimate = Estimate(self._pose[: self._done].copy(), self._filter.position.copy(), self._filter.states.copy())
-        count = len(measured.pose_row)
-        row, kind = self._row[:count].copy(), self._kind[:count]
-        return Assignment(measured, row, estimate, kind, self._traits.until(count), self._settings)
-
-    def _without_chance(self, assignment: Assignment) -> Assignment:
-        """The assignment without landmarks with too few sightings, long ago."""
-        age = assignment.measured.stamp_s[-1] - assignment.last_seen_s
-        return assignment.without(_seldom(assignment) & (age > self._rules.forget_s))
-
-    def _settled(self, assignment: Assignment, sigma: FloatArray, recent: int | None = None) -> _Solved:
-        """Solve the batch with the noise (M, 2) of detections, and merge duplicates of all landmarks or of those seen
-        last.
-        """
-        return self._all_merged(self._solved(_with_sigma(assignment, sigma)), recent)
-
-    def _all_merged(
-        self, solved: _Solved, recent: int | None = None, *, within: tuple[int, int] | None = None
-    ) -> _Solved:
+    def _merged(self, solved: SolvedT, recent: int | None = None, *, within: tuple[int, int] | None = None) -> SolvedT:
         """Merge duplicates while there are any.
 
         Args:
@@ -410,217 +231,146 @@ class Associator:
             recent: number of landmarks, those seen last, whose duplicates are searched; None for all.
             within: only landmarks from the first number on, except the second number of youngest ones.
         """
-        settings, p_merge = self._settings, self._rules.p_merge
 
-        def propose(solved: _Solved, refused: set[tuple[int, int]]) -> list[tuple[int, int]]:
-            now, density = solved.assignment, solved.density_m2
-            among, known = _latest(now, recent), np.ones(now.n_landmarks, dtype=bool)
+        def propose(solved: SolvedT, refused: set[tuple[int, int]]) -> list[tuple[int, int]]:
+            solution = self._compared(solved)
+            count = len(solution.place)
+            among, known = _latest(solution, recent), np.ones(count, dtype=np.bool_)
             if within is not None:
-                known = np.arange(now.n_landmarks) < now.n_landmarks - within[1]
-                among = known & (np.arange(now.n_landmarks) >= within[0])
+                known = np.arange(count) < count - within[1]
+                among = known & (np.arange(count) >= within[0])
             pairs = propose_merges(
-                compared(now, solved.marginals, density), probability=p_merge,
-                among=among, known=known, last=recent is None, refused=refused,
+                solution, probability=self._rules.p_merge, among=among, known=known, last=recent is None,
+                refused=refused,
             )  # fmt: skip
-            part = LoosePart.of(now, solved.marginals, refused) if not pairs and within is None else None
-            if part is None:
-                return pairs
-            sure = agreed_pairs(
-                part.source, part.target, part.allowed, density=density, probability=p_merge, settings=settings
-            )
-            return part.rows(sure)
+            return pairs if pairs or within is not None else self._loose(solved, refused)
 
-        def merge(solved: _Solved, pairs: list[tuple[int, int]]) -> _Solved | None:
-            now = solved.assignment
-            trial = self._solved(now.merged(pairs))
-            return trial if trial.cost - solved.cost <= accepted_rise(pairs, now.sightings, 2, self._rules) else None
+        def merge(solved: SolvedT, pairs: list[tuple[int, int]]) -> SolvedT | None:
+            trial = self._solved_merged(solved, pairs)
+            numbers = solved.numbers[[u for u, _ in pairs]]
+            rise = accepted_rise(pairs, solved.sightings, numbers, self._rules)
+            return trial if trial.cost - solved.cost <= rise else None
 
         return merge_while_any(solved, propose, merge)
 
-    def _attached(self, solved: _Solved) -> _Solved:
-        """Align a loose part with the rest in the best of its ways, if that explains detections of removed ghosts.
+    def _views(self, detections: IntArray) -> list[IntArray]:
+        """Detections of a frame, those of each sensor by themselves."""
+        return [detections]
 
-        No way is certain. But copies of landmarks, removed as ghosts, leave detections that this alignment explains;
-        fewer landmarks alone are no reason.
+    @abstractmethod
+    def _driven(self, near: NearT, times: float) -> NearT:
+        """The landmarks nearby after the motion to the next frame, with a multiple of the odometry noise."""
+
+    @abstractmethod
+    def _gated(self, near: NearT, view: IntArray) -> tuple[Pairings, BoolArray]:
+        """The detections of a view, paired with the landmarks whose gates they pass, by place; and (K,) whether these
+        are tracked: known relative to the robot as well as they are measured.
         """
-        part = LoosePart.of(solved.assignment, solved.marginals)
-        if part is None or not len(part.root):
-            return solved
-        rules, best = self._rules, solved
-        every = overlays(part.source, part.target, part.allowed, density=solved.density_m2, settings=self._settings)
-        least = self._total(self._real(solved)) - rules.constellation.certain_nats
-        for overlay in every[:REALIGNED]:
-            trial = self._all_merged(self._solved(solved.assignment.merged(part.rows(overlay.pairs))))
-            fewer = max(0, solved.assignment.n_landmarks - trial.assignment.n_landmarks)
-            against = self._total(self._real(trial)) + rules.landmark_nats * fewer
-            if against < least:
-                best, least = trial, against
-        return best
 
-    def _real(self, solved: _Solved) -> _Solved:
-        """The same without ghosts, at its optimum."""
-        real = without_ghosts(solved.assignment)
-        return solved if real.n_landmarks == solved.assignment.n_landmarks else self._solved(real)
+    @abstractmethod
+    def _certain(
+        self, near: NearT, pairings: Pairings, followed: BoolArray, probability: FloatArray, known: FloatArray
+    ) -> BoolArray:
+        """(K,) pairings to be used, by their probability and (n,) that of any pairing of each detection."""
 
-    def _contradictions_split(self, solved: _Solved, refused: set[tuple[int, int]]) -> _Solved:
-        """Split contradictory visits from their landmarks, and merge again, if the result is better.
+    @abstractmethod
+    def _update(self, known: IntArray, new: IntArray) -> None:
+        """Update the landmarks nearby with detections of known landmarks, and of new ones."""
 
-        Visits that were tried without gain are in `refused`, by first detection and number.
-        """
-        rules = self._rules
+    @abstractmethod
+    def _begun(self, begun: FoundT | None) -> SolvedT:
+        """The optimum of an association; None for that of `step`."""
 
-        def split(parts: list[IntArray]) -> _Solved | None:
-            trial = self._all_merged(self._solved(now.split(parts)))
-            return trial if _is_better(trial, solved) else None
+    @abstractmethod
+    def _reassigned(self, solved: SolvedT) -> AssignmentT:
+        """Every detection with its most probable landmark, with overlooked landmarks, without those seen too seldom."""
 
-        for _ in range(SPLIT_ROUNDS):
-            now = solved.assignment
-            linear = solved.smoother.detections(now.estimate)
-            visits = weighed_visits(now, solved.marginals, linear, density=solved.density_m2)
-            doubtful = visits.evidence < math.log(rules.p_merge / (1.0 - rules.p_merge))
-            by_traits = visits.by_traits < -rules.readings.misread_nats
-            doubtful &= (visits.squared > gates(1, rules.contradiction)[1]) | by_traits
-            order = np.flatnonzero(doubtful)[np.argsort(visits.evidence[doubtful], kind="stable")]
-            _, first = np.unique(visits.landmark[order], return_index=True)  # one of each landmark
-            parts = [visits.rows[k] for k in order[np.sort(first)] if _key(visits.rows[k]) not in refused]
-            better = tried_by_halves(parts, split, lambda part: refused.add(_key(part)))
-            if better is None:
-                break
-            solved = better
-        return solved
+    @abstractmethod
+    def _learned(self, assignment: AssignmentT) -> SolvedT:
+        """The optimum of an assignment as `_reassigned` returns it, and the noise there."""
 
-    def _realigned(self, solved: _Solved) -> _Solved:
-        """Realign displaced stretches, if the result is better."""
-        for _ in range(REALIGNED):
-            now = solved.assignment
-            trusted = now.sightings >= self._settings.fewest_sightings
-            stretches = displaced_stretches(
-                now, solved.marginals, trusted, density=solved.density_m2, probability=self._rules.p_merge
-            )
-            starts = (laid(now, stretch, before) for stretch in stretches[:STRETCHES] for before in BEFORE)
-            trials = (self._all_merged(self._solved(start)) for start in starts)
-            better = next((trial for trial in trials if _is_better(trial, solved)), None)
-            if better is None:
-                break
-            solved = self._contradictions_split(better, set())
-        return solved
+    @abstractmethod
+    def _solved_merged(self, solved: SolvedT, pairs: list[tuple[int, int]]) -> SolvedT:
+        """The optimum with pairs (younger, older) of landmarks merged."""
 
-    def _solved(self, assignment: Assignment, noise: Noise | None = None) -> _Solved:
-        """Optimum, covariances and cost, and the noise of sightings that its residuals show."""
-        problem = assignment.problem()
-        noise = self.noise if noise is None else noise
-        smoother = Smoother(problem, noise, heavy=True)
-        slices = smoother.solved_in_slices(assignment.estimate, iterations=8, tolerance=1e-3, settled=0.1)
-        estimate, marginals = exhausted(slices)
-        measured = assignment.measured
-        given = self._problem.sigma_given[: len(measured.pose_row)]
-        unknown = replace(problem, sigma_given=given[assignment.landmark_row >= 0])
-        left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
-        start = self._rules.noise_floor * self._start_noise.detection
-        noise_of = fit_sighting_noise(unknown, estimate, start, left, self._rules)
-        sigma = self._rules.noise_caution * noise_of.of_detections(self._problem)
-        cost = smoother.under(noise, heavy=False).cost(estimate) - assignment.traits.evidence(*assignment.of_visits())
-        return _Solved(replace(assignment, estimate=estimate), marginals, cost, smoother, sigma)
+    @abstractmethod
+    def _compared(self, solved: SolvedT) -> Solution:
+        """The landmarks, for `propose_merges`."""
+
+    @abstractmethod
+    def _result(self, solved: SolvedT) -> FoundT:
+        """The result of a search."""
+
+    @abstractmethod
+    def _judged(self, found: FoundT) -> SolvedT:
+        """The optimum of an association by the noise with which all of this associator are judged."""
+
+    @abstractmethod
+    def _total(self, solved: SolvedT) -> float:
+        """`against` under the noise of the solution."""
+
+    @abstractmethod
+    def _loose(self, solved: SolvedT, refused: set[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Pairs (younger, older) by which a loose part of the map certainly fits to the rest."""
+
+    @abstractmethod
+    def _corrected(self, solved: SolvedT, refused: set[tuple[int, int]]) -> SolvedT:
+        """Separate landmarks that are two, where this is better; what was tried without gain is in `refused`."""
+
+    @abstractmethod
+    def _realigned(self, solved: SolvedT) -> SolvedT:
+        """Move what is displaced, where this is better."""
 
 
-def compared(assignment: Assignment, marginals: Marginals, density: float) -> Solution:
-    """Return the landmarks of an assignment at its optimum, for `propose_merges`."""
-    place, kind, named = assignment.estimate.landmark, assignment.of_kind, assignment.n_named
-    like, settings = assignment.like(), assignment.settings.association
-
-    def differences(younger: IntArray, older: IntArray) -> Differences:
-        rows, both = np.unique(np.concatenate([younger, older]), return_inverse=True)
-        u, o = both[: len(younger)], both[len(younger) :]
-        joint = marginals.joint(rows)
-        at = np.arange(len(joint))
-        joint[at, at] += np.repeat(assignment.shared_variance[rows], 2)
-        blocks = joint.reshape(len(rows), 2, len(rows), 2)
-        cross = blocks[u, :, o, :]
-        own = blocks[u, :, u, :] + blocks[o, :, o, :] - cross - cross.transpose(0, 2, 1)
-
-        def together(some: IntArray) -> FloatArray:
-            difference = joint[:, se2.xy_rows(u[some])] - joint[:, se2.xy_rows(o[some])]
-            return difference[se2.xy_rows(u[some])] - difference[se2.xy_rows(o[some])]
-
-        readings = np.minimum(named[younger], named[older])
-        new = math.log(density) - by_name(kind[younger], kind[older], readings, settings)
-        new -= assignment.traits.same(like.part(younger), like.part(older))
-        return Differences(place[younger] - place[older], own, new, together)
-
-    frame, row = assignment.measured.pose_row, assignment.landmark_row
-    n_frames, around = len(assignment.measured.stamp_s), settings.around_frames
-    return Solution(
-        place, marginals.landmark, differences, assignment.sightings, assignment.last_seen_s,
-        *seen_together(frame, row, n_frames, len(place), around), kind, settings,
-    )  # fmt: skip
+_AnyAssociator = TypeVar("_AnyAssociator", bound=Associator[Any, Any, Any, Any])
 
 
-def _with_sigma(assignment: Assignment, sigma: FloatArray) -> Assignment:
-    """The assignment with other standard deviations of detections, the first of (M, 2)."""
-    measured = replace(assignment.measured, sigma_given=sigma[: len(assignment.measured.pose_row)])
-    return replace(assignment, measured=measured)
-
-
-def _twice(assignment: Assignment) -> FloatArray:
-    """(K,) evidence against several landmarks with one name [nats]."""
-    kind, named = assignment.of_kind, assignment.n_named
-    one, other = np.nonzero(np.triu(same_name(kind[:, None], kind[None]), 1))
-    return by_name(kind[one], kind[other], np.minimum(named[one], named[other]), assignment.settings.association)
-
-
-def by_name(one: IntArray, other: IntArray, readings: IntArray, settings: AssociationConfig) -> FloatArray:
-    """Return the evidence of names that pairs are the same [nats], by labels (K, P) of both.
+def with_traits(
+    first: tuple[_AnyAssociator, FoundT],
+    features: FloatArray,
+    settings: SlamConfig,
+    found: Callable[[Traits], tuple[_AnyAssociator, FoundT]],
+) -> tuple[_AnyAssociator, FoundT]:
+    """Return `best_with_traits` of detections with features (M, D).
 
     Args:
-        one: labels of the first of each pair.
-        other: labels of the second.
-        readings: (K,) number of times that the name was read, of the lesser one.
-        settings: of the association.
+        first: an associator with its result, without traits.
+        features: (M, D) readings, nan for none.
+        settings: of the estimator.
+        found: returns another associator with its result, from the first frame on with given traits.
     """
-    return np.asarray(settings.name_nats * np.minimum(readings, settings.most_names) * same_name(one, other))
+    nothing = first[1].traits
+
+    def explain(
+        best: tuple[_AnyAssociator, FoundT], trial: tuple[_AnyAssociator, FoundT]
+    ) -> tuple[float, Traits | None]:
+        own = learned(features, *trial[0].of_visits(trial[1]), settings=settings)
+        return best[0].against(replace(trial[1], traits=own or nothing)), own  # type: ignore[type-var]
+
+    def again(best: tuple[_AnyAssociator, FoundT], traits: Traits) -> tuple[_AnyAssociator, FoundT]:
+        known = replace(best[1], traits=traits)  # type: ignore[type-var]
+        if traits.evidence(*best[0].of_visits(known)) > 0.0:
+            other = best[0].having(traits)
+            return other, other.finish(known)
+        return found(traits)  # most of it is wrong
+
+    within_visits = learned(features, *first[0].of_visits(first[1]), revisits=False, settings=settings)
+    return best_with_traits(first, within_visits, explain, again)
 
 
-def correlated(assignment: Assignment) -> float:
-    """Return the variance of sums of residuals over visits, relative to that of independent ones; at least 1."""
-    seen = assignment.landmark_row >= 0
-    sigma = assignment.measured.sigma_given[seen]
-    residual = np.clip(detection_residuals(assignment.problem(), assignment.estimate) / sigma, -3.0, 3.0)
-    visit = assignment.of_visits()[0][seen]
-    if not len(visit):
-        return 1.0
-    together = np.column_stack([np.bincount(visit, of) for of in residual.T])
-    return max(1.0, float((together**2).sum() / max((residual**2).sum(), 1e-300)))
-
-
-def without_ghosts(assignment: Assignment) -> Assignment:
-    """Return the assignment without landmarks that have too few sightings, or fewer than a real one would have."""
-    assignment = assignment.without(_seldom(assignment))
-    return assignment.without(~likely_real(assignment) & (assignment.n_named == 0))
-
-
-def _seldom(assignment: Assignment) -> BoolArray:
-    """(L,) landmarks without a name and with too few sightings."""
-    return np.asarray((assignment.sightings < assignment.settings.fewest_sightings) & (assignment.n_named == 0))
-
-
-def _latest(assignment: Assignment, count: int | None) -> BoolArray:
+def _latest(solution: Solution, count: int | None) -> BoolArray:
     """(L,) the landmarks with sightings enough to pair that were seen last; None for all."""
-    enough = assignment.sightings >= assignment.settings.association.fewest_to_pair
-    last = np.where(enough, assignment.last_seen_s, -np.inf)
+    last = np.where(solution.sightings >= solution.settings.fewest_to_pair, solution.last_seen_s, -np.inf)
     if count is None or count >= len(last):
-        return np.ones(len(last), dtype=bool)
+        return np.ones(len(last), dtype=np.bool_)
     return np.asarray(last >= np.partition(last, -count)[-count])
 
 
-def _is_better(trial: _Solved, solved: _Solved) -> bool:
-    """Whether the gain of a trial exceeds the cost of its additional landmarks."""
-    more = trial.assignment.n_landmarks - solved.assignment.n_landmarks
-    gained = solved.cost - trial.cost + _twice(solved.assignment).sum() - _twice(trial.assignment).sum()
-    return bool(gained - solved.assignment.settings.association.landmark_nats * more > (0.0 if more else SAME_NATS))
-
-
-def _key(rows: IntArray) -> tuple[int, int]:
-    return int(rows[0]), len(rows)
+def _are_same(before: AnyAssignment, again: AnyAssignment, solved: AnyAssignment) -> bool:
+    """Whether a comparison with the whole map left the landmarks, and nearly all detections, as they were before."""
+    changed = np.mean(_partners(before.landmark_row) != _partners(again.landmark_row))
+    least = min(before.n_landmarks, again.n_landmarks)
+    return bool(changed <= SAME_SHARE and solved.n_landmarks == before.n_landmarks == least)
 
 
 def _partners(row: IntArray) -> IntArray:
@@ -630,116 +380,3 @@ def _partners(row: IntArray) -> IntArray:
     _, at, of = np.unique(row[seen], return_index=True, return_inverse=True)
     first[seen] = seen[at][of]
     return first
-
-
-def pairings_of_frame(
-    local: LocalFilter,
-    problem: Problem,
-    sigma: FloatArray,
-    detections: IntArray,
-    *,
-    density: float,
-    kind: tuple[IntArray, IntArray],
-    settings: AssociationConfig,
-) -> tuple[Pairings, BoolArray]:
-    """Return detections of a frame paired with the landmarks whose gates they pass, K of them; and (K,) whether these
-    are tracked: known relative to the robot as well as they are measured.
-
-    Args:
-        local: the pose of the frame, with the landmarks that are compared.
-        problem: the readings.
-        sigma: (M, 2) standard deviations of all detections.
-        detections: (n,) rows of those of the frame.
-        density: expected landmarks per square metre in an unmapped area.
-        kind: (n, 2) classes and names of the detections and (L, 2) of the landmarks.
-        settings: of the association.
-    """
-    target = np.sort(local.active)
-    source, target = np.repeat(np.arange(len(detections)), len(target)), np.tile(target, len(detections))
-    same = alike(kind[0][source], kind[1][target])
-    source, target = source[same], target[same]
-    seen = detections[source]
-    nis, log_det, innovation, by = local.compare(target, problem.reading[seen], sigma[seen])
-    inside = np.flatnonzero(nis <= gates(1, settings.gate_confidence)[1])
-    # the neighbourhood of a tracked landmark is mapped; other gates may contain an unmapped landmark by chance
-    wider = 2.0 * math.log(settings.followed**2)
-    followed = log_det[inside] <= 2.0 * np.log(sigma[seen[inside]]).sum(axis=1) + wider
-    source, target, seen, count = source[inside], target[inside], seen[inside], len(inside)
-    at, joint = np.empty((count, WIDTH), dtype=np.int64), np.empty((2 * count, 2 * count))
-    at[:, :BY_PLACE], at[:, BY_PLACE:] = np.arange(BY_PLACE), local.columns(local.bring(target)).reshape(-1, 2)
-    if count:
-        scratch = np.empty((2 * count, len(local.covariance)))
-        spread_of_frame(local.covariance, by[inside].reshape(2 * count, WIDTH), at, scratch, joint)
-    joint[np.diag_indices(2 * count)] += (sigma[seen] ** 2).ravel()
-    # area element r dr db
-    new = np.log(np.where(followed, settings.unmet_share, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))
-    new -= settings.name_nats * same_name(kind[0][source], kind[1][target])
-    return Pairings(source, target, innovation[inside], joint, new, len(detections)), followed
-
-
-LEAST_LEFT = 0.1
-"""Least share of the variance of a residual that the fit leaves: a bound against division by small numbers."""
-ROUNDS = 10
-"""Rounds of Fisher scoring; they converge within these."""
-
-
-@dataclass(frozen=True, slots=True)
-class SightingNoise:
-    """Variances: of range at no distance [m^2], its growth with r^4 [1/m^2], of bearing [rad^2]."""
-
-    range_variance: float
-    range_growth: float
-    bearing_variance: float
-
-    def of_detections(self, problem: Problem) -> FloatArray:
-        """Return (M, 2) standard deviation of every detection: its own if it states one."""
-        fourth = problem.reading[:, 0] ** 4
-        modelled = np.column_stack(
-            [self.range_variance + self.range_growth * fourth, np.full(len(fourth), self.bearing_variance)]
-        )
-        return np.where(np.isfinite(problem.sigma_given), problem.sigma_given, np.sqrt(modelled))
-
-
-def fit_sighting_noise(
-    problem: Problem, estimate: Estimate, start: FloatArray, left: FloatArray, settings: AssociationConfig
-) -> SightingNoise:
-    """Estimate noise from the residuals of assigned detections that state none.
-
-    Args:
-        problem: detections with their landmarks.
-        estimate: the optimum.
-        start: (2,) standard deviations of the prior.
-        left: (M, 2) share of the variance that the fit leaves in the residuals (restricted likelihood, see
-            `slam.noise`).
-        settings: of the association.
-    """
-    pseudo, clipped_at = settings.pseudo_sightings, settings.clipped_at
-    free = ~np.isfinite(problem.sigma_given)
-    left = np.maximum(left, LEAST_LEFT)
-    squared = detection_residuals(problem, estimate) ** 2 / left
-    fourth = problem.reading[free[:, 0], 0] ** 4
-    middle = float(np.median(fourth)) if len(fourth) else 1.0
-    in_range, in_bearing = squared[free[:, 0], 0], squared[free[:, 1], 1]
-    own = left[free[:, 1], 1]
-    variance, growth, bearing = start[0] ** 2, 0.0, start[1] ** 2
-    for _ in range(ROUNDS):
-        expected = variance + growth * fourth
-        clipped = np.minimum(in_range, clipped_at * expected)
-        # Fisher scoring of a Gaussian whose variance is linear in two non-negative numbers
-        weight = np.append((left[free[:, 0], 0] / expected) ** 2, pseudo / (variance + growth * middle) ** 2)
-        column = np.append(fourth, middle)
-        value = np.append(clipped, start[0] ** 2)
-        variance, growth = _line_not_negative(column, value, weight)
-        total = own @ np.minimum(in_bearing, clipped_at * bearing) + pseudo * start[1] ** 2
-        bearing = total / (own.sum() + pseudo)
-    return SightingNoise(variance, growth, float(bearing))
-
-
-def _line_not_negative(x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[float, float]:
-    """Weighted least squares of `y = a + b x` with `a` at least a thousandth of the mean, `b` not negative."""
-    total = weight.sum()
-    mean_x, mean_y = (weight * x).sum() / total, (weight * y).sum() / total
-    spread = (weight * (x - mean_x) ** 2).sum()
-    slope = (weight * (x - mean_x) * (y - mean_y)).sum() / spread if spread > 0.0 else 0.0
-    slope = float(np.clip(slope, 0.0, 0.999 * mean_y / mean_x))
-    return float(mean_y - slope * mean_x), slope

@@ -17,9 +17,10 @@ from scipy import sparse
 
 from evermap.config import SlamConfig
 from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetections, density_of_unmet, names_of
-from evermap.slam.association.associator import Associator
+from evermap.slam.association.associator import with_traits
 from evermap.slam.association.constellation import LocalMap
-from evermap.slam.association.features import Traits, best_with_traits, learned
+from evermap.slam.association.features import Traits
+from evermap.slam.association.in_plane import PlanarAssociator
 from evermap.slam.association.particles import drawn
 from evermap.slam.batch import USUAL, Batch
 from evermap.slam.calibration import CalibrationPrior
@@ -31,7 +32,7 @@ from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import StreamingSlam
 from evermap.types import UNKNOWN, FloatArray, IntArray, Recording
 
-_Found: TypeAlias = tuple[Associator, Assignment]
+_Found: TypeAlias = tuple[PlanarAssociator, Assignment]
 
 ALL_TRIED = 100
 """Number of landmarks of a prior map up to which every pair is tried; above, an index of constellations is used."""
@@ -99,7 +100,7 @@ def associated(
     name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
     kind = np.column_stack([given.class_id, name])[prepared.used]
 
-    def finished(associator: Associator) -> Assignment:
+    def finished(associator: PlanarAssociator) -> Assignment:
         for _ in problem.stamp_s:
             associator.step()
         if (name != UNKNOWN).any():
@@ -107,16 +108,16 @@ def associated(
         return associator.finish()
 
     def found(traits: Traits | None) -> _Found:
-        first = Associator(problem, noise, kind, traits=traits, settings=settings)
+        first = PlanarAssociator(problem, noise, kind, traits=traits, settings=settings)
         assignment = finished(first)
         if first.doubtful > settings.association.doubtful_share:
-            again = functools.partial(Associator, problem, noise, kind, traits=traits, settings=settings)
+            again = functools.partial(PlanarAssociator, problem, noise, kind, traits=traits, settings=settings)
             assignment = searched(first, assignment, lambda odometry: finished(again(odometry=odometry)))
         return first, assignment
 
     best = found(None)
     if given.features is not None:
-        best = _with_traits(best, given.features[prepared.used], settings, found)
+        best = with_traits(best, given.features[prepared.used], settings, found)
     associator, assignment = best
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
@@ -128,28 +129,6 @@ def associated(
     return Associated(row, name, assignment.of_kind, assignment.together, loose, settings, locate)
 
 
-def _with_traits(
-    first: _Found, features: FloatArray, settings: SlamConfig, found: Callable[[Traits], _Found]
-) -> _Found:
-    """`best_with_traits` of detections with features (M, D); `found` returns another result with given traits."""
-    nothing = first[1].traits
-
-    def explain(best: _Found, trial: _Found) -> tuple[float, Traits | None]:
-        own = learned(features, *trial[1].of_visits(), settings=settings)
-        return best[0].against(replace(trial[1], traits=own or nothing)), own
-
-    def again(best: _Found, traits: Traits) -> _Found:
-        known = replace(best[1], traits=traits)
-        if traits.evidence(*known.of_visits()) > 0.0:
-            other = best[0].having(traits)
-            return other, other.finish(known)
-        return found(traits)  # most of it is wrong
-
-    return best_with_traits(
-        first, learned(features, *first[1].of_visits(), revisits=False, settings=settings), explain, again
-    )
-
-
 def _in_metres(assignment: Assignment, noise: Noise, prior: CalibrationPrior) -> LocalMap:
     """The landmarks with the scale divided by the priors, and its uncertainty in the covariance."""
     marginals = Smoother(assignment.problem(), noise, heavy=True).marginals(assignment.estimate)
@@ -159,7 +138,9 @@ def _in_metres(assignment: Assignment, noise: Noise, prior: CalibrationPrior) ->
     return LocalMap(place, covariance + log_sigma**2 * np.outer(place.ravel(), place.ravel()))
 
 
-def searched(associator: Associator, assignment: Assignment, again: Callable[[FloatArray], Assignment]) -> Assignment:
+def searched(
+    associator: PlanarAssociator, assignment: Assignment, again: Callable[[FloatArray], Assignment]
+) -> Assignment:
     """Return the best assignment of repeated rounds of particles, each started from the best assignment so far.
 
     Of `RUNS` draws per round those with most evidence are solved (one of many landmarks, all of few), and the best is

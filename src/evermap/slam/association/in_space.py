@@ -9,7 +9,7 @@ covariances (`merging`), and each detection is compared with the whole map once 
 
 from __future__ import annotations
 
-import copy
+import functools
 import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -22,6 +22,7 @@ from evermap.config import AssociationConfig, SlamConfig
 from evermap.errors import DataError
 from evermap.estimate.sparse.system import Factorised
 from evermap.geometry import se2, se3
+from evermap.geometry.chunked import blocks
 from evermap.geometry.group import accumulate
 from evermap.slam.association.assignment import (
     NOBODY,
@@ -34,21 +35,18 @@ from evermap.slam.association.assignment import (
     same_name,
     seen_together,
     shared_variance,
-    visits_of,
 )
+from evermap.slam.association.associator import Associator, with_traits
 from evermap.slam.association.constellation import LocalMap
-from evermap.slam.association.features import Likeness, Traits, best_with_traits, learned
+from evermap.slam.association.features import Likeness, Traits
 from evermap.slam.association.identify import Associated
-from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
+from evermap.slam.association.jcbb import Pairings, gates
 from evermap.slam.association.merging import (
     Differences,
     Solution,
-    accepted_rise,
     in_reach,
-    merge_while_any,
-    propose_merges,
 )
-from evermap.slam.association.revise import LAST_ROUNDS, lying_together, may_be_of, most_probable
+from evermap.slam.association.revise import lying_together, may_be_of, most_probable
 from evermap.slam.space.estimate import as_seen, converged, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, prepare_space, without_range
 from evermap.slam.space.linearise import POINT, POSE
@@ -56,8 +54,6 @@ from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialPro
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
 
-SLIPS = 3
-"""Number of powers of `slam.association.slip` that are tried as the factor on the odometry noise: bounds the work."""
 FAR_M = 1e3
 """Standard deviation of the position of a landmark before its first detection: uninformative."""
 ROUNDS = 2
@@ -89,10 +85,18 @@ def associated_in_space(recording: SpatialRecording, settings: SlamConfig, *, ke
     by_class = np.where(asked, given.class_id - UNKNOWN, UNKNOWN)
     intake = prepare_space(replace(recording, detections=replace(given, landmark_id=by_class)), settings.space)
     kind = np.column_stack([given.class_id, name])[intake.used]
-    associator = SpatialAssociator(intake, kind, settings)
-    solved = associator.finish()
-    if given.features is not None:
-        solved = _with_traits(associator, solved, given.features[intake.used])
+
+    def found(traits: Traits | None, known: SpatialSolution | None = None) -> tuple[SpatialAssociator, SpatialSolution]:
+        associator = SpatialAssociator(intake, kind, settings, traits, known)
+        for _ in associator.stamp_s:
+            associator.step()
+        return associator, associator.finish()
+
+    associator, solved = found(None)
+    if given.features is not None:  # all are judged by the noise and the density of the first one
+        first = SpatialAssociator(intake, kind, settings, known=solved), solved
+        again = functools.partial(found, known=solved)
+        associator, solved = with_traits(first, given.features[intake.used], settings, again)
     row[intake.used], local, together, loose = associator.concluded(solved)
     of_kind = labels_of(kind, row[intake.used], len(local.place))
     loose = loose._replace(row=intake.used[loose.row])
@@ -107,18 +111,17 @@ class _Nearby:
         place, covariance: (L, 3), and (3 L, 3 L) of all together.
         ways: (2, L, 7) the two possible poses of each, from its last detection; sigma_rad: (L,) of their orientations,
             0 for points.
-        seen_s: (L,) stamp of that detection.
     """
 
     def __init__(self) -> None:
         self.row: IntArray = np.zeros(0, dtype=np.int64)
         self.place, self.covariance = np.zeros((0, 3)), np.zeros((0, 0))
-        self.ways, self.sigma_rad, self.seen_s = np.zeros((2, 0, 7)), np.zeros(0), np.zeros(0)
+        self.ways, self.sigma_rad = np.zeros((2, 0, 7)), np.zeros(0)
 
     def driven(self, motion: FloatArray, variance: FloatArray) -> _Nearby:
         """Return the landmarks after a motion (7,), with its variances (2,) of each axis and angle."""
         turn, count, after = se3.rotation_of(motion), len(self.row), _Nearby()
-        after.row, after.sigma_rad, after.seen_s = self.row, self.sigma_rad.copy(), self.seen_s.copy()
+        after.row, after.sigma_rad = self.row, self.sigma_rad.copy()
         after.place = (self.place - motion[:3]) @ turn
         after.ways = se3.compose(se3.inverse(motion), self.ways)
         blocks = self.covariance.reshape(count, 3, count, 3)
@@ -128,11 +131,12 @@ class _Nearby:
         after.covariance = blocks.reshape(3 * count, 3 * count) + (by * np.repeat(variance, 3)) @ by.T
         return after
 
-    def keep(self, some: BoolArray) -> None:
-        """Remove all but some landmarks (L,)."""
-        at = se2.xy_rows(np.flatnonzero(some), 3)
-        self.row, self.place, self.covariance = self.row[some], self.place[some], self.covariance[np.ix_(at, at)]
-        self.ways, self.sigma_rad, self.seen_s = self.ways[:, some], self.sigma_rad[some], self.seen_s[some]
+    def part(self, some: BoolArray) -> _Nearby:
+        """Return some of the landmarks (L,)."""
+        at, found = se2.xy_rows(np.flatnonzero(some), 3), _Nearby()
+        found.row, found.place, found.covariance = self.row[some], self.place[some], self.covariance[np.ix_(at, at)]
+        found.ways, found.sigma_rad = self.ways[:, some], self.sigma_rad[some]
+        return found
 
     def meet(self, row: IntArray) -> None:
         """Add landmarks without any information."""
@@ -143,7 +147,7 @@ class _Nearby:
         covariance[:before, :before] = self.covariance
         self.covariance = covariance
         self.ways = np.concatenate([self.ways, se3.identity(2, count)], axis=1)
-        self.sigma_rad, self.seen_s = (np.append(each, np.zeros(count)) for each in (self.sigma_rad, self.seen_s))
+        self.sigma_rad = np.append(self.sigma_rad, np.zeros(count))
 
     def update(self, at: IntArray, place: FloatArray, covariance: FloatArray) -> None:
         """Update landmarks in rows `at` (n,) with a detection each."""
@@ -157,44 +161,59 @@ class _Nearby:
         self.covariance = 0.5 * (after + after.T)
 
 
-class _Followed(NamedTuple):
-    """Landmarks (M,) of the detections, filled in view after view; class and name (L, 2) of each landmark, and what
-    each is like.
-    """
+class SpatialAssignment(NamedTuple):
+    """Landmarks (M,) of detections, poses (N, 7) and noise levels to begin a solution with, and traits."""
 
-    row: IntArray
-    of: IntArray
-    like: Likeness
+    landmark_row: IntArray
+    pose: FloatArray
+    noise: SpatialNoise
+    traits: Traits
 
+    @property
+    def n_landmarks(self) -> int:
+        """Number of landmarks."""
+        return int(self.landmark_row.max(initial=-1)) + 1
 
-class _Match(NamedTuple):
-    """Certain pairings: rows of a view with rows of the nearby landmarks; p (n,) of each detection to be new; and the
-    evidence over only new landmarks [nats].
-    """
-
-    source: IntArray
-    target: IntArray
-    p_new: FloatArray
-    evidence: float
+    def rows(self, landmark_row: IntArray) -> SpatialAssignment:
+        """Return the same with other landmarks (M,), numbered by first detection."""
+        return self._replace(
+            landmark_row=_without(landmark_row, np.zeros(int(landmark_row.max(initial=-1)) + 1, dtype=np.bool_))
+        )
 
 
 @dataclass(frozen=True, slots=True)
-class _Solved:
+class SpatialSolution:
     """Landmarks (M,) of detections at the optimum, the linearisation there, its noise levels, the density of landmarks
-    [1/m^3], and its cost [nats]: a trial, until something goes on from it.
+    [1/m^3], traits, and its cost [nats]: a trial, until something goes on from it.
     """
 
-    row: IntArray
+    landmark_row: IntArray
     estimate: SpatialEstimate
     smoother: SpatialSmoother
     now: SpatialLinear
     noise: SpatialNoise
     density: float
+    traits: Traits
     cost: float
 
+    @property
+    def n_landmarks(self) -> int:
+        """Number of landmarks."""
+        return len(self.estimate.place)
 
-class SpatialAssociator:
-    """Associate all detections of a recording in space.
+    @property
+    def sightings(self) -> IntArray:
+        """(L,) number of detections of each landmark."""
+        return np.bincount(self.landmark_row[self.landmark_row >= 0], minlength=self.n_landmarks)
+
+    @property
+    def numbers(self) -> IntArray:
+        """(L,) numbers of each landmark: three of a point, six of a pose."""
+        return np.where(self.smoother.problem.oriented, 6, 3)
+
+
+class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSolution, _Nearby]):
+    """The associator in space.
 
     Args:
         intake: the recording, in which every class is one landmark.
@@ -202,74 +221,68 @@ class SpatialAssociator:
             other.
         settings: of the estimator.
         traits: readings of the landmarks themselves; None if they give no evidence.
+        known: a solution of the same recording, to begin with its noise and its density.
     """
 
+    has_own_noise = True
+
     def __init__(
-        self, intake: SpatialIntake, kind: IntArray, settings: SlamConfig, traits: Traits | None = None
+        self,
+        intake: SpatialIntake,
+        kind: IntArray,
+        settings: SlamConfig,
+        traits: Traits | None = None,
+        known: SpatialSolution | None = None,
     ) -> None:
         problem = self._problem = _thinned(intake)
-        self._traits = Traits.none(len(problem.pose_row), settings) if traits is None else traits
-        self._kind, self.settings, self._rules = kind, settings, settings.association
+        density = density_of_unmet(np.zeros((0, 3)), settings) if known is None else known.density
+        super().__init__(problem.stamp_s, problem.pose_row, kind, _Nearby(), density, traits, settings)
         caution, space = self._rules.odometry_caution, problem.settings
-        self._noise = SpatialNoise(caution * space.drift_m, caution * space.drift_rad, pixel=space.sigma_px)
+        noise = SpatialNoise(caution * space.drift_m, caution * space.drift_rad, pixel=space.sigma_px)
+        self._noise = noise if known is None else known.noise
         mount = problem.mount[problem.sensor]
         self._at = se3.transform(mount, problem.measured[:, :3])
         self._root = self._rules.noise_caution * se3.rotation_of(mount) @ np.linalg.inv(problem.measured_root)
         self._ways = se3.compose(mount, problem.either)
         self._turned = problem.kind != POINT
         self._view = np.unique(problem.pose_row * len(problem.mount) + problem.sensor, return_inverse=True)[1]
-        self._density = density_of_unmet(np.zeros((0, 3)), settings)
 
-    def having(self, traits: Traits, known: _Solved) -> SpatialAssociator:
-        """Return an associator of the same detections that also uses traits, and begins with the noise and the density
-        of a solution.
-        """
-        other = copy.copy(self)
-        other._traits, other._noise, other._density = traits, known.noise, known.density
-        return other
+    def _begun(self, begun: SpatialSolution | None) -> SpatialSolution:
+        if begun is not None:
+            return self._solved(SpatialAssignment(begun.landmark_row, begun.estimate.pose, self._noise, begun.traits))
+        start = SpatialAssignment(self._row, accumulate(self._problem.increment), self._noise, self._traits)
+        return self._with_noise(start.rows(self._row))
 
-    def of_visits(self, solved: _Solved) -> tuple[IntArray, IntArray]:
-        """Return `visits_of` these landmarks."""
-        return visits_of(self._problem.stamp_s[self._problem.pose_row], solved.row, self._rules.forget_s)
+    def _reassigned(self, solved: SpatialSolution) -> SpatialAssignment:
+        again = self._with_overlooked(self._most_probable(solved), solved)
+        again = _without(again, np.bincount(again[again >= 0]) < self._settings.fewest_sightings)
+        return SpatialAssignment(again, solved.estimate.pose, solved.noise, solved.traits)
 
-    def against(self, solved: _Solved, traits: Traits | None, first: _Solved) -> float:
-        """Return the negative log likelihood [nats] of all detections, and of their traits, up to a constant: by the
-        noise and the density of a `first` solution.
+    def _learned(self, assignment: SpatialAssignment) -> SpatialSolution:
+        return self._with_noise(assignment)
 
-        An unassigned detection is of one of the landmarks that there are elsewhere, as in `_reassigned`.
-        """
-        again = self._solved(solved.row, solved.estimate.pose, first.noise)
-        spread = self._covariance(solved.row == NOBODY, first.noise)
-        nobody = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(first.density)
-        numbers = np.where(again.smoother.problem.oriented, 6, 3)
-        cost = again.now.cost + np.maximum(nobody, 0.0).sum()
-        cost += 0.5 * self._rules.landmark_nats * numbers.sum()  # stated for two numbers
-        return float(cost - (0.0 if traits is None else traits.evidence(*self.of_visits(solved))))
-
-    def finish(self, known: _Solved | None = None) -> _Solved:
-        """Return the landmarks of all detections, from `known` ones on; those seen seldom are among them."""
-        fewest = self.settings.fewest_sightings
-        if known is None:
-            row = self._follow()
-            row = _without(row, np.zeros(int(row.max(initial=-1)) + 1, dtype=np.bool_))
-            known = self._learned(row, _driven(self._problem), self._noise)
-        else:
-            known = self._solved(known.row, known.estimate.pose, self._noise)
-        solved = self._merged(known)
-        for _ in range(LAST_ROUNDS):
-            again = self._with_overlooked(self._reassigned(solved), solved)
-            again = _without(again, np.bincount(again[again >= 0]) < fewest)
-            if np.array_equal(again, solved.row):
-                break
-            solved = self._merged(self._learned(again, solved.estimate.pose, solved.noise))
+    def _result(self, solved: SpatialSolution) -> SpatialSolution:
         return solved
 
-    def concluded(self, solved: _Solved) -> tuple[IntArray, LocalMap, sparse.csr_array, LooseDetections]:
+    def _judged(self, found: SpatialSolution) -> SpatialSolution:
+        return self._solved(SpatialAssignment(found.landmark_row, found.estimate.pose, self._noise, found.traits))
+
+    def _total(self, solved: SpatialSolution) -> float:
+        """An unassigned detection is of one of the landmarks that there are elsewhere, as in `_most_probable`."""
+        spread = self._covariance(solved.landmark_row == NOBODY, solved.noise)
+        nobody = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(self._density)
+        cost = solved.now.cost + np.maximum(nobody, 0.0).sum()
+        cost += 0.5 * self._rules.landmark_nats * solved.numbers.sum()  # stated for two numbers
+        return float(cost - solved.traits.evidence(*self.of_visits(solved)))
+
+    def concluded(self, solved: SpatialSolution) -> tuple[IntArray, LocalMap, sparse.csr_array, LooseDetections]:
         """Return (M,) the landmark of every detection, numbered by first detection, `NOBODY` for none; the landmarks;
         (L, L) the number of views that show both of two; and the detections of none, rows of those of the recording.
         """
-        kept = np.flatnonzero(np.bincount(solved.row[solved.row >= 0]) >= self.settings.fewest_sightings)
-        row = np.where(np.isin(solved.row, kept), np.searchsorted(kept, solved.row), NOBODY)
+        kept = np.flatnonzero(
+            np.bincount(solved.landmark_row[solved.landmark_row >= 0]) >= self._settings.fewest_sightings
+        )
+        row = np.where(np.isin(solved.landmark_row, kept), np.searchsorted(kept, solved.landmark_row), NOBODY)
         views = int(self._view.max(initial=-1)) + 1
         together, _ = seen_together(self._view, row, views, len(kept), 0)
         some = np.flatnonzero((row == NOBODY) & (self._kind[:, -1] == UNKNOWN))
@@ -277,7 +290,7 @@ class SpatialAssociator:
         loose = LooseDetections(some, at, self._wide_m(solved.noise)[some], self._kind[some, 0])
         return row, self._local(solved, kept), together, loose
 
-    def _local(self, solved: _Solved, rows: IntArray) -> LocalMap:
+    def _local(self, solved: SpatialSolution, rows: IntArray) -> LocalMap:
         """Return some landmarks, with the errors that all sightings of one have in common."""
         problem = solved.smoother.problem
         place, turned = solved.estimate.place[rows], problem.oriented[rows]
@@ -291,41 +304,19 @@ class SpatialAssociator:
         told = turned & (problem.symmetries.of[rows] == 0)  # what looks the same in several has none
         return LocalMap(place[:, :3], covariance, np.where(told[:, None], place[:, 3:], np.nan))
 
-    def _follow(self) -> IntArray:
-        """(M,) landmarks: the detections of every view are paired with the landmarks of the last seconds."""
-        problem, near = self._problem, _Nearby()
-        found = _Followed(np.full(len(self._view), NOBODY), np.zeros((0, 2), dtype=np.int64), self._traits.nothing(0))
-        begin = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
-        for frame, now_s in enumerate(problem.stamp_s.tolist()):
-            near.keep(now_s - near.seen_s <= self._rules.forget_s)
-            rows = np.arange(begin[frame], begin[frame + 1])
-            views = [rows[self._view[rows] == one] for one in np.unique(self._view[rows])]
-            if frame:
-                near = self._after_driving(near, found, frame, views[0])
-            for view in views:
-                found = self._use(near, found, view, self._match(near, found, view), now_s)
-        return found.row
+    def _views(self, detections: IntArray) -> list[IntArray]:
+        return [detections[self._view[detections] == one] for one in np.unique(self._view[detections])]
 
-    def _after_driving(self, before: _Nearby, found: _Followed, frame: int, view: IntArray) -> _Nearby:
-        """The nearby landmarks after the motion to a frame; if none matches, after one with slipping wheels."""
-        motion, lasted_s = self._problem.increment[frame - 1], self._problem.lasted_s[frame - 1]
-        variance = lasted_s * np.array([self._noise.translation, self._noise.rotation]) ** 2
-        near = before.driven(motion, variance)
-        match = self._match(near, found, view)
-        if len(match.source) or not len(near.row):
-            return near
-        for times in range(1, SLIPS + 1):
-            slipped = before.driven(motion, self._rules.slip ** (2 * times) * variance)
-            other = self._match(slipped, found, view)
-            if len(other.source) and other.evidence >= match.evidence + times * self._rules.slip_nats:
-                return slipped
-        return near
+    def _driven(self, near: _Nearby, times: float) -> _Nearby:
+        problem, row = self._problem, self._done - 1
+        variance = problem.lasted_s[row] * np.array([self._noise.translation, self._noise.rotation]) ** 2
+        away_s = problem.stamp_s[self._done] - self._seen_s[near.row]
+        return near.part(away_s <= self._rules.forget_s).driven(problem.increment[row], times**2 * variance)
 
-    def _match(self, near: _Nearby, found: _Followed, view: IntArray) -> _Match:
-        """Weigh the detections of a view against the nearby landmarks."""
-        rules, of = self._rules, found.of
+    def _gated(self, near: _Nearby, view: IntArray) -> tuple[Pairings, BoolArray]:
+        rules = self._rules
         source, target = (each.ravel() for each in np.indices((len(view), len(near.row))))
-        kept = alike(self._kind[view[source]], of[near.row[target]])
+        kept = alike(self._kind[view[source]], self._of_kind[near.row[target]])
         source, target = source[kept], target[kept]
         own = self._covariance(view, self._noise)
         innovation = self._at[view[source]] - near.place[target]
@@ -342,25 +333,33 @@ class SpatialAssociator:
         # the neighbourhood of a tracked landmark is mapped; other gates may contain an unmapped one by chance
         followed = log_det <= least + 3.0 * math.log(rules.followed**2)
         new = np.log(np.where(followed, rules.unmet_share, 1.0) * self._density)
-        new -= rules.name_nats * same_name(self._kind[view[source]], of[near.row[target]])
-        new -= self._traits.same(self._traits.singly(view[source]), found.like.part(near.row[target]))
-        pairs = Pairings(
-            source, target, innovation, joint.reshape(3 * len(source), 3 * len(source)), new, len(view), least
-        )
-        probability, evidence = pairing_probability(pairs, confidence=rules.gate_confidence)
-        known = np.zeros(len(view))
-        np.add.at(known, source, probability)
+        joint = joint.reshape(3 * len(source), 3 * len(source))
+        return Pairings(source, near.row[target], innovation, joint, new, len(view), least), followed
+
+    def _certain(
+        self, _near: _Nearby, pairings: Pairings, _followed: BoolArray, probability: FloatArray, known: FloatArray
+    ) -> BoolArray:
+        rules, source = self._rules, pairings.source
         best = np.zeros(len(source), dtype=np.bool_)
         if len(source):
             order = np.lexsort((-probability, source))
             best[order[np.diff(source[order], prepend=-1) > 0]] = True
+        log_det = np.linalg.slogdet(blocks(pairings.covariance, 3))[1]
         tight = best & (known[source] > 1.0 - rules.p_new) & (log_det < 3.0 * math.log(rules.tight_m2))
-        taken = np.flatnonzero((probability > 1.0 - rules.p_new) | tight)
-        return _Match(source[taken], target[taken], 1.0 - known, evidence)
+        return np.asarray((probability > 1.0 - rules.p_new) | tight)
+
+    def _loose(self, solved: SpatialSolution, refused: set[tuple[int, int]]) -> list[tuple[int, int]]:  # noqa: ARG002
+        return []
+
+    def _corrected(self, solved: SpatialSolution, refused: set[tuple[int, int]]) -> SpatialSolution:  # noqa: ARG002
+        return solved
+
+    def _realigned(self, solved: SpatialSolution) -> SpatialSolution:
+        return solved
 
     def _turned_alike(self, detection: IntArray, near: _Nearby, target: IntArray) -> BoolArray:
         """(K,) detections with the orientation of landmarks, in one of the two possible poses of either."""
-        away_s = self._problem.stamp_s[self._problem.pose_row[detection]] - near.seen_s[target]
+        away_s = self._problem.stamp_s[self._problem.pose_row[detection]] - self._seen_s[near.row[target]]
         sigma = np.hypot(self._noise.rotation * np.sqrt(away_s), near.sigma_rad[target])
         return self._within(detection, near.ways[:, target], near.sigma_rad[target] > 0.0, sigma)
 
@@ -373,32 +372,26 @@ class SpatialAssociator:
         sigma = np.hypot(np.hypot(sigma, self._problem.sigma_rad[detection]), rules.turn_floor_rad)
         return np.asarray(~turned | ~self._turned[detection] | (angle <= rules.turn_sigmas * sigma))
 
-    def _use(self, near: _Nearby, found: _Followed, view: IntArray, match: _Match, now_s: float) -> _Followed:
-        """Update with the certain pairings, and start landmarks from detections without candidates."""
-        row, of, known = found.row, found.of.copy(), view[match.source]
-        row[known] = near.row[match.target]
-        of[row[known]] = np.maximum(of[row[known]], self._kind[known])
-        new = view[match.p_new >= self._rules.p_new]
-        row[new] = len(of) + np.arange(len(new))
-        seen = np.append(known, new)
-        near.meet(row[new])
-        at = np.append(match.target, len(near.row) - len(new) + np.arange(len(new)))
+    def _update(self, known: IntArray, new: IntArray) -> None:
+        near, seen = self._near, np.append(known, new)
+        near.meet(self._row[new])
+        at = np.searchsorted(near.row, self._row[seen])
         near.update(at, self._at[seen], self._covariance(seen, self._noise))
         sigma = np.where(self._turned[seen], self._problem.sigma_rad[seen], 0.0)
-        near.ways[:, at], near.sigma_rad[at], near.seen_s[at] = self._ways[:, seen], sigma, now_s
-        return _Followed(row, np.vstack([of, self._kind[new]]), self._traits.followed(found.like, row[seen], seen))
+        near.ways[:, at], near.sigma_rad[at] = self._ways[:, seen], sigma
 
-    def _learned(self, row: IntArray, pose: FloatArray, noise: SpatialNoise) -> _Solved:
-        """Solve for landmarks (M,) and noise, from poses that may be far off and noise levels."""
-        problem = self._problem_of(row)
-        points = converged(problem.as_points(), first_places(problem, pose), noise, heavy_rounds=ROUNDS)
+    def _with_noise(self, start: SpatialAssignment) -> SpatialSolution:
+        """Solve for landmarks and noise, from poses that may be far off and noise levels."""
+        problem = self._problem_of(start.landmark_row)
+        places = first_places(problem, start.pose)
+        points = converged(problem.as_points(), places, start.noise, heavy_rounds=ROUNDS)
         noise = points.noise
         if problem.oriented.any():
-            problem, start = _one_way(problem, points.estimate, points.now.weight)
-            noise = converged(problem, start, noise, heavy_rounds=ROUNDS).noise
+            problem, turned = _one_way(problem, points.estimate, points.now.weight)
+            noise = converged(problem, turned, noise, heavy_rounds=ROUNDS).noise
         caution = self._rules.odometry_caution
         noise = replace(noise, translation=caution * noise.translation, rotation=caution * noise.rotation)
-        return self._solved(row, points.estimate.pose, noise)
+        return self._solved(start._replace(pose=points.estimate.pose, noise=noise))
 
     def _problem_of(self, row: IntArray) -> SpatialProblem:
         """The measurements of landmarks (M,)."""
@@ -410,8 +403,9 @@ class SpatialAssociator:
         symmetries = problem.symmetries[problem.place[used[first]]]
         return replace(problem, **some, place=row[used], oriented=turned, symmetries=symmetries)
 
-    def _solved(self, row: IntArray, pose: FloatArray, noise: SpatialNoise) -> _Solved:
-        """Solve for landmarks (M,), from poses that may be far off: positions first, then orientations, too."""
+    def _solved(self, start: SpatialAssignment) -> SpatialSolution:
+        """Solve for landmarks, from poses that may be far off: positions first, then orientations, too."""
+        row, pose, noise, traits = start
         problem = self._problem_of(row)
         points = SpatialSmoother(problem.as_points(), pose)
         estimate, _ = points.optimum(first_places(problem, pose), noise, heavy=True)
@@ -422,34 +416,23 @@ class SpatialAssociator:
             smoother = SpatialSmoother(problem, pose)
             estimate, _ = smoother.optimum(estimate, noise, heavy=True)
             estimate, now = smoother.optimum(estimate, noise, heavy=False)
-        density = landmark_density(estimate.place[:, :3], np.bincount(problem.place), self.settings)
-        solved = _Solved(row, estimate, smoother, now, noise, density, now.cost)
-        return replace(solved, cost=now.cost - self._traits.evidence(*self.of_visits(solved)))
+        density = landmark_density(estimate.place[:, :3], np.bincount(problem.place), self._settings)
+        cost = now.cost - traits.evidence(*self.of_visits(start))
+        return SpatialSolution(row, estimate, smoother, now, noise, density, traits, cost)
 
-    def _merged(self, solved: _Solved) -> _Solved:
-        """Merge duplicates while there are any."""
+    def _solved_merged(self, solved: SpatialSolution, pairs: list[tuple[int, int]]) -> SpatialSolution:
+        row = np.append(merged_rows(pairs, solved.n_landmarks), NOBODY)[solved.landmark_row]
+        start = SpatialAssignment(row, solved.estimate.pose, solved.noise, solved.traits)
+        return self._solved(start.rows(row))
 
-        def propose(solved: _Solved, refused: set[tuple[int, int]]) -> list[tuple[int, int]]:
-            every = np.ones(len(solved.estimate.place), dtype=np.bool_)
-            solution, p_merge = self._compared(solved), self._rules.p_merge
-            return propose_merges(solution, probability=p_merge, among=every, last=True, refused=refused)
-
-        def merge(solved: _Solved, pairs: list[tuple[int, int]]) -> _Solved | None:
-            count = len(solved.estimate.place)
-            row = np.where(solved.row >= 0, merged_rows(pairs, count)[solved.row], NOBODY)
-            trial = self._solved(_without(row, np.zeros(count, dtype=np.bool_)), solved.estimate.pose, solved.noise)
-            numbers = np.where(solved.smoother.problem.oriented[[u for u, _ in pairs]], 6, 3)
-            sightings = np.bincount(solved.row[solved.row >= 0], minlength=count)
-            rise = accepted_rise(pairs, sightings, numbers, self._rules)
-            return trial if trial.cost - solved.cost <= rise else None
-
-        return merge_while_any(solved, propose, merge)
-
-    def _compared(self, solved: _Solved) -> Solution:
-        """The landmarks for `propose_merges`."""
+    def _compared(self, solved: SpatialSolution) -> Solution:
         rules = self._rules
-        used, count = np.flatnonzero(solved.row >= 0), len(solved.estimate.place)
-        row, of, n = solved.row[used], labels_of(self._kind, solved.row, count), len(self._problem.stamp_s)
+        used, count = np.flatnonzero(solved.landmark_row >= 0), len(solved.estimate.place)
+        row, of, n = (
+            solved.landmark_row[used],
+            labels_of(self._kind, solved.landmark_row, count),
+            len(self._problem.stamp_s),
+        )
         spread, turned = solved.smoother.spread(solved.now), solved.smoother.problem.oriented
         at = spread.own_first[n : n + count, None, None] + np.arange(3)
         own = spread.own[at + np.where(turned, 6, 3)[:, None, None] * np.arange(3)[:, None]]
@@ -458,7 +441,7 @@ class SpatialAssociator:
         like = np.array([alike(each, of).mean() for each in of])
         log_density = np.log(solved.density * like)
         factorised = solved.smoother.factorised(solved.now)
-        known = self._traits, self._likeness(solved)
+        known = solved.traits, self._likeness(solved)
         differences = _Differing(solved, factorised, self._shared_m2(solved), log_density, of, *known, rules)
         n_views = int(self._view.max()) + 1
         return Solution(
@@ -466,9 +449,9 @@ class SpatialAssociator:
             *seen_together(self._view[used], row, n_views, count, rules.around_frames), of, rules,
         )  # fmt: skip
 
-    def _shared_m2(self, solved: _Solved) -> FloatArray:
+    def _shared_m2(self, solved: SpatialSolution) -> FloatArray:
         """(L,) `shared_variance` of the landmarks."""
-        return shared_variance(self._wide_m(solved.noise), solved.row, len(solved.estimate.place), self._rules)
+        return shared_variance(self._wide_m(solved.noise), solved.landmark_row, len(solved.estimate.place), self._rules)
 
     def _covariance(self, rows: IntArray | BoolArray | slice, noise: SpatialNoise) -> FloatArray:
         """(K, 3, 3) covariances of positions in the frame of the robot."""
@@ -479,7 +462,7 @@ class SpatialAssociator:
         """(M,) standard deviation of a position, along its widest axis."""
         return np.asarray(np.sqrt(np.linalg.eigvalsh(self._covariance(slice(None), noise))[:, 2]))
 
-    def _reassigned(self, solved: _Solved) -> IntArray:
+    def _most_probable(self, solved: SpatialSolution) -> IntArray:
         """(M,) the most probable landmark of every detection, given all poses; see `revise.reassigned`."""
         rules, of_space = self._rules, self._rules.space
         tail_by, tail_share, widened = of_space.tail, of_space.tail_share, of_space.widened
@@ -487,7 +470,7 @@ class SpatialAssociator:
         at, gate = se3.transform(pose, self._at), gates(1, rules.gate_confidence, 3)[1]
         reach = tail_by * math.sqrt(widened * gate) * float(np.quantile(self._wide_m(solved.noise), 0.99))
         seen, row = in_reach(place[:, :3], at, reach)
-        kept = may_be_of(self._kind[seen], labels_of(self._kind, solved.row, len(place))[row])
+        kept = may_be_of(self._kind[seen], labels_of(self._kind, solved.landmark_row, len(place))[row])
         seen, row = seen[kept], row[kept]
         turned = se3.compose(se3.inverse(pose[seen]), place[row])
         oriented = solved.smoother.problem.oriented[row]
@@ -500,19 +483,19 @@ class SpatialAssociator:
         score = -0.5 * (np.linalg.slogdet(spread)[1] + 3.0 * math.log(2.0 * math.pi)) - math.log(solved.density)
         tail = math.log(tail_share) - 3.0 * math.log(tail_by) - 0.5 * squared / tail_by**2
         score += np.logaddexp(math.log(1.0 - tail_share) - 0.5 * squared, tail)
-        score += self._traits.same(self._traits.singly(seen), self._likeness(solved).part(row))
+        score += solved.traits.same(solved.traits.singly(seen), self._likeness(solved).part(row))
         inside = (squared < tail_by**2 * gate) & (score > 0.0)
         return most_probable(seen[inside], row[inside], score[inside], self._view, len(place), rules.p_own)
 
-    def _likeness(self, solved: _Solved) -> Likeness:
+    def _likeness(self, solved: SpatialSolution) -> Likeness:
         """What each landmark is like, by its visits."""
         visit, landmark = self.of_visits(solved)
-        visits = self._traits.of_visits(visit, len(landmark))
-        return self._traits.of_landmarks(visits, landmark, len(solved.estimate.place))
+        visits = solved.traits.of_visits(visit, len(landmark))
+        return solved.traits.of_landmarks(visits, landmark, len(solved.estimate.place))
 
-    def _with_overlooked(self, row: IntArray, solved: _Solved) -> IntArray:
+    def _with_overlooked(self, row: IntArray, solved: SpatialSolution) -> IntArray:
         """(M,) landmarks, with a new one per cluster of unassigned detections from enough views, by a solution."""
-        fewest = self.settings.fewest_sightings
+        fewest = self._settings.fewest_sightings
         left = np.flatnonzero(row == NOBODY)
         at = se3.transform(solved.estimate.pose[self._problem.pose_row[left]], self._at[left])
         found = lying_together(at, self._wide_m(solved.noise)[left], self._kind[left], self._view[left], fewest)
@@ -535,7 +518,7 @@ class _Differing:
         settings: of the association.
     """
 
-    solved: _Solved
+    solved: SpatialSolution
     factorised: Factorised
     shared: FloatArray
     log_density: FloatArray
@@ -606,21 +589,6 @@ class _Differing:
         return np.asarray(np.log(0.5 / (8.0 * math.pi**2) + 0.5 * np.maximum(found, 0.0) / max(len(place), 1)))
 
 
-def _with_traits(plain: SpatialAssociator, first: _Solved, features: FloatArray) -> _Solved:
-    """`best_with_traits` of detections with features (M, D)."""
-
-    def explain(_: _Solved, trial: _Solved) -> tuple[float, Traits | None]:
-        own = learned(features, *plain.of_visits(trial), settings=plain.settings)
-        return plain.against(trial, own, first), own
-
-    def again(best: _Solved, traits: Traits) -> _Solved:
-        right = traits.evidence(*plain.of_visits(best)) > 0.0  # else most of it is wrong
-        return plain.having(traits, first).finish(best if right else None)
-
-    within_visits = learned(features, *plain.of_visits(first), revisits=False, settings=plain.settings)
-    return best_with_traits(first, within_visits, explain, again)
-
-
 def _one_way(
     problem: SpatialProblem, estimate: SpatialEstimate, weight: FloatArray
 ) -> tuple[SpatialProblem, SpatialEstimate]:
@@ -643,11 +611,6 @@ def _thinned(intake: SpatialIntake) -> SpatialProblem:
         problem, stamp_s=stamp_s - stamp_s[0], increment=se3.between(pose[:-1], pose[1:]), lasted_s=np.diff(stamp_s),
         pose_row=np.searchsorted(kept, problem.pose_row), path=None,
     )  # fmt: skip
-
-
-def _driven(problem: SpatialProblem) -> FloatArray:
-    """(N, 7) poses along the odometry."""
-    return accumulate(problem.increment)
 
 
 def _without(row: IntArray, gone: BoolArray) -> IntArray:
