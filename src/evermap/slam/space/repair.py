@@ -26,9 +26,13 @@ ROUNDS = 3
 def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
     """Return the optimum, or a better one that begins where other explanations lead."""
     problem = optimum.smoother.problem
+    asked: dict[object, SpatialOptimum] = {}  # what each was last asked about: of the same it says the same
     for _ in range(ROUNDS):
         before = optimum
         for explain in (bridged, other_explanations, _located_again):
+            if asked.get(explain) is optimum:
+                continue
+            asked[explain] = optimum
             if (start := explain(optimum)) is None:
                 continue
             found = converged(problem, start, optimum.noise, heavy_rounds=0)
