@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -389,21 +390,25 @@ def incremental(
         mine = np.arange(first[row], first[row + 1])
         met = mine[known[problem.place[mine]]]
         if len(met):
-            within = STILL_M + noise.translation * np.sqrt(unsure_s), STILL_RAD + noise.rotation * np.sqrt(unsure_s)
-            alike = problem.symmetries[problem.place[met]]
-            candidate = _candidates(pose[row], ways[:, met], place[problem.place[met]], turned[met], alike)
-            cost = _moved(candidate, within)
-            cost += _seen(
-                candidate, either[:, met], place[problem.place[met]], log_share[:, met], sigma_m[met], sigma_rad[met],
-                turned[met], alike,
-            ).sum(axis=1)  # fmt: skip
-            cost[0] -= WORTH
-            best = int(np.argmin(cost))
-            pose[row] = candidate[best]
+            where, alike = place[problem.place[met]], problem.symmetries[problem.place[met]]
+            seen = partial(
+                _seen, either=either[:, met], place=where, log_share=log_share[:, met], sigma_m=sigma_m[met],
+                sigma_rad=sigma_rad[met], turned=turned[met], alike=alike,
+            )  # fmt: skip
+            # no candidate costs less than if it were where all is as seen
+            best, least = 0, float(-log_share[:, met].max(axis=0).sum())
+            if float(seen(pose[row : row + 1]).sum()) - WORTH > least:
+                within = STILL_M + noise.translation * np.sqrt(unsure_s), STILL_RAD + noise.rotation * np.sqrt(unsure_s)
+                candidate = _candidates(pose[row], ways[:, met], where, turned[met], alike)
+                cost = _moved(candidate, within) + seen(candidate).sum(axis=1)
+                cost[0] -= WORTH
+                best = int(np.argmin(cost))
+                pose[row] = candidate[best]
             unsure_s = 0.0 if best else unsure_s
         new = mine[~known[problem.place[mine]]]
-        place[problem.place[new]] = se3.compose(pose[row], either[0, new])
-        known[problem.place[new]] = True
+        if len(new):
+            place[problem.place[new]] = se3.compose(pose[row], either[0, new])
+            known[problem.place[new]] = True
         spread[row] = SLACK_M + noise.translation * np.sqrt(unsure_s), SLACK_RAD + noise.rotation * np.sqrt(unsure_s)
         step_s[row] = time.perf_counter() - began
         if progress is not None:
