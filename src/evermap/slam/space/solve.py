@@ -109,14 +109,15 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     estimate, of_points = stepwise, 2 * np.count_nonzero(problem.kind == POINT) > len(problem.kind)
     if problem.driven:
         whole = _along(problem, intake.driven_pose, known, place)
-        points = converged(problem.as_points(), _likeliest(problem.as_points(), noise, [stepwise, whole]), noise)
+        _, estimate = _likeliest(problem.as_points(), noise, [stepwise, whole])
+        points = converged(problem.as_points(), estimate, noise)
         if of_points and not problem.steady and _is_doubtful(points):
             points = _or_better(points, by_constellations(problem, points.noise, SEEDS))
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)
     elif of_points:
-        estimate = _likeliest(problem, noise, [stepwise, *by_constellations(problem, noise, SEEDS)])
+        estimate, _ = _likeliest(problem, noise, [stepwise, *by_constellations(problem, noise, SEEDS)])
         if _is_loosely_tied(problem):
             begun = converged(problem, estimate, noise)
             estimate = _or_better(begun, [_graduated(problem, noise, estimate)]).estimate
@@ -309,13 +310,14 @@ def _or_better(optimum: SpatialOptimum, starts: list[SpatialEstimate]) -> Spatia
     return optimum
 
 
-def _likeliest(problem: SpatialProblem, noise: SpatialNoise, starts: list[SpatialEstimate]) -> SpatialEstimate:
-    """Return the initial values that lead to the most probable ones."""
-    cost = []
-    for start in starts:
-        smoother = SpatialSmoother(problem, start.pose)
-        cost.append(smoother.optimum(start, noise, heavy=True, iterations=10)[1].cost)
-    return starts[len(starts) - 1 - int(np.argmin(cost[::-1]))]  # of equal ones the last
+def _likeliest(
+    problem: SpatialProblem, noise: SpatialNoise, starts: list[SpatialEstimate]
+) -> tuple[SpatialEstimate, SpatialEstimate]:
+    """Return the initial values that lead to the most probable ones, and these."""
+    found = [SpatialSmoother(problem, start.pose).optimum(start, noise, heavy=True, iterations=10) for start in starts]
+    cost = [now.cost for _, now in found]
+    best = len(starts) - 1 - int(np.argmin(cost[::-1]))  # of equal ones the last
+    return starts[best], found[best][0]
 
 
 def _is_loosely_tied(problem: SpatialProblem) -> bool:
