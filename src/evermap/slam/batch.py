@@ -44,6 +44,8 @@ NEAR, NEAR_NOISE = 0.02, 1e-4
 """Step (m, rad or 1) after which the stream goes on, or learns noise: the next step would be far smaller."""
 FINAL_TOLERANCE, FINAL_GAIN = 1e-5, 1e-2
 """Step (m, rad or 1), or what it gains (nats), at which the final optimum is reached."""
+SAME_FRAME = 1e-4
+"""Motion of the frame (m or rad) up to which covariances in it are the same: they change by no larger share."""
 NEAR_NOISE_GAIN = 1e-4
 """Or what a step gains (nats) for each detection: by so little do noise levels change with it."""
 FEWEST_POSES, LEARNED_SHARE = 40, 0.3
@@ -244,7 +246,9 @@ class Batch:
         ahead, estimate = self._ahead(found.smoother.problem, found.estimate, aligned=aligned)
         if ahead is not found.smoother.problem:
             smoother = found.smoother.under(found.noise.noise, heavy=False, problem=ahead)
-            solved = smoother, estimate, smoother.marginals(estimate)
+            turn = float(np.abs(se2.local(found.estimate.pose[0], estimate.pose[0])).max())
+            marginals = found.marginals if turn < SAME_FRAME else smoother.marginals(estimate)
+            solved = smoother, estimate, marginals
         return divided(solved, self._prior, p_needed, found.noise, revision, aligned=aligned)
 
     def _readmitted(

@@ -85,7 +85,7 @@ def test_a_scale_that_differs_along_the_drive_is_worth_little(differs, bounds):
     recording = replace(world.recording, odometry=replace(odometry, pose_world_robot=np.array(driven)))
     optimum = solve_space(prepare_space(recording, SpaceConfig()), None).optimum
     smoother = optimum.smoother
-    variance, worth = smoother.scale_by_stretches(optimum.now)
+    variance, worth = smoother.worth_by_stretches(optimum.now, -1)
     border = smoother.factorised(optimum.now).border_covariance()
     assert variance == pytest.approx(border[-1, -1], rel=1e-9)
     assert bounds[0] <= worth < bounds[1]

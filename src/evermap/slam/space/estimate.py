@@ -27,6 +27,10 @@ from evermap.types import FloatArray, IntArray
 
 ROUNDS = 12
 """Optimum and noise levels in turns, at most."""
+FIRST_STEPS, STEPS_A_ROUND, LAST_STEPS = 15, 2, 6
+"""Gauss-Newton steps of the first optimum, between two estimates of the noise, and of the last, at most."""
+NEAR, NEAR_ROUND = 1e-5, 0.02
+"""Step (m or rad) that is the last of an optimum, and of one whose levels will not stay."""
 CONVERGED = 0.02
 """Relative change of all noise levels that ends it."""
 MOST_CANDIDATES = 60
@@ -66,13 +70,15 @@ def converged(
     smoother = SpatialSmoother(problem, start.pose)
     for round_ in range(ROUNDS):
         heavy = round_ < heavy_rounds
-        estimate, now = smoother.optimum(estimate, noise, heavy=heavy, iterations=15 if round_ == 0 else 2)
+        # values and levels settle together: after a short step there is no need for the optimum of these levels
+        steps, near = (FIRST_STEPS, NEAR) if round_ == 0 else (STEPS_A_ROUND, NEAR_ROUND)
+        estimate, now = smoother.optimum(estimate, noise, heavy=heavy, iterations=steps, tolerance=near)
         following = refined(smoother, now, noise, begun)
         settled = np.abs(np.log(following.levels / noise.levels)).max() < CONVERGED
         noise = following
         if settled and not heavy:
             break
-    estimate, now = smoother.optimum(estimate, noise, heavy=False, iterations=6)
+    estimate, now = smoother.optimum(estimate, noise, heavy=False, iterations=LAST_STEPS)
     return SpatialOptimum(estimate, noise, smoother, now)
 
 
@@ -86,7 +92,7 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
     problem, kind = smoother.problem, smoother.problem.kind
     if not problem.estimate_noise:
         return noise
-    n_steps, spread, worth = len(problem.increment), smoother.spread(now), problem.settings.pseudo_count
+    n_steps, spread, worth = len(problem.increment), smoother.spread(now, nearly=True), problem.settings.pseudo_count
     of_steps, of_detections = _leverages(smoother, spread.of_factors, spread.of_factors_first)
     levels = noise.levels.copy()
 

@@ -21,21 +21,29 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 ROUNDS = 3
 """Times that other explanations are tried, at most."""
+STEPS, ENDING = 20, 0.1
+"""Gauss-Newton steps from one of them, at most, before it is known whether it is better; the last gains less than this
+share of what it must."""
 
 
 def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
     """Return the optimum, or a better one that begins where other explanations lead."""
-    problem = optimum.smoother.problem
+    problem, gain_nats = optimum.smoother.problem, optimum.smoother.problem.settings.repair.gain_nats
+    asked: dict[object, SpatialOptimum] = {}  # what each was last asked about: of the same it says the same
     for _ in range(ROUNDS):
         before = optimum
         for explain in (bridged, other_explanations, _located_again):
+            if asked.get(explain) is optimum:
+                continue
+            asked[explain] = optimum
             if (start := explain(optimum)) is None:
                 continue
-            found = converged(problem, start, optimum.noise, heavy_rounds=0)
             # at the same noise, or a level that fits worse would look better
-            cost = optimum.smoother.linearised(found.estimate, optimum.noise, heavy=False).cost
-            if cost < optimum.now.cost - problem.settings.repair.gain_nats:
-                optimum = found
+            found, there = optimum.smoother.optimum(
+                start, optimum.noise, heavy=False, iterations=STEPS, settled=ENDING * gain_nats
+            )
+            if there.cost < optimum.now.cost - gain_nats:
+                optimum = converged(problem, found, optimum.noise, heavy_rounds=0)
         if optimum is before:
             break
     return optimum

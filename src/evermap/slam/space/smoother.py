@@ -45,10 +45,13 @@ ODOMETRY, SIGHTINGS = 0, 1
 
 
 class SpatialLinear:
-    """A problem at some values: the linearised graph, and what its blocks say."""
+    """A problem at some values: the linearised graph, what its blocks say, and its normal equations a step before.
 
-    def __init__(self, now: Linear, smoother: SpatialSmoother) -> None:
-        self.now, self._smoother = now, smoother
+    There are none of a step that was damped, or where no step was made.
+    """
+
+    def __init__(self, now: Linear, smoother: SpatialSmoother, before: Factorised | None = None) -> None:
+        self.now, self.before, self._smoother = now, before, smoother
 
     @property
     def values(self) -> FloatArray:
@@ -129,7 +132,14 @@ class SpatialSmoother:
         return Graph(self._blocks(noise, heavy=heavy), self.structure, self._border, self._held, self._retract)
 
     def optimum(
-        self, start: SpatialEstimate, noise: SpatialNoise, *, heavy: bool, iterations: int = 20, tolerance: float = 1e-5
+        self,
+        start: SpatialEstimate,
+        noise: SpatialNoise,
+        *,
+        heavy: bool,
+        iterations: int = 20,
+        tolerance: float = 1e-5,
+        settled: float = SETTLED,
     ) -> tuple[SpatialEstimate, SpatialLinear]:
         """Run damped Gauss-Newton from `start`, until steps are small.
 
@@ -139,13 +149,14 @@ class SpatialSmoother:
             heavy: outliers have the Cauchy's tails.
             iterations: at most.
             tolerance: largest move (m or rad) that ends it.
+            settled: what a step must gain [nats], or it was the last.
 
         Raises:
             NumericalError: no finite optimum.
         """
-        steps = Steps(iterations, tolerance, SETTLED, 0.0, COST_SLACK, FIRST_DAMPING)
+        steps = Steps(iterations, tolerance, settled, 0.0, COST_SLACK, FIRST_DAMPING)
         solution = exhausted(minimised(self.graph(noise, heavy=heavy), start, steps))
-        return solution.state, SpatialLinear(solution.now, self)
+        return solution.state, SpatialLinear(solution.now, self, solution.factorised)
 
     def linearised(self, estimate: SpatialEstimate, noise: SpatialNoise, *, heavy: bool) -> SpatialLinear:
         """Return the problem linearised at `estimate`."""
@@ -155,9 +166,10 @@ class SpatialSmoother:
         """Eliminate everything but the sensors' states and the scale of the odometry."""
         return exhausted(self.graph(SpatialNoise(), heavy=False).factorised(now.now))
 
-    def spread(self, now: SpatialLinear) -> Spread:
-        """Return covariances of all variables and of what each factor ties."""
-        return exhausted(self.factorised(now).spread(len(self.problem.increment)))
+    def spread(self, now: SpatialLinear, *, nearly: bool = False) -> Spread:
+        """Return covariances of all variables and of what each factor ties; `nearly`: a step before will do."""
+        factorised = now.before if nearly and now.before is not None else self.factorised(now)
+        return exhausted(factorised.spread(len(self.problem.increment)))
 
     def residual_of(self, now: Linear) -> FloatArray:
         """Return (M, 8) whitened residuals of detections, by the right sides of their factors."""

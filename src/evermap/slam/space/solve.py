@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -109,14 +110,15 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
     estimate, of_points = stepwise, 2 * np.count_nonzero(problem.kind == POINT) > len(problem.kind)
     if problem.driven:
         whole = _along(problem, intake.driven_pose, known, place)
-        points = converged(problem.as_points(), _likeliest(problem.as_points(), noise, [stepwise, whole]), noise)
+        _, estimate = _likeliest(problem.as_points(), noise, [stepwise, whole])
+        points = converged(problem.as_points(), estimate, noise)
         if of_points and not problem.steady and _is_doubtful(points):
             points = _or_better(points, by_constellations(problem, points.noise, SEEDS))
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)
     elif of_points:
-        estimate = _likeliest(problem, noise, [stepwise, *by_constellations(problem, noise, SEEDS)])
+        estimate, _ = _likeliest(problem, noise, [stepwise, *by_constellations(problem, noise, SEEDS)])
         if _is_loosely_tied(problem):
             begun = converged(problem, estimate, noise)
             estimate = _or_better(begun, [_graduated(problem, noise, estimate)]).estimate
@@ -325,13 +327,14 @@ def _or_better(optimum: SpatialOptimum, starts: list[SpatialEstimate]) -> Spatia
     return optimum
 
 
-def _likeliest(problem: SpatialProblem, noise: SpatialNoise, starts: list[SpatialEstimate]) -> SpatialEstimate:
-    """Return the initial values that lead to the most probable ones."""
-    cost = []
-    for start in starts:
-        smoother = SpatialSmoother(problem, start.pose)
-        cost.append(smoother.optimum(start, noise, heavy=True, iterations=10)[1].cost)
-    return starts[len(starts) - 1 - int(np.argmin(cost[::-1]))]  # of equal ones the last
+def _likeliest(
+    problem: SpatialProblem, noise: SpatialNoise, starts: list[SpatialEstimate]
+) -> tuple[SpatialEstimate, SpatialEstimate]:
+    """Return the initial values that lead to the most probable ones, and these."""
+    found = [SpatialSmoother(problem, start.pose).optimum(start, noise, heavy=True, iterations=10) for start in starts]
+    cost = [now.cost for _, now in found]
+    best = len(starts) - 1 - int(np.argmin(cost[::-1]))  # of equal ones the last
+    return starts[best], found[best][0]
 
 
 def _is_loosely_tied(problem: SpatialProblem) -> bool:
@@ -406,21 +409,25 @@ def incremental(
         mine = np.arange(first[row], first[row + 1])
         met = mine[known[problem.place[mine]]]
         if len(met):
-            within = STILL_M + noise.translation * np.sqrt(unsure_s), STILL_RAD + noise.rotation * np.sqrt(unsure_s)
-            alike = problem.symmetries[problem.place[met]]
-            candidate = _candidates(pose[row], ways[:, met], place[problem.place[met]], turned[met], alike)
-            cost = _moved(candidate, within)
-            cost += _seen(
-                candidate, either[:, met], place[problem.place[met]], log_share[:, met], sigma_m[met], sigma_rad[met],
-                turned[met], alike,
-            ).sum(axis=1)  # fmt: skip
-            cost[0] -= WORTH
-            best = int(np.argmin(cost))
-            pose[row] = candidate[best]
+            where, alike = place[problem.place[met]], problem.symmetries[problem.place[met]]
+            seen = partial(
+                _seen, either=either[:, met], place=where, log_share=log_share[:, met], sigma_m=sigma_m[met],
+                sigma_rad=sigma_rad[met], turned=turned[met], alike=alike,
+            )  # fmt: skip
+            # no candidate costs less than if it were where all is as seen
+            best, least = 0, float(-log_share[:, met].max(axis=0).sum())
+            if float(seen(pose[row : row + 1]).sum()) - WORTH > least:
+                within = STILL_M + noise.translation * np.sqrt(unsure_s), STILL_RAD + noise.rotation * np.sqrt(unsure_s)
+                candidate = _candidates(pose[row], ways[:, met], where, turned[met], alike)
+                cost = _moved(candidate, within) + seen(candidate).sum(axis=1)
+                cost[0] -= WORTH
+                best = int(np.argmin(cost))
+                pose[row] = candidate[best]
             unsure_s = 0.0 if best else unsure_s
         new = mine[~known[problem.place[mine]]]
-        place[problem.place[new]] = se3.compose(pose[row], either[0, new])
-        known[problem.place[new]] = True
+        if len(new):
+            place[problem.place[new]] = se3.compose(pose[row], either[0, new])
+            known[problem.place[new]] = True
         spread[row] = SLACK_M + noise.translation * np.sqrt(unsure_s), SLACK_RAD + noise.rotation * np.sqrt(unsure_s)
         step_s[row] = time.perf_counter() - began
         if progress is not None:

@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from evermap.geometry import se3
+from evermap.geometry.group import accumulate
 from evermap.geometry.rigid import rigid
 from evermap.slam.space.linearise import STATES
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
@@ -84,10 +85,7 @@ class _Growth:
         root = np.linalg.inv(problem.measured_root) * np.array([noise.across, noise.across, noise.along])
         root = se3.rotation_of(mount) @ root
         point = se3.transform(mount, problem.measured[:, :3])
-        odometry = se3.identity(n)
-        if problem.driven:
-            for k, step in enumerate(steps):
-                odometry[k + 1] = se3.compose(odometry[k], step)
+        odometry = accumulate(steps) if problem.driven else se3.identity(n)
         known, place, spread = np.zeros(count, dtype=np.bool_), np.zeros((count, 3)), np.zeros((count, 3, 3))
         prior, stands = problem.prior, problem.prior.weight > problem.settings.inlier
         known[prior.place[stands]], place[prior.place] = True, prior.pose[:, :3]

@@ -332,7 +332,7 @@ class _Member(SpatialSmoother):
         nothing = np.zeros((0, 0))
         self._spread = Spread(own, own_first, nothing, of_factors, np.append(0, np.cumsum(sizes)), nothing, nothing)
 
-    def spread(self, now: SpatialLinear) -> Spread:  # noqa: ARG002
+    def spread(self, now: SpatialLinear, *, nearly: bool = False) -> Spread:  # noqa: ARG002
         """Return covariances of its variables, and of what its odometry and detections tie."""
         return self._spread
 
