@@ -17,6 +17,7 @@ from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, dense_ms
 from evermap.slam.changes.explain import GivenMap, MovedGroup
+from evermap.slam.changes.gain import motion_spread
 from evermap.slam.changes.search import Hypotheses, find_changes
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -211,13 +212,14 @@ def without_transients(
 ) -> Slices[WindowEvidence]:
     """Return the evidence without copies that are displaced alone, from mapped positions (L, 2), in slices."""
     comparison, found = yield from search(evidence, None)
+    spread = motion_spread(prior, evidence.numbers)[: evidence.numbers]
     for _ in range(len(evidence.landmark)):
         copy = np.arange(len(evidence.landmark))
         spared = np.bincount(evidence.landmark)[evidence.landmark] < 2  # their landmarks have no other
-        alone = np.where(spared, 0.0, _gains(comparison, prior.move_sigma_m))
+        alone = np.where(spared, 0.0, _gains(comparison, spread))
         after = _explained_away(evidence, comparison, found, position, prior)
         yield dense_ms(len(comparison.pull))
-        still = np.where(spared, 0.0, _gains(after, prior.move_sigma_m))
+        still = np.where(spared, 0.0, _gains(after, spread))
         candidates: list[tuple[int, float]] = []  # a copy, and what leaving it out gains over keeping it
         worst = int(np.argmax(still))
         if still[worst] > prior.displaced_log_odds:
@@ -234,15 +236,16 @@ def without_transients(
     return evidence
 
 
-def _gains(comparison: Comparison, sigma_m: float) -> FloatArray:
-    """(R,) what every copy gains by a displacement of its own [nats]."""
-    count = len(comparison.pull) // 2
+def _gains(comparison: Comparison, spread: FloatArray) -> FloatArray:
+    """(R,) what every copy gains by a displacement of its own, of standard deviations (n,) [nats]."""
+    n = len(spread)
+    count = len(comparison.pull) // n
     rows = np.arange(count)
-    precision = comparison.precision.reshape(count, 2, count, 2)[rows, :, rows, :]
-    pull = comparison.pull.reshape(count, 2)
-    inner = precision + np.eye(2) / sigma_m**2
+    precision = comparison.precision.reshape(count, n, count, n)[rows, :, rows, :]
+    pull = comparison.pull.reshape(count, n)
+    inner = precision + np.diag(spread**-2)
     solved = np.linalg.solve(inner, pull[:, :, None])[:, :, 0]
-    return np.asarray(0.5 * (pull * solved).sum(axis=1) - 0.5 * np.linalg.slogdet(sigma_m**2 * inner)[1])
+    return np.asarray(0.5 * (pull * solved).sum(axis=1) - 0.5 * np.linalg.slogdet(np.outer(spread, spread) * inner)[1])
 
 
 def _explained_away(
