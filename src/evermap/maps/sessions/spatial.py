@@ -291,7 +291,8 @@ def solve_visit(
     intake = prepare_space(
         recording, of_slam.space, remarks, robust=of_slam.robust, estimate_noise=of_slam.estimate_noise
     )
-    return SpatialVisit(recording, intake, solve_space(intake, prior_map, progress=progress))
+    solved = solve_space(intake, prior_map, progress=progress, changes=of_slam.changes)
+    return SpatialVisit(recording, intake, solved)
 
 
 def solve_visits_together(visits: Sequence[SpatialVisit]) -> list[SpatialVisit]:

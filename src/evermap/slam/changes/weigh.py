@@ -59,11 +59,13 @@ def weigh(
     before: Verdict | None = None,
     thorough: bool = True,
     spared: bool = False,
+    factors: tuple[float, ...] = MAP_FACTORS,
 ) -> Slices[Verdict]:
     """Search for changes, and compute their probabilities, in slices.
 
     What was found `before` is one start of the search; if not `thorough`, its degree of belief is the only one that is
-    tried. If `spared`, no copy of this evidence is displaced alone.
+    tried. If `spared`, no copy of this evidence is displaced alone. The standard deviations of the map may be wrong by
+    `factors`, among them 1.
     """
     factor = 1.0 if before is None else before.map_factor
     usual = prior.softness_m[(len(prior.softness_m) - 1) // 2]
@@ -101,12 +103,12 @@ def weigh(
     yield from best_of([(factor, softness)])
     if thorough and before is None and given.given.any():
         # a map that is believed little explains everything: the other end must have been looked at
-        factor, _ = yield from best_of([(f, softness) for f in MAP_FACTORS])
+        factor, _ = yield from best_of([(f, softness) for f in factors])
     improved = thorough
     while improved:  # one step up or down in either, as long as that gains
         neighbours = [(factor, s) for s in _beside(prior.softness_m, softness)] if n_windows > 1 else []
         if given.given.any():
-            neighbours += [(f, softness) for f in _beside(MAP_FACTORS, factor)]
+            neighbours += [(f, softness) for f in _beside(factors, factor)]
         best = yield from best_of(neighbours)
         improved = trials[best].score > trials[factor, softness].score
         if improved:
