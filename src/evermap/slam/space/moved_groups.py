@@ -19,6 +19,7 @@ from evermap.slam.changes.weigh import MAP_FACTORS, Verdict, weigh
 from evermap.slam.space.against_map import AgainstMap, MovedTogether, evidence_against
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT
+from evermap.slam.space.smoother import SpatialSmoother
 from evermap.types import BoolArray, FloatArray, IntArray
 
 LOOSE_RAD, UNKNOWN_RAD = 1.0, 1e3
@@ -57,6 +58,8 @@ def find_moved_groups(
     if not found:
         return optimum, ()
     verdict, free, against = max(found, key=lambda one: one[0].score)
+    if len(verdict.groups) >= changes.most_groups:  # perhaps more moved, and what has no group of its own was merged
+        return optimum, ()
     groups = tuple(
         MovedTogether(against.row[group.members], group.turns, group.motion, _probability(verdict, group.members))
         for group in verdict.groups
@@ -98,15 +101,13 @@ def _loosened(optimum: SpatialOptimum, stated: FloatArray, changes: ChangesConfi
         weight = np.full(len(prior.place), LEAST_WEIGHT)
         weight[seen[agree]] = 1.0
         there = replace(loose, prior=replace(loose.prior, weight=weight))
-        found.append(_counted(converged(there, start, free.noise, heavy_rounds=0)))
+        found.append(_counted(SpatialOptimum(start, free.noise, SpatialSmoother(there, start.pose), free.now)))
     return found or [_counted(free)]
 
 
 def _counted(optimum: SpatialOptimum) -> SpatialOptimum:
-    """Return the optimum with errors of detections that last counted as what they are worth."""
+    """Return the optimum next to this, with errors of detections that last counted as what they are worth."""
     smoother = optimum.smoother.counted(optimum.estimate, optimum.now)
-    if smoother is optimum.smoother:
-        return optimum
     estimate, now = smoother.optimum(optimum.estimate, optimum.noise, heavy=False)
     return SpatialOptimum(estimate, optimum.noise, smoother, now)
 
