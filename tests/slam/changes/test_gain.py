@@ -22,7 +22,7 @@ from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
-from evermap.slam.changes.gain import Tables, hypothesis_gain, log_onset, log_prior
+from evermap.slam.changes.gain import Tables, hypothesis_gain, log_onset, log_prior, turning_columns
 from evermap.slam.changes.search import item_columns
 from evermap.slam.problem import Estimate
 
@@ -45,7 +45,15 @@ def gain_of(
         np.array(label),
         np.array([0, *onset]),
         np.array([False, *turns]),
-        Tables(quadratic, linear, position, prior.spread, log_prior(prior, count, count), log_onset(n_windows)),
+        Tables(
+            quadratic,
+            linear,
+            position,
+            turning_columns(2),
+            prior.spread,
+            log_prior(prior, count, count),
+            log_onset(n_windows),
+        ),
     )
 
 

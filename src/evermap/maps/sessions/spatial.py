@@ -292,7 +292,8 @@ def solve_visit(
         recording, of_slam.space, remarks, robust=of_slam.robust, estimate_noise=of_slam.estimate_noise
     )
     intake = fit_to_map(intake, prior_map)
-    return SpatialVisit(recording, intake, solve_space(intake, prior_map, progress=progress))
+    solved = solve_space(intake, prior_map, progress=progress, changes=of_slam.changes)
+    return SpatialVisit(recording, intake, solved)
 
 
 def solve_visits_together(visits: Sequence[SpatialVisit], rules: LocalizeConfig) -> list[SpatialVisit]:

@@ -38,7 +38,8 @@ class WindowEvidence:
     Attributes:
         landmark: (R,) landmark of every copy.
         window: (R,) its window.
-        position: (R, 2) where it was linearised [m], sizes as the calibration's prior has them.
+        position: (R, 2) where it was linearised [m], sizes as the calibration's prior has them; in space (R, 3), or
+            (R, 6) with the rotation vector from the given orientation, in the axes of the map.
         information: (2 R, 2 R) with poses and calibration eliminated; lets the whole move and turn.
         pull: (2 R,) gradient.
         log_scale_sigma: how well the size of the whole is known.
@@ -53,8 +54,13 @@ class WindowEvidence:
     log_scale_sigma: float
     log_constant: float = 0.0
 
+    @property
+    def numbers(self) -> int:
+        """Numbers of a landmark: 2 in the plane, 3 of points in space, 6 with orientations."""
+        return int(self.position.shape[1])
+
     def first_seen(self, otherwise: FloatArray) -> FloatArray:
-        """Return (L, 2) the first copy of every landmark; `otherwise` (L, 2) for those that have none."""
+        """Return (L, numbers) the first copy of every landmark; `otherwise` (L, numbers) for those that have none."""
         position = otherwise.copy()
         landmark, first = np.unique(self.landmark, return_index=True)
         position[landmark] = self.position[first]
@@ -63,8 +69,8 @@ class WindowEvidence:
     def without(self, copies: BoolArray) -> WindowEvidence:
         """Return the evidence with some copies (R,) left out, as if their sightings had not been made."""
         kept = ~copies
-        rows = np.repeat(kept, 2)
-        out = np.repeat(copies, 2)
+        rows = np.repeat(kept, self.numbers)
+        out = np.repeat(copies, self.numbers)
         cross = self.information[np.ix_(rows, out)]
         inner = self.information[np.ix_(out, out)]
         solved = np.linalg.solve(inner, np.column_stack([cross.T, self.pull[out]]))
@@ -195,30 +201,32 @@ def _joined(pieces: Sequence[_Piece]) -> tuple[FloatArray, FloatArray, int]:
 
 
 def compare(evidence: WindowEvidence, mean: FloatArray, covariance: FloatArray, mapped: BoolArray) -> Comparison:
-    """Set the evidence against a map of means (L, 2) with covariances (L, 2, 2).
+    """Set the evidence against a map of means (L, n) with covariances (L, n, n), of n numbers a landmark.
 
     Of landmarks that it does not hold, not `mapped` (L,), only what happens during the session shows.
     """
     seen = np.unique(evidence.landmark)
     column = np.searchsorted(seen, evidence.landmark)
-    count, n_seen = len(evidence.landmark), len(seen)
+    count, n_seen, n = len(evidence.landmark), len(seen), evidence.numbers
+    freedom = {2: 3, 3: 6, 6: 6}[n]  # of a motion of the whole
     anchor = np.where(mapped[:, None], mean, evidence.first_seen(mean))[seen]
     # unknowns behind all copies: places and size
     offset = evidence.position - anchor[column]
-    size = evidence.log_scale_sigma * (evidence.position - evidence.position.mean(axis=0)).ravel()
+    size = evidence.log_scale_sigma * (evidence.position - evidence.position.mean(axis=0))
+    size[:, 3:] = 0.0
     places = sparse.csr_array(
-        (np.ones(2 * count), (np.arange(2 * count), se2.xy_rows(column))), shape=(2 * count, 2 * n_seen)
+        (np.ones(n * count), (np.arange(n * count), se2.xy_rows(column, n))), shape=(n * count, n * n_seen)
     )
-    spread = sparse.csr_array(sparse.hstack([places, size[:, None]]))
-    prior = np.zeros((2 * n_seen + 1, 2 * n_seen + 1))
+    spread = sparse.csr_array(sparse.hstack([places, size.reshape(-1, 1)]))
+    prior = np.zeros((n * n_seen + 1, n * n_seen + 1))
     log_prior_determinant = 0.0
     for k in np.flatnonzero(mapped[seen]):
         information = np.linalg.inv(covariance[seen[k]])
-        prior[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = information
+        prior[n * k : n * k + n, n * k : n * k + n] = information
         log_prior_determinant += float(np.linalg.slogdet(information)[1])
     prior[-1, -1] = 1.0
     # without a map the whole is free to be anywhere
-    prior[np.diag_indices(2 * n_seen)] += TINY_INFORMATION
+    prior[np.diag_indices(n * n_seen)] += TINY_INFORMATION
     pull = evidence.pull + evidence.information @ offset.ravel()
     weighted = np.asarray((spread.T @ evidence.information).T)
     inner = cho_factor(spread.T @ weighted + prior)
@@ -229,14 +237,14 @@ def compare(evidence: WindowEvidence, mean: FloatArray, covariance: FloatArray, 
     gained = float((spread.T @ pull) @ solved[:, -1])
     moved = offset.ravel()
     offset_term = -float(moved @ evidence.pull + 0.5 * moved @ evidence.information @ moved)
-    held = evidence.information + TINY_INFORMATION * np.eye(2 * count)
+    held = evidence.information + TINY_INFORMATION * np.eye(n * count)
     estimated = np.linalg.solve(held, pull)  # displacements from the map if all of them were free
     return Comparison(
         precision=0.5 * (precision + precision.T),
         pull=left,
         log_evidence=0.5 * (gained - log_determinant) + evidence.log_constant + offset_term,
         misfit=float(estimated @ left),
-        freedom=float(2 * count - 2 * np.count_nonzero(~mapped[seen]) - 3),
+        freedom=float(n * (count - np.count_nonzero(~mapped[seen])) - freedom),
     )
 
 

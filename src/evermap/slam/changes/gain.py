@@ -6,11 +6,12 @@ with displacements `d ~ N(0, s^2 I)` that enter through columns `B` gain
     1/2 b'B (I/s^2 + B'AB)^-1 B'b  -  1/2 log |I + s^2 B'AB|  +  sum of log prior over groups.
 
 A group may also turn about its centroid, by an angle of any size: its members move by `d + (R(angle) - I) (p - c)`,
-which is linear in four columns (x, y, cosine - 1, sine), so the fit of the angle needs none but their products, and the
-gain is the one above with the columns of the tangent (Laplace).
+which is linear in few columns (in the plane four: x, y, cosine - 1, sine), so the fit of the angle needs none but their
+products, and the gain is the one above with the columns of the tangent (Laplace). In space the columns are x, y, z and
+the nine numbers of R - I; where landmarks have orientations, the rotation vector too, by which these turn.
 
 Which copies of a landmark moved depends on when: item `onset * L + landmark` stands for 'this landmark, from this
-window on'. `quadratic` and `linear` hold `T'AT` and `T'b` for the four columns `T` of every item.
+window on'. `quadratic` and `linear` hold `T'AT` and `T'b` for the columns `T` of every item.
 """
 
 from __future__ import annotations
@@ -28,14 +29,39 @@ _TURN_STEPS = 6
 """Gauss-Newton steps towards the angles; without a turning group one is exact."""
 
 
+PLANE, POINTS, PLACES = 2, 3, 6
+"""Numbers of a landmark: in the plane x, y; of points in space x, y, z; of places with orientations the rotation vector
+from a given orientation as well, in the axes of the map."""
+
+
+def turning_columns(numbers: int) -> FloatArray:
+    """Return (T, D, D) by which matrix each column of turning displaces a point: in the plane that of cosine - 1 and
+    that of the sine, in space those of the numbers of R - I, and 0 for the rotation vector, which moves no point.
+
+    Args:
+        numbers: of a landmark: `PLANE`, `POINTS`, `PLACES`.
+    """
+    if numbers == PLANE:
+        return np.array([[[1.0, 0.0], [0.0, 1.0]], [[0.0, -1.0], [1.0, 0.0]]])
+    return np.concatenate([np.eye(9).reshape(9, 3, 3), np.zeros((numbers - 3, 3, 3))])
+
+
+def motion_spread(prior: ChangesConfig, numbers: int) -> FloatArray:
+    """Return the prior standard deviations of a motion's displacement, 2 or 3 [m], and of its turn, 1 or 3 [rad]."""
+    if numbers == PLANE:
+        return prior.spread
+    return np.repeat([prior.move_sigma_m, prior.turn_sigma_rad], 3)
+
+
 class Tables(NamedTuple):
     """Precomputed tables for gains.
 
     Attributes:
-        quadratic: (4 K, 4 K) `T'AT`.
-        linear: (4 K,) `T'b`.
-        position: (L, 2) mapped positions.
-        spread: (3,) prior standard deviations of x, y and angle.
+        quadratic: (C K, C K) `T'AT`, with D + T columns a item.
+        linear: (C K,) `T'b`.
+        position: (L, D) mapped positions.
+        turning: (T, D, D) columns of turning; see `turning_columns`.
+        spread: (Y,) prior standard deviations of a motion; see `motion_spread`.
         log_prior: (L + 1, 2) log prior of a group by its size, for groups that only move and that turn, relative to
             'nothing moved'.
         log_onset: (W,) log prior of the window from which on a group has moved.
@@ -44,6 +70,7 @@ class Tables(NamedTuple):
     quadratic: FloatArray
     linear: FloatArray
     position: FloatArray
+    turning: FloatArray
     spread: FloatArray
     log_prior: FloatArray
     log_onset: FloatArray
@@ -51,23 +78,24 @@ class Tables(NamedTuple):
 
 @kernel
 def hypothesis_gain(label: IntArray, onset: IntArray, turns: Any, tables: Tables) -> tuple[float, FloatArray]:
-    """Return the gain [nats] and the most probable motion (G, 3) of every group: x [m], y [m], angle [rad].
+    """Return the gain [nats] and the most probable motion (G, Y) of every group: its displacement [m], in the plane
+    an angle, in space a rotation vector [rad].
 
     `label` (L,) is the group of every landmark, 0 = static, groups are 1..G; `onset` (G + 1,) the window from which on
     each has moved, and `turns` (G + 1,) whether it also turns, whose row 0 is not used.
     """
-    groups, spread = len(onset) - 1, tables.spread
+    groups, spread, point_dim = len(onset) - 1, tables.spread, tables.position.shape[1]
     width, first, matrix, right, gain = _products(label, onset, turns, tables)
-    motion = np.zeros((groups, 3))
+    motion = np.zeros((groups, len(spread)))
     total = first[groups + 1]
     if total == 0:
         return gain, motion
-    # unknowns y: x, y and, where a group turns, its angle; columns z(y): x, y, cosine - 1, sine
+    # unknowns y: a displacement and, where a group turns, a rotation; columns z(y): the displacement, and `turning`
     start = np.zeros(groups + 2, dtype=np.int64)
     any_turns = False
     for g in range(1, groups + 1):
-        start[g + 1] = start[g] + (0 if width[g] == 0 else (3 if width[g] == 4 else 2))
-        any_turns = any_turns or width[g] == 4
+        start[g + 1] = start[g] + (0 if width[g] == 0 else (len(spread) if width[g] > point_dim else point_dim))
+        any_turns = any_turns or width[g] > point_dim
     size = start[groups + 1]
     scale = np.zeros(size)
     for g in range(1, groups + 1):
@@ -77,7 +105,7 @@ def hypothesis_gain(label: IntArray, onset: IntArray, turns: Any, tables: Tables
     column, tangent, weighted = np.zeros(total), np.zeros((total, size)), np.zeros(total)
     inner, step = np.zeros((size, size)), np.zeros(size)
     for _ in range(_TURN_STEPS if any_turns else 1):
-        _columns_of(value, scale, width, first, start, column, tangent)
+        _columns_of(value, scale, width, first, start, point_dim, column, tangent)
         for a in range(size):
             for k in range(total):
                 weighted[k] = 0.0
@@ -94,7 +122,7 @@ def hypothesis_gain(label: IntArray, onset: IntArray, turns: Any, tables: Tables
         _solve(inner, step)
         for a in range(size):
             value[a] += step[a]
-    _columns_of(value, scale, width, first, start, column, tangent)
+    _columns_of(value, scale, width, first, start, point_dim, column, tangent)
     for k in range(total):
         pull = right[k]
         for m in range(total):
@@ -112,37 +140,38 @@ def hypothesis_gain(label: IntArray, onset: IntArray, turns: Any, tables: Tables
 def _products(
     label: IntArray, onset: IntArray, turns: Any, tables: Tables
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, float]:
-    """Columns of every group (0, 2 or 4), the first of each, their `C'AC` and `C'b` about the centroids; log prior."""
-    quadratic, linear, position, _, log_prior, log_onset = tables
-    count, groups = len(label), len(onset) - 1
+    """Columns of every group (0, D or D + T), the first of each, their `C'AC` and `C'b` about centroids; log prior."""
+    quadratic, linear, position, turning, _, log_prior, log_onset = tables
+    count, groups, point_dim = len(label), len(onset) - 1, position.shape[1]
+    columns = point_dim + len(turning)
     width, size = np.zeros(groups + 1, dtype=np.int64), np.zeros(groups + 1, dtype=np.int64)
     first = np.zeros(groups + 2, dtype=np.int64)
-    centre = np.zeros((groups + 1, 2))
+    centre = np.zeros((groups + 1, point_dim))
     members = np.zeros((groups + 1, count), dtype=np.int64)
     for i in range(count):
         g = label[i]
         members[g, size[g]] = i
         size[g] += 1
-        centre[g, 0] += position[i, 0]
-        centre[g, 1] += position[i, 1]
+        for a in range(point_dim):
+            centre[g, a] += position[i, a]
     prior = 0.0
     for g in range(1, groups + 1):
         if size[g] > 0:
-            centre[g, 0] /= size[g]
-            centre[g, 1] /= size[g]
-            width[g] = 4 if turns[g] else 2
+            for a in range(point_dim):
+                centre[g, a] /= size[g]
+            width[g] = columns if turns[g] else point_dim
             prior += log_prior[size[g], 1 if turns[g] else 0] + log_onset[onset[g]]
         first[g + 1] = first[g] + width[g]
     total = first[groups + 1]
     matrix, right = np.zeros((total, total)), np.zeros(total)
     for g in range(1, groups + 1):
         for m in range(size[g]):
-            at = 4 * (onset[g] * count + members[g, m])
+            at = columns * (onset[g] * count + members[g, m])
             for a in range(width[g]):
                 right[first[g] + a] += linear[at + a]
             for h in range(g, groups + 1):
                 for n in range(size[h]):
-                    to = 4 * (onset[h] * count + members[h, n])
+                    to = columns * (onset[h] * count + members[h, n])
                     for a in range(width[g]):
                         for c in range(width[h]):
                             matrix[first[g] + a, first[h] + c] += quadratic[at + a, to + c]
@@ -152,24 +181,44 @@ def _products(
                 for c in range(width[h]):
                     matrix[first[h] + c, first[g] + a] = matrix[first[g] + a, first[h] + c]
     # from turning about the origin to turning about the centroid
+    by = np.zeros(point_dim)
     for g in range(1, groups + 1):
-        if width[g] == 4:
-            f, x, y = first[g], centre[g, 0], centre[g, 1]
-            right[f + 2] -= x * right[f] + y * right[f + 1]
-            right[f + 3] -= x * right[f + 1] - y * right[f]
+        f = first[g]
+        for t in range(width[g] - point_dim):
+            _displace(turning[t], centre[g], by)
+            right[f + point_dim + t] -= _weighted(by, right, f)
             for k in range(total):
-                matrix[f + 2, k] -= x * matrix[f, k] + y * matrix[f + 1, k]
-                matrix[f + 3, k] -= x * matrix[f + 1, k] - y * matrix[f, k]
+                matrix[f + point_dim + t, k] -= _weighted(by, matrix[:, k], f)
+        for t in range(width[g] - point_dim):
+            _displace(turning[t], centre[g], by)
             for k in range(total):
-                matrix[k, f + 2] -= x * matrix[k, f] + y * matrix[k, f + 1]
-                matrix[k, f + 3] -= x * matrix[k, f + 1] - y * matrix[k, f]
+                matrix[k, f + point_dim + t] -= _weighted(by, matrix[k], f)
     return width, first, matrix, right, prior
 
 
 @kernel
+def _displace(turning: FloatArray, point: FloatArray, by: FloatArray) -> None:
+    """Write by how much a column of turning displaces a point."""
+    for a in range(len(point)):
+        by[a] = 0.0
+        for c in range(len(point)):
+            by[a] += turning[a, c] * point[c]
+
+
+@kernel
+def _weighted(by: FloatArray, values: FloatArray, first: int) -> float:
+    """Sum of values from the first on, as many as there are weights; some of these are 0."""
+    total = 0.0
+    for a in range(len(by)):
+        if by[a] != 0.0:
+            total += by[a] * values[first + a]
+    return total
+
+
+@kernel
 def _columns_of(
-    value: FloatArray, scale: FloatArray, width: IntArray, first: IntArray, start: IntArray, column: FloatArray,
-    tangent: FloatArray,
+    value: FloatArray, scale: FloatArray, width: IntArray, first: IntArray, start: IntArray, point_dim: int,
+    column: FloatArray, tangent: FloatArray,
 ) -> None:  # fmt: skip
     """Columns (C,) at the unknowns (Y,), and their derivatives (C, Y)."""
     tangent[:] = 0.0
@@ -177,13 +226,54 @@ def _columns_of(
         if width[g] == 0:
             continue
         f, s = first[g], start[g]
-        for a in range(2):
+        for a in range(point_dim):
             column[f + a] = value[s + a] * scale[s + a]
             tangent[f + a, s + a] = scale[s + a]
-        if width[g] == 4:
-            angle = value[s + 2] * scale[s + 2]
-            column[f + 2], column[f + 3] = np.cos(angle) - 1.0, np.sin(angle)
-            tangent[f + 2, s + 2], tangent[f + 3, s + 2] = -np.sin(angle) * scale[s + 2], np.cos(angle) * scale[s + 2]
+        if width[g] == point_dim:
+            continue
+        f, s = f + point_dim, s + point_dim
+        if point_dim == 2:
+            angle = value[s] * scale[s]
+            column[f], column[f + 1] = np.cos(angle) - 1.0, np.sin(angle)
+            tangent[f, s], tangent[f + 1, s] = -np.sin(angle) * scale[s], np.cos(angle) * scale[s]
+        else:
+            turn, by = _rotation(value[s : s + 3] * scale[s : s + 3])
+            for a in range(9):
+                column[f + a] = turn[a // 3, a % 3] - (1.0 if a % 4 == 0 else 0.0)
+                for c in range(3):
+                    tangent[f + a, s + c] = by[c, a // 3, a % 3] * scale[s + c]
+            for a in range(width[g] - point_dim - 9):
+                column[f + 9 + a] = value[s + a] * scale[s + a]
+                tangent[f + 9 + a, s + a] = scale[s + a]
+
+
+@kernel
+def _rotation(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation matrix (3, 3) of a rotation vector, and its derivatives (3, 3, 3) by each number of that.
+
+    `R = 1 + a W + b W^2`, `dR / dv_k = (J e_k) x R` with the left Jacobian `J = 1 + b W + c W^2`, `W` the cross product
+    with the vector.
+    """
+    q = vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]
+    if q < 1e-4:  # series, to 1e-16
+        a, b, c = 1.0 - q / 6.0 + q * q / 120.0, 0.5 - q / 24.0 + q * q / 720.0, 1.0 / 6.0 - q / 120.0 + q * q / 5040.0
+    else:
+        t = np.sqrt(q)
+        a, b, c = np.sin(t) / t, 2.0 * np.sin(0.5 * t) ** 2 / q, (t - np.sin(t)) / (q * t)
+    turn, left, by = np.eye(3), np.eye(3), np.zeros((3, 3, 3))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for matrix, odd, even in ((turn, a, b), (left, b, c)):
+            matrix[j, k] -= odd * vector[i]
+            matrix[k, j] += odd * vector[i]
+            for m in range(3):
+                matrix[i, m] += even * (vector[i] * vector[m] - (q if i == m else 0.0))
+    for k in range(3):
+        for m in range(3):
+            for i in range(3):
+                j, n = (i + 1) % 3, (i + 2) % 3
+                by[k, i, m] = left[j, k] * turn[n, m] - left[n, k] * turn[j, m]
+    return turn, by
 
 
 @kernel
@@ -212,14 +302,18 @@ def _solve(factor: FloatArray, right: FloatArray) -> None:
         right[a] /= factor[a, a]
 
 
-def log_prior(prior: ChangesConfig, n_landmarks: int, largest: int) -> FloatArray:
-    """Return (largest + 1, 2) log priors of a group by size, moved only and also turned: `eps 2^-n / C(N, n)`."""
+def log_prior(prior: ChangesConfig, n_landmarks: int, largest: int, *, numbers: int = PLANE) -> FloatArray:
+    """Return (largest + 1, 2) log priors of a group by size, moved only and also turned: `eps 2^-n / C(N, n)`.
+
+    A point alone has nothing to turn; a place with an orientation has.
+    """
     size = np.arange(largest + 1)
     choices = gammaln(n_landmarks + 1) - gammaln(size + 1) - gammaln(n_landmarks - size + 1)
     group = np.log(prior.p_moved) - np.log1p(-prior.p_moved) - size * np.log(2.0) - choices
     with np.errstate(divide="ignore"):
         table: FloatArray = group[:, None] + np.log([1.0 - prior.p_rotated, prior.p_rotated])
-    table[:2, 1] = -np.inf  # one landmark alone has nothing to turn
+    if numbers != PLACES:
+        table[:2, 1] = -np.inf
     table[0] = 0.0
     return table
 

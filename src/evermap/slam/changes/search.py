@@ -10,7 +10,15 @@ from evermap.config import ChangesConfig
 from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence
-from evermap.slam.changes.gain import Tables, hypothesis_gain, log_onset, log_prior
+from evermap.slam.changes.gain import (
+    PLACES,
+    Tables,
+    hypothesis_gain,
+    log_onset,
+    log_prior,
+    motion_spread,
+    turning_columns,
+)
 from evermap.slam.kernels import kernel
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -30,7 +38,7 @@ class Hypotheses(NamedTuple):
         label: (H, L) group of every landmark, 0 = static; groups are numbered by their first member.
         onset: (H, G + 1) window from which on a group has moved; row 0 is not used.
         turns: (H, G + 1) whether a group also turned.
-        motion: (H, G, 3) displacement of each group's centroid [m] and its angle [rad].
+        motion: (H, G, 3 or 6) displacement of each group's centroid [m] and its angle or rotation vector [rad].
         gain: (H,) log posterior odds against 'nothing moved' [nats].
     """
 
@@ -52,9 +60,10 @@ def find_changes(
 ) -> Slices[Hypotheses]:
     """Return the most probable sets of changes, and all that were weighed on the way, in slices.
 
-    Groups turn about the centroid of mapped positions (L, 2); the first hypothesis of `start` is one start of the
-    search.
+    Groups turn about the centroid of mapped positions (L, D), in space with orientations (L, 6) behind them; the first
+    hypothesis of `start` is one start of the search.
     """
+    numbers = evidence.numbers
     candidates = _candidates(evidence, comparison, len(position), prior, start)
     yield MS_OF_CANDIDATE * len(position)
     quadratic, linear = yield from item_columns(evidence, comparison, position, n_windows, candidates)
@@ -66,12 +75,15 @@ def find_changes(
     tables = Tables(
         quadratic,
         linear,
-        position[candidates],
-        prior.spread,
-        log_prior(prior, len(np.unique(evidence.landmark)), count),
+        position[candidates, : turning_columns(numbers).shape[1]],
+        turning_columns(numbers),
+        motion_spread(prior, numbers),
+        log_prior(prior, len(np.unique(evidence.landmark)), count, numbers=numbers),
         log_onset(n_windows),
     )
-    may_turn, weighed = prior.p_rotated > 0.0, Weighed.nothing(count, prior.most_groups)
+    weighed = Weighed.nothing(count, prior.most_groups)
+    # by the number of members: none, one, more
+    may_turn = (prior.p_rotated > 0.0) & np.array([False, numbers == PLACES, True])
     yield from _climb_from_many_starts((label, onset, turns), tables, weighed, may_turn=may_turn)
     near = weighed.ranked
     for k in near[weighed.gain[near] > weighed.best[0] - NEAR][:MOST_WIDENED]:
@@ -90,14 +102,15 @@ def _candidates(
     evidence: WindowEvidence, comparison: Comparison, n_landmarks: int, prior: ChangesConfig, start: Hypotheses | None
 ) -> IntArray:
     """Landmarks that may have moved: in a large map those that would gain most alone, and those already suspected."""
-    gain = np.full(n_landmarks, -np.inf)
+    gain, numbers = np.full(n_landmarks, -np.inf), evidence.numbers
+    spread = np.diag(1.0 / motion_spread(prior, numbers)[:numbers] ** 2)
     for j in np.unique(evidence.landmark):
         rows = np.flatnonzero(evidence.landmark == j)
-        both = se2.xy_rows(rows)
-        identity = np.tile(np.eye(2), (len(rows), 1))
+        both = se2.xy_rows(rows, numbers)
+        identity = np.tile(np.eye(numbers), (len(rows), 1))
         pull = identity.T @ comparison.pull[both]
         precision = identity.T @ comparison.precision[np.ix_(both, both)] @ identity
-        gain[j] = pull @ np.linalg.solve(precision + np.eye(2) / prior.spread[0] ** 2, pull)
+        gain[j] = pull @ np.linalg.solve(precision + spread, pull)
     suspected = np.zeros(n_landmarks, bool) if start is None else start.label[0] > 0
     gain[suspected] = np.inf
     order = np.argsort(-gain, kind="stable")[: prior.most_candidates]
@@ -107,29 +120,29 @@ def _candidates(
 def item_columns(
     evidence: WindowEvidence, comparison: Comparison, position: FloatArray, n_windows: int, candidates: IntArray
 ) -> Slices[tuple[FloatArray, FloatArray]]:
-    """Return `T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'; in slices.
+    """Return `T'AT` and `T'b`: the columns of every item 'this candidate, from this window on'; in slices.
 
     With one window for all of the session's, the items are 'this candidate, always'.
     """
     rank = np.full(len(position), -1)
     rank[candidates] = np.arange(len(candidates))
     rows = np.flatnonzero(rank[evidence.landmark] >= 0)
-    x, y = position[evidence.landmark[rows]].T
-    zero, one = np.zeros(len(rows)), np.ones(len(rows))
-    columns = np.array([[one, zero, x, -y], [zero, one, y, x]]).transpose(2, 0, 1)  # (R, 2, 4)
-    both = se2.xy_rows(rows)
-    precision = comparison.precision[np.ix_(both, both)].reshape(len(rows), 2, len(rows), 2)
+    numbers = evidence.numbers
+    columns = _columns(position[evidence.landmark[rows]], numbers)
+    both = se2.xy_rows(rows, numbers)
+    precision = comparison.precision[np.ix_(both, both)].reshape(len(rows), numbers, len(rows), numbers)
     # what a copy says is said by every item that begins in its window or before: sums from the last window backwards
-    size = (n_windows, len(candidates), 4)
+    width = columns.shape[2]
+    size = (n_windows, len(candidates), width)
     window, column = np.minimum(evidence.window[rows], n_windows - 1), rank[evidence.landmark[rows]]
     item = window * len(candidates) + column
-    linear = np.zeros((n_windows * len(candidates), 4))
-    np.add.at(linear, item, np.einsum("rka,rk->ra", columns, comparison.pull[both].reshape(-1, 2)))
+    linear = np.zeros((n_windows * len(candidates), width))
+    np.add.at(linear, item, np.einsum("rka,rk->ra", columns, comparison.pull[both].reshape(-1, numbers)))
     linear = np.cumsum(linear.reshape(size)[::-1], axis=0)[::-1]
     half = np.einsum("rkqm,qmb->rkqb", precision, columns)
     blocks = np.einsum("rka,rkqb->raqb", columns, half)
     yield MS_OF_NUMBER * blocks.size
-    quadratic = np.zeros((n_windows * len(candidates), 4, n_windows * len(candidates), 4))
+    quadratic = np.zeros((n_windows * len(candidates), width, n_windows * len(candidates), width))
     if len(np.unique(item)) == len(item):
         quadratic[item[:, None], :, item[None, :], :] = blocks.transpose(0, 2, 1, 3)
     else:
@@ -143,6 +156,22 @@ def item_columns(
         quadratic[:, :, :, later - 1] += quadratic[:, :, :, later]
     yield MS_OF_NUMBER * quadratic.size
     return quadratic.reshape(linear.size, linear.size), linear.ravel()
+
+
+def _columns(position: FloatArray, numbers: int) -> FloatArray:
+    """Return (R, numbers, D + T) by how much each column of a motion displaces copies at positions (R, D at least).
+
+    The copies are the last axis in memory, along which they are summed.
+    """
+    turning = turning_columns(numbers)
+    point_dim = turning.shape[1]
+    columns = np.zeros((numbers, point_dim + len(turning), len(position)))
+    columns[np.arange(point_dim), np.arange(point_dim)] = 1.0
+    for t, a, c in np.argwhere(turning):
+        columns[a, point_dim + t] = turning[t, a, c] * position[:, c]
+    if numbers > point_dim:  # an orientation turns by the rotation vector
+        columns[point_dim + np.arange(point_dim), -point_dim + np.arange(point_dim)] = 1.0
+    return columns.transpose(2, 0, 1)
 
 
 WORTH_KEEPING = 25.0
@@ -262,7 +291,7 @@ def _copy(label: IntArray, onset: IntArray, turns: Any, to_label: IntArray, to_o
 
 @kernel
 def _climb(
-    label: IntArray, onset: IntArray, turns: Any, may_turn: bool, tables: Tables, weighed: Weighed, uphill: bool
+    label: IntArray, onset: IntArray, turns: Any, may_turn: Any, tables: Tables, weighed: Weighed, uphill: bool
 ) -> float:
     """Climb from a start to a local optimum, in place, and return its gain; or evaluate all neighbours of the start."""
     n_windows = len(tables.log_onset)
@@ -299,7 +328,7 @@ def _size(label: IntArray, group: int) -> int:
 
 
 @kernel
-def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: int, may_turn: bool) -> bool:
+def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: int, may_turn: Any) -> bool:
     """Move number `move` in place; False where it changes nothing."""
     count, groups = len(label), len(onset) - 1
     if move < count * (groups + 1):
@@ -313,7 +342,7 @@ def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: i
         # two that turned together are no one group that only moved, so merging and turning is one step
         turn, pair = move // (groups * groups), move % (groups * groups)
         g, h = 1 + pair // groups, 1 + pair % groups
-        if g == h or _size(label, g) == 0 or _size(label, h) == 0 or (turn and (turns[g] or not may_turn)):
+        if g == h or _size(label, g) == 0 or _size(label, h) == 0 or (turn and (turns[g] or not may_turn[2])):
             return False
         for i in range(count):
             if label[i] == h:
@@ -347,7 +376,7 @@ def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: i
         onset[g] = window
         return True
     g = move - groups * n_windows + 1
-    if not may_turn or _size(label, g) < 2:
+    if _size(label, g) == 0 or not may_turn[min(_size(label, g), 2)]:
         return False
     turns[g] = not turns[g]
     return True
@@ -355,7 +384,7 @@ def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: i
 
 @kernel
 def _add_best_pair(
-    landmark: int, group: int, may_turn: bool, tables: Tables, label: IntArray, onset: IntArray, turns: Any
+    landmark: int, group: int, may_turn: Any, tables: Tables, label: IntArray, onset: IntArray, turns: Any
 ) -> None:
     """Add a group of a static landmark and its best static partner, at the best time, in place.
 
@@ -363,11 +392,11 @@ def _add_best_pair(
     """
     n_windows = len(tables.log_onset)
     best, partner, window, turning = -np.inf, landmark, 0, False
-    for attempt in range(n_windows + (1 if may_turn else 0)):
+    for attempt in range(n_windows + (1 if may_turn[2] else 0)):
         turns[group] = attempt == n_windows  # last, at the time that was best without
         onset[group] = window if turns[group] else attempt
         for other in range(len(label)):
-            if label[other] > 0 or (turns[group] and other == landmark):
+            if label[other] > 0 or (turns[group] and other == landmark and not may_turn[1]):
                 continue
             label[landmark] = group
             label[other] = group
@@ -383,7 +412,7 @@ def _add_best_pair(
 
 
 def _climb_from_many_starts(
-    start: tuple[IntArray, IntArray, BoolArray], tables: Tables, weighed: Weighed, *, may_turn: bool
+    start: tuple[IntArray, IntArray, BoolArray], tables: Tables, weighed: Weighed, *, may_turn: BoolArray
 ) -> Slices[None]:
     """Climb from a start, from the best pair of every landmark, and from the best so far with each landmark changed.
 

@@ -17,6 +17,7 @@ from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, dense_ms
 from evermap.slam.changes.explain import GivenMap, MovedGroup
+from evermap.slam.changes.gain import motion_spread
 from evermap.slam.changes.search import Hypotheses, find_changes
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -58,11 +59,13 @@ def weigh(
     before: Verdict | None = None,
     thorough: bool = True,
     spared: bool = False,
+    factors: tuple[float, ...] = MAP_FACTORS,
 ) -> Slices[Verdict]:
     """Search for changes, and compute their probabilities, in slices.
 
     What was found `before` is one start of the search; if not `thorough`, its degree of belief is the only one that is
-    tried. If `spared`, no copy of this evidence is displaced alone.
+    tried. If `spared`, no copy of this evidence is displaced alone. The standard deviations of the map may be wrong by
+    `factors`, among them 1.
     """
     factor = 1.0 if before is None else before.map_factor
     usual = prior.softness_m[(len(prior.softness_m) - 1) // 2]
@@ -100,12 +103,12 @@ def weigh(
     yield from best_of([(factor, softness)])
     if thorough and before is None and given.given.any():
         # a map that is believed little explains everything: the other end must have been looked at
-        factor, _ = yield from best_of([(f, softness) for f in MAP_FACTORS])
+        factor, _ = yield from best_of([(f, softness) for f in factors])
     improved = thorough
     while improved:  # one step up or down in either, as long as that gains
         neighbours = [(factor, s) for s in _beside(prior.softness_m, softness)] if n_windows > 1 else []
         if given.given.any():
-            neighbours += [(f, softness) for f in _beside(MAP_FACTORS, factor)]
+            neighbours += [(f, softness) for f in _beside(factors, factor)]
         best = yield from best_of(neighbours)
         improved = trials[best].score > trials[factor, softness].score
         if improved:
@@ -211,13 +214,14 @@ def without_transients(
 ) -> Slices[WindowEvidence]:
     """Return the evidence without copies that are displaced alone, from mapped positions (L, 2), in slices."""
     comparison, found = yield from search(evidence, None)
+    spread = motion_spread(prior, evidence.numbers)[: evidence.numbers]
     for _ in range(len(evidence.landmark)):
         copy = np.arange(len(evidence.landmark))
         spared = np.bincount(evidence.landmark)[evidence.landmark] < 2  # their landmarks have no other
-        alone = np.where(spared, 0.0, _gains(comparison, prior.move_sigma_m))
+        alone = np.where(spared, 0.0, _gains(comparison, spread))
         after = _explained_away(evidence, comparison, found, position, prior)
         yield dense_ms(len(comparison.pull))
-        still = np.where(spared, 0.0, _gains(after, prior.move_sigma_m))
+        still = np.where(spared, 0.0, _gains(after, spread))
         candidates: list[tuple[int, float]] = []  # a copy, and what leaving it out gains over keeping it
         worst = int(np.argmax(still))
         if still[worst] > prior.displaced_log_odds:
@@ -234,15 +238,16 @@ def without_transients(
     return evidence
 
 
-def _gains(comparison: Comparison, sigma_m: float) -> FloatArray:
-    """(R,) what every copy gains by a displacement of its own [nats]."""
-    count = len(comparison.pull) // 2
+def _gains(comparison: Comparison, spread: FloatArray) -> FloatArray:
+    """(R,) what every copy gains by a displacement of its own, of standard deviations (n,) [nats]."""
+    n = len(spread)
+    count = len(comparison.pull) // n
     rows = np.arange(count)
-    precision = comparison.precision.reshape(count, 2, count, 2)[rows, :, rows, :]
-    pull = comparison.pull.reshape(count, 2)
-    inner = precision + np.eye(2) / sigma_m**2
+    precision = comparison.precision.reshape(count, n, count, n)[rows, :, rows, :]
+    pull = comparison.pull.reshape(count, n)
+    inner = precision + np.diag(spread**-2)
     solved = np.linalg.solve(inner, pull[:, :, None])[:, :, 0]
-    return np.asarray(0.5 * (pull * solved).sum(axis=1) - 0.5 * np.linalg.slogdet(sigma_m**2 * inner)[1])
+    return np.asarray(0.5 * (pull * solved).sum(axis=1) - 0.5 * np.linalg.slogdet(np.outer(spread, spread) * inner)[1])
 
 
 def _explained_away(

@@ -12,9 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.geometry import se2, se3
+from evermap.slam.changes.evidence import WindowEvidence
+from evermap.slam.changes.explain import GivenMap
+from evermap.slam.changes.gain import PLACES, POINTS
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT, SpatialProblem
-from evermap.types import FloatArray
+from evermap.types import FloatArray, IntArray
 
 ROUNDS = 12
 FARTHEST = 0.25
@@ -27,6 +30,22 @@ LEAST_INFORMATION = 1.0 / 25.0
 """Of a place by the others alone: it is somewhere within 5 m, or 5 rad."""
 
 
+class MovedTogether(NamedTuple):
+    """Places of a map that moved as one, before the session.
+
+    Attributes:
+        members: (k,) rows of the prior.
+        turns: whether they also turned.
+        motion: (6,) displacement of the centroid [m] and rotation vector [rad], in the axes of the map.
+        probability: of this very group, over all sets of changes that were weighed.
+    """
+
+    members: IntArray
+    turns: bool
+    motion: FloatArray
+    probability: float
+
+
 @dataclass(frozen=True, slots=True)
 class MapComparison:
     """Comparison of the map's places with those of the session.
@@ -36,33 +55,47 @@ class MapComparison:
         off: (K, 6) twist from where the map has it to where it is, by the session and the other places.
         covariance: (K, 6, 6) of that.
         factor: by which the map's stated standard deviations were multiplied.
+        groups: places that moved together, by the joint search.
     """
 
     p_stands: FloatArray
     off: FloatArray
     covariance: FloatArray
     factor: float
+    groups: tuple[MovedTogether, ...] = ()
 
 
-def compared(optimum: SpatialOptimum, stated: FloatArray) -> tuple[SpatialOptimum, MapComparison]:
+def compared(
+    optimum: SpatialOptimum, stated: FloatArray, groups: tuple[MovedTogether, ...] = ()
+) -> tuple[SpatialOptimum, MapComparison]:
     """Return the optimum with every place of the map weighted by the probability that it stands, and these.
 
     Args:
         optimum: of a problem with a prior map.
         stated: (K, 6) standard deviations of the map's places.
+        groups: places that are known to have moved.
     """
     problem = optimum.smoother.problem
-    found = _asked(optimum, stated)
+
+    def ask(sigma: FloatArray) -> MapComparison:
+        found = _asked(optimum, sigma)
+        for group in groups:  # other sets of changes are worlds of their own, not this one with half a map
+            found.p_stands[group.members] = 0.0
+        return found
+
+    found = ask(stated)
     for _ in range(ROUNDS):
         factor = _accuracy(found, stated, problem)
         weight = _believed(found, factor * stated, problem.prior.weight)
         held = bool(np.any((found.p_stands < 0.5) & (weight >= 0.5)))
         problem = replace(problem, prior=replace(problem.prior, sigma=factor * stated, weight=weight))
         optimum = converged(problem, optimum.estimate, optimum.noise, heavy_rounds=0)
-        before, found = found, replace(_asked(optimum, factor * stated), factor=factor)
+        before, found = found, replace(ask(factor * stated), factor=factor)
         if not held and np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED:
             break
-    return optimum, found
+    for group in groups:
+        found.p_stands[group.members] = 1.0 - group.probability
+    return optimum, replace(found, groups=groups)
 
 
 def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
@@ -134,6 +167,27 @@ def by_itself(optimum: SpatialOptimum) -> Alone:
     if not len(problem.prior.place):
         covariance[np.ix_(rows, rows)] = onto @ joint @ onto.T
         return Alone(shift, covariance, rotation)
+    values, vectors, pull = _without_map(optimum, joint, seen, first)
+    told = values > LOOSE
+    shift[seen] = (onto @ vectors[:, told] @ ((vectors[:, told].T @ pull) / values[told])).reshape(-1, 3)
+    root = onto @ (vectors / np.sqrt(np.maximum(values, LOOSE)))
+    covariance[np.ix_(rows, rows)] = root @ root.T
+    return Alone(shift, covariance, rotation)
+
+
+def _without_map(
+    optimum: SpatialOptimum, joint: FloatArray, seen: IntArray, first: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return eigenvalues (n,) and vectors (n, n) of the information on places without what the map says, and the pull
+    (n,) of the session at the optimum, where the map's holds it in balance.
+
+    Args:
+        optimum: with a map.
+        joint: (n, n) covariance of the places with the map.
+        seen: (S,) rows of these places.
+        first: (P,) where the numbers of each begin.
+    """
+    problem, place = optimum.smoother.problem, optimum.estimate.place
     information, pull = np.linalg.inv(joint), np.zeros(len(joint))
     for k in np.flatnonzero(np.isin(problem.prior.place, seen)).tolist():
         row = int(problem.prior.place[k])
@@ -144,11 +198,69 @@ def by_itself(optimum: SpatialOptimum) -> Alone:
         information[own, own] -= said @ jacobian
         pull[own] = said @ off
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
-    told = values > LOOSE
-    shift[seen] = (onto @ vectors[:, told] @ ((vectors[:, told].T @ pull) / values[told])).reshape(-1, 3)
-    root = onto @ (vectors / np.sqrt(np.maximum(values, LOOSE)))
-    covariance[np.ix_(rows, rows)] = root @ root.T
-    return Alone(shift, covariance, rotation)
+    return values, vectors, pull
+
+
+class AgainstMap(NamedTuple):
+    """What a session says of the places of a map, for the joint search.
+
+    Attributes:
+        row: (S,) rows of the prior that were seen.
+        evidence: of these, in numbers of their own: the position, and with orientations the rotation vector from where
+            the map has it, in the axes of the map.
+        given: the map in the same numbers.
+    """
+
+    row: IntArray
+    evidence: WindowEvidence
+    given: GivenMap
+
+
+def evidence_against(optimum: SpatialOptimum, stated: FloatArray) -> AgainstMap:
+    """Return what a session says of the places of the map, linearised where a loosened map holds it.
+
+    Args:
+        optimum: at which no place is bent by the map.
+        stated: (K, 6) standard deviations of the map's places.
+    """
+    problem, prior, n = optimum.smoother.problem, optimum.smoother.problem.prior, len(optimum.smoother.problem.stamp_s)
+    hits = np.bincount(problem.place, optimum.now.weight, minlength=len(problem.oriented))
+    row = np.flatnonzero(hits[prior.place] > problem.settings.map.least_seen)
+    seen, turned = prior.place[row], problem.oriented[prior.place[row]]
+    place, numbers = optimum.estimate.place[seen], PLACES if turned.any() else POINTS
+    dim = np.where(turned, 6, 3)
+    begin = np.append(0, np.cumsum(dim))
+    first = np.full(len(problem.oriented), -1, dtype=np.int64)
+    first[seen] = begin[:-1]
+    joint = optimum.smoother.factorised(optimum.now).joint(n + seen)
+    values, vectors, pull = _without_map(optimum, joint, seen, first)
+    known = problem.symmetries[seen].nearest(prior.pose[row], place)
+    unknown = turned & (stated[row, 3:] >= ANY_RAD).all(axis=1)
+    known[unknown, 3:] = place[unknown, 3:]  # of which the map says nothing
+    position, onto = np.zeros((len(row), numbers)), np.zeros((numbers * len(row), len(joint)))
+    mean, covariance = np.zeros((len(row), numbers)), np.tile(np.eye(numbers), (len(row), 1, 1))
+    position[:, :3], mean[:, :3] = place[:, :3], known[:, :3]
+    for k, oriented in enumerate(turned.tolist()):
+        at, own, to = numbers * k, int(begin[k]), se3.rotation_of(place[k]) if oriented else np.eye(3)
+        onto[at : at + 3, own : own + 3] = to  # forces turn as shifts do
+        covariance[k, :3, :3] = np.diag(stated[row[k], :3] ** 2)
+        if oriented:
+            twist = se3.log(se3.compose(place[k], se3.inverse(known[k]))) * np.repeat([0.0, 1.0], 3)
+            position[k, 3:] = twist[3:]
+            jacobian = se3.right_jacobian_inverse(twist)[3:, 3:].T @ to  # from a turn in its own axes
+            onto[at + 3 : at + 6, own + 3 : own + 6] = np.linalg.inv(jacobian).T
+            axes = se3.rotation_of(known[k])
+            covariance[k, 3:, 3:] = (axes * stated[row[k], 3:] ** 2) @ axes.T
+    told = onto @ vectors[:, values > LOOSE]
+    evidence = WindowEvidence(
+        landmark=np.arange(len(row)),
+        window=np.zeros(len(row), dtype=np.int64),
+        position=position,
+        information=(told * values[values > LOOSE]) @ told.T,
+        pull=told @ (vectors[:, values > LOOSE].T @ pull),
+        log_scale_sigma=0.0,
+    )
+    return AgainstMap(row, evidence, GivenMap(mean, covariance, np.ones(len(row), dtype=np.bool_)))
 
 
 def _log_density(off: FloatArray, covariance: FloatArray) -> float:

@@ -375,8 +375,26 @@ def _changes(told: _Told, identities: IntArray, names: Mapping[int, str]) -> tup
         return ()
     problem, optimum = told.problem, told.solved.optimum
     used = optimum.now.weight > problem.settings.inlier
-    changes = []
+    changes, together = [], [group for group in found.groups if len(group.members) > 1]
+    for group in sorted(together, key=lambda group: -group.probability):
+        places = problem.prior.place[group.members]
+        shift = (optimum.estimate.place[places, :3] - problem.prior.pose[group.members, :3]).mean(axis=0)
+        changes.append(
+            MapChange(
+                landmark_ids=tuple(np.sort(identities[places]).tolist()),
+                kind=ChangeKind.ROTATED if group.turns else ChangeKind.MOVED,
+                stamp_from_s=float("nan"),
+                stamp_to_s=float(told.stamp_s[0]),
+                displacement_m=tuple(shift.tolist()),
+                rotation_rad=float(np.linalg.norm(group.motion[3:])),
+                probability=group.probability,
+                n_hits=int(np.count_nonzero(used & np.isin(problem.place, places))),
+            ).named(names)
+        )
+    in_group = np.isin(np.arange(len(found.p_stands)), [k for group in together for k in group.members.tolist()])
     for k in np.argsort(found.p_stands, kind="stable"):
+        if in_group[k]:
+            continue
         if 1.0 - found.p_stands[k] < problem.settings.map.p_told:
             break
         place = int(problem.prior.place[k])

@@ -14,18 +14,20 @@ from functools import partial
 import numpy as np
 
 from evermap.align.candidates import Matches, find_consensus
+from evermap.config import ChangesConfig
 from evermap.estimate.measurement import Tied
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
 from evermap.geometry.upright import is_level
 from evermap.slam.calibration import priced
-from evermap.slam.space.against_map import MapComparison, compared
+from evermap.slam.space.against_map import MapComparison, MovedTogether, compared
 from evermap.slam.space.delays import Delays, with_delays
 from evermap.slam.space.drift import Drift, drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import CORNERS, POINT, STATES
+from evermap.slam.space.moved_groups import find_moved_groups
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.repair import rejoined, repaired, split, unjumped
 from evermap.slam.space.smoother import SpatialSmoother
@@ -87,13 +89,19 @@ class SpatialSolved:
     step_s: FloatArray
 
 
-def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Progress | None = None) -> SpatialSolved:
+def solve_space(
+    intake: SpatialIntake,
+    prior_map: Landmarks | None,
+    progress: Progress | None = None,
+    changes: ChangesConfig | None = None,
+) -> SpatialSolved:
     """Estimate poses, places and noise of a recording in space.
 
     Args:
         intake: the recording as input of the estimator.
         prior_map: landmarks to localise in; None maps from scratch, in the frame of the first pose.
         progress: told after every frame.
+        changes: settings of the search for landmarks of the map that moved together; None asks each by itself.
 
     Raises:
         NumericalError: no finite optimum.
@@ -145,7 +153,10 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, progress: Pr
         optimum = converged(*together, optimum.noise, heavy_rounds=0)
     from_map = None
     if len(stated):
-        optimum, from_map = compared(optimum, stated)
+        groups: tuple[MovedTogether, ...] = ()
+        if changes is not None:
+            optimum, groups = find_moved_groups(optimum, stated, changes)
+        optimum, from_map = compared(optimum, stated, groups)
     smoother, sober = optimum.smoother.counted(optimum.estimate, optimum.now, counted), optimum.noise
     if drift is not None and counted is None and not problem.steady:
         goes = (drift.translation or 0.0) * drift.doubt, (drift.rotation or 0.0) * drift.doubt
