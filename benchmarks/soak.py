@@ -42,7 +42,9 @@ SURE = 1e-3
 """Beliefs are scored as if they were at least so far from 0 and 1."""
 FIXED = "fixture"
 """Class of what never moves in the simulated building."""
-UNKNOWABLE = ("elsewhere_s", "gone_s", "first_seen_s", "last_seen_s", "sigma_range_m", "sigma_bearing_rad", "p_next")
+UNKNOWABLE = (
+    "elsewhere_s", "gone_s", "first_seen_s", "last_seen_s", "sigma_range_m", "sigma_bearing_rad", "p_next", "direction",
+)  # fmt: skip
 """Columns in which nan or inf mean 'not known'."""
 
 

@@ -47,6 +47,7 @@ from evermap.types import (
     SpatialRecording,
     SpatialSensor,
     Trajectory,
+    Up,
 )
 
 N = 1500
@@ -157,6 +158,7 @@ OBJECTS: dict[str, Any] = {
         SESSION,
         Entered(SESSION, LivingMap(), LivingMap(), (NAMED,) * N, ("monday",) * N, 3, {"a": bytes(N)}),
         Check("a", "b", {"frames": {"rows": N}}, (Finding("clock", "late " * N),) * N, ("a warning",) * N),
+        Up(np.array([0.0, 0.0, 1.0]), 0.02, "imu"),
         StepLifetime.at_points(EDGES[1:], (1.0 / (N - 1),) * (N - 1)),
     )
 }

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from evermap.config import ChangesConfig
-from evermap.estimate.sparse.elimination import Elimination, curvature, eliminate_large
+from evermap.estimate.sparse.elimination import Elimination, curvature, eliminate_large, ways_to_border
 from evermap.estimate.sparse.system import System, exhausted
 from evermap.estimate.sparse.tree import Factors
 from evermap.sensing.visibility import NominalField
@@ -88,6 +88,8 @@ def seldom_used() -> None:
     alone = System(one, Factors(np.arange(2), 0 * one, one, 0 * one), np.zeros((1, 3)), np.zeros(0, dtype=np.int64))
     curvature(alone.tree, alone.factors, np.zeros(2))
     eliminate_large(alone.tree, alone.factors, np.ones(2), np.ones(1), Elimination.of(alone.tree), 0)
+    stored = np.ones(int(alone.tree.stored[-1]))
+    ways_to_border(alone.tree, stored, alone.node_of, np.zeros(1, dtype=np.int64), np.eye(1))
 
 
 def _drive() -> Problem:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from scipy.optimize import least_squares
 
 from evermap.geometry import se2
@@ -32,9 +31,22 @@ def whitening(covariance_m2: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance_m2)))
 
 
-@pytest.mark.parametrize("seed", [1, 2, 5])
-def test_two_sessions_one_after_the_other_are_both_at_once(seed: int) -> None:
-    """Least squares over all landmarks and the motion between the sessions, each by itself a joint Gaussian."""
+def test_two_sessions_one_after_the_other_are_both_at_once() -> None:
+    """In three worlds: single numbers, and the root mean square of them all."""
+    compared = [compare_with_both_at_once(seed) for seed in (1, 2, 5)]
+    off, ratio = (np.concatenate(part) for part in zip(*compared, strict=True))
+    assert np.abs(off).max() < 0.5
+    assert np.sqrt(np.mean(off**2)) < 0.13
+    # the second session is linearised in the map again, with calibration states that it holds less firmly there
+    assert np.abs(ratio - 1.0).max() < 0.125
+    assert np.sqrt(np.mean((ratio - 1.0) ** 2)) < 0.035
+
+
+def compare_with_both_at_once(seed: int) -> tuple[FloatArray, FloatArray]:
+    """Least squares over all landmarks and the motion between the sessions, each by itself a joint Gaussian.
+
+    Returns differences of the map of both sessions from it [sigma], and ratios of standard deviations.
+    """
     world = building(seed, days=2, change_rate=0.0)
     config = settings()
     first, second = (solve_alone(one, LivingMap(clock=one.clock), config) for one in world.sessions)
@@ -81,12 +93,8 @@ def test_two_sessions_one_after_the_other_are_both_at_once(seed: int) -> None:
     np.testing.assert_array_equal(after.places.landmark_id[order], everyone[known])
     sigma = np.sqrt(np.diag(covariance)).reshape(-1, 2)[known]
     off = (after.places.position_m[order] - landmark[known]) / sigma
-    assert np.abs(off).max() < 0.5
-    assert np.sqrt(np.mean(off**2)) < 0.15
     mine = np.sqrt(np.diag(after.covariance_m2)).reshape(-1, 2)[order]
-    # the second session is linearised in the map again, with calibration states that it holds less firmly there
-    np.testing.assert_allclose(mine / sigma, 1.0, atol=0.12)
-    assert np.sqrt(np.mean((mine / sigma - 1.0) ** 2)) < 0.05
+    return off.ravel(), (mine / sigma).ravel()
 
 
 def test_a_large_map_begins_in_chunks_without_the_joint_covariance_of_all() -> None:
