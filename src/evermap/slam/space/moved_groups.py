@@ -40,13 +40,16 @@ def find_moved_groups(
 ) -> tuple[SpatialOptimum, tuple[MovedTogether, ...]]:
     """Return the optimum with the places of groups that moved let go, and these groups; the same where none did.
 
+    Without odometry nothing is searched: whether a part of the map moved or the frames that see it alone are elsewhere,
+    no measurement tells.
+
     Args:
         optimum: of a problem with a prior map.
         stated: (K, 6) standard deviations of the map's places.
         changes: settings of the search.
     """
     problem, prior = optimum.smoother.problem, optimum.smoother.problem.prior
-    if len(prior.place) > MOST_PLACES:
+    if not problem.driven or len(prior.place) > MOST_PLACES:
         return optimum, ()
     found: list[tuple[Verdict, SpatialOptimum, AgainstMap]] = []
     for free in _loosened(optimum, stated, changes):
