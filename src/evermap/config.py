@@ -547,7 +547,7 @@ class UpConfig(Section):
 
     @field_validator("direction")
     @classmethod
-    def _is_direction(cls, given: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    def _check_direction(cls, given: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
         if given is not None and not 0.0 < math.hypot(*given) < math.inf:
             raise ValueError("three numbers, not all zero, as [0, 0, 1]")
         return given

@@ -120,8 +120,8 @@ def _mirrored(
 ) -> int:
     """How many landmarks agree with a mirrored map, where that has at least these log odds; else 0.
 
-    It is not asked where nearly all are `standing`. What lies near a line, or a plane, fits either
-    way; what has an orientation is asked for that.
+    It is not asked where nearly all are `standing`. What lies near a line, or a plane, fits either way; what has an
+    orientation is asked for that.
     """
     if matches.oriented.any() or standing >= CLEARLY * len(np.unique(matches.landmark)):
         return 0
