@@ -922,6 +922,90 @@ class Alternative(Shown):
     landmarks: Landmarks
 
 
+class VerdictKind(StrEnum):
+    """What a run ends with; it needs no truth."""
+
+    SOUND = "sound"
+    """Poses and landmarks are as certain as their covariances say."""
+    WEAK = "weak"
+    """Right as far as it goes, but something that matters can't be known from this recording."""
+    LOST = "lost"
+    """Poses or landmarks can't be trusted, and no cause was found."""
+    MAP_OUTDATED = "map outdated"
+    """Too much of the given map is wrong to localise in, or it is the map of another site, frame or edition."""
+    SENSOR_SUSPECT = "sensor suspect"
+    """A sensor, or the odometry, is not as stated: units, scale, size, clock, mount, axes, lens."""
+
+    @property
+    def is_trustworthy(self) -> bool:
+        """Whether a run that ends so may be used as it is: exit code 0, else 3."""
+        return self in (VerdictKind.SOUND, VerdictKind.WEAK)
+
+
+@dataclass(frozen=True, slots=True)
+class Symptom(Shown):
+    """A sign, which needs no truth, of how far a run can be trusted.
+
+    Attributes:
+        code: stable name, such as `innovations`.
+        message: one line, with numbers and units.
+        value: what was measured.
+        least, most: between which it is where all is well.
+    """
+
+    code: str
+    message: str
+    value: float
+    least: float = -math.inf
+    most: float = math.inf
+
+    @property
+    def is_alarming(self) -> bool:
+        """Whether the value is where it should not be."""
+        return not self.least <= self.value <= self.most
+
+
+@dataclass(frozen=True, slots=True)
+class Cause(Shown):
+    """A cause other than a change of a landmark by which a recording contradicts what was stated.
+
+    Attributes:
+        code: stable name of the kind of cause, such as `tag-size` or `clock`.
+        subject: what it is of: a sensor, a class, an identity, the odometry, the map; '' where there is one only.
+        message: one line that a user understands, with value and unit.
+        value, sigma: of the state that it frees, in the unit that `message` names; nan where there is none.
+        probability: among all that was weighed.
+        fix: the line of `sensor.toml`, or the option, that mends it; '' where there is none.
+        nats: by how much it raises the log evidence of the recording, its price paid.
+    """
+
+    code: str
+    subject: str
+    message: str
+    value: float = math.nan
+    sigma: float = math.nan
+    probability: float = math.nan
+    fix: str = ""
+    nats: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict(Shown):
+    """What a run ends with: how far it can be trusted, and why.
+
+    Attributes:
+        kind: one of five words.
+        message: one line: the reason, and what would decide it or mend it.
+        symptoms: all that was asked, the alarming ones first.
+        causes: those that were found, the most probable first.
+    """
+
+    kind: VerdictKind
+    message: str
+    symptoms: tuple[Symptom, ...] = ()
+    causes: tuple[Cause, ...] = ()
+
+
 @dataclass(frozen=True, slots=True)
 class SlamResult(Shown):
     """All estimates of a run.
@@ -942,6 +1026,8 @@ class SlamResult(Shown):
         gone: landmarks that the map knows but does not believe to be there.
         followed: what moved while it was looked at, a `evermap.tracking.run.TrackResult`; None where nothing was
             followed.
+        causes: what other than changes of landmarks the recording was found to have.
+        verdict: how far all this can be trusted; None where nobody asked.
     """
 
     trajectory: Trajectory
@@ -958,6 +1044,8 @@ class SlamResult(Shown):
     alternatives: tuple[Alternative, ...] = ()
     gone: Landmarks = field(default_factory=lambda: Landmarks.at([], np.zeros((0, 2))))
     followed: Any = None
+    causes: tuple[Cause, ...] = ()
+    verdict: Verdict | None = None
 
     @property
     def undecided(self) -> tuple[Undecided, ...]:

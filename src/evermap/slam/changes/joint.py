@@ -30,7 +30,7 @@ from evermap.slam.changes.evidence import (
 )
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained, parting_time, unswayed
 from evermap.slam.changes.search import item_columns
-from evermap.slam.changes.weigh import Verdict, weigh
+from evermap.slam.changes.weigh import ChangePosterior, weigh
 from evermap.slam.method import Compare, Explanation, Method, Rival
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Noise, Problem, independent
@@ -70,7 +70,7 @@ class Joint(Method):
         self._landmark = np.arange(n_landmarks)
         self._groups: Groups = ()
         self._swaps: tuple[tuple[int, int, float], ...] = ()
-        self.verdict: Verdict | None = None
+        self.posterior: ChangePosterior | None = None
 
     def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
         """Return the place where the landmark is by now."""
@@ -123,7 +123,7 @@ class Joint(Method):
         if final and self._concluded is not None:
             return replace(self._concluded, problem=problem, estimate=estimate)
         if final:
-            self.verdict = None  # hypotheses found on the way are not assumed
+            self.posterior = None  # hypotheses found on the way are not assumed
             if self._loosened is not None:
                 # what has not been explained yet may look like outliers on the wrong side: none is ruled out here
                 problem, free, start = self._loosened
@@ -144,15 +144,15 @@ class Joint(Method):
             )
             if len(evidence.landmark) == 0:
                 return Explanation(problem, estimate, self._current())
-            before = self.verdict
-            verdict, given = yield from self._weighed(evidence, given, len(bounds) - 1, thorough=final)
-            groups = yield from self._all_timed(verdict.groups, base, estimate, noise, evidence, bounds)
-            settled = before is not None and before.map_factor == verdict.map_factor and _same(groups, self._groups)
-            self.verdict, self._groups = verdict, groups
+            before = self.posterior
+            posterior, given = yield from self._weighed(evidence, given, len(bounds) - 1, thorough=final)
+            groups = yield from self._all_timed(posterior.groups, base, estimate, noise, evidence, bounds)
+            settled = before is not None and before.map_factor == posterior.map_factor and _same(groups, self._groups)
+            self.posterior, self._groups = posterior, groups
             if not in_map and not groups and len(self._landmark) == self._count:
                 return Explanation(problem, estimate, self._current())
             # the search may find the map better than it says; the solution does not build on that
-            believed = replace(given, covariance=given.covariance * max(verdict.map_factor, 1.0) ** 2)
+            believed = replace(given, covariance=given.covariance * max(posterior.map_factor, 1.0) ** 2)
             problem, start, self._landmark = self._explained(base, estimate, evidence, believed, groups)
             # with the kernel that never lets go: as long as places are wrong, right detections look like outliers
             smoother = Smoother(problem, noise, heavy=True, robust=self._robust)
@@ -164,10 +164,10 @@ class Joint(Method):
         if not heavy:
             lighter = smoother.under(noise, heavy=False)
             estimate, _ = yield from lighter.solved_in_slices(estimate, iterations=5, tolerance=1e-4)
-        changes = self._changes(self._groups, verdict.probability, base)
+        changes = self._changes(self._groups, posterior.probability, base)
         revision = Explanation(problem, estimate, self._current(), changes)
         if final:
-            lost = in_map and not self._groups and verdict.misfit > self._prior.disagreement
+            lost = in_map and not self._groups and posterior.misfit > self._prior.disagreement
             rivals = self._rivals(base, evidence, believed, estimate, noise, bounds)
             revision = replace(revision, rivals=rivals, warnings=(DISAGREES,) if lost else ())
             self._concluded = revision
@@ -205,10 +205,10 @@ class Joint(Method):
         bounds: IntArray,
     ) -> tuple[Rival, ...]:
         """Explanations nearly as probable as the best, each solved on its own."""
-        assert self.verdict is not None
+        assert self.posterior is not None
         rivals = []
-        for found, probability in self.verdict.alternatives[: self._prior.most_rivals]:
-            if probability < self.verdict.probability * math.exp(-self._prior.rival_nats):
+        for found, probability in self.posterior.alternatives[: self._prior.most_rivals]:
+            if probability < self.posterior.probability * math.exp(-self._prior.rival_nats):
                 break
             groups = exhausted(self._all_timed(found, base, estimate, noise, evidence, bounds))
             problem, start, landmark = self._explained(base, estimate, evidence, believed, groups)
@@ -227,9 +227,9 @@ class Joint(Method):
 
     def _weighed(
         self, evidence: WindowEvidence, given: GivenMap, n_windows: int, *, thorough: bool
-    ) -> Slices[tuple[Verdict, GivenMap]]:
-        """The verdict, and the map with the landmarks that carry each other's identity at each other's place."""
-        verdict = yield from weigh(evidence, given, self._prior, n_windows, before=self.verdict, thorough=thorough)
+    ) -> Slices[tuple[ChangePosterior, GivenMap]]:
+        """The posterior, and the map with the landmarks that carry each other's identity at each other's place."""
+        posterior = yield from weigh(evidence, given, self._prior, n_windows, before=self.posterior, thorough=thorough)
         soft = evidence.softened(self._prior.usual_softness_m)
         yield dense_ms(len(soft.pull))
         while given.given.any():
@@ -242,14 +242,14 @@ class Joint(Method):
             other = with_swap(given, swap.first, swap.second)
             # the same copies for both: what is left out costs nothing, and must not be what decides
             rival = yield from weigh(
-                verdict.evidence, other, self._prior, n_windows, before=verdict, thorough=thorough, spared=True
+                posterior.evidence, other, self._prior, n_windows, before=posterior, thorough=thorough, spared=True
             )
-            log_odds = rival.score + swap.log_prior - verdict.score
+            log_odds = rival.score + swap.log_prior - posterior.score
             if log_odds <= 0.0:  # moves explain it better
                 break
-            verdict, given = rival, other
+            posterior, given = rival, other
             self._swaps = (*self._swaps, (swap.first, swap.second, float(1.0 / (1.0 + np.exp(-log_odds)))))
-        return verdict, given
+        return posterior, given
 
     def _bounds(self, problem: Problem) -> IntArray:
         """First pose of every window; a group that moved has windows of its own, visit by visit."""

@@ -26,7 +26,7 @@ MAP_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ChangePosterior:
     """Result of the search.
 
     Attributes:
@@ -56,11 +56,11 @@ def weigh(
     prior: ChangesConfig,
     n_windows: int,
     *,
-    before: Verdict | None = None,
+    before: ChangePosterior | None = None,
     thorough: bool = True,
     spared: bool = False,
     factors: tuple[float, ...] = MAP_FACTORS,
-) -> Slices[Verdict]:
+) -> Slices[ChangePosterior]:
     """Search for changes, and compute their probabilities, in slices.
 
     What was found `before` is one start of the search; if not `thorough`, its degree of belief is the only one that is
@@ -113,7 +113,7 @@ def weigh(
         improved = trials[best].score > trials[factor, softness].score
         if improved:
             factor, softness = best
-    return _verdict(evidence, list(trials.values()), trials[factor, softness], _SeenWithin.of(evidence, given))
+    return _posterior(evidence, list(trials.values()), trials[factor, softness], _SeenWithin.of(evidence, given))
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +158,7 @@ class _SeenWithin(NamedTuple):
         return (self.given[members] | (self.first[members] < window)) & (self.last[members] >= window)
 
 
-def _verdict(evidence: WindowEvidence, trials: list[_Trial], best: _Trial, seen: _SeenWithin) -> Verdict:
+def _posterior(evidence: WindowEvidence, trials: list[_Trial], best: _Trial, seen: _SeenWithin) -> ChangePosterior:
     """Sum the weights of equal hypotheses over windows, kinds of motion and degrees of belief."""
     top = max(trial.score for trial in trials)
     weight: dict[_Key, float] = {}
@@ -174,7 +174,7 @@ def _verdict(evidence: WindowEvidence, trials: list[_Trial], best: _Trial, seen:
     order = sorted(weight, key=lambda key: -weight[key])
     ranked = [(leader[key][1], weight[key] / total) for key in order]
     gained = best.comparison.misfit - 2.0 * float(best.hypotheses.gain[0])
-    return Verdict(
+    return ChangePosterior(
         groups=ranked[0][0],
         probability=ranked[0][1],
         alternatives=tuple(ranked[1:]),

@@ -15,7 +15,7 @@ from evermap.align.candidates import AGREE_M, Matches, find_consensus
 from evermap.config import ChangesConfig
 from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se3
-from evermap.slam.changes.weigh import MAP_FACTORS, Verdict, weigh
+from evermap.slam.changes.weigh import MAP_FACTORS, ChangePosterior, weigh
 from evermap.slam.space.against_map import AgainstMap, MovedTogether, evidence_against
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT
@@ -51,7 +51,7 @@ def find_moved_groups(
     problem, prior = optimum.smoother.problem, optimum.smoother.problem.prior
     if not problem.driven or len(prior.place) > MOST_PLACES:
         return optimum, ()
-    found: list[tuple[Verdict, SpatialOptimum, AgainstMap]] = []
+    found: list[tuple[ChangePosterior, SpatialOptimum, AgainstMap]] = []
     for free in _loosened(optimum, stated, changes):
         against = evidence_against(free, stated)
         if len(against.row):
@@ -60,12 +60,12 @@ def find_moved_groups(
             )
     if not found:
         return optimum, ()
-    verdict, free, against = max(found, key=lambda one: one[0].score)
-    if len(verdict.groups) >= changes.most_groups:  # perhaps more moved, and what has no group of its own was merged
+    posterior, free, against = max(found, key=lambda one: one[0].score)
+    if len(posterior.groups) >= changes.most_groups:  # perhaps more moved, and what has no group of its own was merged
         return optimum, ()
     groups = tuple(
-        MovedTogether(against.row[group.members], group.turns, group.motion, _probability(verdict, group.members))
-        for group in verdict.groups
+        MovedTogether(against.row[group.members], group.turns, group.motion, _probability(posterior, group.members))
+        for group in posterior.groups
     )
     if not groups:
         return optimum, ()
@@ -115,7 +115,7 @@ def _counted(optimum: SpatialOptimum) -> SpatialOptimum:
     return SpatialOptimum(estimate, optimum.noise, smoother, now)
 
 
-def _probability(verdict: Verdict, members: IntArray) -> float:
+def _probability(posterior: ChangePosterior, members: IntArray) -> float:
     """Return how probable it is that exactly these moved together, over all that was weighed."""
-    weighed = ((verdict.groups, verdict.probability), *verdict.alternatives)
+    weighed = ((posterior.groups, posterior.probability), *posterior.alternatives)
     return sum(p for groups, p in weighed if any(np.array_equal(group.members, members) for group in groups))
