@@ -183,8 +183,8 @@ def test_complement_is_told_as_an_alternative() -> None:
     others = tuple(sorted(set(range(10)) - set(half.members)))
     for seed in range(8):
         method, _ = make_session(seed, half).revised()
-        assert method.verdict is not None
-        ranked = [(method.verdict.groups, method.verdict.probability), *method.verdict.alternatives]
+        assert method.posterior is not None
+        ranked = [(method.posterior.groups, method.posterior.probability), *method.posterior.alternatives]
         p = {tuple(tuple(int(j) for j in group.members) for group in groups): weight for groups, weight in ranked}
         assert p[half.members,] == pytest.approx(p[others,], abs=0.05)
         assert p[half.members,] + p[others,] > 0.9

@@ -114,8 +114,8 @@ def test_probabilities_are_reliable_in_sessions() -> None:
         moves, factor = drawn_moves(rng), drawn_map_factor(rng)
         session = make_session(seed, *moves, n_poses=200, n_landmarks=N_LANDMARKS, map_factor=factor)
         method, _ = session.revised(PRIOR)
-        assert method.verdict is not None
-        reports.append((method.verdict.probability, is_right(method.verdict, moves)))
+        assert method.posterior is not None
+        reports.append((method.posterior.probability, is_right(method.posterior, moves)))
     assert_reliable(reports)
 
 
