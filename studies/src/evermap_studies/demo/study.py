@@ -96,13 +96,20 @@ class _Evening:
 
 
 def run_study(
-    scenario: Scenario, seed: int, *, store: Path | None = None, processes: int = 1, progress: Progress | None = None
+    scenario: Scenario,
+    seed: int,
+    *,
+    methods: tuple[Method, ...] = METHODS,
+    store: Path | None = None,
+    processes: int = 1,
+    progress: Progress | None = None,
 ) -> Study:
     """Simulate, and estimate in every way.
 
     Args:
         scenario: how much.
         seed: of the simulation.
+        methods: which; evermap among them.
         store: file that gets evermap's map, a revision a session.
         processes: between how many the methods are divided; above 1 a script that calls this needs its `__main__`
             guard.
@@ -113,40 +120,40 @@ def run_study(
     """
     building = scenario.simulate(seed)
     truth = truth_of(building)
-    visits: dict[str, list[Visit]] = {method.name: [] for method in METHODS}
+    visits: dict[str, list[Visit]] = {method.name: [] for method in methods}
     evening: dict[str, _Evening] = {}
     length_s = [float(np.ptp(session.frames.stamp_s)) for session in building.sessions]
-    total_s = sum(length_s) * len(METHODS)
+    total_s = sum(length_s) * len(methods)
     done_s = 0.0
 
-    def next_day(methods: tuple[Method, ...]) -> _Day:
-        first = len(visits[methods[0].name])
+    def next_day(some: tuple[Method, ...]) -> _Day:
+        first = len(visits[some[0].name])
         rows = range(first, first + scenario.sessions_per_day)
         return _Day(
             # the estimator sees no truth
             recordings=tuple(replace(building.sessions[k], truth=None, true_landmarks=None) for k in rows),
             changed=tuple(np.flatnonzero(truth.changed[k]) for k in rows),
             until_s=tuple(building.truths[k + 1].start_s if k + 1 < len(truth) else np.nan for k in rows),
-            methods=methods,
-            living=tuple(evening[method.name].living if first else None for method in methods),
+            methods=some,
+            living=tuple(evening[method.name].living if first else None for method in some),
             store=store,
         )
 
-    parts = min(processes, len(METHODS))
+    parts = min(processes, len(methods))
     with _workers(parts) as submit:
-        running = {submit(next_day(METHODS[part::parts])): METHODS[part::parts] for part in range(parts)}
+        running = {submit(next_day(methods[part::parts])): methods[part::parts] for part in range(parts)}
         while running:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                methods = running.pop(future)
-                for method, answer in zip(methods, future.result(), strict=True):
+                some = running.pop(future)
+                for method, answer in zip(some, future.result(), strict=True):
                     evening[method.name] = answer
                     visits[method.name] += answer.visits
-                now = len(visits[methods[0].name])
-                done_s += sum(length_s[now - scenario.sessions_per_day : now]) * len(methods)
+                now = len(visits[some[0].name])
+                done_s += sum(length_s[now - scenario.sessions_per_day : now]) * len(some)
                 if progress is not None:
                     progress(done_s, total_s)
-                if len(visits[methods[0].name]) < scenario.sessions:
-                    running[submit(next_day(methods))] = methods
+                if len(visits[some[0].name]) < scenario.sessions:
+                    running[submit(next_day(some))] = some
     return Study(
         scenario=scenario,
         building=building,
