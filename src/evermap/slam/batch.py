@@ -418,18 +418,23 @@ def divided(
     revision: Explanation,
     *,
     aligned: bool,
+    averaged: bool = True,
     others: tuple[tuple[float, float, float], ...] = (),
 ) -> Outcome:
     """Return what a session knows at its optimum, with what only shows together divided as its sensor states it.
 
     `solved` is the final optimum in the graph's metres, `prior` as the user means it, the rest as in `Outcome`;
-    `others` is what other robots say of its lengths (`CalibrationPrior.metre`).
+    `others` is what other robots say of its lengths (`CalibrationPrior.metre`). States that were not `averaged` at this
+    optimum are asked here whether they are needed, `p_needed` (11,) holds for the others.
     """
     smoother, estimate, marginals = solved
     believed, worth = prior, smoother.worth(estimate, marginals)
     prior = prior.spared(p_needed)
+    if not averaged:
+        asked = needed(smoother.problem.prior, estimate.states, marginals.states, worth)
+        p_needed = np.where(np.isnan(asked), p_needed, asked)
     covariance = marginals.states * np.sqrt(np.outer(worth, worth))
-    covariance += np.diag(prior.doubt(p_needed, estimate.states))
+    covariance += np.diag(prior.doubt(p_needed, estimate.states, averaged=averaged))
     states, scale, log_sigma = estimate.states, 1.0, 0.0
     if others or not aligned:
         divides = believed if others else prior

@@ -178,9 +178,13 @@ class CalibrationPrior:
         """Return the prior with those states held as stated that hardly need to be free, by `p_needed` (11,)."""
         return replace(self, free=self.free & ~(p_needed < self.settings.p_spare))
 
-    def doubt(self, p_needed: FloatArray, states: FloatArray) -> FloatArray:
-        """Return (11,) variances between 'as stated' and 'drawn from the prior', given their means: `averaged`."""
-        odds = np.where(p_needed >= self.settings.p_spare, 1.0 / np.maximum(p_needed, self.settings.p_spare) - 1.0, 0.0)
+    def doubt(self, p_needed: FloatArray, states: FloatArray, *, averaged: bool = True) -> FloatArray:
+        """Return (11,) variances between 'as stated' and 'drawn from the prior'.
+
+        Of estimates (11,) that are the mean over both (`averaged`), or that are under the latter.
+        """
+        p = np.maximum(p_needed, self.settings.p_spare)
+        odds = np.where(p_needed >= self.settings.p_spare, 1.0 / p - 1.0 if averaged else 1.0 - p, 0.0)
         return odds * (states - self.mean) ** 2
 
     def without_scale(self) -> CalibrationPrior:

@@ -61,3 +61,25 @@ def test_a_bent_session_is_straightened(alone: Solved, bend: tuple[float, float,
     assert again.inlier.mean() == pytest.approx(straight.inlier.mean(), abs=1e-3)
     apart = se2.between(again.estimate.pose, straight.estimate.pose)
     np.testing.assert_allclose(np.column_stack([apart[:, :2], se2.wrap(apart[:, 2])]), 0.0, atol=2e-3)
+
+
+def test_the_map_says_whether_a_state_is_needed(alone: Solved) -> None:
+    """Shelves that the map has 12 cm further away than they were seen show an offset of ranges: it is certain then.
+
+    Whatever the session alone made of it; and an offset that it doubts is no further off than it is large.
+    """
+    outcome = alone.outcome
+    row = own_landmarks(outcome).row
+    place_m = outcome.graph_estimate.landmark[row]
+    doubted = replace(outcome, p_needed=np.where(np.isnan(outcome.p_needed), np.nan, 0.02))
+    same, _ = in_map(alone, doubted, row, place_m)
+    variance = np.diag(same.states_covariance)
+    spread = np.diag(same.fit_marginals.states) * same.problem.prior.free
+    off = same.estimate.states - same.problem.prior.mean
+    assert np.all(variance[2:4] <= 4.0 * spread[2:4] + off[2:4] ** 2 + 1e-6)
+    reading = doubted.problem.reading - [0.12, 0.0]
+    nearer = replace(doubted, problem=replace(doubted.problem, reading=reading))
+    moved, _ = in_map(alone, nearer, row, place_m)
+    assert moved.p_needed[0] > 0.99
+    assert moved.estimate.states[0] == pytest.approx(same.estimate.states[0] - 0.12, abs=0.02)
+    assert np.sqrt(moved.states_covariance[0, 0]) < 0.02

@@ -334,7 +334,8 @@ def refitted(
         other = _solved(problem, noise, _placed(problem, start, held.row, settings), robust=robust)
         if other[0].cost(other[1]) < smoother.cost(estimate):
             solved, straightened = other, True
-    return divided(solved, prior, outcome.p_needed, outcome.noise, outcome.revision, aligned=True), straightened
+    in_map = divided(solved, prior, outcome.p_needed, outcome.noise, outcome.revision, aligned=True, averaged=False)
+    return in_map, straightened
 
 
 def _in_map(
