@@ -5,7 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from evermap.config import DecisionConfig
 from evermap.types import Alternative, ChangeKind, MapChange, SlamResult
+
+USUAL = DecisionConfig()
+"""Limits below which a body has not moved, or not turned."""
 
 NATS = 5.0
 """Maximum difference in log probability of a reported alternative from the best explanation."""
@@ -55,12 +59,23 @@ def what(change: MapChange) -> str:
     if change.kind is ChangeKind.RETURNED:
         far = math.hypot(*change.displacement_m)
         return f"{_group(change)} returned" + (f", {far:.2f} m from where it was" if far > 0.0 else "")
+    return f"{_group(change)} {_motion(change)}"
+
+
+def _motion(change: MapChange) -> str:
+    """Return 'moved by (+1.00, 0.00) m', 'turned by +20.0° and moved by ...' or 'turned by +90.0° in place'.
+
+    Of a move that was found without its turn being searched for, the turn is told where it is beyond the limit of the
+    living map.
+    """
+    turn, shift_m = math.degrees(change.rotation_rad), math.hypot(*change.displacement_m)
     moved = f"moved by ({', '.join(map(_signed, change.displacement_m))}) m"
-    if change.kind is ChangeKind.ROTATED:
-        turn = math.degrees(change.rotation_rad)
-        sign = _signed(turn, 1) if len(change.displacement_m) == 2 else f"{turn:.1f}"  # in space about some axis
-        return f"{_group(change)} turned by {sign}° and {moved}"
-    return f"{_group(change)} {moved}"
+    far = abs(change.rotation_rad) >= USUAL.same_turn_rad
+    nowhere = all(round(metres, 2) == 0.0 for metres in change.displacement_m)
+    sign = _signed(turn, 1) if len(change.displacement_m) == 2 else f"{turn:.1f}"  # in space about some axis
+    if round(turn, 1) and (nowhere or (far and shift_m < USUAL.same_spot_m)):
+        return f"turned by {sign}° in place"
+    return f"turned by {sign}° and {moved}" if far or change.kind is ChangeKind.ROTATED else moved
 
 
 def probability(value: float) -> str:
