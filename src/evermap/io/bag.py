@@ -30,9 +30,9 @@ from evermap.estimate.measurements import find_kinds
 from evermap.geometry import se3
 from evermap.io.assemble import finish_recording, looks_of
 from evermap.io.bag_messages import POSES, TWISTS, BagContent, SeenColumns, scanned
-from evermap.io.files import Reader
+from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.rig_toml import Rig, cameras
-from evermap.io.rosbag import BAG_ENDINGS
+from evermap.io.rosbag import BAG_ENDINGS, METADATA
 from evermap.io.sensor_toml import Settings, TomlReader, toml_text
 from evermap.io.spatial import directions, integrated, of_rig, spatial_detections, unit, with_tag_poses
 from evermap.io.text import counted
@@ -53,14 +53,14 @@ from evermap.types import (
 )
 from evermap.valid import CAMERA_MODELS, is_covariance
 
-METADATA = "metadata.yaml"
-"""Metadata file of a folder that is a ROS 2 bag."""
 FEWEST_LOOKS = 20
 """Messages above which a detector without any empty one is assumed to publish only detections."""
 MOST_DIGITS = 15
 """Of a text that is a number; larger ones are not exact in float64."""
 LATE_S = 0.5
 """Difference between the delays of two topics from stamp to arrival that indicates different clocks."""
+_NATIVE = ("odometry", "detections")
+"""Tables that make a folder a recording of its own, whatever bag it was made from."""
 SINCE_1970_S = 1e8
 """Larger stamps count from 1970; smaller ones from the start of a simulation."""
 _TRUTH = re.compile(r"(^|[/_])(gt|truth|ground_?truth|mocap|vicon|vrpn|optitrack|qualisys)([/_]|$)")
@@ -117,8 +117,30 @@ class BagSettings:
 
 def settings_path(path: str | Path) -> Path:
     """Return where the settings of a bag are: beside it, with '.toml' behind its name."""
-    path = Path(path)
+    path = _bag_at(Path(path))
     return path.with_name(path.resolve().name + ".toml")
+
+
+def _is_bag(files: FileSet) -> bool:
+    """Return whether a folder is a bag of ROS 2, by its metadata, or holds one bag and no tables of a recording."""
+    if files.zipped:
+        return False
+    if METADATA in files and b"rosbag2_bagfile_information" in files.read(METADATA):
+        return True
+    return len(_bags_in(files)) == 1 and not any(name.split(".")[0] in _NATIVE for name in files.members)
+
+
+def _bags_in(files: FileSet) -> list[str]:
+    return [name for name in files.members if name.endswith(BAG_ENDINGS)]
+
+
+def _bag_at(path: Path) -> Path:
+    """Return the bag that a path means: a file, a folder with metadata, or the only bag in a folder."""
+    files = find_file_set(path, _is_bag) if path.is_dir() else None
+    if files is None:
+        return path
+    whole = METADATA in files and b"rosbag2_bagfile_information" in files.read(METADATA)
+    return files.root / files.folder if whole else files.path_of(_bags_in(files)[0])
 
 
 def read_bag(path: str | Path, robot: int | None = None, topics: str | Path | None = None) -> SpatialRecording:
@@ -137,7 +159,7 @@ def read_bag(path: str | Path, robot: int | None = None, topics: str | Path | No
     path = Path(path)
     if robot is not None:
         raise InputError(f"there is no robot {robot}: a bag has one robot", path=path, hint="omit the robot")
-    content, stated = scanned(path), settings_path(path) if topics is None else Path(topics)
+    content, stated = scanned(_bag_at(path)), settings_path(path) if topics is None else Path(topics)
     settings = guessed_settings(content)
     if topics is None and not stated.is_file():
         return _recording(path, content, settings, guessed=True)
@@ -151,7 +173,7 @@ def bag_settings(path: str | Path) -> str:
         InputError: the bag is missing or damaged.
         MissingExtraError: `rosbags` is not installed.
     """
-    content = scanned(Path(path))
+    content = scanned(_bag_at(Path(path)))
     settings = guessed_settings(content)
     sections: dict[str, dict[str, Any]] = {"bag": {key: getattr(settings, key) for key in _TEXTS}}
     for name, one in settings.sensors.items():
@@ -560,8 +582,8 @@ def _odometry(
 
 BAG = Reader(
     "bag",
-    "a bag of ROS 1 (.bag) or ROS 2 (folder with metadata.yaml, .mcap, .db3)",
-    lambda files: METADATA in files and not files.zipped,
+    "ROS 1 (.bag) or ROS 2 (folder, .mcap, .db3)",
+    _is_bag,
     read_bag,
     endings=BAG_ENDINGS,
 )

@@ -108,7 +108,7 @@ def _complete_robots(files: FileSet) -> tuple[int, ...]:
 
 MRCLAM = Reader(
     "mrclam",
-    "MRCLAM zip or folder with Robot<N>_Odometry.dat, Robot<N>_Measurement.dat and Barcodes.dat",
+    "Robot<N>_Odometry.dat, Robot<N>_Measurement.dat and Barcodes.dat",
     _is_mrclam,
     read_mrclam,
     _complete_robots,

@@ -114,7 +114,7 @@ def _is_native(files: FileSet) -> bool:
     return named and not is_tagslam(files)
 
 
-NATIVE = Reader("native", "folder or zip with odometry.csv and detections.csv (or .parquet)", _is_native, read_native)
+NATIVE = Reader("native", "odometry.csv and detections.csv (or .parquet)", _is_native, read_native)
 
 
 def _read_settings(files: FileSet, warnings: list[str]) -> Settings:

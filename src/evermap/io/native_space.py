@@ -75,9 +75,13 @@ def _pixel(name: str, *, optional: bool) -> Quantity:
 
 
 def in_space(tables: Mapping[str, Table | None], files: FileSet) -> bool:
-    """Return whether tables are those of a recording in space: their columns decide, and a `camera.toml`."""
+    """Return whether tables are those of a recording in space: their columns decide, else a `camera.toml`."""
     columns = ((tables[name], names) for name, names in _IN_SPACE.items())
-    return CAMERA_FILE in files or any(table is not None and table.has_any(names) for table, names in columns)
+    seen = tables["detections"]
+    planar = seen is not None and seen.has_any(("range_m", "bearing_rad"))
+    return (CAMERA_FILE in files and not planar) or any(
+        table is not None and table.has_any(names) for table, names in columns
+    )
 
 
 def spatial_recording(

@@ -49,7 +49,7 @@ def place_session(recording: AnyRecording, log: Sequence[Revision], clock_gap_s:
                 "driven both at once",
                 field="stamp_s",
                 hint='stamps since 1970 with clock = "unix" in sensor.toml; if clocks start anew with each session, '
-                "--set living.clock_gap_s=SECONDS between two of them; where robots are several, robot = in sensor.toml",
+                "--set living.clock_gap_s=SECONDS between two of them; of several robots, robot in sensor.toml",
             )
     return recording
 
