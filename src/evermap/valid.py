@@ -70,13 +70,16 @@ class Quantity:
             problem = f"row {row}: {self._complaint(float(values[row]))}"
             raise InputError(problem, field=field, hint=self.hint or None)
 
-    def _first_bad(self, values: FloatArray) -> int | None:
-        absent = np.isnan(values) if self.optional else np.zeros(len(values), dtype=bool)
+    def is_fine(self, values: FloatArray) -> BoolArray:
+        """Return which values (R,) are within the limits, or not given where they need not be."""
         with np.errstate(invalid="ignore"):
             fine = np.isfinite(values) & (values >= self.low) & (values <= self.high)
             if self.positive:
                 fine &= values > 0
-        bad = np.flatnonzero(~fine & ~absent)
+        return fine | np.isnan(values) if self.optional else fine
+
+    def _first_bad(self, values: FloatArray) -> int | None:
+        bad = np.flatnonzero(~self.is_fine(values))
         return int(bad[0]) if len(bad) else None
 
     def _complaint(self, value: float) -> str:

@@ -357,9 +357,13 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     finite = np.asarray(np.isfinite(detections.position_sensor_m).all(axis=1))
     if not finite.all():
         warnings.append(f"{counted(int((~finite).sum()), 'detection')} without a finite position left out")
+    here = finite & (detections.position_sensor_m == 0.0).all(axis=1)
+    if here.any():
+        warnings.append(f"{counted(int(here.sum()), 'detection')} at the sensor's own place left out")
+    finite &= ~here
     detections = detections[np.flatnonzero(finite)[np.argsort(detections.frame[finite], kind="stable")]]
-    truth = _odometry(path, content, settings, settings.truth, clock)
-    odometry = _odometry(path, content, settings, settings.odometry, clock)
+    truth = _odometry(path, content, settings, settings.truth, clock, warnings)
+    odometry = _odometry(path, content, settings, settings.odometry, clock, warnings)
     recording = Recording(
         name=path.resolve().name.split(".")[0],
         odometry=odometry,
@@ -557,18 +561,29 @@ def _exactly(path: SpatialOdometry) -> Trajectory:
 
 
 def _odometry(
-    path: Path, content: BagContent, settings: BagSettings, topic: str, clock: Clock
+    path: Path, content: BagContent, settings: BagSettings, topic: str, clock: Clock, warnings: list[str]
 ) -> SpatialOdometry | None:
-    """Poses of the robot, in the order of their stamps; the last of those with the same."""
+    """Poses of the robot, in the order of their stamps; the last of those with the same. `warnings` counts bad ones."""
     if not topic:
         return None
     rows, stamp_s = np.array(content.motion[topic], dtype=np.float64), stamps_of(content, topic, settings.clock)
+    late = int(np.sum(stamp_s < np.maximum.accumulate(stamp_s)))
     order = np.argsort(stamp_s, kind="stable")
+    is_number = np.isfinite(rows[order, : 7 if content.kind(topic) in POSES else 6]).all(axis=1)
+    order = order[is_number & np.isfinite(stamp_s[order])]
+    bad = {"not a number": len(rows) - len(order)}
     if content.kind(topic) in POSES:  # the orientation of a robot is unknown if its message lacks it
-        order = order[np.linalg.norm(rows[order, 3:7], axis=1) > 0.5]
+        turned = np.linalg.norm(rows[order, 3:7], axis=1) > 0.5
+        bad["without orientation"], order = int((~turned).sum()), order[turned]
     if not len(order):
         raise DataError(f"poses on {topic} have no orientation", path=path, hint="another topic (`--init-bag`)")
     keep = order[np.append(np.diff(stamp_s[order]) > 0.0, True)]
+    bad["with the stamp of the next"] = len(order) - len(keep)
+    left_out = ", ".join(f"{count} {what}" for what, count in bad.items() if count)
+    if left_out:
+        warnings.append(f"{topic}: of {len(rows)} messages left out: {left_out}")
+    if late:
+        warnings.append(f"{topic}: {counted(late, 'message')} out of order sorted")
     stamp_s, rows = stamp_s[keep], rows[keep]
     child = content.frames.get(topic, "")
     z_up = "optical" not in child and "optical" not in settings.base_frame  # REP 103

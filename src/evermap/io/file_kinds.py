@@ -102,7 +102,8 @@ def kind_of_folder(files: list[FileSet], path: Path) -> FileKind | None:
 
 
 def _kind_of_member(files: FileSet, name: str) -> FileKind | None:
-    return None if files.zipped else kind_of_file(files.path_of(name))
+    path = files.path_of(name)
+    return None if files.zipped or _is_empty(path) else kind_of_file(path)
 
 
 def _is_empty(path: Path) -> bool:

@@ -38,7 +38,7 @@ from evermap.types import (
     SpatialSensor,
     Trajectory,
 )
-from evermap.valid import CAMERA_MODELS, Quantity
+from evermap.valid import CAMERA_MODELS, STAMP_S, Quantity
 
 _MOST_TAGS = 100_000
 """Maximum tags of a board: no tag family has more."""
@@ -284,6 +284,7 @@ def _sightings(files: FileSet, setup: TagRig, warnings: list[str]) -> TagSightin
     table = _table(files, "detections", warnings)
     assert table is not None
     table.expect(("stamp_s", "camera", "tag_id", *CORNERS), tuple(table.columns))
+    table = table.screened((STAMP_S, *(Quantity(name, -1e6, 1e6, hint="pixels") for name in CORNERS)), warnings)
     corner = np.stack([table.numbers(Quantity(name, -1e6, 1e6, hint="pixels")) for name in CORNERS], axis=1)
     stamp_s = forward_stamps(table)
     frames = _table(files, "frames", warnings)
