@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from evermap.config import DecisionConfig
 from evermap.types import Alternative, ChangeKind, MapChange, SlamResult
 
-USUAL = DecisionConfig()
-"""Limits below which a body has not moved, or not turned."""
+SAME_SPOT_M, SAME_TURN_RAD = 0.1, 0.3
+"""Below these a body that turned has not moved, and one that moved is not said to have turned, as in a living map."""
 
 NATS = 5.0
 """Maximum difference in log probability of a reported alternative from the best explanation."""
@@ -70,10 +69,10 @@ def _motion(change: MapChange) -> str:
     """
     turn, shift_m = math.degrees(change.rotation_rad), math.hypot(*change.displacement_m)
     moved = f"moved by ({', '.join(map(_signed, change.displacement_m))}) m"
-    far = abs(change.rotation_rad) >= USUAL.same_turn_rad
+    far = abs(change.rotation_rad) >= SAME_TURN_RAD
     nowhere = all(round(metres, 2) == 0.0 for metres in change.displacement_m)
     sign = _signed(turn, 1) if len(change.displacement_m) == 2 else f"{turn:.1f}"  # in space about some axis
-    if round(turn, 1) and (nowhere or (far and shift_m < USUAL.same_spot_m)):
+    if round(turn, 1) and (nowhere or (far and shift_m < SAME_SPOT_M)):
         return f"turned by {sign}° in place"
     return f"turned by {sign}° and {moved}" if far or change.kind is ChangeKind.ROTATED else moved
 
