@@ -220,9 +220,9 @@ def _seen_of(content: BagContent, topic: str, parts: Callable[[Any, int], Iterat
 
 
 def _said(message: Any) -> tuple[float, str]:
-    """Return stamp [s] and frame of a message, or of the first of its parts; nan and '' if missing."""
+    """Return stamp [s] and frame of a message, or of the first of its parts that says one; nan and '' if missing."""
     for one in (message, *getattr(message, "markers", ()), *getattr(message, "entities", ())):
-        if hasattr(one, "header"):
+        if hasattr(one, "header") and (one.header.frame_id or not len(getattr(one, "markers", ()))):
             return stamp_of(one), str(one.header.frame_id)
         if hasattr(one, "timestamp"):
             return seconds(one.timestamp), str(one.frame_id)
@@ -266,7 +266,9 @@ def _markers(message: Any, look: int) -> Iterator[Seen]:
         for name, pose in zip(message.marker_ids, message.poses, strict=True):
             yield Seen(look, int(name), pose=pose_of(pose))
     for one in getattr(message, "markers", ()):
-        yield Seen(look, int(one.marker_id), pose=pose_of(_inner(one.pose)))
+        yield Seen(look, int(getattr(one, "marker_id", getattr(one, "id", -1))), pose=pose_of(_inner(one.pose)))
+    for one in getattr(message, "landmarks", ()):
+        yield Seen(look, str(one.id), pose=pose_of(one.tracking_from_landmark_transform))
     for one in getattr(message, "transforms", ()):
         yield Seen(look, int(one.fiducial_id), pose=pose_of(one.transform))
 
@@ -325,7 +327,9 @@ def _score(result: Any) -> float:
 
 def _drawn(message: Any, look: int) -> Iterator[Seen]:
     for one in getattr(message, "markers", ()):
-        if one.action == 0:  # added or changed
+        if not hasattr(one, "action"):  # of aruco_msgs: a detection, not a picture of one
+            yield Seen(look, int(one.id), pose=pose_of(_inner(one.pose)))
+        elif one.action == 0:  # added or changed
             name = int(one.id) if not one.ns else f"{one.ns}/{one.id}"
             yield Seen(look, name, label=str(one.ns), pose=pose_of(one.pose))
     for one in getattr(message, "entities", ()):
@@ -341,6 +345,8 @@ _DETECTIONS: dict[str, Callable[[Any, int], Iterator[Seen]]] = {
     "ArucoMarkers": _markers,
     "ArucoDetection": _markers,
     "FiducialTransformArray": _markers,
+    "AlvarMarkers": _markers,
+    "LandmarkList": _markers,
     "Detection3DArray": _objects,
     "Detection2DArray": _objects,
     "MarkerArray": _drawn,
