@@ -29,7 +29,7 @@ from evermap.estimate.kind import Messages, TableRows
 from evermap.estimate.measurements import find_kinds
 from evermap.geometry import se3
 from evermap.io.assemble import finish_recording, looks_of
-from evermap.io.bag_messages import POSES, TWISTS, BagContent, SeenColumns, scanned
+from evermap.io.bag_messages import POSES, TRANSFORMS, TWISTS, BagContent, SeenColumns, scanned
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.rig_toml import Rig, cameras
 from evermap.io.rosbag import BAG_ENDINGS, METADATA
@@ -209,15 +209,17 @@ def guessed_settings(content: BagContent) -> BagSettings:
         transform = kind == POSES.index("TransformStamped")
         return transform, kind > 0, "odom" not in topic and "vio" not in topic, -len(content.motion[topic])
 
-    moving = [topic for topic in content.motion if content.motion[topic]]
+    moving = [topic for topic in content.motion if content.motion[topic] and content.has_moving(topic)]
     true = sorted((one for one in moving if _TRUTH.search(one) and content.kind(one) in POSES), key=rank)
     driven = sorted((one for one in moving if not _TRUTH.search(one) and not _NO_ODOMETRY.search(one)), key=rank)
     odometry = driven[0] if driven else ""
-    sighted = [topic for topic in content.seen if content.seen[topic]]
+    sighted = [topic for topic in content.seen if content.seen[topic] and content.has_moving(topic)]
     named = {name for edge in content.edges for name in edge}
     usual = next((name for name in ("base_link", "base_footprint") if name in named), "")
     base = content.frames.get(odometry, "") or usual
-    plain = [topic for topic in sighted if content.kind(topic) not in _PICTURES]
+    transforms = [topic for topic in sighted if topic.startswith(TRANSFORMS)]  # of tags: only without messages of them
+    sighted = [topic for topic in sighted if topic not in transforms]
+    plain = [topic for topic in sighted if content.kind(topic) not in _PICTURES] or transforms
     base = base or next((content.frames.get(topic, "") for topic in plain), "")
     chosen = plain or [one for one in sighted if content.mount(base, content.frames.get(one, "")) is not None]
     sensors = {name: _sensor(content, topic) for topic, name in _short(chosen).items()}

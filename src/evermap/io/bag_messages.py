@@ -6,6 +6,7 @@ or its corners; class and score of an object in the forms of three releases of `
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,11 @@ if TYPE_CHECKING:
 POSES = ("Odometry", "PoseWithCovarianceStamped", "PoseStamped", "TransformStamped")
 TWISTS = ("TwistWithCovarianceStamped", "TwistStamped")
 FRAMES = ("TFMessage", "tfMessage")
+TRANSFORMS = "tf:"
+"""Begin of the names under which transforms are kept as if they were a topic: of odometry, and of tags."""
+_ODOMETRY = re.compile(r"(^|[/_])odom")
+_TAG = re.compile(r"(tag|marker|aruco|fiducial).*?(\d{1,9})$", re.IGNORECASE)
+"""Frames that are of odometry or of a tag, by the names that their packages give them."""
 
 
 class Seen(NamedTuple):
@@ -91,6 +97,8 @@ class BagContent:
     """By kind of measurement and topic: numbers of messages, and what these say."""
     edges: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
     moving: set[tuple[str, str]] = field(default_factory=set)
+    keeps_transforms: bool = False
+    """Whether transforms of odometry and tags are kept as if they were messages of a topic."""
 
     def kind(self, topic: str) -> str:
         """Return the type of a topic without its package."""
@@ -110,6 +118,13 @@ class BagContent:
         if frame:
             self.frames.setdefault(topic, _plain(frame))
         return len(self.stamps[topic]) - 1
+
+    def has_moving(self, topic: str) -> bool:
+        """Return whether what is kept under the name of a topic is of frames that move, as all real topics are."""
+        if not topic.startswith(TRANSFORMS):
+            return True
+        parent, _, child = topic.removeprefix(TRANSFORMS).partition(">")
+        return any(edge[0] == parent and child in ("", edge[1]) for edge in self.moving)
 
     def mount(self, base: str, sensor: str) -> FloatArray | None:
         """Return the pose (7,) of one frame in another, along frames that do not move; None without such a way."""
@@ -135,7 +150,7 @@ def scanned(path: Path) -> BagContent:
         InputError: it is missing or damaged.
         MissingExtraError: `rosbags` is not installed.
     """
-    content = BagContent()
+    content = BagContent(keeps_transforms=True)
 
     def handlers(topics: Mapping[str, Topic]) -> dict[str, Handler]:
         content.topics = dict(topics)
@@ -156,7 +171,7 @@ def handler_of(content: BagContent, topic: str) -> Handler | None:
     if kind == "CameraInfo":
         return _camera_of(content, topic)
     if kind in FRAMES:
-        return lambda message, _: _edges_of(content, message)
+        return lambda message, received_s: _edges_of(content, message, received_s)
     return None
 
 
@@ -229,13 +244,31 @@ def _said(message: Any) -> tuple[float, str]:
     return float("nan"), ""
 
 
-def _edges_of(content: BagContent, message: Any) -> None:
+def _edges_of(content: BagContent, message: Any, received_s: float) -> None:
     for one in message.transforms:
         edge, pose = (_plain(one.header.frame_id), _plain(one.child_frame_id)), np.array(pose_of(one.transform))
+        if content.keeps_transforms:
+            _take_transform(content, edge, pose, (stamp_of(one), received_s))
         if edge not in content.edges:
             content.edges[edge] = se3.normalised(pose)
         elif np.abs(se3.log(se3.compose(se3.inverse(content.edges[edge]), se3.normalised(pose)))).max() > 1e-6:
             content.moving.add(edge)
+
+
+def _take_transform(content: BagContent, edge: tuple[str, str], pose: FloatArray, stamps: tuple[float, float]) -> None:
+    """Keep a transform that may be all that a bag says of the odometry or of tags, under a name in place of a topic."""
+    parent, child = edge
+    if _ODOMETRY.search(parent):
+        topic = f"{TRANSFORMS}{parent}>{child}"
+        content.topics.setdefault(topic, Topic("geometry_msgs/msg/TransformStamped", 0))
+        content.frames.setdefault(topic, child)
+        content.stamps.setdefault(topic, []).append(stamps)
+        content.motion.setdefault(topic, []).append((*pose.tolist(), *np.zeros(6)))
+    elif (tag := _TAG.search(child)) is not None:
+        topic = f"{TRANSFORMS}{parent}"
+        content.stamps.setdefault(topic, [])
+        look = content.take_look(topic, *stamps, parent)
+        content.seen.setdefault(topic, []).append(Seen(look, int(tag[2]), pose=tuple(pose.tolist())))
 
 
 def _plain(frame: str) -> str:
