@@ -62,3 +62,11 @@ def test_a_shift_moves_every_stamp_and_nothing_else() -> None:
     np.testing.assert_allclose(later.odometry.stamp_s - SESSIONS[0].odometry.stamp_s, 7.0)
     np.testing.assert_allclose(later.frames.stamp_s - SESSIONS[0].frames.stamp_s, 7.0)
     assert later.detections is SESSIONS[0].detections
+
+
+def test_without_a_store_an_overlap_is_a_remark() -> None:
+    living = em.run_session(SESSIONS[0]).living
+    told = em.run_session(SESSIONS[1], living).recording.warnings
+    assert any("overlaps what the map has seen" in remark for remark in told)
+    later = shift_stamps(SESSIONS[1], living.stamp_s + 10.0)
+    assert not any("overlaps" in remark for remark in em.run_session(later, living).recording.warnings)

@@ -51,7 +51,7 @@ from evermap.types import (
     Trajectory,
     landmark_id_of,
 )
-from evermap.valid import CAMERA_MODELS, is_covariance
+from evermap.valid import CAMERA_MODELS, SINCE_1970_S, is_covariance
 
 FEWEST_LOOKS = 20
 """Messages above which a detector without any empty one is assumed to publish only detections."""
@@ -61,8 +61,6 @@ LATE_S = 0.5
 """Difference between the delays of two topics from stamp to arrival that indicates different clocks."""
 _NATIVE = ("odometry", "detections")
 """Tables that make a folder a recording of its own, whatever bag it was made from."""
-SINCE_1970_S = 1e8
-"""Larger stamps count from 1970; smaller ones from the start of a simulation."""
 _TRUTH = re.compile(r"(^|[/_])(gt|truth|ground_?truth|mocap|vicon|vrpn|optitrack|qualisys)([/_]|$)")
 _NO_ODOMETRY = re.compile(r"amcl|goal|initialpose|target|plan|cmd|map_|landmark")
 _PICTURES = ("MarkerArray", "SceneUpdate")

@@ -46,13 +46,12 @@ from evermap.types import (
     Trajectory,
     landmark_id_of,
 )
+from evermap.valid import SINCE_1970_S
 
 Key = tuple[str, int]
 """A variable: letters and a number, as ('x', 5); ('', 5) where it is called by a number."""
 
 ENDINGS = (".g2o", ".pyfg", ".toro", ".graph", ".g2o.gz")
-SINCE_1970_S = 1e8
-"""Larger stamps count from 1970."""
 _MOST_M, _LARGEST_ID = 1e8, 2**53
 _NAME = re.compile(r"([A-Za-z_]*)(\d{1,20})")
 

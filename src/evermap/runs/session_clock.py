@@ -13,12 +13,8 @@ import numpy as np
 
 from evermap.errors import DataError
 from evermap.maps.store import Revision, RevisionKind
-from evermap.types import AnyRecording, Clock, Measurements
-
-OVERLAP_S = 1.0
-"""Sessions of one robot may overlap by so much: parts of a drive share their seam."""
-SINCE_1970_S = 1e8
-"""Larger stamps count from 1970, whatever the recording says of its clock."""
+from evermap.types import AnyRecording, Measurements
+from evermap.valid import OVERLAP_S, has_own_clock
 
 
 def place_session(recording: AnyRecording, log: Sequence[Revision], clock_gap_s: float | None) -> AnyRecording:
@@ -31,7 +27,7 @@ def place_session(recording: AnyRecording, log: Sequence[Revision], clock_gap_s:
         DataError: it keeps its stamps, and another session of the same robot was at the same time.
     """
     stamp_s = recording.frames.stamp_s
-    if recording.clock is not Clock.RECORDING or not len(stamp_s) or not np.nanmin(stamp_s) < SINCE_1970_S:
+    if not has_own_clock(recording):
         return recording
     first_s, last_s = float(np.nanmin(stamp_s)), float(np.nanmax(stamp_s))
     origins = [one.provenance for one in log if one.provenance.kind is RevisionKind.SESSION]
