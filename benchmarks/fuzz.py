@@ -509,6 +509,9 @@ def kinds(folder: Path) -> dict[str, Callable[[], Kind]]:
         "bags-ros1": lambda: Kind(".bag", _bags(folder, "{}.bag"), edit_bag, _read_bag),
         "bags-mcap": lambda: Kind(".mcap", _bags(folder, "{}"), edit_bag, _read_bag),
         "bags-sqlite": lambda: Kind(".db3", _bags(folder, "{}_sqlite"), edit_bag, _read_bag),
+        "pose-graphs": lambda: Kind(".g2o", _GRAPHS, edit_text, _read_recording),
+        "no-recordings": lambda: Kind("", _OTHERS, flip, _read_other),
+        "recording-csv": lambda: Kind(".csv", (_seen_rows(),), edit_text, _read_rows),
         "tum": lambda: Kind(".tum", (_TUM,), edit_text, _read_tum),
         "priors": lambda: Kind(".txt", _PRIORS, edit_text, _read_prior),
     }  # fmt: skip
@@ -517,6 +520,60 @@ def kinds(folder: Path) -> dict[str, Callable[[], Kind]]:
 _LIFETIMES = (
     b"left,right,class_id,x_m,y_m\n10,20,car,1,1\n30,,car,1,1\n5,5,car,12,1\n50,60,pallet,1,1\n70,,pallet,1,1\n"
 )
+_GRAPHS = (
+    (
+        b"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0.1\nVERTEX_XY 7 1 1\nEDGE_SE2 0 1 1.0 0.0 0.1 500 0 0 500 0 5000\n"
+        b"EDGE_SE2 1 2 1.0 0 0 500 0 0 500 0 5000\nEDGE_SE2 0 2 2.0 0.1 0.1 500 0 0 500 0 5000\n"
+        b"EDGE_SE2_XY 0 7 1.0 1.0 100 0 100\nEDGE_SE2_XY 2 7 -1.0 1.0 100 0 100\nEDGE_RANGE_SE2_XY 1 8 3.0 100\n"
+    ),
+    (
+        b"VERTEX_SE2 0.0 A0 0 0 0\nVERTEX_SE2 1.0 A1 1 0 0\nVERTEX_SE2 0.5 B0 1 0 0\nVERTEX_XY L3 1 1\n"
+        b"EDGE_SE2 1.0 A0 A1 1 0 0 .01 0 0 .01 0 .01\nEDGE_RANGE 1.0 A1 L3 1.0 0.01\nEDGE_RANGE 0.0 A0 L3 1.4 0.01\n"
+    ),
+    b"PARAMS_SE3OFFSET 0 0 0 1 0 0 0 1\nVERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n"
+    b"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 " + b" ".join([b"100"] * 21) + b"\n"
+    b"EDGE_SE3:QUAT 8070450532247928832 7782220156096217095 1 0 0 0 0 0 1\n"
+    b"EDGE_SE3_TRACKXYZ 0 50 0 1 2 3 100 0 0 100 0 100\nEDGE_SE3_TRACKXYZ 1 50 0 0 2 3 100 0 0 100 0 100\n",
+)
+_OTHERS = (
+    b"1.5 1 2 0 0 0 0 1\n2.5 1 2 0 0 0 0 1\n", b"1 0 0 0 0 1 0 0 0 0 1 0\n", b"#timestamp [ns],x\n1,2\n",
+    b"MATLAB 5.0 MAT-file, Platform: GLNXA64", b"version https://git-lfs.github.com/spec/v1\noid sha256:4d\nsize 12\n",
+    b"\x89PNG\r\n\x1a\n" + bytes(40), b"SQLite format 3\0" + bytes(84), b"\x1f\x8b\x08" + bytes(30), b"{}", b"PK\3\4",
+)  # fmt: skip
+
+
+def _read_other(path: Path) -> str:
+    """What a file that is no recording is said to be; to read it, or not to fail, would be the defect."""
+    from evermap.io import read_recording
+
+    try:
+        read_recording(path)
+    except EvermapError as error:
+        line = error.one_line()
+        assert printable(line) == line, line
+        return ""
+    return "a recording"
+
+
+def _seen_rows() -> bytes:
+    rows = "".join(f"{0.1 * k:.1f},{k % 3},{2.0 + 0.01 * k:.2f},{0.1 * (k % 5):.1f}\n" for k in range(60))
+    return ("stamp_s,landmark_id,range_m,bearing_rad\n" + rows).encode()
+
+
+def _read_rows(path: Path) -> Any:
+    """A table of detections, beside odometry."""
+    from evermap.io import read_recording
+
+    folder = path.with_suffix(".drive")
+    folder.mkdir(exist_ok=True)
+    odometry = "".join(f"{0.1 * k:.1f},1.0,0.1\n" for k in range(60))
+    (folder / "odometry.csv").write_text("stamp_s,forward_mps,angular_radps\n" + odometry)
+    (folder / "detections.csv").write_bytes(path.read_bytes())
+    found = plain(replace(read_recording(folder), source=""))
+    shutil.rmtree(folder)
+    return found
+
+
 _TUM = b"# t x y z qx qy qz qw\n1.0 2 3 0 0 0 0 1\n2.5 3 4 0 0 0 1 0\n"
 _PRIORS = (
     b"exponential:half-life=30d", b"0.9*exponential:half-life=12h+0.1*never-leaves", b"weibull:scale=3d,shape=0.7",

@@ -1005,6 +1005,11 @@ class LivingConfig(Section):
     )
     near_m: Positive = key(10.0, "margin beyond the sensor's range of the surroundings of a session [m]")
     most_sites: int = key(3, "maximum sites of one clique", ge=1, le=100)
+    clock_gap_s: NotNegative | None = key(
+        None,
+        "time between two sessions whose clocks start anew: each begins so long after the last one [s]; not set: "
+        "sessions of one robot that overlap in time are refused",
+    )
     fit: FitConfig = part(FitConfig, "acceptance of a session")
     overlay: OverlayConfig = part(OverlayConfig, "priors of moves")
     sight: SightConfig = part(SightConfig, "lines of sight")

@@ -136,7 +136,7 @@ def run_session(
     from evermap.slam import check
 
     config = config or Config()
-    recording = session.in_its_space(recording, living, config)
+    recording = session.with_overlap(session.in_its_space(recording, living, config), living)
     living, whole = session.opened(living, recording), recording
     located: Localised[PlanarVisit] | Localised[SpatialVisit]
     if is_in_space(recording):

@@ -19,6 +19,7 @@ from evermap.types import (
     UNKNOWN,
     AnyRecording,
     BoolArray,
+    Clock,
     Detections,
     FloatArray,
     IntArray,
@@ -70,13 +71,16 @@ class Quantity:
             problem = f"row {row}: {self._complaint(float(values[row]))}"
             raise InputError(problem, field=field, hint=self.hint or None)
 
-    def _first_bad(self, values: FloatArray) -> int | None:
-        absent = np.isnan(values) if self.optional else np.zeros(len(values), dtype=bool)
+    def is_fine(self, values: FloatArray) -> BoolArray:
+        """Return which values (R,) are within the limits, or not given where they need not be."""
         with np.errstate(invalid="ignore"):
             fine = np.isfinite(values) & (values >= self.low) & (values <= self.high)
             if self.positive:
                 fine &= values > 0
-        bad = np.flatnonzero(~fine & ~absent)
+        return fine | np.isnan(values) if self.optional else fine
+
+    def _first_bad(self, values: FloatArray) -> int | None:
+        bad = np.flatnonzero(~self.is_fine(values))
         return int(bad[0]) if len(bad) else None
 
     def _complaint(self, value: float) -> str:
@@ -87,6 +91,10 @@ class Quantity:
         return f"{value:g} is outside [{self.low:g}, {self.high:g}]"
 
 
+SINCE_1970_S = 1e8
+"""Larger stamps count from 1970, whatever a recording says of its clock; smaller ones from the start of something."""
+OVERLAP_S = 1.0
+"""Sessions of one robot may overlap by so much: parts of a drive share their seam."""
 LATEST_S = 9.2e9
 """Stamps beyond this, the year 2261, do not fit into 64 bits of nanoseconds; they are milliseconds or garbage."""
 STAMP_S = Quantity("stamp_s", -LATEST_S, LATEST_S, hint="stamps in seconds, not in milli- or nanoseconds", dates=True)
@@ -149,6 +157,12 @@ def validate(recording: Any) -> None:
         _check_trajectory(recording.truth, "truth")
     if recording.true_landmarks is not None:
         check_landmarks(recording.true_landmarks, "true_landmarks")
+
+
+def has_own_clock(recording: AnyRecording) -> bool:
+    """Return whether stamps count from a start that only this recording, or its simulation, knows."""
+    stamp_s = recording.frames.stamp_s
+    return recording.clock is Clock.RECORDING and len(stamp_s) > 0 and bool(np.nanmin(stamp_s) < SINCE_1970_S)
 
 
 def check_frame_in_space(detections: SpatialDetections, sensors: int) -> None:

@@ -45,6 +45,23 @@ class Ros:
         self.store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
         extra = {
             "aruco_msgs/msg/ArucoMarkers": "std_msgs/Header header\nint64[] marker_ids\ngeometry_msgs/Pose[] poses",
+            "aruco_msgs/msg/Marker": (
+                "std_msgs/Header header\nuint32 id\ngeometry_msgs/PoseWithCovariance pose\nfloat64 confidence"
+            ),
+            "aruco_msgs/msg/MarkerArray": "std_msgs/Header header\naruco_msgs/Marker[] markers",
+            "ar_track_alvar_msgs/msg/AlvarMarker": (
+                "std_msgs/Header header\nuint32 id\nuint32 confidence\ngeometry_msgs/PoseStamped pose"
+            ),
+            "ar_track_alvar_msgs/msg/AlvarMarkers": (
+                "std_msgs/Header header\nar_track_alvar_msgs/AlvarMarker[] markers"
+            ),
+            "cartographer_ros_msgs/msg/LandmarkEntry": (
+                "string id\ngeometry_msgs/Pose tracking_from_landmark_transform\nfloat64 translation_weight\n"
+                "float64 rotation_weight"
+            ),
+            "cartographer_ros_msgs/msg/LandmarkList": (
+                "std_msgs/Header header\ncartographer_ros_msgs/LandmarkEntry[] landmarks"
+            ),
             "fiducial_msgs/msg/FiducialTransform": (
                 "int32 fiducial_id\ngeometry_msgs/Transform transform\nfloat64 image_error\nfloat64 object_error\n"
                 "float64 fiducial_area"
@@ -242,6 +259,47 @@ def markers(ros: Ros, stamp_s: float, k: int) -> Any:
     return ros.make("visualization_msgs/MarkerArray", found)
 
 
+def aruco_ros(ros: Ros, stamp_s: float, k: int) -> Any:
+    """Markers of aruco_ros, whose array has the name of one of pictures."""
+    header = ros.header(stamp_s, "camera_optical")
+    found = [ros.make("aruco_msgs/Marker", header, name, ros.spread(pose), 0.9) for name, pose in in_camera(k).items()]
+    return ros.make("aruco_msgs/MarkerArray", header, found)
+
+
+def alvar(ros: Ros, stamp_s: float, k: int) -> Any:
+    """Markers of ar_track_alvar; only each of them says its frame."""
+    header = ros.header(stamp_s, "camera_optical")
+    found = [
+        ros.make(
+            "ar_track_alvar_msgs/AlvarMarker",
+            header,
+            name,
+            90,
+            ros.make("geometry_msgs/PoseStamped", header, ros.pose(pose)),
+        )
+        for name, pose in in_camera(k).items()
+    ]
+    return ros.make("ar_track_alvar_msgs/AlvarMarkers", ros.header(stamp_s, ""), found)
+
+
+def cartographer(ros: Ros, stamp_s: float, k: int) -> Any:
+    """Landmarks as cartographer takes them."""
+    found = [
+        ros.make("cartographer_ros_msgs/LandmarkEntry", str(name), ros.pose(pose), 1.0, 1.0)
+        for name, pose in in_camera(k).items()
+    ]
+    return ros.make("cartographer_ros_msgs/LandmarkList", ros.header(stamp_s, "camera_optical"), found)
+
+
+def only_transforms(ros: Ros, stamp_s: float, k: int) -> Any:
+    """Tags that are said nowhere but on /tf."""
+    seen = [
+        ros.stamped_transform(stamp_s, "camera_optical", f"tag36h11:{name}", pose)
+        for name, pose in in_camera(k).items()
+    ]
+    return ros.make("tf2_msgs/TFMessage", seen)
+
+
 DETECTORS: dict[str, tuple[str, Callable[[Ros, float, int], Any]]] = {
     "tags": ("apriltag_msgs/AprilTagDetectionArray", tags),
     "objects": ("vision_msgs/Detection3DArray", objects),
@@ -251,6 +309,10 @@ DETECTORS: dict[str, tuple[str, Callable[[Ros, float, int], Any]]] = {
     "fiducials": ("fiducial_msgs/FiducialTransformArray", fiducials),
     "apriltag_ros": ("apriltag_ros/AprilTagDetectionArray", apriltag_ros),
     "markers": ("visualization_msgs/MarkerArray", markers),
+    "aruco_ros": ("aruco_msgs/MarkerArray", aruco_ros),
+    "alvar": ("ar_track_alvar_msgs/AlvarMarkers", alvar),
+    "cartographer": ("cartographer_ros_msgs/LandmarkList", cartographer),
+    "transforms": ("tf2_msgs/TFMessage", only_transforms),
 }
 
 

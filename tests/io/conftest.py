@@ -133,6 +133,17 @@ def ycbv() -> Files:
 
 
 @pytest.fixture
+def pose_graph() -> Files:
+    """A graph of g2o: three poses, of which the first and last see two points, and an edge between these."""
+    return {
+        "world.g2o": "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0.1\nVERTEX_SE2 2 2 0.1 0.1\nVERTEX_XY 7 1 1\n"
+        "EDGE_SE2 0 1 1.0 0.0 0.1 500 0 0 500 0 5000\nEDGE_SE2 1 2 1.0 0.0 0.0 500 0 0 500 0 5000\n"
+        "EDGE_SE2 0 2 2.0 0.1 0.1 500 0 0 500 0 5000\nEDGE_SE2_XY 0 7 1.0 1.0 100 0 100\n"
+        "EDGE_SE2_XY 2 7 -1.0 1.0 100 0 100\nEDGE_SE2_XY 2 8 1.0 2.0 100 0 100\n"
+    }
+
+
+@pytest.fixture
 def bag(tmp_path: Path) -> dict[str, bytes]:
     """A bag of ROS 2 in MCAP; a robot drives past two markers."""
     pytest.importorskip("rosbags", reason="the extra ros is not installed")

@@ -20,7 +20,8 @@ from evermap.errors import DataError, InputError
 from evermap.geometry import se3
 from evermap.geometry.camera import project, unproject
 from evermap.io import list_robots, read_recording, reader_for
-from evermap.io.bag import bag_settings, read_bag, settings_path
+from evermap.io.bag import bag_settings, guessed_settings, read_bag, settings_path
+from evermap.io.bag_messages import scanned
 from evermap.io.rosbag import UNSTATED
 from evermap.types import UNKNOWN, SpatialRecording, landmark_id_of
 
@@ -57,6 +58,10 @@ def places(recording: SpatialRecording) -> Iterator[tuple[int, np.ndarray]]:
         ("drive", "fiducials"),
         ("drive", "apriltag_ros"),
         ("drive_sqlite", "tags"),
+        ("drive", "aruco_ros"),
+        ("drive.bag", "alvar"),
+        ("drive", "cartographer"),
+        ("drive", "transforms"),
     ],
 )
 def test_tags_are_where_they_are(name: str, detector: str, tmp_path: Path) -> None:
@@ -81,6 +86,19 @@ def test_tags_are_where_they_are(name: str, detector: str, tmp_path: Path) -> No
     assert recording.truth.pose_world_robot == pytest.approx(np.array([path_of(k) for k in range(STEPS)]))
     # without an empty message among so many the detector may be one that is silent where it sees nothing
     assert recording.frames.complete == (detector == "tags")
+
+
+def test_odometry_that_is_only_in_transforms(tmp_path: Path) -> None:
+    bag = write(tmp_path / "drive", "aruco")
+    content = scanned(bag)
+    assert guessed_settings(content).odometry == "/odom"
+    for topic in ("/odom", "/wheels/twist"):
+        del content.motion[topic]
+    assert guessed_settings(content).odometry == "tf:odom>base_link"
+    settings_path(bag).write_text(bag_settings(bag).replace('"/odom"', '"tf:odom>base_link"'))
+    odometry = read_bag(bag).odometry
+    assert odometry is not None
+    assert odometry.pose_world_robot == pytest.approx(np.array([path_of(k) for k in range(STEPS)]))
 
 
 def test_a_single_file_of_mcap(tmp_path: Path) -> None:

@@ -138,6 +138,11 @@ def edit(name: str, old: str, new: str) -> Callable[[Files], None]:
     return apply
 
 
+def edit_all(name: str, old: str, new: str) -> Callable[[Files], None]:
+    """More than the few bad rows that are left out."""
+    return lambda files: files.update({name: files[name].replace(old, new)})
+
+
 def drop(name: str) -> Callable[[Files], None]:
     return lambda files: files.pop(name)
 
@@ -175,19 +180,19 @@ def test_a_row_out_of_order_is_sorted_in_and_told(mrclam: Files, lay_out: Callab
 BAD = {
     "missing barcodes": (drop("Barcodes.dat"), ["Barcodes.dat", "missing"]),
     "words": (
-        edit("Robot1_Odometry.dat", "1000.100 \t  0.100", "1000.100 \t fast"),
-        ["Odometry.dat:4", "forward_mps", "'fast'"],
+        edit_all("Robot1_Odometry.dat", " \t  0.100 \t", " \t fast \t"),
+        ["Odometry.dat:3", "forward_mps", "'fast'"],
     ),
     "nan": (
-        edit("Robot1_Odometry.dat", "1000.100 \t  0.100", "1000.100 \t nan"),
-        ["Odometry.dat:4", "forward_mps", "nan"],
+        edit_all("Robot1_Odometry.dat", " \t  0.100 \t", " \t nan \t"),
+        ["Odometry.dat:3", "forward_mps", "nan"],
     ),
     "inf": (edit("Robot1_Measurement.dat", "3.000", "inf"), ["Measurement.dat:4", "range_m", "inf"]),
     "negative range": (edit("Robot1_Measurement.dat", "3.000", "-3.0"), ["Measurement.dat:4", "range_m", "-3"]),
     "degrees": (edit("Robot1_Measurement.dat", "-0.250", "-14.3"), ["Measurement.dat:3", "bearing_rad", "radians"]),
     "milliseconds": (
-        edit("Robot1_Odometry.dat", "1000.100", "1248272272841000"),
-        ["Odometry.dat:4", "stamp_s", "seconds"],
+        edit_all("Robot1_Odometry.dat", "\n100", "\n124827227284"),
+        ["Odometry.dat:3", "stamp_s", "seconds"],
     ),
     "truncated in the middle": (
         edit("Robot1_Measurement.dat", "3.000 \t 0.100", "3.000"),

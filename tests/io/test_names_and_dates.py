@@ -168,6 +168,10 @@ def test_bad_dates_are_refused(tmp_path: Path, file: str, old: str, new: str, wo
     folder = dated(write_template(tmp_path / "dated"), "Z")
     text = (folder / file).read_text()
     assert old in text
+    if file == "odometry.csv":  # in a long table one such row would be left out
+        lines = text.splitlines()
+        at = next(row for row, line in enumerate(lines) if line.startswith(old))
+        text = "\n".join([*(line for line in lines if line.startswith("stamp_s")), *lines[at - 6 : at + 6]]) + "\n"
     (folder / file).write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=words):
         read_recording(folder)

@@ -310,6 +310,11 @@ def edit(name: str, old: str, new: str) -> Callable[[Files], None]:
     return apply
 
 
+def edit_all(name: str, old: str, new: str) -> Callable[[Files], None]:
+    """More than the few bad rows that are left out."""
+    return lambda files: files.update({name: files[name].replace(old, new)})
+
+
 def put(name: str, text: str) -> Callable[[Files], None]:
     return lambda files: files.update({name: text})
 
@@ -334,7 +339,7 @@ BAD = {
     "words": (edit(DET, "3.5", "far"), [f"{DET}:4", "'range_m'", "'far' is not a number"]),
     "empty cell": (edit(DET, "3.5", ""), [f"{DET}:4", "'range_m'", "is empty"]),
     "nan": (edit(DET, "3.5", "nan"), [f"{DET}:4", "'range_m'", "nan"]),
-    "inf": (edit(ODO, "0.3,0.5", "0.3,inf"), [f"{ODO}:5", "'forward_mps'", "inf"]),
+    "inf": (edit_all(ODO, ",0.5,", ",inf,"), [f"{ODO}:2", "'forward_mps'", "inf"]),
     "negative range": (edit(DET, "3.5", "-3.5"), [f"{DET}:4", "'range_m'", "-3.5"]),
     "no return": (edit(DET, "3.5", "0"), [f"{DET}:4", "'range_m'", "no return"]),
     "degrees": (edit(DET, "-0.3", "-17"), [f"{DET}:3", "'bearing_rad'", "radians"]),
@@ -343,7 +348,7 @@ BAD = {
     "negative id": (edit(DET, "0.5,7", "0.5,-7"), [f"{DET}:3", "'landmark_id'", "-7"]),
     "zero sigma": (edit(DET, "0.02,0.01", "0,0.01"), [f"{DET}:3", "'sigma_range_m'", "greater than zero"]),
     "both sigmas": (edit(DET, "sigma_bearing_rad", "sigma_m"), [f"{DET}:2", "'sigma_m'", "both given"]),
-    "time backwards": (edit(ODO, "\n1.0,", "\n0.2,"), [f"{ODO}:12", "'stamp_s'", "backwards by 0.7 s"]),
+    "time backwards": (edit_all(ODO, "\n1.", "\n0."), [f"{ODO}:12", "'stamp_s'", "backwards by 0.9 s"]),
     "detections backwards": (edit(DET, "\n2.0", "\n0.5"), [f"{DET}:6", "'stamp_s'", "backwards"]),
     "frames backwards": (edit("frames.csv", "1.5", "0.1"), ["frames.csv:5", "backwards"]),
     "detection without frame": (

@@ -196,6 +196,7 @@ def test_two_robots_at_once(tmp_path: Path) -> None:
     second = replace(
         second,
         name="second robot",
+        robot="second",
         odometry=replace(second.odometry, stamp_s=second.odometry.stamp_s + late_s),
         frames=replace(second.frames, stamp_s=second.frames.stamp_s + late_s),
     )

@@ -44,6 +44,19 @@ def change(*ids, kind=ChangeKind.MOVED, start=NAN, stop=1000.0, by=(1.0, 0.0), t
             change(1, 2, kind=ChangeKind.ROTATED, start=1050.0, stop=1050.1, turn=-0.35),
             "landmarks 1, 2 turned by -20.1° and moved by (+1.00, 0.00) m 50 s after the start",
         ),
+        (
+            change(1, 2, kind=ChangeKind.ROTATED, by=(0.004, 0.0), turn=0.1),
+            "landmarks 1, 2 turned by +5.7° in place before the session",
+        ),
+        (
+            change(3, by=(0.0, 0.0, 0.03), turn=math.pi / 2),
+            "landmark 3 turned by 90.0° in place before the session",
+        ),
+        (
+            change(3, by=(0.0, 0.0, 0.5), turn=math.pi / 2),
+            "landmark 3 turned by 90.0° and moved by (0.00, 0.00, +0.50) m before the session",
+        ),
+        (change(3, by=(0.2, 0.0, 0.0), turn=0.1), "landmark 3 moved by (+0.20, 0.00, 0.00) m before the session"),
         (change(11, 17, kind=ChangeKind.SWAPPED), "landmarks 11, 17 exchanged their identities before the session"),
         (
             change(*range(40)),

@@ -408,6 +408,7 @@ def _numbers(change: MapChange) -> dict[str, Any]:
         "from_s": json_number(change.stamp_from_s),
         "to_s": json_number(change.stamp_to_s),
         "displacement_m": [json_number(value) for value in change.displacement_m],
+        "rotation_rad": json_number(change.rotation_rad),
         "probability": change.probability,
     }
 

@@ -6,11 +6,13 @@ from pathlib import Path
 
 from evermap.errors import InputError
 from evermap.io.bag import BAG, read_bag
-from evermap.io.files import Reader, file_sets, find_file_set
+from evermap.io.file_kinds import kind_of_file, kind_of_folder
+from evermap.io.files import Reader, file_sets, find_file_set, head_of, refuse_pointer
 from evermap.io.landmarks import read_landmarks, read_prior_map, write_map_geojson, write_map_parquet
 from evermap.io.mrclam import MRCLAM, read_mrclam
 from evermap.io.native import NATIVE, read_native
 from evermap.io.native_write import write_native
+from evermap.io.pose_graph import POSE_GRAPH
 from evermap.io.shifts import Shift, parse_shift, shifted
 from evermap.io.tagslam import TAGSLAM
 from evermap.io.template import write_template
@@ -40,7 +42,7 @@ __all__ = [
     "write_tum",
 ]
 
-READERS: tuple[Reader, ...] = (MRCLAM, TAGSLAM, YCBV, BAG, NATIVE)
+READERS: tuple[Reader, ...] = (MRCLAM, TAGSLAM, YCBV, BAG, NATIVE, POSE_GRAPH)
 """All readers, in the order in which they are tried. Add a new reader here and nowhere else."""
 
 
@@ -52,12 +54,20 @@ def reader_for(path: str | Path) -> Reader:
     """
     path = Path(path)
     found = file_sets(path)
+    if path.is_file():
+        refuse_pointer(head_of(path), path)
     for reader in READERS:
         if reader.matches(path):
             return reader
     if path.is_file() and not found:
-        hint = f"its folder {path.parent}, or a zip of it"
+        kind, hint = kind_of_file(path), f"its folder {path.parent}, or a zip of it"
+        if kind is not None:
+            is_table = kind.hint == "its folder"
+            raise InputError(f"is {kind.what}, not a recording", path=path, hint=hint if is_table else kind.hint)
         raise InputError("a single file is not a recording", path=path, hint=hint)
+    kind = kind_of_folder(found, path)
+    if kind is not None:
+        raise InputError(f"is not a recording: it holds {kind.what}", path=path, hint=kind.hint)
     names = sorted(name for files in found for name in files.members)
     holds = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "") if names else "no files"
     wanted = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in READERS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -10,6 +11,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.geometry import se2
+from evermap.io.bad_rows import Flaw, allowed_bad, flaw_of, sound_rows
 from evermap.io.table import Table
 from evermap.io.text import counted
 from evermap.types import (
@@ -25,8 +27,9 @@ from evermap.types import (
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
+    SpatialSensor,
 )
-from evermap.valid import STAMP_S, validate
+from evermap.valid import BEARING_RAD, RANGE_M, SIGMA_BEARING_RAD, SIGMA_RANGE_M, STAMP_S, validate
 
 SAME_STAMP_S = 1e-6
 """Stamps closer than this are the same instant when detections are assigned to frames."""
@@ -34,6 +37,9 @@ SAME_STAMP_S = 1e-6
 ODOMETRY_GAP_S = 10.0
 """Longer pauses of the odometry are reported, and frames farther than this from any odometry are dropped."""
 
+
+OUTSIDE = 0.1
+"""Share of an image by which the corner of a tag may lie outside: lenses and detectors extrapolate."""
 
 _Seen = TypeVar("_Seen", Detections, SpatialDetections)
 _Recorded = TypeVar("_Recorded", Recording, SpatialRecording)
@@ -130,6 +136,7 @@ def finish_recording(recording: _Recorded, *, warnings: list[str]) -> _Recorded:
     Raises:
         DataError: fewer than two odometry rows, no frame within the odometry's time, or no landmark seen.
     """
+    recording = _without_bad(recording, warnings)
     validate(recording)
     odometry, source = recording.odometry, recording.source
     if odometry is not None:
@@ -140,6 +147,52 @@ def finish_recording(recording: _Recorded, *, warnings: list[str]) -> _Recorded:
         raise DataError("no landmark was detected during the odometry", path=source)
     _warn_of_repeats(recording.detections, warnings)
     return replace(recording, warnings=tuple(warnings))
+
+
+def _without_bad(recording: _Recorded, warnings: list[str]) -> _Recorded:
+    """The recording without a few detections that cannot be; if there are many, `validate` says what is wrong."""
+    seen, path = recording.detections, Path(recording.source)
+    if isinstance(seen, Detections):
+        quantities = (RANGE_M, replace(BEARING_RAD, optional=True), SIGMA_RANGE_M, SIGMA_BEARING_RAD)
+        flaws = [flaw_of(quantity, getattr(seen, quantity.name), path, seen.source_line) for quantity in quantities]
+    else:
+        cornered = np.isfinite(seen.corner_px).all(axis=(1, 2))
+        far = np.linalg.norm(seen.position_sensor_m, axis=1)
+        flaws = [flaw_of(replace(RANGE_M, high=np.inf), np.where(cornered, 1.0, far), path, seen.source_line)]
+        flaws += _outside_image(seen, recording.sensors, path, warnings)
+    if any(flaw.bad.sum() > allowed_bad(len(seen)) for flaw in flaws):
+        return recording
+    sound = sound_rows(flaws, len(seen), path, warnings)
+    return recording if sound is None else replace(recording, detections=seen[sound])
+
+
+def _outside_image(
+    seen: SpatialDetections, sensors: Sequence[SpatialSensor], path: Path, warnings: list[str]
+) -> list[Flaw]:
+    """Tags whose corners are far outside the image; many of them mean a calibration of another resolution."""
+    outside = np.zeros(len(seen), dtype=np.bool_)
+    for number, sensor in enumerate(sensors):
+        if sensor.resolution_px is None:
+            continue
+        rows = np.flatnonzero(seen.sensor == number)
+        share = seen.corner_px[rows] / np.array(sensor.resolution_px, dtype=np.float64)
+        outside[rows] = ((share < -OUTSIDE) | (share > 1.0 + OUTSIDE)).any(axis=(1, 2))
+    count = int(outside.sum())
+    if count > allowed_bad(len(seen)):
+        known = ", ".join(
+            f"{one.name} {one.resolution_px[0]} x {one.resolution_px[1]}" for one in sensors if one.resolution_px
+        )
+        warnings.append(
+            f"{counted(count, 'tag')} of {len(seen)} lie outside the image ({known}): is the calibration of another "
+            "resolution?"
+        )
+        return []
+
+    def error(row: int) -> InputError:
+        line = int(seen.source_line[row]) or None
+        return InputError("lies outside the image", path=path, line=line, field="corners")
+
+    return [Flaw(outside, error)]
 
 
 def _warn_of_gaps(odometry: Odometry | SpatialOdometry, warnings: list[str]) -> None:

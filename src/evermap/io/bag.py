@@ -29,10 +29,10 @@ from evermap.estimate.kind import Messages, TableRows
 from evermap.estimate.measurements import find_kinds
 from evermap.geometry import se3
 from evermap.io.assemble import finish_recording, looks_of
-from evermap.io.bag_messages import POSES, TWISTS, BagContent, SeenColumns, scanned
-from evermap.io.files import Reader
+from evermap.io.bag_messages import POSES, TRANSFORMS, TWISTS, BagContent, SeenColumns, scanned
+from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.rig_toml import Rig, cameras
-from evermap.io.rosbag import BAG_ENDINGS
+from evermap.io.rosbag import BAG_ENDINGS, METADATA
 from evermap.io.sensor_toml import Settings, TomlReader, toml_text
 from evermap.io.spatial import directions, integrated, of_rig, spatial_detections, unit, with_tag_poses
 from evermap.io.text import counted
@@ -51,18 +51,16 @@ from evermap.types import (
     Trajectory,
     landmark_id_of,
 )
-from evermap.valid import CAMERA_MODELS, is_covariance
+from evermap.valid import CAMERA_MODELS, SINCE_1970_S, is_covariance
 
-METADATA = "metadata.yaml"
-"""Metadata file of a folder that is a ROS 2 bag."""
 FEWEST_LOOKS = 20
 """Messages above which a detector without any empty one is assumed to publish only detections."""
 MOST_DIGITS = 15
 """Of a text that is a number; larger ones are not exact in float64."""
 LATE_S = 0.5
 """Difference between the delays of two topics from stamp to arrival that indicates different clocks."""
-SINCE_1970_S = 1e8
-"""Larger stamps count from 1970; smaller ones from the start of a simulation."""
+_NATIVE = ("odometry", "detections")
+"""Tables that make a folder a recording of its own, whatever bag it was made from."""
 _TRUTH = re.compile(r"(^|[/_])(gt|truth|ground_?truth|mocap|vicon|vrpn|optitrack|qualisys)([/_]|$)")
 _NO_ODOMETRY = re.compile(r"amcl|goal|initialpose|target|plan|cmd|map_|landmark")
 _PICTURES = ("MarkerArray", "SceneUpdate")
@@ -117,8 +115,30 @@ class BagSettings:
 
 def settings_path(path: str | Path) -> Path:
     """Return where the settings of a bag are: beside it, with '.toml' behind its name."""
-    path = Path(path)
+    path = _bag_at(Path(path))
     return path.with_name(path.resolve().name + ".toml")
+
+
+def _is_bag(files: FileSet) -> bool:
+    """Return whether a folder is a bag of ROS 2, by its metadata, or holds one bag and no tables of a recording."""
+    if files.zipped:
+        return False
+    if METADATA in files and b"rosbag2_bagfile_information" in files.read(METADATA):
+        return True
+    return len(_bags_in(files)) == 1 and not any(name.split(".")[0] in _NATIVE for name in files.members)
+
+
+def _bags_in(files: FileSet) -> list[str]:
+    return [name for name in files.members if name.endswith(BAG_ENDINGS)]
+
+
+def _bag_at(path: Path) -> Path:
+    """Return the bag that a path means: a file, a folder with metadata, or the only bag in a folder."""
+    files = find_file_set(path, _is_bag) if path.is_dir() else None
+    if files is None:
+        return path
+    whole = METADATA in files and b"rosbag2_bagfile_information" in files.read(METADATA)
+    return files.root / files.folder if whole else files.path_of(_bags_in(files)[0])
 
 
 def read_bag(path: str | Path, robot: int | None = None, topics: str | Path | None = None) -> SpatialRecording:
@@ -137,7 +157,7 @@ def read_bag(path: str | Path, robot: int | None = None, topics: str | Path | No
     path = Path(path)
     if robot is not None:
         raise InputError(f"there is no robot {robot}: a bag has one robot", path=path, hint="omit the robot")
-    content, stated = scanned(path), settings_path(path) if topics is None else Path(topics)
+    content, stated = scanned(_bag_at(path)), settings_path(path) if topics is None else Path(topics)
     settings = guessed_settings(content)
     if topics is None and not stated.is_file():
         return _recording(path, content, settings, guessed=True)
@@ -151,7 +171,7 @@ def bag_settings(path: str | Path) -> str:
         InputError: the bag is missing or damaged.
         MissingExtraError: `rosbags` is not installed.
     """
-    content = scanned(Path(path))
+    content = scanned(_bag_at(Path(path)))
     settings = guessed_settings(content)
     sections: dict[str, dict[str, Any]] = {"bag": {key: getattr(settings, key) for key in _TEXTS}}
     for name, one in settings.sensors.items():
@@ -187,15 +207,17 @@ def guessed_settings(content: BagContent) -> BagSettings:
         transform = kind == POSES.index("TransformStamped")
         return transform, kind > 0, "odom" not in topic and "vio" not in topic, -len(content.motion[topic])
 
-    moving = [topic for topic in content.motion if content.motion[topic]]
+    moving = [topic for topic in content.motion if content.motion[topic] and content.has_moving(topic)]
     true = sorted((one for one in moving if _TRUTH.search(one) and content.kind(one) in POSES), key=rank)
     driven = sorted((one for one in moving if not _TRUTH.search(one) and not _NO_ODOMETRY.search(one)), key=rank)
     odometry = driven[0] if driven else ""
-    sighted = [topic for topic in content.seen if content.seen[topic]]
+    sighted = [topic for topic in content.seen if content.seen[topic] and content.has_moving(topic)]
     named = {name for edge in content.edges for name in edge}
     usual = next((name for name in ("base_link", "base_footprint") if name in named), "")
     base = content.frames.get(odometry, "") or usual
-    plain = [topic for topic in sighted if content.kind(topic) not in _PICTURES]
+    transforms = [topic for topic in sighted if topic.startswith(TRANSFORMS)]  # of tags: only without messages of them
+    sighted = [topic for topic in sighted if topic not in transforms]
+    plain = [topic for topic in sighted if content.kind(topic) not in _PICTURES] or transforms
     base = base or next((content.frames.get(topic, "") for topic in plain), "")
     chosen = plain or [one for one in sighted if content.mount(base, content.frames.get(one, "")) is not None]
     sensors = {name: _sensor(content, topic) for topic, name in _short(chosen).items()}
@@ -335,9 +357,13 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     finite = np.asarray(np.isfinite(detections.position_sensor_m).all(axis=1))
     if not finite.all():
         warnings.append(f"{counted(int((~finite).sum()), 'detection')} without a finite position left out")
+    here = finite & (detections.position_sensor_m == 0.0).all(axis=1)
+    if here.any():
+        warnings.append(f"{counted(int(here.sum()), 'detection')} at the sensor's own place left out")
+    finite &= ~here
     detections = detections[np.flatnonzero(finite)[np.argsort(detections.frame[finite], kind="stable")]]
-    truth = _odometry(path, content, settings, settings.truth, clock)
-    odometry = _odometry(path, content, settings, settings.odometry, clock)
+    truth = _odometry(path, content, settings, settings.truth, clock, warnings)
+    odometry = _odometry(path, content, settings, settings.odometry, clock, warnings)
     recording = Recording(
         name=path.resolve().name.split(".")[0],
         odometry=odometry,
@@ -535,18 +561,29 @@ def _exactly(path: SpatialOdometry) -> Trajectory:
 
 
 def _odometry(
-    path: Path, content: BagContent, settings: BagSettings, topic: str, clock: Clock
+    path: Path, content: BagContent, settings: BagSettings, topic: str, clock: Clock, warnings: list[str]
 ) -> SpatialOdometry | None:
-    """Poses of the robot, in the order of their stamps; the last of those with the same."""
+    """Poses of the robot, in the order of their stamps; the last of those with the same. `warnings` counts bad ones."""
     if not topic:
         return None
     rows, stamp_s = np.array(content.motion[topic], dtype=np.float64), stamps_of(content, topic, settings.clock)
+    late = int(np.sum(stamp_s < np.maximum.accumulate(stamp_s)))
     order = np.argsort(stamp_s, kind="stable")
+    is_number = np.isfinite(rows[order, : 7 if content.kind(topic) in POSES else 6]).all(axis=1)
+    order = order[is_number & np.isfinite(stamp_s[order])]
+    bad = {"not a number": len(rows) - len(order)}
     if content.kind(topic) in POSES:  # the orientation of a robot is unknown if its message lacks it
-        order = order[np.linalg.norm(rows[order, 3:7], axis=1) > 0.5]
+        turned = np.linalg.norm(rows[order, 3:7], axis=1) > 0.5
+        bad["without orientation"], order = int((~turned).sum()), order[turned]
     if not len(order):
         raise DataError(f"poses on {topic} have no orientation", path=path, hint="another topic (`--init-bag`)")
     keep = order[np.append(np.diff(stamp_s[order]) > 0.0, True)]
+    bad["with the stamp of the next"] = len(order) - len(keep)
+    left_out = ", ".join(f"{count} {what}" for what, count in bad.items() if count)
+    if left_out:
+        warnings.append(f"{topic}: of {len(rows)} messages left out: {left_out}")
+    if late:
+        warnings.append(f"{topic}: {counted(late, 'message')} out of order sorted")
     stamp_s, rows = stamp_s[keep], rows[keep]
     child = content.frames.get(topic, "")
     z_up = "optical" not in child and "optical" not in settings.base_frame  # REP 103
@@ -560,8 +597,8 @@ def _odometry(
 
 BAG = Reader(
     "bag",
-    "a bag of ROS 1 (.bag) or ROS 2 (folder with metadata.yaml, .mcap, .db3)",
-    lambda files: METADATA in files and not files.zipped,
+    "ROS 1 (.bag) or ROS 2 (folder, .mcap, .db3)",
+    _is_bag,
     read_bag,
     endings=BAG_ENDINGS,
 )

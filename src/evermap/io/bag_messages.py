@@ -6,6 +6,7 @@ or its corners; class and score of an object in the forms of three releases of `
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,11 @@ if TYPE_CHECKING:
 POSES = ("Odometry", "PoseWithCovarianceStamped", "PoseStamped", "TransformStamped")
 TWISTS = ("TwistWithCovarianceStamped", "TwistStamped")
 FRAMES = ("TFMessage", "tfMessage")
+TRANSFORMS = "tf:"
+"""Begin of the names under which transforms are kept as if they were a topic: of odometry, and of tags."""
+_ODOMETRY = re.compile(r"(^|[/_])odom")
+_TAG = re.compile(r"(tag|marker|aruco|fiducial).*?(\d{1,9})$", re.IGNORECASE)
+"""Frames that are of odometry or of a tag, by the names that their packages give them."""
 
 
 class Seen(NamedTuple):
@@ -91,6 +97,8 @@ class BagContent:
     """By kind of measurement and topic: numbers of messages, and what these say."""
     edges: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
     moving: set[tuple[str, str]] = field(default_factory=set)
+    keeps_transforms: bool = False
+    """Whether transforms of odometry and tags are kept as if they were messages of a topic."""
 
     def kind(self, topic: str) -> str:
         """Return the type of a topic without its package."""
@@ -110,6 +118,13 @@ class BagContent:
         if frame:
             self.frames.setdefault(topic, _plain(frame))
         return len(self.stamps[topic]) - 1
+
+    def has_moving(self, topic: str) -> bool:
+        """Return whether what is kept under the name of a topic is of frames that move, as all real topics are."""
+        if not topic.startswith(TRANSFORMS):
+            return True
+        parent, _, child = topic.removeprefix(TRANSFORMS).partition(">")
+        return any(edge[0] == parent and child in ("", edge[1]) for edge in self.moving)
 
     def mount(self, base: str, sensor: str) -> FloatArray | None:
         """Return the pose (7,) of one frame in another, along frames that do not move; None without such a way."""
@@ -135,7 +150,7 @@ def scanned(path: Path) -> BagContent:
         InputError: it is missing or damaged.
         MissingExtraError: `rosbags` is not installed.
     """
-    content = BagContent()
+    content = BagContent(keeps_transforms=True)
 
     def handlers(topics: Mapping[str, Topic]) -> dict[str, Handler]:
         content.topics = dict(topics)
@@ -156,7 +171,7 @@ def handler_of(content: BagContent, topic: str) -> Handler | None:
     if kind == "CameraInfo":
         return _camera_of(content, topic)
     if kind in FRAMES:
-        return lambda message, _: _edges_of(content, message)
+        return lambda message, received_s: _edges_of(content, message, received_s)
     return None
 
 
@@ -220,22 +235,40 @@ def _seen_of(content: BagContent, topic: str, parts: Callable[[Any, int], Iterat
 
 
 def _said(message: Any) -> tuple[float, str]:
-    """Return stamp [s] and frame of a message, or of the first of its parts; nan and '' if missing."""
+    """Return stamp [s] and frame of a message, or of the first of its parts that says one; nan and '' if missing."""
     for one in (message, *getattr(message, "markers", ()), *getattr(message, "entities", ())):
-        if hasattr(one, "header"):
+        if hasattr(one, "header") and (one.header.frame_id or not len(getattr(one, "markers", ()))):
             return stamp_of(one), str(one.header.frame_id)
         if hasattr(one, "timestamp"):
             return seconds(one.timestamp), str(one.frame_id)
     return float("nan"), ""
 
 
-def _edges_of(content: BagContent, message: Any) -> None:
+def _edges_of(content: BagContent, message: Any, received_s: float) -> None:
     for one in message.transforms:
         edge, pose = (_plain(one.header.frame_id), _plain(one.child_frame_id)), np.array(pose_of(one.transform))
+        if content.keeps_transforms:
+            _take_transform(content, edge, pose, (stamp_of(one), received_s))
         if edge not in content.edges:
             content.edges[edge] = se3.normalised(pose)
         elif np.abs(se3.log(se3.compose(se3.inverse(content.edges[edge]), se3.normalised(pose)))).max() > 1e-6:
             content.moving.add(edge)
+
+
+def _take_transform(content: BagContent, edge: tuple[str, str], pose: FloatArray, stamps: tuple[float, float]) -> None:
+    """Keep a transform that may be all that a bag says of the odometry or of tags, under a name in place of a topic."""
+    parent, child = edge
+    if _ODOMETRY.search(parent):
+        topic = f"{TRANSFORMS}{parent}>{child}"
+        content.topics.setdefault(topic, Topic("geometry_msgs/msg/TransformStamped", 0))
+        content.frames.setdefault(topic, child)
+        content.stamps.setdefault(topic, []).append(stamps)
+        content.motion.setdefault(topic, []).append((*pose.tolist(), *np.zeros(6)))
+    elif (tag := _TAG.search(child)) is not None:
+        topic = f"{TRANSFORMS}{parent}"
+        content.stamps.setdefault(topic, [])
+        look = content.take_look(topic, *stamps, parent)
+        content.seen.setdefault(topic, []).append(Seen(look, int(tag[2]), pose=tuple(pose.tolist())))
 
 
 def _plain(frame: str) -> str:
@@ -266,7 +299,9 @@ def _markers(message: Any, look: int) -> Iterator[Seen]:
         for name, pose in zip(message.marker_ids, message.poses, strict=True):
             yield Seen(look, int(name), pose=pose_of(pose))
     for one in getattr(message, "markers", ()):
-        yield Seen(look, int(one.marker_id), pose=pose_of(_inner(one.pose)))
+        yield Seen(look, int(getattr(one, "marker_id", getattr(one, "id", -1))), pose=pose_of(_inner(one.pose)))
+    for one in getattr(message, "landmarks", ()):
+        yield Seen(look, str(one.id), pose=pose_of(one.tracking_from_landmark_transform))
     for one in getattr(message, "transforms", ()):
         yield Seen(look, int(one.fiducial_id), pose=pose_of(one.transform))
 
@@ -325,7 +360,9 @@ def _score(result: Any) -> float:
 
 def _drawn(message: Any, look: int) -> Iterator[Seen]:
     for one in getattr(message, "markers", ()):
-        if one.action == 0:  # added or changed
+        if not hasattr(one, "action"):  # of aruco_msgs: a detection, not a picture of one
+            yield Seen(look, int(one.id), pose=pose_of(_inner(one.pose)))
+        elif one.action == 0:  # added or changed
             name = int(one.id) if not one.ns else f"{one.ns}/{one.id}"
             yield Seen(look, name, label=str(one.ns), pose=pose_of(one.pose))
     for one in getattr(message, "entities", ()):
@@ -341,6 +378,8 @@ _DETECTIONS: dict[str, Callable[[Any, int], Iterator[Seen]]] = {
     "ArucoMarkers": _markers,
     "ArucoDetection": _markers,
     "FiducialTransformArray": _markers,
+    "AlvarMarkers": _markers,
+    "LandmarkList": _markers,
     "Detection3DArray": _objects,
     "Detection2DArray": _objects,
     "MarkerArray": _drawn,

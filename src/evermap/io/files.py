@@ -7,6 +7,7 @@ not at all: bytes go to a temporary sibling first and then take the name in one 
 from __future__ import annotations
 
 import gzip
+import re
 import secrets
 import shutil
 import struct
@@ -167,12 +168,34 @@ def content_of(path: Path) -> bytes:
         raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
 
 
+HEAD_BYTES = 4096
+"""Bytes from which the kind of a file is recognised."""
+LFS = b"version https://git-lfs.github.com/spec/"
+"""Begin of a pointer that Git LFS leaves where a file was not fetched."""
+
+
+def head_of(path: Path) -> bytes:
+    """Return the first bytes of a file, unpacked where it is gzipped; none where it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(HEAD_BYTES)
+    except OSError:
+        return b""
+    if head[:2] != b"\x1f\x8b":
+        return head
+    try:
+        return zlib.decompressobj(31).decompress(head, HEAD_BYTES)
+    except zlib.error:
+        return b""
+
+
 def unpacked(data: bytes, path: Path) -> bytes:
     """Return the content of a gzipped file, and that of any other as it is.
 
     Raises:
-        InputError: it is gzipped and damaged.
+        InputError: it is gzipped and damaged, or a pointer of Git LFS to a file that was not fetched.
     """
+    refuse_pointer(data, path)
     if data[:2] != b"\x1f\x8b":
         return data
     try:
@@ -180,6 +203,15 @@ def unpacked(data: bytes, path: Path) -> bytes:
     except (OSError, EOFError, zlib.error) as error:
         problem = f"damaged gzip file: {reason(error)}"
         raise InputError(problem, path=path, hint="download or create it again") from error
+
+
+def refuse_pointer(data: bytes, path: Path) -> None:
+    """Raise InputError where bytes are those of a pointer of Git LFS, not of the file that was meant."""
+    if data.startswith(LFS):
+        size = re.search(rb"^size (\d{1,18})$", data[:400], re.MULTILINE)
+        whole = f" of {int(size[1]):,} bytes" if size else ""
+        problem = f"is a pointer of Git LFS to a file{whole} that was not fetched"
+        raise InputError(problem, path=path, hint="`git lfs pull` in its repository")
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +225,8 @@ class Reader:
         read: returns the recording of a path and a robot; None for the format's default robot.
         robots: robots in files that can be asked for; none where the format does not number them.
         endings: of single files that are a recording of this format,
-        beside: where such files are beside them.
+        accepts: which of those files are, by what they hold and what is beside them; None: all.
+        head: whether a single file begins as one of this format, by its first bytes.
     """
 
     name: str
@@ -202,13 +235,16 @@ class Reader:
     read: Callable[[str | Path, int | None], Recording | SpatialRecording]
     robots: Callable[[FileSet], tuple[int, ...]] = lambda _: ()
     endings: tuple[str, ...] = ()
-    beside: Callable[[FileSet], bool] | None = None
+    accepts: Callable[[Path], bool] | None = None
+    head: Callable[[bytes], bool] | None = None
 
     def matches(self, path: str | Path) -> bool:
         """Return whether the files of this format are there, at the top or one folder down."""
         path = Path(path)
         if self.endings and path.is_file() and path.name.endswith(self.endings):
-            return self.beside is None or find_file_set(path.parent, self.beside) is not None
+            return self.accepts is None or self.accepts(path)
+        if self.head is not None and path.is_file() and self.head(head_of(path)):
+            return True
         return find_file_set(path, self.holds) is not None
 
 

@@ -21,8 +21,11 @@ def measurement_names() -> tuple[str, ...]:
     return tuple(find_kinds())
 
 
-def read_measurements(tables: Mapping[str, Table | None], names: dict[int, str]) -> tuple[Measurements, ...]:
-    """Return what such tables hold, sorted by time; `names` takes up ids of landmarks that are texts.
+def read_measurements(
+    tables: Mapping[str, Table | None], names: dict[int, str], warnings: list[str]
+) -> tuple[Measurements, ...]:
+    """Return what such tables hold, sorted by time; `names` takes up ids of landmarks that are texts, and `warnings`
+    counts bad rows.
 
     Raises:
         InputError: a column is missing or unknown, or a value is malformed, with its line.
@@ -34,6 +37,8 @@ def read_measurements(tables: Mapping[str, Table | None], names: dict[int, str])
             continue
         of_place = ("landmark_id",) if kind.ties == "pose_place" else ()
         table.expect((STAMP_S.name, *of_place, *kind.columns), tuple(kind.optional))
+        known = [*kind.columns, *kind.optional]
+        table = table.screened((STAMP_S, *(_quantity(kind, column) for column in known)), warnings)
         stamp_s = table.numbers(STAMP_S)
         columns = {column: _read_column(table, kind, column) for column in (*kind.columns, *kind.optional)}
         place = table.ids("landmark_id", optional=False, names=names) if of_place else np.full(len(table), UNKNOWN)
@@ -45,12 +50,17 @@ def read_measurements(tables: Mapping[str, Table | None], names: dict[int, str])
 
 def _read_column(table: Table, kind: MeasurementKind, column: str) -> FloatArray:
     """Return a column, with what is meant where it is left out or, of an optional one, empty."""
+    quantity = _quantity(kind, column)
+    return table.filled(quantity, float(kind.optional[column])) if quantity.optional else table.numbers(quantity)
+
+
+def _quantity(kind: MeasurementKind, column: str) -> Quantity:
+    """Return what the numbers of a column may be."""
     if column == "to_stamp_s":
-        return table.numbers(Quantity(column, STAMP_S.low, STAMP_S.high, hint=STAMP_S.hint, dates=True))
+        return Quantity(column, STAMP_S.low, STAMP_S.high, hint=STAMP_S.hint, dates=True)
     limit, hint = (2.0 * pi, "radians, not degrees") if column.endswith("_rad") else (1e8, "SI units")
     positive, optional = column.startswith("sigma") or column == "range_m", column in kind.optional
-    quantity = Quantity(column, -limit, limit, positive=positive, optional=optional, hint=hint)
-    return table.filled(quantity, float(kind.optional[column])) if optional else table.numbers(quantity)
+    return Quantity(column, -limit, limit, positive=positive, optional=optional, hint=hint)
 
 
 def measurement_columns(table: Measurements) -> dict[str, Any]:

@@ -7,7 +7,6 @@ Read from the zip or its unpacked folder; only one robot at a time.
 from __future__ import annotations
 
 import re
-from bisect import bisect_right
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -17,13 +16,13 @@ import numpy as np
 from evermap import valid as q
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import check_forward, finish_recording, last_of_equal, repeats, wrap_far
+from evermap.io.bad_rows import longest_forward
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.text import Rows, counted, parse_rows
 from evermap.types import (
     UNKNOWN,
     Clock,
     Detections,
-    FloatArray,
     Frames,
     IntArray,
     Landmarks,
@@ -108,7 +107,7 @@ def _complete_robots(files: FileSet) -> tuple[int, ...]:
 
 MRCLAM = Reader(
     "mrclam",
-    "MRCLAM zip or folder with Robot<N>_Odometry.dat, Robot<N>_Measurement.dat and Barcodes.dat",
+    "Robot<N>_Odometry.dat, Robot<N>_Measurement.dat and Barcodes.dat",
     _is_mrclam,
     read_mrclam,
     _complete_robots,
@@ -243,22 +242,13 @@ def _sorted(rows: Rows, warnings: list[str]) -> Rows:
     stamp_s = rows.column(0)
     if np.all(np.diff(stamp_s) >= 0.0):
         return rows
-    stray = len(rows) - _longest_forward(stamp_s)
+    stray = len(rows) - longest_forward(stamp_s)
     if stray > max(1, MOST_STRAY * len(rows)):
         check_forward(stamp_s, path=rows.path, line=rows.line)
     row = int(np.argmax(np.diff(stamp_s) < 0.0)) + 1
     where = f"time runs backwards at line {rows.line[row]}"
     warnings.append(f"{rows.path.name}: {counted(stray, 'row')} out of order sorted ({where})")
     return rows[np.argsort(stamp_s, kind="stable")]
-
-
-def _longest_forward(stamp_s: FloatArray) -> int:
-    """Length of the longest subsequence that never runs backwards (patience sorting)."""
-    ends: list[float] = []
-    for stamp in stamp_s.tolist():
-        place = bisect_right(ends, stamp)
-        ends[place : place + 1] = [stamp]
-    return len(ends)
 
 
 def _refuse_repeats(rows: Rows, numbers: IntArray, field: str) -> None:

@@ -12,6 +12,7 @@ from evermap import valid as q
 from evermap.errors import DataError, InputError, similar
 from evermap.geometry import se2
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal, wrap_far
+from evermap.io.bad_rows import Flaw, flaw_of
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, survey_of
 from evermap.io.measurements import measurement_names, read_measurements
@@ -88,14 +89,14 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
         sensor=settings.sensor,
         truth=truth_of(tables["truth"], ("x_m", "y_m", "theta_rad"), _poses, clock, warnings),
         true_landmarks=survey_of(tables["landmarks"], class_names=class_names, clock=clock, names=names),
-        robot_sightings=_robot_sightings(tables["robot_sightings"], clock),
+        robot_sightings=_robot_sightings(tables["robot_sightings"], clock, warnings),
         objects=_objects(tables["objects"], names),
         class_names=class_names,
         source=str(path),
         clock=clock,
         robot=settings.robot,
         landmark_names=names,
-        measurements=read_measurements(tables, names),
+        measurements=read_measurements(tables, names, warnings),
     )
     return finish_recording(recording, warnings=warnings)
 
@@ -114,7 +115,7 @@ def _is_native(files: FileSet) -> bool:
     return named and not is_tagslam(files)
 
 
-NATIVE = Reader("native", "folder or zip with odometry.csv and detections.csv (or .parquet)", _is_native, read_native)
+NATIVE = Reader("native", "odometry.csv and detections.csv (or .parquet)", _is_native, read_native)
 
 
 def _read_settings(files: FileSet, warnings: list[str]) -> Settings:
@@ -143,6 +144,8 @@ def _odometry(table: Table, clock: Clock, warnings: list[str]) -> Odometry:
         table.expect(("stamp_s", *_INCREMENTS))
     if len(table) == 0:
         raise DataError("contains no odometry", path=table.path)
+    if given is _VELOCITIES:
+        table = table.screened((q.STAMP_S, q.FORWARD_MPS, q.LATERAL_MPS, q.ANGULAR_RADPS), warnings)
     stamp_s = forward_stamps(table)
     if given is _VELOCITIES:
         keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
@@ -183,10 +186,11 @@ def _poses(table: Table) -> FloatArray:
     return np.stack([table.numbers(q.X_M), table.numbers(q.Y_M), heading], axis=1)
 
 
-def _robot_sightings(table: Table | None, clock: Clock) -> RobotSightings | None:
+def _robot_sightings(table: Table | None, clock: Clock, warnings: list[str]) -> RobotSightings | None:
     if table is None or len(table) == 0:
         return None
     table.expect(("stamp_s", "robot_id", *_POLAR))
+    table = table.screened((q.STAMP_S, q.RANGE_M, q.BEARING_RAD), warnings)
     range_m, bearing_rad = table.numbers(q.RANGE_M), wrap_far(table.numbers(q.BEARING_RAD))
     return RobotSightings(forward_stamps(table), table.ids("robot_id", optional=False), range_m, bearing_rad, clock)
 
@@ -257,6 +261,10 @@ def _frames_and_detections(
     table.expect(("stamp_s", *required), ("landmark_id", *more, *optional))
     if frame_table is not None:
         frame_table.expect(("stamp_s",))
+        frame_table = frame_table.screened((q.STAMP_S,), warnings)
+    table = table.screened(_SEEN, warnings)
+    if given is _CARTESIAN:
+        table = table.screened((), warnings, [_at_the_sensor(table)])
     frames, frame = frames_of(
         table, frame_table, complete=settings.frames_complete, clock=settings.clock, warnings=warnings
     )
@@ -280,6 +288,18 @@ def _polar(table: Table) -> tuple[FloatArray, FloatArray]:
     """Range and bearing within half a turn, nan where a bearing is empty, or there is no such column. Shapes (R,)."""
     bearing_rad = table.filled(replace(q.BEARING_RAD, optional=True), np.nan)
     return table.numbers(q.RANGE_M), np.where(np.isnan(bearing_rad), np.nan, wrap_far(bearing_rad))
+
+
+_SEEN = (
+    q.STAMP_S, q.RANGE_M, replace(q.BEARING_RAD, optional=True), q.X_M, q.Y_M, q.SIGMA_RANGE_M, q.SIGMA_BEARING_RAD,
+    *(replace(q.SIGMA_RANGE_M, name=name) for name in _ROUND_SIGMAS),
+)  # fmt: skip
+
+
+def _at_the_sensor(table: Table) -> Flaw:
+    """Detections at the place of the sensor itself, in no direction."""
+    far = np.hypot(table.numbers(q.X_M), table.numbers(q.Y_M))
+    return flaw_of(replace(q.RANGE_M, name="x_m, y_m", high=np.inf), far, table.path, table.line)
 
 
 def _polar_of_cartesian(table: Table) -> tuple[FloatArray, FloatArray]:

@@ -12,6 +12,7 @@ from evermap import valid as q
 from evermap.errors import DataError
 from evermap.geometry.camera import unproject
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal
+from evermap.io.bad_rows import flaw_of
 from evermap.io.files import FileSet
 from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, survey_of
 from evermap.io.measurements import read_measurements
@@ -32,8 +33,10 @@ from evermap.io.spatial import (
     sensor_rows,
     spatial_detections,
     true_poses,
+    turn_flaws,
     unit,
     with_tag_poses,
+    without_zero_turns,
 )
 from evermap.io.table import Table
 from evermap.io.text import counted
@@ -68,6 +71,7 @@ _IN_SPACE = {
     "truth": ("z_m", *QUATERNION),
 }
 _SIGMA_RAD = Quantity("sigma_rad", positive=True, optional=True, hint="radians")
+_SIGMA_M = Quantity("sigma_m", high=1e6, positive=True, optional=True, hint="metres")
 
 
 def _pixel(name: str, *, optional: bool) -> Quantity:
@@ -75,9 +79,13 @@ def _pixel(name: str, *, optional: bool) -> Quantity:
 
 
 def in_space(tables: Mapping[str, Table | None], files: FileSet) -> bool:
-    """Return whether tables are those of a recording in space: their columns decide, and a `camera.toml`."""
+    """Return whether tables are those of a recording in space: their columns decide, else a `camera.toml`."""
     columns = ((tables[name], names) for name, names in _IN_SPACE.items())
-    return CAMERA_FILE in files or any(table is not None and table.has_any(names) for table, names in columns)
+    seen = tables["detections"]
+    planar = seen is not None and seen.has_any(("range_m", "bearing_rad"))
+    return (CAMERA_FILE in files and not planar) or any(
+        table is not None and table.has_any(names) for table, names in columns
+    )
 
 
 def spatial_recording(
@@ -101,7 +109,7 @@ def spatial_recording(
     class_names = settings.class_names
     if class_names is None:
         class_names = distinct_labels(table, landmarks)
-    table = _by_sensor(table)
+    table = _screened(_by_sensor(table), warnings)
     frames, frame = _frames(table, tables["frames"], rig, warnings)
     detections = _detections(table, frame, rig, class_names, names, warnings)
     if landmarks is not None and len(landmarks):
@@ -121,7 +129,7 @@ def spatial_recording(
         robot=settings.robot,
         landmark_names=names,
         symmetries=rig.symmetries,
-        measurements=read_measurements(tables, names),
+        measurements=read_measurements(tables, names, warnings),
     )
     unknown = [name for name in rig.symmetries if name not in class_names]
     if unknown:
@@ -132,6 +140,7 @@ def spatial_recording(
 def _frames(table: Table, frame_table: Table | None, rig: Rig, warnings: list[str]) -> tuple[Frames, IntArray]:
     if frame_table is not None:
         frame_table.expect(("stamp_s",), _WHERE)
+        frame_table = frame_table.screened((q.STAMP_S,), warnings)
     complete, several = rig.settings.frames_complete, len(rig.sensors) > 1
     return frames_of(
         table, frame_table, complete=complete, clock=rig.settings.clock, warnings=warnings, several=several
@@ -150,6 +159,7 @@ def _odometry(table: Table | None, clock: Clock, warnings: list[str]) -> Spatial
         raise DataError("contains no odometry", path=table.path)
     if given is not TWIST:
         return posed_odometry(table, VARIANCES, clock, warnings)
+    table = table.screened((q.STAMP_S, *q.TWIST), warnings)
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
     twist = np.stack([table.filled(axis, 0.0) for axis in q.TWIST], axis=1)
@@ -178,6 +188,24 @@ def truth_of(
         warnings.append(f"{table.path.name}: contains no pose, treated as missing")
         return None
     return true_poses(table, clock, warnings, poses)
+
+
+def _screened(table: Table, warnings: list[str]) -> Table:
+    """The detections without bad rows, and without orientations of four zeros."""
+    cornered = table.has_any(CORNERS)
+    axes = [replace(axis, optional=cornered) for axis in (q.X_M, q.Y_M, q.Z_M)]
+    pixels = [_pixel(name, optional=True) for name in CORNERS] + [
+        _pixel(name, optional=False) for name in (*POINT, *RIGHT)
+    ]
+    turns = [replace(one, optional=True) for one in q.QUATERNION]
+    table = table.screened((q.STAMP_S, *axes, *pixels, *turns, _SIGMA_RAD, _SIGMA_M), warnings)
+    table = without_zero_turns(table, warnings)
+    flaws = turn_flaws(table, optional=True)
+    if all(axis in table for axis in AT):
+        far = np.linalg.norm(positions(table, optional=cornered), axis=1)
+        possible = replace(q.RANGE_M, name="x_m, y_m, z_m", high=np.inf, optional=cornered)
+        flaws.append(flaw_of(possible, far, table.path, table.line))
+    return table.screened((), warnings, flaws)
 
 
 def _by_sensor(table: Table) -> Table:
@@ -275,7 +303,7 @@ def _placed(table: Table) -> dict[str, FloatArray]:
     if covariance is not None and "sigma_m" in table:
         raise table.error("both sigma_m and cov_* columns are given", row=None, field="sigma_m", hint="keep one")
     if "sigma_m" in table:
-        sigma = table.numbers(Quantity("sigma_m", high=1e6, positive=True, optional=True, hint="metres"))
+        sigma = table.numbers(_SIGMA_M)
         covariance = sigma[:, None, None] ** 2 * np.eye(3)
         covariance[np.isnan(sigma)] = np.nan
     if covariance is not None:

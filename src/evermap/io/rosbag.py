@@ -19,6 +19,8 @@ from evermap.types import Clock, FloatArray, IntArray, SpatialOdometry
 
 Handler: TypeAlias = Callable[[Any, float], None]
 BAG_ENDINGS = (".bag", ".bag.bz2", ".mcap", ".db3")
+METADATA = "metadata.yaml"
+"""Metadata file of a folder that is a ROS 2 bag."""
 MOST_HAMMING = 2
 """Tags with more corrected bits are dropped: most of them are false detections."""
 
@@ -113,6 +115,11 @@ def read_tag_bag(
         line=np.zeros(len(rows), dtype=np.int64),
     )
     return seen, _odometry(odometry)
+
+
+def topics_of(path: Path) -> dict[str, Topic]:
+    """Return the topics of a bag, without its messages; raises what `scan` does."""
+    return scan(path, lambda _: {})
 
 
 def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Handler]]) -> dict[str, Topic]:

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from evermap.errors import InputError
 from evermap.geometry import se3
 from evermap.geometry.camera import unproject
 from evermap.geometry.group import accumulate
 from evermap.geometry.square import square_poses
 from evermap.io.assemble import forward_stamps, last_of_equal
+from evermap.io.bad_rows import Flaw
 from evermap.io.table import Table
 from evermap.io.text import counted
 from evermap.types import (
@@ -27,7 +29,7 @@ from evermap.types import (
     Trajectory,
 )
 from evermap.valid import QUATERNION as QUANTITIES
-from evermap.valid import X_M, Y_M, Z_M, Quantity, is_covariance
+from evermap.valid import STAMP_S, THETA_RAD, X_M, Y_M, Z_M, Quantity, is_covariance
 
 AT = ("x_m", "y_m", "z_m")
 QUATERNION = tuple(quantity.name for quantity in QUANTITIES)
@@ -50,16 +52,41 @@ def quaternions(table: Table, *, optional: bool = False) -> FloatArray:
         InputError: a column is missing, or numbers are not a unit quaternion within a hundredth.
     """
     table.expect(QUATERNION, tuple(table.columns))
+    for flaw in turn_flaws(table, optional=optional):
+        if flaw.bad.any():
+            raise flaw.error(int(np.argmax(flaw.bad)))
+    given = np.stack([table.numbers(replace(one, optional=optional)) for one in QUANTITIES], axis=1)
+    return unit(given)
+
+
+def turn_flaws(table: Table, *, optional: bool = False) -> list[Flaw]:
+    """Return the rows whose quaternion is none, of a table that has some; where `optional` it may be empty."""
+    if not all(name in table for name in QUATERNION):
+        return []
     given = np.stack([table.numbers(replace(one, optional=optional)) for one in QUANTITIES], axis=1)
     length = np.linalg.norm(given, axis=1)
     absent = np.isnan(given).all(axis=1)
-    wrong = np.flatnonzero(~(np.abs(length - 1.0) <= 1e-2) & ~absent)
-    if len(wrong):
-        row, hint = int(wrong[0]), "scalar last; all four or none"
+
+    def error(row: int) -> InputError:
         odd = f"is not a unit quaternion, its length is {length[row]:g}"
         problem = "is incomplete" if np.isnan(length[row]) else odd
-        raise table.error(problem, row=row, field="qx, qy, qz, qw", hint=hint)
-    return unit(given)
+        return table.error(problem, row=row, field="qx, qy, qz, qw", hint="scalar last; all four or none")
+
+    return [Flaw(~(np.abs(length - 1.0) <= 1e-2) & ~absent, error)]
+
+
+def without_zero_turns(table: Table, warnings: list[str]) -> Table:
+    """Return detections in which four zeros, as detectors write that know no orientation, are empty cells."""
+    if not all(name in table for name in QUATERNION):
+        return table
+    given = np.stack([table.numbers(replace(one, optional=True)) for one in QUANTITIES], axis=1)
+    zero = (given == 0.0).all(axis=1)
+    if not zero.any():
+        return table
+    given[zero] = np.nan
+    warnings.append(f"{table.path.name}: {counted(int(zero.sum()), 'orientation')} of four zeros taken as unknown")
+    turned = dict(zip(QUATERNION, np.ascontiguousarray(given.T), strict=True))
+    return replace(table, columns={**table.columns, **turned})
 
 
 def unit(quaternion: FloatArray) -> FloatArray:
@@ -79,6 +106,8 @@ def poses(table: Table) -> FloatArray:
 
 def posed_odometry(table: Table, variances: tuple[str, ...], clock: Clock, warnings: list[str]) -> SpatialOdometry:
     """Return the odometry in a table of poses, with the columns of their six variances as far as it has them."""
+    table = table.screened((STAMP_S, X_M, Y_M, Z_M, *QUANTITIES), warnings)
+    table = table.screened((), warnings, turn_flaws(table))
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
     variance = [table.filled(Quantity(name, 0.0, 1e12, optional=True), np.nan) for name in variances]
@@ -89,6 +118,8 @@ def true_poses(
     table: Table, clock: Clock, warnings: list[str], of: Callable[[Table], FloatArray] = poses
 ) -> Trajectory:
     """Return the truth in a table of poses (R, 3) or (R, 7), which a function reads."""
+    table = table.screened((STAMP_S, X_M, Y_M, Z_M, THETA_RAD, *QUANTITIES), warnings)
+    table = table.screened((), warnings, turn_flaws(table))
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
     pose = of(table)[keep]

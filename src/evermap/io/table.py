@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from math import isnan
@@ -15,6 +16,7 @@ import numpy as np
 
 from evermap.errors import InputError, similar, suggestion
 from evermap.interrupts import raises
+from evermap.io.bad_rows import Flaw, count_text, order_of_stray, refuse_many, sound_rows
 from evermap.io.text import clock_of_date, date_s, decode_text, parse_float, quote, reason
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, landmark_id_of
 from evermap.valid import STAMP_S, Quantity
@@ -36,6 +38,8 @@ ENDINGS = (".csv", ".csv.gz", ".parquet")
 FORMULA = r"^'*[=+@\t\r-]"
 """Begin of a cell that a spreadsheet would execute, or that looks as if it had been guarded against that."""
 GUARDED = r"^'+[=+@\t\r-]"
+_NO_NAME = ("none", "null", "n/a", "nan", "unknown", "?", "-")
+"""Texts that detectors write where they do not know what they see."""
 _LARGEST_ID = 2**53
 """Whole numbers beyond this lose digits as float64, in which Parquet tables made by others often hold ids."""
 
@@ -109,6 +113,62 @@ class Table(NamedColumns):
     __slots__ = ()
     columns: Mapping[str, Any]
 
+    def screened(self, quantities: Iterable[Quantity], warnings: list[str], further: Sequence[Flaw] = ()) -> Table:
+        """Return the table without rows in which a quantity (of which it may lack some) is not what it may be.
+
+        With stamps among them, a few rows that are out of order are sorted. `warnings` counts both; `further` flaws
+        are those of several columns.
+
+        Raises:
+            InputError: so many are bad that the file is.
+        """
+        quantities = [quantity for quantity in quantities if quantity.name in self]
+        flaws = [flaw for quantity in quantities if (flaw := self._flaw(quantity)) is not None]
+        sound = sound_rows([*flaws, *further], len(self), self.path, warnings)
+        table = self if sound is None else self.rows(np.flatnonzero(sound))
+        if all(quantity.name != STAMP_S.name for quantity in quantities):
+            return table
+        order = order_of_stray(table.numbers(STAMP_S), path=self.path, line=table.line, warnings=warnings)
+        return table if order is None else table.rows(order)
+
+    def rows(self, rows: IntArray) -> Table:
+        """Return some of the rows, in their order."""
+        return replace(self, columns={name: _cells_of(column, rows) for name, column in self.columns.items()},
+                       line=self.line[rows])  # fmt: skip
+
+    def _flaw(self, quantity: Quantity) -> Flaw | None:
+        """Which rows a quantity makes bad; None for none."""
+        try:
+            self.numbers(quantity)
+        except InputError:
+            pass
+        else:
+            return None
+        cells = self.columns[quantity.name]
+        values = cells if isinstance(cells, np.ndarray) else self._read_each(quantity, texts_of(cells))
+        fine = quantity.is_fine(values)
+
+        def error(row: int) -> InputError:
+            try:  # after a good one, which says whether cells are dates
+                self.rows(np.append(np.flatnonzero(fine)[:1], row)).numbers(quantity)
+            except InputError as found:
+                return found
+            return self.error("cannot be read", row=row, field=quantity.name)
+
+        return Flaw(~fine, error)
+
+    def _read_each(self, quantity: Quantity, cells: Sequence[str]) -> FloatArray:
+        """Return the numbers or dates in cells (R,), inf where one cannot be read."""
+        read = date_s if quantity.dates and self.clock(quantity.name) is not None else parse_float
+        values = np.full(len(cells), np.inf)
+        for row, cell in enumerate(cells):
+            if cell.strip():
+                with suppress(ValueError, OverflowError):
+                    values[row] = read(cell)
+            elif quantity.optional:
+                values[row] = np.nan
+        return values
+
     def one_form(self, first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:
         """Return which of two ways to say the same the table uses; raises InputError where it mixes them."""
         if self.has_any(first) and self.has_any(second):
@@ -155,6 +215,8 @@ class Table(NamedColumns):
     def _named_ids(self, name: str, optional: bool, names: dict[int, str]) -> IntArray:
         """Ids of a column in which some may be texts."""
         row_label, labels = self.labels(name)
+        nameless = {label for label in labels if optional and label.lower() in _NO_NAME}
+        labels = ["" if label in nameless else label for label in labels]
         texts = {label for label in labels if label and not _is_number(label)}
         for text in sorted(texts):
             if names.setdefault(landmark_id_of(text), text) != text:
@@ -162,7 +224,7 @@ class Table(NamedColumns):
                 problem = f"{quote(text)} and {quote(other)} have the same hash"
                 raise self.error(problem, row=row, field=name, hint="rename one of them")
         plain = [str(landmark_id_of(label)) if label in texts else label for label in labels]
-        cells = arrow_cells(plain).take(arrow_cells(row_label)) if texts else self.columns[name]
+        cells = arrow_cells(plain).take(arrow_cells(row_label)) if texts or nameless else self.columns[name]
         return replace(self, columns={name: cells}).ids(name, optional=optional)
 
     def labels(self, name: str) -> tuple[IntArray, list[str]]:
@@ -226,12 +288,21 @@ class Table(NamedColumns):
         return seconds
 
 
+def _cells_of(column: Any, rows: IntArray) -> Any:
+    """Some cells of a column, in the form in which it is held."""
+    if isinstance(column, np.ndarray):
+        return column[rows]
+    return [column[row] for row in rows.tolist()] if isinstance(column, Sequence) else column.take(arrow_cells(rows))
+
+
 def parse_table(data: bytes, path: Path, warnings: list[str]) -> Table:
-    """Return a table by the ending of its name: one of `ENDINGS`. Arguments and errors as `parse_csv`."""
-    return parse_parquet(data, path) if path.name.endswith(".parquet") else parse_csv(data, path, warnings)
+    """Return a table by the ending of its name: one of `ENDINGS`. Arguments and errors as `parse_csv`; a few lines with
+    the wrong number of cells are left out, which `warnings` counts.
+    """
+    return parse_parquet(data, path) if path.name.endswith(".parquet") else parse_csv(data, path, warnings, few=True)
 
 
-def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
+def parse_csv(data: bytes, path: Path, warnings: list[str], *, few: bool = False) -> Table:
     """Return a CSV table: comma separated, the first line that is not a comment names the columns, `#` starts a comment
     line.
 
@@ -242,34 +313,48 @@ def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
     Raises:
         InputError: no header, a repeated column name, a line with the wrong number of cells, bytes that are not text.
     """
-    return _parse_plain(data, path) or parse_by_line(data, path, warnings)
+    return _parse_plain(data, path) or parse_by_line(data, path, warnings, few=few)
 
 
-def parse_by_line(data: bytes, path: Path, warnings: list[str]) -> Table:
-    """Return a CSV table as `parse_csv`, slowly; errors name the line."""
+def parse_by_line(data: bytes, path: Path, warnings: list[str], *, few: bool = False) -> Table:
+    """Return a CSV table as `parse_csv`, slowly; errors name the line. `few`: lines that are cut may be left out."""
     lines = decode_text(data, path).split("\n")
     content = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line.lstrip()[0] != "#"]
     if not content:
         raise InputError("is empty; the first line must name the columns", path=path)
     names = _header(content[0][1], path, content[0][0])
     rows: list[list[str]] = []
+    numbers: list[int] = []
+    cut: list[InputError] = []
     for number, line in content[1:]:
-        cells = _split(line, path, number)
+        try:
+            cells = _split(line, path, number)
+        except InputError as error:
+            cut.append(error)
+            continue
         if len(cells) == len(names) or (len(cells) == len(names) + 1 and not cells[-1].strip()):
             rows.append(cells[: len(names)])
+            numbers.append(number)
         elif number == content[-1][0] and len(cells) < len(names):
             warnings.append(f"{path.name}: 1 unfinished last line ({number}) left out")
         else:
-            raise InputError(f"{len(cells)} cells instead of {len(names)} ({', '.join(names)})", path=path, line=number)
-    unended = len(rows) == len(content) - 1 and content[-1][0] == len(lines)
+            problem = f"{len(cells)} cells instead of {len(names)} ({', '.join(names)})"
+            cut.append(InputError(problem, path=path, line=number))
+    if cut and not few:
+        raise cut[0]
+    if cut:
+        refuse_many(len(cut), len(content) - 1, cut[0])
+        left_out = count_text(len(cut), len(content) - 1)
+        warnings.append(f"{path.name}: {left_out} left out: {cut[0].problem} (line {cut[0].line})")
+    unended = bool(numbers) and numbers[-1] == content[-1][0] == len(lines)
     if unended and _is_broken([row[-1] for row in rows]):
         warnings.append(f"{path.name}: 1 unfinished last line ({len(lines)}) left out")
         rows.pop()
+        numbers.pop()
     columns: Iterable[Sequence[str]] = zip(*rows, strict=True) if rows else [()] * len(names)
     if b"'" in data:
         columns = [[unguarded(cell) for cell in column] for column in columns]
-    line_numbers = np.array([number for number, _ in content[1 : len(rows) + 1]], dtype=np.int64)
-    return Table(path, dict(zip(names, columns, strict=True)), line_numbers, content[0][0])
+    return Table(path, dict(zip(names, columns, strict=True)), np.array(numbers, dtype=np.int64), content[0][0])
 
 
 def _parse_plain(data: bytes, path: Path) -> Table | None:

@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.errors import DataError, InputError
+from evermap.errors import DataError, InputError, MissingExtraError
 from evermap.geometry import se3
 from evermap.io.assemble import finish_recording, forward_stamps, looks_of
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.landmarks import survey_of
 from evermap.io.native_space import CORNERS
 from evermap.io.rig_toml import Rig
-from evermap.io.rosbag import BAG_ENDINGS, MOST_HAMMING, TagSightings, read_tag_bag
+from evermap.io.rosbag import BAG_ENDINGS, METADATA, MOST_HAMMING, TagSightings, read_tag_bag, topics_of
 from evermap.io.spatial import of_rig, posed_odometry, sensor_rows, spatial_detections, true_poses, with_tag_poses
 from evermap.io.table import ENDINGS, Table, parse_table
 from evermap.io.tag_maps import map_of_survey, pose_of
@@ -38,7 +38,7 @@ from evermap.types import (
     SpatialSensor,
     Trajectory,
 )
-from evermap.valid import CAMERA_MODELS, Quantity
+from evermap.valid import CAMERA_MODELS, STAMP_S, Quantity
 
 _MOST_TAGS = 100_000
 """Maximum tags of a board: no tag family has more."""
@@ -98,10 +98,43 @@ def read_tagslam(path: str | Path, robot: int | None = None) -> SpatialRecording
 
 
 def is_tagslam(files: FileSet) -> bool:
-    """Return whether files look like a TagSLAM recording, in tables or as a bag."""
-    return _is_calibrated(files) and (
-        _has_detections(files) or any(name.endswith(BAG_ENDINGS) for name in files.members)
-    )
+    """Return whether files are a TagSLAM recording: its calibration beside tables of tags, or beside one of its bags.
+
+    A calibration alone does not make other tables, or another bag, TagSLAM's.
+    """
+    if not _is_calibrated(files):
+        return False
+    if _has_detections(files):
+        return _lists_tags(files)
+    bags = [name for name in files.members if name.endswith(BAG_ENDINGS)]
+    return METADATA not in files and any(files.zipped or _is_its_bag(files, files.path_of(name)) for name in bags)
+
+
+def _lists_tags(files: FileSet) -> bool:
+    """Return whether the table of detections is one of tags, by its columns."""
+    try:
+        table = _table(files, "detections", [])
+    except InputError:  # reading it will tell
+        return True
+    return table is not None and "tag_id" in table and "landmark_id" not in table
+
+
+def _is_its_bag(files: FileSet, bag: Path) -> bool:
+    """Return whether a bag has a topic that `cameras.yaml` calls one of tags."""
+    try:
+        cameras = _yaml(files, CAMERAS).values()
+        wanted = {str(camera.get("tagtopic", "")) for camera in cameras if isinstance(camera, dict)}
+        return bool(wanted & topics_of(bag).keys())
+    except MissingExtraError:  # reading it will tell
+        return True
+    except InputError:
+        return False
+
+
+def _is_beside_calibration(path: Path) -> bool:
+    """Return whether a bag is one of TagSLAM, by the calibration beside it and the topics in it."""
+    files = find_file_set(path.parent, _is_calibrated)
+    return files is not None and _is_its_bag(files, path)
 
 
 def _has_detections(files: FileSet) -> bool:
@@ -126,11 +159,11 @@ def _is_calibrated(files: FileSet) -> bool:
 
 TAGSLAM = Reader(
     "tagslam",
-    "folder with cameras.yaml, camera_poses.yaml, tagslam.yaml and detections.csv, or a .bag with them",
+    "cameras.yaml and camera_poses.yaml beside detections.csv or a .bag of tags",
     is_tagslam,
     read_tagslam,
     endings=BAG_ENDINGS,
-    beside=_is_calibrated,
+    accepts=_is_beside_calibration,
 )
 
 
@@ -251,6 +284,7 @@ def _sightings(files: FileSet, setup: TagRig, warnings: list[str]) -> TagSightin
     table = _table(files, "detections", warnings)
     assert table is not None
     table.expect(("stamp_s", "camera", "tag_id", *CORNERS), tuple(table.columns))
+    table = table.screened((STAMP_S, *(Quantity(name, -1e6, 1e6, hint="pixels") for name in CORNERS)), warnings)
     corner = np.stack([table.numbers(Quantity(name, -1e6, 1e6, hint="pixels")) for name in CORNERS], axis=1)
     stamp_s = forward_stamps(table)
     frames = _table(files, "frames", warnings)

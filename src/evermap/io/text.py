@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
+from evermap.io.bad_rows import count_text, flaw_of, refuse_many, sound_rows
 from evermap.types import Clock, FloatArray, IntArray, Tabular
 from evermap.valid import Quantity
 
@@ -129,11 +130,11 @@ def parse_rows(data: bytes, path: Path, quantities: tuple[Quantity, ...], warnin
     """Return numbers of a file; `#` starts a comment anywhere, lines may end in any way.
 
     A last line with too few numbers, or with a broken number and no line end, was cut off while it was written:
-    it is left out, and `warnings` gets a remark.
+    it is left out, and so are a few bad lines elsewhere (`bad_rows`); `warnings` gets a remark.
 
     Raises:
-        InputError: a line has the wrong number of columns or something that is not a number; a value is not finite or
-            out of its limits; the file is not text.
+        InputError: many lines have the wrong number of columns or something that is not a number, or a value that is
+            not finite or out of its limits; the file is not text.
     """
     text = decode_text(data, path)
     lines = text.split("\n")
@@ -142,9 +143,10 @@ def parse_rows(data: bytes, path: Path, quantities: tuple[Quantity, ...], warnin
     values = _parse_fast(text, len(quantities)) if len(line) else np.zeros((0, len(quantities)))
     if values is None or len(values) != len(line):
         values, line = _parse_carefully(lines, line, path, quantities, warnings)
-    for index, quantity in enumerate(quantities):
-        quantity.check(values[:, index], path=path, line=line)
-    return Rows(values, line, path)
+    flaws = [flaw_of(quantity, values[:, index], path, line) for index, quantity in enumerate(quantities)]
+    sound = sound_rows(flaws, len(line), path, warnings)
+    rows = Rows(values, line, path)
+    return rows if sound is None else rows[sound]
 
 
 def _parse_fast(text: str, columns: int) -> FloatArray | None:
@@ -158,7 +160,8 @@ def _parse_fast(text: str, columns: int) -> FloatArray | None:
 def _parse_carefully(
     lines: list[str], line: IntArray, path: Path, quantities: tuple[Quantity, ...], warnings: list[str]
 ) -> tuple[FloatArray, IntArray]:
-    """Parse what numpy could not, to find the line at fault."""
+    """Parse what numpy could not, to find the lines at fault; a few are left out."""
+    cut: dict[int, InputError] = {}
     values = np.empty((len(line), len(quantities)))
     for row, number in enumerate(line):
         cells = lines[number - 1].split("#")[0].split()
@@ -177,7 +180,12 @@ def _parse_carefully(
                 problem = problem or InputError(wrong, path=path, line=int(number), field=quantity.name)
         if problem is not None and unfinished:
             warnings.append(f"{path.name}: 1 unfinished last line ({number}) left out")
-            return values[:row], line[:row]
-        if problem is not None:
-            raise problem
-    return values, line
+            values, line = values[:row], line[:row]
+        elif problem is not None:
+            cut[row] = problem
+    if cut:
+        first = next(iter(cut.values()))
+        refuse_many(len(cut), len(line), first)
+        warnings.append(f"{path.name}: {count_text(len(cut), len(line))} left out: {first.problem} (line {first.line})")
+    sound = ~np.isin(np.arange(len(line)), list(cut))
+    return values[sound], line[sound]

@@ -74,7 +74,7 @@ def _is_ycbv(files: FileSet) -> bool:
     return _name(files, "odometry") is not None and any(_DETECTIONS.fullmatch(name) for name in files.members)
 
 
-YCBV = Reader("ycbv", "folder with odometry.tum.gz and detections_OBJECT.tum.gz", _is_ycbv, read_ycbv)
+YCBV = Reader("ycbv", "odometry.tum.gz and detections_OBJECT.tum.gz", _is_ycbv, read_ycbv)
 
 
 def _name(files: FileSet, name: str) -> str | None:

@@ -343,6 +343,7 @@ def told(ros: Ros, change: MapChange, stamp_s: float, name: str, there: Mapping[
 
     `there` has positions (3,) of landmarks by their ids, after the change.
     """
+    from evermap.viz.change_words import probability, what
     from evermap.viz.rerun_scene import rgb
     from evermap.viz.style import ALERT
 
@@ -360,7 +361,7 @@ def told(ros: Ros, change: MapChange, stamp_s: float, name: str, there: Mapping[
     arrow = ros.make(
         "foxglove_msgs/ArrowPrimitive", ros.pose(pose), shaft, 0.3 * POINT_M, POINT_M, 0.6 * POINT_M, colour
     )
-    text = f"{change.kind.value} {', '.join(change.labels)} {change.probability:.2f}"
+    text = f"{what(change)}, {probability(change.probability)}"
     return line, _entity(ros, stamp_s, name, arrow, {"kind": change.kind.value}, text, pose)
 
 

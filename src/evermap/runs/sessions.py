@@ -32,6 +32,7 @@ from evermap.maps.store import (
 )
 from evermap.maps.store.content import DamagedError
 from evermap.maps.store.measured import RECORDING, TRAJECTORY, pack_recording, pack_trajectory, unpack_recording
+from evermap.runs.session_clock import place_session
 from evermap.show import Shown
 from evermap.types import Progress, is_in_space
 from evermap.valid import check_type
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from evermap.maps.lives import Life
     from evermap.maps.sessions.session import Session
     from evermap.maps.store.sql import SqlStore
-    from evermap.types import AnyRecording, Clock, IntArray, Landmarks, MapChange
+    from evermap.types import AnyRecording, Clock, FloatArray, IntArray, Landmarks, MapChange
 
 
 class TwiceError(InputError):
@@ -175,9 +176,11 @@ def enter_session(
     newest = store.load(head)
     recording = in_its_space(recording, newest, config or Config())
     config = _of_its_space(recording, config)
+    gap_s, kept = (config or Config()).living.clock_gap_s, _recordings(store, head)
+    _refuse_twice(store, kept, pack_recording(recording), recording, anew=gap_s is not None)
+    lineage = set(store.lineage(head))
+    recording = place_session(recording, [item for item in store.log() if item.number in lineage], gap_s)
     data = pack_recording(recording)
-    kept = _recordings(store, head)
-    _refuse_twice(store, kept, data, recording)
     stamps = recording.frames.stamp_s
     start_s = float(stamps[0]) if len(stamps) else np.inf
     worth = (config or Config()).living.prior_stays
@@ -316,8 +319,12 @@ def at_time(store: MapStore, stamp_s: float) -> LivingMap:
     return living
 
 
-def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, recording: AnyRecording) -> None:
+def _refuse_twice(
+    store: MapStore, kept: dict[int, Attachment], data: bytes, recording: AnyRecording, *, anew: bool
+) -> None:
     """Refuse a recording that is in the map, or another copy of its drive: condensed, converted, or packed otherwise.
+
+    `anew`: its clock starts anew, so that only stamps since the start of a drive are compared.
 
     Raises:
         TwiceError: it is.
@@ -327,16 +334,20 @@ def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, rec
     for number, item in kept.items():
         if item.n_bytes == len(data) and store.attached(item) == data:
             raise _twice(store, number, f"{recording.name}: is in the map already, as revision {number}", is_copy=False)
-    near = _overlapping(store, kept, recording)
+    near = _spans(store, kept) if anew else _overlapping(store, kept, recording)
     if not near:
         return
     fixed = repaired(recording)
     ends = {_ends(recording), _ends(fixed)}
     alike = [number for number, span in near.items() if span in ends]  # others cannot be of its drive
-    mine = drive_of(fixed) if alike else ()
+    if anew:
+        lasting = [last_s - first_s for first_s, last_s in ends]
+        alike = [k for k, (first_s, last_s) in near.items() if np.isclose(last_s - first_s, lasting, atol=1e-6).any()]
+    since_start = _since_start if anew else tuple
+    mine = since_start(drive_of(fixed)) if alike else ()
     for number in alike:
         other = _kept_recording(store, kept[number], number)
-        if type(other) is type(recording) and same_drive(mine, drive_of(repaired(other))):
+        if type(other) is type(recording) and same_drive(mine, since_start(drive_of(repaired(other)))):
             same = f"'{printable(other.name, 80)}' has the same frames and readings"
             problem = f"{recording.name}: its drive is in the map already, as revision {number}: {same}"
             raise _twice(store, number, problem, is_copy=True)
@@ -366,8 +377,21 @@ def _overlapping(
 ) -> dict[int, tuple[float, float]]:
     """First and last stamp of the sessions that overlap a recording in time, by revision."""
     first_s, last_s = _ends(recording)
-    spans = {item.number: (item.provenance.stamp_from_s, item.provenance.stamp_to_s) for item in store.log()}
-    return {number: spans[number] for number in kept if spans[number][0] <= last_s and spans[number][1] >= first_s}
+    spans = _spans(store, kept)
+    return {number: span for number, span in spans.items() if span[0] <= last_s and span[1] >= first_s}
+
+
+def _spans(store: MapStore, kept: Mapping[int, Attachment]) -> dict[int, tuple[float, float]]:
+    """First and last stamp of sessions, by revision."""
+    log = {item.number: item.provenance for item in store.log() if item.number in kept}
+    return {number: (origin.stamp_from_s, origin.stamp_to_s) for number, origin in log.items()}
+
+
+def _since_start(drive: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """A result of `drive_of` with stamps since its first one, to a microsecond."""
+    stamp_s, rows = drive
+    rows = np.column_stack([np.round(rows[:, 0] - stamp_s[0], 6), rows[:, 1:]])
+    return np.round(stamp_s - stamp_s[0], 6), rows[np.lexsort(rows.T[::-1])]
 
 
 def _ends(recording: AnyRecording) -> tuple[float, float]:

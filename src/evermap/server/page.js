@@ -116,8 +116,10 @@ const percent = (p) => (p > 0.005 && p < 0.995 ? `${Math.round(100 * p)} %` : p 
 function what(change, labels) {
   const names = change.landmarks.map((id) => labels.get(id) ?? String(id)).join(", ");
   const metres = change.displacement_m.every((x) => x !== null) ? Math.hypot(...change.displacement_m) : 0;
-  const by = change.kind === "moved" ? ` by ${metres.toFixed(2)} m` : "";
-  return `${names} ${change.kind}${by} (${percent(change.probability)})`;
+  const degrees = Math.abs((change.rotation_rad ?? 0) * 180 / Math.PI), moves = ["moved", "rotated"].includes(change.kind);
+  const turned = moves && degrees >= 17, inPlace = turned && metres < 0.1; // the limits of a living map
+  const by = [turned ? `turned by ${degrees.toFixed(0)}°${inPlace ? " in place" : ""}` : "", moves && !inPlace ? `moved by ${metres.toFixed(2)} m` : ""];
+  return `${names} ${moves ? by.filter(Boolean).join(" and ") : change.kind} (${percent(change.probability)})`;
 }
 
 // North is up: y of the map grows, y of the picture falls.

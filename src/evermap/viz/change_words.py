@@ -7,6 +7,9 @@ from collections.abc import Sequence
 
 from evermap.types import Alternative, ChangeKind, MapChange, SlamResult
 
+SAME_SPOT_M, SAME_TURN_RAD = 0.1, 0.3
+"""Below these a body that turned has not moved, and one that moved is not said to have turned, as in a living map."""
+
 NATS = 5.0
 """Maximum difference in log probability of a reported alternative from the best explanation."""
 _MAX_IDS = 12
@@ -55,12 +58,23 @@ def what(change: MapChange) -> str:
     if change.kind is ChangeKind.RETURNED:
         far = math.hypot(*change.displacement_m)
         return f"{_group(change)} returned" + (f", {far:.2f} m from where it was" if far > 0.0 else "")
+    return f"{_group(change)} {_motion(change)}"
+
+
+def _motion(change: MapChange) -> str:
+    """Return 'moved by (+1.00, 0.00) m', 'turned by +20.0° and moved by ...' or 'turned by +90.0° in place'.
+
+    Of a move that was found without its turn being searched for, the turn is told where it is beyond the limit of the
+    living map.
+    """
+    turn, shift_m = math.degrees(change.rotation_rad), math.hypot(*change.displacement_m)
     moved = f"moved by ({', '.join(map(_signed, change.displacement_m))}) m"
-    if change.kind is ChangeKind.ROTATED:
-        turn = math.degrees(change.rotation_rad)
-        sign = _signed(turn, 1) if len(change.displacement_m) == 2 else f"{turn:.1f}"  # in space about some axis
-        return f"{_group(change)} turned by {sign}° and {moved}"
-    return f"{_group(change)} {moved}"
+    far = abs(change.rotation_rad) >= SAME_TURN_RAD
+    nowhere = all(round(metres, 2) == 0.0 for metres in change.displacement_m)
+    sign = _signed(turn, 1) if len(change.displacement_m) == 2 else f"{turn:.1f}"  # in space about some axis
+    if round(turn, 1) and (nowhere or (far and shift_m < SAME_SPOT_M)):
+        return f"turned by {sign}° in place"
+    return f"turned by {sign}° and {moved}" if far or change.kind is ChangeKind.ROTATED else moved
 
 
 def probability(value: float) -> str:

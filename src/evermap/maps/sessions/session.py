@@ -44,7 +44,7 @@ from evermap.types import (
     is_in_space,
     rows_of,
 )
-from evermap.valid import check_type
+from evermap.valid import OVERLAP_S, check_type, has_own_clock
 
 RecordingT = TypeVar("RecordingT", Recording, SpatialRecording)
 
@@ -131,6 +131,26 @@ def _check_fits(recording: AnyRecording, living: LivingMap) -> None:
 def _class_names(living: LivingMap, recording: AnyRecording) -> tuple[str, ...]:
     """Names of the map's classes, then of the recording's new ones."""
     return living.class_names + tuple(name for name in recording.class_names if name not in living.class_names)
+
+
+def with_overlap(recording: AnyRecording, living: LivingMap | None) -> AnyRecording:
+    """Return a recording with a remark where its clock overlaps what the map has seen, and it names no robot.
+
+    `enter_session`, which knows whose the other sessions are, refuses it.
+    """
+    stamp_s = recording.frames.stamp_s
+    if (
+        living is None
+        or not has_own_clock(recording)
+        or recording.robot
+        or not float(stamp_s[0]) < living.stamp_s - OVERLAP_S
+    ):
+        return recording
+    remark = (
+        f"its clock ({stamp_s[0]:.1f} to {stamp_s[-1]:.1f} s) overlaps what the map has seen (until "
+        f"{living.stamp_s:.1f} s): one robot cannot have driven both at once; give each session its own time"
+    )
+    return replace(recording, warnings=(*recording.warnings, remark))
 
 
 def in_its_space(recording: AnyRecording, living: LivingMap | None, config: Config) -> AnyRecording:
