@@ -115,7 +115,8 @@ stream_faults = st.builds(
 )  # fmt: skip
 any_faults = st.builds(
     FaultConfig,
-    frames=stream_faults, odometry=stream_faults, p_wrong_identity=rate, p_shuffled=rate, p_impossible=rate,
+    frames=stream_faults, odometry=stream_faults, p_wrong_identity=rate, p_shuffled=rate,
+    p_impossible=rate.map(lambda p: min(p, 0.3)),  # where half of the ranges are, they are in another unit
     freezes_per_h=per_h, p_spike=rate, p_odometry_impossible=rate, clock_jumps_per_h=per_h,
     clock_jump_s=st.sampled_from([5.0, 1e4]), p_empty=rate,
 )  # fmt: skip

@@ -180,8 +180,9 @@ def _in_step(recording: Recording, _: CleaningConfig, remarks: list[str]) -> Rec
     counting messages, and is off by those that were lost at that moment.
     """
     odometry, frame_s = recording.odometry, recording.frames.stamp_s
-    since_s, delay_s = (column.tolist() for column in clock_steps(recording))
     unsure_s = AROUND_S if any(SET_BACK in remark for remark in remarks) else LEAST_STEP_S
+    pause_s = max((float(np.diff(one).max(initial=0.0)) for one in (odometry.stamp_s, frame_s)), default=0.0)
+    since_s, delay_s = (column.tolist() for column in clock_steps(recording, pause_s + unsure_s))
 
     def step(row: int) -> tuple[int, float]:
         """Return the row of odometry at which the clocks part, and for how long that stream paused."""

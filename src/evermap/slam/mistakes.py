@@ -146,6 +146,8 @@ AT_ONCE = 32
 """Number of corrections that are tried together: arrays of a megabyte."""
 SHARES = 16
 """Parts of the pairs, half of which may rule out candidates one after the other."""
+LIKELIEST_BY = 250
+"""Pairs that show which delay is the likeliest for a whole recording."""
 LEAST_STEP_S = 0.4
 """Minimum clock difference that is reported; smaller ones are estimated by the calibration."""
 _FACTORS = tuple(10.0**power for power in np.arange(-4.0, 4.01, 0.1) if abs(power) > 0.25)
@@ -419,11 +421,15 @@ class SpatialPairs:
 Pairs: TypeAlias = PlanarPairs | SpatialPairs
 
 
-def clock_steps(recording: Recording) -> tuple[FloatArray, FloatArray]:
+def clock_steps(recording: Recording, longest_s: float = inf) -> tuple[FloatArray, FloatArray]:
     """Return from when on the odometry's clock is ahead of the detections', and by how much.
 
     Piecewise constant, by dynamic programming (Viterbi 1967): in every second a pair of sightings has a Cauchy loss, on
     the scale of the usual residual, at each delay, and a step costs `CheckConfig.gain`.
+
+    Args:
+        recording: in the plane.
+        longest_s: by how much a step may be at most; delays that are further from the likeliest one are not tried.
 
     Returns:
         (K,) stamps of frames, the first -inf, and (K,) delays that hold from then on [s].
@@ -434,6 +440,10 @@ def clock_steps(recording: Recording) -> tuple[FloatArray, FloatArray]:
         return np.array([-inf]), np.zeros(1)
     pairs = PlanarPairs(recording, first, second)
     delays_s = np.concatenate([[0.0, 0.5, -0.5], _DELAYS_S, np.negative(_DELAYS_S)])
+    if longest_s < np.ptp(delays_s):  # a share of the pairs shows which is likeliest
+        part = pairs.among(slice(None, None, max(1, len(first) // LIKELIEST_BY)))
+        usual_s = delays_s[np.argmin(_loss(part.residual(*map(_late, delays_s)), settings))]
+        delays_s = delays_s[np.abs(delays_s - usual_s) <= longest_s + 0.5]
     far = np.minimum(off(pairs.residual(*map(_late, delays_s))), 10.0)
     until_s = recording.frames.stamp_s[recording.detections.frame[second]]
     begin_s, second_of = np.unique(np.floor(until_s), return_inverse=True)
