@@ -7,7 +7,8 @@ from pathlib import Path
 from evermap.errors import InputError
 from evermap.io.bag import BAG, read_bag
 from evermap.io.files import Reader, file_sets, find_file_set
-from evermap.io.landmarks import read_landmarks, read_prior_map, write_map_geojson, write_map_parquet
+from evermap.io.landmarks import write_map_geojson, write_map_parquet
+from evermap.io.map_formats import read_landmarks, read_prior_map
 from evermap.io.mrclam import MRCLAM, read_mrclam
 from evermap.io.native import NATIVE, read_native
 from evermap.io.native_write import write_native
