@@ -79,12 +79,23 @@ def draw_audit(entries: Sequence[PlanEntry], paths: Sequence[FloatArray], title:
     rows = math.ceil(len(close) / _A_ROW)
     every = np.array([one.before_m[:2] for one in entries] + [one.after_m[:2] for one in entries])
     every = np.concatenate([every[np.isfinite(every).all(axis=1)], *(path[:, :2] for path in paths)])
-    span = np.ptp(every, axis=0) + 1.0
-    plan_in = float(np.clip(8.6 * span[1] / span[0], 2.6, 7.0))
+    near = [one.state != "unseen" for one in entries]
+    need = np.array(
+        [at[:2] for one, kept in zip(entries, near, strict=True) if kept for at in (one.before_m, one.after_m)]
+    )
+    need = np.concatenate(
+        [need.reshape(-1, 2)[np.isfinite(need.reshape(-1, 2)).all(axis=1)], *(p[:, :2] for p in paths)]
+    )
+    low, high = need.min(axis=0), need.max(axis=0)
+    inside = (every >= low - 0.5 * (high - low) - 1.0) & (every <= high + 0.5 * (high - low) + 1.0)
+    every = every[inside.all(axis=1)]
+    low, high = every.min(axis=0), every.max(axis=0)
+    span = high - low + 1.0
+    plan_in = float(np.clip(8.6 * span[1] / span[0], 2.4, 7.0))
     with drawing(9.0, plan_in + 0.9 + 2.3 * rows) as figure:
         grid = figure.add_gridspec(1 + rows, _A_ROW, height_ratios=[plan_in + 0.5, *[2.1] * rows])
         plan = figure.add_subplot(grid[0, :])
-        _draw_plan(plan, entries, paths)
+        _draw_plan(plan, entries, paths, (low, high))
         for k, one in enumerate(close):
             _draw_close_up(figure.add_subplot(grid[1 + k // _A_ROW, k % _A_ROW]), one)
         handles = plan.get_legend_handles_labels()
@@ -97,7 +108,9 @@ def draw_audit(entries: Sequence[PlanEntry], paths: Sequence[FloatArray], title:
     return NamedFigure("audit", figure, title, caption)
 
 
-def _draw_plan(axes: Axes, entries: Sequence[PlanEntry], paths: Sequence[FloatArray]) -> None:
+def _draw_plan(
+    axes: Axes, entries: Sequence[PlanEntry], paths: Sequence[FloatArray], corners: tuple[FloatArray, FloatArray]
+) -> None:
     from matplotlib.patches import FancyArrowPatch
 
     for k, path in enumerate(paths):
@@ -123,14 +136,25 @@ def _draw_plan(axes: Axes, entries: Sequence[PlanEntry], paths: Sequence[FloatAr
                 (start[0], start[1]), (end[0], end[1]), arrowstyle="-|>", connectionstyle=way, mutation_scale=9.0,
                 shrinkA=2.0, shrinkB=2.0, color=colour, lw=1.4, zorder=9,
             ))  # fmt: skip
+    outside = sum(not _is_inside(one, corners) for one in entries)
+    if outside:
+        axes.text(0.995, 0.02, f"{outside} unseen farther away", transform=axes.transAxes, ha="right", color=MUTED)
     named = [one for one in entries if one.state != "right"] if len(entries) > LABELS_UP_TO else list(entries)
     faults = [one for one in named if one.state not in ("right", "unseen")] if len(named) > LABELS_UP_TO else named
+    faults = [one for one in faults if _is_inside(one, corners)]
     points = [np.where(np.isfinite(one.before_m), one.before_m, one.after_m)[:2] for one in faults]
     label_points(axes, points, [one.label for one in faults])
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.05)
+    (low, high), pad = corners, 0.06 * float(np.max(corners[1] - corners[0])) + 0.3
+    axes.set_xlim(low[0] - pad, high[0] + pad)
+    axes.set_ylim(low[1] - pad, high[1] + pad)
+    axes.set_aspect("equal", adjustable="box")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
+
+
+def _is_inside(one: PlanEntry, corners: tuple[FloatArray, FloatArray]) -> bool:
+    at = np.where(np.isfinite(one.before_m), one.before_m, one.after_m)[:2]
+    return bool(((at >= corners[0]) & (at <= corners[1])).all())
 
 
 def _draw_close_up(axes: Axes, one: PlanEntry) -> None:

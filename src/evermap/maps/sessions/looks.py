@@ -14,7 +14,6 @@ known of a class); several sessions are weighed together. Without a look the map
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -31,22 +30,10 @@ from evermap.sensing.visibility import LooksAt, NominalField
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 USUAL = LooksConfig()
-FLANK_RAD = math.radians(30.0)
-"""Largest angle between a look and what is seen on either side of it: what hides the one alone is narrower."""
-FLANK_SHARE = 0.6
-"""Least range of these, as a share of that of the look: what hides is not behind them."""
-ELSEWHERE_M = 1.0
-"""Distance between two positions of a sensor from which something narrow does not hide the same place."""
-EXPECTED = 1.5
-"""Detections that a position must lead to expect."""
-P_HIDDEN = 0.1
-"""Probability that a place between others that are seen is hidden from one position."""
-P_ALWAYS_HIDDEN = 0.003
-"""Probability that it is hidden from all."""
-ALL_AROUND_RAD = math.radians(120.0)
-"""Angle about a landmark of unknown orientation over which it must be missed: it may be seen from one side only."""
 ROUNDS = 5
 """Of expectation and maximisation, at most."""
+EXPECTED = 1.5
+"""Detections that one position must lead to expect, or its misses are chance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,44 +389,47 @@ def _empty_looks(
 
 
 def flanked_misses(
-    watch: Watch, floor_m: FloatArray, unseen: BoolArray, oriented: BoolArray
+    watch: Watch, floor_m: FloatArray, unseen: BoolArray, oriented: BoolArray, settings: LooksConfig = USUAL
 ) -> tuple[BoolArray, FloatArray]:
     """Return which looks at places that were never detected lie between detections of others, and (P,) how probable all
     these misses are if something stands there.
 
-    A look between what is seen on both sides of it, at no less than `FLANK_SHARE` of its range, is blocked by something
-    narrow only. From several positions that is improbable, unless the place is hidden from all of them.
+    A look between what is seen on both sides of it from nearby, at no less than a share of its range, is blocked by
+    something narrow only. From several positions that is improbable, unless the place is hidden from all.
 
     Args:
         watch: looks of a session.
         floor_m: (P, 2) places.
         unseen: (P,) whether a place was never detected.
         oriented: (P,) whether the looks know to where it faces.
+        settings: what counts.
     """
     listed, eye = watch.listed, watch.eye
     away = floor_m[listed.landmark] - eye[listed.pose, :2]
     range_m, bearing = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
     flanked = np.zeros(len(listed.pose), dtype=np.bool_)
-    asked = unseen[listed.landmark]
-    order = np.argsort(listed.pose, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(listed.pose[order])) + 1):
-        looks, hits = rows[asked[rows]], rows[listed.hit[rows]]
-        if not len(looks) or len(hits) < 2:
-            continue
-        turn = se2.wrap(bearing[hits][None] - bearing[looks][:, None])
-        beyond = range_m[hits][None] >= FLANK_SHARE * range_m[looks][:, None]
-        left, right = beyond & (turn > 0.0) & (turn < FLANK_RAD), beyond & (turn < 0.0) & (turn > -FLANK_RAD)
-        flanked[looks] = left.any(axis=1) & right.any(axis=1)
+    asked = np.flatnonzero(unseen[listed.landmark])
+    half = np.floor(2.0 * eye[:, :2] / settings.elsewhere_m).astype(np.int64)
+    hits = np.unique(np.column_stack([half[listed.pose[listed.hit]], listed.landmark[listed.hit]]), axis=0)
+    for cell in np.unique(half[listed.pose[asked]], axis=0):
+        looks = asked[(half[listed.pose[asked]] == cell).all(axis=1)]
+        seen = np.unique(hits[(np.abs(hits[:, :2] - cell) <= 1).all(axis=1), 2])
+        ahead = floor_m[seen][None] - eye[listed.pose[looks], :2][:, None]
+        turn = se2.wrap(np.arctan2(ahead[..., 1], ahead[..., 0]) - bearing[looks][:, None])
+        near = np.hypot(ahead[..., 0], ahead[..., 1]) < settings.flank_share * range_m[looks][:, None]
+        beside = ~near & (np.abs(turn) < settings.flank_rad)
+        flanked[looks] = (beside & (turn > 0.0)).any(axis=1) & (beside & (turn < 0.0)).any(axis=1)
     p_missed = np.ones(len(floor_m))
     for place in np.unique(listed.landmark[flanked]).tolist():
         rows = np.flatnonzero(flanked & (listed.landmark == place))
         around = np.sort(bearing[rows])
         gap = np.diff(np.append(around, around[0] + 2.0 * np.pi)).max()
-        if not oriented[place] and 2.0 * np.pi - gap < ALL_AROUND_RAD:
-            continue
-        cell = np.unique(np.floor(eye[listed.pose[rows], :2] / ELSEWHERE_M), axis=0, return_inverse=True)[1].ravel()
+        if not oriented[place] and 2.0 * np.pi - gap < settings.one_sided_rad:
+            continue  # it may be seen from another side only
+        position = np.floor(eye[listed.pose[rows], :2] / settings.elsewhere_m)
+        cell = np.unique(position, axis=0, return_inverse=True)[1].ravel()
         expected = np.bincount(cell, listed.p_detect[rows])
         log_missed = np.bincount(cell, np.log1p(-np.minimum(listed.p_detect[rows], 0.99)))[expected >= EXPECTED]
-        each = P_HIDDEN + (1.0 - P_HIDDEN) * np.exp(log_missed)
-        p_missed[place] = max(float(np.prod(each)), P_ALWAYS_HIDDEN)
+        each = settings.p_flanked_hidden + (1.0 - settings.p_flanked_hidden) * np.exp(log_missed)
+        p_missed[place] = max(float(np.prod(each)), settings.p_always_hidden)
     return flanked, p_missed

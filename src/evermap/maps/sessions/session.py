@@ -54,8 +54,6 @@ from evermap.types import (
 )
 from evermap.valid import check_type
 
-P_GONE = 0.03
-"""Prior probability that an entry of a given map stands nowhere."""
 RecordingT = TypeVar("RecordingT", Recording, SpatialRecording)
 
 Visit = PlanarVisit | SpatialVisit
@@ -461,9 +459,10 @@ def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingC
     names, floor_m = living.places.landmark_id, np.ascontiguousarray(living.places.position_m[:, :2])
     asked = np.isin(names, unseen.landmark_id)
     oriented = np.zeros(len(names), dtype=np.bool_) if rotation is None else np.isfinite(living.places.rotation[:, 0])
-    flanked, p_missed = flanked_misses(watch, floor_m, asked, oriented)
+    flanked, p_missed = flanked_misses(watch, floor_m, asked, oriented, config.looks)
     row = np.searchsorted(names, unseen.landmark_id)  # one place each, in the order of their names
-    p_exists = p_missed[row] * (1.0 - P_GONE) / (p_missed[row] * (1.0 - P_GONE) + P_GONE)
+    p_gone = config.looks.p_gone
+    p_exists = p_missed[row] * (1.0 - p_gone) / (p_missed[row] * (1.0 - p_gone) + p_gone)
     pose, which = watch.listed.pose[flanked], watch.listed.landmark[flanked]
     frame = np.searchsorted(visit.recording.frames.stamp_s, watch.stamp_s[pose])
     every = slam.misses.joined(Misses(frame.astype(np.int64), names[which], watch.listed.p_detect[flanked]))
