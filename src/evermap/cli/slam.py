@@ -544,6 +544,7 @@ def _run_in_map(
     from evermap.runs.sessions import at_time, begin_map, enter_session
     from evermap.slam.space.moving import has_traffic
     from evermap.types import is_in_space
+    from evermap.valid import strangers
 
     config, localize, map_file = asked.config, asked.localize, asked.map_file
     assert map_file is not None
@@ -559,6 +560,8 @@ def _run_in_map(
     with opened as store:
         start = time.perf_counter()
         entered: Entered | None = None
+        if survey is not None and not unknown and (apart := strangers(survey, [recording])):
+            raise DataError(apart, field="prior_map", hint="the map of this site; without one the session begins a map")
         if survey is not None and not (later and len(store.load().places)):
             begin_map(store, survey, recording, command_line())
         if is_in_space(recording):

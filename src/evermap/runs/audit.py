@@ -35,6 +35,7 @@ from evermap.types import (
     SlamResult,
     is_in_space,
 )
+from evermap.valid import strangers
 
 DECIDED = 0.9
 """Probability from which an entry is called wrong, and its complement below which it is called right."""
@@ -265,7 +266,8 @@ def audit_map(
     config = _with_all_changes(config or Config())
     drives = in_order(recordings)
     given = _in_space_of(given, drives)
-    _check_ids(given, drives)
+    if problem := strangers(given, drives):
+        raise DataError(problem, hint="the map of this site, with the ids that the detector reports")
     heard, told, errors = list[_Heard](), list[AuditDrive](), list[EvermapError]()
     for recording in drives:
         try:
@@ -345,30 +347,6 @@ def _with_all_changes(config: Config) -> Config:
     of_map = space.map.model_copy(update={"p_told": min(REPORTED, space.map.p_told)})
     slam = config.slam.model_copy(update={"space": space.model_copy(update={"map": of_map})})
     return config.model_copy(update={"slam": slam})
-
-
-def _check_ids(given: Landmarks, drives: Sequence[AnyRecording]) -> None:
-    """Refuse a map of which no drive sees an id.
-
-    Raises:
-        DataError: says which ids there are.
-    """
-    seen = np.unique(np.concatenate([one.detections.landmark_id for one in drives]))
-    seen = seen[seen >= 0]
-    if len(seen) and not np.isin(seen, given.landmark_id).any():
-        names = {**given.names, **{key: name for one in drives for key, name in one.landmark_names.items()}}
-        problem = (
-            f"no landmark of the map was ever seen: the map has {_some(given.landmark_id.tolist(), names)}, "
-            f"the drive has {_some(seen.tolist(), names)}"
-        )
-        raise DataError(problem, hint="the map of this site, with the ids that the detector reports")
-
-
-def _some(ids: Sequence[int], names: Mapping[int, str]) -> str:
-    called = [names.get(identity, str(identity)) for identity in ids]
-    return ", ".join(called[:4]) + (
-        f" to {called[-1]}" if len(called) > 5 else f", {called[4]}" if len(called) > 4 else ""
-    )
 
 
 def _unheard(recording: AnyRecording, reason: str) -> AuditDrive:
