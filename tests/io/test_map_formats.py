@@ -18,7 +18,7 @@ from evermap.geometry import se3
 from evermap.io.map_entries import Correction, number_like
 from evermap.io.map_formats import (
     MAP_FORMATS,
-    MapFile,
+    SurveyFile,
     correct_map,
     format_called,
     format_of,
@@ -122,7 +122,7 @@ def made(seed: int = 3, count: int = 6) -> Landmarks:
     return replace(flat, covariance_m2=np.broadcast_to(0.02**2 * np.eye(3), (count, 3, 3)).copy())
 
 
-def parsed(text: str, path: Path) -> MapFile:
+def parsed(text: str, path: Path) -> SurveyFile:
     path.write_bytes(text.encode())
     return read_map_file(path)
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from space.corridors import World, tagged_corridor
 
 from evermap.errors import DataError
-from evermap.io.map_formats import MAP_FORMATS, MapFile, correct_map, read_landmarks, read_map_file, write_map
+from evermap.io.map_formats import MAP_FORMATS, SurveyFile, correct_map, read_landmarks, read_map_file, write_map
 from evermap.runs.audit import Audit, EntryState, audit_map, in_order, join_drives
 from evermap.runs.audit_report import audit_dict, conclude, entry_row, write_audit
 from evermap.runs.summary import RunInfo
@@ -46,7 +46,7 @@ def without(recording: SpatialRecording, *ids: int) -> SpatialRecording:
     return replace(recording, detections=rows_of(seen, ~np.isin(seen.landmark_id, ids)))
 
 
-def as_file(tags: Landmarks, path: Path, name: str = "wpilib") -> MapFile:
+def as_file(tags: Landmarks, path: Path, name: str = "wpilib") -> SurveyFile:
     return read_map_file(write_map(tags, path, FORMATS[name]), sigma_m=0.01)
 
 

@@ -114,7 +114,7 @@ class MapFormat:
 
 
 @dataclass(frozen=True, slots=True)
-class MapFile:
+class SurveyFile:
     """A map as a file has it.
 
     Attributes:
@@ -149,7 +149,7 @@ def read_prior_map(path: str | Path, sigma_m: float = 0.02, sigma_rad: float = 0
     return replace(read_map_file(path, sigma_m=sigma_m, sigma_rad=sigma_rad).landmarks, frame="prior_map")
 
 
-def read_map_file(path: str | Path, *, sigma_m: float = 0.02, sigma_rad: float = 0.05) -> MapFile:
+def read_map_file(path: str | Path, *, sigma_m: float = 0.02, sigma_rad: float = 0.05) -> SurveyFile:
     """Return a map with its file, to correct it (`correct_map`). Arguments and errors are those of `read_prior_map`."""
     found = _read(path, sigma_m, sigma_rad)
     if len(found.landmarks) == 0:
@@ -162,7 +162,7 @@ def read_landmarks(path: str | Path, *, sigma_m: float = 0.0, sigma_rad: float =
     return _read(path, sigma_m, sigma_rad).landmarks
 
 
-def _read(path: str | Path, sigma_m: float, sigma_rad: float) -> MapFile:
+def _read(path: str | Path, sigma_m: float, sigma_rad: float) -> SurveyFile:
     path = find_map_file(Path(path))
     data = content_of(path)
     kind = format_of(data, path)
@@ -175,7 +175,7 @@ def _read(path: str | Path, sigma_m: float, sigma_rad: float) -> MapFile:
         frame=about.get("frame", "truth"),
         clock=Clock(about.get("clock", Clock.RECORDING)),
     )
-    return MapFile(path, kind, data, replace(landmarks, up=up_of(about)))
+    return SurveyFile(path, kind, data, replace(landmarks, up=up_of(about)))
 
 
 def format_of(data: bytes, path: Path) -> MapFormat:
@@ -253,7 +253,7 @@ def _are_numbers(cells: Sequence[str]) -> bool:
         return False
 
 
-def correct_map(file: MapFile, corrections: Iterable[Correction]) -> bytes:
+def correct_map(file: SurveyFile, corrections: Iterable[Correction]) -> bytes:
     """Return the bytes of a map's file in which only what is corrected is changed; unpacked.
 
     Raises:
@@ -432,7 +432,7 @@ def _locate_geojson(text: str, _: Path) -> tuple[Sequence[FileEntry], Units]:
     ], Units()
 
 
-def _corrected_parquet(file: MapFile, corrections: Sequence[Correction]) -> bytes:
+def _corrected_parquet(file: SurveyFile, corrections: Sequence[Correction]) -> bytes:
     """The table with other numbers in some cells; its types and metadata stay."""
     table = pq.read_table(pa.BufferReader(file.data))
     names = list(table.column_names)

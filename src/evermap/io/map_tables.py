@@ -55,7 +55,7 @@ _NAMED = {
 """Roles of columns that others wrote."""
 
 
-class Columns(NamedTuple):
+class MapColumns(NamedTuple):
     """What the columns of a table mean.
 
     Attributes:
@@ -69,7 +69,7 @@ class Columns(NamedTuple):
     units: Units
 
 
-def roles_of(names: Sequence[str], path: Path) -> Columns | None:
+def roles_of(names: Sequence[str], path: Path) -> MapColumns | None:
     """Return what the columns of a table that others wrote mean; None where it is no map.
 
     Raises:
@@ -99,23 +99,23 @@ def roles_of(names: Sequence[str], path: Path) -> Columns | None:
     metre, radian = metres.pop(), (radians or {1.0}).pop()
     lengths = (3, 6) if metre == 1.0 else (2, 4) if metre > 0.01 else (1, 3)
     angles = (4, 8) if radian == 1.0 else (2, 6)
-    return Columns(identity, roles, Units(metre, radian, decimals=(lengths, angles)))
+    return MapColumns(identity, roles, Units(metre, radian, decimals=(lengths, angles)))
 
 
-def native_columns(names: Sequence[str]) -> Columns:
+def native_columns(names: Sequence[str]) -> MapColumns:
     """Return what the columns of evermap's own tables mean, and of TagSLAM's tables of surveyed tags."""
     identity = "landmark_id" if "landmark_id" in names else "tag_id"
     vector = {f"r{axis}": f"r{axis}_rad" for axis in "xyz"} if identity == "tag_id" else {}
     own = {role: name for name, role in _NATIVE.items()}
     spread = {name: name for name in (*COVARIANCE, *TURN_COVARIANCE)}
     roles = {role: name for role, name in {**own, **vector, **spread}.items() if name in names}
-    return Columns(identity, roles, Units())
+    return MapColumns(identity, roles, Units())
 
 
-def wpilib_columns() -> Columns:
+def wpilib_columns() -> MapColumns:
     """Return what the columns of WPILib's tables mean."""
     identity, *names = WPILIB_CSV
-    return Columns(identity, dict(zip((*POSITION, *FACING), names, strict=True)), WPILIB_CSV_UNITS)
+    return MapColumns(identity, dict(zip((*POSITION, *FACING), names, strict=True)), WPILIB_CSV_UNITS)
 
 
 def header_of(text: str) -> list[str]:
@@ -129,7 +129,7 @@ def header_of(text: str) -> list[str]:
     return []
 
 
-def map_of_columns(table: Table, columns: Columns) -> Table:
+def map_of_columns(table: Table, columns: MapColumns) -> Table:
     """Return a table of others with the columns of a map.
 
     Raises:
@@ -153,7 +153,7 @@ def map_of_columns(table: Table, columns: Columns) -> Table:
     return replace(table, columns=found)
 
 
-def _numbers(table: Table, role: str, name: str, columns: Columns) -> FloatArray:
+def _numbers(table: Table, role: str, name: str, columns: MapColumns) -> FloatArray:
     """A column, with the limits of what it means."""
     unit = columns.units
     if role in QUATERNION:
@@ -166,7 +166,7 @@ def _numbers(table: Table, role: str, name: str, columns: Columns) -> FloatArray
     return table.numbers(Quantity(name, 0.0, 1e9, optional=True, hint="a length"))
 
 
-def entries_of_csv(text: str, columns: Columns, path: Path) -> list[FileEntry]:
+def entries_of_csv(text: str, columns: MapColumns, path: Path) -> list[FileEntry]:
     """Return the rows of a CSV text with where their cells are."""
     table = parse_by_line(text.encode(), path, [])
     names = list(table.columns)

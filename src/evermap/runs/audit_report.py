@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.io.map_formats import MapFile, correct_map, write_map_bytes
+from evermap.io.map_formats import SurveyFile, correct_map, write_map_bytes
 from evermap.io.spatial import AT, QUATERNION
 from evermap.runs.audit import ORDER, Audit, AuditDrive, AuditEntry, EntryState, count_states
 from evermap.runs.folder import RunFolder
@@ -22,7 +22,7 @@ _FEW = 12
 """Labels that are listed in a line."""
 
 
-def audit_dict(audit: Audit, file: MapFile, written: Path | None = None) -> dict[str, Any]:
+def audit_dict(audit: Audit, file: SurveyFile, written: Path | None = None) -> dict[str, Any]:
     """Return an audit as plain values under stable keys."""
     return {
         "map": str(file.path),
@@ -161,7 +161,7 @@ def quiet_lines(audit: Audit) -> list[str]:
     return lines
 
 
-def markdown(audit: Audit, file: MapFile, written: Path | None) -> str:
+def markdown(audit: Audit, file: SurveyFile, written: Path | None) -> str:
     """Return the report as Markdown."""
     title, message = f"Audit of {file.path.name}", conclude(audit)[1]
     lines = [f"# {title}", "", f"**{message[0].upper()}{message[1:]}.**", "", "![plan](figures/audit.png)", ""]
@@ -180,7 +180,7 @@ def markdown(audit: Audit, file: MapFile, written: Path | None) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _of_file(audit: Audit, file: MapFile, written: Path) -> str:
+def _of_file(audit: Audit, file: SurveyFile, written: Path) -> str:
     count = len(audit.corrections())
     kept = [entry.label for entry in audit.entries if entry.state in (EntryState.GONE, EntryState.MISSING)]
     text = f"{written.name}: {file.format.title}, {count} entries corrected, every other byte as it was."
@@ -202,7 +202,7 @@ def sensor_lines(audit: Audit) -> list[str]:
 
 
 def write_audit(
-    out: str | Path, audit: Audit, file: MapFile, info: RunInfo, *, force: bool = False, inputs: Sequence[Any] = ()
+    out: str | Path, audit: Audit, file: SurveyFile, info: RunInfo, *, force: bool = False, inputs: Sequence[Any] = ()
 ) -> dict[str, Any]:
     """Write the folder of an audit: report.html, report.md, the plan, summary.json and the corrected file.
 
@@ -228,7 +228,7 @@ def write_audit(
         return folder.finish({**head, **told})
 
 
-def plan_of(audit: Audit, file: MapFile) -> Any:
+def plan_of(audit: Audit, file: SurveyFile) -> Any:
     """Return the plan, as a named figure."""
     from evermap.viz.audit_figure import PlanEntry, draw_audit
 
@@ -249,7 +249,7 @@ def plan_of(audit: Audit, file: MapFile) -> Any:
     return draw_audit(drawn, paths, f"Audit of {file.path.name}")
 
 
-def _page(audit: Audit, file: MapFile, figure: Any, written: Path) -> str:
+def _page(audit: Audit, file: SurveyFile, figure: Any, written: Path) -> str:
     """The report as a page."""
     from evermap import __version__
     from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
