@@ -36,12 +36,14 @@ _MARKS = {"gone": "x", "missing": "P", "undecided": "s", "unseen": "o", "right":
 _MEANING = {
     "wrong": "elsewhere since the first drive", "stale": "moved since an earlier drive",
     "exchanged": "in each other's place", "gone": "looked for, not there", "missing": "not in the map",
-    "undecided": "undecided", "unseen": "never looked at", "right": "right",
+    "undecided": "undecided", "unseen": "never looked at", "right": "where the map has it",
 }  # fmt: skip
 _CLOSE_UPS, _A_ROW = 8, 4
 _LEAST_HALF_M = 0.25
 """Half the side of a close-up, at least."""
 _MOST_PATH = 4000
+_LEAST_FACE_RAD = 0.05
+"""Turn about its own axis from which a tag is drawn as it is seen."""
 
 
 class PlanEntry(NamedTuple):
@@ -91,19 +93,22 @@ def draw_audit(entries: Sequence[PlanEntry], paths: Sequence[FloatArray], title:
     every = every[inside.all(axis=1)]
     low, high = every.min(axis=0), every.max(axis=0)
     span = high - low + 1.0
-    plan_in = float(np.clip(8.6 * span[1] / span[0], 2.4, 7.0))
+    plan_in = float(np.clip(8.6 * span[1] / span[0], 2.4, 5.6))
     with drawing(9.0, plan_in + 0.9 + 2.3 * rows) as figure:
         grid = figure.add_gridspec(1 + rows, _A_ROW, height_ratios=[plan_in + 0.5, *[2.1] * rows])
         plan = figure.add_subplot(grid[0, :])
         _draw_plan(plan, entries, paths, (low, high))
         for k, one in enumerate(close):
             _draw_close_up(figure.add_subplot(grid[1 + k // _A_ROW, k % _A_ROW]), one)
-        handles = plan.get_legend_handles_labels()
-        figure.legend(*handles, loc="outside upper center", ncols=4)
+        handles, labels = plan.get_legend_handles_labels()
+        rank = [[*_COLOURS, "drives"].index(label.split(" (")[0]) for label in labels]
+        order = np.argsort(rank, kind="stable").tolist()
+        figure.legend([handles[k] for k in order], [labels[k] for k in order], loc="outside upper center", ncols=3)
     caption = (
         "The map from above, in its own frame. Arrows lead from where the map has an entry to where it is; bent ones "
         "join entries that stand in each other's place. Below, what moved or turned, close up: the diamond is the map, "
-        "the solid dot is where it stands, with its 2σ ellipse; lines show to where a tag faces."
+        "the solid dot is where it stands, with its 2σ ellipse; lines show to where a tag faces, "
+        "and in the corner is how it is turned about that, as one sees it who stands before it."
     )
     return NamedFigure("audit", figure, title, caption)
 
@@ -130,7 +135,11 @@ def _draw_plan(
         axes.plot(*at.T, label=f"{state} ({len(mine)}): {_MEANING[state]}", **look)
         if moved:
             axes.plot(*after.T, "o", color=colour, ms=3.5, zorder=7)
+        least = 0.008 * float(np.max(corners[1] - corners[0]))
         for start, end in zip(before, after, strict=True) if moved else ():
+            if np.linalg.norm(end - start) < least:
+                axes.plot(*start, "o", mfc="none", mec=colour, ms=11.0, mew=1.0, zorder=6)
+                continue
             way = "arc3,rad=0.2" if state == "exchanged" else "arc3"
             axes.add_patch(FancyArrowPatch(
                 (start[0], start[1]), (end[0], end[1]), arrowstyle="-|>", connectionstyle=way, mutation_scale=9.0,
@@ -176,6 +185,7 @@ def _draw_close_up(axes: Axes, one: PlanEntry) -> None:
             axes.plot(
                 *np.array([at, end]).T, color=INK if dashed else colour, lw=1.6, ls="--" if dashed else "-", zorder=4
             )
+    _draw_face(axes, one, colour)
     axes.plot(*before, "D", mfc=PAPER, mec=INK, ms=6, mew=1.1, ls="", zorder=5)
     if far > 0.1 * half:
         axes.add_patch(FancyArrowPatch(
@@ -193,3 +203,17 @@ def _draw_close_up(axes: Axes, one: PlanEntry) -> None:
     axes.set_title(one.text, fontsize=8.5)
     axes.locator_params(nbins=3)
     axes.grid(True, lw=0.5)
+
+
+def _draw_face(axes: Axes, one: PlanEntry, colour: str) -> None:
+    """How a tag is turned about its own axis, as one who stands before it sees it: in the corner of its close-up."""
+    if one.before_turn is None or one.after_turn is None:
+        return
+    poses = [np.append(np.zeros(3), turn) for turn in (one.before_turn, one.after_turn)]
+    about = float(se3.log(se3.between(*poses))[5])
+    if abs(about) < _LEAST_FACE_RAD:
+        return
+    square = 0.08 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1], [0, 1], [1, -1]])
+    for angle, look in ((0.0, {"color": INK, "ls": "--"}), (about, {"color": colour, "ls": "-"})):
+        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        axes.plot(*(np.array([0.85, 0.85]) + square @ turn.T).T, lw=1.2, transform=axes.transAxes, zorder=8, **look)
