@@ -602,9 +602,10 @@ def _never_seen(entry: AuditEntry, given: Landmarks, row: int, heard: Sequence[_
         reason = "its number was read, but no reading fits a place; more sightings decide"
         return replace(entry, state=EntryState.UNDECIDED, reason=reason)
     if missed:
-        reason = f"{entry.n_misses} looks found nothing, but it may be hidden; looks from more sides decide"
         p = max((value for value in p_gone if math.isfinite(value)), default=math.nan)
-        return replace(entry, state=EntryState.UNDECIDED, probability=p, reason=reason)
+        state = EntryState.UNDECIDED if p > 0.5 else EntryState.UNSEEN
+        reason = f"{entry.n_misses} looks found nothing, but it may be hidden; looks from more sides decide"
+        return replace(entry, state=state, probability=p, reason=reason)
     paths = [one.drive.path_m for one in heard if len(one.drive.path_m)]
     if not paths:
         return entry

@@ -32,6 +32,8 @@ from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 USUAL = LooksConfig()
 ROUNDS = 5
 """Of expectation and maximisation, at most."""
+USUAL_RANGE = 0.9
+"""Share of the detections within whose range a miss says something: data sheets promise more."""
 EXPECTED = 1.5
 """Detections that one position must lead to expect, or its misses are chance."""
 
@@ -408,7 +410,8 @@ def flanked_misses(
     away = floor_m[listed.landmark] - eye[listed.pose, :2]
     range_m, bearing = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
     flanked = np.zeros(len(listed.pose), dtype=np.bool_)
-    asked = np.flatnonzero(unseen[listed.landmark])
+    reach_m = float(np.quantile(range_m[listed.hit], USUAL_RANGE)) if listed.hit.any() else 0.0
+    asked = np.flatnonzero(unseen[listed.landmark] & (range_m <= reach_m))
     half = np.floor(2.0 * eye[:, :2] / settings.elsewhere_m).astype(np.int64)
     hits = np.unique(np.column_stack([half[listed.pose[listed.hit]], listed.landmark[listed.hit]]), axis=0)
     for cell in np.unique(half[listed.pose[asked]], axis=0):
