@@ -412,7 +412,6 @@ def _writer(
         ConfigError: no map is written to such a file.
     """
     from evermap.io.map_formats import format_called, write_map
-    from evermap.io.nav2 import write_grid
 
     if out is None:
         return lambda *_: {}
@@ -426,9 +425,7 @@ def _writer(
             raise ConfigError("is written as GeoJSON", path=out, field="--route-graph", hint="--out open.geojson")
         return partial(_route_graph, out, route_graph, 0.5 if radius_m is None else radius_m)
     if format_name is None and ending == ".yaml":
-        radius_m = 0.25 if radius_m is None else radius_m
-        grid = partial(write_grid, path=out, cell_m=cell_m, radius_m=radius_m)
-        return lambda _, landmarks: grid(landmarks) and {}
+        return partial(_grid, out, cell_m, 0.25 if radius_m is None else radius_m)
     kind = format_called(format_name, out)
 
     def write(_: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
@@ -459,6 +456,14 @@ def _stated_up(text: str, living: LivingMap) -> Up:
     if direction.shape != (3,) or not 0.0 < length < math.inf:
         raise ConfigError(f"'{text}' is no direction", field="--up", hint="three numbers, as 0,0,1")
     return Up(direction / length, STATED_RAD, "stated")
+
+
+def _grid(out: Path, cell_m: float, radius_m: float, _: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
+    """Write the mask of a keepout filter."""
+    from evermap.io.nav2 import write_grid
+
+    write_grid(landmarks, out, cell_m=cell_m, radius_m=radius_m)
+    return {}
 
 
 def _speed_mask(

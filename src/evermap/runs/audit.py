@@ -198,9 +198,15 @@ class Audit(Shown):
             if entry.state is EntryState.EXCHANGED:
                 found.append(Correction(entry.landmark_id, like_id=entry.like_id))
             elif entry.state in (EntryState.WRONG, EntryState.STALE):
-                at = (entry.position_m, entry.covariance_m2) if entry.moved else (None, None)
-                turn = (entry.rotation, entry.rotation_covariance) if entry.turned else (None, None)
-                found.append(Correction(entry.landmark_id, *at, *turn))
+                found.append(
+                    Correction(
+                        entry.landmark_id,
+                        entry.position_m if entry.moved else None,
+                        entry.covariance_m2 if entry.moved else None,
+                        entry.rotation if entry.turned else None,
+                        entry.rotation_covariance if entry.turned else None,
+                    )
+                )
         return found
 
     def _facts(self) -> dict[str, Any]:
@@ -218,6 +224,7 @@ class _Word:
         position_m, covariance_m2, rotation, rotation_covariance: where it is.
         n_hits: sightings.
         first_s, last_s: of them.
+        p_exists: that it is there.
         instead: another explanation of the drive.
     """
 
@@ -230,6 +237,7 @@ class _Word:
     n_hits: int
     first_s: float
     last_s: float
+    p_exists: float
     instead: str = ""
 
 
@@ -321,7 +329,7 @@ def _span(recording: AnyRecording) -> tuple[float, float]:
 def _later(recording: AnyRecording, by_s: float) -> AnyRecording:
     """The drive with all its stamps moved, without what it does not need here."""
     odometry = recording.odometry
-    moved = {
+    moved: dict[str, Any] = {
         "frames": replace(recording.frames, stamp_s=recording.frames.stamp_s + by_s),
         "odometry": None if odometry is None else replace(odometry, stamp_s=odometry.stamp_s + by_s),
         "measurements": tuple(replace(one, stamp_s=one.stamp_s + by_s) for one in recording.measurements),
@@ -337,8 +345,8 @@ def _in_space_of(given: Landmarks, drives: Sequence[AnyRecording]) -> Landmarks:
     if given.position_m.shape[1] == 2 or all(map(is_in_space, drives)):
         return given
     at, spread = given.position_m[:, :2], given.covariance_m2[:, :2, :2]
-    flat = {"rotation": None, "rotation_covariance": None, "size_m": None}
-    return replace(given, position_m=at.copy(), covariance_m2=spread.copy(), **flat)
+    flat = replace(given, rotation=None, rotation_covariance=None, size_m=None)
+    return replace(flat, position_m=at.copy(), covariance_m2=spread.copy())
 
 
 def _with_all_changes(config: Config) -> Config:
@@ -424,6 +432,7 @@ def _words(result: SlamResult, start_s: float) -> dict[int, _Word]:
             int(mapped.n_hits[row]),
             float(np.fmax(mapped.first_seen_s[row], start_s)),
             float(mapped.last_seen_s[row]),
+            float(mapped.p_exists[row]),
             instead.get(name, ""),
         )
     return found
@@ -486,7 +495,8 @@ def _judge(given: Landmarks, row: int, heard: Sequence[_Heard]) -> AuditEntry:
         reason = f"elsewhere in one drive, and where the map has it in {where}; another drive decides"
         return replace(entry, state=EntryState.UNDECIDED, reason=reason)
     state = EntryState.STALE if since or within else EntryState.WRONG
-    return replace(entry, state=state, **_what_to_correct(entry, given, row))
+    moved, turned = _what_to_correct(entry, given, row)
+    return replace(entry, state=state, moved=moved, turned=turned)
 
 
 def join_drives(p_moved: Sequence[float]) -> tuple[float, int]:
@@ -532,8 +542,8 @@ def _place(words: Sequence[_Word]) -> _Word:
     if len(same) == 1:
         return last
     weights = [np.linalg.inv(word.covariance_m2 + 1e-8 * np.eye(len(last.position_m))) for word in same]
-    covariance = np.linalg.inv(sum(weights))
-    position = covariance @ sum(w @ word.position_m for w, word in zip(weights, same, strict=True))
+    covariance = np.linalg.inv(np.sum(weights, axis=0))
+    position = covariance @ np.sum([w @ word.position_m for w, word in zip(weights, same, strict=True)], axis=0)
     apart = sum(float((o := word.position_m - position) @ w @ o) for w, word in zip(weights, same, strict=True))
     scale = max(1.0, apart / (len(position) * (len(same) - 1)))
     best = min(
@@ -571,18 +581,23 @@ def _turn(before: FloatArray, after: FloatArray) -> FloatArray:
     return np.asarray(se3.log(se3.between(*poses))[3:])
 
 
-def _what_to_correct(entry: AuditEntry, given: Landmarks, row: int) -> dict[str, bool]:
+def _what_to_correct(entry: AuditEntry, given: Landmarks, row: int) -> tuple[bool, bool]:
     """Whether position and rotation differ from the map by more than both are uncertain; at least one does."""
     dim = given.position_m.shape[1]
     off = entry.displacement_m
     far = float(off @ np.linalg.solve(entry.covariance_m2 + given.covariance_m2[row] + 1e-8 * np.eye(dim), off))
-    around = 0.0
-    if entry.rotation is not None and entry.rotation_covariance is not None and given.rotation is not None:
-        turn = _turn(given.rotation[row], entry.rotation)
-        said = np.zeros((3, 3)) if given.rotation_covariance is None else given.rotation_covariance[row]
-        around = float(turn @ np.linalg.solve(entry.rotation_covariance + said + 1e-8 * np.eye(3), turn))
-    turned = around > SIGNIFICANT
-    return {"moved": far > SIGNIFICANT or not turned, "turned": turned}
+    turned = _is_turned(entry, given, row, 1e-4, SIGNIFICANT)
+    return far > SIGNIFICANT or not turned, turned
+
+
+def _is_turned(entry: AuditEntry, given: Landmarks, row: int, least_rad: float, most: float) -> bool:
+    """Whether an entry is turned otherwise than a row of the map by more than `most` squared sigmas."""
+    if entry.rotation is None or entry.rotation_covariance is None or given.rotation is None:
+        return False
+    turn = _turn(given.rotation[row], entry.rotation)
+    said = np.zeros((3, 3)) if given.rotation_covariance is None else given.rotation_covariance[row]
+    spread = entry.rotation_covariance + said + least_rad**2 * np.eye(3)
+    return bool(turn @ np.linalg.solve(spread, turn) > most)
 
 
 def _never_seen(entry: AuditEntry, given: Landmarks, row: int, heard: Sequence[_Heard]) -> AuditEntry:
@@ -647,14 +662,7 @@ def _whose_place(entry: AuditEntry, rows: Sequence[int], given: Landmarks) -> in
         off = entry.position_m - given.position_m[row]
         spread = entry.covariance_m2 + given.covariance_m2[row] + NEAR_M**2 * np.eye(dim)
         far = float(off @ np.linalg.solve(spread, off))
-        turned = given.rotation is not None and entry.rotation is not None and entry.rotation_covariance is not None
-        if turned and far < best and given.rotation is not None and entry.rotation is not None:
-            turn = _turn(given.rotation[row], entry.rotation)
-            said = np.zeros((3, 3)) if given.rotation_covariance is None else given.rotation_covariance[row]
-            around = entry.rotation_covariance + said + NEAR_RAD**2 * np.eye(3)
-            if float(turn @ np.linalg.solve(around, turn)) > SAME_PLACE:
-                continue
-        if far < best:
+        if far < best and not _is_turned(entry, given, row, NEAR_RAD, SAME_PLACE):
             best, found = far, int(given.landmark_id[row])
     return found
 
@@ -671,7 +679,8 @@ def _missing(given: Landmarks, heard: Sequence[_Heard]) -> list[AuditEntry]:
     found = []
     for name, said in words.items():
         hits = sum(word.n_hits for word in said)
-        if hits < FEWEST:
+        p_there = min(1.0 - math.prod(1.0 - word.p_exists for word in said), MOST)
+        if hits < FEWEST or p_there < DECIDED:
             continue
         place, label = _place(said), names.get(name, str(name))
         spread = place.covariance_m2[:dim, :dim]
@@ -679,7 +688,7 @@ def _missing(given: Landmarks, heard: Sequence[_Heard]) -> list[AuditEntry]:
         reason = f"a second landmark with the number {twin}" if twin else "not in the map"
         found.append(
             AuditEntry(
-                name, label, EntryState.MISSING, MOST, np.full(dim, np.nan),
+                name, label, EntryState.MISSING, p_there, np.full(dim, np.nan),
                 math.sqrt(max(float(np.trace(spread)) / dim, 0.0)), math.nan, math.nan, math.nan, said[0].first_s,
                 hits, 0, len(said), place.position_m[:dim], spread, place.rotation, place.rotation_covariance,
                 reason=reason,

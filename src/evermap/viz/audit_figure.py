@@ -214,6 +214,7 @@ def _draw_face(axes: Axes, one: PlanEntry, colour: str) -> None:
     if abs(about) < _LEAST_FACE_RAD:
         return
     square = 0.08 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1], [0, 1], [1, -1]])
-    for angle, look in ((0.0, {"color": INK, "ls": "--"}), (about, {"color": colour, "ls": "-"})):
+    for angle, ink, dashes in ((0.0, INK, "--"), (about, colour, "-")):
         turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        axes.plot(*(np.array([0.85, 0.85]) + square @ turn.T).T, lw=1.2, transform=axes.transAxes, zorder=8, **look)
+        corner = np.array([0.85, 0.85]) + square @ turn.T
+        axes.plot(*corner.T, color=ink, ls=dashes, lw=1.2, transform=axes.transAxes, zorder=8)

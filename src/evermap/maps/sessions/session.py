@@ -468,7 +468,8 @@ def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingC
     every = slam.misses.joined(Misses(frame.astype(np.int64), names[which], watch.listed.p_detect[flanked]))
     every = rows_of(every, np.lexsort((every.landmark_id, every.frame)))
     unseen = replace(unseen, p_exists=p_exists, n_misses=np.bincount(which, minlength=len(names))[row])
-    return replace(slam, misses=every, gone=replace(unseen[p_exists < EXISTS], frame=found.frame))
+    gone = replace(unseen[p_exists < EXISTS], frame=found.frame)
+    return replace(slam, misses=every, gone=gone if len(gone) else slam.gone)
 
 
 def judged_so_far(
