@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import functools
 import json
+import subprocess
+import sys
+import tarfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from space.corridors import World, tagged_corridor
 
 from evermap.errors import DataError
+from evermap.io import read_recording
 from evermap.io.map_formats import MAP_FORMATS, SurveyFile, correct_map, read_landmarks, read_map_file, write_map
 from evermap.runs.audit import Audit, EntryState, audit_map, in_order, join_drives
 from evermap.runs.audit_report import audit_dict, conclude, entry_row, write_audit
@@ -143,6 +147,23 @@ def test_what_moved_between_two_drives_is_stale_and_what_was_wrong_before_is_wro
     assert found.drives[0].from_s < stale.from_s <= found.drives[0].to_s < found.drives[1].from_s <= stale.to_s
 
 
+def test_what_moved_while_the_robot_drove_is_stale_from_then_on() -> None:
+    """On the way back the tag 6 hangs where 14 was: its number is at two places, one after the other."""
+    world = corridor(3)
+    seen, stamps = world.recording.detections, world.recording.frames.stamp_s
+    half_s = float(stamps[len(stamps) // 2])
+    back = stamps[seen.frame] > half_s
+    names = np.where(back & (seen.landmark_id == 14), 6, seen.landmark_id)
+    kept = ~(back & (seen.landmark_id == 6)) & ~(~back & (seen.landmark_id == 14))
+    drive = replace(world.recording, detections=rows_of(replace(seen, landmark_id=names), kept))
+    given = surveyed(world).as_prior(0.01)
+    found = audit_map(given[given.landmark_id != 14], [drive])
+    assert told(found) == {"6": EntryState.STALE}
+    entry = found.faults[0]
+    assert entry.from_s <= half_s <= entry.to_s
+    assert entry.position_m == pytest.approx(world.tags.position_m[14], abs=0.1)
+
+
 def test_probabilities_of_drives_are_joined_by_when_it_may_have_moved() -> None:
     assert join_drives([0.5]) == (pytest.approx(0.5), 0)
     both, since = join_drives([0.5, 0.5])
@@ -245,3 +266,61 @@ def test_the_report_says_all_of_it(tmp_path: Path) -> None:
     corrected = tmp_path / "out" / "corrected" / "field.json"
     assert corrected.read_bytes() == correct_map(file, found.corrections())
     assert (tmp_path / "out" / "figures" / "audit.svg").stat().st_size > 1000
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_two_labels_of_a_published_survey_are_exchanged(shared_data: Path, tmp_path: Path) -> None:
+    """STAR-loc: 35 and 36, by three sessions whose clocks all start at 0; nothing else."""
+    folder, drives = shared_data / "starloc", []
+    for name in ("loop-2d_s1", "loop-3d_s1", "zigzag_s2"):
+        command = [sys.executable, folder / "starloc_to_plain.py", folder, name, tmp_path / name]
+        subprocess.run(command, check=True)
+        drives.append(read_recording(tmp_path / name))
+    file = read_map_file(folder / "mocap" / "environment_v1.csv")
+    found = audit_map(file.landmarks, drives)
+    assert {entry.label for entry in found.faults} == {"35", "36"}
+    assert {entry.state for entry in found.faults} == {EntryState.EXCHANGED}
+    assert sum(entry.state is EntryState.RIGHT for entry in found.entries) >= 48
+    before, after = file.data.decode().splitlines(), correct_map(file, found.corrections()).decode().splitlines()
+    changed = [(old, new) for old, new in zip(before, after, strict=True) if old != new]
+    assert [new.split(",")[1:4] for _, new in changed] == [old.split(",")[1:4] for old, _ in changed[::-1]]
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_edited_entries_of_a_real_survey_are_found_beside_those_that_are_off(shared_data: Path, seed: int) -> None:
+    """A building on two days: three entries moved by .4 m are found, and nothing else changes its state."""
+    folder = shared_data / "tagslam"
+    drives = [read_recording(folder / name) for name in ("test_10", "test_11")]
+    given = read_map_file(folder / "test_10" / "survey.csv.gz").landmarks
+    before = audit_map(given, drives)
+    often = [entry.landmark_id for entry in before.entries if entry.state is EntryState.RIGHT and entry.n_hits >= 10]
+    rng, at = np.random.default_rng(seed), given.position_m.copy()
+    chosen = rng.choice(often, 3, replace=False)
+    for name in chosen:
+        way = rng.normal(size=3)
+        at[given.landmark_id == name] += 0.4 * way / np.linalg.norm(way)
+    after = audit_map(replace(given, position_m=at), drives)
+    faults = {entry.landmark_id for entry in before.faults}
+    assert {entry.landmark_id for entry in after.faults} == faults | set(chosen.tolist())
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("case", ["c_latency", "c_midmove"])
+def test_drives_on_an_official_field(shared_data: Path, tmp_path: Path, case: str) -> None:
+    """Right layout, late camera: only the clock is wrong. Of a tag that is moved on the way its new place is told."""
+    with tarfile.open(shared_data / "cases" / f"{case}.tar.gz") as packed:
+        packed.extractall(tmp_path, filter="data")
+    layout = shared_data / "field" / "wpilib" / "format_2022_to_2026" / "2025-reefscape-andymark.json"
+    file, drive = read_map_file(layout), read_recording(tmp_path / case)
+    found = audit_map(file.landmarks, [drive])
+    if case == "c_latency":
+        assert not found.faults
+        assert any("delay" in line for line in found.drives[0].sensor)
+        assert correct_map(file, found.corrections()) == layout.read_bytes()
+        return
+    assert {entry.label.partition("#")[0] for entry in found.faults} == {"12"}
+    (entry,) = found.faults  # stale, or a second tag of its number where frames of both places are mixed
+    assert entry.position_m == pytest.approx([1.66, 1.23, 1.485], abs=0.05)

@@ -45,6 +45,8 @@ UNREPORTED = 0.005
 """Probability of a move of which a drive says nothing: of what is seen often and contradicts nothing."""
 P_MOVED = 0.03
 """Prior probability that an entry is wrong, or moves between two drives; that of `slam.space.map.p_moved`."""
+P_SAME = 0.95
+"""Probability that what is seen first at one place, then at another, and never at both, is one landmark that moved."""
 MOST = 0.999
 """Greatest probability: drives by one robot share errors that no chain of independent ones knows."""
 FEWEST = 3
@@ -388,6 +390,7 @@ def _hear(recording: AnyRecording, result: SlamResult, given: Landmarks) -> _Hea
         path_m=result.trajectory.pose_world_robot[:, :dim],
     )
     words = {} if lost else _words(result, float(recording.frames.stamp_s[0]))
+    words = _with_twins(words, result.landmarks.names, recording.landmark_names)
     gone = result.gone
     missed = np.unique(result.misses.landmark_id, return_counts=True)
     return _Heard(
@@ -435,6 +438,30 @@ def _words(result: SlamResult, start_s: float) -> dict[int, _Word]:
             float(mapped.p_exists[row]),
             instead.get(name, ""),
         )
+    return found
+
+
+def _with_twins(words: Mapping[int, _Word], names: Mapping[int, str], given: Mapping[int, str]) -> dict[int, _Word]:
+    """Words in which a number at two places, first at one and then at the other, is one landmark that moved between.
+
+    The estimator calls the second place '7#2'. What is no farther from the first than both are uncertain is no place.
+    """
+    found = dict(words)
+    ids = {name: key for key, name in given.items()}
+    for key, label in names.items():
+        stem, mark, _ = label.partition("#")
+        base = ids.get(stem, int(stem) if stem.isdecimal() else -1)
+        if not mark or key not in found or base not in found:
+            continue
+        one, twin = found[base], found[key]
+        off = twin.position_m - one.position_m
+        spread = one.covariance_m2 + twin.covariance_m2 + NEAR_M**2 * np.eye(len(off))
+        if off @ np.linalg.solve(spread, off) < SAME_PLACE:
+            del found[key]
+        elif one.last_s <= twin.first_s and one.p_moved < 0.5:
+            moved = MapChange((base,), ChangeKind.MOVED, one.last_s, twin.first_s, tuple(off.tolist()), 0.0, P_SAME)
+            found[base] = replace(twin, p_moved=P_SAME, change=moved, first_s=one.first_s)
+            del found[key]
     return found
 
 
