@@ -80,3 +80,32 @@ def test_maps_are_exported_in_formats_of_others(place: Path) -> None:
         assert format_of(out.read_bytes(), out).name == kind.name
         assert len(read_landmarks(out)) > 0
     assert run("map", "export", place / "site.evermap", "--out", place / "a.json", "--format", "g2o").exit_code == 2
+
+
+def test_a_survey_that_begins_a_map_is_not_corrected_in_silence(place: Path) -> None:
+    survey, out = place / "rec" / "survey.csv", place / "begun"
+    done = run("slam", place / "rec", "--map", place / "begun.evermap", "--prior-map", survey, "--out", out)
+    assert done.exit_code == 0, done.output
+    mapped = json.loads(run("map", "show", place / "begun.evermap", "--json").stdout)["landmarks"]
+    at = {item["landmark"]: (item["x_m"], item["y_m"]) for item in mapped}
+    before = read_landmarks(survey)
+    far = [
+        name
+        for name, (x, y) in zip(before.landmark_id.tolist(), before.position_m.tolist(), strict=True)
+        if max(abs(at[name][0] - x), abs(at[name][1] - y)) > 0.3
+    ]
+    assert far == [4]
+    assert "landmark 4 moved" in done.stdout or "survey has 4 (1.1" in done.stderr
+
+
+def test_a_map_of_other_landmarks_is_not_used_in_silence(place: Path, tmp_path: Path) -> None:
+    (tmp_path / "other.csv").write_text("id,x,y\n7001,0,0\n7002,1,0\n")
+    given = ("slam", place / "rec", "--out", tmp_path / "out", "--prior-map", tmp_path / "other.csv")
+    alone = run(*given, "--json")
+    assert alone.exit_code == 0, alone.output
+    said = [text for text in json.loads(alone.stdout)["warnings"] if "no landmark of the map was ever seen" in text]
+    assert len(said) == 1
+    begun = run(*given, "--map", tmp_path / "new.evermap")
+    assert begun.exit_code == 2
+    assert "no landmark of the map was ever seen: the map has 7001, 7002, the recording has 1, 2" in begun.stderr
+    assert not (tmp_path / "new.evermap").exists()

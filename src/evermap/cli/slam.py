@@ -556,6 +556,8 @@ def _run_in_map(
     said = priors_of(common, by_class)
     others = [name for name in said if name not in (by_class or {})]  # a file tells of classes of other sites, too
     unknown = config.slam.unknown_ids
+    if survey is not None and not later and not unknown and (apart := strangers(survey, [recording])):
+        raise DataError(apart, field="prior_map", hint="the map of this site; without one the session begins a map")
     with held():  # a map without its tables is none
         opened = open_store(map_file, create=not localize)
     kept(map_file, f"the map {map_file} is unchanged")
@@ -563,8 +565,6 @@ def _run_in_map(
         start = time.perf_counter()
         entered: Entered | None = None
         begun_from: Landmarks | None = None
-        if survey is not None and not unknown and (apart := strangers(survey, [recording])):
-            raise DataError(apart, field="prior_map", hint="the map of this site; without one the session begins a map")
         if survey is not None and not (later and len(store.load().places)):
             begin_map(store, survey, recording, command_line())
             begun_from = survey

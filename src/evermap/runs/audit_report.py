@@ -12,7 +12,7 @@ import numpy as np
 
 from evermap.io.map_formats import SurveyFile, correct_map, write_map_bytes
 from evermap.io.spatial import AT, QUATERNION
-from evermap.runs.audit import ORDER, Audit, AuditDrive, AuditEntry, EntryState, count_states
+from evermap.runs.audit import DECIDED, FEWEST, ORDER, Audit, AuditDrive, AuditEntry, EntryState, count_states
 from evermap.runs.folder import RunFolder
 from evermap.runs.summary import RunInfo, summary_head
 from evermap.types import Clock, json_number, stamp_text
@@ -142,18 +142,23 @@ def _percent(entry: AuditEntry) -> str:
     return "> 99 %" if p > 0.99 else f"{100 * p:.0f} %"
 
 
+def is_doubtful(entry: AuditEntry) -> bool:
+    """Return whether an entry is undecided because it may be wrong, and not because it was seen too few times."""
+    return entry.state is EntryState.UNDECIDED and not entry.probability <= 1.0 - DECIDED
+
+
 def listed_rows(audit: Audit, *, everything: bool = False) -> list[tuple[str, ...]]:
     """Return the rows of what is to be known: faults and what cannot be decided; or of every entry."""
-    told = [entry for entry in audit.entries
-            if everything or entry.state.is_fault or entry.state is EntryState.UNDECIDED]  # fmt: skip
+    told = [entry for entry in audit.entries if everything or entry.state.is_fault or is_doubtful(entry)]
     return [entry_row(entry, audit.clock) for entry in told]
 
 
 def quiet_lines(audit: Audit) -> list[str]:
     """Return one line each on entries that are right, and on those that were never seen."""
     lines = []
-    for state, word in ((EntryState.RIGHT, "right"), (EntryState.UNSEEN, "never seen")):
-        mine = [entry for entry in audit.entries if entry.state is state]
+    few = f"seen fewer than {FEWEST} times"
+    for state, word in ((EntryState.RIGHT, "right"), (EntryState.UNDECIDED, few), (EntryState.UNSEEN, "never seen")):
+        mine = [entry for entry in audit.entries if entry.state is state and not is_doubtful(entry)]
         if mine:
             some = ", ".join(entry.label for entry in mine[:_FEW])
             more = f" and {len(mine) - _FEW} more" if len(mine) > _FEW else ""
