@@ -18,10 +18,22 @@ from space.corridors import World, tagged_corridor
 from evermap.errors import DataError
 from evermap.io import read_recording
 from evermap.io.map_formats import MAP_FORMATS, SurveyFile, correct_map, read_landmarks, read_map_file, write_map
+from evermap.pipeline import run_slam
+from evermap.runs import audit as audit_module
 from evermap.runs.audit import Audit, EntryState, audit_map, in_order, join_drives
 from evermap.runs.audit_report import audit_dict, conclude, entry_row, write_audit
 from evermap.runs.summary import RunInfo
-from evermap.types import Landmarks, Recording, SensorKind, SpatialRecording, rows_of
+from evermap.types import (
+    Cause,
+    Landmarks,
+    Recording,
+    SensorKind,
+    SlamResult,
+    SpatialRecording,
+    Verdict,
+    VerdictKind,
+    rows_of,
+)
 from evermap_studies.worlds.edited import later
 from evermap_studies.worlds.robots import Robot, simulate_robot
 
@@ -246,6 +258,34 @@ def test_a_drive_that_cannot_be_used_is_named_and_the_others_count() -> None:
     assert [drive.is_heard for drive in found.drives] == [True, False]
     assert found.drives[1].reason
     assert told(found, EntryState.WRONG, EntryState.STALE, EntryState.EXCHANGED) == {}
+
+
+@pytest.mark.parametrize(
+    ("kind", "causes", "counts"),
+    [
+        (VerdictKind.LOST, 0, False),
+        (VerdictKind.SENSOR_SUSPECT, 0, False),
+        (VerdictKind.SENSOR_SUSPECT, 1, True),
+        (VerdictKind.MAP_OUTDATED, 0, True),
+        (VerdictKind.WEAK, 0, True),
+    ],
+)
+def test_a_verdict_decides_whether_a_drive_counts(kind, causes, counts, monkeypatch) -> None:
+    """What the estimator doubts is no evidence against the map; a cause that it found is listed as the sensor's."""
+    cause = Cause("tag-size", "left", "tags are 3 % smaller than stated", fix="tag_size_m = 0.097")
+    verdict = Verdict(kind, "what the estimator says")
+    results = [replace(solved_corridor(), verdict=verdict, causes=(cause,) * causes)]
+    monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: results[0])
+    world = corridor(2)
+    found = audit_map(surveyed(world).as_prior(0.01), [world.recording])
+    assert found.drives[0].is_heard == counts
+    assert conclude(found)[0] == ("right" if counts else "untested")
+    assert found.drives[0].sensor == ("tags are 3 % smaller than stated; tag_size_m = 0.097",) * causes
+
+
+@functools.cache
+def solved_corridor() -> SlamResult:
+    return run_slam(corridor(2).recording, prior_map=surveyed(corridor(2)).as_prior(0.01))
 
 
 def test_the_report_says_all_of_it(tmp_path: Path) -> None:

@@ -33,6 +33,8 @@ from evermap.types import (
     ParameterEstimate,
     Progress,
     SlamResult,
+    Verdict,
+    VerdictKind,
     is_in_space,
 )
 from evermap.valid import strangers
@@ -376,7 +378,7 @@ def _hear(recording: AnyRecording, result: SlamResult, given: Landmarks) -> _Hea
         reason = next(
             (text for text in result.warnings if "cannot localise" in text), "it could not be laid on the map"
         )
-    trusted = verdict is None or verdict.kind.is_trustworthy or bool(result.causes)
+    trusted = verdict is None or verdict.kind.is_trustworthy or _is_usable(verdict, result, given)
     drive = AuditDrive(
         name=recording.name,
         source=recording.source,
@@ -401,6 +403,19 @@ def _hear(recording: AnyRecording, result: SlamResult, given: Landmarks) -> _Hea
         dict(zip(missed[0].tolist(), missed[1].tolist(), strict=True)),
         frozenset(np.unique(recording.detections.landmark_id).tolist()),
     )
+
+
+def _is_usable(verdict: Verdict, result: SlamResult, given: Landmarks) -> bool:
+    """Whether a drive that is not sound says something of the map: a suspect sensor, if its cause was found and is in
+    the solution; an outdated map, if most of what was seen of it is where it says.
+    """
+    if verdict.kind is VerdictKind.SENSOR_SUSPECT:
+        return bool(result.causes)
+    if verdict.kind is not VerdictKind.MAP_OUTDATED:
+        return False
+    seen = np.isin(result.landmarks.landmark_id, given.landmark_id)
+    moved = {name for change in result.changes if change.probability > 0.5 for name in change.landmark_ids}
+    return 2 * len(moved) < int(seen.sum())
 
 
 def _words(result: SlamResult, start_s: float) -> dict[int, _Word]:

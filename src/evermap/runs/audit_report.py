@@ -104,7 +104,7 @@ def entry_row(entry: AuditEntry, clock: Clock) -> tuple[str, ...]:
     """Return the cells of an entry, under `HEAD`."""
     moved = entry.state in (EntryState.WRONG, EntryState.STALE, EntryState.EXCHANGED, EntryState.UNDECIDED)
     known = moved and math.isfinite(entry.distance_m)
-    way = ", ".join(f"{metres:+.2f}" for metres in entry.displacement_m)
+    way = ", ".join(f"{round(metres, 2) + 0.0:+.2f}" for metres in entry.displacement_m.tolist())
     far = f"{entry.distance_m:.2f} ± {entry.sigma_m:.2f} m ({way})" if known else "-"
     turned = known and math.isfinite(entry.turn_rad)
     turn = f"{math.degrees(entry.turn_rad):.1f} ± {math.degrees(entry.turn_sigma_rad):.1f}°" if turned else "-"
@@ -129,9 +129,11 @@ def when_text(entry: AuditEntry, clock: Clock) -> str:
     """Return since when an entry is not as the map has it."""
     if not entry.state.is_fault or entry.state is EntryState.MISSING or not math.isfinite(entry.to_s):
         return "-"
+    if entry.state is EntryState.GONE and clock is Clock.RECORDING:
+        return "before it was looked for"
     late = stamp_text(entry.to_s, clock)
     if not math.isfinite(entry.from_s):
-        return f"before {late}"
+        return f"before {late}" if clock is not Clock.RECORDING else "before it was first seen"
     return f"{stamp_text(entry.from_s, clock)} to {late}"
 
 
@@ -262,7 +264,7 @@ def _page(audit: Audit, file: SurveyFile, figure: Any, written: Path) -> str:
     counts, (_, message) = count_states(audit.entries), conclude(audit)
     faults = len(audit.faults)
     cards = [
-        card("Wrong entries", float(faults), "{:.0f}", f"of {len(audit.given)}", _fault_words(counts)),
+        card("Faults", float(faults), "{:.0f}", f"of {len(audit.given)}", _fault_words(counts)),
         card("Right", float(counts["right"]), "{:.0f}", "entries", "Where the map has them."),
         card("Open", float(counts["undecided"] + counts["unseen"]), "{:.0f}", "entries",
              f"{counts['undecided']} undecided, {counts['unseen']} never looked at."),
