@@ -893,6 +893,17 @@ class LooksConfig(Section):
     sure: Share = key(0.9, "probability from which something new is told to have come after a look, not an earlier one")
     lasting: Share = key(0.5, "share of the places hidden in a session that are hidden in all earlier ones")
     sticky: float = key(2.0, "consecutive frames that count as one independent one", ge=1.0)
+    flank_rad: Positive = key(
+        0.7, "angle within which something is seen on both sides of what a map has and is missed [rad]"
+    )
+    flank_share: Share = key(0.6, "least range of that, as a share of the range of what is missed")
+    elsewhere_m: Positive = key(
+        1.0, "distance between positions from which something narrow hides different places [m]"
+    )
+    one_sided_rad: Positive = key(2.1, "angle over which a landmark of unknown orientation must be missed [rad]")
+    p_flanked_hidden: Share = key(0.05, "probability that it is hidden from one position all the same")
+    p_always_hidden: Share = key(0.003, "probability that it is hidden from all")
+    p_gone: Share = key(0.03, "probability that a landmark of a given map is nowhere")
 
 
 class DecisionConfig(Section):

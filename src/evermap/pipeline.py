@@ -61,7 +61,9 @@ def run_slam(
         return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
     visit = session.solved(recording, config, prior_map, remarks, realtime=realtime, progress=progress)
     result = session.existing(visit, visit.concluded(), config.living)
-    return result if prior_map is None else with_known_up(result, prior_map.up)
+    if prior_map is None:
+        return result
+    return with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)
 
 
 @single_threaded()

@@ -322,6 +322,23 @@ def check_type(recording: Any) -> None:
         raise InputError(f"a Recording is needed, not {type(recording).__name__}", field="recording", hint=hint)
 
 
+def strangers(landmarks: Landmarks, recordings: Iterable[AnyRecording]) -> str:
+    """Return one line on a map and recordings that have no landmark id in common; '' where they have one, or where
+    there are none to compare.
+    """
+    every = list(recordings)
+    seen = np.unique(np.concatenate([one.detections.landmark_id for one in every]))
+    seen = seen[seen >= 0]
+    if not len(seen) or not len(landmarks) or np.isin(seen, landmarks.landmark_id).any():
+        return ""
+    names = {**landmarks.names, **{key: name for one in every for key, name in one.landmark_names.items()}}
+    listed = []
+    for ids in (landmarks.landmark_id.tolist(), seen.tolist()):
+        called = [names.get(identity, str(identity)) for identity in ids]
+        listed.append(", ".join(called[:4]) + (f" to {called[-1]}" if len(called) > 4 else ""))
+    return f"no landmark of the map was ever seen: the map has {listed[0]}, the recording has {listed[1]}"
+
+
 def check_landmarks(landmarks: Any, field: str) -> None:
     """Raise InputError unless `landmarks` are records of a map, each once and with numbers that can be."""
     if not isinstance(landmarks, Landmarks):

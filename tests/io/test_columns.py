@@ -17,8 +17,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from evermap.errors import InputError
+from evermap.io import read_landmarks
 from evermap.io.columns import Columns, csv_bytes, named, read_columns
-from evermap.io.landmarks import read_landmarks, write_map_csv
+from evermap.io.landmarks import write_map_csv
 from evermap.io.table import Table, csv_text, parse_by_line, parse_csv, parse_table
 from evermap.types import landmark_id_of
 from evermap.valid import Quantity

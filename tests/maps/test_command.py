@@ -308,7 +308,7 @@ def test_gc_prunes_old_revisions(site: Path, tmp_path: Path) -> None:
         (("pin", "SITE", "9999"), "no landmark 9999 in revision 3 (try: evermap map show"),
         (
             ("export", "SITE", "--out", "map.png"),
-            "map.png: field '--out': cannot write a '.png' file (try: map.parquet",
+            "map.png: cannot write a '.png' map (try: parquet, wpilib",
         ),
         (("export", "SITE", "--out", "s.csv", "--speed-mask"), "s.csv: field '--speed-mask': is an image"),
         (("export", "SITE", "--out", "s.csv", "--route-graph", "g"), "s.csv: field '--route-graph': is written as Geo"),

@@ -11,8 +11,7 @@ from recordings import some_rows
 
 from evermap.config import load_config
 from evermap.geometry import se2
-from evermap.io import read_planar
-from evermap.io.landmarks import read_prior_map
+from evermap.io import read_planar, read_prior_map
 from evermap.io.template import write_template
 from evermap.pipeline import run_slam
 from evermap.types import FloatArray, Landmarks

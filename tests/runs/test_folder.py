@@ -13,7 +13,7 @@ import pytest
 
 from evermap.config import load_config
 from evermap.errors import ConfigError, MissingExtraError
-from evermap.io.landmarks import read_prior_map
+from evermap.io import read_prior_map
 from evermap.io.tum import read_tum
 from evermap.runs import folder as runfolder
 from evermap.runs.folder import MANIFEST, RunFolder, check_output_file, check_replaceable, write_run

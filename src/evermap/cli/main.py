@@ -14,7 +14,22 @@ import typer
 from typer.core import TyperGroup
 
 from evermap import __version__, interrupts, plugins
-from evermap.cli import bench, check, convert, info, learn, live, persist, reproduce, serve, slam, survival, track, view
+from evermap.cli import (
+    audit,
+    bench,
+    check,
+    convert,
+    info,
+    learn,
+    live,
+    persist,
+    reproduce,
+    serve,
+    slam,
+    survival,
+    track,
+    view,
+)
 from evermap.cli import map as living_map
 from evermap.cli.options import Verb, name_options, option
 from evermap.cli.terminal import fail, say, warn
@@ -95,6 +110,7 @@ app = typer.Typer(
 app.command("check")(check.check)
 app.command("info")(info.info)
 app.command("slam", help=slam.HELP)(slam.slam)
+app.command("audit", help=audit.HELP)(audit.audit)
 app.command("live")(live.live)
 app.command("persist", help=persist.HELP)(persist.persist)
 app.command("track", help=track.HELP)(track.track)

@@ -250,6 +250,15 @@ _ExportOut = Annotated[
         "Where to write the landmarks: .parquet, .geojson, .csv, or .yaml for a grid.", metavar="FILE", default=False
     ),
 ]
+_ExportFormat = Annotated[
+    str | None,
+    option(
+        "--format",
+        "Format of the landmarks in --out.",
+        metavar="csv|columns|parquet|geojson|wpilib|wpilib-2027|wpilib-csv|tagslam|fiducials|rtabmap",
+        default="by the ending of --out",
+    ),
+]
 _ExportLifetimes = Annotated[
     Path | None, option("Where to write the lifetimes by class.", metavar="FILE.json", default=False)
 ]
@@ -292,6 +301,7 @@ _RadiusM = Annotated[
 def export(
     file: MapFile,
     out: _ExportOut = None,
+    format_name: _ExportFormat = None,
     lifetimes: _ExportLifetimes = None,
     revision: _AtRevision = None,
     p_least: _PLeast = None,
@@ -310,6 +320,7 @@ def export(
     \b
     Examples:
       evermap map export site.evermap --out map.geojson
+      evermap map export site.evermap --out field.json --format wpilib
       evermap map export site.evermap --lifetimes lifetimes.json
       evermap map export site.evermap --out keepout.yaml --p-least 0.1
       evermap map export site.evermap --out speed.yaml --speed-mask --ahead 12h
@@ -326,7 +337,7 @@ def export(
     if out is None and lifetimes is None:
         raise ConfigError("nothing to write", field="--out", hint="--out map.geojson, or --lifetimes lifetimes.json")
     ahead_s = parse_duration_s(ahead) if speed_mask else None
-    write = _writer(out, cell_m, radius_m, ahead_s, route_graph)
+    write = _writer(out, format_name, cell_m, radius_m, ahead_s, route_graph)
     for path in (out, lifetimes):
         if path is not None:
             check_output_file(path, inputs=[file, route_graph], ending=".json" if path is lifetimes else "")
@@ -388,16 +399,19 @@ def why(
 
 
 def _writer(
-    out: Path | None, cell_m: float, radius_m: float | None, ahead_s: float | None, route_graph: Path | None
+    out: Path | None,
+    format_name: str | None,
+    cell_m: float,
+    radius_m: float | None,
+    ahead_s: float | None,
+    route_graph: Path | None,
 ) -> Callable[[LivingMap, Landmarks], dict[str, Any]]:
     """Return the writer for such a file, which returns facts for the summary.
 
     Raises:
         ConfigError: no map is written to such a file.
     """
-    from evermap.io import write_map_geojson, write_map_parquet
-    from evermap.io.landmarks import write_map_csv
-    from evermap.io.nav2 import write_grid
+    from evermap.io.map_formats import format_called, write_map
 
     if out is None:
         return lambda *_: {}
@@ -410,20 +424,13 @@ def _writer(
         if ending not in (".geojson", ".json"):
             raise ConfigError("is written as GeoJSON", path=out, field="--route-graph", hint="--out open.geojson")
         return partial(_route_graph, out, route_graph, 0.5 if radius_m is None else radius_m)
-    writers: dict[str, Callable[..., Any]] = {
-        ".yaml": partial(write_grid, cell_m=cell_m, radius_m=0.25 if radius_m is None else radius_m),
-        ".parquet": write_map_parquet,
-        ".geojson": write_map_geojson,
-        ".json": write_map_geojson,
-        ".csv": write_map_csv,
-    }
-    if ending not in writers:
-        hint = "map.parquet, .geojson, .csv or .yaml"
-        raise ConfigError(f"cannot write a '{out.suffix}' file", path=out, field="--out", hint=hint)
+    if format_name is None and ending == ".yaml":
+        return partial(_grid, out, cell_m, 0.25 if radius_m is None else radius_m)
+    kind = format_called(format_name, out)
 
     def write(_: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
-        writers[ending](landmarks, out)
-        return {}
+        write_map(landmarks, out, kind)
+        return {"format": kind.name}
 
     return write
 
@@ -449,6 +456,14 @@ def _stated_up(text: str, living: LivingMap) -> Up:
     if direction.shape != (3,) or not 0.0 < length < math.inf:
         raise ConfigError(f"'{text}' is no direction", field="--up", hint="three numbers, as 0,0,1")
     return Up(direction / length, STATED_RAD, "stated")
+
+
+def _grid(out: Path, cell_m: float, radius_m: float, _: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
+    """Write the mask of a keepout filter."""
+    from evermap.io.nav2 import write_grid
+
+    write_grid(landmarks, out, cell_m=cell_m, radius_m=radius_m)
+    return {}
 
 
 def _speed_mask(

@@ -55,6 +55,8 @@ _ROWS = (
 
 SURVEY_SIGMA_M = 0.02
 """Standard deviation of the landmarks of a surveyed map, unless it is stated: a default."""
+TOLD_M, MOST_TOLD = 0.1, 12
+"""Distance from which an entry of a survey that a session has put elsewhere is told, and how many at most."""
 _SECTIONS = ("living", "sensor", "output", "track")
 """Sections of the configuration that are read beside `slam`."""
 
@@ -544,6 +546,7 @@ def _run_in_map(
     from evermap.runs.sessions import at_time, begin_map, enter_session
     from evermap.slam.space.moving import has_traffic
     from evermap.types import is_in_space
+    from evermap.valid import strangers
 
     config, localize, map_file = asked.config, asked.localize, asked.map_file
     assert map_file is not None
@@ -553,14 +556,18 @@ def _run_in_map(
     said = priors_of(common, by_class)
     others = [name for name in said if name not in (by_class or {})]  # a file tells of classes of other sites, too
     unknown = config.slam.unknown_ids
+    if survey is not None and not later and not unknown and (apart := strangers(survey, [recording])):
+        raise DataError(apart, field="prior_map", hint="the map of this site; without one the session begins a map")
     with held():  # a map without its tables is none
         opened = open_store(map_file, create=not localize)
     kept(map_file, f"the map {map_file} is unchanged")
     with opened as store:
         start = time.perf_counter()
         entered: Entered | None = None
+        begun_from: Landmarks | None = None
         if survey is not None and not (later and len(store.load().places)):
             begin_map(store, survey, recording, command_line())
+            begun_from = survey
         if is_in_space(recording):
             recording = in_its_space(recording, store.load(), config)
         in_space = is_in_space(recording)
@@ -584,6 +591,28 @@ def _run_in_map(
             raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}; the map is unchanged")
         if entered is not None:
             _commit(entered, store, map_file, config, elapsed_s)
+            if begun_from is not None:
+                _tell_corrected(begun_from, entered.living.landmarks())
+
+
+def _tell_corrected(survey: Landmarks, mapped: Landmarks) -> None:
+    """Say which entries of the survey that began a map its first session has put elsewhere."""
+    import numpy as np
+
+    _, row, at = np.intersect1d(survey.landmark_id, mapped.landmark_id, return_indices=True)
+    row, at = row[mapped.n_hits[at] > 0], at[mapped.n_hits[at] > 0]
+    far_m = np.linalg.norm(mapped.position_m[at] - survey.position_m[row], axis=1)
+    sigma_m = np.sqrt(np.trace(mapped.covariance_m2[at] + survey.covariance_m2[row], axis1=1, axis2=2))
+    moved = np.flatnonzero(far_m > np.maximum(TOLD_M, 3.0 * sigma_m))
+    if len(moved):
+        names = survey.names
+        labels = [f"{names.get(k, str(k))} ({d:.2f} m)" for k, d in zip(survey.landmark_id[row[moved]].tolist(),
+                                                                       far_m[moved].tolist(), strict=True)]  # fmt: skip
+        more = f" and {len(labels) - MOST_TOLD} more" if len(labels) > MOST_TOLD else ""
+        warn(
+            f"this session is not where the survey has {', '.join(labels[:MOST_TOLD])}{more}: the map follows the "
+            "session; evermap audit says which entries of the survey are wrong, and how probably"
+        )
 
 
 def _commit(entered: Entered, store: MapStore, map_file: str, config: Config, elapsed_s: float) -> None:

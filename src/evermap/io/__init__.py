@@ -8,7 +8,8 @@ from evermap.errors import InputError
 from evermap.io.bag import BAG, read_bag
 from evermap.io.file_kinds import kind_of_file, kind_of_folder
 from evermap.io.files import Reader, file_sets, find_file_set, head_of, refuse_pointer
-from evermap.io.landmarks import read_landmarks, read_prior_map, write_map_geojson, write_map_parquet
+from evermap.io.landmarks import write_map_geojson, write_map_parquet
+from evermap.io.map_formats import read_landmarks, read_prior_map
 from evermap.io.mrclam import MRCLAM, read_mrclam
 from evermap.io.native import NATIVE, read_native
 from evermap.io.native_write import write_native

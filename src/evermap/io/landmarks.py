@@ -1,4 +1,4 @@
-"""Maps in files: prior maps read from CSV, Parquet or GeoJSON, maps written as Parquet and read back the same."""
+"""Maps as tables: landmarks of the columns of a map, and the columns of landmarks, in CSV, Parquet and GeoJSON."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from evermap.errors import DataError, InputError
+from evermap.errors import InputError
 from evermap.io.assemble import repeats
-from evermap.io.files import content_of, write_atomic
+from evermap.io.files import write_atomic
 from evermap.io.spatial import (
     AT,
     BOX,
@@ -27,8 +27,7 @@ from evermap.io.spatial import (
     quaternions,
     upper_triangle,
 )
-from evermap.io.table import Table, csv_text, pa, parquet_bytes, parse_csv, parse_parquet, pq
-from evermap.io.tag_maps import is_wpilib, map_of_survey, tags_of_fiducials, tags_of_tagslam, tags_of_wpilib
+from evermap.io.table import Table, csv_text, pa, parquet_bytes, pq
 from evermap.io.text import is_number, parse_json
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, Up, json_number
 from evermap.valid import FEATURES, P_EXISTS, STAMP_S, X_M, Y_M, Quantity
@@ -54,68 +53,7 @@ _SIGMA_RAD = Quantity("sigma_rad", 0.0, 1e3, optional=True, hint="standard devia
 _FIRST_SEEN_S = replace(STAMP_S, name="first_seen_s", optional=True, dates=False)
 _LAST_SEEN_S = replace(_FIRST_SEEN_S, name="last_seen_s")
 _FEATURES = {quantity.name: quantity for quantity in FEATURES}
-_Z_UP = {"up": {"direction": [0.0, 0.0, 1.0], "sigma_rad": 0.01, "source": "stated"}}
-"""Of formats that say so."""
 _DESCRIPTOR, _NUMBERED = "descriptor_", re.compile(r"descriptor_(0|[1-9]\d{0,4})")
-
-
-def read_prior_map(path: str | Path, sigma_m: float = 0.02, sigma_rad: float = 0.05) -> Landmarks:
-    """Return landmark positions to start from, for `--prior-map FILE`. Their frame becomes 'prior_map'.
-
-    Args:
-        path: CSV, Parquet or GeoJSON with `landmark_id, x_m, y_m` and optionally `sigma_m` or all of `cov_xx_m2,
-            cov_xy_m2, cov_yy_m2`, `class_id`, and the other columns of `map.parquet`; or a run or recording folder
-            that has such a file. In space with `z_m` and the columns that go with it. Or tags as TagSLAM
-            (`tagslam.yaml`, `survey`), WPILib (field layout in JSON) or fiducial_slam (`map.txt`) states them.
-        sigma_m: standard deviation of positions for which the file gives none.
-        sigma_rad: standard deviation of orientations in space for which the file gives none.
-
-    Raises:
-        InputError: the file is missing or malformed, or a standard deviation is not positive.
-        DataError: it holds no landmark.
-    """
-    if not (np.isfinite(sigma_m) and sigma_m > 0):
-        raise InputError(f"sigma of the prior map must be a positive number of metres, not {sigma_m}")
-    if not (np.isfinite(sigma_rad) and sigma_rad > 0):
-        raise InputError(f"sigma of its orientations must be a positive number of radians, not {sigma_rad}")
-    landmarks = read_landmarks(path, sigma_m=sigma_m, sigma_rad=sigma_rad)
-    if len(landmarks) == 0:
-        raise DataError("the map contains no landmark", path=path)
-    return replace(landmarks, frame="prior_map")
-
-
-def read_landmarks(path: str | Path, *, sigma_m: float = 0.0, sigma_rad: float = 0.0) -> Landmarks:
-    """Return a map in the frame that its file states ('truth' where it states none). Arguments as `read_prior_map`."""
-    path = _map_file(Path(path))
-    data = content_of(path)
-    ending = Path(path.name.lower().removesuffix(".gz")).suffix
-    warnings: list[str] = []
-    about: dict[str, Any] = {}
-    if ending == ".csv":
-        table = parse_csv(data, path, warnings)
-        if warnings:
-            # a session may do without its last reading, but a map without its last landmark is another map
-            raise InputError("the last line is unfinished", path=path, hint="complete or remove it")
-    elif ending in (".parquet", ".pq"):
-        table, about = parse_parquet(data, path), parquet_about(data, path)
-    elif ending in (".geojson", ".json"):
-        table, about = (tags_of_wpilib(data, path), _Z_UP) if is_wpilib(data) else parse_geojson(data, path)
-    elif ending in (".yaml", ".yml"):
-        table = tags_of_tagslam(data, path)
-    elif ending == ".txt":
-        table = tags_of_fiducials(data, path)
-    else:
-        hint = ".csv, .parquet, .geojson; of tags .yaml (TagSLAM), .json (WPILib), .txt (fiducial_slam)"
-        raise InputError(f"unknown map format '{ending}'", path=path, hint=hint)
-    landmarks = landmarks_from_table(
-        map_of_survey(table) if "tag_id" in table and "landmark_id" not in table else table,
-        sigma_m=sigma_m,
-        sigma_rad=sigma_rad,
-        class_names=tuple(about["class_names"]) if "class_names" in about else None,
-        frame=about.get("frame", "truth"),
-        clock=Clock(about.get("clock", Clock.RECORDING)),
-    )
-    return replace(landmarks, up=_up_of(about))
 
 
 def landmarks_from_table(
@@ -244,7 +182,7 @@ def up_dict(up: Up) -> dict[str, Any]:
     }
 
 
-def _up_of(about: Mapping[str, Any]) -> Up:
+def up_of(about: Mapping[str, Any]) -> Up:
     """Return what `up_dict` gave, of a checked description."""
     up = about.get("up")
     return Up(np.array(up["direction"], dtype=np.float64), float(up["sigma_rad"]), up["source"]) if up else Up()
@@ -378,7 +316,12 @@ def _pose_columns(table: Table, sigma_rad: float) -> dict[str, Any]:
     return found
 
 
-def _map_file(path: Path) -> Path:
+def find_map_file(path: Path) -> Path:
+    """Return the file of a map: itself, or that of a run or recording folder.
+
+    Raises:
+        InputError: there is none.
+    """
     if not path.exists():
         raise InputError("no such map", path=path, hint="check the path")
     if not path.is_dir():
@@ -393,7 +336,12 @@ _CORNERS = 36
 
 
 def write_map_geojson(landmarks: Landmarks, path: str | Path) -> Path:
-    """Write a map as GeoJSON: two features a landmark. Returns the path.
+    """Write a map as GeoJSON (`map_geojson`). Returns the path."""
+    return write_atomic(path, map_geojson(landmarks))
+
+
+def map_geojson(landmarks: Landmarks) -> str:
+    """Return a map as GeoJSON: two features a landmark.
 
     The first is a point with all columns of `map.parquet` as properties and `"kind": "landmark"`; the second, where the
     covariance is not zero, the polygon of its 2-sigma ellipse in x and y (Mahalanobis distance 2, 86.5 % of the
@@ -416,7 +364,7 @@ def write_map_geojson(landmarks: Landmarks, path: str | Path) -> Path:
     head = json.dumps({"type": "FeatureCollection", "crs": None, "evermap": about})[:-1]
     # one feature a line: maps stay readable and diff well
     body = ",\n".join(json.dumps(feature, allow_nan=False) for feature in features)
-    return write_atomic(path, f'{head}, "features": [\n{body}\n]}}\n')
+    return f'{head}, "features": [\n{body}\n]}}\n'
 
 
 def ellipse_polygons(center_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from evermap.io.rig_toml import Rig
 from evermap.io.rosbag import BAG_ENDINGS, METADATA, MOST_HAMMING, TagSightings, read_tag_bag, topics_of
 from evermap.io.spatial import of_rig, posed_odometry, sensor_rows, spatial_detections, true_poses, with_tag_poses
 from evermap.io.table import ENDINGS, Table, parse_table
-from evermap.io.tag_maps import map_of_survey, pose_of
+from evermap.io.tag_maps import map_of_survey, pose_of_tagslam
 from evermap.io.text import counted, is_number
 from evermap.io.yaml import parse_yaml
 from evermap.types import (
@@ -221,7 +221,9 @@ def _setup(files: FileSet) -> TagRig:
         sensor = SpatialSensor(
             name=name,
             mount_robot_sensor=tuple(
-                pose_of(_get(files, CAMERA_POSES, pose, "pose", name), files.path_of(CAMERA_POSES), name).tolist()
+                pose_of_tagslam(
+                    _get(files, CAMERA_POSES, pose, "pose", name), files.path_of(CAMERA_POSES), name
+                ).tolist()
             ),
             intrinsics=(fx, fy, cx, cy),
             distortion=distortion,
@@ -234,7 +236,8 @@ def _setup(files: FileSet) -> TagRig:
         raise InputError("lists no camera", path=files.path_of(CAMERAS))
     bodies = _bodies(files, content)
     mounted = next((body for body in bodies.values() if "T_body_odom" in body), {})
-    odometry = pose_of(mounted["T_body_odom"], files.path_of(SETTINGS), "T_body_odom") if mounted else se3.identity()
+    stated = mounted.get("T_body_odom")
+    odometry = pose_of_tagslam(stated, files.path_of(SETTINGS), "T_body_odom") if mounted else se3.identity()
     sizes, default = _sizes(files, bodies, content.get("default_body"))
     topic = next((str(body["odom_topic"]) for body in bodies.values() if "odom_topic" in body), "")
     rig = Rig(sensors=tuple(sensors), tag_size_m=default, tag_sizes=sizes)

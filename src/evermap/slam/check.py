@@ -36,7 +36,7 @@ from evermap.types import (
     is_in_space,
     rows_of,
 )
-from evermap.valid import WITHOUT_IDS, check_landmarks, validate
+from evermap.valid import WITHOUT_IDS, check_landmarks, strangers, validate
 
 DEFAULTS = SlamConfig()
 OUTSIDE = 0.05
@@ -396,6 +396,8 @@ def screened(
     else:
         recording = valid(recording, config.sensor, prior_map)
     remarks = odd(recording, settings)
+    if prior_map is not None and settings.unknown_ids is not True and (apart := strangers(prior_map, [recording])):
+        remarks = (*remarks, apart)
     if not is_in_space(recording):
         recording, told = with_bearings(recording, settings)
         remarks = (*remarks, *told)

@@ -32,6 +32,10 @@ from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 USUAL = LooksConfig()
 ROUNDS = 5
 """Of expectation and maximisation, at most."""
+USUAL_RANGE = 0.9
+"""Share of the detections within whose range a miss says something: data sheets promise more."""
+EXPECTED = 1.5
+"""Detections that one position must lead to expect, or its misses are chance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,3 +388,51 @@ def _empty_looks(
     )
     good = field.worth_a_look(rate)
     return views.frames[near][good], rate[good], views.stamp_s[near][good]
+
+
+def flanked_misses(
+    watch: Watch, floor_m: FloatArray, unseen: BoolArray, oriented: BoolArray, settings: LooksConfig = USUAL
+) -> tuple[BoolArray, FloatArray]:
+    """Return which looks at places that were never detected lie between detections of others, and (P,) how probable all
+    these misses are if something stands there.
+
+    A look between what is seen on both sides of it from nearby, at no less than a share of its range, is blocked by
+    something narrow only. From several positions that is improbable, unless the place is hidden from all.
+
+    Args:
+        watch: looks of a session.
+        floor_m: (P, 2) places.
+        unseen: (P,) whether a place was never detected.
+        oriented: (P,) whether the looks know to where it faces.
+        settings: what counts.
+    """
+    listed, eye = watch.listed, watch.eye
+    away = floor_m[listed.landmark] - eye[listed.pose, :2]
+    range_m, bearing = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
+    flanked = np.zeros(len(listed.pose), dtype=np.bool_)
+    reach_m = float(np.quantile(range_m[listed.hit], USUAL_RANGE)) if listed.hit.any() else 0.0
+    asked = np.flatnonzero(unseen[listed.landmark] & (range_m <= reach_m))
+    half = np.floor(2.0 * eye[:, :2] / settings.elsewhere_m).astype(np.int64)
+    hits = np.unique(np.column_stack([half[listed.pose[listed.hit]], listed.landmark[listed.hit]]), axis=0)
+    for cell in np.unique(half[listed.pose[asked]], axis=0):
+        looks = asked[(half[listed.pose[asked]] == cell).all(axis=1)]
+        seen = np.unique(hits[(np.abs(hits[:, :2] - cell) <= 1).all(axis=1), 2])
+        ahead = floor_m[seen][None] - eye[listed.pose[looks], :2][:, None]
+        turn = se2.wrap(np.arctan2(ahead[..., 1], ahead[..., 0]) - bearing[looks][:, None])
+        near = np.hypot(ahead[..., 0], ahead[..., 1]) < settings.flank_share * range_m[looks][:, None]
+        beside = ~near & (np.abs(turn) < settings.flank_rad)
+        flanked[looks] = (beside & (turn > 0.0)).any(axis=1) & (beside & (turn < 0.0)).any(axis=1)
+    p_missed = np.ones(len(floor_m))
+    for place in np.unique(listed.landmark[flanked]).tolist():
+        rows = np.flatnonzero(flanked & (listed.landmark == place))
+        around = np.sort(bearing[rows])
+        gap = np.diff(np.append(around, around[0] + 2.0 * np.pi)).max()
+        if not oriented[place] and 2.0 * np.pi - gap < settings.one_sided_rad:
+            continue  # it may be seen from another side only
+        position = np.floor(eye[listed.pose[rows], :2] / settings.elsewhere_m)
+        cell = np.unique(position, axis=0, return_inverse=True)[1].ravel()
+        expected = np.bincount(cell, listed.p_detect[rows])
+        log_missed = np.bincount(cell, np.log1p(-np.minimum(listed.p_detect[rows], 0.99)))[expected >= EXPECTED]
+        each = settings.p_flanked_hidden + (1.0 - settings.p_flanked_hidden) * np.exp(log_missed)
+        p_missed[place] = max(float(np.prod(each)), settings.p_always_hidden)
+    return flanked, p_missed

@@ -16,7 +16,15 @@ from evermap.maps.living import EXISTS, LivingMap, Places, Stays
 from evermap.maps.sessions import believe, decide
 from evermap.maps.sessions.believe import Believed, arrived, departed
 from evermap.maps.sessions.extend import Extended, Found, extended
-from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Sighting, Watch, arrivals, looked_at
+from evermap.maps.sessions.looks import (
+    Arrivals,
+    PlaceLooks,
+    Sighting,
+    Watch,
+    arrivals,
+    flanked_misses,
+    looked_at,
+)
 from evermap.maps.sessions.placing import ANYWAY, Laid, Localised
 from evermap.maps.sessions.planar import PlanarVisit
 from evermap.maps.sessions.spatial import SpatialVisit, solve_visit
@@ -435,6 +443,53 @@ def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult
     p_exists = judged_now.p_exists[row] if config.existence else mapped.p_exists
     mapped = replace(mapped, p_exists=p_exists, n_misses=judged_now.n_misses[row])
     return replace(slam, landmarks=mapped, misses=missed(living, now.sites.p_here, seen, visit))
+
+
+def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingConfig) -> SlamResult:
+    """Return the result of a recording in a given map with the entries of that which were never detected: the looks
+    that missed them, and among `gone` those that are not believed to be there.
+
+    What was detected is where the result has it; the beliefs about it stay as they are.
+    """
+    found = slam.landmarks
+    unseen = given[~np.isin(given.landmark_id, found.landmark_id)]
+    if slam.trajectory.frame != "prior_map" or not len(unseen) or found.position_m.shape != (
+        len(found), given.position_m.shape[1]
+    ):  # fmt: skip
+        return slam
+    names = np.concatenate([found.landmark_id, unseen.landmark_id])
+    position = np.concatenate([found.position_m, unseen.position_m])
+    both = Landmarks.at(names, position[:, :2], class_id=np.full(len(names), UNKNOWN))
+    order = np.argsort(names, kind="stable")
+    rotation = None
+    if position.shape[1] == 3:
+        none_m = [np.full((len(some), 4), np.nan) for some in (found, unseen)]
+        turns = [none_m[k] if some.rotation is None else some.rotation for k, some in enumerate((found, unseen))]
+        rotation = np.concatenate(turns)[order]
+    small = np.broadcast_to(1e-6 * np.eye(position.shape[1]), (len(names), *2 * (position.shape[1],)))
+    both = replace(both, position_m=position[order], covariance_m2=small.copy(), rotation=rotation)
+    if rotation is not None:
+        both = replace(both, rotation_covariance=np.broadcast_to(1e-6 * np.eye(3), (len(names), 3, 3)).copy())
+    living = replace(LivingMap.begun(both), clock=visit.recording.clock).from_now_on(visit.span_s[0])
+    none = np.zeros(len(living.sites), dtype=np.bool_)
+    site = living.sites.site_id[np.searchsorted(both.landmark_id, found.landmark_id)]
+    place = living.place_row(found.landmark_id, site)
+    entry = Extended(living, living, found.landmark_id, place, living.sites.p_here, none)
+    watch = visit.watched(entry, config)
+    names, floor_m = living.places.landmark_id, np.ascontiguousarray(living.places.position_m[:, :2])
+    asked = np.isin(names, unseen.landmark_id)
+    oriented = np.zeros(len(names), dtype=np.bool_) if rotation is None else np.isfinite(living.places.rotation[:, 0])
+    flanked, p_missed = flanked_misses(watch, floor_m, asked, oriented, config.looks)
+    row = np.searchsorted(names, unseen.landmark_id)  # one place each, in the order of their names
+    p_gone = config.looks.p_gone
+    p_exists = p_missed[row] * (1.0 - p_gone) / (p_missed[row] * (1.0 - p_gone) + p_gone)
+    pose, which = watch.listed.pose[flanked], watch.listed.landmark[flanked]
+    frame = np.searchsorted(visit.recording.frames.stamp_s, watch.stamp_s[pose])
+    every = slam.misses.joined(Misses(frame.astype(np.int64), names[which], watch.listed.p_detect[flanked]))
+    every = rows_of(every, np.lexsort((every.landmark_id, every.frame)))
+    unseen = replace(unseen, p_exists=p_exists, n_misses=np.bincount(which, minlength=len(names))[row])
+    gone = replace(unseen[p_exists < EXISTS], frame=found.frame)
+    return replace(slam, misses=every, gone=gone if len(gone) else slam.gone)
 
 
 def judged_so_far(
