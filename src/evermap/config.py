@@ -472,6 +472,7 @@ class AssociationConfig(Section):
     fewest_displaced: Count = key(4, "landmarks from which a stretch is displaced as a whole")
     least_seen: Share = key(1.0 / 3.0, "sightings below this share of the usual number are of no landmark")
     doubtful_share: Probability = key(0.008, "share of ambiguous detections from which particles are drawn")
+    p_closed: Probability = key(1e-4, "chance of so bent an odometry, if all closed loops are right, below which, too")
     constellation: ConstellationConfig = part(ConstellationConfig, "aligned maps")
     readings: ReadingsConfig = part(ReadingsConfig, "columns of detections")
     particles: ParticlesConfig = part(ParticlesConfig, "drawn histories")

@@ -110,7 +110,8 @@ def associated(
     def found(traits: Traits | None) -> _Found:
         first = PlanarAssociator(problem, noise, kind, traits=traits, settings=settings)
         assignment = finished(first)
-        if first.doubtful > settings.association.doubtful_share:
+        rules = settings.association
+        if first.doubtful > rules.doubtful_share or first.closures(assignment).p_by_chance < rules.p_closed:
             again = functools.partial(PlanarAssociator, problem, noise, kind, traits=traits, settings=settings)
             assignment = searched(first, assignment, lambda odometry: finished(again(odometry=odometry)))
         return first, assignment

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import gammaincc
 
 from evermap.config import AssociationConfig, SlamConfig
 from evermap.estimate.sparse.system import exhausted
@@ -111,6 +113,23 @@ class PlanarSolution:
         return landmark_density(now.estimate.landmark, now.sightings, now.settings)
 
 
+class Closures(NamedTuple):
+    """What it costs that landmarks which were seen again, after `slam.association.forget_s`, are the same.
+
+    Attributes:
+        count: visits of landmarks that had been visited before.
+        nats: rise of the cost of the optimum by them; of each one on average, if all are right.
+    """
+
+    count: int
+    nats: float
+
+    @property
+    def p_by_chance(self) -> float:
+        """Probability of such a rise if all are right: each is half the square of two standard normal numbers."""
+        return float(gammaincc(self.count, max(self.nats, 0.0))) if self.count else 1.0
+
+
 class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalFilter]):
     """The associator in the plane.
 
@@ -183,12 +202,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalF
         if not len(_twice(now)):
             return
         begun = replace(now, estimate=replace(now.estimate, pose=pose()))
-        row, points = begun.in_visits(), begun.points()
-        seen = row >= 0
-        each = np.bincount(row[seen])
-        place: FloatArray = np.column_stack([np.bincount(row[seen], x) / each for x in points[seen].T])
-        begun = replace(begun, landmark_row=row, estimate=replace(begun.estimate, landmark=place))
-        again, first = self._solved(begun), 0
+        again, first = self._solved(begun.split_visits()), 0
         while (later := again.assignment.n_landmarks - first) > 0:
             again = self._merged(again, within=(first, later - RECENT))
             first = again.assignment.n_landmarks - (later - RECENT)
@@ -214,6 +228,12 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalF
         if not self._is_finished:
             self._is_finished, self.worth = True, correlated(solved.assignment)
         return without_ghosts(self._attached(solved).assignment)
+
+    def closures(self, found: Assignment) -> Closures:
+        """Return what the loops cost that an association closes; `found` as `finish` returns it."""
+        solved = self._judged(found)
+        apart = self._solved(solved.assignment.split_visits())
+        return Closures(apart.n_landmarks - solved.n_landmarks, solved.cost - apart.cost)
 
     def learned_odometry(self, assignment: Assignment) -> FloatArray:
         """Return (5,) noise levels of the odometry by restricted likelihood, given all associations.
