@@ -473,6 +473,8 @@ class AssociationConfig(Section):
     least_seen: Share = key(1.0 / 3.0, "sightings below this share of the usual number are of no landmark")
     doubtful_share: Probability = key(0.008, "share of ambiguous detections from which particles are drawn")
     p_closed: Probability = key(1e-4, "chance of so bent an odometry, if all closed loops are right, below which, too")
+    bent_nats: Positive = key(3.0, "... and nats for each landmark met again above which it is told; 1 is right")
+    dropped_share: Share = key(0.4, "share of detections of no landmark above which it is told")
     constellation: ConstellationConfig = part(ConstellationConfig, "aligned maps")
     readings: ReadingsConfig = part(ReadingsConfig, "columns of detections")
     particles: ParticlesConfig = part(ParticlesConfig, "drawn histories")

@@ -114,7 +114,9 @@ def orchard(seed: int, kind: Orchard = KINDS["plain"]) -> Recording:
     if kind.radius_m:
         radius = np.append(np.resize(kind.radius_m, len(tree)), np.mean(kind.radius_m))[which]
         features = radius[:, None] + rng.normal(0.0, 0.015, (len(of), 1))
-    detections = Detections(of, which, *reading.T, none + UNKNOWN, unknown, unknown, none, features, ("radius_m",) * bool(kind.radius_m))
+    detections = Detections(
+        of, which, *reading.T, none + UNKNOWN, unknown, unknown, none, features, ("radius_m",) * bool(kind.radius_m)
+    )
     return Recording(
         name=f"orchard, seed {seed}",
         odometry=odometry,
