@@ -863,7 +863,7 @@ class AssociationEvidence(Shown):
         n_closures: visits of landmarks that had been visited before; -1 where it was not asked.
         closure_nats: by how much these raise the negative log likelihood of the optimum: by one each, on average, if
             all are right.
-        lead_nats: log evidence over odometry alone, where no landmark is met again; negative if that was taken.
+        lead_nats: log evidence over odometry alone, where no landmark is met again; negative if that explains more.
     """
 
     dropped: float

@@ -21,7 +21,7 @@ from evermap.types import (
 )
 
 LONG_M, REACH_M = 40.0, 6.0
-SIGMA, SIGMA_TREE_M = (0.03, 0.01), 0.05
+SIGMA = 0.03, 0.01
 SPEED_MPS, ODOMETRY_S, PER_FRAME = 0.7, 0.1, 5
 TURN_RADPS, HALF_TURN_RAD, ROUND_RAD = 0.5, 3.1, np.pi
 
@@ -32,6 +32,7 @@ class Orchard:
 
     Attributes:
         apart_m: from a tree to the next in its row; rows are at `row_m`.
+        sigma_tree_m: of the places of trees; 0 for a perfect lattice.
         ahead_rad: half the field of view.
         p_seen: probability of a tree in view to be detected.
         no_third: whether every third detection is lost.
@@ -40,11 +41,12 @@ class Orchard:
         turn_mps: speed in a turn.
         laps: of a loop around the row in the middle; 0 for one lane and back in the next one, then away.
         radius_m: of the trunks, in turn; none if they are not measured.
-        until_s: end, if there is no loop.
+        start_m: where the robot begins in its lane; until_s: when it ends, if there is no loop.
     """
 
     apart_m: float = 2.0
     row_m: tuple[float, ...] = (-2.0, 2.0, 6.0)
+    sigma_tree_m: float = 0.05
     ahead_rad: float = 1.22
     p_seen: float = 0.9
     no_third: bool = False
@@ -55,6 +57,7 @@ class Orchard:
     turn_mps: float = SPEED_MPS
     laps: int = 0
     radius_m: tuple[float, ...] = ()
+    start_m: float = 0.0
     until_s: float = 240.0
 
 
@@ -79,10 +82,10 @@ def orchard(seed: int, kind: Orchard = KINDS["plain"]) -> Recording:
     """A laser goes down a lane between two rows of trees, comes back along the third, and leaves; or goes round."""
     rng = np.random.default_rng([seed, 60])
     along, row = np.meshgrid(np.arange(kind.apart_m, LONG_M + kind.apart_m / 2.0, kind.apart_m), kind.row_m)
-    tree = np.column_stack([along.ravel(), row.ravel()]) + rng.normal(0.0, SIGMA_TREE_M, (along.size, 2))
+    tree = np.column_stack([along.ravel(), row.ravel()]) + rng.normal(0.0, kind.sigma_tree_m, (along.size, 2))
     step = _steps(kind)
     stamp_s = np.arange(len(step)) * ODOMETRY_S
-    pose = [np.zeros(3)]
+    pose = [np.array([kind.start_m, 0.0, 0.0])]
     for one in step[:-1]:
         pose.append(se2.compose(pose[-1], se2.exp(one * ODOMETRY_S)))
     frame = np.arange(0, len(stamp_s), PER_FRAME)

@@ -42,7 +42,7 @@ class Identified(NamedTuple):
 def describe_doubts(evidence: AssociationEvidence, settings: AssociationConfig) -> tuple[str, ...]:
     """Return what makes an association doubtful, one line each."""
     found = []
-    if evidence.lead_nats < 0.0:
+    if evidence.lead_nats < -settings.landmark_nats:
         found.append(
             f"no loop is closed: odometry alone, with {evidence.n_alone} landmarks, explains the detections without "
             f"identity better, by {-evidence.lead_nats:.0f} nats"

@@ -159,7 +159,7 @@ def weighed_against_odometry(
     alone = without_ghosts(associator.led_by_odometry())
     lead_nats = associator.against(alone) - associator.against(assignment) if alone.n_landmarks else math.nan
     closures = associator.closures(assignment)
-    if lead_nats < 0.0:
+    if lead_nats < -assignment.settings.association.landmark_nats:  # without loops both are the same but for rounding
         assignment = alone
     dropped = float(np.mean(assignment.landmark_row == NOBODY))
     facts = dropped, assignment.n_landmarks, alone.n_landmarks, closures.count, closures.nats, lead_nats
