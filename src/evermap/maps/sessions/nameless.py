@@ -148,11 +148,12 @@ def identify_in(recording: AnyRecording, prior_map: Landmarks, config: Config) -
         DataError: as of `named_in`.
     """
     living = replace(LivingMap.begun(prior_map, config.living.whole_places), clock=recording.clock)
-    given = without_ids(recording, config)
-    of_map, living = admitted(given, living.from_now_on(float(recording.frames.stamp_s[0])))
+    given = without_ids(recording, config)  # type: ignore[type-var]
+    now = living.from_now_on(float(recording.frames.stamp_s[0]))
+    of_map, living = admitted(given, now)  # type: ignore[type-var]
     found, name, landmark_id = _met(of_map, living, config)
-    taken = np.concatenate([prior_map.landmark_id, given.detections.landmark_id])
-    return Identified(with_ids(given, found.landmark_row, name, numbered(landmark_id, taken)), found.evidence)
+    ids = numbered(landmark_id, np.concatenate([prior_map.landmark_id, given.detections.landmark_id]))
+    return Identified(with_ids(given, found.landmark_row, name, ids), found.evidence)  # type: ignore[type-var]
 
 
 def _met(recording: AnyRecording, living: LivingMap, config: Config) -> tuple[Associated, IntArray, IntArray]:

@@ -162,7 +162,7 @@ def weighed_against_odometry(
     if lead_nats < -assignment.settings.association.landmark_nats:  # without loops both are the same but for rounding
         assignment = alone
     dropped = float(np.mean(assignment.landmark_row == NOBODY))
-    facts = dropped, assignment.n_landmarks, alone.n_landmarks, closures.count, closures.nats, lead_nats
+    facts = dropped, assignment.n_landmarks, alone.n_landmarks, closures.visits, closures.nats, lead_nats
     return assignment, AssociationEvidence(*facts)
 
 

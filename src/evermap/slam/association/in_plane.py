@@ -120,17 +120,17 @@ class Closures(NamedTuple):
     """What it costs that landmarks which were seen again, after `slam.association.forget_s`, are the same.
 
     Attributes:
-        count: visits of landmarks that had been visited before.
+        visits: visits of landmarks that had been visited before.
         nats: rise of the cost of the optimum by them; of each one on average, if all are right.
     """
 
-    count: int
+    visits: int
     nats: float
 
     @property
     def p_by_chance(self) -> float:
         """Probability of such a rise if all are right: each is half the square of two standard normal numbers."""
-        return float(gammaincc(self.count, max(self.nats, 0.0))) if self.count else 1.0
+        return float(gammaincc(self.visits, max(self.nats, 0.0))) if self.visits else 1.0
 
 
 class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalFilter]):
