@@ -54,13 +54,15 @@ def run_slam(
     recording, remarks = check.screened(recording, config, prior_map)
     remarks = (*told, *remarks)
     if config.slam.unknown_ids and prior_map is not None:
-        recording = nameless.numbered_in(recording, prior_map, config)  # type: ignore[type-var]
+        recording, evidence = nameless.identify_in(recording, prior_map, config)
     else:
-        recording = association.with_identities(recording, config.slam)
+        recording, evidence = association.identify_landmarks(recording, config.slam)
+    if evidence is not None:
+        remarks = (*remarks, *association.describe_doubts(evidence, config.slam.association))
     if has_traffic(recording):
         return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
     visit = session.solved(recording, config, prior_map, remarks, realtime=realtime, progress=progress)
-    result = session.existing(visit, visit.concluded(), config.living)
+    result = replace(session.existing(visit, visit.concluded(), config.living), association=evidence)
     if prior_map is None:
         return result
     return with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)

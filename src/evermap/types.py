@@ -852,6 +852,33 @@ class Innovations(_Columns):
     dof: IntArray | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class AssociationEvidence(Shown):
+    """What speaks for the landmarks that detections without identities were given; it needs no truth.
+
+    Attributes:
+        dropped: share of the detections that are of no landmark.
+        n_landmarks: landmarks that were kept.
+        n_alone: landmarks by odometry alone, each visit counted; -1 where it was not asked, as in space.
+        n_closures: visits of landmarks that had been visited before; -1 where it was not asked.
+        closure_nats: by how much these raise the negative log likelihood of the optimum: by one each, on average, if
+            all are right.
+        lead_nats: log evidence over odometry alone, where no landmark is met again; negative if that explains more.
+    """
+
+    dropped: float
+    n_landmarks: int
+    n_alone: int = -1
+    n_closures: int = -1
+    closure_nats: float = math.nan
+    lead_nats: float = math.nan
+
+    @property
+    def nats_per_closure(self) -> float:
+        """Return the rise of the negative log likelihood by each landmark that was met again; nan if none was."""
+        return self.closure_nats / self.n_closures if self.n_closures > 0 else math.nan
+
+
 class ChangeKind(StrEnum):
     """Kind of a change of a group of landmarks."""
 
@@ -1028,6 +1055,7 @@ class SlamResult(Shown):
             followed.
         causes: what other than changes of landmarks the recording was found to have.
         verdict: how far all this can be trusted; None where nobody asked.
+        association: what speaks for the identities that were found; None where they were given.
     """
 
     trajectory: Trajectory
@@ -1046,6 +1074,7 @@ class SlamResult(Shown):
     followed: Any = None
     causes: tuple[Cause, ...] = ()
     verdict: Verdict | None = None
+    association: AssociationEvidence | None = None
 
     @property
     def undecided(self) -> tuple[Undecided, ...]:

@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 from bits import bits
 from identity_scores import identity_scores
-from orchards import orchard
+from orchards import CASE, KINDS, Orchard, orchard
 from problems import World, make_world
 from recordings import building
 
 from evermap.config import Config, SlamConfig
 from evermap.geometry import se2
 from evermap.maps.sessions.nameless import numbered_in
+from evermap.metrics.summary import compare_with_truth
+from evermap.pipeline import run_slam
 from evermap.slam import linearise, preintegration
-from evermap.slam.association import in_plane, in_space, with_identities
+from evermap.slam.association import describe_doubts, identify_landmarks, in_plane, in_space, with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator
 from evermap.slam.association.features import Traits
@@ -39,7 +41,7 @@ from evermap.slam.association.revise import (
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
-from evermap.types import UNKNOWN, Landmarks
+from evermap.types import UNKNOWN, AssociationEvidence, Landmarks
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
 NAMELESS = SlamConfig(unknown_ids=True)
@@ -241,6 +243,65 @@ def test_trees_in_rows_are_kept(seed: int) -> None:
     assert (scores.n_landmarks, scores.n_identities) == (60, 60)
     assert scores.purity > 0.99
     assert scores.completeness > 0.98
+
+
+def check_orchard(kind: Orchard, seed: int, most_m: float) -> None:
+    """The trees are kept, and the evidence for them is what is measured."""
+    recording = orchard(seed, kind)
+    result = run_slam(recording, Config(slam=NAMELESS))
+    poses = compare_with_truth(recording, result).poses
+    true = np.unique(recording.detections.landmark_id[recording.detections.landmark_id != UNKNOWN])
+    assert poses is not None
+    assert poses.rmse_m < most_m
+    assert abs(len(result.landmarks) - len(true)) <= 1
+    evidence = result.association
+    assert evidence is not None
+    assert evidence.dropped == pytest.approx(np.mean(recording.detections.landmark_id == UNKNOWN), abs=0.01)
+    assert evidence.n_closures > 0
+    assert evidence.nats_per_closure < 1.5
+    assert evidence.lead_nats > 50.0
+    assert describe_doubts(evidence, NAMELESS.association) == ()
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("false", 2), ("false", 11), ("narrow", 18)])
+def test_trees_are_kept_where_the_first_pass_goes_wrong(kind: str, seed: int) -> None:
+    """It took a row for the next one, or closed no loop: what odometry alone leads to explains more."""
+    check_orchard(KINDS[kind], seed, 0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_twenty_orchards_are_right(seed: int) -> None:
+    check_orchard(CASE, seed, 0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_twenty_orchards_with_false_detections_are_right(seed: int) -> None:
+    check_orchard(KINDS["false"], seed, 0.05)
+
+
+def test_rows_taken_for_the_next_bend_the_odometry() -> None:
+    assert identify_landmarks(orchard(0, CASE), SlamConfig()).evidence is None  # they were given
+    bent = AssociationEvidence(0.5, 48, 78, 34, 129.0, -200.0)
+    alone, closed, dropped = describe_doubts(bent, NAMELESS.association)
+    assert "78 landmarks" in alone
+    assert "by 3.8 nats each" in closed
+    assert "50%" in dropped
+
+
+@pytest.mark.parametrize("sigma_tree_m", [0.0, 0.02])
+def test_a_lattice_that_fits_shifted_by_one_tree_is_refused(sigma_tree_m: float) -> None:
+    """In the middle of a row nothing says which tree is which: the result is in its own frame, and says so."""
+    recording = orchard(0, replace(CASE, start_m=10.0, until_s=25.0, sigma_tree_m=sigma_tree_m))
+    trees = recording.true_landmarks
+    assert trees is not None
+    survey = Landmarks.at(trees.landmark_id, trees.position_m, sigma_m=0.02)
+    result = run_slam(recording, Config(slam=NAMELESS), prior_map=survey)
+    assert result.trajectory.frame == "first_pose"
+    assert not result.changes
+    assert any("cannot localise in the prior map" in warning for warning in result.warnings)
+    assert not any("no loop is closed" in warning for warning in result.warnings)
 
 
 def test_a_detection_of_nothing_is_nobodys() -> None:

@@ -12,10 +12,10 @@ from space.corridors import tagged_corridor
 
 from evermap.config import AssociationConfig, Config, Section, SlamConfig
 from evermap.maps.sessions.nameless import numbered_in
-from evermap.slam.association import with_identities
+from evermap.slam.association import describe_doubts, with_identities
 from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.place_index import PlaceIndex
-from evermap.types import UNKNOWN
+from evermap.types import UNKNOWN, AssociationEvidence
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
 
@@ -51,6 +51,7 @@ def test_every_key_is_read_from_the_settings_of_the_caller() -> None:
     mixed = replace(seen, landmark_id=some, features=radius[:, None], feature_names=("radius_m",))
     settings: Any = Watched(SlamConfig(unknown_ids="empty"), read)
     with_identities(replace(park, detections=mixed), settings)
+    describe_doubts(AssociationEvidence(0.5, 1, 1, 1, 10.0, 0.0), settings.association)
     settings = Watched(SlamConfig(unknown_ids=True), read)
     config: Any = SimpleNamespace(slam=settings, living=Config().living)
     assert park.true_landmarks is not None

@@ -32,7 +32,7 @@ from evermap.maps.sessions.box_search import TESTED_M2, windows
 from evermap.maps.sessions.gaussian import drifted
 from evermap.maps.sessions.placing import SMALLEST_P, one_to_one
 from evermap.maps.sessions.session import admitted
-from evermap.slam.association import associate
+from evermap.slam.association import Identified, associate
 from evermap.slam.association.assignment import alike, visits_of, with_ids
 from evermap.slam.association.consensus import Candidates, consensus
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
@@ -132,6 +132,11 @@ def named_in(recording: AnyRecordingT, living: LivingMap, config: Config) -> Any
 
 
 def numbered_in(recording: AnyRecordingT, prior_map: Landmarks, config: Config) -> AnyRecordingT:
+    """Return the recording of `identify_in`."""
+    return identify_in(recording, prior_map, config).recording  # type: ignore[return-value]
+
+
+def identify_in(recording: AnyRecording, prior_map: Landmarks, config: Config) -> Identified:
     """Return a recording with landmark ids by geometry: those of a fixed map, and numbers for new landmarks.
 
     Args:
@@ -143,11 +148,12 @@ def numbered_in(recording: AnyRecordingT, prior_map: Landmarks, config: Config) 
         DataError: as of `named_in`.
     """
     living = replace(LivingMap.begun(prior_map, config.living.whole_places), clock=recording.clock)
-    given = without_ids(recording, config)
-    of_map, living = admitted(given, living.from_now_on(float(recording.frames.stamp_s[0])))
+    given = without_ids(recording, config)  # type: ignore[type-var]
+    now = living.from_now_on(float(recording.frames.stamp_s[0]))
+    of_map, living = admitted(given, now)  # type: ignore[type-var]
     found, name, landmark_id = _met(of_map, living, config)
-    taken = np.concatenate([prior_map.landmark_id, given.detections.landmark_id])
-    return with_ids(given, found.landmark_row, name, numbered(landmark_id, taken))
+    ids = numbered(landmark_id, np.concatenate([prior_map.landmark_id, given.detections.landmark_id]))
+    return Identified(with_ids(given, found.landmark_row, name, ids), found.evidence)  # type: ignore[type-var]
 
 
 def _met(recording: AnyRecording, living: LivingMap, config: Config) -> tuple[Associated, IntArray, IntArray]:

@@ -339,6 +339,14 @@ class Assignment:
         found[seen] = np.argsort(np.argsort(first))[rank]  # by first detection
         return found
 
+    def split_visits(self) -> Assignment:
+        """Return the assignment with a landmark per visit, in the middle of its detections; see `in_visits`."""
+        row, points = self.in_visits(), self.points()
+        seen = row >= 0
+        each = np.bincount(row[seen])
+        place: FloatArray = np.column_stack([np.bincount(row[seen], x) / each for x in points[seen].T])
+        return replace(self, landmark_row=row, estimate=replace(self.estimate, landmark=place))
+
     def _renumbered(self, rank: IntArray, kept: BoolArray) -> Assignment:
         row = np.full_like(self.landmark_row, NOBODY)
         seen = self.landmark_row >= 0

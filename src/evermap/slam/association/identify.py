@@ -6,6 +6,7 @@ The landmark of a detection may depend on detections minutes later; the estimato
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from evermap.slam.association.assignment import NOBODY, Assignment, LooseDetecti
 from evermap.slam.association.associator import with_traits
 from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.features import Traits
-from evermap.slam.association.in_plane import PlanarAssociator
+from evermap.slam.association.in_plane import PlanarAssociator, without_ghosts
 from evermap.slam.association.particles import drawn
 from evermap.slam.batch import USUAL, Batch
 from evermap.slam.calibration import CalibrationPrior
@@ -30,7 +31,7 @@ from evermap.slam.method import Static
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import StreamingSlam
-from evermap.types import UNKNOWN, FloatArray, IntArray, Recording
+from evermap.types import UNKNOWN, AssociationEvidence, FloatArray, IntArray, Recording
 
 _Found: TypeAlias = tuple[PlanarAssociator, Assignment]
 
@@ -40,6 +41,9 @@ RUNS, MOST_ROUNDS, MOST_IN_VAIN = 4, 6, 2
 """Draws per round, maximum number of rounds, and of rounds in a row without gain: bound the work."""
 SETTLED = 120
 """Maximum number of landmarks of all draws that are solved per round, or one draw: as long as the draws take."""
+MOST_LED = 120
+"""Number of landmarks up to which the search begins from odometry alone, too; above, where loops bend it: bounds the
+work, which grows with all visits."""
 LITTLE = 200.0
 """Gain per detection below which the search ends, as a fraction 1/`LITTLE` of the cost of an outlier: a tolerance."""
 
@@ -57,6 +61,7 @@ class Associated:
         loose: detections of no landmark, without a name.
         settings: of the estimator.
         locate: returns `in_metres`.
+        evidence: what speaks for it.
     """
 
     landmark_row: IntArray
@@ -66,6 +71,7 @@ class Associated:
     loose: LooseDetections
     settings: SlamConfig
     locate: Callable[[], LocalMap]
+    evidence: AssociationEvidence
 
     @property
     def names(self) -> IntArray:
@@ -110,7 +116,11 @@ def associated(
     def found(traits: Traits | None) -> _Found:
         first = PlanarAssociator(problem, noise, kind, traits=traits, settings=settings)
         assignment = finished(first)
-        if first.doubtful > settings.association.doubtful_share:
+        rules, is_bent = settings.association, _is_bent(first, assignment)
+        if is_bent or assignment.n_landmarks <= MOST_LED:
+            assignment = _best_of(first, assignment, first.led_by_odometry())
+            is_bent = is_bent and _is_bent(first, assignment)
+        if is_bent or first.doubtful > rules.doubtful_share:
             again = functools.partial(PlanarAssociator, problem, noise, kind, traits=traits, settings=settings)
             assignment = searched(first, assignment, lambda odometry: finished(again(odometry=odometry)))
         return first, assignment
@@ -119,6 +129,7 @@ def associated(
     if given.features is not None:
         best = with_traits(best, given.features[prepared.used], settings, found)
     associator, assignment = best
+    assignment, evidence = weighed_against_odometry(associator, assignment)
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
     scale = prior.split_scale(assignment.estimate.states, np.eye(N_STATES))[2]
@@ -126,7 +137,33 @@ def associated(
     at, wide = assignment.points()[some] * scale, assignment.wide_m[some]
     loose = LooseDetections(prepared.used[some], at, wide, kind[some, 0])
     locate = functools.partial(_in_metres, assignment, associator.noise, prior)
-    return Associated(row, name, assignment.of_kind, assignment.together, loose, settings, locate)
+    return Associated(row, name, assignment.of_kind, assignment.together, loose, settings, locate, evidence)
+
+
+def _is_bent(associator: PlanarAssociator, assignment: Assignment) -> bool:
+    """Whether the loops that an association closes bend the odometry more than right ones would."""
+    return associator.closures(assignment).p_by_chance < assignment.settings.association.p_closed
+
+
+def _best_of(associator: PlanarAssociator, assignment: Assignment, start: Assignment) -> Assignment:
+    """The better one of an association and what another start leads to."""
+    cost = associator.against(assignment)
+    trial = associator.finish(start, goal=cost)
+    return trial if associator.against(trial) < cost else assignment
+
+
+def weighed_against_odometry(
+    associator: PlanarAssociator, assignment: Assignment
+) -> tuple[Assignment, AssociationEvidence]:
+    """Return an association, or that by odometry alone if it explains the detections better; and what speaks for it."""
+    alone = without_ghosts(associator.led_by_odometry())
+    lead_nats = associator.against(alone) - associator.against(assignment) if alone.n_landmarks else math.nan
+    closures = associator.closures(assignment)
+    if lead_nats < -assignment.settings.association.landmark_nats:  # without loops both are the same but for rounding
+        assignment = alone
+    dropped = float(np.mean(assignment.landmark_row == NOBODY))
+    facts = dropped, assignment.n_landmarks, alone.n_landmarks, closures.visits, closures.nats, lead_nats
+    return assignment, AssociationEvidence(*facts)
 
 
 def _in_metres(assignment: Assignment, noise: Noise, prior: CalibrationPrior) -> LocalMap:

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import gammaincc
 
 from evermap.config import AssociationConfig, SlamConfig
 from evermap.estimate.sparse.system import exhausted
@@ -36,6 +38,7 @@ from evermap.slam.association.merging import (
 from evermap.slam.association.revise import likely_real, reassigned, unseen_nats, with_overlooked
 from evermap.slam.association.wrong_associations import displaced_stretches, laid, weighed_visits
 from evermap.slam.batch import USUAL, sighted_at
+from evermap.slam.bridge import dead_reckoned
 from evermap.slam.filter_kernels import BY_PLACE, GATED, WIDTH, spread_of_frame
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.local_filter import LocalFilter, Motion
@@ -60,6 +63,8 @@ SPLIT_ROUNDS = 5
 """Maximum number of rounds of splitting."""
 NOISE_ROUNDS = 6
 """Rounds of learning the odometry noise; extrapolated, they converge within these."""
+ALONE_ROUNDS = 2
+"""Times that detections are compared with the landmarks by odometry alone: the second finds next to nothing more."""
 SAME_NATS = 0.5
 """Least fall of the cost for as many landmarks: the tolerance of the optimum."""
 
@@ -109,6 +114,23 @@ class PlanarSolution:
         """Density of the landmarks [1/m^2]."""
         now = self.assignment
         return landmark_density(now.estimate.landmark, now.sightings, now.settings)
+
+
+class Closures(NamedTuple):
+    """What it costs that landmarks which were seen again, after `slam.association.forget_s`, are the same.
+
+    Attributes:
+        visits: visits of landmarks that had been visited before.
+        nats: rise of the cost of the optimum by them; of each one on average, if all are right.
+    """
+
+    visits: int
+    nats: float
+
+    @property
+    def p_by_chance(self) -> float:
+        """Probability of such a rise if all are right: each is half the square of two standard normal numbers."""
+        return float(gammaincc(self.visits, max(self.nats, 0.0))) if self.visits else 1.0
 
 
 class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalFilter]):
@@ -183,12 +205,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalF
         if not len(_twice(now)):
             return
         begun = replace(now, estimate=replace(now.estimate, pose=pose()))
-        row, points = begun.in_visits(), begun.points()
-        seen = row >= 0
-        each = np.bincount(row[seen])
-        place: FloatArray = np.column_stack([np.bincount(row[seen], x) / each for x in points[seen].T])
-        begun = replace(begun, landmark_row=row, estimate=replace(begun.estimate, landmark=place))
-        again, first = self._solved(begun), 0
+        again, first = self._solved(begun.split_visits()), 0
         while (later := again.assignment.n_landmarks - first) > 0:
             again = self._merged(again, within=(first, later - RECENT))
             first = again.assignment.n_landmarks - (later - RECENT)
@@ -214,6 +231,35 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalF
         if not self._is_finished:
             self._is_finished, self.worth = True, correlated(solved.assignment)
         return without_ghosts(self._attached(solved).assignment)
+
+    def closures(self, found: Assignment) -> Closures:
+        """Return what the loops cost that an association closes; `found` as `finish` returns it."""
+        if not found.n_landmarks:
+            return Closures(0, 0.0)
+        solved = self._judged(found)
+        apart = self._solved(solved.assignment.split_visits())
+        return Closures(apart.n_landmarks - solved.n_landmarks, solved.cost - apart.cost)
+
+    def led_by_odometry(self) -> Assignment:
+        """Return landmarks where detections lie together by odometry alone, each visit by itself, near their optimum.
+
+        It depends on no association so far.
+        """
+        problem, count = self._problem, len(self._kind)
+        sigma = self._rules.noise_caution * self._start_noise.of_detections(problem.sigma_given)
+        pose = dead_reckoned(problem.stamp_s, problem.drive, problem.prior.mean, self._start_noise)[0]
+        estimate = Estimate(pose, np.zeros((0, 2)), problem.prior.mean.copy())
+        nobody = np.full(count, NOBODY)
+        found = Assignment(problem, nobody, estimate, self._kind, self._traits, self._settings)
+        found = with_overlooked(_with_sigma(found, sigma))
+        for _ in range(ALONE_ROUNDS):
+            if not found.n_landmarks:
+                break
+            solved = self._solved(found.split_visits())
+            again = reassigned(solved.assignment, solved.marginals.explained_detections, density=solved.density_m2)
+            found = _with_sigma(with_overlooked(again).split_visits(), solved.sigma)
+            found = found.without(_seldom(found))
+        return found
 
     def learned_odometry(self, assignment: Assignment) -> FloatArray:
         """Return (5,) noise levels of the odometry by restricted likelihood, given all associations.

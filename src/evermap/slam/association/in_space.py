@@ -52,7 +52,7 @@ from evermap.slam.space.intake import SpatialIntake, prepare_space, without_rang
 from evermap.slam.space.linearise import POINT, POSE
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
+from evermap.types import UNKNOWN, AssociationEvidence, BoolArray, FloatArray, IntArray, SpatialRecording
 
 FAR_M = 1e3
 """Standard deviation of the position of a landmark before its first detection: uninformative."""
@@ -80,7 +80,9 @@ def associated_in_space(recording: SpatialRecording, settings: SlamConfig, *, ke
     if not asked.any():  # a recording of boxes alone
         none, local = np.zeros(0, dtype=np.int64), LocalMap(np.zeros((0, 3)), np.zeros((0, 0)))
         loose = LooseDetections(none, local.place, np.zeros(0), none)
-        return Associated(row, name, none.reshape(0, 2), sparse.csr_array((0, 0)), loose, settings, lambda: local)
+        evidence = AssociationEvidence(0.0, 0)
+        kinds, apart = none.reshape(0, 2), sparse.csr_array((0, 0))
+        return Associated(row, name, kinds, apart, loose, settings, lambda: local, evidence)
     # symmetries are those of classes, so each class is one landmark until landmarks are known
     by_class = np.where(asked, given.class_id - UNKNOWN, UNKNOWN)
     intake = prepare_space(replace(recording, detections=replace(given, landmark_id=by_class)), settings.space)
@@ -100,7 +102,8 @@ def associated_in_space(recording: SpatialRecording, settings: SlamConfig, *, ke
     row[intake.used], local, together, loose = associator.concluded(solved)
     of_kind = labels_of(kind, row[intake.used], len(local.place))
     loose = loose._replace(row=intake.used[loose.row])
-    return Associated(row, name, of_kind, together, loose, settings, lambda: local)
+    evidence = AssociationEvidence(float(np.mean(row[intake.used] == NOBODY)), len(local.place))
+    return Associated(row, name, of_kind, together, loose, settings, lambda: local, evidence)
 
 
 class _Nearby:
