@@ -44,6 +44,7 @@ def run_slam(
         ConfigError: settings that contradict each other or the recording.
         NumericalError: no finite optimum.
     """
+    from evermap.explain.causes import Inputs
     from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check, plane
     from evermap.slam.space.moving import has_traffic, run_in_traffic
@@ -59,8 +60,9 @@ def run_slam(
         recording = association.with_identities(recording, config.slam)
     if has_traffic(recording):
         return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
-    visit = session.solved(recording, config, prior_map, remarks, realtime=realtime, progress=progress)
-    result = session.existing(visit, visit.concluded(), config.living)
+    given = Inputs.of(recording, prior_map)
+    visit, result = session.explained(given, config, remarks, realtime=realtime, progress=progress)
+    result = session.existing(visit, result, config.living)
     return result if prior_map is None else with_known_up(result, prior_map.up)
 
 
