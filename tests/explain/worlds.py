@@ -1,4 +1,4 @@
-"""A robot on a field of 12 by 8 m, in the plane and in space, and what may be stated wrongly of it; rotations by scipy."""
+"""A robot on a field of 12 by 8 m, in the plane and in space, and what is stated wrongly of it; rotations by scipy."""
 
 from __future__ import annotations
 

@@ -32,6 +32,8 @@ FAR = 2.5
 """Standard deviations beforehand beyond which no state is tried at once."""
 LEAST_SCALE = 0.015
 """Logarithm of a scale from which its first value is tried: smaller ones the linear test finds."""
+INLIER, FEWER = 0.5, 0.7
+"""Probability from which a detection is no outlier, and share of the outliers that a cause must leave at most."""
 OF_LANDMARKS = frozenset({ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED})
 
 
@@ -106,7 +108,7 @@ def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tup
     """
     rules, found = config.explain, list[str]()
     seen = result.innovations
-    inlier = seen.p_inlier >= 0.5
+    inlier = seen.p_inlier >= INLIER
     if len(inlier) and float(np.mean(~inlier)) > rules.rejected:
         found.append("detections rejected")
     if inlier.any():
@@ -203,11 +205,22 @@ def _next_cause(
             trial = _refined(trial, inputs, taken, solve_under, budget)
             weighed.append(trial)
             ahead = math.inf if best is None else trial.beats(best)
+            if best is not None and not _relieves(trial, best, config):
+                continue  # it fits better, as any further state does, but nothing that was asked is explained
             if ahead > rules.lead_nats and (winner is None or trial.beats(winner) > 0.0):
                 winner = trial
                 if not find_symptoms(trial.solution.result, trial.inputs, config):
                     return winner
     return winner
+
+
+def _relieves(trial: Trial[VisitT], best: Trial[VisitT], config: SlamConfig) -> bool:
+    """Return whether a trial has fewer symptoms, fewer landmarks that are told to have changed, or rejects far less."""
+    was, now = best.solution.result, trial.solution.result
+    before, after = find_symptoms(was, best.inputs, config), find_symptoms(now, trial.inputs, config)
+    changed = [len({one for change in result.changes for one in change.landmark_ids}) for result in (was, now)]
+    rejected = [float(np.mean(result.innovations.p_inlier < INLIER)) for result in (was, now)]
+    return len(after) < len(before) or changed[1] < changed[0] or rejected[1] < FEWER * rejected[0]
 
 
 def _plain(
@@ -339,7 +352,7 @@ def _screen_continuous(
     best: Trial[VisitT] | None,
     inputs: Inputs,
     suspects: list[Suspect],
-    config: SlamConfig,  # noqa: ARG001
+    config: SlamConfig,
 ) -> list[tuple[float, Suspect, float]]:
     """Return continuous causes with what they gain by the score test [nats], price paid, and their states.
 
@@ -347,9 +360,7 @@ def _screen_continuous(
     """
     if best is None:
         return []
-    session = _without_changes(best, config)
-    if session is None:
-        return []
+    session = _without_changes(best)
     screen = Screen.of(optimum_of(session))
     found = list[tuple[float, Suspect, float]]()
     for suspect in suspects:
@@ -364,17 +375,18 @@ def _screen_continuous(
         score = screen.score(direction, suspect.sigma**-2)
         state = float(np.clip(score.value, -FAR * suspect.sigma, FAR * suspect.sigma))
         gain = score.gain * screen.optimum.worth - 0.5 * math.log(max(score.information, 1e-12) * suspect.sigma**2)
-        if gain + suspect.log_p > 0.0:
+        if gain + suspect.log_p > config.explain.lead_nats:
             found.append((gain + suspect.log_p, suspect, state))
     return sorted(found, key=lambda each: -each[0])
 
 
-def _without_changes(best: Trial[VisitT], config: SlamConfig) -> AnySession | None:
+def _without_changes(best: Trial[VisitT]) -> AnySession:
     """Return the session with all landmarks of the map where it has them, which is what causes are asked of."""
     session, inputs = best.solution.session, best.inputs
     if not isinstance(session, Solved):
         return held_by_map(session)
-    if not best.solution.result.changes or is_in_space(inputs.recording):
+    assert not is_in_space(inputs.recording)
+    if not best.solution.result.changes:
         return session
     static = session.settings.model_copy(update={"method": "nohyp"})
     try:
