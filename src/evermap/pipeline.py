@@ -152,7 +152,8 @@ def run_session(
         alone = solve_alone(recording, living, config, progress=progress)
         living = session.with_names_of(living, alone.recording)
         located = planar.localised(alone, living, config)
-    return session.begun_with(session.brought_in(located, living, config.living), whole)
+    entered = session.brought_in(located, living, config.living)
+    return session.begun_with(session.with_causes(entered, living, config), whole)
 
 
 @single_threaded()

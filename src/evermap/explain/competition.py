@@ -18,7 +18,7 @@ import numpy as np
 from evermap.config import SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.causes import Inputs, Suspect, list_suspects, rows_of_kind
-from evermap.explain.evidence import AnySession, Screen, evidence_at, optimum_of
+from evermap.explain.evidence import AnySession, Screen, evidence_at, optimum_of, used_rows
 from evermap.explain.linearise import change_by, gain_by, held_by_map
 from evermap.explain.seeds import find_scales, find_shape, find_single_scales
 from evermap.slam.estimate import Solved, solve
@@ -30,8 +30,13 @@ NEAR = 2.0
 """Standard deviations within which a state is refined no further."""
 FAR = 2.5
 """Standard deviations beforehand beyond which no state is tried at once."""
-LEAST_SCALE = 0.015
-"""Logarithm of a scale from which its first value is tried: smaller ones the linear test finds."""
+LEAST_SCALE, LEAST_SINGLE = 0.015, 0.05
+"""Logarithm of a scale, of all or of one landmark, from which its first value is tried: smaller ones the linear test
+finds."""
+FALLS, LINEAR = 0.2, 4.0
+"""Share by which the loss of pairs must fall, and times that a cause may gain what the linear test says."""
+STRETCHES = frozenset({"tag-size", "range-scale"})
+"""Causes that stretch detections: of some landmarks as of all."""
 INLIER, FEWER = 0.5, 0.7
 """Probability from which a detection is no outlier, and share of the outliers that a cause must leave at most."""
 OF_LANDMARKS = frozenset({ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED})
@@ -118,7 +123,9 @@ def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tup
             found.append("innovations")
     if any(change.kind in OF_LANDMARKS for change in result.changes):
         found.append("changes")
-    if any("#" in str(name) for name in result.landmarks.names.values()):
+    twice = [one for one, name in result.landmarks.names.items() if "#" in str(name)]
+    hits = result.landmarks.n_hits
+    if twice and hits[np.isin(result.landmarks.landmark_id, twice)].sum() > rules.rejected * hits.sum():
         found.append("identities at several places")
     for state in result.parameters:
         if not state.fixed and state.prior_sigma > 0.0:
@@ -296,7 +303,7 @@ def _by_seeds(
         else:
             seeds = {"range-scale": ranges, "tag-size": ranges, "odometry-scale": driven, "map-scale": of_map}
             state = seeds.get(suspect.code, math.nan)
-        if abs(state) > LEAST_SCALE:
+        if abs(state) > (LEAST_SCALE if suspect.rows is None else LEAST_SINGLE):
             found.append((math.inf, suspect, state))
     # what was rejected stands out; of all lengths that which is off least is likelier
     return sorted(found, key=lambda each: (each[1].rows is not None, abs(each[2])))
@@ -337,7 +344,7 @@ def _screen_discrete(
         if pairs is None:
             continue
         gain = loss - _pair_loss(pairs, rules.fits)
-        if gain > rules.gain:
+        if gain > max(rules.gain, FALLS * loss):
             found.append((gain, suspect, 0.0))
     return sorted(found, key=lambda each: -each[0])
 
@@ -362,20 +369,27 @@ def _screen_continuous(
         return []
     session = _without_changes(best)
     screen = Screen.of(optimum_of(session))
-    found = list[tuple[float, Suspect, float]]()
+    found, of_all = list[tuple[float, Suspect, float]](), None
+    # what changes explain, a cause must explain, too
+    with_changes = optimum_of(best.solution.session, best.solution.result.changes)
+    deficit = evidence_at(with_changes) - evidence_at(screen.optimum)
     for suspect in suspects:
         if not suspect.is_continuous:
             if not (suspect.pairs or suspect.of_map):
                 gain = gain_by(session, inputs, suspect) * screen.optimum.worth + suspect.log_p
                 found += [(gain, suspect, 0.0)] if gain > 0.0 else []
             continue
-        direction = change_by(session, screen, inputs, suspect)
+        if suspect.rows is None or of_all is None:
+            direction = change_by(session, screen, inputs, suspect)
+            of_all = direction if suspect.code in STRETCHES and suspect.rows is None else of_all
+        else:  # each detection stretches by itself
+            direction = of_all * screen.of_detections(rows_of_kind(inputs.recording, suspect.rows)[used_rows(session)])
         if direction is None:
             continue
         score = screen.score(direction, suspect.sigma**-2)
         state = float(np.clip(score.value, -FAR * suspect.sigma, FAR * suspect.sigma))
         gain = score.gain * screen.optimum.worth - 0.5 * math.log(max(score.information, 1e-12) * suspect.sigma**2)
-        if gain + suspect.log_p > config.explain.lead_nats:
+        if gain + suspect.log_p > config.explain.lead_nats and LINEAR * score.gain > deficit:
             found.append((gain + suspect.log_p, suspect, state))
     return sorted(found, key=lambda each: -each[0])
 
@@ -469,13 +483,14 @@ def _state_evidence(taken: Taken) -> float:
 def _trial(inputs: Inputs, solution: Candidate[VisitT], taken: tuple[Taken, ...]) -> Trial[VisitT]:
     session = solution.session
     optimum = optimum_of(session, solution.result.changes)
+    used = used_rows(session)
     if isinstance(session, Solved):
-        used, problem_s, places = session.prepared.used, session.outcome.problem.stamp_s, 0
+        problem_s, places = session.outcome.problem.stamp_s, 0
         if session.outcome.aligned and session.prepared.prior_map is not None:
             places = int(session.prepared.prior_map.given.sum())
     else:
         problem = session.solved.optimum.smoother.problem
-        used, problem_s, places = session.intake.used, problem.stamp_s, len(problem.prior.place)
+        problem_s, places = problem.stamp_s, len(problem.prior.place)
     volume = float(inputs.stretched[used].sum()) + inputs.stretched_step * (len(problem_s) - 1)
     volume += inputs.stretched_place * places
     left_out = len(inputs.stretched) - len(used)

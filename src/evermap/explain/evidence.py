@@ -35,7 +35,7 @@ from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PIXEL, POSE, ROWS
 from evermap.slam.space.problem import ANY_RAD, SpatialProblem
 from evermap.slam.space.solve import SpatialSolved
-from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
+from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 
 LOG_2PI = math.log(2.0 * math.pi)
 ROOM_M, ROOM_RAD = 20.0, math.pi
@@ -137,6 +137,11 @@ def log_determinant(factorised: Factorised) -> float:
     diagonal = np.repeat(tree.stored[:-1], tree.own) + row * (np.repeat(tree.size, tree.own) + 1)
     own = 2.0 * float(np.log(factorised.rows[diagonal]).sum())
     return own + float(np.linalg.slogdet(factorised.information)[1])
+
+
+def used_rows(session: AnySession) -> IntArray:
+    """Return (M,) rows of the recording's detections that a session used, in the order of its problem."""
+    return session.prepared.used if isinstance(session, Solved) else session.intake.used
 
 
 def optimum_of(session: AnySession, changes: tuple[MapChange, ...] = ()) -> Optimum:
@@ -333,6 +338,14 @@ class Screen:
         """Return the screen of an optimum."""
         at, residual, root = residuals_of(optimum.graph, optimum.now)
         return cls(optimum, at, residual, root, exhausted(optimum.graph.factorised(optimum.now)))
+
+    def of_detections(self, some: BoolArray) -> BoolArray:
+        """Return (R,) which rows are of some of the detections (M,)."""
+        structure = self.optimum.graph.structure
+        first, rows = structure.first, structure.system.factors.rows
+        mine = np.zeros(len(rows), dtype=np.bool_)
+        mine[first[DETECTIONS] : first[DETECTIONS + 1]] = some[: first[DETECTIONS + 1] - first[DETECTIONS]]
+        return np.repeat(mine, rows)
 
     def score(self, direction: FloatArray, information: float, off: float = 0.0) -> Score:
         """Return what a number does by which residuals (R,), not weighted, change so.

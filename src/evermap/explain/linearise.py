@@ -108,8 +108,13 @@ def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> Spat
     prior = problem.prior
     if undone.prior_map is not inputs.prior_map and undone.prior_map is not None:
         prior = _prior_from(prior, undone.prior_map, before.landmark_id[session.solved.identity])
-    if undone.recording is inputs.recording:
-        return replace(problem, prior=prior)
+    one, other = inputs.recording, undone.recording
+    if other.detections is one.detections and other.odometry is one.odometry and other.frames is one.frames:
+        lens = [
+            [(each.intrinsics, each.distortion, each.distortion_model) for each in of.sensors] for of in (one, other)
+        ]
+        if lens[0] == lens[1]:  # but for mounts all is as it was
+            return replace(problem, prior=prior, mount=np.array([each.mount_robot_sensor for each in other.sensors]))
     intake = prepare_space(
         undone.recording, problem.settings, robust=problem.robust, estimate_noise=problem.estimate_noise
     )

@@ -433,6 +433,23 @@ def explained(
     return best.visit, replace(best.result, causes=found.causes, warnings=(*best.result.warnings, *why))
 
 
+def with_causes(session: Session, living: LivingMap, config: Config) -> Session:
+    """Return a session that was set aside with causes other than changes, if any explain why it does not fit the map.
+
+    It is not entered under them: that is for who trusts them, or mends the recording.
+    """
+    if session.found or not config.slam.explain.on or not len(living.places):
+        return session
+    given = Inputs.of(session.recording, living.landmarks(p_least=EXISTS))
+    try:
+        causes = explained(given, config, ())[1].causes
+    except (DataError, NumericalError):
+        return session
+    why = tuple(f"{cause.message} (p = {cause.probability:.2f}); {cause.fix}" for cause in causes)
+    slam = replace(session.slam, causes=causes, warnings=(*session.slam.warnings, *why))
+    return replace(session, slam=slam)
+
+
 def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult:
     """Return the result of a single recording with its misses and the belief that each landmark exists.
 
