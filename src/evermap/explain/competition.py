@@ -33,6 +33,8 @@ FAR = 2.5
 LEAST_SCALE, LEAST_SINGLE = 0.015, 0.05
 """Logarithm of a scale, of all or of one landmark, from which its first value is tried: smaller ones the linear test
 finds."""
+REFINED = 2
+"""Trials whose states are refined: the best ones."""
 FALLS, LINEAR = 0.2, 4.0
 """Share by which the loss of pairs must fall, and times that a cause may gain what the linear test says."""
 STRETCHES = frozenset({"tag-size", "range-scale"})
@@ -204,20 +206,23 @@ def _next_cause(
     known = {(one.suspect.code, one.suspect.subject) for one in taken}
     suspects = [one for one in list_suspects(inputs) if (one.code, one.subject) not in known]
     tried, winner = set[tuple[str, str]](), None
+
+    def ahead(trial: Trial[VisitT]) -> float:
+        return trial.evidence if best is None else trial.beats(best)
+
     for screen in (_plain, _screen_continuous):  # what costs nothing first
-        for suspect, state in _diverse(screen(best, inputs, suspects, config), rules.most_tried, tried):
-            trial = _solve_trial(inputs, taken, suspect, state, solve_under, budget)
-            if trial is None:
-                continue
-            trial = _refined(trial, inputs, taken, solve_under, budget)
-            weighed.append(trial)
-            ahead = math.inf if best is None else trial.beats(best)
-            if best is not None and not _relieves(trial, best, config):
-                continue  # it fits better, as any further state does, but nothing that was asked is explained
-            if ahead > rules.lead_nats and (winner is None or trial.beats(winner) > 0.0):
+        asked = _diverse(screen(best, inputs, suspects, config), rules.most_tried, tried)
+        made = (_solve_trial(inputs, taken, suspect, state, solve_under, budget) for suspect, state in asked)
+        trials = sorted((trial for trial in made if trial is not None), key=ahead, reverse=True)
+        trials[:REFINED] = [_refined(trial, inputs, taken, solve_under, budget) for trial in trials[:REFINED]]
+        weighed += trials
+        for trial in trials:
+            if best is not None and not (ahead(trial) > rules.lead_nats and _relieves(trial, best, config)):
+                continue  # it fits better, as with any further state, but nothing that was asked is explained
+            if winner is None or trial.beats(winner) > 0.0:
                 winner = trial
-                if not find_symptoms(trial.solution.result, trial.inputs, config):
-                    return winner
+        if winner is not None and not find_symptoms(winner.solution.result, winner.inputs, config):
+            return winner
     return winner
 
 
