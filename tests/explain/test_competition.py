@@ -137,6 +137,22 @@ def test_a_camera_turned_by_180_degrees_is_named() -> None:
     assert result.changes == ()
 
 
+@pytest.mark.parametrize("late_s", [0.12, 0.3])
+def test_late_stamps_are_named(late_s: float) -> None:
+    recording, survey = recorded(World(seed=10, late_s=late_s), "corners")
+    result = run_slam(recording, prior_map=survey)
+    assert {(cause.code, cause.subject) for cause in result.causes} == {("clock", "front"), ("clock", "back")}
+    assert [cause.value for cause in result.causes] == pytest.approx([late_s, late_s], abs=0.01)
+    assert result.changes == ()
+
+
+def test_wheels_of_another_radius_are_named() -> None:
+    recording, survey = recorded(World(seed=11, wheels=1.05), "corners")
+    result = run_slam(recording, prior_map=survey)
+    assert named(result, "odometry-scale").value == pytest.approx(1.05, rel=0.005)
+    assert result.changes == ()
+
+
 def test_exchanged_focal_lengths_are_named() -> None:
     recording, survey = recorded(World(seed=9), "corners")
     swapped = tuple(replace(one, intrinsics=(660.0, 700.0, 640.0, 400.0)) for one in recording.sensors)

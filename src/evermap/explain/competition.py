@@ -39,6 +39,8 @@ FALLS, LINEAR = 0.2, 4.0
 """Share by which the loss of pairs must fall, and times that a cause may gain what the linear test says."""
 STRETCHES = frozenset({"tag-size", "range-scale"})
 """Causes that stretch detections: of some landmarks as of all."""
+SURE = 0.99
+"""Probability from which a delay is told as a cause."""
 INLIER, FEWER = 0.5, 0.7
 """Probability from which a detection is no outlier, and share of the outliers that a cause must leave at most."""
 OF_LANDMARKS = frozenset({ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED})
@@ -168,7 +170,7 @@ def explain(
     rules = config.explain
     base = None if solution is None else _trial(inputs, solution, ())
     if base is not None and solution is not None and not find_symptoms(solution.result, inputs, config):
-        return Explained(base, ())
+        return Explained(base, find_delays(solution.result, rules.late_s))
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
     budget = _Budget(rules.most_solutions)
     weighed = [] if base is None else [base]
@@ -182,7 +184,22 @@ def explain(
             break
     if best is None:
         return None
-    return Explained(best, _causes(best, weighed, base), tuple(weighed))
+    causes = (*_causes(best, weighed, base), *find_delays(best.solution.result, rules.late_s))
+    return Explained(best, causes, tuple(weighed))
+
+
+def find_delays(result: SlamResult, late_s: float) -> tuple[Cause, ...]:
+    """Return clocks that the estimator itself found to be late by so much, which the solution has put right."""
+    found = list[Cause]()
+    for state in result.parameters:
+        name = state.name.removesuffix("_delay_s")
+        if name == state.name or state.fixed or abs(state.value) < late_s or not state.p_needed > SURE:
+            continue
+        table = "odometry.csv" if name == "odometry" else f"detections.csv of {name}"
+        how = f"stamps of {name} are {abs(state.value):.3g} s {'late' if state.value > 0.0 else 'early'}"
+        fix = f"{table}: stamp_s {'-' if state.value > 0.0 else '+'} {abs(state.value):.3g}"
+        found.append(Cause("clock", name, how, state.value, state.sigma, state.p_needed, fix))
+    return tuple(found)
 
 
 @dataclass

@@ -25,6 +25,7 @@ from evermap.estimate.graph import Graph, Linear
 from evermap.estimate.sparse.elimination import numbers_of
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.slam import intake
+from evermap.slam.calibration import FORWARD
 from evermap.slam.changes.gain import PLANE, log_onset, log_prior
 from evermap.slam.correlation import Lasting
 from evermap.slam.estimate import Solved
@@ -40,6 +41,10 @@ from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 LOG_2PI = math.log(2.0 * math.pi)
 ROOM_M, ROOM_RAD = 20.0, math.pi
 """Standard deviations of where a landmark is of which nothing is known, and of its turn."""
+LEAST_INFORMATION = 1e-6
+"""Information of the border's priors, at least: that on delays may be less than none."""
+TURN, LEAST_SCALE = FORWARD + 1, 1e-3
+"""Calibration state of the turns, and the least scale of which a logarithm is taken."""
 ODOMETRY, DETECTIONS, START, REST = 0, 1, 2, 3
 """Blocks of a graph, the same in the plane and in space."""
 
@@ -124,7 +129,7 @@ def evidence_at(optimum: Optimum) -> float:
 
 def log_volume(graph: Graph[Any], now: Linear) -> float:
     """Return the logarithm of the volume that the unknowns are left, times the density of the border's prior."""
-    information = graph.border.information
+    information = np.maximum(graph.border.information, LEAST_INFORMATION)  # what jitter seems to say was taken off
     border = 0.5 * float(np.log(information).sum()) - 0.5 * len(information) * LOG_2PI
     count = int(graph.structure.layout.dim.sum())
     return border + 0.5 * count * LOG_2PI - 0.5 * log_determinant(exhausted(graph.factorised(now)))
@@ -178,6 +183,9 @@ def _in_plane(solved: Solved, changes: tuple[MapChange, ...]) -> Optimum:
     table = solved.settings.changes
     prices = sum(_price(change, len(problem.landmark_mean), PLANE, log_prior, table) for change in changes)
     log_priors += _odometry_peak(graph, now, 3, slice(3, 6))
+    # the residuals are those of motions, the velocities were measured: times their scales they are motions
+    scales = np.maximum(state.states[[FORWARD, FORWARD, TURN]], LEAST_SCALE)
+    log_priors += (n - 1) * float(np.log(scales).sum())
     worth = _worth(smoother.lasting(state), problem.stamp_s[problem.pose_row], problem.landmark_row)
     return Optimum(replace(graph, held=held), now, state, seen, log_priors, prices, worth)
 
