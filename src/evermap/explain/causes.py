@@ -381,7 +381,7 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
             by = se3.turn(mistake.turned)
             yield Suspect(
                 mistake.code, "all sensors", USUAL_P,
-                partial(_change_mounts, sensors=range(len(sensors)), how=lambda m, by=by: se3.compose(m, by)),
+                partial(_change_mounts, sensors=range(len(sensors)), how=partial(_turn_within, by=by)),
                 _constant(mistake.message), _constant("[camera.*.mount]"),
             )  # fmt: skip
     cameras = [row for row, sensor in enumerate(sensors) if sensor.intrinsics is not None]
@@ -444,7 +444,7 @@ def _of_mount(row: int, sensor: SpatialSensor, *, many: bool, driven: bool) -> I
     for mistake in mistakes.AXES:
         by = se3.turn(mistake.turned)
         yield Suspect(
-            mistake.code, name, USUAL_P, partial(_change_mount, sensor=row, how=lambda m, by=by: se3.compose(m, by)),
+            mistake.code, name, USUAL_P, partial(_change_mount, sensor=row, how=partial(_turn_within, by=by)),
             _constant(f"{name}: {mistake.message}"), told,
         )  # fmt: skip
     for words, how in _FLIPS:
@@ -452,6 +452,11 @@ def _of_mount(row: int, sensor: SpatialSensor, *, many: bool, driven: bool) -> I
             "mount-flip", name, USUAL_P if words in _OFTEN else RARE_P,
             partial(_change_mount, sensor=row, how=how), _constant(f"{name} seems {words}"), told,
         )  # fmt: skip
+
+
+def _turn_within(mount: FloatArray, by: FloatArray) -> FloatArray:
+    """Return a mount with the sensor's axes turned."""
+    return np.asarray(se3.compose(mount, by))
 
 
 def _turned_about(axis: int, angle_rad: float, *, of_robot: bool) -> Callable[[FloatArray], FloatArray]:
@@ -579,7 +584,7 @@ def _of_map() -> Iterable[Suspect]:
         ("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048), ("inches", 0.0254),
     ):  # fmt: skip
         yield Suspect(
-            "map-unit", "map", UNIT_P, lambda inputs, _, factor=factor: _stretch_map(inputs, math.log(factor)),
+            "map-unit", "map", UNIT_P, partial(_stretch_map_by, factor=factor),
             _constant(f"the given map seems to be in {unit}, not in metres"),
             _constant(f"--prior-map: lengths x {factor:g}"), of_map=True, pairs=False,
         )  # fmt: skip
@@ -588,6 +593,10 @@ def _of_map() -> Iterable[Suspect]:
         _constant("the given map is not one of what was seen: another site, or another edition"),
         _constant("--prior-map: leave it out, or give the map of this site"), of_map=True, pairs=False,
     )  # fmt: skip
+
+
+def _stretch_map_by(inputs: Inputs, _: float, factor: float) -> Inputs:
+    return _stretch_map(inputs, math.log(factor))
 
 
 def _stretch_map(inputs: Inputs, state: float) -> Inputs:

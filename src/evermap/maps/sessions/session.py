@@ -408,9 +408,9 @@ def explained(
 
     def under(given: Inputs, **more: Any) -> Candidate[Visit]:
         visit = solved(given.recording, config, given.prior_map, remarks, **more)
-        is_flat = isinstance(visit, PlanarVisit)
-        session = visit.solved if is_flat else SpatialSession(visit.intake, visit.solved)  # type: ignore[union-attr]
-        return Candidate(visit, session, visit.concluded())  # type: ignore[arg-type]
+        if isinstance(visit, PlanarVisit):
+            return Candidate(visit, visit.solved, visit.concluded())
+        return Candidate(visit, SpatialSession(visit.intake, visit.solved), visit.concluded())
 
     told = list[str]()
     try:
