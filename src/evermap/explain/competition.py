@@ -47,7 +47,7 @@ OF_LANDMARKS = frozenset({ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPP
 
 
 @dataclass(frozen=True)
-class Candidate(Generic[VisitT]):
+class SessionSolution(Generic[VisitT]):
     """What a solution of some inputs consists of."""
 
     visit: VisitT
@@ -77,7 +77,7 @@ class Trial(Generic[VisitT]):
     """
 
     inputs: Inputs
-    solution: Candidate[VisitT]
+    solution: SessionSolution[VisitT]
     taken: tuple[Taken, ...]
     evidence: float
     worth: float
@@ -104,7 +104,7 @@ class Explained(Generic[VisitT]):
     weighed: tuple[Trial[VisitT], ...] = field(default=())
 
 
-Solve = Callable[[Inputs], Candidate[VisitT]]
+Solve = Callable[[Inputs], SessionSolution[VisitT]]
 
 
 def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tuple[str, ...]:
@@ -151,7 +151,7 @@ def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tup
 
 def explain(
     inputs: Inputs,
-    solution: Candidate[VisitT] | None,
+    solution: SessionSolution[VisitT] | None,
     solve_under: Solve[VisitT],
     config: SlamConfig,
     say: Callable[[str], None] = lambda _: None,
@@ -198,7 +198,7 @@ def find_delays(result: SlamResult, late_s: float) -> tuple[Cause, ...]:
         table = "odometry.csv" if name == "odometry" else f"detections.csv of {name}"
         how = f"stamps of {name} are {abs(state.value):.3g} s {'late' if state.value > 0.0 else 'early'}"
         fix = f"{table}: stamp_s {'-' if state.value > 0.0 else '+'} {abs(state.value):.3g}"
-        found.append(Cause("clock", name, how, state.value, state.sigma, state.p_needed, fix))
+        found.append(Cause("clock", name, how, state.value, state.sigma, min(state.p_needed, 1.0), fix))
     return tuple(found)
 
 
@@ -502,7 +502,7 @@ def _state_evidence(taken: Taken) -> float:
     )
 
 
-def _trial(inputs: Inputs, solution: Candidate[VisitT], taken: tuple[Taken, ...]) -> Trial[VisitT]:
+def _trial(inputs: Inputs, solution: SessionSolution[VisitT], taken: tuple[Taken, ...]) -> Trial[VisitT]:
     session = solution.session
     optimum = optimum_of(session, solution.result.changes)
     used = used_rows(session)
@@ -522,6 +522,25 @@ def _trial(inputs: Inputs, solution: Candidate[VisitT], taken: tuple[Taken, ...]
     return Trial(inputs, solution, taken, evidence + sum(map(_state_evidence, taken)), optimum.worth)
 
 
+OWN_STATES = {
+    "odometry-scale": (("odometry_forward_scale", 1.0), ("odometry_scale", 1.0)),
+    "turn-scale": (("odometry_turn_scale", 1.0),),
+    "range-scale": (("range_scale", -1.0),),
+}
+"""Calibration states that are the same number as a cause's, and the sign with which their logarithms add to it."""
+
+
+def _with_own_state(taken: Taken, result: SlamResult) -> tuple[float, float]:
+    """Return the state of a cause and its standard deviation, with what the estimator's own state adds to it."""
+    state, sigma = taken.state, taken.information**-0.5 if taken.information > 0.0 else math.nan
+    own = {one.name: one for one in result.parameters}
+    for name, sign in OWN_STATES.get(taken.suspect.code, ()):
+        if name in own and not own[name].fixed and own[name].value > 0.0:
+            state += sign * math.log(own[name].value)
+            sigma = min(sigma, own[name].sigma / own[name].value) if own[name].sigma > 0.0 else sigma
+    return state, sigma
+
+
 def _causes(best: Trial[VisitT], weighed: list[Trial[VisitT]], base: Trial[VisitT] | None) -> tuple[Cause, ...]:
     """Return the causes of the best trial, with their probabilities among all that was weighed."""
     if not best.taken:
@@ -535,13 +554,13 @@ def _causes(best: Trial[VisitT], weighed: list[Trial[VisitT]], base: Trial[Visit
         name = one.suspect.code, one.suspect.subject
         holds = [any((t.suspect.code, t.suspect.subject) == name for t in trial.taken) for trial in weighed]
         suspect = one.suspect
-        value = suspect.shown(one.state) if suspect.is_continuous else math.nan
-        sigma = one.information**-0.5 if one.information > 0.0 else math.nan
-        scale = abs(suspect.shown(one.state + 1e-6) - suspect.shown(one.state)) / 1e-6
+        state, sigma = _with_own_state(one, best.solution.result)
+        value = suspect.shown(state) if suspect.is_continuous else math.nan
+        scale = abs(suspect.shown(state + 1e-6) - suspect.shown(state)) / 1e-6
         found.append(
             Cause(
-                suspect.code, suspect.subject, suspect.say(one.state), value, sigma * scale,
-                float(share[np.array(holds)].sum()), suspect.fix(one.state), gained,
+                suspect.code, suspect.subject, suspect.say(state), value, sigma * scale,
+                float(share[np.array(holds)].sum()), suspect.fix(state), gained,
             )
         )  # fmt: skip
     return tuple(sorted(found, key=lambda cause: -cause.probability))

@@ -11,7 +11,7 @@ from evermap.config import Config, LivingConfig
 from evermap.errors import DataError, NumericalError
 from evermap.existence.sites import Evidence
 from evermap.explain.causes import Inputs
-from evermap.explain.competition import Candidate, explain
+from evermap.explain.competition import SessionSolution, explain
 from evermap.explain.evidence import SpatialSession
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
@@ -406,11 +406,11 @@ def explained(
         DataError, NumericalError: as of `run_slam`.
     """
 
-    def under(given: Inputs, **more: Any) -> Candidate[Visit]:
+    def under(given: Inputs, **more: Any) -> SessionSolution[Visit]:
         visit = solved(given.recording, config, given.prior_map, remarks, **more)
         if isinstance(visit, PlanarVisit):
-            return Candidate(visit, visit.solved, visit.concluded())
-        return Candidate(visit, SpatialSession(visit.intake, visit.solved), visit.concluded())
+            return SessionSolution(visit, visit.solved, visit.concluded())
+        return SessionSolution(visit, SpatialSession(visit.intake, visit.solved), visit.concluded())
 
     told = list[str]()
     try:
