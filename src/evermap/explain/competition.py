@@ -39,6 +39,8 @@ FALLS, LINEAR = 0.2, 4.0
 """Share by which the loss of pairs must fall, and times that a cause may gain what the linear test says."""
 STRETCHES = frozenset({"tag-size", "range-scale"})
 """Causes that stretch detections: of some landmarks as of all."""
+AGREE = 0.25
+"""Share of what the map's scale is off by, up to which ranges and odometry agree with each other."""
 SURE = 0.99
 """Probability from which a delay is told as a cause."""
 INLIER, FEWER = 0.5, 0.7
@@ -304,6 +306,8 @@ def _by_seeds(
     """Return scales with first values that need no solution (`seeds`), where these are another than stated."""
     scales = find_scales(inputs.recording, inputs.prior_map, config.check)
     ranges, driven, of_map = scales.ranges, scales.odometry, scales.map
+    if abs(scales.by_odometry) < AGREE * abs(scales.by_map):  # two against one: the map
+        ranges = driven = math.nan
     single: dict[int, float] = {}
     if best is not None:
         result = best.solution.result
