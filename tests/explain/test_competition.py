@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evermap import run_slam
+from evermap import run_session, run_slam
 from evermap.config import Config
 from evermap.geometry.rigid import rigid
 from evermap.geometry.se2 import transform as transform_plane
@@ -123,6 +123,17 @@ def test_turns_of_the_wrong_sign_are_named() -> None:
     assert result.changes == ()
     told = error_m(run_slam(recording, prior_map=survey), recording, in_map=True)
     assert error_m(result, recording, in_map=True) < ORACLE * told + SMALL_M
+
+
+def test_a_session_that_is_set_aside_says_why() -> None:
+    first, second = World(seed=1).plane(), World(seed=2).plane()
+    living = run_session(first).living
+    odometry = second.odometry
+    turned = replace(odometry, stamp_s=odometry.stamp_s + 1000.0, angular_radps=-odometry.angular_radps)
+    frames = replace(second.frames, stamp_s=second.frames.stamp_s + 1000.0)
+    session = run_session(replace(second, odometry=turned, frames=frames, truth=None), living)
+    assert not session.found
+    assert [cause.code for cause in session.slam.causes] == ["turn-sign"]
 
 
 def test_a_camera_turned_by_180_degrees_is_named() -> None:

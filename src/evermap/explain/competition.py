@@ -40,7 +40,7 @@ FALLS, LINEAR = 0.2, 4.0
 STRETCHES = frozenset({"tag-size", "range-scale"})
 """Causes that stretch detections: of some landmarks as of all."""
 AGREE = 0.25
-"""Share of what the map's scale is off by, up to which ranges and odometry agree with each other."""
+"""Share of what one of ranges, odometry and map is off by, up to which the other two agree with each other."""
 SURE = 0.99
 """Probability from which a delay is told as a cause."""
 INLIER, FEWER = 0.5, 0.7
@@ -306,12 +306,21 @@ def _by_seeds(
     """Return scales with first values that need no solution (`seeds`), where these are another than stated."""
     scales = find_scales(inputs.recording, inputs.prior_map, config.check)
     ranges, driven, of_map = scales.ranges, scales.odometry, scales.map
-    if abs(scales.by_odometry) < AGREE * abs(scales.by_map):  # two against one: the map
-        ranges = driven = math.nan
+    apart = {  # of ranges, odometry and map, how far the other two are apart
+        "ranges": abs(scales.by_map - scales.by_odometry),
+        "odometry": abs(scales.by_map),
+        "map": abs(scales.by_odometry),
+    }
+    odd = min(apart, key=lambda one: apart[one])
+    if apart[odd] < AGREE * max(apart.values()):  # two against one
+        ranges, driven, of_map = (
+            state if odd == one else math.nan
+            for one, state in (("ranges", ranges), ("odometry", driven), ("map", of_map))
+        )
     single: dict[int, float] = {}
     if best is not None:
         result = best.solution.result
-        if inputs.prior_map is not None and result.trajectory.frame != "prior_map" and not math.isfinite(of_map):
+        if inputs.prior_map is not None and result.trajectory.frame != "prior_map" and not math.isfinite(scales.by_map):
             ratio = find_shape(result, inputs.prior_map)
             states = {state.name: state.value for state in result.parameters}
             ranges = ratio - math.log(states.get("range_scale", 1.0 + states.get("range_slope", 0.0)))
