@@ -35,8 +35,9 @@ RULES = {
     "tracking": "errors compiled show types config geometry survival valid io sensing existence",
     "viz": "errors types geometry survival metrics existence",
     "slam": "errors interrupts compiled plugins show types config geometry valid sensing tracking estimate align",
-    "maps": "errors show types config geometry survival valid sensing existence tracking estimate align slam",
-    "pipeline": "errors compiled types config estimate slam maps",
+    "explain": "errors types config geometry estimate slam",
+    "maps": "errors show types config geometry survival valid sensing existence tracking estimate align slam explain",
+    "pipeline": "errors compiled types config estimate slam explain maps",
     "runs": (
         "errors interrupts show types config geometry survival valid io metrics existence tracking viz maps pipeline"
     ),
@@ -123,7 +124,7 @@ def test_the_library_knows_no_study() -> None:
 
 def test_the_core_knows_nothing_of_its_users() -> None:
     outside = {"viz", "cli", "runs", "metrics"}
-    for part in ("survival", "sensing", "existence", "tracking", "slam", "maps", "pipeline"):
+    for part in ("survival", "sensing", "existence", "tracking", "slam", "explain", "maps", "pipeline"):
         assert not set(RULES[part].split()) & outside, part
 
 

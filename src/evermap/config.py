@@ -626,6 +626,22 @@ class SpaceConfig(Section):
         return KINDS_IN_SPACE | given
 
 
+class ExplainConfig(Section):
+    """Causes other than changes of landmarks: when they are asked, and what they must gain."""
+
+    on: bool = key(True, "ask for causes where a session contradicts what was stated")
+    rejected: Share = key(0.08, "share of rejected detections from which causes are asked")
+    innovations: Positive = key(1.35, "mean squared normalised innovation, a number, from which causes are asked")
+    states: Positive = key(4.0, "standard deviations of a calibration state from its prior from which causes are asked")
+    noise: Positive = key(3.0, "factor of a noise level on what is stated from which causes are asked")
+    late_s: Positive = key(0.1, "delay of a clock from which it is told as a cause, though estimated anyway [s]")
+    map_changed: Share = key(0.4, "share of a given map that has changed from which the map itself is asked")
+    lead_nats: NotNegative = key(6.0, "log evidence by which a cause must win, its price paid [nats]")
+    most_causes: Count = key(2, "causes that are combined, at most")
+    most_tried: Count = key(4, "causes under which a session is solved again, for each that is added, at most")
+    most_solutions: Count = key(12, "solutions in all, at most")
+
+
 class NoiseConfig(Section):
     """Noise levels that a run starts from, where the sensor states none."""
 
@@ -679,6 +695,7 @@ class SlamConfig(Section):
     modes: ModesConfig = part(ModesConfig, "methods 'max-mixture' to 'viterbi': landmarks with several positions")
     changes: ChangesConfig = part(ChangesConfig, "method 'joint': groups of moved landmarks")
     noise: NoiseConfig = part(NoiseConfig, "noise levels to start from")
+    explain: ExplainConfig = part(ExplainConfig, "causes other than changes of landmarks")
     odometry: OdometryConfig = part(OdometryConfig, "silences and jitter of the odometry")
     votes: VotesConfig = part(VotesConfig, "identities that were read wrongly")
     association: AssociationConfig = part(AssociationConfig, "landmarks without identities")

@@ -44,6 +44,7 @@ def run_slam(
         ConfigError: settings that contradict each other or the recording.
         NumericalError: no finite optimum.
     """
+    from evermap.explain.causes import Inputs
     from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check, plane
     from evermap.slam.space.moving import has_traffic, run_in_traffic
@@ -61,8 +62,9 @@ def run_slam(
         remarks = (*remarks, *association.describe_doubts(evidence, config.slam.association))
     if has_traffic(recording):
         return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
-    visit = session.solved(recording, config, prior_map, remarks, realtime=realtime, progress=progress)
-    result = replace(session.existing(visit, visit.concluded(), config.living), association=evidence)
+    given = Inputs.of(recording, prior_map)
+    visit, result = session.explained(given, config, remarks, realtime=realtime, progress=progress)
+    result = replace(session.existing(visit, result, config.living), association=evidence)
     if prior_map is None:
         return result
     return with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)
@@ -154,7 +156,8 @@ def run_session(
         alone = solve_alone(recording, living, config, progress=progress)
         living = session.with_names_of(living, alone.recording)
         located = planar.localised(alone, living, config)
-    return session.begun_with(session.brought_in(located, living, config.living), whole)
+    entered = session.brought_in(located, living, config.living)
+    return session.begun_with(session.with_causes(entered, living, config), whole)
 
 
 @single_threaded()

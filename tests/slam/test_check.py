@@ -199,7 +199,8 @@ def test_a_calibration_state_far_outside_of_its_prior_is_told() -> None:
     assert "odometry_forward_scale = 1.3 is 6 standard deviations" in told
     assert "wheel radius" in told
     slow = odometry(forward_mps=lambda v: 0.6 * v)(patrol())
-    assert any("odometry_forward_scale" in remark for remark in run_slam(slow).warnings)
+    causes = {cause.code: cause.value for cause in run_slam(slow).causes}
+    assert causes["odometry-scale"] == pytest.approx(1 / 0.6, rel=0.03)
 
 
 VALID = {

@@ -45,6 +45,7 @@ class Mistake:
         turn, forward: factors on the turn rate and the forward speed.
         delay_s: odometry stamps are so much later than the motion.
         turned: quaternion that turns positions in the sensor's frame.
+        field: column, or table, that is wrong.
     """
 
     code: str
@@ -56,6 +57,7 @@ class Mistake:
     forward: float = 1.0
     delay_s: float = 0.0
     turned: tuple[float, ...] = tuple(se3.NO_TURN)
+    field: str = ""
 
     def after(self, other: Mistake) -> Mistake:
         """Return both, the other one undone first."""
@@ -72,6 +74,7 @@ class Mistake:
             self.forward * other.forward,
             self.delay_s + other.delay_s,
             turned,
+            self.field,
         )
 
 
@@ -89,33 +92,46 @@ _LENGTHS_IN_SPACE = tuple(
     for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048), ("inches", 0.0254))
     for field, what in (("detections", "positions"), ("odometry", "poses of the robot"))
 )
-_UNITS, _UNITS_IN_SPACE = (
+UNITS, UNITS_IN_SPACE = (
     tuple(
-        Mistake("length-unit", f"{what} seem to be in {unit}, not in metres ({field})", lengths=factor)
+        Mistake("length-unit", f"{what} seem to be in {unit}, not in metres ({field})", lengths=factor, field=field)
         for field, what, unit, factor in lengths
     )
     for lengths in (_LENGTHS, _LENGTHS_IN_SPACE)
 )
-_ANGLES = (
-    Mistake("bearing-unit", "bearings seem to be in degrees, not in radians (bearing_rad)", bearing=pi / 180),
-    Mistake("turn-unit", "turn rates seem to be in degrees, not in radians a second (angular_radps)", turn=pi / 180),
+ANGLES = (
+    Mistake(
+        "bearing-unit",
+        "bearings seem to be in degrees, not in radians (bearing_rad)",
+        bearing=pi / 180,
+        field="bearing_rad",
+    ),
+    Mistake(
+        "turn-unit",
+        "turn rates seem to be in degrees, not in radians a second (angular_radps)",
+        turn=pi / 180,
+        field="angular_radps",
+    ),
     Mistake(
         "bearing-sign",
         "bearings, or turn rates, seem to have the wrong sign: counter-clockwise is positive, from x ahead to y on the "
         "left (bearing_rad, angular_radps)",
         bearing=-1.0,
+        field="bearing_rad",
     ),
     Mistake(
         "turn-sign",
         "turn rates, or bearings, seem to have the wrong sign: counter-clockwise is positive (angular_radps, "
         "bearing_rad)",
         turn=-1.0,
+        field="angular_radps",
     ),
     Mistake(
         "forward-sign",
         "the robot seems to drive in the opposite direction: forward speeds have the wrong sign (forward_mps), or the "
         "sensor looks backwards ([mount] theta_rad)",
         forward=-1.0,
+        field="forward_mps",
     ),
     *(
         Mistake(
@@ -124,12 +140,13 @@ _ANGLES = (
             "and y_m, or [mount] theta_rad)",
             bearing=sign,
             offset_rad=offset,
+            field="bearing_rad",
         )
         for sign in (1.0, -1.0)
         for offset in (pi / 2, -pi / 2)
     ),
 )
-_AXES = tuple(
+AXES = tuple(
     Mistake(
         "mount-axes",
         f"detections seem to be in a frame with {seen}, but the mount is for one with {stated}: "
@@ -293,7 +310,7 @@ def sighting_pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntA
 class PlanarPairs:
     """Pairs of sightings of a landmark each, and what odometry says of them."""
 
-    units, angles = _UNITS, _ANGLES
+    units, angles = UNITS, ANGLES
     why_longer = "another unit of ranges or speeds (range_m, forward_mps)"
     speeds = "forward_mps, angular_radps"
 
@@ -360,7 +377,7 @@ class PlanarPairs:
 class SpatialPairs:
     """Pairs of sightings in space."""
 
-    units, angles = _UNITS_IN_SPACE, _AXES
+    units, angles = UNITS_IN_SPACE, AXES
     why_longer = "another unit of detections or odometry, or a wrong size of tags (tag_size_m)"
     speeds = "odometry"
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from evermap.config import Config, LivingConfig
-from evermap.errors import DataError
+from evermap.errors import DataError, NumericalError
 from evermap.existence.sites import Evidence
+from evermap.explain.causes import Inputs
+from evermap.explain.competition import SessionSolution, explain
+from evermap.explain.evidence import SpatialSession
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Places, Stays
@@ -408,6 +411,71 @@ def solved(
         return solve_visit(recording, config, prior_map, remarks, progress=progress)
     alone = solve(recording, config.slam, prior_map=prior_map, remarks=remarks, realtime=realtime, progress=progress)
     return PlanarVisit(alone)
+
+
+def explained(
+    inputs: Inputs,
+    config: Config,
+    remarks: tuple[str, ...],
+    *,
+    realtime: bool = False,
+    progress: Progress | None = None,
+) -> tuple[Visit, SlamResult]:
+    """Return a session solved, and its result: as given, or under the causes that explain it better (`explain`).
+
+    Args:
+        inputs: with identities.
+        config: settings.
+        remarks: on the recording, the first warnings.
+        realtime: as of `run_slam`, of the session as given.
+        progress: the same.
+
+    Raises:
+        DataError, NumericalError: as of `run_slam`.
+    """
+
+    def under(given: Inputs, **more: Any) -> SessionSolution[Visit]:
+        visit = solved(given.recording, config, given.prior_map, remarks, **more)
+        if isinstance(visit, PlanarVisit):
+            return SessionSolution(visit, visit.solved, visit.concluded())
+        return SessionSolution(visit, SpatialSession(visit.intake, visit.solved), visit.concluded())
+
+    told = list[str]()
+    try:
+        as_given = under(inputs, realtime=realtime, progress=progress)
+    except (DataError, NumericalError):
+        found = None
+        if config.slam.explain.on:
+            found = explain(inputs, None, under, config.slam, told.append)
+        if found is None:
+            raise
+    else:
+        if not config.slam.explain.on or as_given.result.interrupted or realtime:
+            return as_given.visit, as_given.result
+        found = explain(inputs, as_given, under, config.slam, told.append)
+        assert found is not None
+    best = found.best.solution
+    if not found.causes:
+        return best.visit, best.result
+    why = tuple(f"{cause.message} (p = {cause.probability:.2f}); {cause.fix}" for cause in found.causes)
+    return best.visit, replace(best.result, causes=found.causes, warnings=(*best.result.warnings, *why))
+
+
+def with_causes(session: Session, living: LivingMap, config: Config) -> Session:
+    """Return a session that was set aside with causes other than changes, if any explain why it does not fit the map.
+
+    It is not entered under them: that is for who trusts them, or mends the recording.
+    """
+    if session.found or not config.slam.explain.on or not len(living.places):
+        return session
+    given = Inputs.of(session.recording, living.landmarks(p_least=EXISTS))
+    try:
+        causes = explained(given, config, ())[1].causes
+    except (DataError, NumericalError):
+        return session
+    why = tuple(f"{cause.message} (p = {cause.probability:.2f}); {cause.fix}" for cause in causes)
+    slam = replace(session.slam, causes=causes, warnings=(*session.slam.warnings, *why))
+    return replace(session, slam=slam)
 
 
 def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult:

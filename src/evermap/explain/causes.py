@@ -1,0 +1,623 @@
+"""Causes as values: what each undoes of a recording and of a given map, what it costs, and the words for it.
+
+A cause is undone on trial by a pure transformation of the inputs; the solution of what comes out is compared with that
+of the inputs as given (`competition`). A *continuous* cause has a state of one number, 0 where all is as stated, with a
+Gaussian prior; a *discrete* one has none. Mistakes that show in pairs of sightings alone (`slam.mistakes`) are causes,
+too: the same values serve `check` and the competition.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from evermap.geometry import se2, se3
+from evermap.slam import mistakes
+from evermap.types import (
+    UNKNOWN,
+    AnyRecording,
+    FloatArray,
+    Landmarks,
+    Recording,
+    SpatialRecording,
+    SpatialSensor,
+    is_in_space,
+)
+
+USUAL_P, RARE_P, UNIT_P = 1e-3, 1e-4, 1e-3
+"""Probabilities beforehand of a cause that is met every day in bug reports, of one that is not, and of a unit."""
+SCALE, ONE_TAG, TURN, MAP_SCALE = 0.15, 0.3, 0.15, 0.1
+"""Standard deviations of logarithms: of all ranges or speeds, of the size of one tag, of turns, of a map."""
+DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL = 0.5, 0.2, 0.3, 0.1
+"""Standard deviations of a delay, of a mount's position and turn, and of the logarithm of a focal length."""
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What a session is solved from.
+
+    Attributes:
+        recording: with identities, as it is estimated.
+        prior_map: that was given; None without.
+        stretched: (M,) logarithm of the volume by which each detection's numbers were stretched since they were read.
+        stretched_step: the same of the odometry between two poses.
+        stretched_place: the same of a place of the map.
+    """
+
+    recording: AnyRecording
+    prior_map: Landmarks | None
+    stretched: FloatArray
+    stretched_step: float
+    stretched_place: float
+
+    @classmethod
+    def of(cls, recording: AnyRecording, prior_map: Landmarks | None) -> Inputs:
+        """Return the inputs as given."""
+        return cls(recording, prior_map, np.zeros(len(recording.detections)), 0.0, 0.0)
+
+
+Undo = Callable[[Inputs, float], Inputs]
+
+
+@dataclass(frozen=True, slots=True)
+class Suspect:
+    """A cause that may be: what it undoes, what it costs, and its words.
+
+    Attributes:
+        code: stable name of the kind of cause.
+        subject: what it is of: a sensor, a class, an identity, 'odometry', 'map'.
+        p: probability beforehand.
+        undo: inputs, and the state, to the inputs without it.
+        say: the state to one line for the user.
+        fix: the state to the line of `sensor.toml`, or the option, that mends it.
+        sigma: standard deviation of the state beforehand; 0 of a discrete cause.
+        shown: the state as a user reads it: a ratio, seconds, metres, radians.
+        of_map: whether it is of the given map.
+        pairs: whether it shows in pairs of sightings of one landmark and the odometry between them.
+        rows: which landmarks it is of: an 'id', a 'class' or a 'size'; None of all.
+    """
+
+    code: str
+    subject: str
+    p: float
+    undo: Undo
+    say: Callable[[float], str]
+    fix: Callable[[float], str]
+    sigma: float = 0.0
+    shown: Callable[[float], float] = float
+    of_map: bool = False
+    pairs: bool = True
+    rows: tuple[str, float] | None = None
+
+    @property
+    def is_continuous(self) -> bool:
+        """Return whether it has a state."""
+        return self.sigma > 0.0
+
+    @property
+    def log_p(self) -> float:
+        """Return its price [nats], negative."""
+        return math.log(self.p)
+
+
+def list_suspects(inputs: Inputs) -> tuple[Suspect, ...]:
+    """Return all causes that may be asked of a recording, and of the map that is given with it."""
+    recording, found = inputs.recording, list[Suspect]()
+    found += _in_space(recording) if is_in_space(recording) else _in_plane(recording)
+    if inputs.prior_map is not None:
+        found += _of_map()
+    return tuple(found)
+
+
+def _constant(text: str) -> Callable[[float], str]:
+    return lambda _: text
+
+
+def _times(state: float) -> float:
+    return math.exp(state)
+
+
+# ---- in the plane
+
+
+def _in_plane(recording: Recording) -> Iterable[Suspect]:
+    names = recording.landmark_names
+    yield Suspect(
+        "range-scale", "sensor", USUAL_P, partial(_stretch_ranges, of=None),
+        lambda s: f"true distances are {math.exp(s):.4g} times the ranges: another scale, or another size of tags",
+        lambda s: f"[sensor] sigma_scale = {_round_up(abs(s))}", SCALE, _times,
+    )  # fmt: skip
+    yield Suspect(
+        "odometry-scale", "odometry", USUAL_P, _stretch_speeds,
+        lambda s: f"the robot drives {math.exp(s):.4g} times what its odometry says: wheel radius",
+        lambda s: f"[odometry] sigma_odometer_scale = {_round_up(abs(s))}", SCALE, _times,
+    )  # fmt: skip
+    yield Suspect(
+        "turn-scale", "odometry", USUAL_P, _stretch_turns,
+        lambda s: f"the robot turns {math.exp(s):.4g} times what its odometry says: wheel base, or gyroscope",
+        _constant("odometry.csv: angular_radps"), TURN, _times,
+    )  # fmt: skip
+    yield Suspect(
+        "clock", "sensor", USUAL_P, _shift_stamps,
+        lambda s: f"stamps of the detections are {abs(s):.3g} s {'late' if s > 0 else 'early'}",
+        lambda s: f"detections.csv, frames.csv: stamp_s {'-' if s > 0 else '+'} {abs(s):.3g}", DELAY_S,
+    )  # fmt: skip
+    for axis, key in enumerate(("x_m", "y_m", "theta_rad")):
+        unit, sigma = ("rad", MOUNT_RAD) if axis == 2 else ("m", MOUNT_M)
+        yield Suspect(
+            "mount", f"sensor {key}", USUAL_P, partial(_move_planar_mount, axis=axis),
+            lambda s, key=key, unit=unit: f"the sensor's mount is {s:.3g} {unit} off in {key}",  # type: ignore[misc]
+            lambda s, key=key, axis=axis: f"[mount] {key} = {recording.sensor.mount_robot_sensor[axis] + s:.4g}",  # type: ignore[misc]
+            sigma,
+        )  # fmt: skip
+    for mistake in (*mistakes.UNITS, *mistakes.ANGLES):
+        yield Suspect(
+            mistake.code, mistake.field, UNIT_P if mistake.code == "length-unit" else USUAL_P,
+            partial(_undo_in_plane, mistake=mistake), _constant(mistake.message), _constant(_fix_of(mistake)),
+        )  # fmt: skip
+    for identity in _seen_often(recording):
+        yield _one_size(names.get(identity, str(identity)), _stretch_ranges, ("id", identity), "")
+    for row, name in enumerate(recording.class_names):
+        yield _kind_size(f"class {name}", _stretch_ranges, ("class", row), "")
+
+
+def _one_size(subject: str, stretch: Callable[..., Inputs], of: tuple[str, float], key: str) -> Suspect:
+    return Suspect(
+        "tag-size", subject, RARE_P, partial(stretch, of=of),
+        lambda s: f"landmark {subject} is {math.exp(s):.4g} times as large, or as far, as the sensor takes it to be",
+        lambda s: f"[tags.sizes] {subject} = {float(key) * math.exp(s):.4g}" if key else "the size of this tag",
+        ONE_TAG, _times, rows=of,
+    )  # fmt: skip
+
+
+def _kind_size(subject: str, stretch: Callable[..., Inputs], of: tuple[str, float], key: str) -> Suspect:
+    return Suspect(
+        "tag-size", subject, USUAL_P, partial(stretch, of=of),
+        lambda s: f"landmarks of {subject} are {math.exp(s):.4g} times as large as the sensor takes them to be",
+        lambda s: f"[tags] size_m = {float(key) * math.exp(s):.4g}" if key else "the size of these tags",
+        ONE_TAG, _times, rows=of,
+    )  # fmt: skip
+
+
+def _round_up(share: float) -> str:
+    """Return a standard deviation that covers an error, in one figure."""
+    if share <= 0.0:
+        return "0.001"
+    unit = 10.0 ** math.floor(math.log10(share))
+    return f"{math.ceil(share / unit) * unit:.1g}"
+
+
+def _fix_of(mistake: mistakes.Mistake) -> str:
+    table = "odometry.csv" if mistake.field.endswith("ps") or mistake.field == "odometry" else "detections.csv"
+    return f"{table}: {mistake.field}" if mistake.field else "[mount]"
+
+
+def _seen_often(recording: AnyRecording) -> list[int]:
+    ids = recording.detections.landmark_id
+    name, count = np.unique(ids[ids != UNKNOWN], return_counts=True)
+    return [int(one) for one in name[count >= mistakes.USUAL.fewest // 4]]
+
+
+def rows_of_kind(recording: AnyRecording, of: tuple[str, float] | None) -> Any:
+    """Return (M,) detections of an identity, of a class, or of tags of a size; all for None."""
+    seen = recording.detections
+    if of is None:
+        return np.ones(len(seen), dtype=np.bool_)
+    kind, which = of
+    if kind == "id":
+        return seen.landmark_id == which
+    if kind == "class":
+        return seen.class_id == which
+    return np.isclose(seen.tag_size_m, which)  # type: ignore[union-attr]
+
+
+def _stretch_ranges(inputs: Inputs, state: float, of: tuple[str, float] | None) -> Inputs:
+    recording: Any = inputs.recording
+    mine = rows_of_kind(recording, of)
+    seen, factor = recording.detections, np.where(mine, math.exp(state), 1.0)
+    further = replace(seen, range_m=seen.range_m * factor, sigma_range_m=seen.sigma_range_m * factor)
+    return replace(
+        inputs,
+        recording=replace(recording, detections=further),
+        stretched=inputs.stretched + state * mine,
+    )
+
+
+def _stretch_speeds(inputs: Inputs, state: float) -> Inputs:
+    recording, factor = inputs.recording, math.exp(state)
+    if is_in_space(recording):
+        driven = recording.odometry
+        assert driven is not None
+        odometry: Any = replace(driven, pose_world_robot=se3.scaled(driven.pose_world_robot, factor))
+    else:
+        driven_flat = recording.odometry
+        odometry = replace(
+            driven_flat, forward_mps=driven_flat.forward_mps * factor, lateral_mps=driven_flat.lateral_mps * factor
+        )
+    step = inputs.stretched_step + recording.dim * state
+    return replace(inputs, recording=replace(recording, odometry=odometry), stretched_step=step)
+
+
+def _stretch_turns(inputs: Inputs, state: float) -> Inputs:
+    turned = _turn_by(inputs, math.exp(state))
+    return replace(turned, stretched_step=turned.stretched_step + state * (3 if is_in_space(inputs.recording) else 1))
+
+
+def _turn_by(inputs: Inputs, factor: float) -> Inputs:
+    """Return the same with all turns of the odometry times a factor."""
+    recording = inputs.recording
+    if not is_in_space(recording):
+        driven = recording.odometry
+        odometry: Any = replace(driven, angular_radps=driven.angular_radps * factor)
+        return replace(inputs, recording=replace(recording, odometry=odometry))
+    path = recording.odometry
+    assert path is not None
+    step = se3.log(se3.between(path.pose_world_robot[:-1], path.pose_world_robot[1:]))
+    step[:, 3:] *= factor
+    pose = np.empty_like(path.pose_world_robot)
+    pose[0] = path.pose_world_robot[0]
+    for row, by in enumerate(se3.exp(step)):
+        pose[row + 1] = se3.compose(pose[row], by)
+    return replace(inputs, recording=replace(recording, odometry=replace(path, pose_world_robot=pose)))
+
+
+def _shift_stamps(inputs: Inputs, state: float) -> Inputs:
+    """Return the same with the frames earlier by the delay of their stamps."""
+    recording: Any = inputs.recording
+    frames = replace(recording.frames, stamp_s=recording.frames.stamp_s - state)
+    return replace(inputs, recording=replace(recording, frames=frames))
+
+
+def _move_planar_mount(inputs: Inputs, state: float, axis: int) -> Inputs:
+    recording: Any = inputs.recording
+    mount = list(recording.sensor.mount_robot_sensor)
+    mount[axis] += state
+    sensor = replace(recording.sensor, mount_robot_sensor=tuple(mount))
+    return replace(inputs, recording=replace(recording, sensor=sensor))
+
+
+def _undo_in_plane(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Inputs:
+    """Return the same without a mistake of the readings."""
+    recording: Any = inputs.recording
+    if mistake.lengths != 1.0:
+        state = math.log(mistake.lengths)
+        if mistake.field == "forward_mps":
+            return _stretch_speeds(inputs, -state)
+        return _stretch_ranges(inputs, state, None)
+    seen, driven = recording.detections, recording.odometry
+    bearing = se2.wrap(mistake.bearing * seen.bearing_rad + mistake.offset_rad)
+    stretch = math.log(abs(mistake.bearing))
+    sigma = seen.sigma_bearing_rad * abs(mistake.bearing)
+    odometry = replace(
+        driven, forward_mps=driven.forward_mps * mistake.forward, angular_radps=driven.angular_radps * mistake.turn
+    )
+    detections = replace(seen, bearing_rad=bearing, sigma_bearing_rad=sigma)
+    if (mistake.bearing, mistake.offset_rad) == (1.0, 0.0):
+        detections = seen
+    return replace(
+        inputs,
+        recording=replace(recording, detections=detections, odometry=odometry),
+        stretched=inputs.stretched + stretch,
+        stretched_step=inputs.stretched_step + math.log(abs(mistake.turn)),
+    )
+
+
+# ---- in space
+
+
+def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
+    seen, sensors = recording.detections, recording.sensors
+    sizes = np.unique(np.round(seen.tag_size_m[np.isfinite(seen.tag_size_m)], 6))
+    one = f"{sizes[0]:.12g}" if len(sizes) == 1 else ""
+    corners = bool(np.isfinite(seen.corner_px[:, 0, 0]).any())
+    many = len(sensors) > 1
+    if one or corners:
+        yield _all_tags(one)
+    else:
+        yield Suspect(
+            "range-scale", "sensor", USUAL_P, partial(_stretch_positions, of=None),
+            lambda s: f"true distances are {math.exp(s):.4g} times those of the detections: the detector has another "
+            "size of tags, or the sensor another scale",
+            lambda s: f"tag size of the detector x {math.exp(s):.4g}, or sigma_scale = {_round_up(abs(s))}",
+            SCALE, _times,
+        )  # fmt: skip
+    if len(sizes) > 1:
+        for size in sizes.tolist():
+            yield _kind_size(f"size {size:g} m", _stretch_positions, ("size", size), f"{size:.12g}")
+    for row, name in enumerate(recording.class_names if len(recording.class_names) > 1 else ()):
+        yield _kind_size(f"class {name}", _stretch_positions, ("class", row), "")
+    for identity in _seen_often(recording):
+        own = seen.tag_size_m[seen.landmark_id == identity]
+        size = f"{np.nanmedian(own):.12g}" if np.isfinite(own).any() else ""
+        name = recording.landmark_names.get(identity, str(identity))
+        yield _one_size(name, _stretch_positions, ("id", identity), size)
+    if recording.odometry is not None:
+        yield Suspect(
+            "odometry-scale", "odometry", USUAL_P, _stretch_speeds,
+            lambda s: f"the robot drives {math.exp(s):.4g} times what its odometry says: wheel radius",
+            lambda s: f"sigma_odometer_scale = {_round_up(abs(s))}", SCALE, _times,
+        )  # fmt: skip
+        yield Suspect(
+            "turn-scale", "odometry", USUAL_P, _stretch_turns,
+            lambda s: f"the robot turns {math.exp(s):.4g} times what its odometry says: wheel base, or gyroscope",
+            _constant("odometry.csv: angular_radps"), TURN, _times,
+        )  # fmt: skip
+        yield Suspect(
+            "turn-sign", "odometry", USUAL_P, lambda inputs, _: _turn_by(inputs, -1.0),
+            _constant("turns of the odometry seem to have the wrong sign: counter-clockwise is positive"),
+            _constant("odometry.csv: angular_radps"),
+        )  # fmt: skip
+        yield Suspect(
+            "clock", sensors[0].name if len(sensors) == 1 else "all sensors", USUAL_P, _shift_stamps,
+            lambda s: f"stamps of the detections are {abs(s):.3g} s {'late' if s > 0 else 'early'}",
+            lambda s: f"detections.csv, frames.csv: stamp_s {'-' if s > 0 else '+'} {abs(s):.3g}", DELAY_S,
+        )  # fmt: skip
+        yield Suspect(
+            "odometry-mirrored", "odometry", RARE_P, lambda inputs, _: _mirrored_drive(inputs),
+            _constant("the odometry seems mirrored: y is to the left, turns are counter-clockwise"),
+            _constant("odometry.csv: lateral_mps, angular_radps"),
+        )  # fmt: skip
+    for mistake in mistakes.UNITS_IN_SPACE:
+        state = math.log(mistake.lengths)
+        if mistake.field == "odometry" and recording.odometry is None:
+            continue
+        undo = (
+            (lambda inputs, _, state=state: _stretch_speeds(inputs, -state))
+            if mistake.field == "odometry"
+            else (lambda inputs, _, state=state: _stretch_positions(inputs, state, None))
+        )
+        yield Suspect(
+            mistake.code, mistake.field, UNIT_P, undo, _constant(mistake.message), _constant(_fix_of(mistake))
+        )
+    for row, sensor in enumerate(sensors):
+        yield from _of_mount(row, sensor, many=many, driven=recording.odometry is not None)
+    if many and recording.odometry is not None:  # one driver for all is likelier than as many mistakes
+        for mistake in mistakes.AXES:
+            by = se3.turn(mistake.turned)
+            yield Suspect(
+                mistake.code, "all sensors", USUAL_P,
+                partial(_change_mounts, sensors=range(len(sensors)), how=partial(_turn_within, by=by)),
+                _constant(mistake.message), _constant("[camera.*.mount]"),
+            )  # fmt: skip
+    cameras = [row for row, sensor in enumerate(sensors) if sensor.intrinsics is not None]
+    if not corners:
+        return
+    for same in {sensors[row].intrinsics: None for row in cameras}:
+        yield from _of_lens([row for row in cameras if sensors[row].intrinsics == same], sensors)
+
+
+def _all_tags(size: str) -> Suspect:
+    return Suspect(
+        "tag-size", "all tags", USUAL_P, partial(_stretch_positions, of=None),
+        lambda s: (f"tags are {float(size) * math.exp(s):.4g} m large, not {float(size):.4g} m" if size
+                   else f"tags are {math.exp(s):.4g} times as large as stated"),
+        lambda s: (f"[tags] size_m = {float(size) * math.exp(s):.4g}" if size
+                   else f"[tags] sizes x {math.exp(s):.4g}"),
+        SCALE, _times,
+    )  # fmt: skip
+
+
+def _stretch_positions(inputs: Inputs, state: float, of: tuple[str, float] | None) -> Inputs:
+    recording: Any = inputs.recording
+    mine, seen = rows_of_kind(recording, of), recording.detections
+    factor = np.where(mine, math.exp(state), 1.0)
+    further = replace(
+        seen,
+        position_sensor_m=seen.position_sensor_m * factor[:, None],
+        covariance_sensor_m2=seen.covariance_sensor_m2 * factor[:, None, None] ** 2,
+        tag_size_m=seen.tag_size_m * factor,
+    )
+    cameras = np.array([sensor.intrinsics is not None for sensor in recording.sensors])[seen.sensor]
+    read = ~(cameras & np.isfinite(seen.corner_px[:, 0, 0]))  # of others the position was measured
+    return replace(
+        inputs,
+        recording=replace(recording, detections=further),
+        stretched=inputs.stretched + 3.0 * state * (mine & read),
+    )
+
+
+def _mirrored_drive(inputs: Inputs) -> Inputs:
+    """Return the same with the odometry mirrored left to right."""
+    recording: Any = inputs.recording
+    pose = recording.odometry.pose_world_robot.copy()
+    pose[:, [1, 3, 5]] *= -1.0
+    return replace(inputs, recording=replace(recording, odometry=replace(recording.odometry, pose_world_robot=pose)))
+
+
+def _of_mount(row: int, sensor: SpatialSensor, *, many: bool, driven: bool) -> Iterable[Suspect]:
+    """Return what may be wrong with where a sensor sits; of one sensor without odometry nothing shows."""
+    if not (many or driven):
+        return
+    name, told = sensor.name, _constant(f"[camera.{sensor.name}.mount]")
+    for axis, part in enumerate(("x", "y", "z", "roll", "pitch", "yaw")):
+        unit, sigma = ("rad", MOUNT_RAD) if axis > 2 else ("m", MOUNT_M)
+        yield Suspect(
+            "mount", f"{name} {part}", USUAL_P, partial(_move_mount, sensor=row, axis=axis),
+            lambda s, part=part, unit=unit: f"the mount of {name} is {s:.3g} {unit} off in {part} of the robot",  # type: ignore[misc]
+            told, sigma,
+        )  # fmt: skip
+    for mistake in mistakes.AXES:
+        by = se3.turn(mistake.turned)
+        yield Suspect(
+            mistake.code, name, USUAL_P, partial(_change_mount, sensor=row, how=partial(_turn_within, by=by)),
+            _constant(f"{name}: {mistake.message}"), told,
+        )  # fmt: skip
+    for words, how in _FLIPS:
+        yield Suspect(
+            "mount-flip", name, USUAL_P if words in _OFTEN else RARE_P,
+            partial(_change_mount, sensor=row, how=how), _constant(f"{name} seems {words}"), told,
+        )  # fmt: skip
+
+
+def _turn_within(mount: FloatArray, by: FloatArray) -> FloatArray:
+    """Return a mount with the sensor's axes turned."""
+    return np.asarray(se3.compose(mount, by))
+
+
+def _turned_about(axis: int, angle_rad: float, *, of_robot: bool) -> Callable[[FloatArray], FloatArray]:
+    quaternion = np.zeros(4)
+    quaternion[axis], quaternion[3] = math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad)
+    by = se3.turn(quaternion)
+
+    def how(mount: FloatArray) -> FloatArray:
+        if of_robot:
+            turned = se3.compose(by, mount)
+            return np.concatenate([mount[:3], turned[3:]])
+        return np.asarray(se3.compose(mount, by))
+
+    return how
+
+
+_FLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
+    ("mounted looking the other way: its yaw is 180 degrees off", _turned_about(2, math.pi, of_robot=True)),
+    ("mounted upside down: its image is turned by 180 degrees", _turned_about(2, math.pi, of_robot=False)),
+    ("turned by 90 degrees to the left of its stated mount", _turned_about(2, 0.5 * math.pi, of_robot=True)),
+    ("turned by 90 degrees to the right of its stated mount", _turned_about(2, -0.5 * math.pi, of_robot=True)),
+    ("to have its mount stated inversely: the robot in the sensor's frame", lambda m: np.asarray(se3.inverse(m))),
+    ("to have its quaternion stated as w, x, y, z", lambda m: np.concatenate([m[:3], m[4:], m[3:4]])),
+    ("mounted on the other side: the sign of y", lambda m: m * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 1.0])),
+)  # fmt: skip
+_OFTEN = frozenset(words for words, _ in _FLIPS[:2])
+
+
+def _move_mount(inputs: Inputs, state: float, sensor: int, axis: int) -> Inputs:
+    """Return the same with a mount moved along, or turned about, an axis of the robot."""
+
+    def how(mount: FloatArray) -> FloatArray:
+        if axis < 3:
+            moved = mount.copy()
+            moved[axis] += state
+            return moved
+        return _turned_about(axis - 3, state, of_robot=True)(mount)
+
+    return _change_mount(inputs, state, sensor, how)
+
+
+def _change_mount(inputs: Inputs, state: float, sensor: int, how: Callable[[FloatArray], FloatArray]) -> Inputs:
+    return _change_mounts(inputs, state, (sensor,), how)
+
+
+def _change_mounts(inputs: Inputs, _: float, sensors: Iterable[int], how: Callable[[FloatArray], FloatArray]) -> Inputs:
+    recording: Any = inputs.recording
+    changed = list(recording.sensors)
+    for row in sensors:
+        mount = how(np.array(changed[row].mount_robot_sensor))
+        changed[row] = replace(changed[row], mount_robot_sensor=tuple(mount.tolist()))
+    return replace(inputs, recording=replace(recording, sensors=tuple(changed)))
+
+
+def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspect]:
+    """Return what may be wrong with the calibration that some cameras share."""
+    sensor = sensors[row[0]]
+    assert sensor.intrinsics is not None
+    fx, fy, cx, cy = sensor.intrinsics
+    name = sensor.name if len(row) == 1 else ", ".join(sensors[one].name for one in row)
+
+    def lens(code: str, words: str, fix: str, p: float, **changed: Any) -> Suspect:
+        undo = partial(_change_lens, rows=row, how=lambda _, __: changed)
+        return Suspect(code, name, p, undo, _constant(f"{name}: {words}"), _constant(fix), pairs=False)
+
+    yield Suspect(
+        "focal-length", name, USUAL_P, partial(_change_lens, rows=row, how=_zoomed),
+        lambda s: f"{name}: the focal length is {fx * math.exp(s):.4g} px, not {fx:.4g} px",
+        lambda s: f"[camera.{name}] intrinsics = [{fx * math.exp(s):.5g}, {fy * math.exp(s):.5g}, {cx:g}, {cy:g}]",
+        FOCAL, lambda s: fx * math.exp(s), pairs=False,
+    )  # fmt: skip
+    if abs(fx - fy) > 1e-3 * fx or abs(cx - cy) > 1e-3 * cx:
+        for words, swapped in (
+            ("fx and fy seem to be swapped", (fy, fx, cx, cy)), ("cx and cy seem to be swapped", (fx, fy, cy, cx)),
+            ("fx, fy and cx, cy seem to be swapped", (fy, fx, cy, cx)),
+            ("intrinsics seem to be stated as fx, cx, fy, cy", (fx, cx, fy, cy)),
+        ):  # fmt: skip
+            listed = ", ".join(f"{each:g}" for each in swapped)
+            yield lens("intrinsics", words, f"[camera.{name}] intrinsics = [{listed}]", USUAL_P, intrinsics=swapped)
+    if not any(sensor.distortion):
+        return
+    yield lens(
+        "distortion", "corners seem to be undistorted already", f'[camera.{name}] model = "pinhole"', USUAL_P,
+        distortion=(), distortion_model="pinhole",
+    )  # fmt: skip
+    if len(sensor.distortion) >= 4:
+        other = "equidistant" if sensor.distortion_model == "radtan" else "radtan"
+        yield lens(
+            "lens-model", f"the lens seems to be of the model '{other}'", f'[camera.{name}] model = "{other}"', USUAL_P,
+            distortion=sensor.distortion[:4], distortion_model=other,
+        )  # fmt: skip
+
+
+def _zoomed(sensor: SpatialSensor, state: float) -> dict[str, Any]:
+    assert sensor.intrinsics is not None
+    fx, fy, cx, cy = sensor.intrinsics
+    return {"intrinsics": (fx * math.exp(state), fy * math.exp(state), cx, cy)}
+
+
+def _change_lens(
+    inputs: Inputs, state: float, rows: Iterable[int], how: Callable[[Any, float], dict[str, Any]]
+) -> Inputs:
+    recording: Any = inputs.recording
+    sensors = list(recording.sensors)
+    for row in rows:
+        sensors[row] = replace(sensors[row], **how(sensors[row], state))
+    return replace(inputs, recording=replace(recording, sensors=tuple(sensors)))
+
+
+# ---- of a given map
+
+
+def _of_map() -> Iterable[Suspect]:
+    yield Suspect(
+        "map-scale", "map", USUAL_P, _stretch_map,
+        lambda s: f"true distances are {math.exp(s):.4g} times those of the given map: another scale",
+        lambda s: f"--prior-map: lengths x {math.exp(s):.5g}", MAP_SCALE, _times, of_map=True, pairs=False,
+    )  # fmt: skip
+    yield Suspect(
+        "map-mirrored", "map", USUAL_P, lambda inputs, _: _mirror_map(inputs),
+        _constant("the given map is mirrored: y to the right, x and y exchanged, or z downwards"),
+        _constant("--prior-map: the sign of y"), of_map=True, pairs=False,
+    )  # fmt: skip
+    for unit, factor in (
+        ("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048), ("inches", 0.0254),
+    ):  # fmt: skip
+        yield Suspect(
+            "map-unit", "map", UNIT_P, partial(_stretch_map_by, factor=factor),
+            _constant(f"the given map seems to be in {unit}, not in metres"),
+            _constant(f"--prior-map: lengths x {factor:g}"), of_map=True, pairs=False,
+        )  # fmt: skip
+    yield Suspect(
+        "map-other-site", "map", RARE_P, lambda inputs, _: replace(inputs, prior_map=None),
+        _constant("the given map is not one of what was seen: another site, or another edition"),
+        _constant("--prior-map: leave it out, or give the map of this site"), of_map=True, pairs=False,
+    )  # fmt: skip
+
+
+def _stretch_map_by(inputs: Inputs, _: float, factor: float) -> Inputs:
+    return _stretch_map(inputs, math.log(factor))
+
+
+def _stretch_map(inputs: Inputs, state: float) -> Inputs:
+    given, factor = inputs.prior_map, math.exp(state)
+    assert given is not None
+    dim = given.position_m.shape[1]
+    other = replace(given, position_m=given.position_m * factor, covariance_m2=given.covariance_m2 * factor**2)
+    return replace(inputs, prior_map=other, stretched_place=inputs.stretched_place + dim * state)
+
+
+def _mirror_map(inputs: Inputs) -> Inputs:
+    """Return the same with the map mirrored; it knows no orientations then, of which there are several mirrors."""
+    given = inputs.prior_map
+    assert given is not None
+    sign = np.ones(given.position_m.shape[1])
+    sign[1] = -1.0
+    other = replace(
+        given,
+        position_m=given.position_m * sign,
+        covariance_m2=given.covariance_m2 * sign[:, None] * sign,
+        rotation=None,
+        rotation_covariance=None,
+    )
+    return replace(inputs, prior_map=other)

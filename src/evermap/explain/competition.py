@@ -1,0 +1,579 @@
+"""The competition of causes: a session solved as given, and under the causes that explain it better.
+
+It is entered where there are symptoms, so a sound run costs nothing. Continuous causes are screened by a score test at
+the optimum at which the map stands as given, discrete ones by pairs of sightings. The session is solved again under the
+best few, and what wins by log evidence, prices paid, is kept: the cause's state is refined there, and a second cause
+may be added. Trials are pure functions of the inputs, so one that loses leaves no trace.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from evermap.config import SlamConfig
+from evermap.errors import EvermapError
+from evermap.explain.causes import Inputs, Suspect, list_suspects, rows_of_kind
+from evermap.explain.evidence import AnySession, Screen, evidence_at, optimum_of, used_rows
+from evermap.explain.linearise import change_by, gain_by, held_by_map
+from evermap.explain.seeds import find_scales, find_shape, find_single_scales
+from evermap.slam.estimate import Solved, solve
+from evermap.slam.mistakes import HONEST, find_motion, off, pairs_of
+from evermap.types import Cause, ChangeKind, SlamResult, is_in_space
+
+VisitT = TypeVar("VisitT")
+NEAR = 2.0
+"""Standard deviations within which a state is refined no further."""
+FAR = 2.5
+"""Standard deviations beforehand beyond which no state is tried at once."""
+LEAST_SCALE, LEAST_SINGLE = 0.015, 0.05
+"""Logarithm of a scale, of all or of one landmark, from which its first value is tried: smaller ones the linear test
+finds."""
+REFINED = 2
+"""Trials whose states are refined: the best ones."""
+FALLS, LINEAR = 0.2, 4.0
+"""Share by which the loss of pairs must fall, and times that a cause may gain what the linear test says."""
+STRETCHES = frozenset({"tag-size", "range-scale"})
+"""Causes that stretch detections: of some landmarks as of all."""
+AGREE = 0.25
+"""Share of what one of ranges, odometry and map is off by, up to which the other two agree with each other."""
+SURE = 0.99
+"""Probability from which a delay is told as a cause."""
+INLIER, FEWER = 0.5, 0.7
+"""Probability from which a detection is no outlier, and share of the outliers that a cause must leave at most."""
+OF_LANDMARKS = frozenset({ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED})
+
+
+@dataclass(frozen=True)
+class SessionSolution(Generic[VisitT]):
+    """What a solution of some inputs consists of."""
+
+    visit: VisitT
+    session: AnySession
+    result: SlamResult
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A cause that was taken, with its state, and the information on that where it was asked."""
+
+    suspect: Suspect
+    state: float
+    information: float = math.nan
+
+
+@dataclass(frozen=True)
+class Trial(Generic[VisitT]):
+    """A solution under some causes.
+
+    Attributes:
+        inputs: without what the causes did.
+        solution: of them.
+        taken: the causes.
+        evidence: log evidence of the measurements as given, with the prices of all causes and changes.
+        worth: share of what the measurements say that is new.
+    """
+
+    inputs: Inputs
+    solution: SessionSolution[VisitT]
+    taken: tuple[Taken, ...]
+    evidence: float
+    worth: float
+
+    def beats(self, other: Trial[VisitT]) -> float:
+        """Return by how much the evidence is larger, as far as measurements are independent [nats]."""
+        own, others = (sum(one.suspect.log_p for one in trial.taken) for trial in (self, other))
+        price = own - others
+        return (self.evidence - other.evidence - price) * min(self.worth, other.worth) + price
+
+
+@dataclass(frozen=True)
+class Explained(Generic[VisitT]):
+    """The end of a competition.
+
+    Attributes:
+        best: the trial that won.
+        causes: of it, the most probable first.
+        weighed: trials that were solved.
+    """
+
+    best: Trial[VisitT]
+    causes: tuple[Cause, ...]
+    weighed: tuple[Trial[VisitT], ...] = field(default=())
+
+
+Solve = Callable[[Inputs], SessionSolution[VisitT]]
+
+
+def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tuple[str, ...]:
+    """Return why causes other than changes are asked: short names; none where all is well.
+
+    Args:
+        result: of the session as given.
+        inputs: of it.
+        config: thresholds are those of `slam.explain` and `slam.check`.
+    """
+    rules, found = config.explain, list[str]()
+    seen = result.innovations
+    inlier = seen.p_inlier >= INLIER
+    if len(inlier) and float(np.mean(~inlier)) > rules.rejected:
+        found.append("detections rejected")
+    if inlier.any():
+        dof = np.full(len(inlier), 2) if seen.dof is None else seen.dof
+        usual = float(seen.nis[inlier].sum()) / float(dof[inlier].sum())
+        if usual > rules.innovations:
+            found.append("innovations")
+    if any(change.kind in OF_LANDMARKS for change in result.changes):
+        found.append("changes")
+    twice = [one for one, name in result.landmarks.names.items() if "#" in str(name)]
+    hits = result.landmarks.n_hits
+    if twice and hits[np.isin(result.landmarks.landmark_id, twice)].sum() > rules.rejected * hits.sum():
+        found.append("identities at several places")
+    for state in result.parameters:
+        if not state.fixed and state.prior_sigma > 0.0:
+            if abs(state.value - state.prior_mean) > rules.states * state.prior_sigma:
+                found.append(state.name)
+        elif (state.name.endswith("_noise_factor") and state.value > rules.noise) or (
+            state.name == "sigma_corner_px" and state.value > rules.noise * config.space.sigma_px
+        ):
+            found.append(state.name)
+    if inputs.prior_map is not None:
+        own = np.unique(inputs.recording.detections.landmark_id)
+        common = np.isin(inputs.prior_map.landmark_id, own)
+        if result.trajectory.frame != "prior_map" or not common.any():
+            found.append("map")
+    if not found and any(not finding.usable for finding in find_motion(inputs.recording, config.check)):
+        found.append("pairs")
+    return tuple(found)
+
+
+def explain(
+    inputs: Inputs,
+    solution: SessionSolution[VisitT] | None,
+    solve_under: Solve[VisitT],
+    config: SlamConfig,
+    say: Callable[[str], None] = lambda _: None,
+) -> Explained[VisitT] | None:
+    """Return the solution under the causes that explain a session best; None where nothing can be solved.
+
+    Args:
+        inputs: as given.
+        solution: of them; None where there was none (the estimator failed).
+        solve_under: solves other inputs.
+        config: settings of the estimator.
+        say: told what is done.
+
+    Without symptoms the solution is returned as it is.
+    """
+    rules = config.explain
+    base = None if solution is None else _trial(inputs, solution, ())
+    if base is not None and solution is not None and not find_symptoms(solution.result, inputs, config):
+        return Explained(base, find_delays(solution.result, rules.late_s))
+    say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
+    budget = _Budget(rules.most_solutions)
+    weighed = [] if base is None else [base]
+    best = base
+    for _ in range(rules.most_causes):
+        found = _next_cause(best, inputs, solve_under, config, budget, weighed)
+        if found is None:
+            break
+        best = _without_needless(found, inputs, solve_under, budget, weighed)
+        if not find_symptoms(best.solution.result, best.inputs, config):
+            break
+    if best is None:
+        return None
+    causes = (*_causes(best, weighed, base), *find_delays(best.solution.result, rules.late_s))
+    return Explained(best, causes, tuple(weighed))
+
+
+def find_delays(result: SlamResult, late_s: float) -> tuple[Cause, ...]:
+    """Return clocks that the estimator itself found to be late by so much, which the solution has put right."""
+    found = list[Cause]()
+    for state in result.parameters:
+        name = state.name.removesuffix("_delay_s")
+        if name == state.name or state.fixed or abs(state.value) < late_s or not state.p_needed > SURE:
+            continue
+        table = "odometry.csv" if name == "odometry" else f"detections.csv of {name}"
+        how = f"stamps of {name} are {abs(state.value):.3g} s {'late' if state.value > 0.0 else 'early'}"
+        fix = f"{table}: stamp_s {'-' if state.value > 0.0 else '+'} {abs(state.value):.3g}"
+        found.append(Cause("clock", name, how, state.value, state.sigma, min(state.p_needed, 1.0), fix))
+    return tuple(found)
+
+
+@dataclass
+class _Budget:
+    """Solutions that may still be made."""
+
+    left: int
+
+
+def _next_cause(
+    best: Trial[VisitT] | None,
+    given: Inputs,
+    solve_under: Solve[VisitT],
+    config: SlamConfig,
+    budget: _Budget,
+    weighed: list[Trial[VisitT]],
+) -> Trial[VisitT] | None:
+    """Return the best trial with one more cause; None if none is better."""
+    rules, inputs = config.explain, given if best is None else best.inputs
+    taken = () if best is None else best.taken
+    known = {(one.suspect.code, one.suspect.subject) for one in taken}
+    suspects = [one for one in list_suspects(inputs) if (one.code, one.subject) not in known]
+    tried, winner = set[tuple[str, str]](), None
+
+    def ahead(trial: Trial[VisitT]) -> float:
+        return trial.evidence if best is None else trial.beats(best)
+
+    for screen in (_plain, _screen_continuous):  # what costs nothing first
+        asked = _diverse(screen(best, inputs, suspects, config), rules.most_tried, tried)
+        made = (_solve_trial(inputs, taken, suspect, state, solve_under, budget) for suspect, state in asked)
+        trials = sorted((trial for trial in made if trial is not None), key=ahead, reverse=True)
+        trials[:REFINED] = [_refined(trial, inputs, taken, solve_under, budget) for trial in trials[:REFINED]]
+        weighed += trials
+        for trial in trials:
+            if best is not None and not (ahead(trial) > rules.lead_nats and _relieves(trial, best, config)):
+                continue  # it fits better, as with any further state, but nothing that was asked is explained
+            if winner is None or trial.beats(winner) > 0.0:
+                winner = trial
+        if winner is not None and not find_symptoms(winner.solution.result, winner.inputs, config):
+            return winner
+    return winner
+
+
+def _relieves(trial: Trial[VisitT], best: Trial[VisitT], config: SlamConfig) -> bool:
+    """Return whether a trial has fewer symptoms, fewer landmarks that are told to have changed, or rejects far less."""
+    was, now = best.solution.result, trial.solution.result
+    before, after = find_symptoms(was, best.inputs, config), find_symptoms(now, trial.inputs, config)
+    changed = [len({one for change in result.changes for one in change.landmark_ids}) for result in (was, now)]
+    rejected = [float(np.mean(result.innovations.p_inlier < INLIER)) for result in (was, now)]
+    return len(after) < len(before) or changed[1] < changed[0] or rejected[1] < FEWER * rejected[0]
+
+
+def _plain(
+    best: Trial[VisitT] | None, inputs: Inputs, suspects: list[Suspect], config: SlamConfig
+) -> list[tuple[float, Suspect, float]]:
+    """Return causes that show without a solution, or in one that fails."""
+    of_map = [(0.0, one, 0.0) for one in suspects if _is_of_map(one, best, config)]
+    return [*_screen_discrete(inputs, suspects, config), *_by_seeds(best, inputs, suspects, config), *of_map]
+
+
+def _without_needless(
+    best: Trial[VisitT], given: Inputs, solve_under: Solve[VisitT], budget: _Budget, weighed: list[Trial[VisitT]]
+) -> Trial[VisitT]:
+    """Return the trial without causes that were taken before the one that explains what they did, too."""
+    for one in best.taken[:-1]:
+        rest = tuple(other for other in best.taken if other is not one)
+        if budget.left <= 0:
+            break
+        budget.left -= 1
+        try:
+            undone = given
+            for other in rest:
+                undone = other.suspect.undo(undone, other.state)
+            trial = _trial(undone, solve_under(undone), rest)
+        except EvermapError:
+            continue
+        weighed.append(trial)
+        if trial.beats(best) > 0.0:
+            best = trial
+    return best
+
+
+def _is_of_map(suspect: Suspect, best: Trial[VisitT] | None, config: SlamConfig) -> bool:
+    """Return whether a discrete cause of the map is asked: where most of the map does not hold, or it was not found."""
+    if not suspect.of_map or suspect.is_continuous:
+        return False
+    if best is None:
+        return True
+    result, given = best.solution.result, best.inputs.prior_map
+    if given is None:
+        return False
+    if result.trajectory.frame != "prior_map":
+        return True
+    changed = sum(len(change.landmark_ids) for change in result.changes if change.kind in OF_LANDMARKS)
+    common = np.isin(given.landmark_id, best.inputs.recording.detections.landmark_id).sum()
+    return bool(changed > config.explain.map_changed * common)
+
+
+def _by_seeds(
+    best: Trial[VisitT] | None, inputs: Inputs, suspects: Iterable[Suspect], config: SlamConfig
+) -> list[tuple[float, Suspect, float]]:
+    """Return scales with first values that need no solution (`seeds`), where these are another than stated."""
+    scales = find_scales(inputs.recording, inputs.prior_map, config.check)
+    ranges, driven, of_map = scales.ranges, scales.odometry, scales.map
+    apart = {  # of ranges, odometry and map, how far the other two are apart
+        "ranges": abs(scales.by_map - scales.by_odometry),
+        "odometry": abs(scales.by_map),
+        "map": abs(scales.by_odometry),
+    }
+    odd = min(apart, key=lambda one: apart[one])
+    if apart[odd] < AGREE * max(apart.values()):  # two against one
+        ranges, driven, of_map = (
+            state if odd == one else math.nan
+            for one, state in (("ranges", ranges), ("odometry", driven), ("map", of_map))
+        )
+    single: dict[int, float] = {}
+    if best is not None:
+        result = best.solution.result
+        if inputs.prior_map is not None and result.trajectory.frame != "prior_map" and not math.isfinite(scales.by_map):
+            ratio = find_shape(result, inputs.prior_map)
+            states = {state.name: state.value for state in result.parameters}
+            ranges = ratio - math.log(states.get("range_scale", 1.0 + states.get("range_slope", 0.0)))
+            driven = ratio + math.log(states.get("odometry_forward_scale", states.get("odometry_scale", 1.0)))
+            of_map = -ratio
+        single = find_single_scales(inputs.recording, result)
+    found = list[tuple[float, Suspect, float]]()
+    for suspect in suspects:
+        if suspect.rows is not None and suspect.rows[0] == "id":
+            state = single.get(int(suspect.rows[1]), math.nan)
+        elif suspect.rows is not None:
+            of_kind = np.unique(inputs.recording.detections.landmark_id[rows_of_kind(inputs.recording, suspect.rows)])
+            own = [single[one] for one in of_kind.tolist() if one in single]
+            state = float(np.median(own)) if len(own) > 1 and 2 * len(own) > len(of_kind) else math.nan
+        else:
+            seeds = {"range-scale": ranges, "tag-size": ranges, "odometry-scale": driven, "map-scale": of_map}
+            state = seeds.get(suspect.code, math.nan)
+        if abs(state) > (LEAST_SCALE if suspect.rows is None else LEAST_SINGLE):
+            found.append((math.inf, suspect, state))
+    # what was rejected stands out; of all lengths that which is off least is likelier
+    return sorted(found, key=lambda each: (each[1].rows is not None, abs(each[2])))
+
+
+def _diverse(
+    ranked: list[tuple[float, Suspect, float]], most: int, tried: set[tuple[str, str]]
+) -> list[tuple[Suspect, float]]:
+    """Return the best few that were not `tried`, which are added: of each kind of cause two at most, so that one kind
+    does not crowd out the others.
+    """
+    found, count = list[tuple[Suspect, float]](), dict[str, int]()
+    for _, suspect, state in ranked:
+        name = suspect.code, suspect.subject
+        if count.get(suspect.code, 0) < 2 and name not in tried and len(found) < most:
+            tried.add(name)
+            count[suspect.code] = count.get(suspect.code, 0) + 1
+            found.append((suspect, state))
+    return found
+
+
+def _screen_discrete(
+    inputs: Inputs, suspects: Iterable[Suspect], config: SlamConfig
+) -> list[tuple[float, Suspect, float]]:
+    """Return discrete causes that bring pairs of sightings nearer, with what they gain [nats]."""
+    rules = config.check
+    before = pairs_of(inputs.recording, rules)
+    if before is None or before.still:
+        return []
+    loss, found = _pair_loss(before, rules.fits), list[tuple[float, Suspect, float]]()
+    for suspect in suspects:
+        if suspect.is_continuous or suspect.of_map or not suspect.pairs:
+            continue
+        try:
+            pairs = pairs_of(suspect.undo(inputs, 0.0).recording, rules)
+        except (EvermapError, ValueError):
+            continue
+        if pairs is None:
+            continue
+        gain = loss - _pair_loss(pairs, rules.fits)
+        if gain > max(rules.gain, FALLS * loss):
+            found.append((gain, suspect, 0.0))
+    return sorted(found, key=lambda each: -each[0])
+
+
+def _pair_loss(pairs: object, fits: float) -> float:
+    """Cauchy loss of pairs of sightings [nats]."""
+    residual = np.minimum(off(pairs.residual(HONEST)), 10.0)  # type: ignore[attr-defined]
+    return float(np.log1p((residual / fits) ** 2).sum())
+
+
+def _screen_continuous(
+    best: Trial[VisitT] | None,
+    inputs: Inputs,
+    suspects: list[Suspect],
+    config: SlamConfig,
+) -> list[tuple[float, Suspect, float]]:
+    """Return continuous causes with what they gain by the score test [nats], price paid, and their states.
+
+    And discrete ones of a lens, which do not show in pairs, by a few steps.
+    """
+    if best is None:
+        return []
+    session = _without_changes(best)
+    screen = Screen.of(optimum_of(session))
+    found, of_all = list[tuple[float, Suspect, float]](), None
+    # what changes explain, a cause must explain, too
+    with_changes = optimum_of(best.solution.session, best.solution.result.changes)
+    deficit = evidence_at(with_changes) - evidence_at(screen.optimum)
+    for suspect in suspects:
+        if not suspect.is_continuous:
+            if not (suspect.pairs or suspect.of_map):
+                gain = gain_by(session, inputs, suspect) * screen.optimum.worth + suspect.log_p
+                found += [(gain, suspect, 0.0)] if gain > 0.0 else []
+            continue
+        if suspect.rows is None or of_all is None:
+            direction = change_by(session, screen, inputs, suspect)
+            of_all = direction if suspect.code in STRETCHES and suspect.rows is None else of_all
+        else:  # each detection stretches by itself
+            direction = of_all * screen.of_detections(rows_of_kind(inputs.recording, suspect.rows)[used_rows(session)])
+        if direction is None:
+            continue
+        score = screen.score(direction, suspect.sigma**-2)
+        state = float(np.clip(score.value, -FAR * suspect.sigma, FAR * suspect.sigma))
+        gain = score.gain * screen.optimum.worth - 0.5 * math.log(max(score.information, 1e-12) * suspect.sigma**2)
+        if gain + suspect.log_p > config.explain.lead_nats and LINEAR * score.gain > deficit:
+            found.append((gain + suspect.log_p, suspect, state))
+    return sorted(found, key=lambda each: -each[0])
+
+
+def _without_changes(best: Trial[VisitT]) -> AnySession:
+    """Return the session with all landmarks of the map where it has them, which is what causes are asked of."""
+    session, inputs = best.solution.session, best.inputs
+    if not isinstance(session, Solved):
+        return held_by_map(session)
+    assert not is_in_space(inputs.recording)
+    if not best.solution.result.changes:
+        return session
+    static = session.settings.model_copy(update={"method": "nohyp"})
+    try:
+        return solve(inputs.recording, static, prior_map=inputs.prior_map)
+    except EvermapError:
+        return session
+
+
+def _solve_trial(
+    inputs: Inputs,
+    taken: tuple[Taken, ...],
+    suspect: Suspect,
+    state: float,
+    solve_under: Solve[VisitT],
+    budget: _Budget,
+) -> Trial[VisitT] | None:
+    if budget.left <= 0:
+        return None
+    budget.left -= 1
+    try:
+        undone = suspect.undo(inputs, state)
+        return _trial(undone, solve_under(undone), (*taken, Taken(suspect, state)))
+    except EvermapError:  # nothing can be estimated under it
+        return None
+
+
+def _refined(
+    trial: Trial[VisitT],
+    before: Inputs,
+    taken: tuple[Taken, ...],
+    solve_under: Solve[VisitT],
+    budget: _Budget,
+) -> Trial[VisitT]:
+    """Return the trial with the state of its last cause at its optimum, and the information on it."""
+    last = trial.taken[-1]
+    suspect = last.suspect
+    while suspect.is_continuous:
+        session = held_by_map(trial.solution.session)
+        screen = Screen.of(optimum_of(session))
+        direction = change_by(session, screen, trial.inputs, suspect)
+        if direction is None:
+            break
+        score = screen.score(direction, suspect.sigma**-2, last.state)
+        worth = screen.optimum.worth
+        information = suspect.sigma**-2 + (score.information - suspect.sigma**-2) * worth
+        trial = _with_last(trial, replace(last, information=information))
+        step = float(np.clip(score.value, -suspect.sigma, suspect.sigma))
+        if abs(step) * math.sqrt(information) < NEAR * 0.5 or budget.left <= 0:
+            break
+        nearer = _solve_trial(before, taken, suspect, last.state + step, solve_under, budget)
+        if nearer is None:
+            break
+        nearer = _with_last(nearer, replace(nearer.taken[-1], information=information))
+        if nearer.evidence <= trial.evidence:
+            break
+        trial, last = nearer, nearer.taken[-1]
+    return trial
+
+
+def _with_last(trial: Trial[VisitT], last: Taken) -> Trial[VisitT]:
+    """Return the trial with its last cause known better, and the evidence with the state integrated out."""
+    before = trial.taken[-1]
+    change = _state_evidence(last) - _state_evidence(before)
+    return replace(trial, taken=(*trial.taken[:-1], last), evidence=trial.evidence + change)
+
+
+def _state_evidence(taken: Taken) -> float:
+    """Log prior density of a state, times the volume that it is left; its price alone where it is discrete."""
+    suspect = taken.suspect
+    if not suspect.is_continuous:
+        return suspect.log_p
+    information = taken.information if math.isfinite(taken.information) else suspect.sigma**-2
+    return (
+        suspect.log_p
+        - 0.5 * (taken.state / suspect.sigma) ** 2
+        - 0.5 * math.log(max(information * suspect.sigma**2, 1.0))
+    )
+
+
+def _trial(inputs: Inputs, solution: SessionSolution[VisitT], taken: tuple[Taken, ...]) -> Trial[VisitT]:
+    session = solution.session
+    optimum = optimum_of(session, solution.result.changes)
+    used = used_rows(session)
+    if isinstance(session, Solved):
+        problem_s, places = session.outcome.problem.stamp_s, 0
+        if session.outcome.aligned and session.prepared.prior_map is not None:
+            places = int(session.prepared.prior_map.given.sum())
+    else:
+        problem = session.solved.optimum.smoother.problem
+        problem_s, places = problem.stamp_s, len(problem.prior.place)
+    volume = float(inputs.stretched[used].sum()) + inputs.stretched_step * (len(problem_s) - 1)
+    volume += inputs.stretched_place * places
+    left_out = len(inputs.stretched) - len(used)
+    seen = optimum.detections
+    outlier = float(np.mean(np.where(np.isfinite(seen.log_odds), seen.log_nominal - seen.log_odds, 0.0)))
+    evidence = evidence_at(optimum) + volume + left_out * outlier
+    return Trial(inputs, solution, taken, evidence + sum(map(_state_evidence, taken)), optimum.worth)
+
+
+OWN_STATES = {
+    "odometry-scale": (("odometry_forward_scale", 1.0), ("odometry_scale", 1.0)),
+    "turn-scale": (("odometry_turn_scale", 1.0),),
+    "range-scale": (("range_scale", -1.0),),
+}
+"""Calibration states that are the same number as a cause's, and the sign with which their logarithms add to it."""
+
+
+def _with_own_state(taken: Taken, result: SlamResult) -> tuple[float, float]:
+    """Return the state of a cause and its standard deviation, with what the estimator's own state adds to it."""
+    state, sigma = taken.state, taken.information**-0.5 if taken.information > 0.0 else math.nan
+    own = {one.name: one for one in result.parameters}
+    for name, sign in OWN_STATES.get(taken.suspect.code, ()):
+        if name in own and not own[name].fixed and own[name].value > 0.0:
+            state += sign * math.log(own[name].value)
+            sigma = min(sigma, own[name].sigma / own[name].value) if own[name].sigma > 0.0 else sigma
+    return state, sigma
+
+
+def _causes(best: Trial[VisitT], weighed: list[Trial[VisitT]], base: Trial[VisitT] | None) -> tuple[Cause, ...]:
+    """Return the causes of the best trial, with their probabilities among all that was weighed."""
+    if not best.taken:
+        return ()
+    relative = np.array([trial.beats(best) for trial in weighed])
+    share = np.exp(np.minimum(relative, 0.0))
+    share /= max(float(share.sum()), 1e-300)
+    found = []
+    gained = math.nan if base is None else best.beats(base)
+    for one in best.taken:
+        name = one.suspect.code, one.suspect.subject
+        holds = [any((t.suspect.code, t.suspect.subject) == name for t in trial.taken) for trial in weighed]
+        suspect = one.suspect
+        state, sigma = _with_own_state(one, best.solution.result)
+        value = suspect.shown(state) if suspect.is_continuous else math.nan
+        scale = abs(suspect.shown(state + 1e-6) - suspect.shown(state)) / 1e-6
+        found.append(
+            Cause(
+                suspect.code, suspect.subject, suspect.say(state), value, sigma * scale,
+                float(share[np.array(holds)].sum()), suspect.fix(state), gained,
+            )
+        )  # fmt: skip
+    return tuple(sorted(found, key=lambda cause: -cause.probability))

@@ -1,0 +1,377 @@
+"""The log evidence of a solved session, and what one more number would add to it.
+
+**Evidence.** All unknowns are integrated out around the optimum (Laplace's method; MacKay 1992, *Bayesian
+interpolation*): what the measurements and the priors are worth there, and half the log determinant of what is known of
+the unknowns, which is the price of every state that was needed (Occam). A detection is an inlier of the noise that was
+learned or an outlier whose density is that of the *nominal* noise at the squared residual at which both are alike, so
+that neither a wider noise nor fewer detections come for nothing. Landmarks of which no map says anything are somewhere
+within `ROOM_M`. Solutions of the same measurements can be compared, also where the measurements were transformed, if
+the volume of the transformation is counted (`causes.Inputs`).
+
+**Score.** A further number changes all residuals by a known direction `d`. With everything else marginalised, the
+information on it is `h = d'd - b'H^-1 b`, `b = J'd`, and the cost falls by `g^2 / 2 h` at `-g / h`, with
+`g = d'r - b'H^-1 J'r` (Rao's score test).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from evermap.estimate.graph import Graph, Linear
+from evermap.estimate.sparse.elimination import numbers_of
+from evermap.estimate.sparse.system import Factorised, exhausted
+from evermap.slam import intake
+from evermap.slam.calibration import FORWARD
+from evermap.slam.changes.gain import PLANE, log_onset, log_prior
+from evermap.slam.correlation import Lasting
+from evermap.slam.estimate import Solved
+from evermap.slam.linearise import PlacePriors, detection_residuals
+from evermap.slam.smoother import Smoother
+from evermap.slam.space.against_map import MapComparison
+from evermap.slam.space.intake import SpatialIntake, start_noise
+from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PIXEL, POSE, ROWS
+from evermap.slam.space.problem import ANY_RAD, SpatialProblem
+from evermap.slam.space.solve import SpatialSolved
+from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
+
+LOG_2PI = math.log(2.0 * math.pi)
+ROOM_M, ROOM_RAD = 20.0, math.pi
+"""Standard deviations of where a landmark is of which nothing is known, and of its turn."""
+LEAST_INFORMATION = 1e-6
+"""Information of the border's priors, at least: that on delays may be less than none."""
+TURN, LEAST_SCALE = FORWARD + 1, 1e-3
+"""Calibration state of the turns, and the least scale of which a logarithm is taken."""
+ODOMETRY, DETECTIONS, START, REST = 0, 1, 2, 3
+"""Blocks of a graph, the same in the plane and in space."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialSession:
+    """A session in space, solved: its input, and its values."""
+
+    intake: SpatialIntake
+    solved: SpatialSolved
+
+
+AnySession: TypeAlias = Solved | SpatialSession
+"""A session that is solved, in the plane or in space."""
+
+
+class DetectionTerms(NamedTuple):
+    """What M detections are worth.
+
+    Attributes:
+        squared: (M,) squared normalised residuals.
+        log_peak: (M,) logarithms of the densities at no residual, by the noise that was learned.
+        log_nominal: (M,) the same by the noise that is stated, or usual.
+        log_odds: (M,) half the squared residual at which an outlier is as likely, by nominal noise; infinite for none.
+        share: (M,) of their information that is new.
+    """
+
+    squared: FloatArray
+    log_peak: FloatArray
+    log_nominal: FloatArray
+    log_odds: FloatArray
+    share: FloatArray
+
+    @property
+    def log_density(self) -> FloatArray:
+        """Return (M,) logarithms of the densities of the mixtures of inlier and outlier."""
+        inlier = self.log_peak - 0.5 * self.squared
+        return np.asarray(np.logaddexp(inlier, self.log_nominal - self.log_odds) - np.log1p(np.exp(-self.log_odds)))
+
+    @property
+    def cost(self) -> float:
+        """Return what they are worth to the estimator: their negative log likelihood, 0 at no residual."""
+        loss = -np.logaddexp(-0.5 * self.squared, -self.log_odds) + np.log1p(np.exp(-self.log_odds))
+        return float(self.share @ loss)
+
+
+@dataclass(frozen=True, slots=True)
+class Optimum:
+    """The graph of a session at its optimum, and what its evidence needs beside it.
+
+    Attributes:
+        graph: the problem, with a prior for everything of which nothing is known.
+        now: the same, linearised.
+        state: the values.
+        detections: what these are worth.
+        log_priors: logarithms of the densities of all priors but the border's where they are highest, and of the
+            odometry's.
+        log_prices: log prior probability of all changes that the solution has.
+            worth: share of what detections say that is new, given that errors last.
+    """
+
+    graph: Graph[Any]
+    now: Linear
+    state: Any
+    detections: DetectionTerms
+    log_priors: float
+    log_prices: float
+    worth: float
+
+
+def log_evidence(session: AnySession, changes: tuple[MapChange, ...] = ()) -> float:
+    """Return the log evidence of a solved session, with the prices of the changes that it was told to have [nats]."""
+    return evidence_at(optimum_of(session, changes))
+
+
+def evidence_at(optimum: Optimum) -> float:
+    """Return the log evidence at an optimum [nats]."""
+    graph, seen = optimum.graph, optimum.detections
+    fit = float(seen.share @ seen.log_density) - (optimum.now.cost - seen.cost)
+    return fit + optimum.log_priors + optimum.log_prices + log_volume(graph, optimum.now)
+
+
+def log_volume(graph: Graph[Any], now: Linear) -> float:
+    """Return the logarithm of the volume that the unknowns are left, times the density of the border's prior."""
+    information = np.maximum(graph.border.information, LEAST_INFORMATION)  # what jitter seems to say was taken off
+    border = 0.5 * float(np.log(information).sum()) - 0.5 * len(information) * LOG_2PI
+    count = int(graph.structure.layout.dim.sum())
+    return border + 0.5 * count * LOG_2PI - 0.5 * log_determinant(exhausted(graph.factorised(now)))
+
+
+def log_determinant(factorised: Factorised) -> float:
+    """Return the log determinant of the information on all variables."""
+    tree = factorised.system.tree
+    row = np.arange(tree.own.sum()) - np.repeat(np.cumsum(tree.own) - tree.own, tree.own)
+    diagonal = np.repeat(tree.stored[:-1], tree.own) + row * (np.repeat(tree.size, tree.own) + 1)
+    own = 2.0 * float(np.log(factorised.rows[diagonal]).sum())
+    return own + float(np.linalg.slogdet(factorised.information)[1])
+
+
+def used_rows(session: AnySession) -> IntArray:
+    """Return (M,) rows of the recording's detections that a session used, in the order of its problem."""
+    return session.prepared.used if isinstance(session, Solved) else session.intake.used
+
+
+def optimum_of(session: AnySession, changes: tuple[MapChange, ...] = ()) -> Optimum:
+    """Return the graph of a session at its optimum, with the log prior probability of its changes."""
+    return _in_plane(session, changes) if isinstance(session, Solved) else _in_space(session)
+
+
+def _in_plane(solved: Solved, changes: tuple[MapChange, ...]) -> Optimum:
+    outcome, problem, noise = solved.outcome, solved.outcome.problem, solved.outcome.noise.noise
+    state = outcome.graph_estimate
+    smoother = Smoother(problem, noise, robust=solved.settings.robust)
+    graph, now = smoother.graph(state), smoother.linearised(state)
+    sigma = noise.of_detections(problem.sigma_given)
+    nominal = intake.beliefs(solved.recording.sensor, solved.settings)[1].of_detections(problem.sigma_given)
+    residual = detection_residuals(problem, state) / sigma
+    odds = noise.outlier_log_odds if solved.settings.robust else np.inf
+    seen = DetectionTerms(
+        (residual**2).sum(axis=1), -np.log(sigma).sum(axis=1) - LOG_2PI, -np.log(nominal).sum(axis=1) - LOG_2PI,
+        np.full(len(sigma), odds), np.ones(len(sigma)),
+    )  # fmt: skip
+    n, known = len(problem.stamp_s), int(state.known.sum())
+    log_priors = 1.5 * (math.log(problem.start_information) - LOG_2PI)
+    free = np.ones(known, dtype=np.bool_)
+    for block in graph.blocks[REST:]:
+        if isinstance(block, PlacePriors):
+            free[block.ties.ravel() - n] = False
+            size = np.linalg.svd(block.root, compute_uv=False)
+            size = size[size > 1e-9 * size.max(initial=0.0)]
+            log_priors += float(np.log(size).sum()) - 0.5 * len(size) * LOG_2PI
+    held = graph.held.copy()
+    where = 3 * n + np.flatnonzero(np.repeat(free, 2))
+    held[where] = ROOM_M**-2
+    log_priors -= len(where) * (math.log(ROOM_M) + 0.5 * LOG_2PI)
+    table = solved.settings.changes
+    prices = sum(_price(change, len(problem.landmark_mean), PLANE, log_prior, table) for change in changes)
+    log_priors += _odometry_peak(graph, now, 3, slice(3, 6))
+    # the residuals are those of motions, the velocities were measured: times their scales they are motions
+    scales = np.maximum(state.states[[FORWARD, FORWARD, TURN]], LEAST_SCALE)
+    log_priors += (n - 1) * float(np.log(scales).sum())
+    worth = _worth(smoother.lasting(state), problem.stamp_s[problem.pose_row], problem.landmark_row)
+    return Optimum(replace(graph, held=held), now, state, seen, log_priors, prices, worth)
+
+
+def _in_space(session: SpatialSession) -> Optimum:
+    optimum = session.solved.optimum
+    smoother, linear = optimum.fitted or (optimum.smoother, optimum.now)
+    problem, state, noise = smoother.problem, optimum.estimate, optimum.noise
+    graph, now = smoother.graph(noise, heavy=False), linear.now
+    nominal = start_noise(problem.settings, driven=problem.driven)
+    odds = np.array(problem.settings.outlier_log_odds) if problem.robust else np.full(3, np.inf)
+    seen = DetectionTerms(
+        (linear.residual**2).sum(axis=1), _log_peaks(problem, noise.levels), _log_peaks(problem, nominal.levels),
+        odds[problem.kind], problem.share,
+    )  # fmt: skip
+    n, count, sigma = len(problem.stamp_s), len(problem.oriented), problem.start_sigma
+    log_priors = -float(np.log(sigma).sum()) - 3.0 * LOG_2PI
+    extra, prices = _map_terms(problem, session.solved.from_map, state.place)
+    free = np.ones(count, dtype=np.bool_)
+    free[problem.prior.place] = False
+    begin, held = graph.structure.system.tree.begin, graph.held.copy()
+    some = n + np.flatnonzero(free)
+    dim = graph.structure.layout.dim[some]
+    at = numbers_of(begin[some], np.full(len(some), 3))
+    held[at] = ROOM_M**-2
+    turned = numbers_of(begin[some[dim == 6]] + 3, np.full(int((dim == 6).sum()), 3))
+    held[turned] = np.maximum(held[turned], ROOM_RAD**-2)
+    log_priors -= len(at) * (math.log(ROOM_M) + 0.5 * LOG_2PI) + len(turned) * (math.log(ROOM_RAD) + 0.5 * LOG_2PI)
+    if problem.driven:
+        log_priors += _odometry_peak(graph, now, 6, slice(6, 12))
+    twice = int((session.solved.number > 1).sum())  # one identity at two places
+    prices += twice * math.log(problem.settings.map.p_moved)
+    worth = _worth(smoother.lasting(linear), problem.stamp_s[problem.pose_row], problem.place)
+    return Optimum(replace(graph, held=held), now, state, seen, log_priors + extra, prices, worth)
+
+
+def _log_peaks(problem: SpatialProblem, level: FloatArray) -> FloatArray:
+    """(M,) logarithms of the densities of detections at no residual, of the numbers that were measured."""
+    kind = problem.kind
+    with np.errstate(divide="ignore", invalid="ignore"):
+        position = np.linalg.slogdet(problem.measured_root)[1] - 2.0 * math.log(level[ACROSS]) - math.log(level[ALONG])
+        turn = -3.0 * np.log(level[ORIENTATION] * problem.sigma_rad)
+        corners = np.linalg.slogdet(problem.corner_root)[1].sum(axis=1)
+    # of corners the pixels were measured: the slope between these and the plane at depth 1 is no density
+    corners = np.full_like(corners, -8.0 * math.log(level[PIXEL]))
+    log = np.where(kind == CORNERS, corners, position + np.where(kind == POSE, turn, 0.0))
+    return np.asarray(log - 0.5 * ROWS[kind] * LOG_2PI)
+
+
+def _map_terms(problem: SpatialProblem, compared: MapComparison | None, place: FloatArray) -> tuple[float, float]:
+    """Return the log density of what a map says at its best, with the cost of places that do not stand put right, and
+    the log prior probability of those.
+    """
+    prior, settings = problem.prior, problem.settings.map
+    density = prices = 0.0
+    groups = () if compared is None else compared.groups
+    grouped = {int(row): k for k, group in enumerate(groups) for row in group.members}
+    met: set[int] = set()
+    for k, row in enumerate(prior.place.tolist()):
+        dim = 6 if problem.oriented[row] else 3
+        told = prior.sigma[k, :dim] < ANY_RAD
+        off = problem.off_map(np.array([k]), place[row][None], oriented=dim == 6)[0]
+        log_sigma = np.log(prior.sigma[k, :dim])
+        if prior.weight[k] >= problem.settings.inlier:
+            density -= float(log_sigma.sum()) + 0.5 * dim * LOG_2PI
+            density += 0.5 * (prior.weight[k] - 1.0) * float(np.sum((off / prior.sigma[k, :dim]) ** 2))
+            prices += math.log1p(-settings.p_moved)
+            continue
+        density += 0.5 * prior.weight[k] * float(np.sum((off / prior.sigma[k, :dim]) ** 2))
+        group = grouped.get(k)
+        if group is not None and group in met:  # it went along: at its place in the group
+            density -= float(log_sigma.sum()) + 0.5 * dim * LOG_2PI
+            prices -= math.log(2.0)
+            continue
+        if group is not None:
+            met.add(group)
+        prices += math.log(settings.p_moved)
+        scales = [(m, rad) for m in settings.moved_m for rad in settings.moved_rad[: None if dim == 6 else 1]]
+        wide = []
+        for m, rad in scales:
+            spread = np.where(told, np.hypot(prior.sigma[k, :dim], np.array([m] * 3 + [rad] * (dim - 3))), ANY_RAD)
+            wide.append(-float(np.log(spread).sum() + 0.5 * np.sum((off / spread) ** 2)) - 0.5 * dim * LOG_2PI)
+        density += float(np.logaddexp.reduce(wide)) - math.log(len(scales))
+    return density, prices
+
+
+def _odometry_peak(graph: Graph[Any], now: Linear, dim: int, by_second: slice) -> float:
+    """Log density of all odometry at no residual: the step to the second pose, whitened, is what was measured."""
+    values = now.values[graph.structure.values_of(ODOMETRY)]
+    count = len(now.weights[ODOMETRY])
+    if not count:
+        return 0.0
+    rows = values.reshape(count, dim, -1)[..., by_second]
+    size = np.linalg.slogdet(rows)[1] - 0.5 * dim * np.log(now.weights[ODOMETRY])
+    return float(size.sum()) - 0.5 * count * dim * LOG_2PI
+
+
+def _price(change: MapChange, n_landmarks: int, numbers: int, table: Any, settings: Any) -> float:
+    """Log prior probability of a change that a solution in the plane has."""
+    size = len(change.landmark_ids)
+    turned = 1 if change.kind is ChangeKind.ROTATED else 0
+    rows = table(settings, max(n_landmarks, size), size, numbers=numbers)
+    own = float(rows[size, turned])
+    own = own if math.isfinite(own) else float(rows[size, 0])
+    return own + float(log_onset(2)[0 if math.isnan(change.stamp_from_s) else 1])
+
+
+def _worth(lasting: Lasting, stamp_s: FloatArray, place: Any) -> float:
+    return float(lasting.information(stamp_s, place).mean()) if len(place) else 1.0
+
+
+def residuals_of(graph: Graph[Any], now: Linear) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return (R,) where the right sides of all rows are among the values, (R,) whitened residuals that are not
+    weighted, and (R,) roots of the weights.
+    """
+    tree, factors = graph.structure.system.tree, graph.structure.system.factors
+    rows = factors.rows
+    width = np.diff(tree.value_first) // np.maximum(rows, 1)
+    factor = np.repeat(np.arange(len(rows)), rows)
+    row = np.arange(rows.sum()) - np.repeat(np.cumsum(rows) - rows, rows)
+    at = tree.value_first[factor] + (row + 1) * width[factor] - 1
+    root = np.sqrt(np.maximum(np.concatenate(now.weights), 1e-12))[factor]
+    return at, -now.values[at] / root, root
+
+
+class Score(NamedTuple):
+    """What one more number would do.
+
+    Attributes:
+        value: its optimum, by what is linear in it.
+        information: on it, with all else marginalised.
+        gain: by which the cost falls there [nats].
+    """
+
+    value: float
+    information: float
+    gain: float
+
+
+@dataclass(frozen=True)
+class Screen:
+    """An optimum, ready to ask what further numbers would do to it.
+
+    Attributes:
+        optimum: the optimum.
+        at, residual, root: as `residuals_of`.
+        solved: its normal equations.
+    """
+
+    optimum: Optimum
+    at: IntArray
+    residual: FloatArray
+    root: FloatArray
+    solved: Factorised
+
+    @classmethod
+    def of(cls, optimum: Optimum) -> Screen:
+        """Return the screen of an optimum."""
+        at, residual, root = residuals_of(optimum.graph, optimum.now)
+        return cls(optimum, at, residual, root, exhausted(optimum.graph.factorised(optimum.now)))
+
+    def of_detections(self, some: BoolArray) -> BoolArray:
+        """Return (R,) which rows are of some of the detections (M,)."""
+        structure = self.optimum.graph.structure
+        first, rows = structure.first, structure.system.factors.rows
+        mine = np.zeros(len(rows), dtype=np.bool_)
+        mine[first[DETECTIONS] : first[DETECTIONS + 1]] = some[: first[DETECTIONS + 1] - first[DETECTIONS]]
+        return np.repeat(mine, rows)
+
+    def score(self, direction: FloatArray, information: float, off: float = 0.0) -> Score:
+        """Return what a number does by which residuals (R,), not weighted, change so.
+
+        Args:
+            direction: (R,) by how much for a unit.
+            information: of its prior.
+            off: where it is, from the mean of that.
+        """
+        graph, now = self.optimum.graph, self.optimum.now
+        told = direction * self.root
+        values = now.values.copy()
+        values[self.at] = -told
+        moved = replace(now, values=values, border_right=np.zeros_like(now.border_right))
+        solved = exhausted(graph.factorised(moved))
+        border = np.linalg.solve(solved.information, solved.right)
+        taken = float(solved.own_right @ solved.own_right + solved.right @ border)
+        crossed = float(solved.own_right @ self.solved.own_right + self.solved.right @ border)
+        known = max(float(told @ told) - taken, 0.0) + information
+        pull = float(told @ (self.residual * self.root)) - crossed + information * off
+        return Score(-pull / known, known, 0.5 * pull**2 / known)

@@ -1,0 +1,193 @@
+"""First values of scales, by what needs no solution or no more of it than poses: a linear test may be far off there.
+
+* Two landmarks in one frame are as far apart as in the map: ranges against the map.
+* Two sightings of one landmark and the odometry between them: ranges against the odometry.
+* Landmarks of a solution that was not found in a map, against the map: all lengths.
+* Directions from several poses meet at the landmark, which says how far it was: ranges of one landmark.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.config import CheckConfig
+from evermap.geometry import se2, se3
+from evermap.slam.mistakes import Mistake, off, pairs_of
+from evermap.types import UNKNOWN, AnyRecording, FloatArray, IntArray, Landmarks, SlamResult, is_in_space
+
+LARGEST, STEPS = 0.7, 141
+"""Largest logarithm of a scale that is tried, and steps from the smallest to that."""
+APART_M, FEWEST_APART = 1.0, 8
+"""Distance between two landmarks from which its ratio tells a scale, and how many of these it takes."""
+FEWEST_VIEWS, PARALLAX = 6, 0.02
+"""Views of a landmark, and the least share of them that are crosswise, from which directions say how far it is."""
+MOST_PAIRS = 4000
+"""Pairs of a kind that are looked at: more say no more."""
+
+
+class Scales(NamedTuple):
+    """Logarithms of scales, nan where nothing tells.
+
+    Attributes:
+        by_map: of distances in the map over those of the detections.
+        by_odometry: of distances by the odometry over those of the detections.
+    """
+
+    by_map: float
+    by_odometry: float
+
+    @property
+    def ranges(self) -> float:
+        """Return that of true distances over ranges, if the map is right, else the odometry."""
+        return self.by_map if math.isfinite(self.by_map) else self.by_odometry
+
+    @property
+    def odometry(self) -> float:
+        """Return that of true distances over those of the odometry: by the map, else by the ranges."""
+        return (self.by_map if math.isfinite(self.by_map) else 0.0) - self.by_odometry
+
+    @property
+    def map(self) -> float:
+        """Return that of true distances over those of the map, if ranges are right."""
+        return -self.by_map
+
+
+def find_scales(recording: AnyRecording, given: Landmarks | None, settings: CheckConfig) -> Scales:
+    """Return scales between detections, odometry and map."""
+    return Scales(_against_map(recording, given), _against_odometry(recording, settings))
+
+
+def _against_map(recording: AnyRecording, given: Landmarks | None) -> float:
+    if given is None:
+        return math.nan
+    seen = recording.detections
+    at, known = positions_in_robot(recording)
+    row = np.minimum(np.searchsorted(given.landmark_id, seen.landmark_id), len(given.landmark_id) - 1)
+    known &= given.landmark_id[row] == seen.landmark_id
+    rows = np.flatnonzero(known)
+    pairs = [(rows[:-lag], rows[lag:]) for lag in (1, 2, 3) if lag < len(rows)]
+    if not pairs:
+        return math.nan
+    one, other = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    same = (seen.frame[one] == seen.frame[other]) & (row[one] != row[other])
+    one, other = one[same], other[same]
+    if len(one) > MOST_PAIRS:
+        some = np.linspace(0, len(one) - 1, MOST_PAIRS).astype(np.int64)
+        one, other = one[some], other[some]
+    dim = min(at.shape[1], given.position_m.shape[1])
+    seen_m = np.linalg.norm(at[one, :dim] - at[other, :dim], axis=1)
+    given_m = np.linalg.norm(given.position_m[row[one], :dim] - given.position_m[row[other], :dim], axis=1)
+    far = (seen_m > 0.1 * np.linalg.norm(at[one], axis=1)) & (given_m > 0.0)
+    return float(np.median(np.log(given_m[far] / seen_m[far]))) if np.count_nonzero(far) >= FEWEST_APART else math.nan
+
+
+def positions_in_robot(recording: AnyRecording) -> tuple[FloatArray, np.ndarray]:
+    """Return (M, dim) positions of detections in the robot's frame, and (M,) which are known."""
+    if is_in_space(recording):
+        from evermap.slam.space.intake import positions_of, without_range
+
+        mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])[recording.detections.sensor]
+        at = positions_of(recording)
+        known = np.isfinite(at).all(axis=1) & ~without_range(recording)
+        return se3.transform(mount, np.where(known[:, None], at, 0.0)), known & (
+            recording.detections.landmark_id != UNKNOWN
+        )
+    seen = recording.detections
+    known = np.isfinite(seen.bearing_rad) & (seen.landmark_id != UNKNOWN)
+    bearing = np.nan_to_num(seen.bearing_rad)
+    at = seen.range_m[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+    return se2.transform(np.array(recording.sensor.mount_robot_sensor, dtype=np.float64), at), known
+
+
+def _against_odometry(recording: AnyRecording, settings: CheckConfig) -> float:
+    pairs = pairs_of(recording, settings)
+    if pairs is None or pairs.still:
+        return math.nan
+    tried = np.linspace(-LARGEST, LARGEST, STEPS)
+    losses = []
+    for state in tried.tolist():
+        apart = np.minimum(off(pairs.residual(Mistake("", "", lengths=math.exp(state)))), 10.0)
+        losses.append(float(np.log1p((apart / settings.fits) ** 2).sum()))
+    return float(tried[int(np.argmin(losses))])
+
+
+def find_shape(result: SlamResult, given: Landmarks) -> float:
+    """Return the logarithm of distances in a map over those in a result that was not found there; nan for too few."""
+    _, own, theirs = np.intersect1d(result.landmarks.landmark_id, given.landmark_id, return_indices=True)
+    one, other = np.triu_indices(len(own), 1)
+    if len(one) > MOST_PAIRS:
+        some = np.linspace(0, len(one) - 1, MOST_PAIRS).astype(np.int64)
+        one, other = one[some], other[some]
+    dim = min(result.landmarks.position_m.shape[1], given.position_m.shape[1])
+    found_m, given_m = (
+        np.linalg.norm(at[one, :dim] - at[other, :dim], axis=1)
+        for at in (result.landmarks.position_m[own], given.position_m[theirs])
+    )
+    far = (found_m > APART_M) & (given_m > 0.0)
+    return float(np.median(np.log(given_m[far] / found_m[far]))) if np.count_nonzero(far) >= 3 else math.nan
+
+
+def find_single_scales(recording: AnyRecording, result: SlamResult) -> dict[int, float]:
+    """Return, of landmarks most of whose detections were rejected, the logarithm of true distances over ranges.
+
+    By where the directions from the poses of the solution meet.
+    """
+    seen, innovations = recording.detections, result.innovations
+    path, found = result.trajectory, dict[int, float]()
+    good = innovations.p_inlier >= 0.5
+    kept = np.zeros(len(seen), dtype=np.bool_)
+    kept[innovations.detection[good]] = True
+    eye, along, range_m, known = _rays(recording, path.stamp_s, path.pose_world_robot)
+    names = np.unique(seen.landmark_id[known])
+    for name in names.tolist():
+        mine = np.flatnonzero(known & (seen.landmark_id == name))
+        if len(mine) < FEWEST_VIEWS or np.mean(kept[mine]) > 0.5:
+            continue
+        ratio = _where_rays_meet(eye[mine], along[mine], range_m[mine])
+        if math.isfinite(ratio):
+            found[int(name)] = ratio
+    return found
+
+
+def _rays(
+    recording: AnyRecording, stamp_s: FloatArray, pose: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, np.ndarray]:
+    """(M, dim) where detections were made from, (M, dim) unit vectors, (M,) ranges, and (M,) which are known."""
+    at, known = positions_in_robot(recording)
+    seen_s = recording.frames.stamp_s[recording.detections.frame]
+    near: IntArray = np.clip(np.searchsorted(stamp_s, seen_s), 1, len(stamp_s) - 1)
+    near = near - (seen_s - stamp_s[near - 1] < stamp_s[near] - seen_s)
+    robot = pose[near]
+    if is_in_space(recording):
+        mounts = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])[recording.detections.sensor]
+        eye, there = se3.compose(robot, mounts)[:, :3], se3.transform(robot, at)
+    else:
+        mount = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64)
+        eye, there = se2.compose(robot, mount)[:, :2], se2.transform(robot, at)
+    away = there - eye
+    range_m = np.linalg.norm(away, axis=1)
+    return eye, away / np.maximum(range_m, 1e-9)[:, None], range_m, known
+
+
+def _where_rays_meet(eye: FloatArray, along: FloatArray, range_m: FloatArray) -> float:
+    """Log of the distance to where rays meet over the ranges along them, in the median; nan where it does not show."""
+    dim = eye.shape[1]
+    weight = np.ones(len(eye))
+    point = eye[0]
+    for _ in range(10):  # to the point that most rays pass
+        across = weight[:, None, None] * (np.eye(dim) - along[:, :, None] * along[:, None, :])
+        total = across.sum(axis=0)
+        if np.linalg.eigvalsh(total)[0] < PARALLAX * weight.sum():
+            return math.nan
+        point = np.linalg.solve(total, np.einsum("mij,mj->i", across, eye))
+        away = point - eye
+        miss = np.linalg.norm(away - (away * along).sum(axis=1)[:, None] * along, axis=1)
+        weight = 1.0 / (1.0 + (miss / max(float(np.median(miss)), 1e-3)) ** 2)
+    far = ((point - eye) * along).sum(axis=1)
+    ahead = far > 0.1 * range_m
+    if np.count_nonzero(ahead) < FEWEST_VIEWS:
+        return math.nan
+    return float(np.median(np.log(far[ahead] / range_m[ahead])))

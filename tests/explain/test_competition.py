@@ -1,0 +1,172 @@
+"""Causes that are named, and changes that are not told instead, in worlds with one thing stated wrongly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evermap import run_session, run_slam
+from evermap.config import Config
+from evermap.geometry.rigid import rigid
+from evermap.geometry.se2 import transform as transform_plane
+from evermap.geometry.se3 import transform as transform_space
+from evermap.types import AnyRecording, Cause, Landmarks, SlamResult
+
+from .worlds import SIZE_M, World
+
+ORACLE = 1.5
+"""Error over that of an oracle that knows the cause, at most ..."""
+SMALL_M = 0.004
+"""... beside what two drives in the same world differ by."""
+
+
+def error_m(result: SlamResult, recording: AnyRecording, *, in_map: bool) -> float:
+    """Root mean square of positions, aligned where there is no map."""
+    truth, found = recording.truth, result.trajectory
+    assert truth is not None
+    row = np.minimum(np.searchsorted(found.stamp_s, truth.stamp_s - 1e-6), len(found) - 1)
+    near = np.abs(found.stamp_s[row] - truth.stamp_s) < 0.06
+    dim = 3 if found.pose_world_robot.shape[1] == 7 else 2
+    at, true = found.pose_world_robot[row[near], :dim], truth.pose_world_robot[near, :dim]
+    if not in_map:
+        at = (transform_space if dim == 3 else transform_plane)(rigid(at, true), at)
+    return float(np.sqrt(((at - true) ** 2).sum(axis=1).mean()))
+
+
+def recorded(world: World, kind: str) -> tuple[AnyRecording, Landmarks]:
+    """The drive, and the survey."""
+    if kind == "plane":
+        return world.plane(), world.map_in_plane()
+    return world.space(corners=kind == "corners"), world.map_in_space()
+
+
+def without_causes() -> Config:
+    return Config.model_validate({"slam": {"explain": {"on": False}}})
+
+
+def named(result: SlamResult, code: str) -> Cause:
+    assert [cause.code for cause in result.causes] == [code], result.causes
+    return result.causes[0]
+
+
+@pytest.mark.parametrize("kind", ["plane", "corners", "poses"])
+@pytest.mark.parametrize("mapped", [False, True])
+def test_nothing_is_asked_of_a_sound_drive(kind: str, mapped: bool) -> None:
+    recording, survey = recorded(World(seed=1), kind)
+    given = survey if mapped else None
+    result, plain = (run_slam(recording, config, prior_map=given) for config in (Config(), without_causes()))
+    assert result.causes == ()
+    np.testing.assert_array_equal(result.trajectory.pose_world_robot, plain.trajectory.pose_world_robot)
+
+
+@pytest.mark.parametrize(
+    ("kind", "code"), [("plane", "range-scale"), ("corners", "tag-size"), ("poses", "range-scale")]
+)
+@pytest.mark.parametrize("factor", [1.2, 1 / 1.15])
+def test_another_size_of_all_tags_moves_none(kind: str, code: str, factor: float) -> None:
+    recording, survey = recorded(World(seed=2, longer=factor), kind)
+    result = run_slam(recording, prior_map=survey)
+    cause = named(result, code)
+    assert cause.value == pytest.approx(factor, rel=0.005)
+    assert result.changes == ()
+    if kind == "corners":
+        assert f"size_m = {SIZE_M * factor:.3f}"[:-1] in cause.fix
+    oracle, _ = recorded(World(seed=2), kind)
+    told = error_m(run_slam(oracle, prior_map=survey), oracle, in_map=True)
+    assert error_m(result, recording, in_map=True) < ORACLE * told + SMALL_M
+
+
+@pytest.mark.parametrize("kind", ["plane", "corners"])
+def test_another_size_of_one_tag_moves_it_not(kind: str) -> None:
+    recording, survey = recorded(World(seed=3, sizes={5: 1.3}), kind)
+    result = run_slam(recording, prior_map=survey)
+    cause = named(result, "tag-size")
+    assert cause.subject == "5"
+    assert cause.value == pytest.approx(1.3, rel=0.005)
+    assert result.changes == ()
+
+
+@pytest.mark.parametrize("kind", ["plane", "corners"])
+def test_landmarks_that_moved_are_no_cause(kind: str) -> None:
+    recording, survey = recorded(World(seed=4, moved={2: (0.5, 0.3), 9: (-0.6, 0.2)}), kind)
+    result = run_slam(recording, prior_map=survey)
+    assert result.causes == ()
+    assert {one for change in result.changes for one in change.landmark_ids} == {2, 9}
+
+
+@pytest.mark.parametrize("kind", ["plane", "corners"])
+def test_a_map_in_another_metre_is_named(kind: str) -> None:
+    recording, survey = recorded(World(seed=5), kind)
+    longer = replace(survey, position_m=survey.position_m * 1.1)
+    result = run_slam(recording, prior_map=longer)
+    cause = named(result, "map-scale")
+    assert cause.value == pytest.approx(1 / 1.1, rel=0.005)
+    assert result.changes == ()
+
+
+def test_a_mirrored_map_is_named() -> None:
+    recording, survey = recorded(World(seed=6), "plane")
+    mirrored = replace(survey, position_m=survey.position_m * [1.0, -1.0])
+    result = run_slam(recording, prior_map=mirrored)
+    assert named(result, "map-mirrored").fix
+    assert result.changes == ()
+
+
+def test_turns_of_the_wrong_sign_are_named() -> None:
+    recording, survey = recorded(World(seed=7), "plane")
+    odometry = recording.odometry
+    wrong = replace(recording, odometry=replace(odometry, angular_radps=-odometry.angular_radps))
+    result = run_slam(wrong, prior_map=survey)
+    assert named(result, "turn-sign").fix == "odometry.csv: angular_radps"
+    assert result.changes == ()
+    told = error_m(run_slam(recording, prior_map=survey), recording, in_map=True)
+    assert error_m(result, recording, in_map=True) < ORACLE * told + SMALL_M
+
+
+def test_a_session_that_is_set_aside_says_why() -> None:
+    first, second = World(seed=1).plane(), World(seed=2).plane()
+    living = run_session(first).living
+    odometry = second.odometry
+    turned = replace(odometry, stamp_s=odometry.stamp_s + 1000.0, angular_radps=-odometry.angular_radps)
+    frames = replace(second.frames, stamp_s=second.frames.stamp_s + 1000.0)
+    session = run_session(replace(second, odometry=turned, frames=frames, truth=None), living)
+    assert not session.found
+    assert [cause.code for cause in session.slam.causes] == ["turn-sign"]
+
+
+def test_a_camera_turned_by_180_degrees_is_named() -> None:
+    recording, survey = recorded(World(seed=8), "corners")
+    front, back = recording.sensors
+    x, y, z, *quaternion = front.mount_robot_sensor
+    qx, qy, qz, qw = quaternion
+    turned = (x, y, z, -qy, qx, qw, -qz)  # the robot's z by 180 degrees, before the mount
+    wrong = replace(recording, sensors=(replace(front, mount_robot_sensor=turned), back))
+    result = run_slam(wrong, prior_map=survey)
+    assert named(result, "mount-flip").subject == "front"
+    assert result.changes == ()
+
+
+@pytest.mark.parametrize("late_s", [0.12, 0.3])
+def test_late_stamps_are_named(late_s: float) -> None:
+    recording, survey = recorded(World(seed=10, late_s=late_s), "corners")
+    result = run_slam(recording, prior_map=survey)
+    assert {(cause.code, cause.subject) for cause in result.causes} == {("clock", "front"), ("clock", "back")}
+    assert [cause.value for cause in result.causes] == pytest.approx([late_s, late_s], abs=0.01)
+    assert result.changes == ()
+
+
+def test_wheels_of_another_radius_are_named() -> None:
+    recording, survey = recorded(World(seed=11, wheels=1.05), "corners")
+    result = run_slam(recording, prior_map=survey)
+    assert named(result, "odometry-scale").value == pytest.approx(1.05, rel=0.005)
+    assert result.changes == ()
+
+
+def test_exchanged_focal_lengths_are_named() -> None:
+    recording, survey = recorded(World(seed=9), "corners")
+    swapped = tuple(replace(one, intrinsics=(660.0, 700.0, 640.0, 400.0)) for one in recording.sensors)
+    result = run_slam(replace(recording, sensors=swapped), prior_map=survey)
+    assert {cause.code for cause in result.causes} == {"intrinsics"}, result.causes
+    assert result.changes == ()

@@ -1,0 +1,111 @@
+"""The log evidence and the score of one more number, against dense algebra on a small linear problem."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from evermap.estimate.graph import Border, Graph, Layout, Room, build_structure, grouped
+from evermap.estimate.sparse.system import exhausted
+from evermap.explain.evidence import LOG_2PI, DetectionTerms, Optimum, Screen, evidence_at, log_determinant
+
+N_POSES, N_PLACES = 6, 3
+
+
+@dataclass(frozen=True)
+class LinearBlock:
+    """Factors `z = A x + noise` of variance 1."""
+
+    ties: np.ndarray
+    jacobian: np.ndarray
+    measured: np.ndarray
+    pose: np.ndarray
+
+    @property
+    def rows(self) -> np.ndarray:
+        return np.full(len(self.ties), self.jacobian.shape[1])
+
+    def linearise(self, state: np.ndarray, out: Room) -> Iterator[float]:
+        """All numbers are of one dimension."""
+        residual = np.einsum("frk,fk->fr", self.jacobian, state[self.ties]) - self.measured
+        out.values[:] = np.concatenate([self.jacobian, -residual[..., None]], axis=2).ravel()
+        yield 0.0
+        return 0.5 * float((residual**2).sum())
+
+
+@pytest.fixture
+def problem() -> tuple[Graph[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
+    random = np.random.default_rng(3)
+    border = N_POSES + N_PLACES
+    step = np.arange(N_POSES - 1)
+    driven = np.column_stack([step, step + 1, np.full(N_POSES - 1, border)])
+    pose, place = np.repeat(np.arange(N_POSES), 2), random.integers(0, N_PLACES, 2 * N_POSES)
+    seen = np.column_stack([pose, N_POSES + place, np.full(2 * N_POSES, border)])
+    start = np.zeros((1, 1), dtype=np.int64)
+    blocks = tuple(
+        LinearBlock(ties, random.normal(size=(len(ties), 2, ties.shape[1])), random.normal(size=(len(ties), 2)), at)
+        for ties, at in ((driven, step), (seen, pose), (start, np.zeros(1, dtype=np.int64)))
+    )
+    layout = Layout(
+        np.ones(border + 1, dtype=np.int64), np.array([border]), grouped(N_POSES, 2),
+        np.column_stack([np.arange(N_POSES), random.normal(size=N_POSES)]).astype(float),
+    )  # fmt: skip
+    held = np.zeros(border + 1)
+    held[N_POSES:border] = 0.25
+    prior = Border(np.array([4.0]), lambda state: state[-1:])
+    graph = Graph(blocks, exhausted(build_structure(layout, blocks)), prior, held, lambda x, step: (x + step, 0.0))
+    rows = [np.zeros(border + 1) for _ in range(2 * sum(len(block.ties) for block in blocks))]
+    measured = np.concatenate([block.measured.ravel() for block in blocks])
+    at = 0
+    for block in blocks:
+        for ties, jacobian in zip(block.ties, block.jacobian, strict=True):
+            for row in jacobian:
+                rows[at][ties] = row
+                at += 1
+    information = np.append(np.zeros(N_POSES), [0.25] * N_PLACES + [4.0])
+    return graph, np.array(rows), measured, information
+
+
+def test_evidence_is_the_marginal_likelihood_of_a_linear_problem(problem: tuple) -> None:
+    graph, dense, measured, information = problem
+    # of the poses nothing is known beforehand but what is measured: a wide prior, the same on both sides
+    held = graph.held.copy()
+    held[:N_POSES] = information[:N_POSES] = 1e-2
+    graph = Graph(graph.blocks, graph.structure, graph.border, held, graph.retract)
+    hessian = dense.T @ dense + np.diag(information)
+    state = np.linalg.solve(hessian, dense.T @ measured)
+    now = exhausted(graph.linearised(state))
+    free = information[:-1]  # priors of all but the border
+    quadratic = 0.5 * float(free @ state[:-1] ** 2)
+    peaks = 0.5 * float(np.log(free).sum()) - 0.5 * len(free) * LOG_2PI - 0.5 * len(measured) * LOG_2PI - quadratic
+    empty = DetectionTerms(*(np.zeros(0) for _ in range(5)))
+    found = evidence_at(Optimum(graph, now, state, empty, peaks, 0.0, 1.0))
+    exact = multivariate_normal(cov=np.eye(len(measured)) + dense @ np.diag(1.0 / information) @ dense.T)
+    assert found == pytest.approx(float(exact.logpdf(measured)), abs=1e-8)
+    solved = exhausted(graph.factorised(now))
+    assert log_determinant(solved) == pytest.approx(float(np.linalg.slogdet(hessian)[1]), abs=1e-9)
+
+
+def test_score_is_the_step_of_one_more_number(problem: tuple) -> None:
+    graph, dense, measured, information = problem
+    random = np.random.default_rng(5)
+    state = np.linalg.solve(dense.T @ dense + np.diag(information), dense.T @ measured)
+    state = state + 0.01 * random.normal(size=len(state))  # nearly at the optimum, as an iteration ends
+    now = exhausted(graph.linearised(state))
+    empty = DetectionTerms(*(np.zeros(0) for _ in range(5)))
+    screen = Screen.of(Optimum(graph, now, state, empty, 0.0, 0.0, 1.0))
+    direction, prior, off = random.normal(size=len(measured)), 3.0, 0.2
+    score = screen.score(direction, prior, off)
+    wider = np.column_stack([dense, direction])
+    whole = wider.T @ wider + np.diag(np.append(information, prior))
+    # the priors of what is held pull to where it is, that of the border to its mean
+    pull = -wider.T @ (dense @ state - measured)
+    pull[-2] -= 4.0 * state[-1]
+    pull[-1] -= prior * off
+    step = np.linalg.solve(whole, pull)
+    assert score.value == pytest.approx(step[-1], rel=1e-6)
+    assert score.information == pytest.approx(1.0 / np.linalg.inv(whole)[-1, -1], rel=1e-6)
