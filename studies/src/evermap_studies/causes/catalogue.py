@@ -103,7 +103,12 @@ def _table() -> list[World]:
             some.add(
                 "poses", f"odometry {scale - 1:.0%} wrong, noise {sigma:g}", "noise",
                 wrong.odometer(scale, scale), maps=MAP, seeds=10, bound_m=bound_m,
-                make={"odometry_hz": 50.0, "frame_hz": 10.0, "odometry_sigma": (sigma, sigma, sigma)},
+                make={
+                    "odometry_hz": 50.0,
+                    "frame_hz": 10.0,
+                    "odometry_sigma": (sigma, sigma, sigma),
+                    "range_max_m": 4.5,
+                },
                 quick="poses+" if (sigma, scale) in ((0.3, 1.01), (0.1, 1.02)) else "",
             )  # fmt: skip
     some.add(

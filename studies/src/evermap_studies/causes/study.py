@@ -31,8 +31,8 @@ SCORING = (
     "named: a cause, a finding, a change, a calibration state near its true value, or the line of a refusal says it; "
     "near: error of poses at most 1.5 times that of an oracle that knows the cause, plus 5 mm; right: named, near or "
     "refused, no false change, no false cause, verdict as it should be; silent: enters a map although it is worse than "
-    "odometry alone, certain of a false change, has squared errors beyond 4 times their expectation, or a map or sensor "
-    "with which nobody can go on, and not a word"
+    "odometry alone, certain of a false change, has squared errors beyond 4 times their expectation, or map or sensor "
+    "are beyond use, and nothing names it"
 )
 
 
