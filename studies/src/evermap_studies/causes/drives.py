@@ -116,7 +116,9 @@ MAKES = {
     "corners": Make("field", Reading.CORNERS, 6.0, 0.6, (0.3,), (0.03, 0.03, 0.03), speed_mps=1.5, sideways=True,
                     distortion=(-0.24, 0.06, 0.0004, -0.0003)),
     "two kinds": Make("two kinds", Reading.CORNERS, 6.0, 0.6, (0.3,), (0.03, 0.03, 0.03), speed_mps=1.5, sideways=True),
-    "visual": Make("field", Reading.CORNERS, 6.0, 0.6, (0.3,), (0.02, 0.02, 0.01), speed_mps=1.2, carried=True),
+    "visual": Make(
+        "field", Reading.CORNERS, 6.0, 0.6, (0.3,), (0.02, 0.02, 0.01), speed_mps=1.2, frame_hz=10.0, carried=True
+    ),
     "carried": Make(
         "tagged room", Reading.CORNERS, 7.0, 0.6, (0.3,), None, speed_mps=0.5, frame_hz=10.0, carried=True
     ),
@@ -143,7 +145,7 @@ class Drive:
         sensors: as stated; tag_size_m: stated edges by identity; baseline_m: stated.
         places: the map that is given, None without.
         truth_s, truth: (T,) and (T, 7) where the robot was.
-        true_places: where landmarks are in the end.
+        true_places: where landmarks are, under the identities that they have in the readings.
         named: identities are given.
         kind: of the sensor, as stated.
         moved_frame: the map given is in another frame than the truth.
@@ -229,7 +231,7 @@ def simulate(make: Make, seed: int, events: Sequence[Event] = (), *, in_map: boo
         tag_size_m={int(one): float(site.size_m[one % NEXT - 1]) for one in ids},
         truth_s=stamp_s[::every],
         truth=truth[::every],
-        true_places=_places(site, events, make.reading in PLANAR, last=True),
+        true_places=_places(site, events, make.reading in PLANAR, last=False),
         has_odometry=make.odometry_sigma is not None,
         named=make.named,
         kind=SensorKind.LASER if make.reading is Reading.RANGE_BEARING else None,
@@ -248,6 +250,12 @@ def old_map(drive: Drive, seed: int) -> Landmarks:
     assert drive.site is not None
     rng = np.random.default_rng([seed, 48]).spawn(5)[4]
     return as_survey(_places(drive.site, (), drive.is_planar, last=True), rng)
+
+
+def last_places(drive: Drive, events: Sequence[Event]) -> Landmarks:
+    """Return where landmarks are in the end, under the identities that they began with."""
+    assert drive.site is not None
+    return _places(drive.site, events, drive.is_planar, last=True)
 
 
 def as_survey(places: Landmarks, rng: np.random.Generator) -> Landmarks:

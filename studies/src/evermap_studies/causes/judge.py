@@ -15,7 +15,7 @@ from evermap.errors import EvermapError
 from evermap.types import AnyRecording, ChangeKind, Landmarks, MapChange, SlamResult, VerdictKind
 from evermap_studies.causes.answers import ANSWERS, Answer
 from evermap_studies.causes.catalogue import World
-from evermap_studies.causes.drives import NEXT, Drive, Event, as_recording, old_map, simulate
+from evermap_studies.causes.drives import NEXT, Drive, Event, as_recording, last_places, old_map, simulate
 
 Row = dict[str, Any]
 RATIO = 1.5
@@ -30,6 +30,8 @@ FAR = 0.04
 """Difference of a map from the truth [m] from which a landmark may be told as moved."""
 MUST = 0.15
 """Difference [m] from which it has to be."""
+NOWHERE_M = 1e9
+"""Error of poses that are no numbers."""
 NEES = 4.0
 """Mean squared error of poses over its expectation, from which a run isn't what it says."""
 
@@ -64,8 +66,9 @@ def make_case(world: World, seed: int) -> Case:
         events = world.events(right, rng)
         right = simulate(world.make, seed, events, in_map=world.in_map)
     given = right
-    if events and world.in_map:
-        given = replace(given, places=old_map(right, seed))
+    if events:
+        given = replace(given, true_places=last_places(right, events))
+        given = replace(given, places=old_map(right, seed)) if world.in_map else given
     return Case(world, seed, world.mistake(given, rng), right, events)
 
 
@@ -118,6 +121,8 @@ def errors(solved: Solved, drive: Drive) -> Row:
     nothing: Row = {"error_m": None, "aligned_m": None, "odometry_m": None, "nees": None}
     if solved.result is None:
         return nothing
+    if not np.isfinite(solved.result.trajectory.pose_world_robot).all():
+        return {**nothing, "error_m": NOWHERE_M, "aligned_m": NOWHERE_M, "odometry_m": 0.0}
     try:
         metrics = metrics_dict(compare_with_truth(solved.recording, solved.result))
         aligned, placed = metrics["pose_rmse_m"], None
@@ -127,7 +132,7 @@ def errors(solved: Solved, drive: Drive) -> Row:
                 looked_s=solved.recording.frames.stamp_s,
             )  # fmt: skip
             placed = None if found is None else found.rmse_m
-    except EvermapError:
+    except (EvermapError, np.linalg.LinAlgError):
         return nothing
     nees = metrics["pose_nees_anchored_mean"] if drive.places is None else metrics["pose_nees_mean"]
     dof = metrics["nees_dof"] or 2
