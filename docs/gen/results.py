@@ -32,6 +32,7 @@ STUDIES = (
     "space",
     "building",
     "robots",
+    "causes",
     "persistence-speed",
     "soak",
     "scale",

@@ -271,3 +271,22 @@ def test_a_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytes
     again = study.reproduce(tmp_path / "out", settings)
     assert again["runs"] == table["runs"]
     assert "laser alone: odometer +10%" in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_two_runs_are_compared(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    from benchmarks import causes
+
+    row = {
+        **_row(seed=0, right=True, silent=False, causes=[], findings=[], changes=[], refusal="", cpu_s=1.0),
+        "world": "a", "group": "causes", "cause": "change", "space": False, "in_map": True,
+    }  # fmt: skip
+    silent = {**row, "world": "b", "right": False, "silent": True}
+    files = []
+    for name, rows in (("before", [row, silent]), ("after", [{**row, "error_m": 0.5}, {**silent, "silent": False}])):
+        files.append(str(tmp_path / name))
+        Path(files[-1]).write_text("".join(f"{json.dumps(one)}\n" for one in rows))
+    assert causes.main(["--compare", *files]) == 1
+    said = capsys.readouterr().out
+    assert "better: wrong  b, seed 0" in said
+    assert "worse: right  a, seed 0: exit 0, named by cause, 0 false and 0 missing changes, 0.5 m" in said
+    assert causes.main(["--compare", files[0], files[0]]) == 0

@@ -7,7 +7,7 @@ are done are kept beside the results (`ROWS`), one line each, so that a run that
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,8 @@ SCHEMA_VERSION = "1"
 EXPERIMENT = "causes"
 ROWS = ".rows.jsonl"
 """End of the name of the file with a line a run, beside the folder of results."""
+MOST_WORLDS = 80
+"""Worlds that have a line each in the table; of more there is a line for each cause."""
 SCORING = (
     "named: a cause, a finding, a change, a calibration state near its true value, or the line of a refusal says it; "
     "near: error of poses at most 1.5 times that of an oracle that knows the cause, plus 5 mm; right: named, near or "
@@ -103,24 +105,32 @@ def reproduce(
     path = Path(f"{Path(out)}{ROWS}")
     with RunFolder(out, force=force) as folder:
         stopwatch = Stopwatch()
-        done = {(row["world"], row["seed"]): row for row in read_rows(path)}
-        oracles = {row["oracle_key"]: row for row in done.values() if row.get("oracle_m") is not None}
-        known = {key: {"error_m": row["oracle_m"]} for key, row in oracles.items()}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", encoding="utf-8") as lines:
-            for count, (world, seed) in enumerate(jobs, 1):
-                if (world.name, seed) not in done:
-                    row = run(world, seed, known)
-                    done[world.name, seed] = row
-                    lines.write(json.dumps(row) + "\n")
-                    lines.flush()
-                if progress is not None:
-                    progress(float(count), float(len(jobs)))
-        rows = [done[world.name, seed] for world, seed in jobs]
+        rows = []
+        for row in run_all(jobs, path):
+            rows.append(row)
+            if progress is not None:
+                progress(float(len(rows)), float(len(jobs)))
         content = {**stopwatch.head(EXPERIMENT, SCHEMA_VERSION, SCORING, settings), "runs": rows}
         save_all({"right": draw(rows)}, folder.path)
         folder.path("table.md").write_text(as_markdown(content) + "\n", encoding="utf-8")
         return folder.finish(content)
+
+
+def run_all(jobs: Sequence[tuple[World, int]], path: Path | None) -> Iterator[Row]:
+    """Return the rows of worlds and seeds, one after the other; those in a file are not run again, others added."""
+    rows = [] if path is None else read_rows(path)
+    done = {(row["world"], row["seed"]): row for row in rows}
+    oracles = {row["oracle_key"]: {"error_m": row["oracle_m"]} for row in rows if row["oracle_m"] is not None}
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
+    for world, seed in jobs:
+        if (world.name, seed) not in done:
+            done[world.name, seed] = run(world, seed, oracles)
+            if path is not None:
+                with path.open("a", encoding="utf-8") as lines:
+                    lines.write(f"{json.dumps(done[world.name, seed])}\n")
+        yield done[world.name, seed]
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -213,9 +223,11 @@ def _by_cause(rows: Sequence[Row]) -> str:
         "silent",
         "CPU [s]",
     ]
-    worlds: dict[str, list[Row]] = {}
+    worlds = dict[str, list[Row]]()
+    few = len({row["world"] for row in rows}) <= MOST_WORLDS
     for row in rows:
-        worlds.setdefault(row["world"], []).append(row)
+        space = f"{'space' if row['space'] else 'plane'}, {'in a map' if row['in_map'] else 'alone'}"
+        worlds.setdefault(row["world"] if few else f"{row['cause'] or 'nothing'}: {space}", []).append(row)
     lines = []
     for name, some in worlds.items():
         over = sorted(row["error_m"] / row["bound_m"] for row in some if row["error_m"] is not None and row["bound_m"])
