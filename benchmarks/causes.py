@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from evermap_studies.causes import study
+from evermap_studies.causes.catalogue import GROUPS
 
 Row = dict[str, Any]
 WORSE = 1.1
@@ -68,7 +69,7 @@ def compare(before: Sequence[Row], after: Sequence[Row]) -> tuple[list[str], lis
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run from the command line, with its arguments if none are given."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--part", action="append", choices=study.GROUPS, help="repeatable")
+    parser.add_argument("--part", action="append", choices=GROUPS, help="repeatable")
     parser.add_argument("--world", action="append", default=[], help="part of a name; repeatable")
     parser.add_argument("--runs", type=int, default=20, help="seeds of a world, at most")
     parser.add_argument("--seed", type=int, default=0)
@@ -85,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rows = study.read_rows(chosen.show)
         print(*map(line_of, rows), sep="\n")
     else:
-        groups = tuple(chosen.part) if chosen.part else study.GROUPS
+        groups = tuple(chosen.part) if chosen.part else GROUPS
         settings = study.Settings(groups, tuple(chosen.world), chosen.runs, chosen.seed, quick=chosen.quick)
         rows = []
         for row in study.run_all(study.planned(settings), chosen.rows):

@@ -197,7 +197,7 @@ def _table() -> list[World]:
         "corners poses laser", "map of a common shift", "", wrong.map_frame(0.05, -0.03, 0.0), maps=MAP, seeds=MANY
     )
     some.add("orchard", "trees without identities", "", seeds=MANY, bound_m=0.05, quick="orchard-")
-    some.add("uwb", "the anchors are left behind", "", make={"range_max_m": 9.0}, seeds=MANY)
+    some.add("uwb", "the anchors are left behind", "", make={"site": "anchors behind", "range_max_m": 9.0}, seeds=MANY)
     some.add(
         "laser corners poses",
         "map without an identity in common",
@@ -219,6 +219,7 @@ def _sound() -> list[World]:
         seeds=10,
         quick="laser+ laser- corners+ poses+ stereo- uwb-",
     )
+    some.add("laser corners", "the robot stands", "", make={"speed_mps": 0.0, "sideways": False}, seeds=3)
     some.add("carried", "nothing wrong", "", seeds=10)
     some.add(
         "laser poses corners stereo",

@@ -435,15 +435,16 @@ def _read(
             point = se3.transform(seen[rows, None], corners(size_m[rows]))
         else:
             point = at[rows, None]
-        pixel = project(point, sensor)[0]
+        pixel: FloatArray = project(point, sensor)[0]
         if make.reading is Reading.STEREO:
             right = project(point - [BASELINE_M, 0.0, 0.0], sensor)[0][..., :1]
             pixel = np.concatenate([pixel, right], axis=-1)
         pixel = pixel + make.noise[0] * rng.normal(size=pixel.shape)
         wide, high = RESOLUTION_PX
         across, down = pixel[..., 0], pixel[..., 1]
-        inside = np.asarray((across > 0) & (across < wide) & (down > 0) & (down < high)).all(axis=1)
-        value[rows] = np.where(np.asarray(inside)[:, None], pixel.reshape(len(rows), -1), np.nan)
+        seen_px = np.asarray((across > 0) & (across < wide) & (down > 0) & (down < high))
+        in_image = np.asarray(seen_px.all(axis=1))
+        value[rows] = np.where(in_image[:, None], pixel.reshape(len(rows), -1), np.nan)
     return value
 
 

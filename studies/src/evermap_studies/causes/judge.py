@@ -61,7 +61,8 @@ class Case:
 def make_case(world: World, seed: int) -> Case:
     """Return a world of a seed; same seed, same case."""
     rng = np.random.default_rng([seed, crc32(world.name.encode())])
-    right, events = simulate(world.make, seed, in_map=world.in_map), ()
+    right = simulate(world.make, seed, in_map=world.in_map)
+    events: tuple[Event, ...] = ()
     if world.events is not None:
         events = world.events(right, rng)
         right = simulate(world.make, seed, events, in_map=world.in_map)
@@ -203,14 +204,14 @@ def conclude(world: World, answer: Answer, row: Row) -> Row:
     if world.group == "mistakes":
         right = named and not enters and row["exit"] != 1 and verdict_right
     elif world.cause == "anything":
-        right = not enters and row["exit"] != 1
+        right = row["exit"] != 1 and (not enters or (honest and not worse and error is not None))
     elif row["exit"] == 0:
         right = named and told_right and near and verdict_right and row["missed_changes"] == 0
         right = right and (world.group != "sound" or (honest and not worse))
     else:
         refused = row["exit"] == 3 or (row["exit"] == 2 and not answer.verdicts <= {"sound", "weak"})
         right = named and told_right and verdict_right and refused
-    unsaid = not row["named_by"] and VerdictKind.SOUND not in answer.verdicts
+    unsaid = not row["named_by"] and not answer.is_optional and VerdictKind.SOUND not in answer.verdicts
     silent = enters and (worse or not honest or row["certain_false_changes"] > 0 or unsaid)
     return {"enters": enters, "right": bool(right), "silent": bool(silent)}
 

@@ -137,6 +137,13 @@ def anchored_room(rng: np.random.Generator) -> Site:
     return Site(np.arange(1, count + 1), pose, np.full(count, np.nan), np.array(way))
 
 
+def anchors_behind(rng: np.random.Generator) -> Site:
+    """The same hall with six anchors at one end, which the robot leaves."""
+    place = rng.uniform(-0.4, 0.4, (6, 2)) + [(0.0, 2.0), (0.0, 12.0), (3.0, 0.0), (3.0, 14.0), (7.0, 0.0), (7.0, 14.0)]
+    pose = _points(np.column_stack([place, np.zeros(6)]))
+    return Site(np.arange(1, 7), pose, np.full(6, np.nan), anchored_room(rng).waypoint)
+
+
 def lounge(rng: np.random.Generator) -> Site:
     """A room of 8 x 7 m with marked points on its walls, for a rig that is carried."""
     count = 32
@@ -163,6 +170,7 @@ SITES: dict[str, Callable[[np.random.Generator], Site]] = {
     "warehouse": warehouse,
     "orchard": orchard,
     "anchors": anchored_room,
+    "anchors behind": anchors_behind,
     "lounge": lounge,
     "tagged room": tagged_room,
 }
