@@ -441,8 +441,8 @@ def _read(
             pixel = np.concatenate([pixel, right], axis=-1)
         pixel = pixel + make.noise[0] * rng.normal(size=pixel.shape)
         wide, high = RESOLUTION_PX
-        across, down = pixel[..., 0], pixel[..., 1]
-        seen_px = np.asarray((across > 0) & (across < wide) & (down > 0) & (down < high))
+        u_px, v_px = pixel[..., 0], pixel[..., 1]
+        seen_px = np.asarray((u_px > 0) & (u_px < wide) & (v_px > 0) & (v_px < high))
         in_image = np.asarray(seen_px.all(axis=1))
         value[rows] = np.where(in_image[:, None], pixel.reshape(len(rows), -1), np.nan)
     return value

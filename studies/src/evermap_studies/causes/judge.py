@@ -30,6 +30,8 @@ FAR = 0.04
 """Difference of a map from the truth [m] from which a landmark may be told as moved."""
 MUST = 0.15
 """Difference [m] from which it has to be."""
+VAGUE = frozenset({"landmarks-move", "no-odometry", "too-little"})
+"""Findings that refuse a recording without a cause."""
 NOWHERE_M = 1e9
 """Error of poses that are no numbers."""
 NEES = 4.0
@@ -79,7 +81,7 @@ class Solved:
 
     result: SlamResult | None
     recording: AnyRecording
-    findings: tuple[tuple[str, str], ...]
+    findings: tuple[tuple[str, bool], ...]
     refusal: str
     crashed: bool
     cpu_s: float
@@ -96,7 +98,7 @@ def solve(drive: Drive) -> Solved:
     config = Config() if drive.named else Config.model_validate({"slam": {"unknown_ids": True}})
     dim = None if drive.places is None else int(drive.places.position_m.shape[1])
     scored: AnyRecording = recording
-    findings: tuple[tuple[str, str], ...] = ()
+    findings: tuple[tuple[str, bool], ...] = ()
     started = time.process_time()
     try:
         scored = in_its_space(recording, config.slam, dim=dim)
@@ -108,9 +110,9 @@ def solve(drive: Drive) -> Solved:
     cpu_s = time.process_time() - started
     if result is None or result.verdict is None:
         try:
-            findings = tuple((one.code, one.message) for one in check_recording(recording, config).findings)
+            findings = tuple((one.code, one.usable) for one in check_recording(recording, config).findings)
         except Exception as error:
-            findings = (("", f"{type(error).__name__}: {error}"[:200]),)
+            findings = ((type(error).__name__, False),)
     return Solved(result, scored, findings, refusal, crashed, cpu_s)
 
 
@@ -179,7 +181,7 @@ def judge(case: Case, oracle: Row | None) -> Row:
     }  # fmt: skip
     row["named_by"] = named_by(world, answer, solved, missed, truth)
     row["value_off"] = value_off(world, result)
-    row["false_causes"] = _false_causes(answer, result)
+    row["false_causes"] = _false_causes(answer, solved)
     row["bound_m"] = bound(world, row["oracle_m"])
     return {**row, **conclude(world, answer, row)}
 
@@ -254,12 +256,13 @@ def value_off(world: World, result: SlamResult | None) -> float | None:
     return _rounded(min(off)) if off else None
 
 
-def _false_causes(answer: Answer, result: SlamResult | None) -> int:
-    """Number of causes that are told as likely, and are none of the world's."""
-    if result is None:
+def _false_causes(answer: Answer, solved: Solved) -> int:
+    """Number of causes that are told as likely, or for which `check` refuses the recording, and are false."""
+    if solved.result is None:
         return 0
-    likely = [one for one in result.causes if not one.probability < TOLD]
-    return sum(one.code not in answer.codes for one in likely)
+    likely = [one.code for one in solved.result.causes if not one.probability < TOLD]
+    refused = [code for code, is_usable in solved.findings if not is_usable and code not in VAGUE]
+    return sum(code not in answer.codes for code in (*likely, *refused))
 
 
 @dataclass(frozen=True, slots=True)
