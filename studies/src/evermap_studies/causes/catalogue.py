@@ -109,7 +109,7 @@ def _table() -> list[World]:
                     "odometry_sigma": (sigma, sigma, sigma),
                     "range_max_m": 4.5,
                 },
-                quick="poses+" if (sigma, scale) in ((0.3, 1.01), (0.1, 1.02)) else "",
+                quick="poses+" if (sigma, scale) in ((0.3, 1.01), (0.03, 1.01)) else "",
             )  # fmt: skip
     some.add(
         "corners",
