@@ -32,7 +32,6 @@ STUDIES = (
     "space",
     "building",
     "robots",
-    "causes",
     "persistence-speed",
     "soak",
     "scale",
