@@ -29,6 +29,7 @@ __all__ = [
     "association",
     "bateman2020",
     "building",
+    "causes",
     "demo",
     "liars",
     "lifelong",
@@ -405,6 +406,38 @@ def robots(
         return study.reproduce(target, settings, progress=progress, force=force), study.as_markdown
 
     _run("robots", compute, out, as_json=as_json, force=force, in_seconds=False)
+
+
+def causes(
+    out: Out = None,
+    part: Annotated[
+        list[str] | None,
+        typer.Option(help="Only this part: table, sound, causes, mistakes or attacks; repeatable.", show_default=False),
+    ] = None,
+    world: Annotated[
+        list[str] | None, typer.Option(help="Only worlds with this in their name; repeatable.", show_default=False)
+    ] = None,
+    runs: Annotated[int | None, typer.Option(min=1, help="Seeds of a world, at most.", show_default="20")] = None,
+    seed: Seed = 0,
+    quick: Quick = False,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Make recordings and maps wrong in one way each, and ask for the cause; a run that was stopped goes on.
+
+    \b
+    Examples:
+      evermap reproduce causes --quick
+      evermap reproduce causes --part mistakes --world "laser alone"
+    """
+
+    def compute(target: Path, progress: Progress | None) -> tuple[dict[str, Any], AsText]:
+        from evermap_studies.causes import study
+
+        settings = replace(study.Settings(quick=quick), seed=seed, **_given(groups=part, worlds=world, runs=runs))
+        return study.reproduce(target, settings, progress=progress, force=force), study.as_markdown
+
+    _run("causes", compute, out, as_json=as_json, force=force, in_seconds=False)
 
 
 def _run(
