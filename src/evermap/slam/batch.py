@@ -574,15 +574,16 @@ def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray, fewest: 
     """Move landmarks to the median of their sightings where most sightings disagree with them.
 
     A landmark whose first sighting carried the wrong identity starts in the wrong place, from where all right
-    sightings look like outliers. At least `fewest` vote, by inlier weights (M,).
+    sightings look like outliers. At least `fewest` vote, by inlier weights (M,); ranges without a bearing have no vote.
     """
-    sightings = np.bincount(problem.landmark_row, minlength=len(estimate.landmark))
-    agreeing = np.bincount(problem.landmark_row, weights=weights > 0.5, minlength=len(estimate.landmark))
+    votes = problem.has_bearing
+    sightings = np.bincount(problem.landmark_row, weights=votes, minlength=len(estimate.landmark))
+    agreeing = np.bincount(problem.landmark_row, weights=votes & (weights > 0.5), minlength=len(estimate.landmark))
     # a vote would only set a landmark of a prior map against that map
     disputed: BoolArray = (sightings >= fewest) & (agreeing < 0.5 * sightings) & ~problem.mapped
     if not disputed.any():
         return estimate
-    theirs = problem.seeing(disputed[problem.landmark_row])
+    theirs = problem.seeing(disputed[problem.landmark_row] & votes)
     at = sighted_at(estimate.pose[theirs.pose_row], theirs.reading, estimate.states, problem.mount)
     middle = middles(theirs.landmark_row, at, len(disputed))
     return replace(estimate, landmark=np.where(disputed[:, None], middle, estimate.landmark))

@@ -19,7 +19,7 @@ from evermap.geometry import se2, se3
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import N_STATES, kernel
 from evermap.slam.preintegration import Intervals, Preintegration
-from evermap.types import BoolArray, FloatArray, IntArray, Recording
+from evermap.types import ANY_BEARING_RAD, BoolArray, FloatArray, IntArray, Recording
 
 USUAL = OdometryConfig()
 FEWEST_ROWS = 20
@@ -210,6 +210,11 @@ class Problem:
     def mapped(self) -> BoolArray:
         """(L,) landmarks that a prior map holds."""
         return np.asarray(self.landmark_information.diagonal()[::2] > 0.0)
+
+    @property
+    def has_bearing(self) -> BoolArray:
+        """(M,) detections whose bearing was measured; of the others it says nothing of where the landmark is."""
+        return np.asarray(~(self.sigma_given[:, 1] >= ANY_BEARING_RAD))
 
     def with_places(self, count: int) -> Problem:
         """Return the problem with room for so many places; new ones have no prior."""

@@ -35,7 +35,7 @@ from evermap.slam.method import Compare, Explanation, Method, Rival
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Noise, Problem, independent
 from evermap.slam.smoother import Smoother
-from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
+from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 
 VISIT_MARGIN, MOST_VISITS = 0.5, 8
 """Visits that get windows of their own: this share of the interval around it, and this many."""
@@ -164,7 +164,8 @@ class Joint(Method):
         if not heavy:
             lighter = smoother.under(noise, heavy=False)
             estimate, _ = yield from lighter.solved_in_slices(estimate, iterations=5, tolerance=1e-4)
-        changes = self._changes(self._groups, posterior.probability, base)
+        light = smoother.under(noise, heavy=False)
+        changes = self._changes(self._groups, posterior.probability, base, light, estimate)
         revision = Explanation(problem, estimate, self._current(), changes)
         if final:
             lost = in_map and not self._groups and posterior.misfit > self._prior.disagreement
@@ -217,7 +218,7 @@ class Joint(Method):
             current = _current(landmark, self._count)
             rivals.append(
                 Rival(
-                    self._changes(groups, probability, base),
+                    self._changes(groups, probability, base, smoother, solved),
                     probability,
                     solved.landmark[current],
                     smoother.marginals(solved).landmark[current],
@@ -318,9 +319,15 @@ class Joint(Method):
         )
         return replace(group, since_s=since_s, between_s=between_s)
 
-    def _changes(self, groups: Groups, probability: float, base: Problem) -> tuple[MapChange, ...]:
-        first_s = float(base.stamp_s[0])
-        moved = tuple(_change(group, probability, first_s) for group in groups)
+    def _changes(
+        self, groups: Groups, probability: float, base: Problem, smoother: Smoother, estimate: Estimate
+    ) -> tuple[MapChange, ...]:
+        first_s, stamp_s = float(base.stamp_s[0]), base.stamp_s[base.pose_row]
+        used = smoother.inlier_probability(estimate) > 0.5
+        moved = tuple(
+            replace(_change(group, probability, first_s), n_hits=_count_hits(group, base, used, stamp_s))
+            for group in groups
+        )
         return (*(self._swap_change(swap, first_s) for swap in self._swaps), *moved)
 
     def _swap_change(self, swap: tuple[int, int, float], first_s: float) -> MapChange:
@@ -369,6 +376,12 @@ def _change(group: MovedGroup, probability: float, first_s: float) -> MapChange:
         rotation_rad=float(group.motion[2]),
         probability=probability,
     )
+
+
+def _count_hits(group: MovedGroup, base: Problem, used: BoolArray, stamp_s: FloatArray) -> int:
+    """Detections of the members that are no outliers, since they are at their new places."""
+    since_s = -math.inf if group.since_s is None else group.since_s
+    return int(np.count_nonzero(used & (stamp_s >= since_s) & np.isin(base.landmark_row, group.members)))
 
 
 def _same(groups: Groups, others: Groups) -> bool:
