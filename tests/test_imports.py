@@ -35,8 +35,9 @@ RULES = {
     "tracking": "errors compiled show types config geometry survival valid io sensing existence",
     "viz": "errors types geometry survival metrics existence",
     "slam": "errors interrupts compiled plugins show types config geometry valid sensing tracking estimate align",
+    "explain": "types config geometry metrics slam",
     "maps": "errors show types config geometry survival valid sensing existence tracking estimate align slam",
-    "pipeline": "errors compiled types config estimate slam maps",
+    "pipeline": "errors compiled types config estimate slam explain maps",
     "runs": (
         "errors interrupts show types config geometry survival valid io metrics existence tracking viz maps pipeline"
     ),

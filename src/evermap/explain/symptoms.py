@@ -232,7 +232,7 @@ def measure_signs(
         blind_share=blind_share,
         common=common,
         moved=moved,
-        in_map=None if prior_map is None else result.trajectory.frame == "prior_map",
+        in_map=None if prior_map is None else result.landmarks.frame == "prior_map",
         alternatives=len(result.alternatives),
     )
 
