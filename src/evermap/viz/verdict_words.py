@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from evermap.types import Verdict
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from evermap.types import Verdict
 
 ABOUT_RIGHT = 1.4, 2.6
 """Mean innovations, of 2 numbers each, within which standard deviations are right to 15 %."""
