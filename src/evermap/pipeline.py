@@ -52,8 +52,8 @@ def run_slam(
     from evermap.slam.space.up import with_known_up
 
     config = config or Config()
-    recording, prior_map, told = plane.with_prior(recording, prior_map, config.slam)
-    recording, remarks, found = check.screened(recording, config, prior_map)
+    read, prior_map, told = plane.with_prior(recording, prior_map, config.slam)
+    recording, remarks, found = check.screened(read, config, prior_map)
     remarks = (*told, *remarks)
     if config.slam.unknown_ids and prior_map is not None:
         recording = nameless.numbered_in(recording, prior_map, config)  # type: ignore[type-var]
@@ -65,7 +65,7 @@ def run_slam(
     visit = session.solved(recording, config, prior_map, remarks, realtime=realtime, progress=progress)
     result = session.existing(visit, visit.concluded(), config.living)
     result = result if prior_map is None else with_known_up(result, prior_map.up)
-    return with_verdict(result, recording, config.slam, prior_map, findings=found)
+    return with_verdict(result, recording, config.slam, prior_map, findings=found, as_read=read)
 
 
 @single_threaded()
@@ -100,8 +100,8 @@ def run_together(
         raise ConfigError(problem, field="slam.unknown_ids", hint=hint)
     alone, visits, results, findings = {}, list[spatial.SpatialVisit](), {}, {}
     for number, given in recordings.items():
-        given = replace(given, measurements=without_frames(given.measurements))
-        recording, remarks, findings[number] = check.screened(given, config)
+        apart = replace(given, measurements=without_frames(given.measurements))
+        recording, remarks, findings[number] = check.screened(apart, config)
         if is_in_space(recording):
             visits.append(spatial.solve_visit(recording, config, None, remarks, progress=progress))
             continue

@@ -22,7 +22,6 @@ from evermap.cli.options import (
 from evermap.cli.terminal import EXIT_UNTRUSTWORTHY, fail, print_json, print_table, remark_as, say, warn
 
 
-
 def check(
     input: Annotated[Path, argument("Folder in the native format, zip or ROS bag.", metavar="INPUT")],
     robot: Robot = None,

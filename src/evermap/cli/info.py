@@ -120,7 +120,18 @@ def _run(path: Path, summary: dict[str, Any]) -> Described:
         ("remarks", f"{len(summary.get('warnings') or ())}"),
         ("files", f"{len(files)}, {_readable(sum(files.values()))}" + (f"; {len(missing)} missing" if missing else "")),
     ]
-    picked = ("command", "input", "evermap", "recording", "metrics", "counts", "changes", "accepted", "verdict", "timing")
+    picked = (
+        "command",
+        "input",
+        "evermap",
+        "recording",
+        "metrics",
+        "counts",
+        "changes",
+        "accepted",
+        "verdict",
+        "timing",
+    )
     facts = {name: summary[name] for name in picked if name in summary}
     return Described(
         "run", {**facts, "files": files, "missing": missing, "remarks": len(summary.get("warnings") or ())}, rows

@@ -15,11 +15,13 @@ import numpy as np
 from evermap.geometry import se2, se3
 from evermap.metrics.consistency import comparable_nis, lag1_autocorrelation
 from evermap.types import (
+    ANY_BEARING_RAD,
     UNKNOWN,
     AnyRecording,
     BoolArray,
     ChangeKind,
     FloatArray,
+    Innovations,
     IntArray,
     Landmarks,
     ParameterEstimate,
@@ -69,7 +71,7 @@ class Compared:
 
 
 def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
-    """Return detections beside expectations, of those that have both; readings are compared as they were read."""
+    """Return detections beside expectations, of those that have both, in the plane with the estimated calibration."""
     seen, innovations, places = recording.detections, result.innovations, result.landmarks
     row, known = _rows_of(places, innovations.landmark_id)
     stamp_s = innovations.stamp_s
@@ -87,17 +89,34 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
         length = np.maximum(np.linalg.norm(read, axis=1), 1e-9)
         read = np.where(blind[:, None], read * (range_m / length)[:, None], read)
     else:
-        eye = se2.compose(pose, np.array(recording.sensor.mount_robot_sensor, dtype=np.float64))
-        expected = se2.transform(se2.inverse(eye), places.position_m[row])
-        range_m = np.linalg.norm(expected, axis=1)
-        bearing = seen.bearing_rad[detection]
-        expected_rad = np.arctan2(expected[:, 1], expected[:, 0])
-        bearing = np.where(np.isfinite(bearing), bearing, expected_rad)
-        read = seen.range_m[detection, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+        expected = _expected_readings(pose, places.position_m[row], recording, result.parameters)
+        range_m, bearing = expected[:, 0], seen.bearing_rad[detection]
+        known = np.isfinite(bearing) & ~(seen.sigma_bearing_rad[detection] >= ANY_BEARING_RAD)
+        read = _points(seen.range_m[detection], np.where(known, bearing, expected[:, 1]))
+        expected = _points(range_m, expected[:, 1])
     off = (read - expected) / np.maximum(range_m, 1e-9)[:, None]
     good = np.isfinite(off).all(axis=1)
     used = innovations.p_inlier[keep] >= USED
     return Compared(stamp_s[keep][good], innovations.landmark_id[keep][good], used[good], range_m[good], off[good])
+
+
+def _points(range_m: FloatArray, bearing_rad: FloatArray) -> FloatArray:
+    return range_m[:, None] * np.column_stack([np.cos(bearing_rad), np.sin(bearing_rad)])
+
+
+def _expected_readings(
+    pose: FloatArray, place_m: FloatArray, recording: Recording, parameters: tuple[ParameterEstimate, ...]
+) -> FloatArray:
+    """Return (K, 2) ranges and bearings as the estimated sensor reads them without noise (`slam.calibration.SPECS`)."""
+    value = {each.name: each.value for each in parameters}
+    ahead, left = value.get("mount_forward_m", 0.0), value.get("mount_left_m", 0.0)
+    mount = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64) + [ahead, left, 0.0]
+    x, y = se2.transform(se2.inverse(se2.compose(pose, mount)), place_m).T
+    range_m, bearing = np.hypot(x, y), np.arctan2(y, x)
+    skew, curve = value.get("range_skew_per_rad", 0.0), value.get("range_curvature_per_rad2", 0.0)
+    factor = 1.0 + value.get("range_slope", 0.0) + skew * bearing + curve * bearing**2
+    read_m = value.get("range_bias_m", 0.0) + range_m * factor
+    return np.column_stack([np.maximum(read_m, 1e-3), bearing + value.get("bearing_bias_rad", 0.0)])
 
 
 def _rows_of(places: Landmarks, landmark_id: IntArray) -> tuple[IntArray, BoolArray]:
@@ -128,7 +147,9 @@ class Signs:
         n_landmarks, n_used: landmarks of the result; detections used.
         nis: mean of the inliers over their degrees of freedom, on the scale of 2.
         nis_lag: correlation of a landmark's successive innovations.
-        used, used_worst: share of the identified detections that were used, and that of the worst tenth of the drive.
+        used, used_worst: share of the detections with a prediction that were used, and that of the worst tenth of the
+            drive.
+        named: share of the detections with an identity, as they were read, that were used.
         misfit, misfit_all: median of what used, and all, detections are off by, over their range.
         contradicted: share of the landmarks (seen often) most of whose detections were not used.
         halves: median over landmarks of how far the first half of the drive has them from the second, in standard
@@ -138,13 +159,11 @@ class Signs:
         motion_turn_rad: the same of the turns.
         longer: motion by the trajectory over that by odometry.
         away, away_name: standard deviations by which the calibration state farthest from its prior is off.
-        on_bound: noise levels on their bound.
         size_m: extent of trajectory and map.
         sigma_m: root mean square of the standard deviations of positions; `sigma_most_m` the largest.
         sigma_share: `sigma_m` over the size.
         blind_s, blind_share: longest time without a used detection, in seconds and as a share of the drive.
-        common, moved, unlike: landmarks of the given map that were seen; the shares of them that are reported as
-            changed, and that are not used where the map has them.
+        common, moved: landmarks of the given map that were seen; the share of them that is reported as changed.
         in_map: whether a given map is the frame of the result; None without one.
         alternatives: explanations nearly as probable as the one reported.
     """
@@ -155,6 +174,7 @@ class Signs:
     nis_lag: float = nan
     used: float = nan
     used_worst: float = nan
+    named: float = nan
     misfit: float = nan
     misfit_all: float = nan
     contradicted: float = nan
@@ -165,7 +185,6 @@ class Signs:
     longer: float = nan
     away: float = nan
     away_name: str = ""
-    on_bound: tuple[str, ...] = ()
     size_m: float = nan
     sigma_m: float = nan
     sigma_most_m: float = nan
@@ -186,7 +205,7 @@ def measure_signs(
     result: SlamResult,
     recording: AnyRecording,
     prior_map: Landmarks | None = None,
-    bounds: dict[str, tuple[float, float]] | None = None,
+    as_read: AnyRecording | None = None,
 ) -> Signs:
     """Return all signs of a run.
 
@@ -194,12 +213,12 @@ def measure_signs(
         result: of the run.
         recording: as it was estimated, so that rows of the result's innovations are rows of its detections.
         prior_map: that was given, or what a living map expected.
-        bounds: between which noise levels are learned, by name.
+        as_read: the recording with the identities that it was read with; None where they are the same.
     """
     compared = compare_detections(recording, result)
     motion, turn, longer = _by_odometry(result)
     halves, halves_share = _between_halves(compared)
-    used, worst = _shares_used(result, recording)
+    used, worst = _shares_used(result.innovations)
     away, name = _farthest_state(result.parameters)
     size_m, sigma_m, most_m = _extent(result)
     blind_s, blind_share = _blind(result)
@@ -214,6 +233,7 @@ def measure_signs(
         nis_lag=_or_nan(lag1_autocorrelation(nis[fine], result.innovations.landmark_id[fine].astype(np.float64))),
         used=used,
         used_worst=worst,
+        named=_share_named(result.innovations, as_read or recording),
         misfit=_median(compared.misfit[compared.used]),
         misfit_all=_median(compared.misfit),
         contradicted=_contradicted(result),
@@ -224,7 +244,6 @@ def measure_signs(
         longer=longer,
         away=away,
         away_name=name,
-        on_bound=_on_bound(result.parameters, bounds or {}),
         size_m=size_m,
         sigma_m=sigma_m,
         sigma_most_m=most_m,
@@ -245,14 +264,23 @@ def _median(values: FloatArray) -> float:
     return float(np.median(values)) if len(values) >= FEWEST else nan
 
 
-def _shares_used(result: SlamResult, recording: AnyRecording) -> tuple[float, float]:
+def _shares_used(innovations: Innovations) -> tuple[float, float]:
     """Return the share of detections with a prediction that were used, and the least of a part of the drive."""
-    stamp_s, inlier = result.innovations.stamp_s, result.innovations.p_inlier >= USED
+    stamp_s, inlier = innovations.stamp_s, innovations.p_inlier >= USED
     if len(inlier) < FEWEST:
         return nan, nan
     order = np.argsort(stamp_s, kind="stable")
     parts = np.array_split(inlier[order], min(STRETCHES, len(inlier) // FEWEST))
     return float(inlier.mean()), min(float(part.mean()) for part in parts)
+
+
+def _share_named(innovations: Innovations, recording: AnyRecording) -> float:
+    """Return the share of the detections with an identity that were used; nan where hardly any has one."""
+    named = int(np.count_nonzero(recording.detections.landmark_id != UNKNOWN))
+    used = innovations.detection[innovations.p_inlier >= USED]
+    if named < max(FEWEST, len(used)):  # identities were found, not read
+        return nan
+    return len(used) / named
 
 
 def _contradicted(result: SlamResult) -> float:
@@ -294,7 +322,9 @@ def _by_odometry(result: SlamResult) -> tuple[float, float, float]:
     lag_s = max(SHORTEST_S, float(path.stamp_s[-1] - path.stamp_s[0]) / WINDOWS)
     last = np.searchsorted(path.stamp_s, path.stamp_s + lag_s)
     first = np.flatnonzero(last < len(path))
-    first = first[np.linspace(0, len(first) - 1, min(len(first), 20 * WINDOWS)).astype(np.int64)] if len(first) else first
+    first = (
+        first[np.linspace(0, len(first) - 1, min(len(first), 20 * WINDOWS)).astype(np.int64)] if len(first) else first
+    )
     if len(first) < 3:
         return nan, nan, nan
     one, two = (_motions(each.pose_world_robot, first, last[first]) for each in (path, other))
@@ -327,16 +357,6 @@ def _farthest_state(parameters: tuple[ParameterEstimate, ...]) -> tuple[float, s
     free = [each for each in parameters if not each.fixed and each.prior_sigma > 0.0]
     away = [(abs(each.value - each.prior_mean) / each.prior_sigma, each.name) for each in free]
     return max(away, default=(nan, ""))
-
-
-def _on_bound(parameters: tuple[ParameterEstimate, ...], bounds: dict[str, tuple[float, float]]) -> tuple[str, ...]:
-    """Return the names of noise levels that rest on a bound."""
-    found = []
-    for each in parameters:
-        low, high = bounds.get(each.name, (-np.inf, np.inf))
-        if not low * 1.01 < each.value < high * 0.99:
-            found.append(each.name)
-    return tuple(found)
 
 
 def _extent(result: SlamResult) -> tuple[float, float, float]:
@@ -372,10 +392,7 @@ def _of_map(result: SlamResult, recording: AnyRecording, prior_map: Landmarks | 
     """Return how many landmarks of a given map were seen, and the share of them that is reported as changed."""
     if prior_map is None:
         return -1, nan
-    named = recording.detections.landmark_id
+    named = np.concatenate([recording.detections.landmark_id, result.innovations.landmark_id])
     common = np.intersect1d(prior_map.landmark_id, named[named != UNKNOWN])
     changed = [one for change in result.changes if change.kind in GONE_OR_MOVED for one in change.landmark_ids]
     return len(common), float(np.isin(common, changed).mean()) if len(common) else nan
-
-
-__all__ = ["Compared", "Recording", "Signs", "compare_detections", "measure_signs"]

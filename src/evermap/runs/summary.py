@@ -30,7 +30,8 @@ from evermap.types import (
 )
 
 SUMMARY_SCHEMA_VERSION = "3"
-"""Of `summary.json` of all verbs and studies. 2: `config` holds sections; `version` and `input` for all. 3: `verdict`."""
+"""Of `summary.json` of all verbs and studies. 2: `config` holds sections; `version` and `input` for all. 3: a run has
+its `verdict`."""
 
 _FRAME_MEANING = {
     "first_pose": "the robot's first pose: origin at its position, {axes}; metres",
@@ -160,7 +161,9 @@ def _frame_text(frame: str, size: int) -> str:
 def verdict_dict(verdict: Verdict) -> dict[str, Any]:
     """Return a verdict as plain values with stable keys; null for what is infinite or unknown."""
     numbers = ("value", "least", "most")
-    symptoms = [{**asdict(one), **{name: json_number(getattr(one, name)) for name in numbers}} for one in verdict.symptoms]
+    symptoms = [
+        {**asdict(one), **{name: json_number(getattr(one, name)) for name in numbers}} for one in verdict.symptoms
+    ]
     of_cause = ("value", "sigma", "probability", "nats")
     causes = [{**asdict(one), **{name: json_number(getattr(one, name)) for name in of_cause}} for one in verdict.causes]
     return {

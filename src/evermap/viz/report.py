@@ -14,10 +14,10 @@ import numpy as np
 from evermap.metrics.summary import Evaluation
 from evermap.types import UNKNOWN, AnyRecording, Clock, ParameterEstimate, SlamResult, stamp_text
 from evermap.viz.change_words import explanations, grew, near_alternatives
-from evermap.viz.verdict_words import innovations_text, verdict_text
 from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.run_figures import has_prior, quantity
 from evermap.viz.style import NamedFigure
+from evermap.viz.verdict_words import innovations_text, verdict_text
 
 
 @dataclass(frozen=True, slots=True)
