@@ -72,16 +72,17 @@ class Compared:
 
 def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
     """Return detections beside expectations, of those that have both, in the plane with the estimated calibration."""
-    seen, innovations, places = recording.detections, result.innovations, result.landmarks
+    innovations, places = result.innovations, result.landmarks
     row, known = _rows_of(places, innovations.landmark_id)
     stamp_s = innovations.stamp_s
     pose, near = _poses_at(result.trajectory, stamp_s)
-    keep = known & near & (innovations.detection < len(seen))
+    keep = known & near & (innovations.detection < len(recording.detections))
     detection, row, pose = innovations.detection[keep], row[keep], pose[keep]
     if is_in_space(recording):
         from evermap.slam.space.intake import positions_of, without_range
 
-        mounts = np.array([one.mount_robot_sensor for one in recording.sensors])[seen.sensor[detection]]
+        mounts = np.array([one.mount_robot_sensor for one in recording.sensors])
+        mounts = mounts[recording.detections.sensor[detection]]
         expected = se3.transform(se3.inverse(se3.compose(pose, mounts)), places.position_m[row])
         read = positions_of(recording)[detection]
         range_m = np.linalg.norm(expected, axis=1)
@@ -89,6 +90,7 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
         length = np.maximum(np.linalg.norm(read, axis=1), 1e-9)
         read = np.where(blind[:, None], read * (range_m / length)[:, None], read)
     else:
+        seen = recording.detections
         expected = _expected_readings(pose, places.position_m[row], recording, result.parameters)
         range_m, bearing = expected[:, 0], seen.bearing_rad[detection]
         known = np.isfinite(bearing) & ~(seen.sigma_bearing_rad[detection] >= ANY_BEARING_RAD)
@@ -101,7 +103,7 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
 
 
 def _points(range_m: FloatArray, bearing_rad: FloatArray) -> FloatArray:
-    return range_m[:, None] * np.column_stack([np.cos(bearing_rad), np.sin(bearing_rad)])
+    return np.asarray(range_m[:, None] * np.column_stack([np.cos(bearing_rad), np.sin(bearing_rad)]))
 
 
 def _expected_readings(
