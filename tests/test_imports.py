@@ -35,7 +35,7 @@ RULES = {
     "tracking": "errors compiled show types config geometry survival valid io sensing existence",
     "viz": "errors types geometry survival metrics existence",
     "slam": "errors interrupts compiled plugins show types config geometry valid sensing tracking estimate align",
-    "explain": "errors types config geometry estimate slam",
+    "explain": "errors types config geometry metrics estimate slam",
     "maps": "errors show types config geometry survival valid sensing existence tracking estimate align slam explain",
     "pipeline": "errors compiled types config estimate slam explain maps",
     "runs": (

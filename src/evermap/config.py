@@ -1020,6 +1020,11 @@ class LivingConfig(Section):
         "trajectory marginalised; 'gate' tests one clique after the other, at the aligned poses; 'none': "
         "nothing moves",
     )
+    accept: Literal["sound", "weak", "any"] = key(
+        "sound",
+        "verdicts with which a session enters the map by itself: 'sound' ones only, 'weak' ones, too, or 'any', "
+        "whatever is wrong with it",
+    )
     existence: bool = key(True, "misses lower P(exists); off: landmarks exist permanently")
     returns: bool = key(True, "absent landmarks may return; off: they never do (Rosen 2016)")
     misses: bool = key(True, "use misses as evidence")

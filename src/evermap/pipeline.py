@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from evermap.maps.sessions.session import Session
     from evermap.maps.sessions.spatial import SpatialVisit
     from evermap.slam.estimate import Solved
+    from evermap.slam.mistakes import Finding
 
 
 @single_threaded()
@@ -45,14 +46,15 @@ def run_slam(
         NumericalError: no finite optimum.
     """
     from evermap.explain.causes import Inputs
+    from evermap.explain.verdict import with_verdict
     from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check, plane
     from evermap.slam.space.moving import has_traffic, run_in_traffic
     from evermap.slam.space.up import with_known_up
 
     config = config or Config()
-    recording, prior_map, told = plane.with_prior(recording, prior_map, config.slam)
-    recording, remarks = check.screened(recording, config, prior_map)
+    read, prior_map, told = plane.with_prior(recording, prior_map, config.slam)
+    recording, remarks, found = check.screened(read, config, prior_map)
     remarks = (*told, *remarks)
     if config.slam.unknown_ids and prior_map is not None:
         recording, evidence = nameless.identify_in(recording, prior_map, config)
@@ -61,13 +63,14 @@ def run_slam(
     if evidence is not None:
         remarks = (*remarks, *association.describe_doubts(evidence, config.slam.association))
     if has_traffic(recording):
-        return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
+        result = run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
+        return with_verdict(result, recording, config.slam, findings=found)
     given = Inputs.of(recording, prior_map)
-    visit, result = session.explained(given, config, remarks, realtime=realtime, progress=progress)
+    visit, result, under = session.explained(given, config, remarks, realtime=realtime, progress=progress)
     result = replace(session.existing(visit, result, config.living), association=evidence)
-    if prior_map is None:
-        return result
-    return with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)
+    if prior_map is not None:
+        result = with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)
+    return with_verdict(result, under.recording, config.slam, under.prior_map, findings=found, as_read=read)
 
 
 @single_threaded()
@@ -89,6 +92,7 @@ def run_together(
         NumericalError: no finite optimum.
     """
     from evermap.estimate.tie import without_frames
+    from evermap.explain.verdict import with_verdict
     from evermap.maps.sessions import planar, session, spatial
     from evermap.slam import check, estimate, together
 
@@ -99,9 +103,10 @@ def run_together(
     if config.slam.unknown_ids:
         problem, hint = "landmarks that several robots see are known by their ids", "run the robots one by one"
         raise ConfigError(problem, field="slam.unknown_ids", hint=hint)
-    alone, visits, results = {}, list[spatial.SpatialVisit](), {}
+    alone, visits, results, findings = {}, list[spatial.SpatialVisit](), {}, {}
     for number, given in recordings.items():
-        recording, remarks = check.screened(replace(given, measurements=without_frames(given.measurements)), config)
+        apart = replace(given, measurements=without_frames(given.measurements))
+        recording, remarks, findings[number] = check.screened(apart, config)
         if is_in_space(recording):
             visits.append(spatial.solve_visit(recording, config, None, remarks, progress=progress))
             continue
@@ -112,11 +117,13 @@ def run_together(
         frames = ["first_pose", *["first_robot"] * (len(visits) - 1)]
         joint = spatial.solve_visits_together(visits, config.slam.localize)
         for number, one, frame in zip(recordings, joint, frames, strict=True):
-            results[number] = session.existing(one, one.concluded(frame), config.living)
+            result = session.existing(one, one.concluded(frame), config.living)
+            results[number] = with_verdict(result, one.recording, config.slam, findings=findings[number])
         return results
     for number, solved, online in zip(alone, *together.solve_together(alone), strict=True):
         visit = planar.PlanarVisit(solved)
-        results[number] = session.existing(visit, replace(visit.concluded(online.frame), online=online), config.living)
+        result = session.existing(visit, replace(visit.concluded(online.frame), online=online), config.living)
+        results[number] = with_verdict(result, solved.recording, config.slam, findings=findings[number])
     return results
 
 
@@ -146,7 +153,7 @@ def run_session(
     living, whole = session.opened(living, recording), recording
     located: Localised[PlanarVisit] | Localised[SpatialVisit]
     if is_in_space(recording):
-        recording, remarks = check.screened(nameless.without_ids(recording, config), config)
+        recording, remarks, found = check.screened(nameless.without_ids(recording, config), config)
         session.check_static(recording, config)
         recording, living = session.admitted(recording, living)
         if config.slam.unknown_ids:
@@ -154,10 +161,10 @@ def run_session(
         located = boxes.localised(recording, living, config, remarks, progress)
     else:
         alone = solve_alone(recording, living, config, progress=progress)
-        living = session.with_names_of(living, alone.recording)
+        living, found = session.with_names_of(living, alone.recording), alone.findings
         located = planar.localised(alone, living, config)
-    entered = session.brought_in(located, living, config.living)
-    return session.begun_with(session.with_causes(entered, living, config), whole)
+    entered = session.with_causes(session.brought_in(located, living, config.living), living, config)
+    return _judged(session.begun_with(entered, whole), living, config, found)
 
 
 @single_threaded()
@@ -169,11 +176,12 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     from evermap.maps.sessions import nameless, planar, session
     from evermap.slam import check, estimate
 
-    recording, remarks = check.screened(nameless.without_ids(recording, config), config, repair=True)
+    recording, remarks, found = check.screened(nameless.without_ids(recording, config), config, repair=True)
     recording = session.admit_recording(recording, living)
     if config.slam.unknown_ids:
         recording = session.admit_recording(nameless.named_in(recording, living, config), living)
-    return estimate.solve(*planar.prepare_alone(recording, config), remarks=remarks, progress=progress)
+    solved = estimate.solve(*planar.prepare_alone(recording, config), remarks=remarks, progress=progress)
+    return replace(solved, findings=found)
 
 
 @single_threaded()
@@ -182,7 +190,18 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
     from evermap.maps.sessions import planar, session
 
     living = session.with_names_of(living, alone.recording)
-    return session.brought_in(planar.localised(alone, living, config), living, config.living)
+    entered = session.brought_in(planar.localised(alone, living, config), living, config.living)
+    return _judged(entered, living, config, alone.findings)
+
+
+def _judged(entered: Session, before: LivingMap, config: Config, found: tuple[Finding, ...]) -> Session:
+    """Return a session with its verdict, beside the map as it was `before` it."""
+    from evermap.explain.verdict import with_verdict
+
+    expected = before.landmarks(p_least=0.0) if len(before.places) else None
+    reason = entered.set_aside[0] if entered.set_aside else ""
+    slam = with_verdict(entered.slam, entered.recording, config.slam, expected, findings=found, set_aside=reason)
+    return replace(entered, slam=slam)
 
 
 @single_threaded()
@@ -224,11 +243,12 @@ def run_localization(
         places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))
         joint = living.covariance_m2
         result = localize_in_space(recording, places, config, joint_m2=joint, realtime=realtime, progress=progress)
-        return replace(result, warnings=(*check.odd(recording, config.slam), *result.warnings))
-    remarks = check.odd(recording, config.slam)
+        found = check.odd(recording, config.slam)
+        return replace(result, warnings=(*(finding.message for finding in found), *result.warnings))
+    found = check.odd(recording, config.slam)
     recording, living = session.admitted(recording, living)
     named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])
     places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))
     joint, believed = living.covariance_m2, intake.beliefs(recording.sensor, config.slam)
     result = localize(recording, places, *believed, config, joint_m2=joint, realtime=realtime, progress=progress)
-    return replace(result, warnings=(*remarks, *result.warnings))
+    return replace(result, warnings=(*(finding.message for finding in found), *result.warnings))

@@ -56,7 +56,7 @@ def test_the_summary_is_printed_as_it_is_written_and_lists_every_file(done: tupl
     assert {"beliefs.csv", "changes.jsonl", "forecasts.csv", "report.html", "figures/overview.png"} <= set(there)
     assert "figures/feature-cart-3.png" in there
     assert all((out / name).read_bytes().startswith(PNG) for name in there if name.endswith(".png"))
-    assert summary["schema_version"] == "2"
+    assert summary["schema_version"] == "3"
     assert summary["never_leave_share"] == pytest.approx({"all": 0.0, "cart": 0.1})
     assert summary["detector"]["p_miss"] == {"least": 0.1, "most": 0.1}
     assert summary["model"] == {"all": "one-stay", "cart": "one-stay"}

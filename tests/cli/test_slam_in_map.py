@@ -232,15 +232,14 @@ def test_a_session_of_another_place_is_refused(copy: Path, building: BuildingSim
     write_native(replace(other, detections=detections, true_landmarks=None), tmp_path / "elsewhere")
     before = digest(copy)
     result = slam(tmp_path / "elsewhere", copy, tmp_path / "run")
-    assert result.exit_code == 2
+    assert result.exit_code == 3
     problem = result.stderr.splitlines()[-1]
     assert "was set aside, the map is unchanged: too few of the detected landmarks" in problem
     assert "begin another map" in problem
     assert digest(copy) == before
-    assert json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))["accepted"] is False
-    assert json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))["frames"]["map"].startswith(
-        "first_pose"
-    )
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))
+    assert (summary["accepted"], summary["verdict"]["kind"]) == (False, "map outdated")
+    assert summary["frames"]["map"].startswith("first_pose")
 
 
 def test_localising_needs_a_map_with_something_in_it(recordings: list[Path], tmp_path: Path) -> None:

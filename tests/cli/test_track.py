@@ -117,7 +117,7 @@ def test_summary_counts_what_the_files_hold(yard: Path) -> None:
     assert counts["spells"] == len(rows(yard / "out" / "spells.csv"))
     assert counts["gaps"] == 4 * 7 - 1
     assert counts["frames"] == 4 * 7 * 40
-    assert summary(yard)["schema_version"] == "2"
+    assert summary(yard)["schema_version"] == "3"
     out = yard / "out"
     assert summary(yard)["outputs"] == sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
 

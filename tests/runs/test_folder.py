@@ -73,7 +73,7 @@ def test_everything_that_is_listed_is_there_and_nothing_else(written):
 
 def test_summary_has_its_contract(written, run):
     _, summary = written
-    assert summary["schema_version"] == "2"
+    assert summary["schema_version"] == "3"
     assert summary["metrics"]["pose_rmse_m"] > 0
     assert summary["timing"]["real_time_factor"] == pytest.approx(np.ptp(run[0].frames.stamp_s) / 2.0)
     assert summary["timing"]["step_p99_ms"] == pytest.approx(1e3 * np.percentile(run[1].step_s, 99))

@@ -19,7 +19,7 @@ from evermap.slam import mistakes as mistakes_of
 from evermap.slam.calibration import SPECS
 from evermap.slam.check import far_off
 from evermap.slam.mistakes import USUAL
-from evermap.types import ParameterEstimate, Recording
+from evermap.types import Detections, Frames, Odometry, ParameterEstimate, Recording
 from evermap_studies.sim import BuildingConfig, simulate_building
 
 
@@ -150,6 +150,30 @@ def test_a_robot_that_stands_still_is_no_zero_odometry() -> None:
     )
     assert len(frame) > 100
     assert raw_check(standing)[0] == []
+
+
+@pytest.mark.parametrize("creeps_mps", [0.0, 0.01])
+def test_a_parked_robot_accuses_nobody(creeps_mps: float) -> None:
+    """What shrinks readings shrinks their noise: where the robot stands that is no evidence of degrees."""
+    rng = np.random.default_rng(3)
+    stamp_s = np.arange(0.0, 120.0, 0.1)
+    count, frames = 8, 240
+    bearing = rng.uniform(-2.5, 2.5, count)
+    frame, which = np.divmod(np.arange(frames * count), count)
+    unknown = np.full(len(frame), np.nan)
+    parked = Recording(
+        "parked",
+        Odometry(
+            stamp_s, creeps_mps * rng.normal(size=len(stamp_s)), 0.0 * stamp_s, 0.01 * rng.normal(size=len(stamp_s))
+        ),
+        Frames(np.arange(frames) * 0.5),
+        Detections(
+            frame, which, rng.uniform(2.0, 8.0, count)[which] + 0.05 * rng.normal(size=len(frame)),
+            bearing[which] + 0.15 * rng.normal(size=len(frame)), np.full(len(frame), -1), unknown, unknown,
+            np.zeros(len(frame), dtype=np.int64),
+        ),
+    )  # fmt: skip
+    assert [finding.code for finding in check_recording(parked).findings if not finding.usable] == []
 
 
 def test_an_identity_for_every_detection_is_refused_before_it_costs() -> None:

@@ -19,9 +19,7 @@ from evermap.cli.options import (
     associated,
     configured,
 )
-from evermap.cli.terminal import fail, print_json, print_table, remark_as, say, warn
-
-EXIT_NOT_USABLE = 2
+from evermap.cli.terminal import EXIT_UNTRUSTWORTHY, fail, print_json, print_table, remark_as, say, warn
 
 
 def check(
@@ -37,7 +35,7 @@ def check(
     """Check whether a recording is usable, and report problems.
 
     Checks units, signs, clocks, gaps, jumps, rates, identities, limits and coverage. Exit code 0: usable, possibly with
-    warnings; 2: unusable, in one line.
+    warnings; 3: unusable, each reason in one line, as `evermap slam` ends with; 2: it cannot be read.
 
     \b
     Examples:
@@ -65,7 +63,7 @@ def check(
     for finding in found.findings:
         (warn if finding.usable else fail)(remark_as.get()(finding.message))
     if not found.usable:
-        raise typer.Exit(EXIT_NOT_USABLE)
+        raise typer.Exit(EXIT_UNTRUSTWORTHY)
     if not found.warnings and not found.findings:
         say("no problems found")
 

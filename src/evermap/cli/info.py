@@ -115,15 +115,31 @@ def _run(path: Path, summary: dict[str, Any]) -> Described:
         ("written", f"{timing.get('written_at', '-')} by evermap {summary['evermap']}"),
         *((name.replace("_", " "), f"{value:,.10g}") for name, value in numbers.items()),
         *(main_numbers(summary) if "metrics" in summary and "recording" in summary else []),
+        *([("verdict", _verdict(verdict))] if (verdict := summary.get("verdict")) else []),
         ("changes", ", ".join(f"{count} {kind}" for kind, count in changes.items()) or "none"),
         ("remarks", f"{len(summary.get('warnings') or ())}"),
         ("files", f"{len(files)}, {_readable(sum(files.values()))}" + (f"; {len(missing)} missing" if missing else "")),
     ]
-    picked = ("command", "input", "evermap", "recording", "metrics", "counts", "changes", "accepted", "timing")
+    picked = (
+        "command",
+        "input",
+        "evermap",
+        "recording",
+        "metrics",
+        "counts",
+        "changes",
+        "accepted",
+        "verdict",
+        "timing",
+    )
     facts = {name: summary[name] for name in picked if name in summary}
     return Described(
         "run", {**facts, "files": files, "missing": missing, "remarks": len(summary.get("warnings") or ())}, rows
     )
+
+
+def _verdict(verdict: Mapping[str, Any]) -> str:
+    return shorten(f"{verdict['kind']}: {verdict['message']}", MOST_LETTERS, placeholder=" ...")
 
 
 def _recording(path: Path, robot: int | None) -> Described:

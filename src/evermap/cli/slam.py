@@ -28,7 +28,18 @@ from evermap.cli.options import (
     priors_by_class,
     refuse_given,
 )
-from evermap.cli.terminal import command_line, echo, fail, print_json, print_table, progress_bar, say, warm_up, warn
+from evermap.cli.terminal import (
+    EXIT_UNTRUSTWORTHY,
+    command_line,
+    echo,
+    fail,
+    print_json,
+    print_table,
+    progress_bar,
+    say,
+    warm_up,
+    warn,
+)
 from evermap.errors import ConfigError, DataError, EvermapError
 from evermap.interrupts import held, kept
 
@@ -48,7 +59,7 @@ _ROWS = (
     ("metrics", "landmark_median_m", "landmark error, median", "{:.3f} m"),
     ("metrics", "landmark_orientation_rmse_deg", "landmark orientation, RMSE", "{:.2f} deg"),
     ("metrics", "dead_reckoning_rmse_m", "odometry alone, RMSE", "{:.3f} m"),
-    ("metrics", "nis_mean", "innovations (2 is consistent)", "{:.2f}"),
+    ("metrics", "nis_mean", "innovations (2 expected)", "{:.2f}"),
     ("timing", "real_time_factor", "speed", "{:.0f} x real time"),
     ("timing", "step_p99_ms", "99 % of the frames within", "{:.1f} ms"),
 )
@@ -221,7 +232,8 @@ def slam(
         in_a_map = {"map_file": map_file, "prior": prior, "localize": localize or None, "prior_map": prior_map}
         refuse_given("is for one robot at a time", "omit it or --together", **single, **in_a_map, **of_prior_map)
         _refuse_unread(asked, in_space=False)
-        _each_together(paths, out, asked)
+        if not _each_together(paths, out, asked):
+            raise typer.Exit(EXIT_UNTRUSTWORTHY)
         return
     if prior_map is None:
         refuse_given("there is no prior map", "--prior-map truth, or --prior-map FILE", **of_prior_map)
@@ -232,11 +244,13 @@ def slam(
     asked = asked._replace(prior_map=prior_map, prior_sigma_m=prior_sigma or SURVEY_SIGMA_M, shifts=shifts)
     asked = asked._replace(map_file=map_file, priors=prior or [], localize=localize)
     if len(paths) > 1:
-        _each(paths, out, asked)
+        trustworthy = _each(paths, out, asked)
     elif asked.map_file is None:
-        _run_alone(*_read_inputs(paths[0], out, asked), asked)
+        trustworthy = _run_alone(*_read_inputs(paths[0], out, asked), asked)
     else:
-        _run_in_map(*_read_inputs(paths[0], out, asked), asked)
+        trustworthy = _run_in_map(*_read_inputs(paths[0], out, asked), asked)
+    if not trustworthy:
+        raise typer.Exit(EXIT_UNTRUSTWORTHY)
 
 
 class _Asked(NamedTuple):
@@ -265,23 +279,26 @@ class _Asked(NamedTuple):
     localize: bool = False
 
 
-def _each(paths: Sequence[Path], out: Path | None, asked: _Asked) -> None:
+def _each(paths: Sequence[Path], out: Path | None, asked: _Asked) -> bool:
     """Work on several sessions of a map; one that is refused stops none of the others.
+
+    Returns whether all can be trusted.
 
     Raises:
         DataError: any was refused.
     """
-    refused = []
+    refused, trustworthy = [], True
     for number, path in enumerate(paths):
         say(f"session {number + 1} of {len(paths)}: {path}")
         folder = None if out is None else out / default_out(path.resolve().name).name
         try:
-            _run_in_map(*_read_inputs(path, folder, asked), asked, later=number > 0)
+            trustworthy &= _run_in_map(*_read_inputs(path, folder, asked), asked, later=number > 0)
         except EvermapError as error:
             refused.append(str(path))
             fail(error.one_line())
     if refused:
         raise DataError(f"{len(refused)} of {len(paths)} sessions were refused: {', '.join(refused)}")
+    return trustworthy
 
 
 def _read_inputs(path: Path, out: Path | None, asked: _Asked) -> tuple[AnyRecording, Landmarks | None, Path]:
@@ -311,8 +328,11 @@ def _read_inputs(path: Path, out: Path | None, asked: _Asked) -> tuple[AnyRecord
     return recording, None if survey is None else shifted(survey, asked.shifts), out
 
 
-def _run_alone(recording: AnyRecording, prior: Landmarks | None, out: Path, asked: _Asked) -> None:
-    """Run, write the folder, show the results. A run interrupted by Ctrl-C is written as far as it got."""
+def _run_alone(recording: AnyRecording, prior: Landmarks | None, out: Path, asked: _Asked) -> bool:
+    """Run, write the folder, show the results; returns whether they can be trusted.
+
+    A run interrupted by Ctrl-C is written as far as it got.
+    """
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.pipeline import run_slam
     from evermap.slam.changes.joint import may_search
@@ -339,10 +359,15 @@ def _run_alone(recording: AnyRecording, prior: Landmarks | None, out: Path, aske
     _write(out, recording, result, asked, time.perf_counter() - start)
     if result.interrupted:
         raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}")
+    return _is_trustworthy(result)
 
 
-def _each_together(paths: Sequence[Path], out: Path | None, asked: _Asked) -> None:
-    """Read several robots, run them as one problem, and write a folder for each.
+def _is_trustworthy(result: SlamResult) -> bool:
+    return result.verdict is None or result.verdict.kind.is_trustworthy
+
+
+def _each_together(paths: Sequence[Path], out: Path | None, asked: _Asked) -> bool:
+    """Read several robots, run them as one problem, and write a folder for each; returns whether all can be trusted.
 
     Raises:
         ConfigError: there is one robot.
@@ -372,6 +397,7 @@ def _each_together(paths: Sequence[Path], out: Path | None, asked: _Asked) -> No
     elapsed_s = time.perf_counter() - start
     for number, result in results.items():
         _write(folders[number], recordings[number], result, asked, elapsed_s)
+    return all(map(_is_trustworthy, results.values()))
 
 
 def _write(
@@ -386,6 +412,7 @@ def _write(
     from evermap.runs.folder import write_run
     from evermap.runs.summary import RunInfo
     from evermap.viz.change_words import explanations, grew
+    from evermap.viz.verdict_words import verdict_text
 
     info = RunInfo(
         command=command_line(),
@@ -393,7 +420,7 @@ def _write(
         processing_s=None if asked.realtime else elapsed_s,  # at the recording's pace most of it is waiting
         total_s=elapsed_s,
         grown=None if entered is None else len(entered.grown),
-        accepted=None if entered is None else entered.session.found,
+        accepted=None if entered is None else not entered.refusal(asked.config),
     )
     summary = write_run(out, recording, result, asked.config, info=info, force=asked.force, inputs=asked.inputs)
     for remark in summary["warnings"]:
@@ -409,16 +436,24 @@ def _write(
     both_readings = [pair.text for pair in result.undecided]
     for finding in [*both_readings, *explanations(result), *grew(info.grown)]:
         echo(finding)
+    if result.verdict is not None:
+        echo(f"verdict: {verdict_text(result.verdict)}")
 
 
 def main_numbers(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the main numbers of a run's summary, with their names."""
+    """Return the main numbers of a run's summary, with their names; innovations with what they say."""
+    from evermap.viz.verdict_words import innovations_text
+
     plane = summary["metrics"].get("heading_rmse_deg") is not None
-    return [
-        (label, form.format(summary[section][key]))
+    found = {
+        key: (label, form.format(summary[section][key]))
         for section, key, label, form in _ROWS
         if summary[section].get(key) is not None and not (plane and key == "orientation_rmse_deg")
-    ]
+    }
+    if "nis_mean" in found:
+        label, number = found["nis_mean"]
+        found["nis_mean"] = label, f"{number}: {innovations_text(summary['metrics']['nis_mean'])}"
+    return list(found.values())
 
 
 def _check_map_options(
@@ -533,8 +568,10 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) ->
 
 def _run_in_map(
     recording: AnyRecording, survey: Landmarks | None, out: Path, asked: _Asked, *, later: bool = False
-) -> None:
+) -> bool:
     """Run, write the folder, then commit the map, so that every session in the map has its folder.
+
+    One whose verdict is not sound leaves the map as it is (`living.accept`). Returns whether it can be trusted.
 
     `later`: of several sessions it is not the first, and needs the survey only if none before it began the map.
     """
@@ -593,6 +630,7 @@ def _run_in_map(
             _commit(entered, store, map_file, config, elapsed_s)
             if begun_from is not None:
                 _tell_corrected(begun_from, entered.living.landmarks())
+        return _is_trustworthy(result)
 
 
 def _tell_corrected(survey: Landmarks, mapped: Landmarks) -> None:
@@ -616,10 +654,14 @@ def _tell_corrected(survey: Landmarks, mapped: Landmarks) -> None:
 
 
 def _commit(entered: Entered, store: MapStore, map_file: str, config: Config, elapsed_s: float) -> None:
-    """Make a session the newest revision of a map."""
-    if not entered.session.found:
-        problem, hint = entered.session.set_aside
-        raise ConfigError(f"the session was set aside, the map is unchanged: {problem}", path=map_file, hint=hint)
+    """Make a session the newest revision of a map, unless its verdict or its place in the map forbids it."""
+    from evermap.runs.sessions import ACCEPT
+
+    if refusal := entered.refusal(config):
+        hint = (entered.session.set_aside or ("", ACCEPT))[1]
+        problem = f"the session was set aside, the map is unchanged: {refusal}"
+        fail(ConfigError(problem, path=map_file, hint=hint).one_line())
+        return
     with held():
         revision = entered.commit(store, config, command=command_line(), wall_s=elapsed_s)
         kept(map_file, f"the session is revision {revision} of {map_file}")

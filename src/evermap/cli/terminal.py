@@ -34,6 +34,10 @@ _MOST = 2000
 """Maximum characters of an error; parts of a message have lower limits, so this cuts only other texts."""
 
 
+EXIT_UNTRUSTWORTHY = 3
+"""Of a run whose verdict is none of 'sound' and 'weak'."""
+
+
 def echo(line: str) -> None:
     """Print a line of the result, with unchanged names, without control characters."""
     typer.echo(printable(line))

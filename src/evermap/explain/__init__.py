@@ -1,1 +1,1 @@
-"""Causes that are not changes of landmarks: what they undo of a recording, and how probable it is under each."""
+"""What a recording contradicts and why: causes other than changes of landmarks, and the verdict on a run."""

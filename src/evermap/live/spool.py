@@ -161,8 +161,8 @@ def _entered(map_file: Path, recording: AnyRecording, config: Config, path: Path
         try:
             with open_store(map_file, create=True) as store:
                 entered = enter_session(store, recording, config)
-                if not entered.session.found:
-                    problem = f"set aside: {entered.session.set_aside[0]}"
+                if refusal := entered.refusal(config):
+                    problem = f"set aside: {refusal}"
                     break
                 number = entered.commit(store, config, command="evermap live")
                 return Brought(recording.name, number, entered=entered)

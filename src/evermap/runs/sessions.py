@@ -34,7 +34,7 @@ from evermap.maps.store.content import DamagedError
 from evermap.maps.store.measured import RECORDING, TRAJECTORY, pack_recording, pack_trajectory, unpack_recording
 from evermap.runs.session_clock import place_session
 from evermap.show import Shown
-from evermap.types import Progress, is_in_space
+from evermap.types import Progress, VerdictKind, is_in_space
 from evermap.valid import check_type
 
 if TYPE_CHECKING:
@@ -43,6 +43,10 @@ if TYPE_CHECKING:
     from evermap.maps.sessions.session import Session
     from evermap.maps.store.sql import SqlStore
     from evermap.types import AnyRecording, Clock, FloatArray, IntArray, Landmarks, MapChange
+
+
+ACCEPT = "mend it, or `living.accept = 'any'` to enter it as it is"
+"""What to try with a session that does not enter a map by itself."""
 
 
 class TwiceError(InputError):
@@ -83,6 +87,17 @@ class Entered(Shown):
     parent: int
     attachments: dict[str, bytes]
 
+    def refusal(self, config: Config | None = None) -> str:
+        """Return why the session does not enter the map by itself (`living.accept`), in a line; '' where it does."""
+        if not self.session.found:
+            return self.session.set_aside[0]
+        verdict, accept = self.session.slam.verdict, (config or Config()).living.accept
+        if verdict is None or accept == "any" or verdict.kind is VerdictKind.SOUND:
+            return ""
+        if accept == "weak" and verdict.kind.is_trustworthy:
+            return ""
+        return f"{verdict.kind}: {verdict.message}"
+
     @property
     def grown(self) -> IntArray:
         """New landmarks whose appearance was not observed."""
@@ -105,9 +120,12 @@ class Entered(Shown):
             wall_s: what estimating took.
 
         Raises:
+            DataError: the session is not to enter the map by itself, see `refusal`.
             StaleRevisionError: another commit came in between.
         """
         config, recording = config or Config(), self.session.recording
+        if refusal := self.refusal(config):
+            raise DataError(f"{recording.name}: does not enter the map: {refusal}", hint=ACCEPT)
         stamps = recording.frames.stamp_s
         provenance = Provenance(
             kind=RevisionKind.SESSION,

@@ -18,10 +18,20 @@ import numpy as np
 
 from evermap import __version__
 from evermap.io.landmarks import up_dict
-from evermap.types import AnyRecording, ChangeKind, MapChange, ParameterEstimate, SlamResult, json_number, or_nan
+from evermap.types import (
+    AnyRecording,
+    ChangeKind,
+    MapChange,
+    ParameterEstimate,
+    SlamResult,
+    Verdict,
+    json_number,
+    or_nan,
+)
 
-SUMMARY_SCHEMA_VERSION = "2"
-"""Of `summary.json` of all verbs and studies. 2: `config` holds sections; `version` and `input` for all."""
+SUMMARY_SCHEMA_VERSION = "3"
+"""Of `summary.json` of all verbs and studies. 2: `config` holds sections; `version` and `input` for all. 3: a run has
+its `verdict`."""
 
 _FRAME_MEANING = {
     "first_pose": "the robot's first pose: origin at its position, {axes}; metres",
@@ -128,6 +138,7 @@ def summary_dict(
         "up": up_dict(result.landmarks.up),
         "metrics": dict(metrics),
         "accepted": info.accepted,
+        "verdict": None if result.verdict is None else verdict_dict(result.verdict),
         "counts": {**_counts(recording, result), "landmarks_grown": info.grown},
         "changes": [*map(change_dict, result.changes)],
         "alternatives": [
@@ -145,6 +156,25 @@ def summary_dict(
 
 def _frame_text(frame: str, size: int) -> str:
     return f"{frame}: {_FRAME_MEANING.get(frame, 'as named; metres').format(axes=_AXES[size])}"
+
+
+def verdict_dict(verdict: Verdict) -> dict[str, Any]:
+    """Return a verdict as plain values with stable keys; null for what is infinite or unknown."""
+    numbers = ("value", "least", "most")
+    symptoms = [
+        {**asdict(one), **{name: json_number(getattr(one, name)) for name in numbers}} for one in verdict.symptoms
+    ]
+    of_cause = ("value", "sigma", "probability", "nats")
+    causes = [{**asdict(one), **{name: json_number(getattr(one, name)) for name in of_cause}} for one in verdict.causes]
+    return {
+        "kind": verdict.kind.value,
+        "message": verdict.message,
+        "trustworthy": verdict.kind.is_trustworthy,
+        "symptoms": [
+            {**symptom, "alarming": one.is_alarming} for symptom, one in zip(symptoms, verdict.symptoms, strict=True)
+        ],
+        "causes": causes,
+    }
 
 
 def change_dict(change: MapChange, *, stamp_s: float | None = None, decided_s: float | None = None) -> dict[str, Any]:

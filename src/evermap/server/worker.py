@@ -105,8 +105,8 @@ class Worker:
                     with self._sites.store(job.site, create=True) as store:
                         head = store.head()
                         entered = enter_session(store, recording, self._config)
-                        if not entered.session.found:
-                            return JobOutcome(JobState.ASIDE, entered.session.set_aside[0], entered.parent)
+                        if refusal := entered.refusal(self._config):
+                            return JobOutcome(JobState.ASIDE, refusal, entered.parent)
                         took_s = time.perf_counter() - start
                         number = entered.commit(store, self._config, command="evermap work", wall_s=took_s)
                         return JobOutcome(JobState.ENTERED, ", ".join(entered.session.slam.warnings[:3]), number)

@@ -243,7 +243,7 @@ class CalibrationPrior:
         """
         precision = 1.0 / self.sigma[SLOPE] ** 2 + 1.0 / self.sigma[FORWARD] ** 2
         share = self._slope_share
-        log = share * np.log(states[FORWARD] / self.mean[FORWARD])
+        log = share * np.log(np.abs(states[FORWARD] / self.mean[FORWARD]))  # speeds with the wrong sign are negative
         log -= (1.0 - share) * np.log((1.0 + states[SLOPE]) / (1.0 + self.mean[SLOPE]))
         variance = share**2 * covariance[FORWARD, FORWARD] + (1.0 - share) ** 2 * covariance[SLOPE, SLOPE]
         return float(log), float(variance), float(precision)

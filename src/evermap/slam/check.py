@@ -84,14 +84,17 @@ def findings(recording: AnyRecording, settings: SlamConfig = DEFAULTS) -> tuple[
 
     The limits of its sensors are in force.
     """
-    found = _read_wrongly(recording, settings)
+    found = find_misreadings(recording, settings)
     if is_in_space(recording):
         found = [*_left_out(recording, settings), *found]
     return tuple(sorted(found, key=lambda finding: finding.usable))
 
 
-def _read_wrongly(recording: AnyRecording, settings: SlamConfig) -> list[Finding]:
-    """Units, axes, clocks, limits, identities and jumps: all but what the estimator leaves out, and says so itself."""
+def find_misreadings(recording: AnyRecording, settings: SlamConfig) -> list[Finding]:
+    """Return what is odd of units, axes, clocks, limits, identities and jumps, the worst first.
+
+    That is all but what the estimator leaves out, and says so itself.
+    """
     found = [*find_motion(recording, settings.check)]
     found += _limits_in_space(recording) if is_in_space(recording) else _limits(recording)
     if settings.unknown_ids is not True:
@@ -101,17 +104,17 @@ def _read_wrongly(recording: AnyRecording, settings: SlamConfig) -> list[Finding
     return sorted(found, key=lambda finding: finding.usable)
 
 
-def odd(recording: AnyRecording, settings: SlamConfig) -> tuple[str, ...]:
-    """Return what was read wrongly as warnings of a run.
+def odd(recording: AnyRecording, settings: SlamConfig) -> tuple[Finding, ...]:
+    """Return what was read wrongly: the first warnings of a run, and evidence for its verdict.
 
     Raises:
         DataError: identities that would cost gigabytes and tell nothing.
     """
-    found = _read_wrongly(recording, settings)
+    found = find_misreadings(recording, settings)
     for finding in found:
         if finding.code == "own-identities" and not finding.usable:
             raise DataError(f"{recording.name}: {finding.message}", hint="leave landmark_id empty, and `unknown_ids`")
-    return tuple(finding.message for finding in found)
+    return tuple(found)
 
 
 def far_off(parameters: Sequence[ParameterEstimate], settings: CheckConfig = USUAL) -> tuple[str, ...]:
@@ -369,15 +372,15 @@ def _with_sensors(recording: AnyRecordingT, sensor: SensorConfig) -> AnyRecordin
 @overload
 def screened(
     recording: Recording, config: Config, prior_map: Landmarks | None = ..., *, repair: bool = ...
-) -> tuple[Recording, tuple[str, ...]]: ...
+) -> tuple[Recording, tuple[str, ...], tuple[Finding, ...]]: ...
 @overload
 def screened(
     recording: SpatialRecording, config: Config, prior_map: Landmarks | None = ..., *, repair: bool = ...
-) -> tuple[SpatialRecording, tuple[str, ...]]: ...
+) -> tuple[SpatialRecording, tuple[str, ...], tuple[Finding, ...]]: ...
 def screened(
     recording: Any, config: Config, prior_map: Landmarks | None = None, *, repair: bool = False
-) -> tuple[Any, tuple[str, ...]]:
-    """Return a recording without ids that other detections contradict, and remarks on it.
+) -> tuple[Any, tuple[str, ...], tuple[Finding, ...]]:
+    """Return a recording without ids that other detections contradict, remarks on it, and what was read wrongly.
 
     One without ids to use is returned as it is. With `repair`, what is impossible in a
     recording in the plane is left out (`slam.cleaning`), instead of refused.
@@ -395,17 +398,18 @@ def screened(
         recording = clean(_with_sensors(recording, config.sensor), settings.cleaning)
     else:
         recording = valid(recording, config.sensor, prior_map)
-    remarks = odd(recording, settings)
+    found = odd(recording, settings)
+    remarks = tuple(finding.message for finding in found)
     if prior_map is not None and settings.unknown_ids is not True and (apart := strangers(prior_map, [recording])):
         remarks = (*remarks, apart)
     if not is_in_space(recording):
         recording, told = with_bearings(recording, settings)
         remarks = (*remarks, *told)
     if settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording):  # the tracker assigns ids
-        return recording, remarks
+        return recording, remarks, found
     voted = without_contradicted_ids(recording, settings)
     remarks = (*remarks, *voted.warnings[len(recording.warnings) :])
-    return replace(voted, warnings=recording.warnings), remarks
+    return replace(voted, warnings=recording.warnings), remarks, found
 
 
 def check_recording(recording: AnyRecording, config: Config | None = None) -> Check:

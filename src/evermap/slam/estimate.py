@@ -16,6 +16,7 @@ from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.joint import Joint, may_search
 from evermap.slam.intake import Prepared, beliefs, prepare
 from evermap.slam.method import Method, Static
+from evermap.slam.mistakes import Finding
 from evermap.slam.streaming import StreamingSlam
 from evermap.slam.warmup import warm_up
 from evermap.types import FloatArray, Landmarks, Progress, Recording, Sensor
@@ -34,6 +35,7 @@ class Solved:
         step_s: (F,) seconds per processed frame; of frames that were solved together, the share of each.
         interrupted: True where it was stopped before its end.
         settings: that it was solved with.
+        findings: what was read wrongly, for the verdict.
     """
 
     recording: Recording
@@ -44,6 +46,7 @@ class Solved:
     step_s: FloatArray
     interrupted: bool
     settings: SlamConfig
+    findings: tuple[Finding, ...] = ()
 
     @property
     def start_s(self) -> float:

@@ -4,7 +4,8 @@ Two readings of one landmark, a few seconds apart, and the odometry between them
 landmark is the second time. The difference is taken in the logarithm of the range and in the bearing, in space in the
 direction, which no unit of length can make small by itself. A mistake (ranges in millimetres, bearings clockwise, a
 clock that is three seconds late) is undone on trial; it is likely where almost all pairs that can tell the two apart
-come nearer by it.
+come nearer by it, and nearer than if the robot stood: where it does, any change that shrinks readings shrinks their
+noise, which tells nothing.
 """
 
 from __future__ import annotations
@@ -198,11 +199,14 @@ def likeliest(pairs: Pairs, undone: Mistake, told: Container[str], settings: Che
     def after(mistakes: list[Mistake]) -> FloatArray:
         return pairs.residual(*(mistake.after(undone) for mistake in mistakes))
 
+    def standing(mistakes: list[Mistake]) -> FloatArray:
+        return pairs.residual(*(mistake.after(undone) for mistake in mistakes), stands=True)
+
     candidates = _possible(pairs, candidates, undone, before, settings)
     if not candidates:
         return None
     parts = [candidates[row : row + AT_ONCE] for row in range(0, len(candidates), AT_ONCE)]
-    losses = np.concatenate([_nearer(pairs, before, after(part), settings) for part in parts])
+    losses = np.concatenate([_nearer(pairs, before, after(part), standing(part), settings) for part in parts])
     best, least = candidates[int(np.argmin(losses))], losses.min()
     if least == inf:
         return None
@@ -242,9 +246,11 @@ def _possible(
     return candidates
 
 
-def _nearer(pairs: Pairs, before: FloatArray, after: FloatArray, settings: CheckConfig) -> FloatArray:
+def _nearer(
+    pairs: Pairs, before: FloatArray, after: FloatArray, standing: FloatArray, settings: CheckConfig
+) -> FloatArray:
     """(M,) loss of the residuals (M, K, P) after undoing a mistake each; inf unless almost all pairs that tell come
-    nearer by it.
+    nearer by it, and nearer than if the robot were `standing`.
     """
     was, now = off(before), off(after)
     apart = off(pairs.difference(after, before))
@@ -253,7 +259,8 @@ def _nearer(pairs: Pairs, before: FloatArray, after: FloatArray, settings: Check
     n_telling = telling.sum(axis=1)
     agreed = (telling & (now < was)).sum(axis=1) >= settings.agreed * n_telling
     loss = _loss(after, settings)
-    gain = len(was) * (_loss(before, settings) - loss)
+    rivals = np.minimum(_loss(before, settings), _loss(standing, settings))
+    gain = len(was) * (rivals - loss)
     return np.where((n_telling >= settings.fewest) & agreed & (gain > settings.gain), loss, inf)
 
 
@@ -345,9 +352,13 @@ class PlanarPairs:
         apart[:, 1] = se2.wrap(apart[:, 1])
         return apart
 
-    def residual(self, *mistakes: Mistake) -> FloatArray:
-        """Return (M, 2, P) second reading minus what the first and the odometry predict: log range, and bearing."""
+    def residual(self, *mistakes: Mistake, stands: bool = False) -> FloatArray:
+        """Return (M, 2, P) second reading minus what the first and the odometry predict: log range, and bearing.
+
+        With `stands` the robot doesn't move.
+        """
         motion = self._motions(mistakes)
+        motion = np.zeros_like(motion) if stands else motion
         motion[..., :2] /= np.array([each.lengths for each in mistakes])[:, None, None]
         turned = np.array([(each.bearing, each.offset_rad) for each in mistakes])
         bearing = [turned[:, :1] * each + turned[:, 1:] for each in self._bearing_rad]
@@ -411,9 +422,13 @@ class SpatialPairs:
         """Return (M, 4, P) by how much residuals differ."""
         return after - before
 
-    def residual(self, *mistakes: Mistake) -> FloatArray:
-        """Return (M, 4, P) second sighting minus what the first and the odometry predict: log range, and direction."""
+    def residual(self, *mistakes: Mistake, stands: bool = False) -> FloatArray:
+        """Return (M, 4, P) second sighting minus what the first and the odometry predict: log range, and direction.
+
+        With `stands` the robot doesn't move.
+        """
         motion = self._motions(mistakes)
+        motion = se3.identity(*motion.shape[:-1]) if stands else motion
         motion[..., :3] /= np.array([each.lengths for each in mistakes])[:, None, None]
         turned = se3.turn([each.turned for each in mistakes])[:, None]
         seen, again = (se3.transform(turned, each) for each in self._seen)

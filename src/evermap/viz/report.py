@@ -17,6 +17,7 @@ from evermap.viz.change_words import explanations, grew, near_alternatives
 from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.run_figures import has_prior, quantity
 from evermap.viz.style import NamedFigure
+from evermap.viz.verdict_words import innovations_text, verdict_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +60,7 @@ def render_report(
     if sections:  # the page is about more than this recording
         parts.append(f'<h2>{escape(recording.name)}</h2><p class="lead">{_lead(summary)}</p>')
     parts += [
+        _verdict(result),
         cards_html(_cards(summary)),
         _INTERRUPTED if summary["interrupted"] else "",
         _changes(result, summary),
@@ -90,6 +92,26 @@ def _lead(summary: Mapping[str, Any]) -> str:
     if counts["robot_sightings"]:
         text += f"; {counts['robot_sightings']:,} sightings of other robots, used by --together"
     return f"{text}.<br>Read from <code>{escape(source)}</code>." if source else f"{text}."
+
+
+def _verdict(result: SlamResult) -> str:
+    """Return how far the run can be trusted, and all that was asked, the alarming first."""
+    verdict = result.verdict
+    if verdict is None:
+        return ""
+    rows = [
+        (escape(one.code), escape(one.message), "beyond" if one.is_alarming else "fine") for one in verdict.symptoms
+    ]
+    causes = "".join(
+        f"<li>{escape(one.message)}{f'; <code>{escape(one.fix)}</code>' if one.fix else ''}</li>"
+        for one in verdict.causes
+    )
+    asked = table(("symptom", "here, and what is expected", ""), rows) if rows else ""
+    return (
+        f'<p class="note"><strong>{escape(verdict_text(verdict))}</strong></p>'
+        + (f"<ul>{causes}</ul>" if causes else "")
+        + (f"<details><summary>Why</summary>{asked}</details>" if asked else "")
+    )
 
 
 _INTERRUPTED = '<p class="note">Stopped before the end of the recording: all results are for the part until then.</p>'
@@ -258,10 +280,7 @@ def _nis(metrics: Mapping[str, Any]) -> str:
     mean = metrics["nis_mean"]
     if mean is None:
         return "No detection was judged an inlier: the readings do not fit the estimate."
-    verdict = "the uncertainties are about right"
-    if not 1.4 <= mean <= 2.6:
-        verdict = f"errors are {'larger' if mean > 2.6 else 'smaller'} than estimated"
-    return f"2 is expected: {verdict}. {metrics['nis_in_band_share']:.0%} lie below the 95% bound."
+    return f"2 is expected: {innovations_text(mean)}. {metrics['nis_in_band_share']:.0%} lie below the 95% bound."
 
 
 _MAX_LANDMARK_ROWS = 500

@@ -420,8 +420,9 @@ def explained(
     *,
     realtime: bool = False,
     progress: Progress | None = None,
-) -> tuple[Visit, SlamResult]:
-    """Return a session solved, and its result: as given, or under the causes that explain it better (`explain`).
+) -> tuple[Visit, SlamResult, Inputs]:
+    """Return a session solved, its result, and what that is of: as given, or under the causes that explain it better
+    (`explain`).
 
     Args:
         inputs: with identities.
@@ -451,14 +452,15 @@ def explained(
             raise
     else:
         if not config.slam.explain.on or as_given.result.interrupted or realtime:
-            return as_given.visit, as_given.result
+            return as_given.visit, as_given.result, inputs
         found = explain(inputs, as_given, under, config.slam, told.append)
         assert found is not None
     best = found.best.solution
     if not found.causes:
-        return best.visit, best.result
+        return best.visit, best.result, inputs
     why = tuple(f"{cause.message} (p = {cause.probability:.2f}); {cause.fix}" for cause in found.causes)
-    return best.visit, replace(best.result, causes=found.causes, warnings=(*best.result.warnings, *why))
+    result = replace(best.result, causes=found.causes, warnings=(*best.result.warnings, *why))
+    return best.visit, result, found.best.inputs
 
 
 def with_causes(session: Session, living: LivingMap, config: Config) -> Session:

@@ -1,0 +1,400 @@
+"""Signs of how far a run can be trusted, none of which needs the truth; the same in the plane and in space.
+
+Each compares two sources that a sound run makes agree: a detection with the landmark where the map has it, the first
+half of the drive with the second, odometry with the trajectory, a calibration with its prior, a given map with what was
+found. Values are numbers; what they should be is decided by `explain.verdict`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import nan
+
+import numpy as np
+
+from evermap.geometry import se2, se3
+from evermap.metrics.consistency import comparable_nis, lag1_autocorrelation
+from evermap.types import (
+    ANY_BEARING_RAD,
+    UNKNOWN,
+    AnyRecording,
+    BoolArray,
+    ChangeKind,
+    FloatArray,
+    Innovations,
+    IntArray,
+    Landmarks,
+    ParameterEstimate,
+    Recording,
+    SlamResult,
+    Trajectory,
+    is_in_space,
+)
+
+USED = 0.5
+"""Probability to be no outlier from which a detection counts as used, as in the metrics."""
+FEWEST = 10
+"""Values of which a median says something: half of them are wrong by chance in one of a thousand cases."""
+FARTHEST_S = 0.1
+"""Time between a frame and the pose it is compared with; trajectories in the plane have one every so often."""
+STRETCHES = 10
+"""Parts of a drive of which the worst is looked for."""
+WINDOWS = 40
+"""Parts of a drive by which odometry and trajectory are compared: long over the noise, short against drift."""
+SHORTEST_S = 2.0
+LEAST_MOTION_M = 0.05
+"""Motion within a window, below which the robot stands: its relative error says nothing."""
+PER_LANDMARK = 5
+"""Detections of a landmark, in each half of the drive, of which a mean says something."""
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """Detections beside where the map expects them, one row each, as a detection would have read them without noise.
+
+    Attributes:
+        stamp_s, landmark_id, used: (K,) when, of which landmark, and whether it is no outlier.
+        range_m: (K,) expected range.
+        off: (K, D) detection less expectation over the expected range; of ranges only one number.
+    """
+
+    stamp_s: FloatArray
+    landmark_id: IntArray
+    used: BoolArray
+    range_m: FloatArray
+    off: FloatArray
+
+    @property
+    def misfit(self) -> FloatArray:
+        """Return (K,) lengths of what detections are off by, over their ranges."""
+        return np.asarray(np.linalg.norm(self.off, axis=1))
+
+
+def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
+    """Return detections beside expectations, of those that have both, in the plane with the estimated calibration."""
+    innovations, places = result.innovations, result.landmarks
+    row, known = _rows_of(places, innovations.landmark_id)
+    stamp_s = innovations.stamp_s
+    pose, near = _poses_at(result.trajectory, stamp_s)
+    keep = known & near & (innovations.detection < len(recording.detections))
+    detection, row, pose = innovations.detection[keep], row[keep], pose[keep]
+    if is_in_space(recording):
+        from evermap.slam.space.intake import positions_of, without_range
+
+        mounts = np.array([one.mount_robot_sensor for one in recording.sensors])
+        mounts = mounts[recording.detections.sensor[detection]]
+        expected = se3.transform(se3.inverse(se3.compose(pose, mounts)), places.position_m[row])
+        read = positions_of(recording)[detection]
+        range_m = np.linalg.norm(expected, axis=1)
+        blind = without_range(recording)[detection]
+        length = np.maximum(np.linalg.norm(read, axis=1), 1e-9)
+        read = np.where(blind[:, None], read * (range_m / length)[:, None], read)
+    else:
+        seen = recording.detections
+        expected = _expected_readings(pose, places.position_m[row], recording, result.parameters)
+        range_m, bearing = expected[:, 0], seen.bearing_rad[detection]
+        known = np.isfinite(bearing) & ~(seen.sigma_bearing_rad[detection] >= ANY_BEARING_RAD)
+        read = _points(seen.range_m[detection], np.where(known, bearing, expected[:, 1]))
+        expected = _points(range_m, expected[:, 1])
+    off = (read - expected) / np.maximum(range_m, 1e-9)[:, None]
+    good = np.isfinite(off).all(axis=1)
+    used = innovations.p_inlier[keep] >= USED
+    return Compared(stamp_s[keep][good], innovations.landmark_id[keep][good], used[good], range_m[good], off[good])
+
+
+def _points(range_m: FloatArray, bearing_rad: FloatArray) -> FloatArray:
+    return np.asarray(range_m[:, None] * np.column_stack([np.cos(bearing_rad), np.sin(bearing_rad)]))
+
+
+def _expected_readings(
+    pose: FloatArray, place_m: FloatArray, recording: Recording, parameters: tuple[ParameterEstimate, ...]
+) -> FloatArray:
+    """Return (K, 2) ranges and bearings as the estimated sensor reads them without noise (`slam.calibration.SPECS`)."""
+    value = {each.name: each.value for each in parameters}
+    ahead, left = value.get("mount_forward_m", 0.0), value.get("mount_left_m", 0.0)
+    mount = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64) + [ahead, left, 0.0]
+    x, y = se2.transform(se2.inverse(se2.compose(pose, mount)), place_m).T
+    range_m, bearing = np.hypot(x, y), np.arctan2(y, x)
+    skew, curve = value.get("range_skew_per_rad", 0.0), value.get("range_curvature_per_rad2", 0.0)
+    factor = 1.0 + value.get("range_slope", 0.0) + skew * bearing + curve * bearing**2
+    read_m = value.get("range_bias_m", 0.0) + range_m * factor
+    return np.column_stack([np.maximum(read_m, 1e-3), bearing + value.get("bearing_bias_rad", 0.0)])
+
+
+def _rows_of(places: Landmarks, landmark_id: IntArray) -> tuple[IntArray, BoolArray]:
+    """Return rows of landmarks by their ids, and which are there."""
+    if not len(places):
+        return np.zeros(len(landmark_id), dtype=np.int64), np.zeros(len(landmark_id), dtype=np.bool_)
+    row = np.minimum(np.searchsorted(places.landmark_id, landmark_id), len(places) - 1)
+    return row, np.asarray(places.landmark_id[row] == landmark_id)
+
+
+def _poses_at(path: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the nearest poses, and whether they are near enough."""
+    if not len(path):
+        return np.zeros((len(stamp_s), path.pose_world_robot.shape[1])), np.zeros(len(stamp_s), dtype=np.bool_)
+    after = np.clip(np.searchsorted(path.stamp_s, stamp_s), 1, max(len(path) - 1, 1))
+    after = np.minimum(after, len(path) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.abs(path.stamp_s[before] - stamp_s) <= np.abs(path.stamp_s[after] - stamp_s)
+    row = np.where(nearer, before, after)
+    return path.pose_world_robot[row], np.asarray(np.abs(path.stamp_s[row] - stamp_s) <= FARTHEST_S)
+
+
+@dataclass(frozen=True, slots=True)
+class Signs:
+    """What was measured; nan where a run does not have it. Shares are between 0 and 1.
+
+    Attributes:
+        n_landmarks, n_used: landmarks of the result; detections used.
+        nis: mean of the inliers over their degrees of freedom, on the scale of 2.
+        nis_lag: correlation of a landmark's successive innovations.
+        used, used_worst: share of the detections with a prediction that were used, and that of the worst tenth of the
+            drive.
+        named: share of the detections with an identity, as they were read, that were used.
+        misfit, misfit_all: median of what used, and all, detections are off by, over their range.
+        contradicted: share of the landmarks (seen often) most of whose detections were not used.
+        halves: median over landmarks of how far the first half of the drive has them from the second, in standard
+            deviations by the scatter within halves.
+        halves_share: the same over the range from which they are seen.
+        motion: median difference of odometry and trajectory within a window, as a share of the motion.
+        motion_turn_rad: the same of the turns.
+        longer: motion by the trajectory over that by odometry.
+        away, away_name: standard deviations by which the calibration state farthest from its prior is off.
+        size_m: extent of trajectory and map.
+        sigma_m: root mean square of the standard deviations of positions; `sigma_most_m` the largest.
+        sigma_share: `sigma_m` over the size.
+        blind_s, blind_share: longest time without a used detection, in seconds and as a share of the drive.
+        common, moved: landmarks of the given map that were seen; the share of them that is reported as changed.
+        in_map: whether a given map is the frame of the result; None without one.
+        alternatives: explanations nearly as probable as the one reported.
+    """
+
+    n_landmarks: int = 0
+    n_used: int = 0
+    nis: float = nan
+    nis_lag: float = nan
+    used: float = nan
+    used_worst: float = nan
+    named: float = nan
+    misfit: float = nan
+    misfit_all: float = nan
+    contradicted: float = nan
+    halves: float = nan
+    halves_share: float = nan
+    motion: float = nan
+    motion_turn_rad: float = nan
+    longer: float = nan
+    away: float = nan
+    away_name: str = ""
+    size_m: float = nan
+    sigma_m: float = nan
+    sigma_most_m: float = nan
+    blind_s: float = nan
+    blind_share: float = nan
+    common: int = -1
+    moved: float = nan
+    in_map: bool | None = None
+    alternatives: int = 0
+
+    @property
+    def sigma_share(self) -> float:
+        """Return the standard deviation of positions as a share of the size."""
+        return self.sigma_m / self.size_m if self.size_m > 0.0 else nan
+
+
+def measure_signs(
+    result: SlamResult,
+    recording: AnyRecording,
+    prior_map: Landmarks | None = None,
+    as_read: AnyRecording | None = None,
+) -> Signs:
+    """Return all signs of a run.
+
+    Args:
+        result: of the run.
+        recording: as it was estimated, so that rows of the result's innovations are rows of its detections.
+        prior_map: that was given, or what a living map expected.
+        as_read: the recording with the identities that it was read with; None where they are the same.
+    """
+    compared = compare_detections(recording, result)
+    motion, turn, longer = _by_odometry(result)
+    halves, halves_share = _between_halves(compared)
+    used, worst = _shares_used(result.innovations)
+    away, name = _farthest_state(result.parameters)
+    size_m, sigma_m, most_m = _extent(result)
+    blind_s, blind_share = _blind(result)
+    common, moved = _of_map(result, recording, prior_map)
+    inlier = result.innovations.p_inlier >= USED
+    nis = comparable_nis(result.innovations)
+    fine = inlier & np.isfinite(nis)
+    return Signs(
+        n_landmarks=len(result.landmarks),
+        n_used=int(inlier.sum()),
+        nis=float(nis[fine].mean()) if fine.any() else nan,
+        nis_lag=_or_nan(lag1_autocorrelation(nis[fine], result.innovations.landmark_id[fine].astype(np.float64))),
+        used=used,
+        used_worst=worst,
+        named=_share_named(result.innovations, as_read or recording),
+        misfit=_median(compared.misfit[compared.used]),
+        misfit_all=_median(compared.misfit),
+        contradicted=_contradicted(result),
+        halves=halves,
+        halves_share=halves_share,
+        motion=motion,
+        motion_turn_rad=turn,
+        longer=longer,
+        away=away,
+        away_name=name,
+        size_m=size_m,
+        sigma_m=sigma_m,
+        sigma_most_m=most_m,
+        blind_s=blind_s,
+        blind_share=blind_share,
+        common=common,
+        moved=moved,
+        in_map=None if prior_map is None else result.landmarks.frame == "prior_map",
+        alternatives=len(result.alternatives),
+    )
+
+
+def _or_nan(value: float | None) -> float:
+    return nan if value is None else float(value)
+
+
+def _median(values: FloatArray) -> float:
+    return float(np.median(values)) if len(values) >= FEWEST else nan
+
+
+def _shares_used(innovations: Innovations) -> tuple[float, float]:
+    """Return the share of detections with a prediction that were used, and the least of a part of the drive."""
+    stamp_s, inlier = innovations.stamp_s, innovations.p_inlier >= USED
+    if len(inlier) < FEWEST:
+        return nan, nan
+    order = np.argsort(stamp_s, kind="stable")
+    parts = np.array_split(inlier[order], min(STRETCHES, len(inlier) // FEWEST))
+    return float(inlier.mean()), min(float(part.mean()) for part in parts)
+
+
+def _share_named(innovations: Innovations, recording: AnyRecording) -> float:
+    """Return the share of the detections with an identity that were used; nan where hardly any has one."""
+    named = int(np.count_nonzero(recording.detections.landmark_id != UNKNOWN))
+    used = innovations.detection[innovations.p_inlier >= USED]
+    if named < max(FEWEST, len(used)):  # identities were found, not read
+        return nan
+    return len(used) / named
+
+
+def _contradicted(result: SlamResult) -> float:
+    """Return the share of landmarks that were seen often, most of whose detections were not used."""
+    _, row, count = np.unique(result.innovations.landmark_id, return_inverse=True, return_counts=True)
+    used = np.bincount(row, result.innovations.p_inlier >= USED, minlength=len(count))
+    often = count >= PER_LANDMARK
+    return float(np.mean(used[often] < 0.5 * count[often])) if often.any() else nan
+
+
+def _between_halves(compared: Compared) -> tuple[float, float]:
+    """Return how far landmarks are apart by the first half of their detections and by the second.
+
+    Halves are of the detections of each landmark, in order of time, in the sensor's frame: what calibrations leave is
+    in both. In standard deviations of the difference by the scatter within halves, and over the range.
+    """
+    ratio, share = list[float](), list[float]()
+    for one in np.unique(compared.landmark_id[compared.used]).tolist():
+        mine = np.flatnonzero((compared.landmark_id == one) & compared.used)
+        if len(mine) < 2 * PER_LANDMARK:
+            continue
+        off = compared.off[mine[np.argsort(compared.stamp_s[mine], kind="stable")]]
+        first, second = off[: len(off) // 2], off[len(off) // 2 :]
+        apart = second.mean(axis=0) - first.mean(axis=0)
+        within = first.var(axis=0, ddof=1) / len(first) + second.var(axis=0, ddof=1) / len(second)
+        ratio.append(float(np.sqrt(np.mean(apart**2 / np.maximum(within, 1e-12)))))
+        share.append(float(np.linalg.norm(apart)))
+    return (float(np.median(ratio)), float(np.median(share))) if len(ratio) >= 3 else (nan, nan)
+
+
+def _by_odometry(result: SlamResult) -> tuple[float, float, float]:
+    """Return by how much odometry and trajectory differ within windows, as a share of the motion, in angle, in length.
+
+    All are medians over windows in which either moved.
+    """
+    path, other = result.trajectory, result.dead_reckoning
+    if len(path) < 3 or len(other) != len(path) or not np.array_equal(path.stamp_s, other.stamp_s):
+        return nan, nan, nan
+    lag_s = max(SHORTEST_S, float(path.stamp_s[-1] - path.stamp_s[0]) / WINDOWS)
+    last = np.searchsorted(path.stamp_s, path.stamp_s + lag_s)
+    first = np.flatnonzero(last < len(path))
+    first = (
+        first[np.linspace(0, len(first) - 1, min(len(first), 20 * WINDOWS)).astype(np.int64)] if len(first) else first
+    )
+    if len(first) < 3:
+        return nan, nan, nan
+    one, two = (_motions(each.pose_world_robot, first, last[first]) for each in (path, other))
+    went = np.stack([np.linalg.norm(each[0], axis=1) for each in (one, two)])
+    moves = went.max(axis=0) > LEAST_MOTION_M
+    turn = float(np.median(np.abs(_turn_between(path.pose_world_robot, other.pose_world_robot, first, last[first]))))
+    if moves.sum() < 3:
+        return nan, turn, nan
+    apart = np.linalg.norm(one[0] - two[0], axis=1)[moves] / went.max(axis=0)[moves]
+    longer = went[0][moves].sum() / max(float(went[1][moves].sum()), 1e-9)
+    return float(np.median(apart)), turn, float(longer)
+
+
+def _motions(pose: FloatArray, first: IntArray, last: IntArray) -> tuple[FloatArray]:
+    """Return (W, D) motions in the frame of their start."""
+    group, dim = (se2, 2) if pose.shape[1] == 3 else (se3, 3)
+    return (group.between(pose[first], pose[last])[:, :dim],)
+
+
+def _turn_between(path: FloatArray, other: FloatArray, first: IntArray, last: IntArray) -> FloatArray:
+    """Return (W,) angles between turns by the one and by the other."""
+    if path.shape[1] == 3:
+        one, two = (each[last, 2] - each[first, 2] for each in (path, other))
+        return np.asarray(se2.wrap(one - two))
+    return se3.angle_between(*(se3.between(each[first], each[last]) for each in (path, other)))
+
+
+def _farthest_state(parameters: tuple[ParameterEstimate, ...]) -> tuple[float, str]:
+    """Return by how many of its prior's standard deviations a state is off at most, and which one is."""
+    free = [each for each in parameters if not each.fixed and each.prior_sigma > 0.0]
+    away = [(abs(each.value - each.prior_mean) / each.prior_sigma, each.name) for each in free]
+    return max(away, default=(nan, ""))
+
+
+def _extent(result: SlamResult) -> tuple[float, float, float]:
+    """Return the diagonal of trajectory and map, and root mean square and maximum of the positions' sigmas."""
+    path, dim = result.trajectory, result.landmarks.position_m.shape[1]
+    if not len(path):
+        return nan, nan, nan
+    points = np.concatenate([path.pose_world_robot[:, :dim], result.landmarks.position_m])
+    variance = np.trace(path.covariance[:, :dim, :dim], axis1=1, axis2=2)
+    return (
+        float(np.linalg.norm(np.ptp(points, axis=0))),
+        float(np.sqrt(np.mean(variance))),
+        float(np.sqrt(variance.max())),
+    )
+
+
+def _blind(result: SlamResult) -> tuple[float, float]:
+    """Return the longest time without a used detection, in seconds and as a share of the drive."""
+    path, innovations = result.trajectory, result.innovations
+    if not len(path):
+        return nan, nan
+    used_s = np.sort(innovations.stamp_s[innovations.p_inlier >= USED])
+    edges = np.concatenate([path.stamp_s[:1], used_s, path.stamp_s[-1:]])
+    longest = float(np.diff(edges).max(initial=0.0))
+    lasted = float(path.stamp_s[-1] - path.stamp_s[0])
+    return longest, longest / lasted if lasted > 0.0 else nan
+
+
+GONE_OR_MOVED = (ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED, ChangeKind.VANISHED)
+
+
+def _of_map(result: SlamResult, recording: AnyRecording, prior_map: Landmarks | None) -> tuple[int, float]:
+    """Return how many landmarks of a given map were seen, and the share of them that is reported as changed."""
+    if prior_map is None:
+        return -1, nan
+    named = np.concatenate([recording.detections.landmark_id, result.innovations.landmark_id])
+    common = np.intersect1d(prior_map.landmark_id, named[named != UNKNOWN])
+    changed = [one for change in result.changes if change.kind in GONE_OR_MOVED for one in change.landmark_ids]
+    return len(common), float(np.isin(common, changed).mean()) if len(common) else nan

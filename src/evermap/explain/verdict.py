@@ -1,0 +1,232 @@
+"""The verdict that every run ends with: how far it can be trusted, by signs that need no truth.
+
+Each sign has a range in which it is where all is well (`LIMITS`). Where the readings themselves contradict each other,
+or a calibration is far from what sensors are like, the sensor or the odometry is suspected; where too much of a given
+map is not as found, the map; where the solution contradicts the readings, it is lost. What remains may be right, but
+too little known: then it is weak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from math import inf, isfinite
+
+from evermap.config import SlamConfig
+from evermap.explain.symptoms import Signs, measure_signs
+from evermap.slam.check import far_off
+from evermap.slam.mistakes import Finding
+from evermap.types import AnyRecording, Cause, Landmarks, SlamResult, Symptom, Verdict, VerdictKind
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """Between what a sign is where all is well, and what it says beyond.
+
+    Attributes:
+        code: of the symptom.
+        sign: name in `Signs`.
+        text: the value in words; what is expected follows.
+        least, most: the range.
+        kind: of the verdict, if nothing worse is found.
+        why: what it means where it is beyond.
+        hint: what would decide or mend it.
+    """
+
+    code: str
+    sign: str
+    text: str
+    least: float
+    most: float
+    kind: VerdictKind
+    why: str
+    hint: str = ""
+
+
+LOST, WEAK, OUTDATED, SUSPECT = (
+    VerdictKind.LOST, VerdictKind.WEAK, VerdictKind.MAP_OUTDATED, VerdictKind.SENSOR_SUSPECT
+)  # fmt: skip
+WORST_NIS = 8.0
+"""Four times the expectation of two numbers: errors are twice as large as they are said to be."""
+LIMITS = (
+    Limit(
+        "innovations", "nis", "innovations {:.3g} (2 expected)", 0.25, WORST_NIS, LOST,
+        "readings are farther from the solution than their noise allows",
+    ),
+    Limit(
+        "used", "used", "{:.0%} of the detections used", 0.6, inf, LOST,
+        "many detections contradict the solution",
+    ),
+    Limit(
+        "identities", "named", "{:.0%} of the identified detections used", 0.6, inf, LOST,
+        "many detections contradict the solution, or their identities are wrong",
+    ),
+    Limit(
+        "worst-stretch", "used_worst", "{:.0%} used in the worst tenth of the drive", 0.3, inf, LOST,
+        "a part of the drive contradicts the rest",
+    ),
+    Limit(
+        "landmarks-contradicted", "contradicted", "{:.0%} of the landmarks contradicted by most of their detections",
+        -inf, 0.25, LOST, "landmarks are not where they are seen",
+    ),
+    Limit(
+        "misfit", "misfit_all", "detections off by {:.1%} of their range", -inf, 0.15, LOST,
+        "detections are nowhere near their landmarks",
+    ),
+    Limit(
+        "halves", "halves_share", "halves of the drive differ by {:.1%} of the range", -inf, 0.1, LOST,
+        "landmarks are elsewhere by the second half of the drive than by the first",
+    ),
+    Limit(
+        "odometry", "motion", "odometry off by {:.0%} of the motion", -inf, 0.3, SUSPECT,
+        "odometry and sightings contradict each other",
+        "odometry's direction, clock and noise, or the sensor's [mount]",
+    ),
+    Limit(
+        "length", "longer", "trajectory {:.3g} times as long as by odometry", 1.0 / 1.15, 1.15, SUSPECT,
+        "odometry and sightings contradict each other on the length of the drive",
+        "units and scale of the odometry, or the size of tags and the unit of ranges",
+    ),
+    Limit(
+        "map-changed", "moved", "{:.0%} of the map's landmarks in view changed", -inf, 0.5, OUTDATED,
+        "too much of the map is not as it was", "a new map, or the edition of the map that was built",
+    ),
+    Limit(
+        "uncertainty", "sigma_share", "positions known to {:.1%} of the size of the place", -inf, 0.05, WEAK,
+        "hardly anything ties the poses to each other", "a drive that comes back to landmarks seen before",
+    ),
+    Limit(
+        "landmarks", "n_landmarks", "{:.0f} landmarks", 3.0, inf, WEAK,
+        "so few landmarks check each other hardly", "more landmarks",
+    ),
+    Limit(
+        "blind", "blind_share", "nothing seen for {:.0%} of the drive", -inf, 0.5, WEAK,
+        "there the poses are those of the odometry", "landmarks where nothing is seen",
+    ),
+)  # fmt: skip
+"""In the order of what is told first; set on one half of the worlds of `python -m benchmarks.verdicts`."""
+FEWEST_MOVED = 3
+"""Changed landmarks from which a map is outdated: fewer are changes, whatever share they are."""
+SURE = 0.9
+"""Probability from which a cause is told as such."""
+
+
+def with_verdict(
+    result: SlamResult,
+    recording: AnyRecording,
+    settings: SlamConfig,
+    prior_map: Landmarks | None = None,
+    *,
+    findings: Sequence[Finding] = (),
+    set_aside: str = "",
+    as_read: AnyRecording | None = None,
+) -> SlamResult:
+    """Return the result with its verdict; arguments as of `judge`."""
+    verdict = judge(result, recording, settings, prior_map, findings=findings, set_aside=set_aside, as_read=as_read)
+    return replace(result, verdict=verdict)
+
+
+def judge(
+    result: SlamResult,
+    recording: AnyRecording,
+    settings: SlamConfig,
+    prior_map: Landmarks | None = None,
+    *,
+    findings: Sequence[Finding] = (),
+    set_aside: str = "",
+    as_read: AnyRecording | None = None,
+) -> Verdict:
+    """Return how far a run can be trusted.
+
+    Args:
+        result: of the run, with its causes.
+        recording: as it was estimated; rows of the result's innovations are rows of its detections.
+        settings: that it was estimated with.
+        prior_map: that was given, or what a living map expected.
+        findings: what `slam.check` found odd about the readings alone.
+        set_aside: why a session could not be localised in its map; '' where it was, or there is none.
+        as_read: the recording with the identities that it was read with; None where they are the same.
+    """
+    signs = measure_signs(result, recording, prior_map, as_read)
+    wrong = [finding.message for finding in findings if not finding.usable]
+    return judge_signs(signs, [*wrong, *far_off(result.parameters, settings.check)], result.causes, set_aside)
+
+
+def judge_signs(
+    signs: Signs, suspicions: Sequence[str] = (), causes: Sequence[Cause] = (), set_aside: str = ""
+) -> Verdict:
+    """Return the verdict by signs.
+
+    Args:
+        signs: that were measured.
+        suspicions: what readings and calibration say of the sensor or the odometry, a line each.
+        causes: that were found.
+        set_aside: why a session could not be localised in its map.
+    """
+    symptoms = sorted(_symptoms(signs), key=lambda symptom: not symptom.is_alarming)
+    ordered = tuple(sorted(causes, key=lambda cause: -cause.probability))
+    kind, message = _decide(signs, suspicions, set_aside, symptoms, ordered)
+    return Verdict(kind, message, tuple(symptoms), ordered)
+
+
+def _symptoms(signs: Signs) -> Iterable[Symptom]:
+    """Yield the signs that this run has, each with its range."""
+    for limit in LIMITS:
+        value = float(getattr(signs, limit.sign))
+        few = limit.sign == "moved" and value * signs.common < FEWEST_MOVED
+        if isfinite(value) and not few:
+            expected = _range_text(limit)
+            yield Symptom(limit.code, f"{limit.text.format(value)}, {expected}", value, limit.least, limit.most)
+
+
+def _range_text(limit: Limit) -> str:
+    """Return 'at most 50%', in the unit of the sign."""
+    form = limit.text[limit.text.index("{") : limit.text.index("}") + 1]
+    parts = []
+    if limit.least > -inf:
+        parts.append(f"at least {form.format(limit.least)}")
+    if limit.most < inf:
+        parts.append(f"at most {form.format(limit.most)}")
+    return " and ".join(parts)
+
+
+def _decide(
+    signs: Signs, suspicions: Sequence[str], set_aside: str, symptoms: Sequence[Symptom], causes: Sequence[Cause]
+) -> tuple[VerdictKind, str]:
+    """Return the kind, and its reason in one line: what names its remedy comes first."""
+    # what the estimator finds by itself, and puts right, is told without a comparison
+    sure = [cause for cause in causes if isfinite(cause.nats) and not cause.probability < SURE]
+    if of_map := [cause for cause in sure if _is_of_map(cause)]:
+        return OUTDATED, _cause_text(of_map[0])
+    if sure or suspicions:
+        return SUSPECT, "; ".join([*map(_cause_text, sure), *(() if sure else suspicions)])
+    alarming = {symptom.code: symptom for symptom in symptoms if symptom.is_alarming}
+    beyond = [limit for limit in LIMITS if limit.code in alarming]
+    for kind in (LOST, SUSPECT):
+        if some := [limit for limit in beyond if limit.kind is kind]:
+            return kind, _reasons(some, alarming)
+    if signs.common == 0:
+        return OUTDATED, "no landmark of the map was seen: it is of another site, or its ids are others"
+    if set_aside:
+        return OUTDATED, f"not localised in the map: {set_aside}"
+    if signs.in_map is False:
+        return OUTDATED, "what was seen lies nowhere on the map: it is of another site, frame or scale, or mirrored"
+    for kind in (OUTDATED, WEAK):
+        if some := [limit for limit in beyond if limit.kind is kind]:
+            return kind, _reasons(some, alarming)
+    return VerdictKind.SOUND, "readings, odometry and solution agree"
+
+
+def _is_of_map(cause: Cause) -> bool:
+    return cause.subject.startswith("map") or cause.code.startswith("map")
+
+
+def _cause_text(cause: Cause) -> str:
+    return f"{cause.message} (try: {cause.fix})" if cause.fix else cause.message
+
+
+def _reasons(limits: Sequence[Limit], alarming: dict[str, Symptom]) -> str:
+    """Return what the first one means, all values, and what would help."""
+    values = "; ".join(alarming[limit.code].message for limit in limits)
+    hint = next((limit.hint for limit in limits if limit.hint), "")
+    return f"{limits[0].why}: {values}" + (f" (try: {hint})" if hint else "")
