@@ -485,6 +485,12 @@ class MapInSpaceConfig(Section):
     """What of a given map in space stands where it says, and what was moved."""
 
     sigma: Positive = key(0.02, "standard deviation of landmarks that state none [m, rad]")
+    scale_sigma: float = key(
+        0.02,
+        "standard deviation of the odometry's scale, if unstated, where a given map tells it; 0: exact",
+        ge=0,
+        le=1,
+    )
     loose_m: Positive = key(0.05, "least standard deviation of a map before static landmarks are identified [m, rad]")
     pseudo_count: Positive = key(6.0, "residuals that the accuracy which a map states counts for where that is learned")
     p_moved: Share = key(0.03, "probability that a landmark moved since the map was made")

@@ -59,6 +59,12 @@ class Lasting(NamedTuple):
         """Return whether some last."""
         return bool(self.share.any())
 
+    def correlation(self, stamp_s: FloatArray) -> FloatArray:
+        """Return (K, K) correlations of the errors of sightings of one landmark at stamps (K,)."""
+        lag_s = np.abs(stamp_s[:, None] - stamp_s)
+        found = sum(share * np.exp(-lag_s / each_s) for each_s, share in zip(self.persist_s, self.share, strict=True))
+        return np.where(np.eye(len(stamp_s), dtype=np.bool_), 1.0, found)
+
     def information(self, stamp_s: FloatArray, place: IntArray) -> FloatArray:
         """Return (M,) shares of the information of detections of places (M,) at (M,) stamps, sorted by time."""
         if not self.any:

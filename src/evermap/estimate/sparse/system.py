@@ -80,6 +80,16 @@ class Factorised:
             yield share
         return x
 
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of the information of all variables, the border among them."""
+        tree = self.system.tree
+        node = np.repeat(np.arange(len(tree.own)), tree.own)
+        row = np.arange(len(node)) - np.repeat(np.cumsum(tree.own) - tree.own, tree.own)
+        pivots = self.rows[tree.stored[node] + row * (tree.size[node] + 1)]
+        found = 2.0 * float(np.log(pivots).sum())
+        return found + 2.0 * float(np.log(np.diag(self._border[0])).sum()) if len(self.right) else found
+
     def border_covariance(self) -> FloatArray:
         """Return (B, B) covariance of the border."""
         if not len(self.right):

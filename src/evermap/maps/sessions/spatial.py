@@ -292,7 +292,7 @@ def solve_visit(
     intake = prepare_space(
         recording, of_slam.space, remarks, robust=of_slam.robust, estimate_noise=of_slam.estimate_noise
     )
-    intake = fit_to_map(intake, prior_map)
+    intake = fit_to_map(intake, prior_map, surveyed=True)
     solved = solve_space(intake, prior_map, progress=progress, changes=of_slam.changes)
     return SpatialVisit(recording, intake, solved)
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.config import CalibrationConfig
+from evermap.errors import NumericalError
 from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se3
 from evermap.slam.calibration import priced
@@ -54,7 +55,7 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
     problem, sigma_s = optimum.smoother.problem, optimum.smoother.problem.settings.delay_sigma_s
     if problem.path is None or sigma_s == 0.0 or not problem.driven or _is_of_frames(problem, problem.path):
         return optimum, None
-    count, start = len(problem.mount), optimum.estimate
+    count, start, stated = len(problem.mount), optimum.estimate, optimum
     free = _freed(problem, optimum, np.full(count, sigma_s), np.zeros(count))
     smoother = SpatialSmoother(free, start.pose)
     now = smoother.linearised(start, optimum.noise, heavy=False)
@@ -77,7 +78,10 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
             if not optimum.estimate.delay_s.any():
                 return optimum, found
             return converged(problem, _moved(optimum, problem, asked), optimum.noise), found
-        optimum = converged(free, _moved(optimum, free, asked), optimum.noise)
+        try:
+            optimum = converged(free, _moved(optimum, free, asked), optimum.noise)
+        except NumericalError:  # what seemed to show a delay was jitter of the velocity
+            return stated, found
         smoother, now = optimum.smoother, optimum.now
         again, narrow = _priced(smoother, now, optimum.estimate.delay_s, sigma_s, np.zeros(count))
         found = Delays(np.where(asked, again.sigma_s, found.sigma_s), np.where(asked, again.p_needed, found.p_needed))

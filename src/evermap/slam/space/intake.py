@@ -49,6 +49,7 @@ class SpatialIntake:
         warnings: what was left out, counted.
         names: texts behind landmark ids.
         boxes: (P,) landmarks that are boxes at rest.
+        scale_in_map: standard deviation of the odometry's scale where a given map tells it.
     """
 
     problem: SpatialProblem
@@ -60,6 +61,7 @@ class SpatialIntake:
     warnings: tuple[str, ...]
     names: Mapping[int, str] = field(default_factory=dict)
     boxes: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    scale_in_map: float = 0.0
 
 
 def prepare_space(
@@ -139,6 +141,7 @@ def prepare_space(
         problem, float(stamps[pose_frame[0]]), pose_frame, used, landmark_id, driven_pose, tuple(warnings),
         recording.landmark_names,
         np.bincount(place, np.isfinite(detections.size_m[used]).all(axis=1), len(landmark_id)) > 0.0,
+        settings.map.scale_sigma if driven and recording.sensors[0].sigma_odometer_scale is None else 0.0,
     )  # fmt: skip
 
 

@@ -52,7 +52,7 @@ from evermap.types import (
 
 OF_MOUNT = "correction of the sensor's stated mount, in the sensor's axes"
 DELAY = "seconds by which the sensor's stamps are late"
-SCALE = "true distances over those of the odometry, by the sizes of tags"
+SCALE = "true distances over those of the odometry, by the sizes of tags or by the given map"
 DIVIDED = (
     "true distances over those of the odometry, or ranges over true distances: only their product shows; divided by "
     "`kind`, sigma_scale and sigma_odometer_scale of sensor.toml"
@@ -305,7 +305,7 @@ def _undivided(told: _Told) -> float:
 def _scales(told: _Told, sigma: float) -> list[ParameterEstimate]:
     """Return the scales of odometry and ranges; `sigma` is of the logarithm of what they show together."""
     problem, share = told.problem, told.problem.ranges_share
-    before = told.intake.problem.scale_sigma  # it was averaged since
+    before = told.intake.problem.scale_sigma or told.intake.scale_in_map  # it was averaged since
     odometer, ranges = before * np.sqrt(1.0 - share), before * np.sqrt(share)
     undivided = _undivided(told)
     scale = float(np.exp(problem.odometry_log + told.solved.optimum.estimate.log_scale))

@@ -16,6 +16,7 @@ import numpy as np
 from evermap.align.candidates import Matches, find_consensus
 from evermap.config import ChangesConfig
 from evermap.estimate.measurement import Tied
+from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
@@ -28,6 +29,7 @@ from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, 
 from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import CORNERS, POINT, STATES
 from evermap.slam.space.map_consensus import cost_in_map, laid_by_consensus
+from evermap.slam.space.marginal import log_marginal_likelihood
 from evermap.slam.space.moved_groups import find_moved_groups
 from evermap.slam.space.moved_within import MovedWithin, find_moves_within, superseded
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
@@ -62,6 +64,8 @@ LOOSE = 1.5
 """Numbers measured for each that is sought, up to which views are loosely tied."""
 WIDER, STEPS_OF_WIDER = (30.0, 10.0, 3.0), 20
 """Times that the noise of detections is wider, in turn, and steps at each, at most."""
+NEEDED = 0.75
+"""Probability that the odometry's scale is not as stated, from which it is free in a map."""
 WORTH = 3.0
 """Nats by which a candidate must beat the predicted pose."""
 
@@ -122,7 +126,8 @@ def solve_space(
     noise = start_noise(settings, driven=problem.driven)
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
     known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
-    problem, noise, drift, counted = _with_drift(problem, noise, intake.driven_pose)
+    scale_in_map = intake.scale_in_map if len(stated) and problem.scale_sigma == 0.0 else 0.0
+    problem, noise, drift, counted = _with_drift(problem, noise, intake.driven_pose, in_map=scale_in_map > 0.0)
     stepwise, spread, step_s = incremental(problem, noise, known, place, progress)
     estimate, of_points = stepwise, 2 * np.count_nonzero(problem.kind == POINT) > len(problem.kind)
     if problem.driven:
@@ -144,6 +149,8 @@ def solve_space(
     optimum = repaired(optimum)
     if len(stated) and not problem.driven and of_points:
         optimum = _or_by_consensus(intake, optimum, stated)
+    if scale_in_map > 0.0:
+        optimum = _with_scale_of_map(optimum, scale_in_map)
     problem = optimum.smoother.problem
     if problem.scale_sigma > 0.0:
         optimum = _with_averaged_scale(optimum)
@@ -188,10 +195,11 @@ def solve_space(
     return SpatialSolved(optimum, identity, number, from_map, delays, stepwise.pose, spread, step_s, moves)
 
 
-def fit_to_map(intake: SpatialIntake, prior_map: Landmarks | None) -> SpatialIntake:
+def fit_to_map(intake: SpatialIntake, prior_map: Landmarks | None, *, surveyed: bool = False) -> SpatialIntake:
     """Return a recording for a solution in a map: without measurements that hold in another frame, with a warning each.
 
-    Fixes have a frame of their own. What says where up is holds in a map whose z axis is known to be up.
+    Fixes have a frame of their own. What says where up is holds in a map whose z axis is known to be up. A map that was
+    `surveyed`, not made by odometry, tells the scale of the odometry.
     """
     if prior_map is None or not np.isin(intake.landmark_id, prior_map.landmark_id).any():
         return intake
@@ -205,7 +213,8 @@ def fit_to_map(intake: SpatialIntake, prior_map: Landmarks | None) -> SpatialInt
         else:
             kept.append(tied)
     problem = replace(intake.problem, measurements=tuple(kept))
-    return replace(intake, problem=problem, warnings=(*intake.warnings, *told))
+    scale_in_map = intake.scale_in_map if surveyed else 0.0
+    return replace(intake, problem=problem, scale_in_map=scale_in_map, warnings=(*intake.warnings, *told))
 
 
 def _without_frames(problem: SpatialProblem) -> tuple[SpatialProblem, tuple[Tied, ...]]:
@@ -233,14 +242,21 @@ def _in_measured_frame(
 
 
 def _with_drift(
-    problem: SpatialProblem, noise: SpatialNoise, driven: FloatArray
+    problem: SpatialProblem, noise: SpatialNoise, driven: FloatArray, *, in_map: bool
 ) -> tuple[SpatialProblem, SpatialNoise, Drift | None, FloatArray | None]:
     """Return the problem with what each detection is worth, and the noise levels with the drift of the odometry.
 
     And the drift where it was used, or what detections are worth (M,) where that is for covariances only.
 
     Pixels err by themselves, detectors of objects by the view. That errors persist follows from the odometry alone,
-    of which a fast turn or a drift of other than usual form may be wrong. So independent errors are asked as well.
+    of which a fast turn or a drift of other than usual form may be wrong. So independent errors are asked as well: they
+    hold where they show no correlation beside a drift that landmarks share, or where they are the more probable.
+
+    Args:
+        problem: the measurements.
+        noise: levels to start from.
+        driven: (N, 7) poses by the odometry.
+        in_map: whether a map tells what a metre is.
     """
     by_corners = (problem.kind == CORNERS) | problem.ray
     if not problem.driven:
@@ -254,11 +270,39 @@ def _with_drift(
     elif drift.translation is not None and drift.rotation is not None:
         if share.min() < 1.0:
             free = replace(problem.as_points(), prior=PlacePrior.none(), start_sigma=HELD)
-            alone = converged(free, first_places(free, driven), noise)
-            if _are_independent(alone, drift.translation) and _is_of_one_metre(alone.estimate, driven):
+            start = first_places(free, driven)
+            alone = converged(free, start, noise)
+            of_metre = in_map or _is_of_one_metre(alone.estimate, driven)
+            if of_metre and _are_independent(alone, drift.translation):
+                return problem, replace(alone.noise, pixel=noise.pixel), None, None
+            lasting, drift = _likeliest_lasting(replace(free, share=share), start, noise, drift)
+            if of_metre and log_marginal_likelihood(alone, noise) > lasting:
                 return problem, replace(alone.noise, pixel=noise.pixel), None, None
         noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
     return replace(problem, share=share), noise, drift, None
+
+
+def _likeliest_lasting(
+    problem: SpatialProblem, start: SpatialEstimate, noise: SpatialNoise, drift: Drift
+) -> tuple[float, Drift]:
+    """Return the log marginal likelihood of errors that last, and the drift that goes with them: as it was estimated,
+    or the least that any odometry has.
+
+    Args:
+        problem: with what each detection is worth.
+        start: values to start from.
+        noise: levels that it is compared at.
+        drift: as it was estimated.
+    """
+    settings = problem.settings
+    best, found = -np.inf, drift
+    tried = [drift, drift._replace(translation=settings.steady_m, rotation=settings.steady_rad)]
+    for one in tried if drift.translation != settings.steady_m else tried[:1]:
+        optimum = converged(problem, start, replace(noise, translation=one.translation, rotation=one.rotation))
+        likelihood = log_marginal_likelihood(optimum, noise, optimum.smoother.lasting(optimum.now))
+        if likelihood > best:
+            best, found = likelihood, one
+    return best, found
 
 
 def _are_independent(optimum: SpatialOptimum, drift_m: float) -> bool:
@@ -288,6 +332,23 @@ def _is_of_one_metre(estimate: SpatialEstimate, driven: FloatArray) -> bool:
 def times_of(identity: IntArray) -> IntArray:
     """Return (P,) which of those with its identity (P,) each is, from 1."""
     return np.array([np.count_nonzero(identity[: k + 1] == one) for k, one in enumerate(identity)], dtype=np.int64)
+
+
+def _with_scale_of_map(optimum: SpatialOptimum, sigma: float) -> SpatialOptimum:
+    """Return the optimum with the scale of the odometry free, where a step towards it shows in a map that it is wrong.
+
+    Args:
+        optimum: of an exact odometer.
+        sigma: standard deviation of the scale.
+    """
+    free = replace(optimum.smoother.problem, scale_sigma=sigma)
+    smoother = SpatialSmoother(free, optimum.estimate.pose)
+    now = smoother.linearised(optimum.estimate, optimum.noise, heavy=False)
+    step = exhausted(smoother.factorised(now).solution())
+    variance, worth = smoother.worth_by_stretches(smoother.after(now, step), -1)
+    if priced(float(step[-1]), variance, worth, sigma)[0] < NEEDED:
+        return optimum
+    return converged(free, optimum.estimate, optimum.noise, heavy_rounds=0)
 
 
 def _with_averaged_scale(optimum: SpatialOptimum) -> SpatialOptimum:
