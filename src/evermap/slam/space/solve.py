@@ -278,8 +278,15 @@ def _with_drift(
             lasting, drift = _likeliest_lasting(replace(free, share=share), start, noise, drift)
             if of_metre and log_marginal_likelihood(alone, noise) > lasting:
                 return problem, replace(alone.noise, pixel=noise.pixel), None, None
-        noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
+        noise = _with_drift_of(noise, drift)
     return replace(problem, share=share), noise, drift, None
+
+
+def _with_drift_of(noise: SpatialNoise, drift: Drift) -> SpatialNoise:
+    """Return levels with those of a drift, where it was told apart."""
+    if drift.translation is None or drift.rotation is None:
+        return noise
+    return replace(noise, translation=drift.translation, rotation=drift.rotation)
 
 
 def _likeliest_lasting(
@@ -298,7 +305,7 @@ def _likeliest_lasting(
     best, found = -np.inf, drift
     tried = [drift, drift._replace(translation=settings.steady_m, rotation=settings.steady_rad)]
     for one in tried if drift.translation != settings.steady_m else tried[:1]:
-        optimum = converged(problem, start, replace(noise, translation=one.translation, rotation=one.rotation))
+        optimum = converged(problem, start, _with_drift_of(noise, one))
         likelihood = log_marginal_likelihood(optimum, noise, optimum.smoother.lasting(optimum.now))
         if likelihood > best:
             best, found = likelihood, one
