@@ -144,8 +144,8 @@ _AXES = tuple(
 _DELAYS_S = (*np.arange(1.0, 10.0, 0.5).tolist(), *np.arange(10.0, 61.0, 1.0).tolist())
 AT_ONCE = 32
 """Number of corrections that are tried together: arrays of a megabyte."""
-SHARES = 16
-"""Parts of the pairs, half of which may rule out candidates one after the other."""
+SHARES = (slice(0, None, 64), *(slice(step // 2, None, step) for step in (64, 32, 16, 8, 4)))
+"""Parts of the pairs, half of which may rule out candidates one after the other: few show most of them to be wrong."""
 LIKELIEST_BY = 250
 """Pairs that show which delay is the likeliest for a whole recording."""
 LEAST_STEP_S = 0.4
@@ -212,10 +212,12 @@ def _possible(
     """
     most = len(before[0]) * float(_loss(before, settings)) - settings.gain
     spent = np.zeros(len(candidates))
-    for share in range(SHARES // 2):
-        part = pairs.among(slice(share, None, SHARES))
-        for row in range(0, len(candidates), SHARES * AT_ONCE):
-            tried = slice(row, row + SHARES * AT_ONCE)
+    for share in SHARES:
+        if share.start >= len(before[0]):
+            continue
+        part, at_once = pairs.among(share), share.step * AT_ONCE
+        for row in range(0, len(candidates), at_once):
+            tried = slice(row, row + at_once)
             after = part.residual(*(mistake.after(undone) for mistake in candidates[tried]))
             spent[tried] += after.shape[-1] * _loss(after, settings)
         possible = np.flatnonzero(spent < most).tolist()
