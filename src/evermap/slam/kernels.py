@@ -50,6 +50,41 @@ def multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 
 @kernel
+def reckoned_motions(
+    first_s: FloatArray,
+    second_s: FloatArray,
+    delay_s: FloatArray,
+    stamp_s: FloatArray,
+    track: FloatArray,
+    mount: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write the motions (D, P, 3) of a sensor from P first to second stamps, each delayed by (D,), by a track (N, 3)
+    of the robot, x, y and unwrapped heading at `stamp_s` (N,), of which the ends hold beyond it.
+    """
+    pose = np.empty((2, 3))
+    last = len(stamp_s) - 1
+    for d in range(len(delay_s)):
+        for p in range(len(first_s)):
+            for end in range(2):
+                at_s = (first_s[p] if end == 0 else second_s[p]) + delay_s[d]
+                after = min(max(np.searchsorted(stamp_s, at_s), 1), last)
+                lasted_s = max(stamp_s[after] - stamp_s[after - 1], 1e-300)  # stamps may be equal
+                share = min(max((at_s - stamp_s[after - 1]) / lasted_s, 0.0), 1.0)
+                for k in range(3):
+                    pose[end, k] = track[after - 1, k] + share * (track[after, k] - track[after - 1, k])
+                c, s = math.cos(pose[end, 2]), math.sin(pose[end, 2])
+                pose[end, 0] += c * mount[0] - s * mount[1]
+                pose[end, 1] += s * mount[0] + c * mount[1]
+            heading, turned = pose[0, 2] + mount[2], pose[1, 2] - pose[0, 2]
+            c, s = math.cos(heading), math.sin(heading)
+            x, y = pose[1, 0] - pose[0, 0], pose[1, 1] - pose[0, 1]
+            out[d, p, 0] = c * x + s * y
+            out[d, p, 1] = c * y - s * x
+            out[d, p, 2] = turned - 2.0 * math.pi * round(turned / (2.0 * math.pi))
+
+
+@kernel
 def sandwich(j: FloatArray, cov: FloatArray, part: FloatArray, out: FloatArray) -> None:
     """Compute `j cov j'` for j (r, n) and a symmetric cov, with room for `j cov` in `part` (r, n)."""
     size = j.shape[1]

@@ -20,6 +20,7 @@ import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
+from evermap.slam.kernels import reckoned_motions
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -353,9 +354,9 @@ class PlanarPairs:
                 self._tracks[forward, turn] = _dead_reckoned(self._odometry, forward, turn)
             mine = way == row
             delays_s, which = np.unique(delay_s[mine], return_inverse=True)
-            at_s = np.stack(self._stamp_s)[:, None] + delays_s[:, None]
-            pose = _interpolated(at_s, self._odometry.stamp_s, self._tracks[forward, turn])
-            motion[mine] = se2.between(*se2.compose(pose, self._mount))[which]
+            moved, track = np.empty((len(delays_s), *motion.shape[1:])), self._tracks[forward, turn]
+            reckoned_motions(*self._stamp_s, delays_s, self._odometry.stamp_s, track, self._mount, moved)
+            motion[mine] = moved[which]
         return motion
 
 
@@ -495,15 +496,6 @@ def _dead_reckoned(odometry: Odometry, forward: float, turn: float) -> FloatArra
     x = np.append(0.0, np.cumsum(ahead * np.cos(heading) - aside * np.sin(heading)))
     y = np.append(0.0, np.cumsum(ahead * np.sin(heading) + aside * np.cos(heading)))
     return np.column_stack([x, y, turned])
-
-
-def _interpolated(at_s: FloatArray, stamp_s: FloatArray, track: FloatArray) -> FloatArray:
-    """(..., 3) a track (N, 3) at stamps (...), its ends beyond them, as `np.interp` of each column."""
-    after = np.clip(np.searchsorted(stamp_s, at_s), 1, len(stamp_s) - 1)
-    lasted_s = np.maximum(stamp_s[after] - stamp_s[after - 1], 1e-300)  # stamps may be equal
-    share = np.clip((at_s - stamp_s[after - 1]) / lasted_s, 0.0, 1.0)
-    low = track[after - 1]
-    return np.asarray(low + share[..., None] * (track[after] - low))
 
 
 @dataclass(frozen=True, slots=True)
