@@ -20,7 +20,7 @@ import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
-from evermap.slam.kernels import reckoned_motions
+from evermap.slam.kernels import pair_residuals, reckoned_motions
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -306,15 +306,15 @@ class PlanarPairs:
         self._mount = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64)
         stamp_s = recording.frames.stamp_s[detections.frame]
         self._stamp_s = stamp_s[first], stamp_s[second]
-        self._range_m = detections.range_m[first], detections.range_m[second]
-        self._bearing_rad = detections.bearing_rad[first], detections.bearing_rad[second]
+        self._readings: tuple[FloatArray, FloatArray] = tuple(
+            np.stack([detections.range_m[rows], detections.bearing_rad[rows]]) for rows in (first, second)
+        )  # type: ignore[assignment]
 
     def among(self, rows: slice) -> Self:
         """Return some of the pairs."""
         part = copy(self)
-        part._stamp_s = self._stamp_s[0][rows], self._stamp_s[1][rows]
-        part._range_m = self._range_m[0][rows], self._range_m[1][rows]
-        part._bearing_rad = self._bearing_rad[0][rows], self._bearing_rad[1][rows]
+        part._stamp_s = self._stamp_s[0][rows].copy(), self._stamp_s[1][rows].copy()
+        part._readings = self._readings[0][:, rows].copy(), self._readings[1][:, rows].copy()
         return part
 
     @property
@@ -333,31 +333,18 @@ class PlanarPairs:
 
     def residual(self, *mistakes: Mistake) -> FloatArray:
         """Return (M, 2, P) second reading minus what the first and the odometry predict: log range, and bearing."""
-        motion = self._motions(mistakes)
-        motion[..., :2] /= np.array([each.lengths for each in mistakes])[:, None, None]
-        turned = np.array([(each.bearing, each.offset_rad) for each in mistakes])
-        bearing = [turned[:, :1] * each + turned[:, 1:] for each in self._bearing_rad]
-        range_m = self._range_m
-        seen = np.stack([range_m[0] * np.cos(bearing[0]), range_m[0] * np.sin(bearing[0])], axis=-1)
-        x, y = np.moveaxis(se2.transform(se2.inverse(motion), seen), -1, 0)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            far = np.log(range_m[1]) - np.log(np.maximum(np.hypot(x, y), 1e-12))
-        return np.stack([np.nan_to_num(far, posinf=inf), se2.wrap(bearing[1] - np.arctan2(y, x))], axis=1)
-
-    def _motions(self, mistakes: tuple[Mistake, ...]) -> FloatArray:
-        """(M, P, 3) motions of the sensor from the first sighting to the second, by odometry."""
-        ways, way = np.unique([(each.forward, each.turn) for each in mistakes], axis=0, return_inverse=True)
-        delay_s = np.array([each.delay_s for each in mistakes])
-        motion = np.empty((len(mistakes), len(self._stamp_s[0]), 3))
-        for row, (forward, turn) in enumerate(ways.tolist()):
+        ways = np.array([(each.forward, each.turn, each.delay_s) for each in mistakes])
+        ways, which = np.unique(ways, axis=0, return_inverse=True)
+        motion = np.empty((len(ways), len(self._stamp_s[0]), 3))
+        for row, (forward, turn, delay_s) in enumerate(ways.tolist()):
             if (forward, turn) not in self._tracks:
                 self._tracks[forward, turn] = _dead_reckoned(self._odometry, forward, turn)
-            mine = way == row
-            delays_s, which = np.unique(delay_s[mine], return_inverse=True)
-            moved, track = np.empty((len(delays_s), *motion.shape[1:])), self._tracks[forward, turn]
-            reckoned_motions(*self._stamp_s, delays_s, self._odometry.stamp_s, track, self._mount, moved)
-            motion[mine] = moved[which]
-        return motion
+            track = self._tracks[forward, turn]
+            reckoned_motions(*self._stamp_s, delay_s, self._odometry.stamp_s, track, self._mount, motion[row])
+        undone = np.array([(each.lengths, each.bearing, each.offset_rad) for each in mistakes])
+        found = np.empty((len(mistakes), 2, motion.shape[1]))
+        pair_residuals(motion, which.ravel(), undone, *self._readings, found)
+        return found
 
 
 class SpatialPairs:
