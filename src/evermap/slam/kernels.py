@@ -37,6 +37,7 @@ AT_PLACES = 3 + N_STATES
 """Where places begin in a joint covariance: behind the newest pose and the calibration states."""
 
 FARTHEST = float(np.finfo(np.float64).max)
+"""Difference of logarithms of ranges at which one of them is 0."""
 
 kernel = kept(effort=1, error_model="numpy")
 """Matrices of two to fifteen rows: there is nothing to vectorise, and much to compile."""
