@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from evermap.compiled import kept
-from evermap.types import FloatArray
+from evermap.types import FloatArray, IntArray
 
 NOISE_NAMES = (
     "sigma_forward_per_sqrt_m",
@@ -36,6 +36,9 @@ N_STATES = N_SENSOR + N_MOTION
 AT_PLACES = 3 + N_STATES
 """Where places begin in a joint covariance: behind the newest pose and the calibration states."""
 
+FARTHEST = float(np.finfo(np.float64).max)
+"""Difference of logarithms of ranges at which one of them is 0."""
+
 kernel = kept(effort=1, error_model="numpy")
 """Matrices of two to fifteen rows: there is nothing to vectorise, and much to compile."""
 
@@ -47,6 +50,61 @@ def multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
         a0, a1, a2 = a[i, 0], a[i, 1], a[i, 2]
         for k in range(b.shape[1]):
             out[i, k] = a0 * b[0, k] + a1 * b[1, k] + a2 * b[2, k]
+
+
+@kernel
+def reckoned_motions(
+    first_s: FloatArray,
+    second_s: FloatArray,
+    delay_s: float,
+    stamp_s: FloatArray,
+    track: FloatArray,
+    mount: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write the motions (P, 3) of a sensor from P first to second stamps, all delayed, by a track (N, 3) of the robot,
+    x, y and unwrapped heading at `stamp_s` (N,), of which the ends hold beyond it.
+    """
+    pose = np.empty((2, 3))
+    last = len(stamp_s) - 1
+    for p in range(len(first_s)):
+        for end in range(2):
+            at_s = (first_s[p] if end == 0 else second_s[p]) + delay_s
+            after = min(max(np.searchsorted(stamp_s, at_s), 1), last)
+            lasted_s = max(stamp_s[after] - stamp_s[after - 1], 1e-300)  # stamps may be equal
+            share = min(max((at_s - stamp_s[after - 1]) / lasted_s, 0.0), 1.0)
+            for k in range(3):
+                pose[end, k] = track[after - 1, k] + share * (track[after, k] - track[after - 1, k])
+            c, s = math.cos(pose[end, 2]), math.sin(pose[end, 2])
+            pose[end, 0] += c * mount[0] - s * mount[1]
+            pose[end, 1] += s * mount[0] + c * mount[1]
+        heading = pose[0, 2] + mount[2]
+        c, s = math.cos(heading), math.sin(heading)
+        x, y = pose[1, 0] - pose[0, 0], pose[1, 1] - pose[0, 1]
+        out[p, 0], out[p, 1], out[p, 2] = c * x + s * y, c * y - s * x, pose[1, 2] - pose[0, 2]
+
+
+@kernel
+def pair_residuals(
+    motion: FloatArray, which: IntArray, undone: FloatArray, first: FloatArray, second: FloatArray, out: FloatArray
+) -> None:
+    """Write (M, 2, P) second reading minus what the first and the motion predict, as log range and bearing.
+
+    Of motions (D, P, 3) that of row `which` (M,) holds, divided by the factor on ranges; readings (2, P) are ranges and
+    bearings. `undone` (M, 3) are that factor, and the factor and the offset that bearings are corrected by. What has no
+    range tells nothing of it.
+    """
+    for m in range(len(which)):
+        length, factor, offset = undone[m, 0], undone[m, 1], undone[m, 2]
+        for p in range(first.shape[1]):
+            bearing = factor * first[1, p] + offset
+            x = first[0, p] * math.cos(bearing) - motion[which[m], p, 0] / length
+            y = first[0, p] * math.sin(bearing) - motion[which[m], p, 1] / length
+            distance = math.hypot(x, y)
+            far = np.log(second[0, p]) - np.log(max(distance, 1e-12))
+            out[m, 0, p] = 0.0 if np.isnan(far) else max(far, -FARTHEST)
+            left = factor * second[1, p] + offset - math.atan2(y, x) + motion[which[m], p, 2]
+            out[m, 1, p] = left - 2.0 * math.pi * np.floor(left / (2.0 * math.pi) + 0.5)
 
 
 @kernel

@@ -21,6 +21,7 @@ import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
+from evermap.slam.kernels import pair_residuals, reckoned_motions
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -162,8 +163,8 @@ AXES = tuple(
 _DELAYS_S = (*np.arange(1.0, 10.0, 0.5).tolist(), *np.arange(10.0, 61.0, 1.0).tolist())
 AT_ONCE = 32
 """Number of corrections that are tried together: arrays of a megabyte."""
-SHARES = 16
-"""Parts of the pairs, half of which may rule out candidates one after the other."""
+SHARES = (slice(0, None, 64), *(slice(step // 2, None, step) for step in (64, 32, 16, 8, 4)))
+"""Parts of the pairs, half of which may rule out candidates one after the other: few show most of them to be wrong."""
 LIKELIEST_BY = 250
 """Pairs that show which delay is the likeliest for a whole recording."""
 LEAST_STEP_S = 0.4
@@ -233,10 +234,12 @@ def _possible(
     """
     most = len(before[0]) * float(_loss(before, settings)) - settings.gain
     spent = np.zeros(len(candidates))
-    for share in range(SHARES // 2):
-        part = pairs.among(slice(share, None, SHARES))
-        for row in range(0, len(candidates), SHARES * AT_ONCE):
-            tried = slice(row, row + SHARES * AT_ONCE)
+    for share in SHARES:
+        if share.start >= len(before[0]):
+            continue
+        part, at_once = pairs.among(share), share.step * AT_ONCE
+        for row in range(0, len(candidates), at_once):
+            tried = slice(row, row + at_once)
             after = part.residual(*(mistake.after(undone) for mistake in candidates[tried]))
             spent[tried] += after.shape[-1] * _loss(after, settings)
         possible = np.flatnonzero(spent < most).tolist()
@@ -327,15 +330,15 @@ class PlanarPairs:
         self._mount = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64)
         stamp_s = recording.frames.stamp_s[detections.frame]
         self._stamp_s = stamp_s[first], stamp_s[second]
-        self._range_m = detections.range_m[first], detections.range_m[second]
-        self._bearing_rad = detections.bearing_rad[first], detections.bearing_rad[second]
+        self._readings: tuple[FloatArray, FloatArray] = tuple(
+            np.stack([detections.range_m[rows], detections.bearing_rad[rows]]) for rows in (first, second)
+        )  # type: ignore[assignment]
 
     def among(self, rows: slice) -> Self:
         """Return some of the pairs."""
         part = copy(self)
-        part._stamp_s = self._stamp_s[0][rows], self._stamp_s[1][rows]
-        part._range_m = self._range_m[0][rows], self._range_m[1][rows]
-        part._bearing_rad = self._bearing_rad[0][rows], self._bearing_rad[1][rows]
+        part._stamp_s = self._stamp_s[0][rows].copy(), self._stamp_s[1][rows].copy()
+        part._readings = self._readings[0][:, rows].copy(), self._readings[1][:, rows].copy()
         return part
 
     @property
@@ -357,32 +360,18 @@ class PlanarPairs:
 
         With `stands` the robot doesn't move.
         """
-        motion = self._motions(mistakes)
-        motion = np.zeros_like(motion) if stands else motion
-        motion[..., :2] /= np.array([each.lengths for each in mistakes])[:, None, None]
-        turned = np.array([(each.bearing, each.offset_rad) for each in mistakes])
-        bearing = [turned[:, :1] * each + turned[:, 1:] for each in self._bearing_rad]
-        range_m = self._range_m
-        seen = np.stack([range_m[0] * np.cos(bearing[0]), range_m[0] * np.sin(bearing[0])], axis=-1)
-        x, y = np.moveaxis(se2.transform(se2.inverse(motion), seen), -1, 0)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            far = np.log(range_m[1]) - np.log(np.maximum(np.hypot(x, y), 1e-12))
-        return np.stack([np.nan_to_num(far, posinf=inf), se2.wrap(bearing[1] - np.arctan2(y, x))], axis=1)
-
-    def _motions(self, mistakes: tuple[Mistake, ...]) -> FloatArray:
-        """(M, P, 3) motions of the sensor from the first sighting to the second, by odometry."""
-        ways, way = np.unique([(each.forward, each.turn) for each in mistakes], axis=0, return_inverse=True)
-        delay_s = np.array([each.delay_s for each in mistakes])
-        motion = np.empty((len(mistakes), len(self._stamp_s[0]), 3))
-        for row, (forward, turn) in enumerate(ways.tolist()):
+        ways = np.array([(each.forward, each.turn, each.delay_s) for each in mistakes])
+        ways, which = np.unique(ways, axis=0, return_inverse=True)
+        motion = np.zeros((len(ways), len(self._stamp_s[0]), 3))
+        for row, (forward, turn, delay_s) in enumerate(() if stands else ways.tolist()):
             if (forward, turn) not in self._tracks:
                 self._tracks[forward, turn] = _dead_reckoned(self._odometry, forward, turn)
-            mine = way == row
-            delays_s, which = np.unique(delay_s[mine], return_inverse=True)
-            at_s = np.stack(self._stamp_s)[:, None] + delays_s[:, None]
-            pose = _interpolated(at_s, self._odometry.stamp_s, self._tracks[forward, turn])
-            motion[mine] = se2.between(*se2.compose(pose, self._mount))[which]
-        return motion
+            track = self._tracks[forward, turn]
+            reckoned_motions(*self._stamp_s, delay_s, self._odometry.stamp_s, track, self._mount, motion[row])
+        undone = np.array([(each.lengths, each.bearing, each.offset_rad) for each in mistakes])
+        found = np.empty((len(mistakes), 2, motion.shape[1]))
+        pair_residuals(motion, which.ravel(), undone, *self._readings, found)
+        return found
 
 
 class SpatialPairs:
@@ -525,15 +514,6 @@ def _dead_reckoned(odometry: Odometry, forward: float, turn: float) -> FloatArra
     x = np.append(0.0, np.cumsum(ahead * np.cos(heading) - aside * np.sin(heading)))
     y = np.append(0.0, np.cumsum(ahead * np.sin(heading) + aside * np.cos(heading)))
     return np.column_stack([x, y, turned])
-
-
-def _interpolated(at_s: FloatArray, stamp_s: FloatArray, track: FloatArray) -> FloatArray:
-    """(..., 3) a track (N, 3) at stamps (...), its ends beyond them, as `np.interp` of each column."""
-    after = np.clip(np.searchsorted(stamp_s, at_s), 1, len(stamp_s) - 1)
-    lasted_s = np.maximum(stamp_s[after] - stamp_s[after - 1], 1e-300)  # stamps may be equal
-    share = np.clip((at_s - stamp_s[after - 1]) / lasted_s, 0.0, 1.0)
-    low = track[after - 1]
-    return np.asarray(low + share[..., None] * (track[after] - low))
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,6 +66,7 @@ class Smoother(Solver[Estimate]):
         self._structure: tuple[BoolArray, GraphStructure] | None = None
         self._priors: tuple[BoolArray, tuple[PlacePriors, ...]] | None = None
         self._blocks: tuple[BoolArray, tuple[FactorBlock[Estimate], ...]] | None = None
+        self._lasting: tuple[Estimate, Lasting] | None = None
 
     @property
     def states_sigma(self) -> FloatArray:
@@ -215,11 +216,15 @@ class Smoother(Solver[Estimate]):
         return solved.information[np.ix_(order, order)], solved.right[order]
 
     def lasting(self, estimate: Estimate) -> Lasting:
-        """Return how long errors of detections last, by the residuals there."""
+        """Return how long errors of detections last, by the residuals there; the last answer is kept."""
+        if self._lasting is not None and self._lasting[0] is estimate:
+            return self._lasting[1]
         problem, sigma = self.problem, self.noise.of_detections(self.problem.sigma_given)
         residual = detection_residuals(problem, estimate) / np.where(sigma < ANY_BEARING_RAD, sigma, np.nan)
         stamp_s = problem.stamp_s[problem.pose_row]
-        return lasting_errors(residual, self.inlier_probability(estimate), stamp_s, problem.landmark_row)
+        found = lasting_errors(residual, self.inlier_probability(estimate), stamp_s, problem.landmark_row)
+        self._lasting = estimate, found
+        return found
 
     def counted(self, estimate: Estimate, marginals: Marginals) -> Marginals:
         """Return covariances with each detection counted as what it is worth beside others of its landmark."""

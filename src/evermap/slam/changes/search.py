@@ -104,13 +104,15 @@ def _candidates(
     """Landmarks that may have moved: in a large map those that would gain most alone, and those already suspected."""
     gain, numbers = np.full(n_landmarks, -np.inf), evidence.numbers
     spread = np.diag(1.0 / motion_spread(prior, numbers)[:numbers] ** 2)
-    for j in np.unique(evidence.landmark):
-        rows = np.flatnonzero(evidence.landmark == j)
-        both = se2.xy_rows(rows, numbers)
-        identity = np.tile(np.eye(numbers), (len(rows), 1))
-        pull = identity.T @ comparison.pull[both]
-        precision = identity.T @ comparison.precision[np.ix_(both, both)] @ identity
-        gain[j] = pull @ np.linalg.solve(precision + spread, pull)
+    seen, row = np.unique(evidence.landmark, return_inverse=True)
+    # by one motion of all copies of a landmark
+    pull = np.zeros((len(seen), numbers))
+    np.add.at(pull, row, comparison.pull.reshape(-1, numbers))
+    first, second = np.nonzero(row[:, None] == row)
+    precision = comparison.precision.reshape(len(row), numbers, len(row), numbers)
+    stiff = np.tile(spread, (len(seen), 1, 1))
+    np.add.at(stiff, row[first], precision[first, :, second, :])
+    gain[seen] = (pull * np.linalg.solve(stiff, pull[:, :, None])[:, :, 0]).sum(axis=1)
     suspected = np.zeros(n_landmarks, bool) if start is None else start.label[0] > 0
     gain[suspected] = np.inf
     order = np.argsort(-gain, kind="stable")[: prior.most_candidates]
