@@ -39,6 +39,7 @@ from benchmarks.goldens.scores import _typical
 from evermap.errors import EvermapError
 from evermap.geometry import se3
 from evermap.metrics.summary import compare_with_truth, metrics_dict
+from evermap.slam.plane import in_its_space
 from evermap.types import UNKNOWN, AnyRecording, Landmarks, SlamResult, SpatialRecording, is_in_space
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
@@ -400,6 +401,8 @@ def run(one: Case) -> dict[str, Any]:
         recording, given = one.make()
         named = bool((recording.detections.landmark_id != UNKNOWN).any())
         config = em.Config.model_validate({"slam": {"unknown_ids": not named}})
+        dim = None if given is None else int(given.position_m.shape[1])
+        recording = in_its_space(recording, config.slam, dim=dim)
         result = em.run_slam(recording, config, prior_map=given)
         row |= scores(recording, result, given) | describe(recording, result, given)
     except EvermapError as error:

@@ -583,10 +583,10 @@ def _run_in_map(
     from evermap.maps.store import open_store
     from evermap.pipeline import run_localization
     from evermap.runs.sessions import at_time, begin_map, enter_session
-    from evermap.slam.check import odd
+    from evermap.slam.check import odd, valid
     from evermap.slam.space.moving import has_traffic
     from evermap.types import VerdictKind, is_in_space
-    from evermap.valid import strangers, valid
+    from evermap.valid import strangers
 
     config, localize, map_file = asked.config, asked.localize, asked.map_file
     assert map_file is not None
@@ -628,8 +628,8 @@ def _run_in_map(
                     result = replace(entered.session.slam, changes=entered.changes)
                     recording = entered.session.recording
         except DataError:  # as without a map, where the verdict says what was read wrongly
-            wrong = [finding.message for finding in odd(valid(recording, config.sensor), config.slam)
-                     if not finding.usable]  # fmt: skip
+            read: AnyRecording = valid(recording, config.sensor)  # type: ignore[type-var]
+            wrong = [finding.message for finding in odd(read, config.slam) if not finding.usable]
             if not wrong:
                 raise
             problem = f"the session was set aside: {VerdictKind.SENSOR_SUSPECT}: {'; '.join(wrong)}"
