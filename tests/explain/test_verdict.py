@@ -27,10 +27,9 @@ def recorded() -> tuple[Recording, Landmarks]:
 
 @pytest.mark.parametrize("limit", LIMITS, ids=lambda limit: limit.code)
 def test_a_sign_beyond_its_limit_decides(limit: Limit) -> None:
-    edge, step = (limit.most, 1.01) if limit.most < inf else (limit.least, 0.99)
+    edge, way = (limit.most, 1.0) if limit.most < inf else (limit.least, -1.0)
     signs = replace(GOOD, common=12)
-    for factor, kind in ((1.0, VerdictKind.SOUND), (step, limit.kind)):
-        value = edge * factor
+    for value, kind in ((edge, VerdictKind.SOUND), (edge + way * max(0.01 * abs(edge), 1e-6), limit.kind)):
         changed = {"sigma_m": value * GOOD.size_m} if limit.sign == "sigma_share" else {limit.sign: value}
         assert judge_signs(replace(signs, **changed)).kind is kind
 
