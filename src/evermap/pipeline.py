@@ -221,6 +221,7 @@ def run_localization(
         ConfigError: `slam.unknown_ids`: that is not causal.
         DataError: the map is empty, ranges come without bearings, or the robot's place in it could not be found.
     """
+    from evermap.explain.verdict import with_verdict
     from evermap.maps import vicinity
     from evermap.maps.sessions import believe, session, spatial
     from evermap.slam import check, intake
@@ -244,6 +245,7 @@ def run_localization(
         joint = living.covariance_m2
         result = localize_in_space(recording, places, config, joint_m2=joint, realtime=realtime, progress=progress)
         found = check.odd(recording, config.slam)
+        result = with_verdict(result, recording, config.slam, living.landmarks(p_least=0.0), findings=found)
         return replace(result, warnings=(*(finding.message for finding in found), *result.warnings))
     found = check.odd(recording, config.slam)
     recording, living = session.admitted(recording, living)
@@ -251,4 +253,5 @@ def run_localization(
     places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))
     joint, believed = living.covariance_m2, intake.beliefs(recording.sensor, config.slam)
     result = localize(recording, places, *believed, config, joint_m2=joint, realtime=realtime, progress=progress)
+    result = with_verdict(result, recording, config.slam, living.landmarks(p_least=0.0), findings=found)
     return replace(result, warnings=(*(finding.message for finding in found), *result.warnings))

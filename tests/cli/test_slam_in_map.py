@@ -15,11 +15,15 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
+from evermap.config import Config
+from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
-from evermap.io import read_tum, write_native
+from evermap.io import read_native, read_tum, write_native
 from evermap.io.landmarks import write_map_csv
 from evermap.maps.store import open_store
+from evermap.runs.sessions import enter_session
+from evermap.types import Verdict, VerdictKind
 from evermap_studies.sim import BuildingConfig, BuildingSimulation, SimulatedSensor, simulate_building
 
 # pictures have tests of their own, and take most of the time
@@ -222,6 +226,44 @@ def test_of_several_sessions_the_first_that_is_read_begins_with_the_survey(
     assert "1 of 3 sessions were refused" in result.stderr
     with open_store(map_file) as store:
         assert [len(store.load(number).places) >= len(survey) for number in (1, 2, 3)] == [True] * 3
+
+
+@pytest.mark.parametrize("more", [(), ("--localize",)])
+def test_ranges_in_millimetres_leave_the_map_as_it_is(
+    copy: Path, building: BuildingSimulation, tmp_path: Path, more: tuple[str, ...]
+) -> None:
+    """As without a map: exit code 3, and what is wrong."""
+    other = building.sessions[2]
+    detections = replace(other.detections, range_m=1e3 * other.detections.range_m)
+    write_native(replace(other, detections=detections), tmp_path / "long")
+    before = digest(copy)
+    result = slam(tmp_path / "long", copy, tmp_path / "run", *more)
+    assert result.exit_code == 3, result.output
+    assert "sensor suspect: ranges seem to be in millimetres" in result.stderr.splitlines()[-1]
+    assert digest(copy) == before
+    assert run("slam", tmp_path / "long", "--out", tmp_path / "alone", *QUICK).exit_code == 3
+
+
+def test_which_verdicts_enter_is_set(recordings: list[Path], kept: tuple[Path, list[dict[str, Any]]]) -> None:
+    """A weak session with 'weak' or 'any', others with 'any'; a commit in spite of it leaves the map as it is."""
+    before = digest(kept[0])
+    with open_store(kept[0]) as store:
+        entered = enter_session(store, read_native(recordings[2]), Config())
+        entering = {kind: set[str]() for kind in VerdictKind}
+        for kind in VerdictKind:
+            judged = replace(entered.session.slam, verdict=Verdict(kind, "why"))
+            one = replace(entered, session=replace(entered.session, slam=judged))
+            for accept in ("sound", "weak", "any"):
+                config = Config.model_validate({"living": {"accept": accept}})
+                if not one.refusal(config):
+                    entering[kind].add(accept)
+                    continue
+                with pytest.raises(DataError, match="does not enter the map"):
+                    one.commit(store, config)
+    assert entering.pop(VerdictKind.SOUND) == {"sound", "weak", "any"}
+    assert entering.pop(VerdictKind.WEAK) == {"weak", "any"}
+    assert all(accept == {"any"} for accept in entering.values())
+    assert digest(kept[0]) == before
 
 
 def test_a_session_of_another_place_is_refused(copy: Path, building: BuildingSimulation, tmp_path: Path) -> None:

@@ -412,7 +412,7 @@ def _write(
     from evermap.runs.folder import write_run
     from evermap.runs.summary import RunInfo
     from evermap.viz.change_words import explanations, grew
-    from evermap.viz.verdict_words import verdict_text
+    from evermap.viz.verdict_words import cause_text, further_causes, verdict_text
 
     info = RunInfo(
         command=command_line(),
@@ -437,6 +437,8 @@ def _write(
     for finding in [*both_readings, *explanations(result), *grew(info.grown)]:
         echo(finding)
     if result.verdict is not None:
+        for cause in further_causes(result.verdict):
+            echo(f"cause: {cause_text(cause)}")
         echo(f"verdict: {verdict_text(result.verdict)}")
 
 
@@ -581,8 +583,9 @@ def _run_in_map(
     from evermap.maps.store import open_store
     from evermap.pipeline import run_localization
     from evermap.runs.sessions import at_time, begin_map, enter_session
+    from evermap.slam.check import odd, valid
     from evermap.slam.space.moving import has_traffic
-    from evermap.types import is_in_space
+    from evermap.types import VerdictKind, is_in_space
     from evermap.valid import strangers
 
     config, localize, map_file = asked.config, asked.localize, asked.map_file
@@ -614,14 +617,24 @@ def _run_in_map(
         warm_up(
             lambda: compile_kernels(unknown_ids=unknown, sessions=not localize, localize=localize, in_space=in_space)
         )
-        with progress_bar(recording.name) as progress:
-            if localize:
-                stamps = recording.frames.stamp_s
-                living = at_time(store, float(stamps[0]) if len(stamps) else 0.0)
-                result = run_localization(recording, living, config, realtime=asked.realtime, progress=progress)
-            else:
-                entered = enter_session(store, recording, config, priors=said, later=others, progress=progress)
-                result, recording = replace(entered.session.slam, changes=entered.changes), entered.session.recording
+        try:
+            with progress_bar(recording.name) as progress:
+                if localize:
+                    stamps = recording.frames.stamp_s
+                    living = at_time(store, float(stamps[0]) if len(stamps) else 0.0)
+                    result = run_localization(recording, living, config, realtime=asked.realtime, progress=progress)
+                else:
+                    entered = enter_session(store, recording, config, priors=said, later=others, progress=progress)
+                    result = replace(entered.session.slam, changes=entered.changes)
+                    recording = entered.session.recording
+        except DataError:  # as without a map, where the verdict says what was read wrongly
+            read: AnyRecording = valid(recording, config.sensor)  # type: ignore[type-var]
+            wrong = [finding.message for finding in odd(read, config.slam) if not finding.usable]
+            if not wrong:
+                raise
+            problem = f"the session was set aside: {VerdictKind.SENSOR_SUSPECT}: {'; '.join(wrong)}"
+            fail(DataError(problem, path=map_file).one_line())
+            return False
         elapsed_s = time.perf_counter() - start
         _write(out, recording, result, asked, elapsed_s, entered)
         if result.interrupted:

@@ -168,6 +168,9 @@ class Signs:
         common, moved: landmarks of the given map that were seen; the share of them that is reported as changed.
         in_map: whether a given map is the frame of the result; None without one.
         alternatives: explanations nearly as probable as the one reported.
+        n_unknown: poses and landmarks of the result that are no numbers.
+        dropped, bent_nats, lead_nats: of detections without identities (`AssociationEvidence`): share of no landmark,
+            nats for each landmark met again, and log evidence over odometry alone.
     """
 
     n_landmarks: int = 0
@@ -196,6 +199,10 @@ class Signs:
     moved: float = nan
     in_map: bool | None = None
     alternatives: int = 0
+    n_unknown: int = 0
+    dropped: float = nan
+    bent_nats: float = nan
+    lead_nats: float = nan
 
     @property
     def sigma_share(self) -> float:
@@ -221,12 +228,15 @@ def measure_signs(
     motion, turn, longer = _by_odometry(result)
     halves, halves_share = _between_halves(compared)
     used, worst = _shares_used(result.innovations)
+    blind_s, blind_share = _blind(result)
+    named = _share_named(result.innovations, as_read or recording)
+    if result.trajectory is result.online:  # a localiser leaves out what it has not recognised yet, and knows no later
+        named = blind_s = blind_share = nan
     away, name = _farthest_state(result.parameters)
     size_m, sigma_m, most_m = _extent(result)
-    blind_s, blind_share = _blind(result)
     common, moved = _of_map(result, recording, prior_map)
     inlier = result.innovations.p_inlier >= USED
-    nis = comparable_nis(result.innovations)
+    nis, found = comparable_nis(result.innovations), result.association
     fine = inlier & np.isfinite(nis)
     return Signs(
         n_landmarks=len(result.landmarks),
@@ -235,7 +245,7 @@ def measure_signs(
         nis_lag=_or_nan(lag1_autocorrelation(nis[fine], result.innovations.landmark_id[fine].astype(np.float64))),
         used=used,
         used_worst=worst,
-        named=_share_named(result.innovations, as_read or recording),
+        named=named,
         misfit=_median(compared.misfit[compared.used]),
         misfit_all=_median(compared.misfit),
         contradicted=_contradicted(result),
@@ -255,7 +265,16 @@ def measure_signs(
         moved=moved,
         in_map=None if prior_map is None else result.landmarks.frame == "prior_map",
         alternatives=len(result.alternatives),
+        n_unknown=_count_unknown(result),
+        dropped=nan if found is None else found.dropped,
+        bent_nats=nan if found is None else found.nats_per_closure,
+        lead_nats=nan if found is None else found.lead_nats,
     )
+
+
+def _count_unknown(result: SlamResult) -> int:
+    tables = result.trajectory.pose_world_robot, result.landmarks.position_m
+    return sum(int(np.count_nonzero(~np.isfinite(table).all(axis=1))) for table in tables)
 
 
 def _or_nan(value: float | None) -> float:

@@ -17,7 +17,7 @@ from evermap.viz.change_words import explanations, grew, near_alternatives
 from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.run_figures import has_prior, quantity
 from evermap.viz.style import NamedFigure
-from evermap.viz.verdict_words import innovations_text, verdict_text
+from evermap.viz.verdict_words import cause_text, further_causes, innovations_text, verdict_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +102,7 @@ def _verdict(result: SlamResult) -> str:
     rows = [
         (escape(one.code), escape(one.message), "beyond" if one.is_alarming else "fine") for one in verdict.symptoms
     ]
-    causes = "".join(
-        f"<li>{escape(one.message)}{f'; <code>{escape(one.fix)}</code>' if one.fix else ''}</li>"
-        for one in verdict.causes
-    )
+    causes = "".join(f"<li>{escape(cause_text(one))}</li>" for one in further_causes(verdict))
     asked = table(("symptom", "here, and what is expected", ""), rows) if rows else ""
     return (
         f'<p class="note"><strong>{escape(verdict_text(verdict))}</strong></p>'

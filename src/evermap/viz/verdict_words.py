@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from evermap.types import Verdict
+    from collections.abc import Sequence
+
+    from evermap.types import Cause, Verdict
 
 ABOUT_RIGHT = 1.4, 2.6
 """Mean innovations, of 2 numbers each, within which standard deviations are right to 15 %."""
@@ -16,6 +19,17 @@ FAR_OFF = 4.0
 def verdict_text(verdict: Verdict) -> str:
     """Return a verdict in one line: 'lost: ...'."""
     return f"{verdict.kind}: {verdict.message}"
+
+
+def further_causes(verdict: Verdict) -> Sequence[Cause]:
+    """Return the causes that the line of the verdict does not have: not sure, or put right by the estimator."""
+    return [cause for cause in verdict.causes if cause.message not in verdict.message]
+
+
+def cause_text(cause: Cause) -> str:
+    """Return a cause in one line: 'stamps of front are 0.12 s late (p = 0.98); detections.csv of front: ...'."""
+    sure = f" (p = {cause.probability:.2f})" if isfinite(cause.probability) else ""
+    return f"{cause.message}{sure}{f'; {cause.fix}' if cause.fix else ''}"
 
 
 def innovations_text(mean: float) -> str:

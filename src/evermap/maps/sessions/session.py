@@ -458,9 +458,7 @@ def explained(
     best = found.best.solution
     if not found.causes:
         return best.visit, best.result, inputs
-    why = tuple(f"{cause.message} (p = {cause.probability:.2f}); {cause.fix}" for cause in found.causes)
-    result = replace(best.result, causes=found.causes, warnings=(*best.result.warnings, *why))
-    return best.visit, result, found.best.inputs
+    return best.visit, replace(best.result, causes=found.causes), found.best.inputs
 
 
 def with_causes(session: Session, living: LivingMap, config: Config) -> Session:
@@ -475,9 +473,7 @@ def with_causes(session: Session, living: LivingMap, config: Config) -> Session:
         causes = explained(given, config, ())[1].causes
     except (DataError, NumericalError):
         return session
-    why = tuple(f"{cause.message} (p = {cause.probability:.2f}); {cause.fix}" for cause in causes)
-    slam = replace(session.slam, causes=causes, warnings=(*session.slam.warnings, *why))
-    return replace(session, slam=slam)
+    return replace(session, slam=replace(session.slam, causes=causes))
 
 
 def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult:
