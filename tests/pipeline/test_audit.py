@@ -364,3 +364,15 @@ def test_drives_on_an_official_field(shared_data: Path, tmp_path: Path, case: st
     assert {entry.label.partition("#")[0] for entry in found.faults} == {"12"}
     (entry,) = found.faults  # stale, or a second tag of its number where frames of both places are mixed
     assert entry.position_m == pytest.approx([1.66, 1.23, 1.485], abs=0.05)
+
+
+def test_the_plan_of_an_audit_that_saw_nothing_shows_the_map() -> None:
+    """No drive that can be trusted leaves no path and no entry seen."""
+    from evermap.viz.audit_figure import PlanEntry, draw_audit
+
+    nothing = np.full(2, np.nan)
+    places = [np.array([0.0, 1.0]), np.array([4.0, 3.0])]
+    unseen = [PlanEntry(str(k), "unseen", at, nothing, np.eye(2), None, None, "") for k, at in enumerate(places)]
+    axes = draw_audit(unseen, [], "Audit").figure.axes[0]
+    low, high = np.sort([axes.get_xlim(), axes.get_ylim()], axis=1).T
+    assert all((low < at).all() and (at < high).all() for at in places)

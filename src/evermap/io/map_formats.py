@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import math
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +18,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.geometry import se3
+from evermap.io.file_kinds import kind_of_file
 from evermap.io.files import content_of, write_atomic
 from evermap.io.landmarks import (
     about_map,
@@ -189,8 +188,9 @@ def format_of(data: bytes, path: Path) -> MapFormat:
     for kind in MAP_FORMATS:
         if kind.is_one(data, text):
             return kind
-    if other := _other_kind(data, text):
-        raise InputError(f"is {other[0]}, not a map of landmarks", path=path, hint=other[1])
+    other = kind_of_file(path, data)
+    if other is not None and other.map_hint is not None:
+        raise InputError(f"is {other.what}, not a map of landmarks", path=path, hint=other.map_hint)
     ending = Path(path.name.lower().removesuffix(".gz")).suffix
     for kind in MAP_FORMATS:
         if ending in _ENDINGS.get(kind.name, ()):
@@ -207,50 +207,6 @@ def _text(data: bytes) -> str:
         return data.decode("utf-8")
     except UnicodeDecodeError:
         return ""
-
-
-_OTHERS = (
-    (rb"SQLite format 3\0", "a database (a living map?)", "evermap map export FILE --out map.csv"),
-    (rb"version https://git-lfs", "a pointer of Git LFS", "git lfs pull, which downloads the file itself"),
-    (rb"\s*<(?:!doctype|html)", "a web page", "download the file itself"),
-    (rb"\s*<\?xml|\s*<sdf|\s*<robot", "XML", "a table with id, x, y"),
-    (rb"(?:VERTEX|EDGE)_|VERTEX2|EDGE2|VERTEX3|EDGE3", "a pose graph (g2o or TORO)", "it is a recording, no map"),
-    (rb"#ROSBAG|\x89MCAP", "a bag of ROS", "evermap slam, which makes a map of it"),
-    (rb"PK\x03\x04", "a zip", "unpack it, and name the map in it"),
-    (rb"\x89PNG|\xff\xd8\xff|P[25]\s", "an image", "a table with id, x, y"),
-    (rb"%YAML:1\.0", "a calibration of OpenCV", "a table with id, x, y"),
-)
-"""Beginnings of files that are no maps, what they are, and what to do."""
-
-
-def _other_kind(data: bytes, text: str) -> tuple[str, str] | None:
-    head = data.removeprefix(b"\xef\xbb\xbf")[:200]
-    for start, what, hint in _OTHERS:
-        if re.match(start, head, re.IGNORECASE):
-            return what, hint
-    lines = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    if len(lines) > 1 and all(len(cells) == 8 and _are_numbers(cells) for cells in lines[:20]):
-        return "a trajectory (TUM)", "a table with id, x, y"
-    if len(lines) > 1 and all(len(cells) == 12 and _are_numbers(cells) for cells in lines[:20]):
-        return "a trajectory (KITTI)", "a table with id, x, y"
-    if text.lstrip()[:1] == "{":
-        try:
-            document = json.loads(text)
-        except (ValueError, RecursionError):
-            return None
-        if isinstance(document, dict) and "tags" not in document:
-            keys = ", ".join(list(document)[:5]) or "nothing"
-            return f"JSON with {keys}", "GeoJSON with features, or a field layout of WPILib with tags and field"
-    if re.search(r"(?m)^image\s*:", text) and re.search(r"(?m)^resolution\s*:", text):
-        return "a map of cells (Nav2)", "a table with id, x, y"
-    return None
-
-
-def _are_numbers(cells: Sequence[str]) -> bool:
-    try:
-        return all(math.isfinite(float(cell)) for cell in cells)
-    except ValueError:
-        return False
 
 
 def correct_map(file: SurveyFile, corrections: Iterable[Correction]) -> bytes:

@@ -88,6 +88,7 @@ def draw_audit(entries: Sequence[PlanEntry], paths: Sequence[FloatArray], title:
     need = np.concatenate(
         [need.reshape(-1, 2)[np.isfinite(need.reshape(-1, 2)).all(axis=1)], *(p[:, :2] for p in paths)]
     )
+    need = need if len(need) else every  # no drive could be trusted: nothing was seen
     low, high = need.min(axis=0), need.max(axis=0)
     inside = (every >= low - 0.5 * (high - low) - 1.0) & (every <= high + 0.5 * (high - low) + 1.0)
     every = every[inside.all(axis=1)]
