@@ -9,9 +9,11 @@ import pytest
 
 from evermap import run_session, run_slam
 from evermap.config import Config
+from evermap.errors import NumericalError
 from evermap.geometry.rigid import rigid
 from evermap.geometry.se2 import transform as transform_plane
 from evermap.geometry.se3 import transform as transform_space
+from evermap.maps.sessions.planar import PlanarVisit
 from evermap.types import AnyRecording, Cause, Landmarks, SlamResult
 
 from .worlds import SIZE_M, World
@@ -170,3 +172,17 @@ def test_exchanged_focal_lengths_are_named() -> None:
     result = run_slam(replace(recording, sensors=swapped), prior_map=survey)
     assert {cause.code for cause in result.causes} == {"intrinsics"}, result.causes
     assert result.changes == ()
+
+
+def test_poses_that_are_no_numbers_are_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    concluded = PlanarVisit.concluded
+
+    def nowhere(visit: PlanarVisit) -> SlamResult:
+        result = concluded(visit)
+        poses = result.trajectory.pose_world_robot.copy()
+        poses[len(poses) // 2 :] = np.nan
+        return replace(result, trajectory=replace(result.trajectory, pose_world_robot=poses))
+
+    monkeypatch.setattr(PlanarVisit, "concluded", nowhere)
+    with pytest.raises(NumericalError, match="no numbers"):
+        run_slam(World().plane(), without_causes())

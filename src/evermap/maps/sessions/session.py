@@ -437,9 +437,12 @@ def explained(
 
     def under(given: Inputs, **more: Any) -> SessionSolution[Visit]:
         visit = solved(given.recording, config, given.prior_map, remarks, **more)
+        result = visit.concluded()
+        if not np.isfinite(result.trajectory.pose_world_robot).all():
+            raise NumericalError("the solution has poses that are no numbers", hint="check units, mounts and stamps")
         if isinstance(visit, PlanarVisit):
-            return SessionSolution(visit, visit.solved, visit.concluded())
-        return SessionSolution(visit, SpatialSession(visit.intake, visit.solved), visit.concluded())
+            return SessionSolution(visit, visit.solved, result)
+        return SessionSolution(visit, SpatialSession(visit.intake, visit.solved), result)
 
     told = list[str]()
     try:
