@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from evermap.estimate.innovations import lag1_autocorrelation
 from evermap.metrics.consistency import (
     chi2_interval,
     chi2_quantile,
-    lag1_autocorrelation,
     nees,
     running_mean,
     share_in_band,

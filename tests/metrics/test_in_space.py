@@ -14,9 +14,9 @@ from scipy.special import gammaln, logsumexp
 from synthetic_run import make_spatial_run, spatial_trajectory, spiral_stair
 
 from evermap.errors import DataError
+from evermap.estimate.innovations import comparable_nis
 from evermap.geometry import se3
 from evermap.geometry.group import PLANE, SPACE, group_of
-from evermap.metrics.consistency import comparable_nis
 from evermap.metrics.landmarks import evaluate_landmarks
 from evermap.metrics.summary import compare_with_truth, metrics_dict
 from evermap.metrics.trajectory import align_points, align_poses, drift_per_metre, evaluate_trajectory, interpolate

@@ -12,8 +12,8 @@ from math import nan
 
 import numpy as np
 
+from evermap.estimate.innovations import comparable_nis, lag1_autocorrelation
 from evermap.geometry import se2, se3
-from evermap.metrics.consistency import comparable_nis, lag1_autocorrelation
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evermap.errors import MissingExtraError
+from evermap.estimate.innovations import comparable_nis
 from evermap.geometry import se3
 from evermap.geometry.group import group_of
 from evermap.geometry.upright import move_map
-from evermap.metrics.consistency import chi2_interval, comparable_nis
+from evermap.metrics.consistency import chi2_interval
 from evermap.metrics.summary import Evaluation, compare_with_truth
 from evermap.types import (
     AnyRecording,

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from evermap.estimate.innovations import comparable_nis
 from evermap.geometry.group import PLANE, group_of
-from evermap.metrics.consistency import chi2_interval, chi2_quantile, comparable_nis, running_mean
+from evermap.metrics.consistency import chi2_interval, chi2_quantile, running_mean
 from evermap.metrics.summary import Evaluation
 from evermap.metrics.trajectory import PoseErrors
 from evermap.types import AnyRecording, Clock, FloatArray, ParameterEstimate, SlamResult, stamp_text
