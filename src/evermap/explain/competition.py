@@ -9,7 +9,7 @@ may be added. Trials are pure functions of the inputs, so one that loses leaves 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
@@ -45,6 +45,8 @@ SURE = 0.99
 """Probability from which a delay is told as a cause."""
 INLIER, FEWER = 0.5, 0.7
 """Probability from which a detection is no outlier, and share of the outliers that a cause must leave at most."""
+CHANGES = "changes"
+"""Symptom of a session in which landmarks changed."""
 OF_LANDMARKS = frozenset({ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED})
 
 
@@ -128,7 +130,7 @@ def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tup
         if usual > rules.innovations:
             found.append("innovations")
     if any(change.kind in OF_LANDMARKS for change in result.changes):
-        found.append("changes")
+        found.append(CHANGES)
     twice = [one for one, name in result.landmarks.names.items() if "#" in str(name)]
     hits = result.landmarks.n_hits
     if twice and hits[np.isin(result.landmarks.landmark_id, twice)].sum() > rules.rejected * hits.sum():
@@ -169,16 +171,21 @@ def explain(
 
     Without symptoms the solution is returned as it is.
     """
-    rules = config.explain
+    rules, screens = config.explain, (_plain, _screen_continuous)  # what costs nothing first
+    if solution is not None:
+        symptoms, changed = find_symptoms(solution.result, inputs, config), count_changed(solution.result)
+        if not symptoms:
+            sound = Trial(inputs, solution, (), math.nan, 1.0)
+            return Explained(sound, find_delays(solution.result, rules.late_s))
+        if symptoms == (CHANGES,) and changed < rules.fewest_changed:
+            screens = screens[:1]
     base = None if solution is None else _trial(inputs, solution, ())
-    if base is not None and solution is not None and not find_symptoms(solution.result, inputs, config):
-        return Explained(base, find_delays(solution.result, rules.late_s))
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
     budget = _Budget(rules.most_solutions)
     weighed = [] if base is None else [base]
     best = base
     for _ in range(rules.most_causes):
-        found = _next_cause(best, inputs, solve_under, config, budget, weighed)
+        found = _next_cause(best, inputs, solve_under, config, budget, weighed, screens)
         if found is None:
             break
         best = _without_needless(found, inputs, solve_under, budget, weighed)
@@ -218,8 +225,9 @@ def _next_cause(
     config: SlamConfig,
     budget: _Budget,
     weighed: list[Trial[VisitT]],
+    screens: Sequence[Callable[..., list[tuple[float, Suspect, float]]]],
 ) -> Trial[VisitT] | None:
-    """Return the best trial with one more cause; None if none is better."""
+    """Return the best trial with one more cause that a screen lets through; None if none is better."""
     rules, inputs = config.explain, given if best is None else best.inputs
     taken = () if best is None else best.taken
     known = {(one.suspect.code, one.suspect.subject) for one in taken}
@@ -229,7 +237,7 @@ def _next_cause(
     def ahead(trial: Trial[VisitT]) -> float:
         return trial.evidence if best is None else trial.beats(best)
 
-    for screen in (_plain, _screen_continuous):  # what costs nothing first
+    for screen in screens:
         asked = _diverse(screen(best, inputs, suspects, config), rules.most_tried, tried)
         made = (_solve_trial(inputs, taken, suspect, state, solve_under, budget) for suspect, state in asked)
         trials = sorted((trial for trial in made if trial is not None), key=ahead, reverse=True)
@@ -245,11 +253,16 @@ def _next_cause(
     return winner
 
 
+def count_changed(result: SlamResult) -> int:
+    """Return the number of landmarks that are told to have changed."""
+    return len({one for change in result.changes for one in change.landmark_ids})
+
+
 def _relieves(trial: Trial[VisitT], best: Trial[VisitT], config: SlamConfig) -> bool:
     """Return whether a trial has fewer symptoms, fewer landmarks that are told to have changed, or rejects far less."""
     was, now = best.solution.result, trial.solution.result
     before, after = find_symptoms(was, best.inputs, config), find_symptoms(now, trial.inputs, config)
-    changed = [len({one for change in result.changes for one in change.landmark_ids}) for result in (was, now)]
+    changed = [count_changed(result) for result in (was, now)]
     rejected = [float(np.mean(result.innovations.p_inlier < INLIER)) for result in (was, now)]
     return len(after) < len(before) or changed[1] < changed[0] or rejected[1] < FEWER * rejected[0]
 

@@ -162,7 +162,7 @@ class Signs:
         longer: motion by the trajectory over that by odometry.
         away, away_name: standard deviations by which the calibration state farthest from its prior is off.
         size_m: extent of trajectory and map.
-        sigma_m: root mean square of the standard deviations of positions; `sigma_most_m` the largest.
+        sigma_m: median of the standard deviations of positions; `sigma_most_m` the largest.
         sigma_share: `sigma_m` over the size.
         blind_s, blind_share: longest time without a used detection, in seconds and as a share of the drive.
         common, moved: landmarks of the given map that were seen; the share of them that is reported as changed.
@@ -381,7 +381,7 @@ def _farthest_state(parameters: tuple[ParameterEstimate, ...]) -> tuple[float, s
 
 
 def _extent(result: SlamResult) -> tuple[float, float, float]:
-    """Return the diagonal of trajectory and map, and root mean square and maximum of the positions' sigmas."""
+    """Return the diagonal of trajectory and map, and median and maximum of the positions' sigmas."""
     path, dim = result.trajectory, result.landmarks.position_m.shape[1]
     if not len(path):
         return nan, nan, nan
@@ -389,7 +389,7 @@ def _extent(result: SlamResult) -> tuple[float, float, float]:
     variance = np.trace(path.covariance[:, :dim, :dim], axis1=1, axis2=2)
     return (
         float(np.linalg.norm(np.ptp(points, axis=0))),
-        float(np.sqrt(np.mean(variance))),
+        float(np.sqrt(np.median(variance))),
         float(np.sqrt(variance.max())),
     )
 
@@ -399,10 +399,9 @@ def _blind(result: SlamResult) -> tuple[float, float]:
     path, innovations = result.trajectory, result.innovations
     if not len(path):
         return nan, nan
-    used_s = np.sort(innovations.stamp_s[innovations.p_inlier >= USED])
-    edges = np.concatenate([path.stamp_s[:1], used_s, path.stamp_s[-1:]])
-    longest = float(np.diff(edges).max(initial=0.0))
-    lasted = float(path.stamp_s[-1] - path.stamp_s[0])
+    used_s = innovations.stamp_s[innovations.p_inlier >= USED]
+    edges = np.sort(np.concatenate([path.stamp_s[[0, -1]], used_s]))  # some poses may not have been found
+    longest, lasted = float(np.diff(edges).max()), float(edges[-1] - edges[0])
     return longest, longest / lasted if lasted > 0.0 else nan
 
 
