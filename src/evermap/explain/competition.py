@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Generic, TypeVar
+from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -109,6 +109,8 @@ class Explained(Generic[VisitT]):
 
 
 Solve = Callable[[Inputs], SessionSolution[VisitT]]
+Asked: TypeAlias = list[tuple[float, Suspect, float]]
+"""Causes with what they gain [nats] and the state that is tried first."""
 
 
 def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tuple[str, ...]:
@@ -171,7 +173,8 @@ def explain(
 
     Without symptoms the solution is returned as it is.
     """
-    rules, screens = config.explain, (_plain, _screen_continuous)  # what costs nothing first
+    rules = config.explain
+    screens: tuple[Callable[..., Asked], ...] = (_plain, _screen_continuous)  # what costs nothing first
     if solution is not None:
         symptoms, changed = find_symptoms(solution.result, inputs, config), count_changed(solution.result)
         if not symptoms:
@@ -225,7 +228,7 @@ def _next_cause(
     config: SlamConfig,
     budget: _Budget,
     weighed: list[Trial[VisitT]],
-    screens: Sequence[Callable[..., list[tuple[float, Suspect, float]]]],
+    screens: Sequence[Callable[..., Asked]],
 ) -> Trial[VisitT] | None:
     """Return the best trial with one more cause that a screen lets through; None if none is better."""
     rules, inputs = config.explain, given if best is None else best.inputs
