@@ -655,6 +655,10 @@ def _recording(folder: Path) -> bytes:
     return sink.getvalue()
 
 
+UNSTATED = ("aruco", "scene", "fiducials", "apriltag_ros", "aruco_ros", "alvar", "cartographer")
+"""Detectors whose types of messages an sqlite bag doesn't define."""
+
+
 def _bags(folder: Path, name: str) -> tuple[bytes, ...]:
     """A drive past two tags with every kind of detector."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "io"))
@@ -662,7 +666,7 @@ def _bags(folder: Path, name: str) -> tuple[bytes, ...]:
 
     found = []
     for detector in DETECTORS:
-        unstated = detector in ("aruco", "scene", "fiducials", "apriltag_ros") and name.endswith("_sqlite")
+        unstated = detector in UNSTATED and name.endswith("_sqlite")
         if unstated or (detector == "markers" and name.endswith(".bag")):  # of types that such a bag does not hold
             continue
         path = write(folder / name.format(detector), detector)

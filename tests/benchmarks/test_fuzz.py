@@ -14,7 +14,7 @@ FEWER = 12
 KINDS = [
     "maps", "old-maps", "models", "config", "looks-csv", "looks-parquet", "detections-csv", "detections-parquet",
     "lifetimes-csv", "lifetimes-parquet", "landmarks-csv", "landmarks-parquet", "landmarks-geojson", "recording-zip",
-    "bags-ros1", "bags-mcap", "bags-sqlite", "tum", "priors",
+    "bags-ros1", "bags-mcap", "bags-sqlite", "pose-graphs", "no-recordings", "recording-csv", "tum", "priors",
 ]  # fmt: skip
 
 
