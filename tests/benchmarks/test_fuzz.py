@@ -16,6 +16,10 @@ KINDS = [
     "lifetimes-csv", "lifetimes-parquet", "landmarks-csv", "landmarks-parquet", "landmarks-geojson", "recording-zip",
     "bags-ros1", "bags-mcap", "bags-sqlite", "pose-graphs", "no-recordings", "recording-csv", "tum", "priors",
 ]  # fmt: skip
+TOLERANT = "recording-csv"
+"""Kind of which single bad rows are left out."""
+NAMED = "no-recordings"
+"""Kind that is named for what it is, whatever its content."""
 
 
 def test_the_slice_has_every_kind(tmp_path: Path) -> None:
@@ -33,5 +37,6 @@ def test_mutated_files_give_a_line_or_what_was_written(name: str, files: int, tm
     folder.mkdir()
     counts = fuzz.run(kind, files, 1, folder)
     assert sum(counts.values()) == files
-    assert counts["line"] > files / 4
+    told = counts["line"] + (counts["other"] if name == TOLERANT else 0)
+    assert told > files / 4 or name == NAMED
     assert not counts.keys() - {"same", "other", "line"}, counts

@@ -342,6 +342,11 @@ class PlanarPairs:
         return part
 
     @property
+    def turns(self) -> bool:
+        """Whether the robot ever turns, by its odometry."""
+        return bool(np.abs(self._odometry.angular_radps).max() >= 1e-9)
+
+    @property
     def still(self) -> bool:
         """Whether the robot never moves, by its odometry."""
         driven = self._odometry
@@ -400,6 +405,9 @@ class SpatialPairs:
         part._mount = self._mount[0][rows], self._mount[1][rows]
         part._seen = self._seen[0][rows], self._seen[1][rows]
         return part
+
+    turns = True
+    """Poses hold their turns."""
 
     @property
     def still(self) -> bool:
@@ -554,6 +562,12 @@ def find_motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]
         found.append(Finding(mistake.code, mistake.message, usable=False))
         undone = mistake.after(undone)
     usual = float(np.median(off(pairs.residual(undone))))
+    if usual > settings.off and not pairs.turns:
+        message = (
+            "turn rates are zero throughout, but the landmarks turn in the sensor's view: the odometry's turning seems "
+            "to be missing (angular_radps)"
+        )
+        return [Finding("no-turning", message, usable=False)]
     if usual > settings.off:
         message = (
             f"landmarks are not static: seen again within seconds, half of them are over {usual:.2g} rad or "
