@@ -13,7 +13,7 @@ from evermap.cli.main import app
 from evermap.errors import InputError
 
 VERBS = [
-    "demo", "simulate", "check", "info", "slam", "live", "persist", "track", "view", "convert", "work", "learn",
+    "demo", "simulate", "check", "info", "slam", "audit", "live", "persist", "track", "view", "convert", "work", "learn",
     "bench",
 ]  # fmt: skip
 GROUPS = {

@@ -186,13 +186,15 @@ def enter_session(
         DataError, NumericalError: as `pipeline.run_session`.
     """
     from evermap.maps.learning import with_priors
-    from evermap.maps.sessions.session import in_its_space
+    from evermap.maps.sessions.session import check_fits, in_its_space
     from evermap.pipeline import run_session
 
     check_type(recording)
     head = store.head()
     newest = store.load(head)
     recording = in_its_space(recording, newest, config or Config())
+    if len(newest.places):
+        check_fits(recording, newest)
     config = _of_its_space(recording, config)
     gap_s, kept = (config or Config()).living.clock_gap_s, _recordings(store, head)
     _refuse_twice(store, kept, pack_recording(recording), recording, anew=gap_s is not None)

@@ -98,7 +98,7 @@ def admit_recording(recording: RecordingT, living: LivingMap) -> RecordingT:
     Raises:
         DataError: another clock than the map's, or of the plane where that is of space.
     """
-    _check_fits(recording, living)
+    check_fits(recording, living)
     names = _class_names(living, recording)
     number = np.array([names.index(name) for name in recording.class_names] + [UNKNOWN], dtype=np.int64)
     kept = ~np.isin(recording.detections.landmark_id, living.members.landmark_id[living.members.deleted])
@@ -113,7 +113,7 @@ def with_names_of(living: LivingMap, recording: AnyRecording) -> LivingMap:
     Raises:
         DataError: another clock than the map's, or of the plane where that is of space.
     """
-    _check_fits(recording, living)
+    check_fits(recording, living)
     return replace(
         living,
         class_names=_class_names(living, recording),
@@ -122,7 +122,7 @@ def with_names_of(living: LivingMap, recording: AnyRecording) -> LivingMap:
     )
 
 
-def _check_fits(recording: AnyRecording, living: LivingMap) -> None:
+def check_fits(recording: AnyRecording, living: LivingMap) -> None:
     """Refuse a recording of another space or on another clock than the map."""
     if (living.dim == 3) != is_in_space(recording):
         of = {2: "the plane", 3: "space"}
