@@ -13,8 +13,8 @@ from evermap.cli.main import app
 from evermap.errors import InputError
 
 VERBS = [
-    "demo", "simulate", "check", "info", "slam", "audit", "live", "persist", "track", "view", "convert", "work", "learn",
-    "bench",
+    "demo", "simulate", "check", "info", "slam", "audit", "live", "persist", "track", "view", "convert", "work",
+    "learn", "bench",
 ]  # fmt: skip
 GROUPS = {
     "map": [

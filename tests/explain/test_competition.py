@@ -67,6 +67,7 @@ def test_nothing_is_asked_of_a_sound_drive(kind: str, mapped: bool) -> None:
     ("kind", "code"), [("plane", "range-scale"), ("corners", "tag-size"), ("poses", "range-scale")]
 )
 @pytest.mark.parametrize("factor", [1.2, 1 / 1.15])
+@pytest.mark.slow
 def test_another_size_of_all_tags_moves_none(kind: str, code: str, factor: float) -> None:
     recording, survey = recorded(World(seed=2, longer=factor), kind)
     result = run_slam(recording, prior_map=survey)
@@ -81,6 +82,7 @@ def test_another_size_of_all_tags_moves_none(kind: str, code: str, factor: float
 
 
 @pytest.mark.parametrize("kind", ["plane", "corners"])
+@pytest.mark.slow
 def test_another_size_of_one_tag_moves_it_not(kind: str) -> None:
     recording, survey = recorded(World(seed=3, sizes={5: 1.3}), kind)
     result = run_slam(recording, prior_map=survey)
@@ -90,7 +92,7 @@ def test_another_size_of_one_tag_moves_it_not(kind: str) -> None:
     assert result.changes == ()
 
 
-@pytest.mark.parametrize("kind", ["plane", "corners"])
+@pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow)])
 def test_landmarks_that_moved_are_no_cause(kind: str) -> None:
     recording, survey = recorded(World(seed=4, moved={2: (0.5, 0.3), 9: (-0.6, 0.2)}), kind)
     result = run_slam(recording, prior_map=survey)
@@ -99,6 +101,7 @@ def test_landmarks_that_moved_are_no_cause(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["plane", "corners"])
+@pytest.mark.slow
 def test_a_map_in_another_metre_is_named(kind: str) -> None:
     recording, survey = recorded(World(seed=5), kind)
     longer = replace(survey, position_m=survey.position_m * 1.1)
@@ -138,6 +141,7 @@ def test_a_session_that_is_set_aside_says_why() -> None:
     assert [cause.code for cause in session.slam.causes] == ["turn-sign"]
 
 
+@pytest.mark.slow
 def test_a_camera_turned_by_180_degrees_is_named() -> None:
     recording, survey = recorded(World(seed=8), "corners")
     front, back = recording.sensors
@@ -151,6 +155,7 @@ def test_a_camera_turned_by_180_degrees_is_named() -> None:
 
 
 @pytest.mark.parametrize("late_s", [0.12, 0.3])
+@pytest.mark.slow
 def test_late_stamps_are_named(late_s: float) -> None:
     recording, survey = recorded(World(seed=10, late_s=late_s), "corners")
     result = run_slam(recording, prior_map=survey)
@@ -159,6 +164,7 @@ def test_late_stamps_are_named(late_s: float) -> None:
     assert result.changes == ()
 
 
+@pytest.mark.slow
 def test_wheels_of_another_radius_are_named() -> None:
     recording, survey = recorded(World(seed=11, wheels=1.05), "corners")
     result = run_slam(recording, prior_map=survey)
@@ -166,6 +172,7 @@ def test_wheels_of_another_radius_are_named() -> None:
     assert result.changes == ()
 
 
+@pytest.mark.slow
 def test_exchanged_focal_lengths_are_named() -> None:
     recording, survey = recorded(World(seed=9), "corners")
     swapped = tuple(replace(one, intrinsics=(660.0, 700.0, 640.0, 400.0)) for one in recording.sensors)

@@ -22,7 +22,7 @@ EXIT_UNTESTED = 3
 """No drive can be trusted, so nothing is said of the map."""
 
 HELP = """\
-Find the entries of a surveyed map that are wrong or stale, and write the corrected file.
+Find wrong entries of a surveyed map, and correct its file.
 
 Reads any map (WPILib, TagSLAM, fiducial_slam, rtabmap, GeoJSON, Parquet, tables with id, x, y) and one or more drives
 in it. Says of every entry where it is, since when, and how probably; what was never seen; what cannot be decided, and

@@ -49,7 +49,7 @@ def describe_doubts(evidence: AssociationEvidence, settings: AssociationConfig) 
         )
     if evidence.nats_per_closure > settings.bent_nats:
         found.append(
-            f"landmarks that are seen again contradict the odometry, by {evidence.nats_per_closure:.1f} nats each (1 is "
+            f"landmarks seen again contradict the odometry, by {evidence.nats_per_closure:.1f} nats each (1 is "
             f"right; {evidence.n_closures} of them): some are probably mistaken for others"
         )
     if evidence.dropped > settings.dropped_share:
