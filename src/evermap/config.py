@@ -641,10 +641,6 @@ class ExplainConfig(Section):
     states: Positive = key(4.0, "standard deviations of a calibration state from its prior from which causes are asked")
     noise: Positive = key(3.0, "factor of a noise level on what is stated from which causes are asked")
     late_s: Positive = key(0.1, "delay of a clock from which it is told as a cause, though estimated anyway [s]")
-    fewest_changed: Count = key(
-        3,
-        "changed landmarks from which, if nothing else is odd, causes that need a solution are asked",
-    )
     map_changed: Share = key(0.4, "share of a given map that has changed from which the map itself is asked")
     lead_nats: NotNegative = key(6.0, "log evidence by which a cause must win, its price paid [nats]")
     most_causes: Count = key(2, "causes that are combined, at most")

@@ -30,6 +30,8 @@ NEAR = 2.0
 """Standard deviations within which a state is refined no further."""
 FAR = 2.5
 """Standard deviations beforehand beyond which no state is tried at once."""
+LITTLE = 0.1
+"""Standard deviations beforehand within which a state is as is usual of sensors, and no cause."""
 LEAST_SCALE, LEAST_SINGLE = 0.015, 0.05
 """Logarithm of a scale, of all or of one landmark, from which its first value is tried: smaller ones the linear test
 finds."""
@@ -176,11 +178,11 @@ def explain(
     rules = config.explain
     screens: tuple[Callable[..., Asked], ...] = (_plain, _screen_continuous)  # what costs nothing first
     if solution is not None:
-        symptoms, changed = find_symptoms(solution.result, inputs, config), count_changed(solution.result)
+        symptoms = find_symptoms(solution.result, inputs, config)
         if not symptoms:
             sound = Trial(inputs, solution, (), math.nan, 1.0)
             return Explained(sound, find_delays(solution.result, rules.late_s))
-        if symptoms == (CHANGES,) and changed < rules.fewest_changed:
+        if symptoms == (CHANGES,):  # calibrations that differ little would show in innovations, too
             screens = screens[:1]
     base = None if solution is None else _trial(inputs, solution, ())
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
@@ -439,6 +441,8 @@ def _screen_continuous(
             continue
         score = screen.score(direction, suspect.sigma**-2)
         state = float(np.clip(score.value, -FAR * suspect.sigma, FAR * suspect.sigma))
+        if abs(state) < LITTLE * suspect.sigma:  # as sensors are; a fit improves with any further number
+            continue
         gain = score.gain * screen.optimum.worth - 0.5 * math.log(max(score.information, 1e-12) * suspect.sigma**2)
         if gain + suspect.log_p > config.explain.lead_nats and LINEAR * score.gain > deficit:
             found.append((gain + suspect.log_p, suspect, state))

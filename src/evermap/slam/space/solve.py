@@ -147,7 +147,7 @@ def solve_space(
     problem, estimate = _in_measured_frame(problem, estimate, framed)
     optimum, delays = with_delays(converged(problem, estimate, noise))
     optimum = repaired(optimum)
-    if len(stated) and not problem.driven and of_points:
+    if len(stated) and not problem.driven and of_points and _is_doubtful(optimum):
         optimum = _or_by_consensus(intake, optimum, stated)
     if scale_in_map > 0.0:
         optimum = _with_scale_of_map(optimum, scale_in_map)
