@@ -131,7 +131,7 @@ def test_it_reads_back_and_its_history_is_told(site: Path) -> None:
 
 def test_differences_have_three_numbers_and_an_angle(site: Path) -> None:
     assert said("diff", site, 1)["changes"][0]["displacement_m"] == [0.0, 0.0, 1.0]
-    assert run("diff", site, 1).startswith("landmark 2 moved by (0.00, 0.00, +1.00) m between")
+    assert run("diff", site, 1).startswith("landmark 2 turned by 28.6° and moved by (0.00, 0.00, +1.00) m between")
     (back,) = said("diff", site, 2, 1)["changes"]
     np.testing.assert_allclose(back["displacement_m"], [0.0, 0.0, -1.0])
     assert back["rotation_rad"] == pytest.approx(0.5)
@@ -182,7 +182,9 @@ def test_why_and_show_tell_it(site: Path, tmp_path: Path) -> None:
     assert shown[1]["sigma_m"] == pytest.approx(np.sqrt(np.trace(own) / 3))
     assert "(3.00, 1.00, 2.20)" in run("show", site)
     assert picture.stat().st_size > 10_000
-    assert "revision 2: landmark 2 moved by (0.00, 0.00, +1.00) m" in run("why", site, 2, "--figure", picture)
+    assert "revision 2: landmark 2 turned by 28.6° and moved by (0.00, 0.00, +1.00) m" in run(
+        "why", site, 2, "--figure", picture
+    )
     with open_store(site) as store:
         assert "is believed to be there" in why(store, 2).headline
 

@@ -520,7 +520,7 @@ def _judge(given: Landmarks, row: int, heard: Sequence[_Heard]) -> AuditEntry:
     entry = _with_place(blank, given, row, place)
     entry = replace(entry, probability=p_wrong, n_hits=sum(word.n_hits for word in words))
     change = words[since].change
-    within = change is not None and change.stamp_from_s > words[since].first_s
+    within = change is not None and math.isfinite(change.stamp_from_s)
     if p_wrong <= 1.0 - DECIDED:
         few = entry.n_hits < FEWEST
         reason = f"seen {entry.n_hits} time{'s' if entry.n_hits > 1 else ''}; {FEWEST} sightings decide" if few else ""
