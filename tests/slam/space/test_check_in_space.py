@@ -212,7 +212,7 @@ def test_the_command_tells_the_same(tmp_path: Path) -> None:
     assert carried.exit_code == 0
     assert json.loads(carried.stdout)["odometry"] == {}
     late = run(MISTAKES["odometry 3 s late"][0](room()))
-    assert late.exit_code == 2
+    assert late.exit_code == 3
     assert "s later than those of the detections" in late.stderr
 
 
@@ -233,7 +233,7 @@ def test_a_mistake_is_refused_by_its_name_before_anything_enters_a_map(mistake: 
     write_native(spoil(room()), tmp_path / "room")
     site = tmp_path / "site.evermap"
     run = CliRunner().invoke(app, ["slam", str(tmp_path / "room"), "--map", str(site), "--out", str(tmp_path / "out")])
-    assert run.exit_code == 2
+    assert run.exit_code == 3
     assert re.search(words, run.output)
     with open_store(str(site)) as store:
         assert not len(store.load().members)
