@@ -563,6 +563,19 @@ OWN_STATES = {
 """Calibration states that are the same number as a cause's, and the sign with which their logarithms add to it."""
 
 
+def in_given_units(trial: Trial[VisitT]) -> SlamResult:
+    """Return the result of a trial, its calibration states as they are of the recording that was given."""
+    factor = {
+        name: math.exp(sign * one.state) for one in trial.taken for name, sign in OWN_STATES.get(one.suspect.code, ())
+    }
+    states = [
+        replace(state, value=state.value * factor[state.name], sigma=state.sigma * factor[state.name])
+        if state.name in factor else state
+        for state in trial.solution.result.parameters
+    ]  # fmt: skip
+    return replace(trial.solution.result, parameters=tuple(states))
+
+
 def _with_own_state(taken: Taken, result: SlamResult) -> tuple[float, float]:
     """Return the state of a cause and its standard deviation, with what the estimator's own state adds to it."""
     state, sigma = taken.state, taken.information**-0.5 if taken.information > 0.0 else math.nan

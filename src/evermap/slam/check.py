@@ -127,7 +127,7 @@ def far_off(parameters: Sequence[ParameterEstimate], settings: CheckConfig = USU
         if away > settings.far_off:
             told.append(
                 f"{state.name} = {state.value:.3g} {state.unit}".removesuffix(" 1")
-                + f" is {away:.0f} standard deviations from the prior of sensors: {_CAUSES[state.name]}"
+                + f" is {away:.0f} standard deviations from the prior of sensors: {_CAUSES.get(state.name, 'another value than stated')}"
             )
     return tuple(told)
 
@@ -139,6 +139,8 @@ _CAUSES = {
     "range_curvature_per_rad2": "bearings in another unit",
     "bearing_bias_rad": "the sensor is turned otherwise than [mount] theta_rad says",
     "odometry_delay_s": "two clocks: odometry and detections are stamped differently",
+    "odometry_scale": "poses of the odometry or positions in another unit, or a wrong wheel radius",
+    "range_scale": "positions in another unit, or another size of tags",
     "odometry_forward_scale": "speeds or ranges in another unit, or a wrong wheel radius",
     "odometry_turn_scale": "turn rates in another unit or with the wrong sign, or a wrong wheel base",
     "odometry_askew_rad": "the sensor's angle differs from [mount] theta_rad, or the robot drives at an angle to its "

@@ -11,7 +11,7 @@ from evermap.config import Config, LivingConfig
 from evermap.errors import DataError, NumericalError
 from evermap.existence.sites import Evidence
 from evermap.explain.causes import Inputs
-from evermap.explain.competition import SessionSolution, explain
+from evermap.explain.competition import SessionSolution, explain, in_given_units
 from evermap.explain.evidence import SpatialSession
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
@@ -461,7 +461,7 @@ def explained(
     best = found.best.solution
     if not found.causes:
         return best.visit, best.result, inputs
-    return best.visit, replace(best.result, causes=found.causes), found.best.inputs
+    return best.visit, replace(in_given_units(found.best), causes=found.causes), found.best.inputs
 
 
 def with_causes(session: Session, living: LivingMap, config: Config) -> Session:
