@@ -127,11 +127,12 @@ def far_off(parameters: Sequence[ParameterEstimate], settings: CheckConfig = USU
         if away > settings.far_off:
             told.append(
                 f"{state.name} = {state.value:.3g} {state.unit}".removesuffix(" 1")
-                + f" is {away:.0f} standard deviations from the prior of sensors: {_CAUSES.get(state.name, 'another value than stated')}"
+                + f" is {away:.0f} standard deviations from the prior of sensors: {_CAUSES.get(state.name, OTHER)}"
             )
     return tuple(told)
 
 
+OTHER = "another value than stated"
 _CAUSES = {
     "range_bias_m": "ranges in another unit, or from another origin than the sensor's",
     "range_slope": "ranges or speeds in another unit",
