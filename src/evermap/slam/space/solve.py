@@ -28,10 +28,8 @@ from evermap.slam.space.drift import Drift, drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import CORNERS, POINT, STATES
-from evermap.slam.space.map_consensus import cost_in_map, laid_by_consensus
 from evermap.slam.space.marginal import log_marginal_likelihood
 from evermap.slam.space.moved_groups import find_moved_groups
-from evermap.slam.space.moved_within import MovedWithin, find_moves_within, superseded
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.repair import rejoined, repaired, split, unjumped
 from evermap.slam.space.smoother import SpatialSmoother
@@ -83,7 +81,6 @@ class SpatialSolved:
         online_pose: (N, 7) poses as each frame had them.
         online_spread: (N, 2) roughly how far off these may be [m, rad].
         step_s: (N,) seconds that each frame took.
-        moves: landmarks that moved during the session.
     """
 
     optimum: SpatialOptimum
@@ -94,12 +91,6 @@ class SpatialSolved:
     online_pose: FloatArray
     online_spread: FloatArray
     step_s: FloatArray
-    moves: tuple[MovedWithin, ...] = ()
-
-    @property
-    def left(self) -> BoolArray:
-        """(P,) places that their landmarks have left."""
-        return superseded(self.moves, len(self.identity))
 
 
 def solve_space(
@@ -147,8 +138,6 @@ def solve_space(
     problem, estimate = _in_measured_frame(problem, estimate, framed)
     optimum, delays = with_delays(converged(problem, estimate, noise))
     optimum = repaired(optimum)
-    if len(stated) and not problem.driven and of_points and _is_doubtful(optimum):
-        optimum = _or_by_consensus(intake, optimum, stated)
     if scale_in_map > 0.0:
         optimum = _with_scale_of_map(optimum, scale_in_map)
     problem = optimum.smoother.problem
@@ -158,9 +147,6 @@ def solve_space(
         if problem.ranges_share > 0.0 and not metric:
             optimum = _in_shared_metre(optimum)
         problem = optimum.smoother.problem
-    interval = (changes or ChangesConfig()).interval
-    optimum, identity, moves = find_moves_within(optimum, identity, intake.boxes, interval)
-    problem = optimum.smoother.problem
     if problem.driven and len(problem.prior.place):
         optimum = unjumped(optimum)
         problem = optimum.smoother.problem
@@ -170,9 +156,7 @@ def solve_space(
             break
         problem, estimate, identity = found
         optimum = repaired(converged(problem, estimate, optimum.noise, heavy_rounds=0))
-    left = superseded(moves, len(identity))
-    apart = left | np.isin(np.arange(len(identity)), [move.after for move in moves])
-    if (together := rejoined(optimum, identity, apart)) is not None:
+    if (together := rejoined(optimum, identity)) is not None:
         optimum = converged(*together, optimum.noise, heavy_rounds=0)
     from_map = None
     if len(stated):
@@ -189,10 +173,7 @@ def solve_space(
     optimum = replace(
         optimum, smoother=smoother, now=now, fitted=fitted
     )  # for covariances, which are no better than all this
-    number = times_of(identity)
-    for move in reversed(moves):  # the landmark is where it was last
-        number[[move.before, move.after]] = min(number[move.before], number[move.after])
-    return SpatialSolved(optimum, identity, number, from_map, delays, stepwise.pose, spread, step_s, moves)
+    return SpatialSolved(optimum, identity, times_of(identity), from_map, delays, stepwise.pose, spread, step_s)
 
 
 def fit_to_map(intake: SpatialIntake, prior_map: Landmarks | None, *, surveyed: bool = False) -> SpatialIntake:
@@ -405,18 +386,6 @@ def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[Spati
     stated[:, :3] = stated[:, :3].max(axis=1, keepdims=True)
     prior = PlacePrior(place.astype(np.int64), pose, np.maximum(stated, settings.loose_m), np.ones(len(rows)))
     return replace(problem, prior=prior, start_sigma=FREE), stated
-
-
-def _or_by_consensus(intake: SpatialIntake, optimum: SpatialOptimum, stated: FloatArray) -> SpatialOptimum:
-    """Return the optimum, or a more probable one from the session by itself laid over the map."""
-    alone = solve_space(intake, None).optimum
-    found = laid_by_consensus(optimum.smoother.problem, alone, stated)
-    if (
-        found is None
-        or found[1] > cost_in_map(optimum, stated, alone.noise) - optimum.smoother.problem.settings.repair.gain_nats
-    ):
-        return optimum
-    return found[0]
 
 
 def _is_doubtful(optimum: SpatialOptimum) -> bool:
