@@ -21,6 +21,8 @@ from evermap_studies.causes.catalogue import World, catalogue
 from evermap_studies.causes.drives import MAKES, NEXT, Drive, Reading, as_recording, simulate
 from evermap_studies.causes.judge import compare_changes, conclude, errors, make_case, solve, true_changes
 
+pytestmark = pytest.mark.slow
+
 WORLDS = catalogue()
 WRONG = [world for world in WORLDS if world.cause and world.cause != "noise"]
 MOST = 20.0
