@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from evermap.estimate.graph import Border, Graph, Layout, Room, build_structure, grouped
 from evermap.estimate.sparse.system import exhausted
-from evermap.explain.evidence import LOG_2PI, DetectionTerms, Optimum, Screen, evidence_at, log_determinant
+from evermap.explain.evidence import LOG_2PI, DetectionTerms, Optimum, Screen, evidence_at
 
 N_POSES, N_PLACES = 6, 3
 
@@ -87,7 +87,7 @@ def test_evidence_is_the_marginal_likelihood_of_a_linear_problem(problem: tuple)
     exact = multivariate_normal(cov=np.eye(len(measured)) + dense @ np.diag(1.0 / information) @ dense.T)
     assert found == pytest.approx(float(exact.logpdf(measured)), abs=1e-8)
     solved = exhausted(graph.factorised(now))
-    assert log_determinant(solved) == pytest.approx(float(np.linalg.slogdet(hessian)[1]), abs=1e-9)
+    assert solved.log_determinant == pytest.approx(float(np.linalg.slogdet(hessian)[1]), abs=1e-9)
 
 
 def test_score_is_the_step_of_one_more_number(problem: tuple) -> None:

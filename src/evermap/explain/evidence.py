@@ -132,16 +132,7 @@ def log_volume(graph: Graph[Any], now: Linear) -> float:
     information = np.maximum(graph.border.information, LEAST_INFORMATION)  # what jitter seems to say was taken off
     border = 0.5 * float(np.log(information).sum()) - 0.5 * len(information) * LOG_2PI
     count = int(graph.structure.layout.dim.sum())
-    return border + 0.5 * count * LOG_2PI - 0.5 * log_determinant(exhausted(graph.factorised(now)))
-
-
-def log_determinant(factorised: Factorised) -> float:
-    """Return the log determinant of the information on all variables."""
-    tree = factorised.system.tree
-    row = np.arange(tree.own.sum()) - np.repeat(np.cumsum(tree.own) - tree.own, tree.own)
-    diagonal = np.repeat(tree.stored[:-1], tree.own) + row * (np.repeat(tree.size, tree.own) + 1)
-    own = 2.0 * float(np.log(factorised.rows[diagonal]).sum())
-    return own + float(np.linalg.slogdet(factorised.information)[1])
+    return border + 0.5 * count * LOG_2PI - 0.5 * exhausted(graph.factorised(now)).log_determinant
 
 
 def used_rows(session: AnySession) -> IntArray:
