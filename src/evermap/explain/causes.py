@@ -122,6 +122,33 @@ def _times(state: float) -> float:
     return math.exp(state)
 
 
+# ---- in the plane and in space
+
+
+def _odometry_scale() -> Suspect:
+    return Suspect(
+        "odometry-scale", "odometry", USUAL_P, _stretch_speeds,
+        lambda s: f"the robot drives {math.exp(s):.4g} times what its odometry says: wheel radius",
+        lambda s: f"[odometry] sigma_odometer_scale = {_round_up(abs(s))}", SCALE, _times,
+    )  # fmt: skip
+
+
+def _turn_scale() -> Suspect:
+    return Suspect(
+        "turn-scale", "odometry", USUAL_P, _stretch_turns,
+        lambda s: f"the robot turns {math.exp(s):.4g} times what its odometry says: wheel base, or gyroscope",
+        _constant("odometry.csv: angular_radps"), TURN, _times,
+    )  # fmt: skip
+
+
+def _late_stamps(subject: str) -> Suspect:
+    return Suspect(
+        "clock", subject, USUAL_P, _shift_stamps,
+        lambda s: f"stamps of the detections are {abs(s):.3g} s {'late' if s > 0 else 'early'}",
+        lambda s: f"detections.csv, frames.csv: stamp_s {'-' if s > 0 else '+'} {abs(s):.3g}", DELAY_S,
+    )  # fmt: skip
+
+
 # ---- in the plane
 
 
@@ -132,21 +159,9 @@ def _in_plane(recording: Recording) -> Iterable[Suspect]:
         lambda s: f"true distances are {math.exp(s):.4g} times the ranges: another scale, or another size of tags",
         lambda s: f"[sensor] sigma_scale = {_round_up(abs(s))}", SCALE, _times,
     )  # fmt: skip
-    yield Suspect(
-        "odometry-scale", "odometry", USUAL_P, _stretch_speeds,
-        lambda s: f"the robot drives {math.exp(s):.4g} times what its odometry says: wheel radius",
-        lambda s: f"[odometry] sigma_odometer_scale = {_round_up(abs(s))}", SCALE, _times,
-    )  # fmt: skip
-    yield Suspect(
-        "turn-scale", "odometry", USUAL_P, _stretch_turns,
-        lambda s: f"the robot turns {math.exp(s):.4g} times what its odometry says: wheel base, or gyroscope",
-        _constant("odometry.csv: angular_radps"), TURN, _times,
-    )  # fmt: skip
-    yield Suspect(
-        "clock", "sensor", USUAL_P, _shift_stamps,
-        lambda s: f"stamps of the detections are {abs(s):.3g} s {'late' if s > 0 else 'early'}",
-        lambda s: f"detections.csv, frames.csv: stamp_s {'-' if s > 0 else '+'} {abs(s):.3g}", DELAY_S,
-    )  # fmt: skip
+    yield _odometry_scale()
+    yield _turn_scale()
+    yield _late_stamps("sensor")
     for axis, key in enumerate(("x_m", "y_m", "theta_rad")):
         unit, sigma = ("rad", MOUNT_RAD) if axis == 2 else ("m", MOUNT_M)
         yield Suspect(
@@ -337,26 +352,14 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
         name = recording.landmark_names.get(identity, str(identity))
         yield _one_size(name, _stretch_positions, ("id", identity), size)
     if recording.odometry is not None:
-        yield Suspect(
-            "odometry-scale", "odometry", USUAL_P, _stretch_speeds,
-            lambda s: f"the robot drives {math.exp(s):.4g} times what its odometry says: wheel radius",
-            lambda s: f"sigma_odometer_scale = {_round_up(abs(s))}", SCALE, _times,
-        )  # fmt: skip
-        yield Suspect(
-            "turn-scale", "odometry", USUAL_P, _stretch_turns,
-            lambda s: f"the robot turns {math.exp(s):.4g} times what its odometry says: wheel base, or gyroscope",
-            _constant("odometry.csv: angular_radps"), TURN, _times,
-        )  # fmt: skip
+        yield _odometry_scale()
+        yield _turn_scale()
         yield Suspect(
             "turn-sign", "odometry", USUAL_P, lambda inputs, _: _turn_by(inputs, -1.0),
             _constant("turns of the odometry seem to have the wrong sign: counter-clockwise is positive"),
             _constant("odometry.csv: angular_radps"),
         )  # fmt: skip
-        yield Suspect(
-            "clock", sensors[0].name if len(sensors) == 1 else "all sensors", USUAL_P, _shift_stamps,
-            lambda s: f"stamps of the detections are {abs(s):.3g} s {'late' if s > 0 else 'early'}",
-            lambda s: f"detections.csv, frames.csv: stamp_s {'-' if s > 0 else '+'} {abs(s):.3g}", DELAY_S,
-        )  # fmt: skip
+        yield _late_stamps(sensors[0].name if len(sensors) == 1 else "all sensors")
         yield Suspect(
             "odometry-mirrored", "odometry", RARE_P, lambda inputs, _: _mirrored_drive(inputs),
             _constant("the odometry seems mirrored: y is to the left, turns are counter-clockwise"),
