@@ -159,7 +159,7 @@ def _scaled_positions(recording: Any, factor: Any) -> Any:
     return _seen(recording, position_sensor_m=seen.position_sensor_m * factor)
 
 
-def _mirrored_positions(recording: Any) -> Any:
+def _mirror_positions(recording: Any) -> Any:
     corner = recording.detections.corner_px
     at = recording.detections.position_sensor_m * [-1.0, 1.0, 1.0]
     nan = np.full_like(corner, np.nan)
@@ -192,7 +192,7 @@ IN_SPACE: dict[str, Mistake] = {
     "positions in mm": lambda r, _: _scaled_positions(r, 1e3),
     "tags 10 % larger": lambda r, _: _scaled_positions(r, 1.1),
     "tags 30 % larger": lambda r, _: _scaled_positions(r, 1.3),
-    "positions mirrored": lambda r, _: _mirrored_positions(r),
+    "positions mirrored": lambda r, _: _mirror_positions(r),
     "camera turned 90 deg": lambda r, _: _turned_mount(r, (0.0, 0.0, HALF, HALF)),
     "camera turned 15 deg": lambda r, _: _turned_mount(r, (0.0, 0.1305, 0.0, 0.9914)),
     "two ids swapped at half time": _swapped,
@@ -211,7 +211,7 @@ WITH_ODOMETRY: dict[str, Mistake] = {
 MapMistake = Callable[[Landmarks, np.random.Generator], Landmarks]
 
 
-def _moved_map(given: Landmarks, position_m: np.ndarray) -> Landmarks:
+def _move_map(given: Landmarks, position_m: np.ndarray) -> Landmarks:
     return replace(given, position_m=position_m)
 
 
@@ -219,17 +219,17 @@ def _shuffled(given: Landmarks, rng: np.random.Generator, share: float) -> Landm
     at, some = given.position_m.copy(), np.flatnonzero(rng.random(len(given)) < share)
     size = np.ptp(at[:, :2], axis=0).max()
     at[some, :2] += rng.uniform(-0.3, 0.3, (len(some), 2)) * size
-    return _moved_map(given, at)
+    return _move_map(given, at)
 
 
 def _other_site(given: Landmarks, rng: np.random.Generator) -> Landmarks:
     low, high = given.position_m.min(axis=0), given.position_m.max(axis=0)
-    return _moved_map(given, rng.uniform(low, high + 1e-6, given.position_m.shape))
+    return _move_map(given, rng.uniform(low, high + 1e-6, given.position_m.shape))
 
 
 OF_MAP: dict[str, MapMistake] = {
-    "map mirrored": lambda m, _: _moved_map(m, m.position_m * ([1.0, -1.0, 1.0][: m.position_m.shape[1]])),
-    "map 20 % larger": lambda m, _: _moved_map(m, 1.2 * m.position_m),
+    "map mirrored": lambda m, _: _move_map(m, m.position_m * ([1.0, -1.0, 1.0][: m.position_m.shape[1]])),
+    "map 20 % larger": lambda m, _: _move_map(m, 1.2 * m.position_m),
     "a fifth of the map moved": lambda m, rng: _shuffled(m, rng, 0.2),
     "half of the map moved": lambda m, rng: _shuffled(m, rng, 0.5),
     "map of another site": _other_site,
@@ -272,7 +272,7 @@ def _of_causes(seed: int) -> Iterator[Case]:
 
 
 def _of_base(name: str, make: Made, mistakes: int) -> Iterator[Case]:
-    """Yield a base as it is, with some mistakes by turns, without and with its map."""
+    """Yield a base without and with its map: unchanged, and with some of the mistakes, in rotation."""
 
     def broken(mistake: str, kind: str) -> tuple[AnyRecording, Landmarks | None]:
         rng = np.random.default_rng(zlib.crc32(f"{name}/{kind}/{mistake}".encode()))

@@ -164,7 +164,7 @@ def run_session(
         living, found = session.with_names_of(living, alone.recording), alone.findings
         located = planar.localised(alone, living, config)
     entered = session.with_causes(session.brought_in(located, living, config.living), living, config)
-    return _judged(session.begun_with(entered, whole), living, config, found)
+    return _add_verdict(session.begun_with(entered, whole), living, config, found)
 
 
 @single_threaded()
@@ -191,10 +191,10 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
 
     living = session.with_names_of(living, alone.recording)
     entered = session.brought_in(planar.localised(alone, living, config), living, config.living)
-    return _judged(entered, living, config, alone.findings)
+    return _add_verdict(entered, living, config, alone.findings)
 
 
-def _judged(entered: Session, before: LivingMap, config: Config, found: tuple[Finding, ...]) -> Session:
+def _add_verdict(entered: Session, before: LivingMap, config: Config, found: tuple[Finding, ...]) -> Session:
     """Return a session with its verdict, beside the map as it was `before` it."""
     from evermap.explain.verdict import with_verdict
 

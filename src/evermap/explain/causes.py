@@ -361,7 +361,7 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
         )  # fmt: skip
         yield _late_stamps(sensors[0].name if len(sensors) == 1 else "all sensors")
         yield Suspect(
-            "odometry-mirrored", "odometry", RARE_P, lambda inputs, _: _mirrored_drive(inputs),
+            "odometry-mirrored", "odometry", RARE_P, lambda inputs, _: _mirror_drive(inputs),
             _constant("the odometry seems mirrored: y is to the left, turns are counter-clockwise"),
             _constant("odometry.csv: lateral_mps, angular_radps"),
         )  # fmt: skip
@@ -424,7 +424,7 @@ def _stretch_positions(inputs: Inputs, state: float, of: tuple[str, float] | Non
     )
 
 
-def _mirrored_drive(inputs: Inputs) -> Inputs:
+def _mirror_drive(inputs: Inputs) -> Inputs:
     """Return the same with the odometry mirrored left to right."""
     recording: Any = inputs.recording
     pose = recording.odometry.pose_world_robot.copy()
@@ -462,7 +462,7 @@ def _turn_within(mount: FloatArray, by: FloatArray) -> FloatArray:
     return np.asarray(se3.compose(mount, by))
 
 
-def _turned_about(axis: int, angle_rad: float, *, of_robot: bool) -> Callable[[FloatArray], FloatArray]:
+def _make_turn(axis: int, angle_rad: float, *, of_robot: bool) -> Callable[[FloatArray], FloatArray]:
     quaternion = np.zeros(4)
     quaternion[axis], quaternion[3] = math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad)
     by = se3.turn(quaternion)
@@ -477,10 +477,10 @@ def _turned_about(axis: int, angle_rad: float, *, of_robot: bool) -> Callable[[F
 
 
 _FLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
-    ("mounted looking the other way: its yaw is 180 degrees off", _turned_about(2, math.pi, of_robot=True)),
-    ("mounted upside down: its image is turned by 180 degrees", _turned_about(2, math.pi, of_robot=False)),
-    ("turned by 90 degrees to the left of its stated mount", _turned_about(2, 0.5 * math.pi, of_robot=True)),
-    ("turned by 90 degrees to the right of its stated mount", _turned_about(2, -0.5 * math.pi, of_robot=True)),
+    ("mounted looking the other way: its yaw is 180 degrees off", _make_turn(2, math.pi, of_robot=True)),
+    ("mounted upside down: its image is turned by 180 degrees", _make_turn(2, math.pi, of_robot=False)),
+    ("turned by 90 degrees to the left of its stated mount", _make_turn(2, 0.5 * math.pi, of_robot=True)),
+    ("turned by 90 degrees to the right of its stated mount", _make_turn(2, -0.5 * math.pi, of_robot=True)),
     ("to have its mount stated inversely: the robot in the sensor's frame", lambda m: np.asarray(se3.inverse(m))),
     ("to have its quaternion stated as w, x, y, z", lambda m: np.concatenate([m[:3], m[4:], m[3:4]])),
     ("mounted on the other side: the sign of y", lambda m: m * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 1.0])),
@@ -496,7 +496,7 @@ def _move_mount(inputs: Inputs, state: float, sensor: int, axis: int) -> Inputs:
             moved = mount.copy()
             moved[axis] += state
             return moved
-        return _turned_about(axis - 3, state, of_robot=True)(mount)
+        return _make_turn(axis - 3, state, of_robot=True)(mount)
 
     return _change_mount(inputs, state, sensor, how)
 

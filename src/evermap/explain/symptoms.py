@@ -91,7 +91,7 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
         read = np.where(blind[:, None], read * (range_m / length)[:, None], read)
     else:
         seen = recording.detections
-        expected = _expected_readings(pose, places.position_m[row], recording, result.parameters)
+        expected = _predict_readings(pose, places.position_m[row], recording, result.parameters)
         range_m, bearing = expected[:, 0], seen.bearing_rad[detection]
         known = np.isfinite(bearing) & ~(seen.sigma_bearing_rad[detection] >= ANY_BEARING_RAD)
         read = _points(seen.range_m[detection], np.where(known, bearing, expected[:, 1]))
@@ -106,7 +106,7 @@ def _points(range_m: FloatArray, bearing_rad: FloatArray) -> FloatArray:
     return np.asarray(range_m[:, None] * np.column_stack([np.cos(bearing_rad), np.sin(bearing_rad)]))
 
 
-def _expected_readings(
+def _predict_readings(
     pose: FloatArray, place_m: FloatArray, recording: Recording, parameters: tuple[ParameterEstimate, ...]
 ) -> FloatArray:
     """Return (K, 2) ranges and bearings as the estimated sensor reads them without noise (`slam.calibration.SPECS`)."""
@@ -227,9 +227,9 @@ def measure_signs(
     compared = compare_detections(recording, result)
     motion, turn, longer = _by_odometry(result)
     halves, halves_share = _between_halves(compared)
-    used, worst = _shares_used(result.innovations)
+    used, worst = _count_shares_used(result.innovations)
     blind_s, blind_share = _blind(result)
-    named = _share_named(result.innovations, as_read or recording)
+    named = _find_share_named(result.innovations, as_read or recording)
     if result.trajectory is result.online:  # a localiser leaves out what it has not recognised yet, and knows no later
         named = blind_s = blind_share = nan
     away, name = _farthest_state(result.parameters)
@@ -248,7 +248,7 @@ def measure_signs(
         named=named,
         misfit=_median(compared.misfit[compared.used]),
         misfit_all=_median(compared.misfit),
-        contradicted=_contradicted(result),
+        contradicted=_find_share_contradicted(result),
         halves=halves,
         halves_share=halves_share,
         motion=motion,
@@ -285,7 +285,7 @@ def _median(values: FloatArray) -> float:
     return float(np.median(values)) if len(values) >= FEWEST else nan
 
 
-def _shares_used(innovations: Innovations) -> tuple[float, float]:
+def _count_shares_used(innovations: Innovations) -> tuple[float, float]:
     """Return the share of detections with a prediction that were used, and the least of a part of the drive."""
     stamp_s, inlier = innovations.stamp_s, innovations.p_inlier >= USED
     if len(inlier) < FEWEST:
@@ -295,7 +295,7 @@ def _shares_used(innovations: Innovations) -> tuple[float, float]:
     return float(inlier.mean()), min(float(part.mean()) for part in parts)
 
 
-def _share_named(innovations: Innovations, recording: AnyRecording) -> float:
+def _find_share_named(innovations: Innovations, recording: AnyRecording) -> float:
     """Return the share of the detections with an identity that were used; nan where hardly any has one."""
     named = int(np.count_nonzero(recording.detections.landmark_id != UNKNOWN))
     used = innovations.detection[innovations.p_inlier >= USED]
@@ -304,7 +304,7 @@ def _share_named(innovations: Innovations, recording: AnyRecording) -> float:
     return len(used) / named
 
 
-def _contradicted(result: SlamResult) -> float:
+def _find_share_contradicted(result: SlamResult) -> float:
     """Return the share of landmarks that were seen often, most of whose detections were not used."""
     _, row, count = np.unique(result.innovations.landmark_id, return_inverse=True, return_counts=True)
     used = np.bincount(row, result.innovations.p_inlier >= USED, minlength=len(count))

@@ -112,15 +112,15 @@ class Correction:
 
 def number_json(text: str) -> tuple[str, list[Number]]:
     """Return a JSON text in which every number is replaced by its place in the list that is returned, too."""
-    return _numbered(_JSON, text)
+    return _find_numbers(_JSON, text)
 
 
 def number_yaml(text: str) -> tuple[str, list[Number]]:
     """Return a YAML text in which every number is replaced by its place in the list that is returned, too."""
-    return _numbered(_YAML, text)
+    return _find_numbers(_YAML, text)
 
 
-def _numbered(pattern: re.Pattern[str], text: str) -> tuple[str, list[Number]]:
+def _find_numbers(pattern: re.Pattern[str], text: str) -> tuple[str, list[Number]]:
     numbers: list[Number] = []
 
     def replaced(found: re.Match[str]) -> str:

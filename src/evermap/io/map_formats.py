@@ -200,7 +200,7 @@ def format_of(data: bytes, path: Path) -> MapFormat:
 
 
 def _text(data: bytes) -> str:
-    """A file as text, '' where it is none; its line ends and byte order mark stay."""
+    """Decode a file as UTF-8, with its line ends and byte order mark; '' for a binary file."""
     if b"\0" in data:
         return ""
     try:
@@ -223,7 +223,7 @@ def correct_map(file: SurveyFile, corrections: Iterable[Correction]) -> bytes:
         if one.landmark_id not in known or (one.like_id is not None and one.like_id not in known):
             raise InputError(f"has no landmark {one.landmark_id}", path=file.path)
     if file.format.locate is None:
-        return _corrected_parquet(file, wanted)
+        return _correct_parquet(file, wanted)
     text = file.data.decode("utf-8")
     entries, units = file.format.locate(text, file.path)
     ids = _ids_of(entries, file.landmarks)
@@ -346,7 +346,7 @@ def _of_tags(locate: Callable[[str, Path], list[FileEntry]], units: Units, about
     return read
 
 
-def _located(locate: Callable[[str, Path], list[FileEntry]], units: Units) -> Locate:
+def _make_locate(locate: Callable[[str, Path], list[FileEntry]], units: Units) -> Locate:
     return lambda text, path: (locate(text, path), units)
 
 
@@ -388,7 +388,7 @@ def _locate_geojson(text: str, _: Path) -> tuple[Sequence[FileEntry], Units]:
     ], Units()
 
 
-def _corrected_parquet(file: SurveyFile, corrections: Sequence[Correction]) -> bytes:
+def _correct_parquet(file: SurveyFile, corrections: Sequence[Correction]) -> bytes:
     """The table with other numbers in some cells; its types and metadata stay."""
     table = pq.read_table(pa.BufferReader(file.data))
     names = list(table.column_names)
@@ -458,17 +458,18 @@ MAP_FORMATS: tuple[MapFormat, ...] = (
     MapFormat("parquet", "Parquet", ".parquet", lambda data, _: data[:4] == b"PAR1", _read_parquet, None, _parquet_of),
     MapFormat(
         "wpilib", "a field layout of WPILib (2022 to 2026)", ".wpilib.json", _is_layout(WPILIB_TAGS[0]),
-        _of_tags(entries_of_wpilib, WPILIB_UNITS, _Z_UP), _located(entries_of_wpilib, WPILIB_UNITS), wpilib_text, True,
+        _of_tags(entries_of_wpilib, WPILIB_UNITS, _Z_UP), _make_locate(entries_of_wpilib, WPILIB_UNITS),
+        wpilib_text, True,
     ),
     MapFormat(
         "wpilib-2027", "a field layout of WPILib (from 2027)", ".wpilib.json", _is_layout(WPILIB_TAGS[1]),
-        _of_tags(entries_of_wpilib, WPILIB_UNITS, _Z_UP), _located(entries_of_wpilib, WPILIB_UNITS), wpilib_2027_text,
-        True,
+        _of_tags(entries_of_wpilib, WPILIB_UNITS, _Z_UP), _make_locate(entries_of_wpilib, WPILIB_UNITS),
+        wpilib_2027_text, True,
     ),
     MapFormat("geojson", "GeoJSON", ".geojson", _is_geojson, parse_geojson, _locate_geojson, map_geojson),
     MapFormat(
         "tagslam", "TagSLAM", ".tagslam.yaml", lambda _, text: is_tagslam(text),
-        _of_tags(entries_of_tagslam, TAGSLAM_UNITS, {}), _located(entries_of_tagslam, TAGSLAM_UNITS), tagslam_text,
+        _of_tags(entries_of_tagslam, TAGSLAM_UNITS, {}), _make_locate(entries_of_tagslam, TAGSLAM_UNITS), tagslam_text,
         True,
     ),
     MapFormat("csv", "a table", ".csv", _is_native, _read_native, _locate_native, _csv_of),
@@ -480,11 +481,11 @@ MAP_FORMATS: tuple[MapFormat, ...] = (
               _columns_of),
     MapFormat(
         "fiducials", "a map of fiducial_slam", ".txt", lambda _, text: is_fiducials(text),
-        _of_tags(entries_of_fiducials, DEGREES, {}), _located(entries_of_fiducials, DEGREES), fiducials_text, True,
+        _of_tags(entries_of_fiducials, DEGREES, {}), _make_locate(entries_of_fiducials, DEGREES), fiducials_text, True,
     ),
     MapFormat(
         "rtabmap", "priors of rtabmap's markers", ".rtabmap.txt", lambda _, text: is_rtabmap(text),
-        _of_tags(entries_of_rtabmap, Units(), {}), _located(entries_of_rtabmap, Units()), rtabmap_text, True,
+        _of_tags(entries_of_rtabmap, Units(), {}), _make_locate(entries_of_rtabmap, Units()), rtabmap_text, True,
     ),
 )  # fmt: skip
 """All formats of maps, in the order in which they are tried. Add a new one here and nowhere else."""

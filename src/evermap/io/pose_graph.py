@@ -149,7 +149,7 @@ def read_pose_graph(path: str | Path, robot: int | None = None) -> Recording | S
         DataError: it has no landmark, or no odometry.
     """
     path, warnings = Path(path), list[str]()
-    graph = _parsed(*_content(path), warnings)
+    graph = _parse_graph(*_content(path), warnings)
     chain = _chain(graph, robot, path)
     if not any(graph.of(kind) for kind in ("sighting", "polar", "bearing", "range")):
         edges = f"{counted(len(graph.poses) or len(chain), 'pose')} and {counted(len(graph.of('move')), 'edge')}"
@@ -204,7 +204,7 @@ POSE_GRAPH = Reader(
 # ------------------------------------------------------------------------------------------------- what the lines say
 
 
-def _parsed(data: bytes, path: Path, warnings: list[str]) -> _Graph:
+def _parse_graph(data: bytes, path: Path, warnings: list[str]) -> _Graph:
     lines = decode_text(data, path).split("\n")
     rows = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip() and line.lstrip()[0] != "#"]
     graph, unknown = _Graph(path, _has_stamps(rows)), Counter[str]()
@@ -490,7 +490,7 @@ def _in_plane(
         truth=truth,
         true_landmarks=_survey(graph, names, clock),
         clock=clock,
-        measurements=_measured(aimed, ranged, row, stamp_s, names),
+        measurements=_make_measurements(aimed, ranged, row, stamp_s, names),
     )
 
 
@@ -549,7 +549,7 @@ def _in_space(
         truth=truth,
         true_landmarks=_survey(graph, names, clock),
         clock=clock,
-        measurements=_measured([], _seen(graph, "range", row), row, stamp_s, names),
+        measurements=_make_measurements([], _seen(graph, "range", row), row, stamp_s, names),
     )
 
 
@@ -569,7 +569,7 @@ def _covariances(edges: Sequence[_Edge], of_covariance: bool) -> FloatArray:
     return found
 
 
-def _measured(
+def _make_measurements(
     aimed: Sequence[_Edge], ranged: Sequence[_Edge], row: dict[Key, int], stamp_s: FloatArray, names: dict[int, str]
 ) -> tuple[Measurements, ...]:
     """Return bearings and ranges that come beside other detections."""

@@ -109,7 +109,7 @@ def draw_audit(entries: Sequence[PlanEntry], paths: Sequence[FloatArray], title:
         "The map from above, in its own frame. Arrows lead from where the map has an entry to where it is; bent ones "
         "join entries that stand in each other's place. Below, what moved or turned, close up: the diamond is the map, "
         "the solid dot is where it stands, with its 2σ ellipse; lines show to where a tag faces, "
-        "and in the corner is how it is turned about that, as one sees it who stands before it."
+        "and in the corner is how it is turned about its normal, viewed from the front."
     )
     return NamedFigure("audit", figure, title, caption)
 
@@ -207,7 +207,7 @@ def _draw_close_up(axes: Axes, one: PlanEntry) -> None:
 
 
 def _draw_face(axes: Axes, one: PlanEntry, colour: str) -> None:
-    """How a tag is turned about its own axis, as one who stands before it sees it: in the corner of its close-up."""
+    """Draw, in the corner of a close-up, how a tag is turned about its normal, viewed from the front."""
     if one.before_turn is None or one.after_turn is None:
         return
     poses = [np.append(np.zeros(3), turn) for turn in (one.before_turn, one.after_turn)]
