@@ -1,10 +1,10 @@
-"""A yard with posts whose layout is known: a robot drives through it and reads ranges and bearings, or ranges alone."""
+"""A yard with posts whose layout is known: a robot drives through it and reads ranges and bearings."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from evermap.types import UNKNOWN, Detections, Frames, Landmarks, Odometry, Recording, Sensor, SensorKind, Trajectory
+from evermap.types import UNKNOWN, Detections, Frames, Landmarks, Odometry, Recording, Sensor, Trajectory
 
 SIZE_M = np.array([16.0, 8.0])
 ODOMETRY_S, FRAME_S = 0.02, 0.1
@@ -42,31 +42,6 @@ def yard(
     return _recording(f"yard {seed}", stamp_s, pose, rows, frame, name, range_m, bearing, post, sensor, odometry)
 
 
-def mown_yard(
-    seed: int, *, longer: float = 1.069, noise: float = 0.01, seconds: float = 240.0, sigma_m: float = 0.1
-) -> Recording:
-    """Make a drive among four anchors at the corners: ranges alone, that are too long, twice a second.
-
-    Args:
-        seed: of everything.
-        longer: measured over true ranges.
-        noise: of the odometry's velocities, whose scale is exact.
-        seconds: how long.
-        sigma_m: noise of ranges.
-    """
-    random = np.random.default_rng(seed)
-    stamp_s, pose = _drive(random, seconds, slower=0.35)
-    post = np.array([[-1.0, -1.0], [17.0, -0.5], [16.5, 9.0], [-0.5, 8.5]])
-    rows = np.arange(0, len(stamp_s), round(0.5 / ODOMETRY_S))
-    range_m, _ = _away(pose[rows], post)
-    frame, name = np.nonzero(random.random(range_m.shape) < 0.9)
-    range_m = longer * range_m[frame, name] + sigma_m * random.normal(size=len(frame))
-    sensor = Sensor(range_max_m=30.0, kind=SensorKind.UWB)
-    odometry = _odometry(random, stamp_s, pose, noise, 1.0)
-    unsaid = np.full(len(frame), np.nan)
-    return _recording(f"mown yard {seed}", stamp_s, pose, rows, frame, name, range_m, unsaid, post, sensor, odometry)
-
-
 def layout(recording: Recording, sigma_m: float = 0.0) -> Landmarks:
     """Return the posts as a map to localise in."""
     posts = recording.true_landmarks
@@ -83,10 +58,10 @@ def position_error_m(recording: Recording, path: Trajectory) -> float:
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-def _drive(random: np.random.Generator, seconds: float, slower: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def _drive(random: np.random.Generator, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """(n,) stamps, and (n, 3) poses of a robot that drives along its front."""
     stamp_s = np.arange(0.0, seconds, ODOMETRY_S)
-    phase, rate = random.uniform(0.0, 6.28, 2), slower * np.array([0.23, 0.41]) * random.uniform(0.9, 1.1, 2)
+    phase, rate = random.uniform(0.0, 6.28, 2), np.array([0.23, 0.41]) * random.uniform(0.9, 1.1, 2)
     half = 0.5 * SIZE_M * [0.7, 0.6]
     inside = np.outer(stamp_s, rate) + phase
     at, ahead = 0.5 * SIZE_M + half * np.sin(inside), half * rate * np.cos(inside)
