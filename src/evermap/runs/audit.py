@@ -433,7 +433,7 @@ def _words(result: SlamResult, start_s: float) -> dict[int, _Word]:
                 p_moved[name] = min(p_moved.get(name, 0.0) + other.probability, 1.0)
                 if name not in told:
                     told[name] = change
-                    instead[name] = f"instead of other moves, with {_percent(other.probability)}"
+                    instead[name] = f"instead of other moves, with {format_percent(other.probability)}"
     found, mapped = {}, result.landmarks
     for row, name in enumerate(mapped.landmark_id.tolist()):
         rotation = None if mapped.rotation is None else mapped.rotation[row]
@@ -743,7 +743,8 @@ def _least(value: float) -> float:
     return value if math.isfinite(value) else 0.0
 
 
-def _percent(value: float) -> str:
+def format_percent(value: float) -> str:
+    """Return a probability as text, never as certain."""
     return "> 99 %" if value > 0.99 else "< 1 %" if value < 0.01 else f"{100 * value:.0f} %"
 
 

@@ -12,7 +12,17 @@ import numpy as np
 
 from evermap.io.map_formats import SurveyFile, correct_map, write_map_bytes
 from evermap.io.spatial import AT, QUATERNION
-from evermap.runs.audit import DECIDED, FEWEST, ORDER, Audit, AuditDrive, AuditEntry, EntryState, count_states
+from evermap.runs.audit import (
+    DECIDED,
+    FEWEST,
+    ORDER,
+    Audit,
+    AuditDrive,
+    AuditEntry,
+    EntryState,
+    count_states,
+    format_percent,
+)
 from evermap.runs.folder import RunFolder
 from evermap.runs.summary import RunInfo, summary_head
 from evermap.types import Clock, json_number, stamp_text
@@ -141,7 +151,7 @@ def _percent(entry: AuditEntry) -> str:
     p = entry.probability
     if not math.isfinite(p) or entry.state is EntryState.RIGHT:
         return "-"
-    return "> 99 %" if p > 0.99 else f"{100 * p:.0f} %"
+    return format_percent(p)
 
 
 def is_doubtful(entry: AuditEntry) -> bool:
