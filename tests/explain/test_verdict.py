@@ -34,6 +34,10 @@ def test_a_sign_beyond_its_limit_decides(limit: Limit) -> None:
         assert judge_signs(replace(signs, **changed)).kind is kind
 
 
+def test_errors_smaller_than_stated_are_no_failure() -> None:
+    assert judge_signs(replace(GOOD, nis=1e-9)).kind is VerdictKind.SOUND
+
+
 def test_a_cause_is_told_with_its_remedy_where_it_is_sure() -> None:
     size = Cause("tag-size", "all tags", "tags are 10 % larger", probability=0.99, fix="tag_size_m = 0.176")
     found = judge_signs(GOOD, causes=[size])

@@ -53,8 +53,8 @@ class Fleet:
     def upload(self, data: bytes, site: str = "ward", role: str = "upload") -> httpx.Response:
         return self("POST", f"/maps/{site}/sessions", role, content=data)
 
-    def worker(self, lease_s: float = 60.0) -> Worker:
-        return Worker(self.server.database, self.server.sites, Config(), lease_s)
+    def worker(self, lease_s: float = 60.0, config: Config | None = None) -> Worker:
+        return Worker(self.server.database, self.server.sites, config or Config(), lease_s)
 
 
 def assert_same(a: LivingMap, b: LivingMap) -> None:

@@ -13,7 +13,7 @@ from evermap.config import ChangesConfig
 from evermap.estimate.sparse.system import exhausted
 from evermap.slam.changes.evidence import compare, landmark_evidence
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.changes.weigh import MAP_FACTORS, Verdict, weigh
+from evermap.slam.changes.weigh import MAP_FACTORS, ChangePosterior, weigh
 from evermap.slam.smoother import Smoother
 
 PRIOR = ChangesConfig(p_moved=0.3, move_sigma_m=0.08)
@@ -47,9 +47,9 @@ def drawn_map_factor(rng: np.random.Generator) -> float:
     return float(np.exp(np.clip(PRIOR.map_factor_spread * rng.normal(), *np.log([MAP_FACTORS[0], MAP_FACTORS[-1]]))))
 
 
-def is_right(verdict: Verdict, moves: tuple[Move, ...]) -> bool:
+def is_right(posterior: ChangePosterior, moves: tuple[Move, ...]) -> bool:
     """These groups and no others, and each before the session or within it as it was."""
-    found = {(tuple(int(j) for j in group.members), group.window > 0) for group in verdict.groups}
+    found = {(tuple(int(j) for j in group.members), group.window > 0) for group in posterior.groups}
     return found == {(move.members, move.at_s is not None) for move in moves}
 
 
@@ -70,7 +70,7 @@ def assert_reliable(reports: list[tuple[float, bool]]) -> None:
     assert max(apart) <= 3.0
 
 
-def verdict_on_drawn_evidence(seed: int, n_windows: int) -> tuple[float, bool]:
+def posterior_on_drawn_evidence(seed: int, n_windows: int) -> tuple[float, bool]:
     """A world whose landmarks are measured by 2 cm in every window, from an unknown start."""
     rng = np.random.default_rng([seed, 5])
     moves, factor = drawn_moves(rng), drawn_map_factor(rng)
@@ -89,21 +89,21 @@ def verdict_on_drawn_evidence(seed: int, n_windows: int) -> tuple[float, bool]:
     evidence = replace(plain, position=plain.position + e, information=information)
     mean = position + factor * SIGMA_MAP_M * rng.normal(size=position.shape)
     covariance = np.tile(SIGMA_MAP_M**2 * np.eye(2), (N_LANDMARKS, 1, 1))
-    verdict = exhausted(weigh(evidence, GivenMap(mean, covariance, np.ones(N_LANDMARKS, bool)), PRIOR, n_windows))
-    return verdict.probability, is_right(verdict, moves)
+    posterior = exhausted(weigh(evidence, GivenMap(mean, covariance, np.ones(N_LANDMARKS, bool)), PRIOR, n_windows))
+    return posterior.probability, is_right(posterior, moves)
 
 
 @pytest.mark.slow
 @pytest.mark.experiment
 @pytest.mark.parametrize("n_windows", [1, 3])
 def test_probabilities_are_reliable_where_the_model_holds(n_windows: int) -> None:
-    assert_reliable([verdict_on_drawn_evidence(seed, n_windows) for seed in range(300)])
+    assert_reliable([posterior_on_drawn_evidence(seed, n_windows) for seed in range(300)])
 
 
 @pytest.mark.slow
 @pytest.mark.experiment
 @pytest.mark.xfail(
-    reason="of what a session's verdict reports with 0.88 on average, 0.76 is right: changes too small to show weigh "
+    reason="of what a session's posterior reports with 0.88 on average, 0.76 is right: changes too small to show weigh "
     "too little against 'nothing moved'",
     strict=False,
 )
