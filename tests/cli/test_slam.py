@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from evermap import run_slam
 from evermap.cli.main import app
 from evermap.cli.options import default_out
 from evermap.cli.slam import HowMoved
@@ -396,6 +397,15 @@ def test_contradicted_identities_are_told_once(in_map: bool, tmp_path: Path) -> 
     result = run("slam", folder, "--out", tmp_path / "out", *options, *QUICK)
     assert result.exit_code == 0, result.stderr
     assert result.stderr.count("whose landmark_id contradicts the frames around") == 1
+
+
+def test_errors_that_hardly_show_are_not_told(tmp_path: Path) -> None:
+    """Of the template without some of its ranges: no angle is off, whatever a factor of two in favour of one says."""
+    recording = read_recording(write_template(tmp_path / "template"))
+    assert recording.dim == 2
+    for seed in range(5):
+        kept = np.random.default_rng(seed).random(len(recording.detections)) > 0.02
+        assert not run_slam(replace(recording, detections=recording.detections[kept])).undecided
 
 
 def test_errors_that_only_show_together_are_told_with_both_readings(tmp_path: Path) -> None:

@@ -35,6 +35,8 @@ from evermap.types import (
 
 TRAJECTORY_STEP_S = 0.1
 """Maximum time between poses of the written trajectory."""
+STRONG = 20.0
+"""Bayes factor from which readings are strong evidence (Kass & Raftery 1995)."""
 LONGEST_PAUSE_S = 60.0
 """Maximum pause that is subdivided: a clock set forward by a day would give a million poses."""
 
@@ -278,7 +280,7 @@ def _shown_together(
 
 def _evident(p_needed: float, before: float) -> bool:
     """Return whether readings made it clearly more probable that a state is needed, and it probably is."""
-    return bool(p_needed >= 0.5 and p_needed * (1.0 - before) > 2.0 * before * (1.0 - p_needed))
+    return bool(p_needed >= 0.5 and p_needed * (1.0 - before) > STRONG * before * (1.0 - p_needed))
 
 
 def _levels(fit: NoiseFit) -> list[ParameterEstimate]:
