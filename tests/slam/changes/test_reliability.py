@@ -13,7 +13,7 @@ from evermap.config import ChangesConfig
 from evermap.estimate.sparse.system import exhausted
 from evermap.slam.changes.evidence import compare, landmark_evidence
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.changes.weigh import MAP_FACTORS, Verdict, weigh
+from evermap.slam.changes.weigh import MAP_FACTORS, ChangePosterior, weigh
 from evermap.slam.smoother import Smoother
 
 PRIOR = ChangesConfig(p_moved=0.3, move_sigma_m=0.08)
@@ -47,7 +47,7 @@ def drawn_map_factor(rng: np.random.Generator) -> float:
     return float(np.exp(np.clip(PRIOR.map_factor_spread * rng.normal(), *np.log([MAP_FACTORS[0], MAP_FACTORS[-1]]))))
 
 
-def is_right(verdict: Verdict, moves: tuple[Move, ...]) -> bool:
+def is_right(verdict: ChangePosterior, moves: tuple[Move, ...]) -> bool:
     """These groups and no others, and each before the session or within it as it was."""
     found = {(tuple(int(j) for j in group.members), group.window > 0) for group in verdict.groups}
     return found == {(move.members, move.at_s is not None) for move in moves}
