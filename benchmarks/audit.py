@@ -65,8 +65,8 @@ def edited(make: Make, seed: int, off_m: tuple[float, ...] = OFF_M) -> Edited:
         wrong[turned] = "wrong"
     given = replace(given, position_m=position, rotation=rotation)
     seen = recording.detections
-    recording = replace(recording, detections=rows_of(seen, seen.landmark_id != gone))
-    return Edited(recording, given[given.landmark_id != missing], wrong)
+    without: AnyRecording = replace(recording, detections=rows_of(seen, seen.landmark_id != gone))  # type: ignore[arg-type]
+    return Edited(without, given[given.landmark_id != missing], wrong)
 
 
 def measure(name: str, seed: int, profile: str | None = None) -> str:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -25,6 +25,7 @@ from evermap.pipeline import run_slam
 from evermap.show import Shown
 from evermap.types import (
     AnyRecording,
+    Cause,
     ChangeKind,
     Clock,
     FloatArray,
@@ -59,6 +60,10 @@ SIGNIFICANT = 11.3
 """Squared distance, in sigmas, from which a position or a turn is corrected: 99 % of three coordinates."""
 NEAR_M, NEAR_RAD = 0.02, 0.03
 """Least tolerance of 'the place of another entry'."""
+MAP = "map"
+"""Subject of causes that are of the map as a whole."""
+UNHEARD = "no drive judges single entries"
+"""Reason of entries where no drive can be trusted, or the map as a whole is wrong."""
 APART_S = 60.0
 """Time between drives whose clocks all start anew, by which they are told apart."""
 
@@ -152,6 +157,7 @@ class AuditDrive(Shown):
         n_detections: that it has.
         is_heard: whether its word counts.
         reason: why it does not; the verdict's line where it does.
+        of_map: what is wrong with the map as a whole (scale, unit, mirror), and what mends it; '' of none.
         sensor: what the sensor is off by, one line each, with what mends it.
         warnings: of reader and estimator.
         path_m: (N, D) where it drove, in the map.
@@ -164,6 +170,7 @@ class AuditDrive(Shown):
     n_detections: int
     is_heard: bool
     reason: str
+    of_map: str
     sensor: tuple[str, ...]
     warnings: tuple[str, ...]
     path_m: FloatArray
@@ -194,6 +201,11 @@ class Audit(Shown):
     def is_heard(self) -> bool:
         """Whether any drive could be trusted."""
         return any(drive.is_heard for drive in self.drives)
+
+    @property
+    def of_map(self) -> str:
+        """Return what is wrong with the map as a whole, and what mends it; '' if single entries are judged."""
+        return next((drive.of_map for drive in self.drives if drive.is_heard and drive.of_map), "")
 
     def corrections(self) -> list[Correction]:
         """Return what is to be written into the map's file: of entries that moved, turned or were exchanged."""
@@ -247,14 +259,20 @@ class _Word:
 
 @dataclass(frozen=True, slots=True)
 class _Heard:
-    """A drive that is trusted, with what it says by landmark."""
+    """A drive that is trusted, with what it says by landmark.
+
+    Attributes:
+        drive, words, names: the drive, what it says, and what landmarks are called.
+        p_gone, missed: probability that one is not there, and looks that missed it.
+        read: how often its number was read, but for where a second landmark with it stands.
+    """
 
     drive: AuditDrive
     words: Mapping[int, _Word]
     names: Mapping[int, str]
     p_gone: Mapping[int, float]
     missed: Mapping[int, int]
-    sighted: frozenset[int] = field(default_factory=frozenset)
+    read: Mapping[int, int]
 
 
 def audit_map(
@@ -299,12 +317,29 @@ def audit_map(
             heard.append(one)
     if len(errors) == len(drives):
         raise errors[0]
+    told, heard = _with_map_as_a_whole(told, heard)
     entries = [_judge(given, row, heard) for row in range(len(given))]
     entries = _with_exchanges(entries, given)
     entries += _missing(given, heard)
     entries.sort(key=lambda entry: (ORDER.index(entry.state), -_least(entry.distance_m), entry.landmark_id))
     clock = drives[0].clock
     return Audit(given, tuple(entries), tuple(told), clock)
+
+
+def _with_map_as_a_whole(
+    drives: Sequence[AuditDrive], heard: Sequence[_Heard]
+) -> tuple[list[AuditDrive], list[_Heard]]:
+    """Return drives, and those by which entries are judged.
+
+    Where most drives find the map as a whole to be wrong, entries are judged by none: they are all off. A few drives
+    that do are not heard.
+    """
+    off = [one for one in heard if one.drive.of_map]
+    if 2 * len(off) > len(heard):
+        return list(drives), []
+    names = [one.drive for one in off]
+    kept = [one for one in heard if not one.drive.of_map]
+    return [replace(one, is_heard=False) if any(one is other for other in names) else one for one in drives], kept
 
 
 def in_order(recordings: Sequence[AnyRecording]) -> list[AnyRecording]:
@@ -365,7 +400,7 @@ def _unheard(recording: AnyRecording, reason: str) -> AuditDrive:
     nowhere = np.zeros((0, 3 if is_in_space(recording) else 2))
     count = len(recording.detections)
     return AuditDrive(
-        recording.name, recording.source, *_span(recording), count, False, reason, (), recording.warnings, nowhere
+        recording.name, recording.source, *_span(recording), count, False, reason, "", (), recording.warnings, nowhere
     )
 
 
@@ -375,9 +410,8 @@ def _hear(recording: AnyRecording, result: SlamResult, given: Landmarks) -> _Hea
     lost = result.trajectory.frame != "prior_map" or result.landmarks.frame != "prior_map"
     reason = "" if verdict is None else verdict.message
     if lost:
-        reason = next(
-            (text for text in result.warnings if "cannot localise" in text), "it could not be laid on the map"
-        )
+        otherwise = "it could not be laid on the map" if verdict is None or verdict.kind.is_trustworthy else reason
+        reason = next((text for text in result.warnings if "cannot localise" in text), otherwise)
     trusted = verdict is None or verdict.kind.is_trustworthy or _is_usable(verdict, result, given)
     drive = AuditDrive(
         name=recording.name,
@@ -387,6 +421,7 @@ def _hear(recording: AnyRecording, result: SlamResult, given: Landmarks) -> _Hea
         n_detections=len(recording.detections),
         is_heard=not lost and trusted,
         reason=reason,
+        of_map=next((_cause_line(one) for one in result.causes if one.subject == MAP), ""),
         sensor=_sensor_lines(result),
         warnings=(*recording.warnings, *result.warnings),
         path_m=result.trajectory.pose_world_robot[:, :dim],
@@ -401,8 +436,30 @@ def _hear(recording: AnyRecording, result: SlamResult, given: Landmarks) -> _Hea
         {**recording.landmark_names, **result.landmarks.names},
         dict(zip(gone.landmark_id.tolist(), (1.0 - gone.p_exists).tolist(), strict=True)),
         dict(zip(missed[0].tolist(), missed[1].tolist(), strict=True)),
-        frozenset(np.unique(recording.detections.landmark_id).tolist()),
+        _count_read(recording, words, result.landmarks.names),
     )
+
+
+def _count_read(recording: AnyRecording, words: Mapping[int, _Word], names: Mapping[int, str]) -> dict[int, int]:
+    """Return how often each number was read, without what is explained by a second landmark with it, as '7#2'."""
+    number, count = np.unique(recording.detections.landmark_id, return_counts=True)
+    read = dict(zip(number.tolist(), count.tolist(), strict=True))
+    for key, base in _twins(names, recording.landmark_names).items():
+        if key in words and base in read:
+            read[base] -= words[key].n_hits
+    return read
+
+
+def _twins(names: Mapping[int, str], given: Mapping[int, str]) -> dict[int, int]:
+    """Return the first landmark of each that the estimator calls the second, third with its number."""
+    ids = {name: key for key, name in given.items()}
+    found = dict[int, int]()
+    for key, label in names.items():
+        stem, mark, _ = label.partition("#")
+        base = ids.get(stem, int(stem) if stem.isdecimal() else -1)
+        if mark:
+            found[key] = base
+    return found
 
 
 def _is_usable(verdict: Verdict, result: SlamResult, given: Landmarks) -> bool:
@@ -462,11 +519,8 @@ def _with_twins(words: Mapping[int, _Word], names: Mapping[int, str], given: Map
     The estimator calls the second place '7#2'. What is no farther from the first than both are uncertain is no place.
     """
     found = dict(words)
-    ids = {name: key for key, name in given.items()}
-    for key, label in names.items():
-        stem, mark, _ = label.partition("#")
-        base = ids.get(stem, int(stem) if stem.isdecimal() else -1)
-        if not mark or key not in found or base not in found:
+    for key, base in _twins(names, given).items():
+        if key not in found or base not in found:
             continue
         one, twin = found[base], found[key]
         off = twin.position_m - one.position_m
@@ -482,7 +536,7 @@ def _with_twins(words: Mapping[int, _Word], names: Mapping[int, str], given: Map
 
 def _sensor_lines(result: SlamResult) -> tuple[str, ...]:
     """What a sensor is off by: causes that were found, and calibration states that are not what is stated."""
-    lines = [f"{one.message}" + (f"; {one.fix}" if one.fix else "") for one in result.causes]
+    lines = [_cause_line(one) for one in result.causes if one.subject != MAP]
     named = {one.subject for one in result.causes} | {one.code for one in result.causes}
     for one in result.parameters:
         if not _is_off(one) or one.name in named:
@@ -490,6 +544,10 @@ def _sensor_lines(result: SlamResult) -> tuple[str, ...]:
         value = f"{one.name} = {one.value:.4g} ± {one.sigma:.2g} {one.unit if one.unit != '1' else ''}".rstrip()
         lines.append(f"{value}, stated {one.prior_mean:.4g}: {one.meaning}")
     return tuple(lines)
+
+
+def _cause_line(cause: Cause) -> str:
+    return f"{cause.message}; {cause.fix}" if cause.fix else cause.message
 
 
 def _is_off(one: ParameterEstimate) -> bool:
@@ -535,6 +593,10 @@ def _judge(given: Landmarks, row: int, heard: Sequence[_Heard]) -> AuditEntry:
     if disagree:
         where = ", ".join(disagree)
         reason = f"elsewhere in one drive, and where the map has it in {where}; another drive decides"
+        return replace(entry, state=EntryState.UNDECIDED, reason=reason)
+    hits, read = sum(word.n_hits for word in late), sum(one.read.get(name, 0) for one in sighted[since:])
+    if hits < FEWEST or (not within and 2 * hits < read):  # the one that fits may be the wrong one
+        reason = f"seen {hits} times at its place, of {read} readings of its number; more sightings decide"
         return replace(entry, state=EntryState.UNDECIDED, reason=reason)
     state = EntryState.STALE if since or within else EntryState.WRONG
     moved, turned = _what_to_correct(entry, given, row)
@@ -646,7 +708,7 @@ def _never_seen(entry: AuditEntry, given: Landmarks, row: int, heard: Sequence[_
     """An entry that no drive that counts has seen: gone, or not looked for."""
     name = entry.landmark_id
     if not heard:
-        return replace(entry, reason="no drive could be trusted")
+        return replace(entry, state=EntryState.UNDECIDED, reason=UNHEARD)
     missed = [one for one in heard if one.missed.get(name, 0)]
     p_gone = [one.p_gone.get(name, math.nan) for one in missed]
     sure = [p for p in p_gone if p >= DECIDED]
@@ -655,7 +717,7 @@ def _never_seen(entry: AuditEntry, given: Landmarks, row: int, heard: Sequence[_
         p = min(float(1.0 - np.prod([1.0 - value for value in sure])), MOST)
         reason = f"{entry.n_misses} looks at its place found nothing; remove it, or look where it went"
         return replace(entry, state=EntryState.GONE, probability=p, to_s=stamp.from_s, reason=reason)
-    if any(name in one.sighted for one in heard):
+    if any(one.read.get(name, 0) for one in heard):
         reason = "its number was read, but no reading fits a place; more sightings decide"
         return replace(entry, state=EntryState.UNDECIDED, reason=reason)
     if missed:

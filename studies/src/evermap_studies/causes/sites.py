@@ -165,7 +165,7 @@ def tagged_room(rng: np.random.Generator) -> Site:
 
 
 def racks(rng: np.random.Generator) -> Site:
-    """A hall with five racks of 30 m, 5 m apart, and fifty tags on either side of each; the way is through two lanes."""
+    """A hall with five racks of 30 m, fifty tags on either side of each; the way is through two of the lanes."""
     place, facing = [], []
     for rack in range(5):
         for side in (-1.0, 1.0):
