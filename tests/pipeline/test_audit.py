@@ -21,11 +21,13 @@ from evermap.io.map_formats import MAP_FORMATS, SurveyFile, correct_map, read_la
 from evermap.pipeline import run_slam
 from evermap.runs import audit as audit_module
 from evermap.runs.audit import Audit, EntryState, audit_map, in_order, join_drives
-from evermap.runs.audit_report import audit_dict, conclude, entry_row, write_audit
+from evermap.runs.audit_report import audit_dict, conclude, entry_row, listed_rows, quiet_lines, write_audit
 from evermap.runs.summary import RunInfo
 from evermap.types import (
     Cause,
+    ChangeKind,
     Landmarks,
+    MapChange,
     Recording,
     SensorKind,
     SlamResult,
@@ -280,7 +282,86 @@ def test_a_verdict_decides_whether_a_drive_counts(kind, causes, counts, monkeypa
     found = audit_map(surveyed(world).as_prior(0.01), [world.recording])
     assert found.drives[0].is_heard == counts
     assert conclude(found)[0] == ("right" if counts else "untested")
+    assert bool(quiet_lines(found)) == counts  # of a map that no drive judges not even 'never seen' is said
+    assert listed_rows(found) == []
+    assert {entry.state for entry in found.entries} == {EntryState.RIGHT if counts else EntryState.UNDECIDED}
     assert found.drives[0].sensor == ("tags are 3 % smaller than stated; tag_size_m = 0.097",) * causes
+
+
+@pytest.mark.parametrize(("factor", "fix"), [((3.2808, 3.2808), "0.3048"), ((1.0, -1.0), "the sign of y")])
+def test_a_map_that_is_wrong_as_a_whole_says_so_and_of_no_entry_anything(factor, fix) -> None:
+    """In feet, mirrored: all its entries are off, and what mends them is one line."""
+    recording = hall(1)
+    given = poles(recording, 1)
+    found = audit_map(replace(given, position_m=given.position_m * factor), [recording])
+    verdict, message = conclude(found)
+    assert verdict == "wrong"
+    assert message.startswith("the map as a whole is wrong: ")
+    assert fix in message
+    assert {entry.state for entry in found.entries} == {EntryState.UNDECIDED}
+    assert (listed_rows(found), quiet_lines(found), found.corrections()) == ([], [], [])
+    assert found.drives[0].sensor == ()
+
+
+def test_a_drive_that_alone_finds_the_whole_map_wrong_does_not_count(monkeypatch) -> None:
+    of_map = Cause("map-scale", "map", "true distances are 0.98 times those of the given map", fix="lengths x 0.98")
+    outdated = Verdict(VerdictKind.MAP_OUTDATED, "another scale")
+    sound = solved_corridor()
+    scaled = replace(sound, verdict=outdated, causes=(of_map,))
+    world, given = corridor(2), surveyed(corridor(2)).as_prior(0.01)
+
+    def audit_of(*results: SlamResult) -> Audit:
+        each = iter(results)
+        monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: next(each))
+        return audit_map(given, [world.recording] * len(results))
+
+    one = audit_of(sound, scaled)
+    assert [drive.is_heard for drive in one.drives] == [True, False]
+    assert (conclude(one)[0], one.of_map) == ("right", "")
+    most = audit_of(scaled, sound, scaled)
+    assert (conclude(most)[0], bool(most.of_map)) == ("wrong", True)
+    assert most.corrections() == []
+
+
+@pytest.mark.parametrize(("hits", "state"), [(1, "undecided"), (0.4, "undecided"), (0.6, "wrong")])
+def test_an_entry_is_wrong_by_most_of_the_readings_of_its_number(hits: float, state: str, monkeypatch) -> None:
+    """Of a place that few of its readings fit nothing is claimed: it may be the few that are wrong."""
+    result, world = solved_corridor(), corridor(2)
+    seen = result.landmarks
+    read = int(np.count_nonzero(world.recording.detections.landmark_id == 3))
+    count = hits if isinstance(hits, int) else int(np.ceil(hits * read))
+    assert read > 10
+    at, n_hits = seen.position_m.copy(), seen.n_hits.copy()
+    at[seen.landmark_id == 3] += [0.0, 0.0, 0.5]
+    n_hits[seen.landmark_id == 3] = count
+    change = MapChange((3,), ChangeKind.MOVED, np.nan, 0.0, (0.0, 0.0, 0.5), 0.0, 0.999)
+    moved = replace(result, landmarks=replace(seen, position_m=at, n_hits=n_hits), changes=(change,))
+    monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: moved)
+    found = audit_map(surveyed(world).as_prior(0.01), [world.recording])
+    assert told(found) == {"3": EntryState(state)}
+    (entry,) = [one for one in found.entries if one.landmark_id == 3]
+    assert (f"{count} times" in entry.reason) == (state == "undecided")
+    assert len(found.corrections()) == (state == "wrong")
+
+
+def test_a_number_on_two_landmarks_is_told() -> None:
+    """A pole has the number of another one, which the map has; its own number is not in the map."""
+    recording = hall(1)
+    names, hits = np.unique(recording.detections.landmark_id, return_counts=True)
+    one, other = (int(name) for name in names[np.argsort(-hits)][[0, 3]])
+    seen = recording.detections
+    named = np.where(seen.landmark_id == other, one, seen.landmark_id)
+    drive = replace(recording, detections=replace(seen, landmark_id=named))
+    given = poles(recording, 1)
+    found = audit_map(given[given.landmark_id != other], [drive])
+    assert not found.corrections()
+    (entry,) = [each for each in found.entries if each.landmark_id == one]
+    lines = [*quiet_lines(found), *(row[-1] for row in listed_rows(found))]
+    if entry.state is EntryState.RIGHT:
+        assert any(line.startswith(f"{one}: right, but ") for line in lines)
+    else:
+        assert entry.state is EntryState.UNDECIDED
+        assert "two landmarks" in entry.reason
 
 
 @functools.cache

@@ -54,6 +54,8 @@ MOST = 0.999
 """Greatest probability: drives by one robot share errors that no chain of independent ones knows."""
 FEWEST = 3
 """Sightings from which it is said of an entry that it is right."""
+ELSEWHERE = 0.3
+"""Share of the readings of a number that fit no place of its landmark, from which this is told: it may be on two."""
 SAME_PLACE = 16.3
 """Squared distance, in sigmas, within which two drives saw one place: 99.9 % of three coordinates."""
 SIGNIFICANT = 11.3
@@ -582,6 +584,9 @@ def _judge(given: Landmarks, row: int, heard: Sequence[_Heard]) -> AuditEntry:
     if p_wrong <= 1.0 - DECIDED:
         few = entry.n_hits < FEWEST
         reason = f"seen {entry.n_hits} time{'s' if entry.n_hits > 1 else ''}; {FEWEST} sightings decide" if few else ""
+        read = sum(one.read.get(name, 0) for one in sighted)
+        if not few and read - entry.n_hits >= max(FEWEST, ELSEWHERE * read):
+            reason = f"{read - entry.n_hits} of {read} readings of its number are of something elsewhere"
         return replace(entry, state=EntryState.UNDECIDED if few else EntryState.RIGHT, reason=reason)
     if within and change is not None:
         entry = replace(entry, from_s=change.stamp_from_s, to_s=change.stamp_to_s)
@@ -712,12 +717,15 @@ def _never_seen(entry: AuditEntry, given: Landmarks, row: int, heard: Sequence[_
     missed = [one for one in heard if one.missed.get(name, 0)]
     p_gone = [one.p_gone.get(name, math.nan) for one in missed]
     sure = [p for p in p_gone if p >= DECIDED]
-    stamp = missed[0].drive if missed else None
+    stamp, read = missed[0].drive if missed else None, sum(one.read.get(name, 0) for one in heard)
+    if read >= max(FEWEST, ELSEWHERE * entry.n_misses):  # it is there, wherever; fewer readings may be misread
+        reason = f"its number was read {read} times, but at no one place: it may be on two landmarks"
+        return replace(entry, state=EntryState.UNDECIDED, reason=reason)
     if sure and stamp is not None:
         p = min(float(1.0 - np.prod([1.0 - value for value in sure])), MOST)
         reason = f"{entry.n_misses} looks at its place found nothing; remove it, or look where it went"
         return replace(entry, state=EntryState.GONE, probability=p, to_s=stamp.from_s, reason=reason)
-    if any(one.read.get(name, 0) for one in heard):
+    if read:
         reason = "its number was read, but no reading fits a place; more sightings decide"
         return replace(entry, state=EntryState.UNDECIDED, reason=reason)
     if missed:

@@ -188,6 +188,8 @@ def quiet_lines(audit: Audit) -> list[str]:
             some = ", ".join(entry.label for entry in mine[:_FEW])
             more = f" and {len(mine) - _FEW} more" if len(mine) > _FEW else ""
             lines.append(f"{word} ({len(mine)}): {some}{more}")
+        if state is EntryState.RIGHT:
+            lines += [f"{entry.label}: right, but {entry.reason}" for entry in mine if entry.reason]
     return lines
 
 
