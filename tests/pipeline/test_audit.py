@@ -26,6 +26,7 @@ from evermap.runs.summary import RunInfo
 from evermap.types import (
     Cause,
     ChangeKind,
+    Clock,
     Landmarks,
     MapChange,
     Recording,
@@ -195,6 +196,14 @@ def test_drives_whose_clocks_start_anew_follow_each_other() -> None:
     first, second = in_order([drive, drive])
     assert second.frames.stamp_s[0] > first.frames.stamp_s[-1]
     assert np.diff(second.odometry.stamp_s) == pytest.approx(np.diff(drive.odometry.stamp_s))
+    dated = replace(
+        later(drive, 1.7e9), clock=Clock.UNIX
+    )  # a bag beside tables: the order is that in which they are given
+    first, second, third = in_order([dated, drive, later(drive, 5.0)])
+    assert {one.clock for one in (first, second, third)} == {Clock.RECORDING}
+    spans = [(one.frames.stamp_s[0], one.frames.stamp_s[-1]) for one in (first, second, third)]
+    assert 0.0 <= spans[0][0] < spans[0][1] < spans[1][0] < spans[1][1] < spans[2][0] < 400.0
+    np.testing.assert_allclose(np.diff(first.frames.stamp_s), np.diff(drive.frames.stamp_s), atol=1e-5)
     ordered = in_order([later(drive, 1000.0), drive])
     assert [one.frames.stamp_s[0] for one in ordered] == sorted(one.frames.stamp_s[0] for one in ordered)
 
@@ -362,6 +371,45 @@ def test_a_number_on_two_landmarks_is_told() -> None:
     else:
         assert entry.state is EntryState.UNDECIDED
         assert "two landmarks" in entry.reason
+
+
+def test_an_entry_whose_number_is_read_elsewhere_too_is_right_and_that_is_told(monkeypatch) -> None:
+    """Where the two are not seen at once: of each its place is right, and a third of its readings fits no place."""
+    result, world = solved_corridor(), corridor(2)
+    monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: result)
+    given, seen = surveyed(world).as_prior(0.01), world.recording.detections
+    others = np.flatnonzero(seen.landmark_id == 4)
+    own = int(result.landmarks.n_hits[result.landmarks.landmark_id == 3][0])
+    lines = []
+    for count in (own // 4, own // 2):
+        named = seen.landmark_id.copy()
+        named[others[:count]] = 3
+        drive = replace(world.recording, detections=replace(seen, landmark_id=named))
+        found = audit_map(given, [drive])
+        assert told(found) == {}
+        lines.append([line for line in quiet_lines(found) if line.startswith("3: ")])
+    few, many = lines
+    assert few == []
+    read = int(np.count_nonzero(named == 3))
+    assert many == [f"3: right, but {read - own} of {read} readings of its number are of something elsewhere"]
+
+
+def test_a_place_that_is_read_twice_only_is_not_called_wrong(monkeypatch) -> None:
+    result, world = solved_corridor(), corridor(2)
+    seen, kept = result.landmarks, world.recording.detections
+    mine = np.flatnonzero(kept.landmark_id == 3)
+    at, n_hits = seen.position_m.copy(), seen.n_hits.copy()
+    at[seen.landmark_id == 3] += [0.0, 0.0, 0.5]
+    change = MapChange((3,), ChangeKind.MOVED, np.nan, 0.0, (0.0, 0.0, 0.5), 0.0, 0.999)
+    states = []
+    for count in (2, 3):
+        n_hits[seen.landmark_id == 3] = count
+        moved = replace(result, landmarks=replace(seen, position_m=at, n_hits=n_hits.copy()), changes=(change,))
+        monkeypatch.setattr(audit_module, "run_slam", lambda *_, moved=moved, **__: moved)
+        drive = replace(world.recording, detections=rows_of(kept, np.delete(np.arange(len(kept)), mine[count:])))
+        found = audit_map(surveyed(world).as_prior(0.01), [drive])
+        states.append(told(found)["3"])
+    assert states == [EntryState.UNDECIDED, EntryState.WRONG]
 
 
 @functools.cache

@@ -108,7 +108,7 @@ def audit(
     summary = write_audit(folder, found, file, info, force=force, inputs=inputs)
     verdict, message = conclude(found)
     if as_json:
-        print_json({**summary, "written": None if write is None else str(write)})
+        print_json(summary if write is None else {**summary, "written": str(write)})
     else:
         rows = listed_rows(found)
         if rows:

@@ -345,20 +345,24 @@ def _with_map_as_a_whole(
 
 
 def in_order(recordings: Sequence[AnyRecording]) -> list[AnyRecording]:
-    """Return drives in order of time; those whose clocks start anew are put one after the other."""
+    """Return drives in order of time; those whose clocks start anew, or are of different kinds, are put one after the
+    other as they are given.
+    """
     spans = [(_span(one), one) for one in recordings]
     spans.sort(key=lambda item: item[0][0])
     starts_anew = any(
         later[0][0] < before[0][1] and not math.isnan(later[0][0]) for before, later in itertools.pairwise(spans)
     )
-    if not starts_anew or any(one.clock is not Clock.RECORDING for one in recordings):
+    clocks = {one.clock for one in recordings}
+    if len(clocks) == 1 and not (starts_anew and clocks == {Clock.RECORDING}):
         return [one for _, one in spans]
-    found, end_s = [], -math.inf
+    found, end_s = [], -APART_S if len(clocks) > 1 else -math.inf
     for one in recordings:
         start_s, last_s = _span(one)
-        shift_s = 0.0 if start_s > end_s else math.ceil(end_s + APART_S - start_s)
-        found.append(one if shift_s == 0.0 else _later(one, shift_s))
-        end_s = last_s + shift_s
+        follows = len(clocks) == 1 and start_s > end_s
+        shift_s = 0 if follows or math.isnan(start_s) else math.ceil(end_s + APART_S - start_s)
+        found.append(one if shift_s == 0 else _later(one, shift_s))
+        end_s = max(end_s, last_s + shift_s)
     return found
 
 
@@ -372,10 +376,13 @@ def _later(recording: AnyRecording, by_s: float) -> AnyRecording:
     odometry = recording.odometry
     moved: dict[str, Any] = {
         "frames": replace(recording.frames, stamp_s=recording.frames.stamp_s + by_s),
-        "odometry": None if odometry is None else replace(odometry, stamp_s=odometry.stamp_s + by_s),
+        "odometry": None
+        if odometry is None
+        else replace(odometry, stamp_s=odometry.stamp_s + by_s, clock=Clock.RECORDING),
         "measurements": tuple(replace(one, stamp_s=one.stamp_s + by_s) for one in recording.measurements),
         "truth": None,
         "robot_sightings": None,
+        "clock": Clock.RECORDING,
     }
     known = recording.__dataclass_fields__
     return replace(recording, **{name: part for name, part in moved.items() if name in known})

@@ -170,9 +170,7 @@ def is_judged(audit: Audit) -> bool:
 def listed_rows(audit: Audit, *, everything: bool = False) -> list[tuple[str, ...]]:
     """Return the rows of what is to be known: faults and what cannot be decided; or of every entry."""
     doubtful = is_judged(audit)
-    told = [
-        entry for entry in audit.entries if everything or entry.state.is_fault or (doubtful and is_doubtful(entry))
-    ]
+    told = [entry for entry in audit.entries if everything or entry.state.is_fault or (doubtful and is_doubtful(entry))]
     return [entry_row(entry, audit.clock) for entry in told]
 
 
