@@ -394,6 +394,31 @@ def test_an_entry_whose_number_is_read_elsewhere_too_is_right_and_that_is_told(m
     assert many == [f"3: right, but {read - own} of {read} readings of its number are of something elsewhere"]
 
 
+@pytest.mark.parametrize(
+    ("probability", "state"), [(0.05, "right"), (0.2, "undecided"), (0.85, "undecided"), (0.95, "wrong")]
+)
+def test_nothing_is_claimed_that_is_not_nine_times_as_probable(probability: float, state: str, monkeypatch) -> None:
+    result, world = solved_corridor(), corridor(2)
+    change = MapChange((3,), ChangeKind.MOVED, np.nan, 0.0, (0.0, 0.0, 0.5), 0.0, probability)
+    monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: replace(result, changes=(change,)))
+    found = audit_map(surveyed(world).as_prior(0.01), [world.recording])
+    (entry,) = [one for one in found.entries if one.landmark_id == 3]
+    assert entry.state is EntryState(state)
+    assert entry.probability == pytest.approx(probability, abs=1e-3)
+
+
+@pytest.mark.parametrize(("metres", "degrees", "what"), [(0.1, 0.0, "position"), (0.0, 20.0, "rotation")])
+def test_only_what_is_off_by_more_than_the_survey_is_corrected(metres, degrees, what, monkeypatch) -> None:
+    result, world = solved_corridor(), corridor(2)
+    row = int(np.flatnonzero(result.landmarks.landmark_id == 3)[0])
+    seen = turned(shifted(result.landmarks, row, [metres, 0.0, 0.0]), row, degrees)
+    change = MapChange((3,), ChangeKind.MOVED, np.nan, 0.0, (metres, 0.0, 0.0), 0.0, 0.999)
+    off = replace(result, landmarks=seen, changes=(change,))
+    monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: off)
+    (entry,) = audit_map(surveyed(world).as_prior(0.01), [world.recording]).faults
+    assert (entry.moved, entry.turned) == (what == "position", what == "rotation")
+
+
 def test_a_place_that_is_read_twice_only_is_not_called_wrong(monkeypatch) -> None:
     result, world = solved_corridor(), corridor(2)
     seen, kept = result.landmarks, world.recording.detections
