@@ -407,7 +407,7 @@ def test_nothing_is_claimed_that_is_not_nine_times_as_probable(probability: floa
     assert entry.probability == pytest.approx(probability, abs=1e-3)
 
 
-@pytest.mark.parametrize(("metres", "degrees", "what"), [(0.1, 0.0, "position"), (0.0, 20.0, "rotation")])
+@pytest.mark.parametrize(("metres", "degrees", "what"), [(0.1, 0.0, "position"), (0.0, 5.0, "rotation")])
 def test_only_what_is_off_by_more_than_the_survey_is_corrected(metres, degrees, what, monkeypatch) -> None:
     result, world = solved_corridor(), corridor(2)
     row = int(np.flatnonzero(result.landmarks.landmark_id == 3)[0])
