@@ -195,6 +195,14 @@ def test_texts_of_others_keep_their_form(name: str, tmp_path: Path) -> None:
     assert touched <= 12  # digits of one number, or of two where the body is turned
 
 
+@pytest.mark.parametrize("before", ["\ufeff", "# surveyed on 3.5.2026\r\n", "\ufeff# 301 1 2 3 4 5 6 7 8\r\n\r\n"])
+def test_a_mark_and_comments_before_tags_stay(before: str, tmp_path: Path) -> None:
+    file = parsed(before + FIDUCIALS, tmp_path / "somewhere.dat")
+    assert (file.format.name, file.landmarks.landmark_id.tolist()) == ("fiducials", [301, 303])
+    data = correct_map(file, [Correction(303, position_m=file.landmarks.position_m[1] + [0.25, 0.0, 0.0])])
+    assert data.decode() == (before + FIDUCIALS).replace("46.580077", "46.830077")
+
+
 def test_numbers_are_written_as_others_of_the_file() -> None:
     assert number_like(["35", "58.5", "657.37"], 12.34567, (2, 3)) == "12.35"
     assert number_like(["35", "58.5"], 12.0, (2, 3)) == "12"

@@ -21,11 +21,14 @@ from evermap.io.map_formats import MAP_FORMATS, SurveyFile, correct_map, read_la
 from evermap.pipeline import run_slam
 from evermap.runs import audit as audit_module
 from evermap.runs.audit import Audit, EntryState, audit_map, in_order, join_drives
-from evermap.runs.audit_report import audit_dict, conclude, entry_row, write_audit
+from evermap.runs.audit_report import audit_dict, conclude, entry_row, listed_rows, quiet_lines, write_audit
 from evermap.runs.summary import RunInfo
 from evermap.types import (
     Cause,
+    ChangeKind,
+    Clock,
     Landmarks,
+    MapChange,
     Recording,
     SensorKind,
     SlamResult,
@@ -193,6 +196,14 @@ def test_drives_whose_clocks_start_anew_follow_each_other() -> None:
     first, second = in_order([drive, drive])
     assert second.frames.stamp_s[0] > first.frames.stamp_s[-1]
     assert np.diff(second.odometry.stamp_s) == pytest.approx(np.diff(drive.odometry.stamp_s))
+    dated = replace(
+        later(drive, 1.7e9), clock=Clock.UNIX
+    )  # a bag beside tables: the order is that in which they are given
+    first, second, third = in_order([dated, drive, later(drive, 5.0)])
+    assert {one.clock for one in (first, second, third)} == {Clock.RECORDING}
+    spans = [(one.frames.stamp_s[0], one.frames.stamp_s[-1]) for one in (first, second, third)]
+    assert 0.0 <= spans[0][0] < spans[0][1] < spans[1][0] < spans[1][1] < spans[2][0] < 400.0
+    np.testing.assert_allclose(np.diff(first.frames.stamp_s), np.diff(drive.frames.stamp_s), atol=1e-5)
     ordered = in_order([later(drive, 1000.0), drive])
     assert [one.frames.stamp_s[0] for one in ordered] == sorted(one.frames.stamp_s[0] for one in ordered)
 
@@ -280,7 +291,150 @@ def test_a_verdict_decides_whether_a_drive_counts(kind, causes, counts, monkeypa
     found = audit_map(surveyed(world).as_prior(0.01), [world.recording])
     assert found.drives[0].is_heard == counts
     assert conclude(found)[0] == ("right" if counts else "untested")
+    assert bool(quiet_lines(found)) == counts  # of a map that no drive judges not even 'never seen' is said
+    assert listed_rows(found) == []
+    assert {entry.state for entry in found.entries} == {EntryState.RIGHT if counts else EntryState.UNDECIDED}
     assert found.drives[0].sensor == ("tags are 3 % smaller than stated; tag_size_m = 0.097",) * causes
+
+
+@pytest.mark.parametrize(("factor", "fix"), [((3.2808, 3.2808), "0.3048"), ((1.0, -1.0), "the sign of y")])
+def test_a_map_that_is_wrong_as_a_whole_says_so_and_of_no_entry_anything(factor, fix) -> None:
+    """In feet, mirrored: all its entries are off, and what mends them is one line."""
+    recording = hall(1)
+    given = poles(recording, 1)
+    found = audit_map(replace(given, position_m=given.position_m * factor), [recording])
+    verdict, message = conclude(found)
+    assert verdict == "wrong"
+    assert message.startswith("the map as a whole is wrong: ")
+    assert fix in message
+    assert {entry.state for entry in found.entries} == {EntryState.UNDECIDED}
+    assert (listed_rows(found), quiet_lines(found), found.corrections()) == ([], [], [])
+    assert found.drives[0].sensor == ()
+
+
+def test_a_drive_that_alone_finds_the_whole_map_wrong_does_not_count(monkeypatch) -> None:
+    of_map = Cause("map-scale", "map", "true distances are 0.98 times those of the given map", fix="lengths x 0.98")
+    outdated = Verdict(VerdictKind.MAP_OUTDATED, "another scale")
+    sound = solved_corridor()
+    scaled = replace(sound, verdict=outdated, causes=(of_map,))
+    world, given = corridor(2), surveyed(corridor(2)).as_prior(0.01)
+
+    def audit_of(*results: SlamResult) -> Audit:
+        each = iter(results)
+        monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: next(each))
+        return audit_map(given, [world.recording] * len(results))
+
+    one = audit_of(sound, scaled)
+    assert [drive.is_heard for drive in one.drives] == [True, False]
+    assert (conclude(one)[0], one.of_map) == ("right", "")
+    most = audit_of(scaled, sound, scaled)
+    assert (conclude(most)[0], bool(most.of_map)) == ("wrong", True)
+    assert most.corrections() == []
+
+
+@pytest.mark.parametrize(("hits", "state"), [(1, "undecided"), (0.4, "undecided"), (0.6, "wrong")])
+def test_an_entry_is_wrong_by_most_of_the_readings_of_its_number(hits: float, state: str, monkeypatch) -> None:
+    """Of a place that few of its readings fit nothing is claimed: it may be the few that are wrong."""
+    result, world = solved_corridor(), corridor(2)
+    seen = result.landmarks
+    read = int(np.count_nonzero(world.recording.detections.landmark_id == 3))
+    count = hits if isinstance(hits, int) else int(np.ceil(hits * read))
+    assert read > 10
+    at, n_hits = seen.position_m.copy(), seen.n_hits.copy()
+    at[seen.landmark_id == 3] += [0.0, 0.0, 0.5]
+    n_hits[seen.landmark_id == 3] = count
+    change = MapChange((3,), ChangeKind.MOVED, np.nan, 0.0, (0.0, 0.0, 0.5), 0.0, 0.999)
+    moved = replace(result, landmarks=replace(seen, position_m=at, n_hits=n_hits), changes=(change,))
+    monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: moved)
+    found = audit_map(surveyed(world).as_prior(0.01), [world.recording])
+    assert told(found) == {"3": EntryState(state)}
+    (entry,) = [one for one in found.entries if one.landmark_id == 3]
+    assert (f"{count} times" in entry.reason) == (state == "undecided")
+    assert len(found.corrections()) == (state == "wrong")
+
+
+def test_a_number_on_two_landmarks_is_told() -> None:
+    """A pole has the number of another one, which the map has; its own number is not in the map."""
+    recording = hall(1)
+    names, hits = np.unique(recording.detections.landmark_id, return_counts=True)
+    one, other = (int(name) for name in names[np.argsort(-hits)][[0, 3]])
+    seen = recording.detections
+    named = np.where(seen.landmark_id == other, one, seen.landmark_id)
+    drive = replace(recording, detections=replace(seen, landmark_id=named))
+    given = poles(recording, 1)
+    found = audit_map(given[given.landmark_id != other], [drive])
+    assert not found.corrections()
+    (entry,) = [each for each in found.entries if each.landmark_id == one]
+    lines = [*quiet_lines(found), *(row[-1] for row in listed_rows(found))]
+    if entry.state is EntryState.RIGHT:
+        assert any(line.startswith(f"{one}: right, but ") for line in lines)
+    else:
+        assert entry.state is EntryState.UNDECIDED
+        assert "two landmarks" in entry.reason
+
+
+def test_an_entry_whose_number_is_read_elsewhere_too_is_right_and_that_is_told(monkeypatch) -> None:
+    """Where the two are not seen at once: of each its place is right, and a third of its readings fits no place."""
+    result, world = solved_corridor(), corridor(2)
+    monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: result)
+    given, seen = surveyed(world).as_prior(0.01), world.recording.detections
+    others = np.flatnonzero(seen.landmark_id == 4)
+    own = int(result.landmarks.n_hits[result.landmarks.landmark_id == 3][0])
+    lines = []
+    for count in (own // 4, own // 2):
+        named = seen.landmark_id.copy()
+        named[others[:count]] = 3
+        drive = replace(world.recording, detections=replace(seen, landmark_id=named))
+        found = audit_map(given, [drive])
+        assert told(found) == {}
+        lines.append([line for line in quiet_lines(found) if line.startswith("3: ")])
+    few, many = lines
+    assert few == []
+    read = int(np.count_nonzero(named == 3))
+    assert many == [f"3: right, but {read - own} of {read} readings of its number are of something elsewhere"]
+
+
+@pytest.mark.parametrize(
+    ("probability", "state"), [(0.05, "right"), (0.2, "undecided"), (0.85, "undecided"), (0.95, "wrong")]
+)
+def test_nothing_is_claimed_that_is_not_nine_times_as_probable(probability: float, state: str, monkeypatch) -> None:
+    result, world = solved_corridor(), corridor(2)
+    change = MapChange((3,), ChangeKind.MOVED, np.nan, 0.0, (0.0, 0.0, 0.5), 0.0, probability)
+    monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: replace(result, changes=(change,)))
+    found = audit_map(surveyed(world).as_prior(0.01), [world.recording])
+    (entry,) = [one for one in found.entries if one.landmark_id == 3]
+    assert entry.state is EntryState(state)
+    assert entry.probability == pytest.approx(probability, abs=1e-3)
+
+
+@pytest.mark.parametrize(("metres", "degrees", "what"), [(0.1, 0.0, "position"), (0.0, 5.0, "rotation")])
+def test_only_what_is_off_by_more_than_the_survey_is_corrected(metres, degrees, what, monkeypatch) -> None:
+    result, world = solved_corridor(), corridor(2)
+    row = int(np.flatnonzero(result.landmarks.landmark_id == 3)[0])
+    seen = turned(shifted(result.landmarks, row, [metres, 0.0, 0.0]), row, degrees)
+    change = MapChange((3,), ChangeKind.MOVED, np.nan, 0.0, (metres, 0.0, 0.0), 0.0, 0.999)
+    off = replace(result, landmarks=seen, changes=(change,))
+    monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: off)
+    (entry,) = audit_map(surveyed(world).as_prior(0.01), [world.recording]).faults
+    assert (entry.moved, entry.turned) == (what == "position", what == "rotation")
+
+
+def test_a_place_that_is_read_twice_only_is_not_called_wrong(monkeypatch) -> None:
+    result, world = solved_corridor(), corridor(2)
+    seen, kept = result.landmarks, world.recording.detections
+    mine = np.flatnonzero(kept.landmark_id == 3)
+    at, n_hits = seen.position_m.copy(), seen.n_hits.copy()
+    at[seen.landmark_id == 3] += [0.0, 0.0, 0.5]
+    change = MapChange((3,), ChangeKind.MOVED, np.nan, 0.0, (0.0, 0.0, 0.5), 0.0, 0.999)
+    states = []
+    for count in (2, 3):
+        n_hits[seen.landmark_id == 3] = count
+        moved = replace(result, landmarks=replace(seen, position_m=at, n_hits=n_hits.copy()), changes=(change,))
+        monkeypatch.setattr(audit_module, "run_slam", lambda *_, moved=moved, **__: moved)
+        drive = replace(world.recording, detections=rows_of(kept, np.delete(np.arange(len(kept)), mine[count:])))
+        found = audit_map(surveyed(world).as_prior(0.01), [drive])
+        states.append(told(found)["3"])
+    assert states == [EntryState.UNDECIDED, EntryState.WRONG]
 
 
 @functools.cache

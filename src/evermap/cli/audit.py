@@ -26,7 +26,7 @@ Find wrong entries of a surveyed map, and correct its file.
 
 Reads any map (WPILib, TagSLAM, fiducial_slam, rtabmap, GeoJSON, Parquet, tables with id, x, y) and one or more drives
 in it. Says of every entry where it is, since when, and how probably; what was never seen; what cannot be decided, and
-what would decide it. Exit code 0: nothing is wrong; 4: entries are wrong; 3: no drive can be trusted.
+what would decide it. Exit code 0: nothing is wrong; 4: entries, or all the map, are wrong; 3: no drive can be trusted.
 
 \b
 Examples:
@@ -108,7 +108,7 @@ def audit(
     summary = write_audit(folder, found, file, info, force=force, inputs=inputs)
     verdict, message = conclude(found)
     if as_json:
-        print_json({**summary, "written": None if write is None else str(write)})
+        print_json(summary if write is None else {**summary, "written": str(write)})
     else:
         rows = listed_rows(found)
         if rows:

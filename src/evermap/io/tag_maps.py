@@ -183,9 +183,9 @@ def entries_of_fiducials(text: str, path: Path) -> list[FileEntry]:
         InputError: a line is not that of a tag.
     """
     found = []
-    for number, (line, start) in enumerate(lines_of(text), 1):
+    for number, (line, start) in enumerate(lines_of(text.replace("\ufeff", " ", 1)), 1):
         words = [Number(word[0], start + word.start(), start + word.end()) for word in _WORD.finditer(line)][:8]
-        if not words:
+        if not words or words[0].text.startswith("#"):
             continue
         if len(words) != 8 or not all(map(_is_finite, words)) or not words[0].value.is_integer():
             problem = "is not a tag of fiducial_slam"
@@ -196,7 +196,8 @@ def entries_of_fiducials(text: str, path: Path) -> list[FileEntry]:
 
 def is_fiducials(text: str) -> bool:
     """Return whether a text begins as a map of fiducial_slam: a whole number and at least seven more."""
-    words = next((line.split() for line in text.removeprefix("\ufeff").splitlines() if line.strip()), [])
+    lines = (line.split() for line in text.removeprefix("\ufeff").splitlines())
+    words = next((words for words in lines if words and not words[0].startswith("#")), [])
     numbers = [Number(word, 0, 0) for word in words]
     return len(words) >= 9 and all(map(_is_finite, numbers)) and re.fullmatch(r"\d+", words[0]) is not None
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -25,6 +25,7 @@ from evermap.pipeline import run_slam
 from evermap.show import Shown
 from evermap.types import (
     AnyRecording,
+    Cause,
     ChangeKind,
     Clock,
     FloatArray,
@@ -53,12 +54,18 @@ MOST = 0.999
 """Greatest probability: drives by one robot share errors that no chain of independent ones knows."""
 FEWEST = 3
 """Sightings from which it is said of an entry that it is right."""
+ELSEWHERE = 0.3
+"""Share of the readings of a number that fit no place of its landmark, from which this is told: it may be on two."""
 SAME_PLACE = 16.3
 """Squared distance, in sigmas, within which two drives saw one place: 99.9 % of three coordinates."""
 SIGNIFICANT = 11.3
 """Squared distance, in sigmas, from which a position or a turn is corrected: 99 % of three coordinates."""
 NEAR_M, NEAR_RAD = 0.02, 0.03
 """Least tolerance of 'the place of another entry'."""
+MAP = "map"
+"""Subject of causes that are of the map as a whole."""
+UNHEARD = "no drive judges single entries"
+"""Reason of entries where no drive can be trusted, or the map as a whole is wrong."""
 APART_S = 60.0
 """Time between drives whose clocks all start anew, by which they are told apart."""
 
@@ -152,6 +159,7 @@ class AuditDrive(Shown):
         n_detections: that it has.
         is_heard: whether its word counts.
         reason: why it does not; the verdict's line where it does.
+        of_map: what is wrong with the map as a whole (scale, unit, mirror), and what mends it; '' of none.
         sensor: what the sensor is off by, one line each, with what mends it.
         warnings: of reader and estimator.
         path_m: (N, D) where it drove, in the map.
@@ -164,6 +172,7 @@ class AuditDrive(Shown):
     n_detections: int
     is_heard: bool
     reason: str
+    of_map: str
     sensor: tuple[str, ...]
     warnings: tuple[str, ...]
     path_m: FloatArray
@@ -194,6 +203,11 @@ class Audit(Shown):
     def is_heard(self) -> bool:
         """Whether any drive could be trusted."""
         return any(drive.is_heard for drive in self.drives)
+
+    @property
+    def of_map(self) -> str:
+        """Return what is wrong with the map as a whole, and what mends it; '' if single entries are judged."""
+        return next((drive.of_map for drive in self.drives if drive.is_heard and drive.of_map), "")
 
     def corrections(self) -> list[Correction]:
         """Return what is to be written into the map's file: of entries that moved, turned or were exchanged."""
@@ -247,14 +261,20 @@ class _Word:
 
 @dataclass(frozen=True, slots=True)
 class _Heard:
-    """A drive that is trusted, with what it says by landmark."""
+    """A drive that is trusted, with what it says by landmark.
+
+    Attributes:
+        drive, words, names: the drive, what it says, and what landmarks are called.
+        p_gone, missed: probability that one is not there, and looks that missed it.
+        read: how often its number was read, but for where a second landmark with it stands.
+    """
 
     drive: AuditDrive
     words: Mapping[int, _Word]
     names: Mapping[int, str]
     p_gone: Mapping[int, float]
     missed: Mapping[int, int]
-    sighted: frozenset[int] = field(default_factory=frozenset)
+    read: Mapping[int, int]
 
 
 def audit_map(
@@ -299,6 +319,7 @@ def audit_map(
             heard.append(one)
     if len(errors) == len(drives):
         raise errors[0]
+    told, heard = _with_map_as_a_whole(told, heard)
     entries = [_judge(given, row, heard) for row in range(len(given))]
     entries = _with_exchanges(entries, given)
     entries += _missing(given, heard)
@@ -307,21 +328,41 @@ def audit_map(
     return Audit(given, tuple(entries), tuple(told), clock)
 
 
+def _with_map_as_a_whole(
+    drives: Sequence[AuditDrive], heard: Sequence[_Heard]
+) -> tuple[list[AuditDrive], list[_Heard]]:
+    """Return drives, and those by which entries are judged.
+
+    Where most drives find the map as a whole to be wrong, entries are judged by none: they are all off. A few drives
+    that do are not heard.
+    """
+    off = [one for one in heard if one.drive.of_map]
+    if 2 * len(off) > len(heard):
+        return list(drives), []
+    names = [one.drive for one in off]
+    kept = [one for one in heard if not one.drive.of_map]
+    return [replace(one, is_heard=False) if any(one is other for other in names) else one for one in drives], kept
+
+
 def in_order(recordings: Sequence[AnyRecording]) -> list[AnyRecording]:
-    """Return drives in order of time; those whose clocks start anew are put one after the other."""
+    """Return drives in order of time; those whose clocks start anew, or are of different kinds, are put one after the
+    other as they are given.
+    """
     spans = [(_span(one), one) for one in recordings]
     spans.sort(key=lambda item: item[0][0])
     starts_anew = any(
         later[0][0] < before[0][1] and not math.isnan(later[0][0]) for before, later in itertools.pairwise(spans)
     )
-    if not starts_anew or any(one.clock is not Clock.RECORDING for one in recordings):
+    clocks = {one.clock for one in recordings}
+    if len(clocks) == 1 and not (starts_anew and clocks == {Clock.RECORDING}):
         return [one for _, one in spans]
-    found, end_s = [], -math.inf
+    found, end_s = [], -APART_S if len(clocks) > 1 else -math.inf
     for one in recordings:
         start_s, last_s = _span(one)
-        shift_s = 0.0 if start_s > end_s else math.ceil(end_s + APART_S - start_s)
-        found.append(one if shift_s == 0.0 else _later(one, shift_s))
-        end_s = last_s + shift_s
+        follows = len(clocks) == 1 and start_s > end_s
+        shift_s = 0 if follows or math.isnan(start_s) else math.ceil(end_s + APART_S - start_s)
+        found.append(one if shift_s == 0 else _later(one, shift_s))
+        end_s = max(end_s, last_s + shift_s)
     return found
 
 
@@ -335,10 +376,13 @@ def _later(recording: AnyRecording, by_s: float) -> AnyRecording:
     odometry = recording.odometry
     moved: dict[str, Any] = {
         "frames": replace(recording.frames, stamp_s=recording.frames.stamp_s + by_s),
-        "odometry": None if odometry is None else replace(odometry, stamp_s=odometry.stamp_s + by_s),
+        "odometry": None
+        if odometry is None
+        else replace(odometry, stamp_s=odometry.stamp_s + by_s, clock=Clock.RECORDING),
         "measurements": tuple(replace(one, stamp_s=one.stamp_s + by_s) for one in recording.measurements),
         "truth": None,
         "robot_sightings": None,
+        "clock": Clock.RECORDING,
     }
     known = recording.__dataclass_fields__
     return replace(recording, **{name: part for name, part in moved.items() if name in known})
@@ -365,7 +409,7 @@ def _unheard(recording: AnyRecording, reason: str) -> AuditDrive:
     nowhere = np.zeros((0, 3 if is_in_space(recording) else 2))
     count = len(recording.detections)
     return AuditDrive(
-        recording.name, recording.source, *_span(recording), count, False, reason, (), recording.warnings, nowhere
+        recording.name, recording.source, *_span(recording), count, False, reason, "", (), recording.warnings, nowhere
     )
 
 
@@ -375,9 +419,8 @@ def _hear(recording: AnyRecording, result: SlamResult, given: Landmarks) -> _Hea
     lost = result.trajectory.frame != "prior_map" or result.landmarks.frame != "prior_map"
     reason = "" if verdict is None else verdict.message
     if lost:
-        reason = next(
-            (text for text in result.warnings if "cannot localise" in text), "it could not be laid on the map"
-        )
+        otherwise = "it could not be laid on the map" if verdict is None or verdict.kind.is_trustworthy else reason
+        reason = next((text for text in result.warnings if "cannot localise" in text), otherwise)
     trusted = verdict is None or verdict.kind.is_trustworthy or _is_usable(verdict, result, given)
     drive = AuditDrive(
         name=recording.name,
@@ -387,6 +430,7 @@ def _hear(recording: AnyRecording, result: SlamResult, given: Landmarks) -> _Hea
         n_detections=len(recording.detections),
         is_heard=not lost and trusted,
         reason=reason,
+        of_map=next((_cause_line(one) for one in result.causes if one.subject == MAP), ""),
         sensor=_sensor_lines(result),
         warnings=(*recording.warnings, *result.warnings),
         path_m=result.trajectory.pose_world_robot[:, :dim],
@@ -401,8 +445,30 @@ def _hear(recording: AnyRecording, result: SlamResult, given: Landmarks) -> _Hea
         {**recording.landmark_names, **result.landmarks.names},
         dict(zip(gone.landmark_id.tolist(), (1.0 - gone.p_exists).tolist(), strict=True)),
         dict(zip(missed[0].tolist(), missed[1].tolist(), strict=True)),
-        frozenset(np.unique(recording.detections.landmark_id).tolist()),
+        _count_read(recording, words, result.landmarks.names),
     )
+
+
+def _count_read(recording: AnyRecording, words: Mapping[int, _Word], names: Mapping[int, str]) -> dict[int, int]:
+    """Return how often each number was read, without what is explained by a second landmark with it, as '7#2'."""
+    number, count = np.unique(recording.detections.landmark_id, return_counts=True)
+    read = dict(zip(number.tolist(), count.tolist(), strict=True))
+    for key, base in _twins(names, recording.landmark_names).items():
+        if key in words and base in read:
+            read[base] -= words[key].n_hits
+    return read
+
+
+def _twins(names: Mapping[int, str], given: Mapping[int, str]) -> dict[int, int]:
+    """Return the first landmark of each that the estimator calls the second, third with its number."""
+    ids = {name: key for key, name in given.items()}
+    found = dict[int, int]()
+    for key, label in names.items():
+        stem, mark, _ = label.partition("#")
+        base = ids.get(stem, int(stem) if stem.isdecimal() else -1)
+        if mark:
+            found[key] = base
+    return found
 
 
 def _is_usable(verdict: Verdict, result: SlamResult, given: Landmarks) -> bool:
@@ -462,11 +528,8 @@ def _with_twins(words: Mapping[int, _Word], names: Mapping[int, str], given: Map
     The estimator calls the second place '7#2'. What is no farther from the first than both are uncertain is no place.
     """
     found = dict(words)
-    ids = {name: key for key, name in given.items()}
-    for key, label in names.items():
-        stem, mark, _ = label.partition("#")
-        base = ids.get(stem, int(stem) if stem.isdecimal() else -1)
-        if not mark or key not in found or base not in found:
+    for key, base in _twins(names, given).items():
+        if key not in found or base not in found:
             continue
         one, twin = found[base], found[key]
         off = twin.position_m - one.position_m
@@ -482,7 +545,7 @@ def _with_twins(words: Mapping[int, _Word], names: Mapping[int, str], given: Map
 
 def _sensor_lines(result: SlamResult) -> tuple[str, ...]:
     """What a sensor is off by: causes that were found, and calibration states that are not what is stated."""
-    lines = [f"{one.message}" + (f"; {one.fix}" if one.fix else "") for one in result.causes]
+    lines = [_cause_line(one) for one in result.causes if one.subject != MAP]
     named = {one.subject for one in result.causes} | {one.code for one in result.causes}
     for one in result.parameters:
         if not _is_off(one) or one.name in named:
@@ -490,6 +553,10 @@ def _sensor_lines(result: SlamResult) -> tuple[str, ...]:
         value = f"{one.name} = {one.value:.4g} ± {one.sigma:.2g} {one.unit if one.unit != '1' else ''}".rstrip()
         lines.append(f"{value}, stated {one.prior_mean:.4g}: {one.meaning}")
     return tuple(lines)
+
+
+def _cause_line(cause: Cause) -> str:
+    return f"{cause.message}; {cause.fix}" if cause.fix else cause.message
 
 
 def _is_off(one: ParameterEstimate) -> bool:
@@ -524,6 +591,9 @@ def _judge(given: Landmarks, row: int, heard: Sequence[_Heard]) -> AuditEntry:
     if p_wrong <= 1.0 - DECIDED:
         few = entry.n_hits < FEWEST
         reason = f"seen {entry.n_hits} time{'s' if entry.n_hits > 1 else ''}; {FEWEST} sightings decide" if few else ""
+        read = sum(one.read.get(name, 0) for one in sighted)
+        if not few and read - entry.n_hits >= max(FEWEST, ELSEWHERE * read):
+            reason = f"{read - entry.n_hits} of {read} readings of its number are of something elsewhere"
         return replace(entry, state=EntryState.UNDECIDED if few else EntryState.RIGHT, reason=reason)
     if within and change is not None:
         entry = replace(entry, from_s=change.stamp_from_s, to_s=change.stamp_to_s)
@@ -535,6 +605,10 @@ def _judge(given: Landmarks, row: int, heard: Sequence[_Heard]) -> AuditEntry:
     if disagree:
         where = ", ".join(disagree)
         reason = f"elsewhere in one drive, and where the map has it in {where}; another drive decides"
+        return replace(entry, state=EntryState.UNDECIDED, reason=reason)
+    hits, read = sum(word.n_hits for word in late), sum(one.read.get(name, 0) for one in sighted[since:])
+    if hits < FEWEST or (not within and 2 * hits < read):  # the one that fits may be the wrong one
+        reason = f"seen {hits} times at its place, of {read} readings of its number; more sightings decide"
         return replace(entry, state=EntryState.UNDECIDED, reason=reason)
     state = EntryState.STALE if since or within else EntryState.WRONG
     moved, turned = _what_to_correct(entry, given, row)
@@ -646,16 +720,19 @@ def _never_seen(entry: AuditEntry, given: Landmarks, row: int, heard: Sequence[_
     """An entry that no drive that counts has seen: gone, or not looked for."""
     name = entry.landmark_id
     if not heard:
-        return replace(entry, reason="no drive could be trusted")
+        return replace(entry, state=EntryState.UNDECIDED, reason=UNHEARD)
     missed = [one for one in heard if one.missed.get(name, 0)]
     p_gone = [one.p_gone.get(name, math.nan) for one in missed]
     sure = [p for p in p_gone if p >= DECIDED]
-    stamp = missed[0].drive if missed else None
+    stamp, read = missed[0].drive if missed else None, sum(one.read.get(name, 0) for one in heard)
+    if read >= max(FEWEST, ELSEWHERE * entry.n_misses):  # it is there, wherever; fewer readings may be misread
+        reason = f"its number was read {read} times, but at no one place: it may be on two landmarks"
+        return replace(entry, state=EntryState.UNDECIDED, reason=reason)
     if sure and stamp is not None:
         p = min(float(1.0 - np.prod([1.0 - value for value in sure])), MOST)
         reason = f"{entry.n_misses} looks at its place found nothing; remove it, or look where it went"
         return replace(entry, state=EntryState.GONE, probability=p, to_s=stamp.from_s, reason=reason)
-    if any(name in one.sighted for one in heard):
+    if read:
         reason = "its number was read, but no reading fits a place; more sightings decide"
         return replace(entry, state=EntryState.UNDECIDED, reason=reason)
     if missed:

@@ -52,6 +52,7 @@ def audit_dict(audit: Audit, file: SurveyFile, written: Path | None = None) -> d
                 "detections": drive.n_detections,
                 "counts": drive.is_heard,
                 "reason": drive.reason,
+                "of_map": drive.of_map,
                 "sensor": list(drive.sensor),
                 "warnings": list(drive.warnings),
             }
@@ -96,6 +97,8 @@ def conclude(audit: Audit) -> tuple[str, str]:
     """Return the verdict on a map, 'right', 'wrong' or 'untested', and a sentence on it."""
     if not audit.is_heard:
         return "untested", f"nothing can be said of the map: {audit.drives[0].reason}"
+    if audit.of_map:
+        return "wrong", f"the map as a whole is wrong: {audit.of_map}; mend that first, entries were not judged"
     counts = count_states(audit.entries)
     faults = len(audit.faults)
     tested = counts["right"] + sum(entry.state is not EntryState.MISSING for entry in audit.faults)
@@ -159,14 +162,22 @@ def is_doubtful(entry: AuditEntry) -> bool:
     return entry.state is EntryState.UNDECIDED and not entry.probability <= 1.0 - DECIDED
 
 
+def is_judged(audit: Audit) -> bool:
+    """Return whether anything can be said of single entries."""
+    return audit.is_heard and not audit.of_map
+
+
 def listed_rows(audit: Audit, *, everything: bool = False) -> list[tuple[str, ...]]:
     """Return the rows of what is to be known: faults and what cannot be decided; or of every entry."""
-    told = [entry for entry in audit.entries if everything or entry.state.is_fault or is_doubtful(entry)]
+    doubtful = is_judged(audit)
+    told = [entry for entry in audit.entries if everything or entry.state.is_fault or (doubtful and is_doubtful(entry))]
     return [entry_row(entry, audit.clock) for entry in told]
 
 
 def quiet_lines(audit: Audit) -> list[str]:
-    """Return one line each on entries that are right, and on those that were never seen."""
+    """Return one line each on entries that are right, and on those that were never seen; none where none was judged."""
+    if not is_judged(audit):
+        return []
     lines = []
     few = f"seen fewer than {FEWEST} times"
     for state, word in ((EntryState.RIGHT, "right"), (EntryState.UNDECIDED, few), (EntryState.UNSEEN, "never seen")):
@@ -175,6 +186,8 @@ def quiet_lines(audit: Audit) -> list[str]:
             some = ", ".join(entry.label for entry in mine[:_FEW])
             more = f" and {len(mine) - _FEW} more" if len(mine) > _FEW else ""
             lines.append(f"{word} ({len(mine)}): {some}{more}")
+        if state is EntryState.RIGHT:
+            lines += [f"{entry.label}: right, but {entry.reason}" for entry in mine if entry.reason]
     return lines
 
 

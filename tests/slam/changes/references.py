@@ -51,7 +51,7 @@ def comparison_of(e: np.ndarray, covariance: np.ndarray) -> Comparison:
     """Of displacements `e` that have this covariance if nothing moved."""
     precision = np.linalg.inv(covariance)
     precision = 0.5 * (precision + precision.T)
-    return Comparison(precision, precision @ e, 0.0, float(e @ precision @ e), float(len(e)))
+    return Comparison(precision, precision @ e, 0.0, float(len(e)), precision, precision @ e)
 
 
 def membership(evidence: WindowEvidence, members: np.ndarray, onset: int = 0) -> np.ndarray:

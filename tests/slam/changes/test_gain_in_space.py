@@ -60,7 +60,7 @@ def evidence_of(position: np.ndarray, numbers: int) -> WindowEvidence:
 
 def comparison_of(e: np.ndarray, covariance: np.ndarray) -> Comparison:
     precision = np.linalg.inv(covariance)
-    return Comparison(precision, precision @ e, 0.0, float(e @ precision @ e), float(len(e)))
+    return Comparison(precision, precision @ e, 0.0, float(len(e)), precision, precision @ e)
 
 
 def gain_of(comparison: Comparison, position: np.ndarray, numbers: int, label: list[int], turns: list[bool]):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
@@ -107,15 +107,22 @@ class Comparison(NamedTuple):
         precision: (2 R, 2 R) `A`.
         pull: (2 R,) `b`.
         log_evidence: that nothing moved, up to a constant that is the same for all maps.
-        misfit: `e' A e`: chi-square with `freedom` degrees of freedom if nothing moved.
-        freedom: its degrees of freedom.
+        freedom: degrees of freedom of the misfit.
+        information, drawn: (2 R, 2 R), (2 R,) of the session alone, about the places in the map.
     """
 
     precision: FloatArray
     pull: FloatArray
     log_evidence: float
-    misfit: float
     freedom: float
+    information: FloatArray
+    drawn: FloatArray
+
+    @property
+    def misfit(self) -> float:
+        """Return `e' A e` of the displacements `e` if all were free: chi-square if nothing moved."""
+        held = self.information + TINY_INFORMATION * np.eye(len(self.drawn))
+        return float(np.linalg.solve(held, self.drawn) @ self.pull)
 
 
 def dense_ms(numbers: int) -> float:
@@ -229,22 +236,21 @@ def compare(evidence: WindowEvidence, mean: FloatArray, covariance: FloatArray, 
     prior[np.diag_indices(n * n_seen)] += TINY_INFORMATION
     pull = evidence.pull + evidence.information @ offset.ravel()
     weighted = np.asarray((spread.T @ evidence.information).T)
-    inner = cho_factor(spread.T @ weighted + prior)
-    solved = cho_solve(inner, np.column_stack([weighted.T, spread.T @ pull]))
-    precision = evidence.information - weighted @ solved[:, :-1]
-    left = pull - weighted @ solved[:, -1]
-    log_determinant = 2.0 * float(np.log(np.diag(inner[0])).sum()) - log_prior_determinant
-    gained = float((spread.T @ pull) @ solved[:, -1])
+    root = cholesky(spread.T @ weighted + prior, lower=True)
+    half = solve_triangular(root, np.column_stack([weighted.T, spread.T @ pull]), lower=True)
+    lost = half[:, :-1].T @ half[:, :-1]  # a matrix times itself, of which one half is computed
+    log_determinant = 2.0 * float(np.log(np.diag(root)).sum()) - log_prior_determinant
+    gained = float(half[:, -1] @ half[:, -1])
     moved = offset.ravel()
     offset_term = -float(moved @ evidence.pull + 0.5 * moved @ evidence.information @ moved)
-    held = evidence.information + TINY_INFORMATION * np.eye(n * count)
-    estimated = np.linalg.solve(held, pull)  # displacements from the map if all of them were free
+    precision = evidence.information - lost
     return Comparison(
         precision=0.5 * (precision + precision.T),
-        pull=left,
+        pull=pull - half[:, :-1].T @ half[:, -1],
         log_evidence=0.5 * (gained - log_determinant) + evidence.log_constant + offset_term,
-        misfit=float(estimated @ left),
         freedom=float(n * (count - np.count_nonzero(~mapped[seen])) - freedom),
+        information=evidence.information,
+        drawn=pull,
     )
 
 

@@ -253,6 +253,7 @@ def split(
     asked = outlier & located[problem.pose_row] & ~whole[identity[problem.place]]
     at = as_seen(problem, estimate, problem.measured)
     place, places, copied = problem.place.copy(), list[FloatArray](), list[int]()
+    begun, votes = list[int](), np.zeros(len(problem.place))
     at_places, prior = estimate.place.copy(), problem.prior
     unseen = np.bincount(problem.place, optimum.now.weight, minlength=len(at_places)) < problem.settings.map.least_seen
     for known in np.unique(problem.place[asked]):
@@ -268,6 +269,8 @@ def split(
                 or away < settings.together_m
             ):
                 break
+            votes[near] = 1.0
+            begun.append(int(known) if unseen[known] else len(estimate.place) + len(places))
             if unseen[known]:
                 at_places[known], unseen[known] = at[mine[centre]], False
                 prior = replace(prior, weight=np.where(prior.place == known, LEAST_WEIGHT, prior.weight))
@@ -283,4 +286,5 @@ def split(
         problem, place=place, oriented=problem.oriented[source], symmetries=problem.symmetries[source], prior=prior
     )
     added = replace(estimate, place=np.vstack([at_places, *places]))
+    added.place[begun] = oriented(larger, added, votes)[begun]  # a single detection may have seen it the other way
     return larger, added, identity[source]

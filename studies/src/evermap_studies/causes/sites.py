@@ -164,6 +164,28 @@ def tagged_room(rng: np.random.Generator) -> Site:
     return Site(np.arange(1, 27), pose, np.full(26, TAG_M), ring)
 
 
+def racks(rng: np.random.Generator) -> Site:
+    """A hall with five racks of 30 m, fifty tags on either side of each; the way is through two of the lanes."""
+    place, facing = [], []
+    for rack in range(5):
+        for side in (-1.0, 1.0):
+            along = 0.6 * np.arange(50) + rng.uniform(-0.15, 0.15, 50)
+            across = np.full(50, 5.0 * rack + 0.4 * side)
+            place.append(np.column_stack([along, across, rng.uniform(0.4, 2.2, 50)]))
+            facing.append(side * math.pi / 2 + rng.uniform(-0.1, 0.1, 50))
+    pose = standing(np.concatenate(place), np.concatenate(facing))
+    way = [(0.0, 7.5), (10.0, 7.8), (20.0, 7.2), (30.0, 7.5), (33.0, 10.0), (30.0, 12.5), (20.0, 12.8), (10.0, 12.2),
+           (0.0, 12.5), (-3.0, 10.0)]  # fmt: skip
+    return Site(np.arange(1, 501), pose, np.full(500, TAG_M), np.array(way))
+
+
+def reflectors(rng: np.random.Generator) -> Site:
+    """The same hall with a reflector at the place of every tag, at the height of the laser."""
+    site = racks(rng)
+    place = site.pose[:, :3] * [1.0, 1.0, 0.0]
+    return Site(site.landmark_id, _points(place), np.full(len(place), np.nan), site.waypoint)
+
+
 SITES: dict[str, Callable[[np.random.Generator], Site]] = {
     "field": field,
     "two kinds": two_kinds,
@@ -173,4 +195,6 @@ SITES: dict[str, Callable[[np.random.Generator], Site]] = {
     "anchors behind": anchors_behind,
     "lounge": lounge,
     "tagged room": tagged_room,
+    "racks": racks,
+    "reflectors": reflectors,
 }
