@@ -44,7 +44,7 @@ from evermap.slam.plane import in_its_space
 from evermap.types import UNKNOWN, AnyRecording, Landmarks, SlamResult, SpatialRecording, is_in_space
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
-LONGEST_S, SMALL_LONGEST_S = 240, 12
+LONGEST_S, SMALL_LONGEST_S = 240, 8
 """CPU time of a run, and of one in a small world; a lost one may search for long."""
 WORSE, SLACK_M, MOST_NEES = 1.05, 0.01, 4.0
 FRESH = 1000

@@ -12,7 +12,7 @@ from evermap import run_slam
 from evermap.explain.symptoms import Signs, measure_signs
 from evermap.explain.verdict import LIMITS, Limit, judge_signs
 from evermap.types import AssociationEvidence, Cause, Landmarks, Recording, VerdictKind
-from evermap.viz.verdict_words import cause_text, further_causes, verdict_text
+from evermap.viz.verdict_words import cause_text, further_causes
 from evermap_studies.worlds.lasers import LaserWorld, simulate_laser
 
 GOOD = Signs(n_landmarks=12, n_used=500, nis=2.0, used=0.98, sigma_m=0.02, size_m=10.0)
@@ -56,7 +56,7 @@ def test_every_cause_is_told_once() -> None:
     late = Cause("clock", "front", "stamps of front are 0.12 s late", 0.12, 0.002, 0.99, "stamp_s - 0.12")
     size = Cause("tag-size", "all tags", "tags are 10 % larger", probability=0.99, fix="tag_size_m = 0.176")
     verdict = judge_signs(GOOD, causes=[late, size])
-    lines = [verdict_text(verdict), *map(cause_text, further_causes(verdict))]
+    lines = [verdict.text, *map(cause_text, further_causes(verdict))]
     for cause in (late, size):
         assert sum(cause.message in line and cause.fix in line for line in lines) == 1
 

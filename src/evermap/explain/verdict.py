@@ -109,6 +109,39 @@ LIMITS = (
         "too much of the map is not as it was", "a new map, or the edition of the map that was built",
     ),
     Limit(
+        "scale", "apart", "lengths by odometry and by detections differ by {:.1%}", -inf, 0.05, WEAK,
+        "nothing says which of the two measures true metres",
+        "a map with surveyed positions, or what is known better: sigma_scale of [sensor] or sigma_odometer_scale of "
+        "[odometry] in sensor.toml",
+    ),
+    Limit(
+        "stated-scale", "away_scale", "a scale is {:.1f} standard deviations from what is stated", -inf, 3.0, WEAK,
+        "lengths by odometry and by detections differ more than is stated of either",
+        "a map with surveyed positions, or the size of tags and the wheel radius measured again",
+    ),
+    Limit(
+        "clocks", "shift", "poses by the other clock are {:.1f} standard deviations away", -inf, 2.0, WEAK,
+        "odometry and detections are stamped differently, and nothing says which clock is right",
+        "stamps of one clock, or the delay of the odometry taken off its stamps",
+    ),
+    Limit(
+        "over-odometry", "over_odometry", "detections scatter {:.2f} times as far as by odometry alone", -inf, 1.2, LOST,
+        "odometry alone explains the detections better than the solution does",
+    ),
+    Limit(
+        "noise-of-detections", "noise_seen", "detections {:.1f} times as noisy as sensors usually are", -inf, 4.0, WEAK,
+        "the solution hardly listens to the detections", "calibration of the sensor, or its noise as stated",
+    ),
+    Limit(
+        "noise-of-odometry", "noise_driven", "odometry {:.1f} times as noisy as is usual", -inf, 3.0, WEAK,
+        "the solution hardly follows the odometry", "calibration and clock of the odometry, or the sensor's [mount]",
+    ),
+    Limit(
+        "unexplained", "unexplained", "{:.0f} landmarks with many detections in a row unused", -inf, 0.0, WEAK,
+        "a landmark moved during the drive, or is another one, and it was not found which",
+        "another drive past it",
+    ),
+    Limit(
         "uncertainty", "sigma_share", "positions known to {:.1%} of the size of the place", -inf, 0.05, WEAK,
         "hardly anything ties the poses to each other", "a drive that comes back to landmarks seen before",
     ),
