@@ -11,7 +11,17 @@ import pytest
 from evermap import run_slam
 from evermap.explain.symptoms import Signs, measure_signs
 from evermap.explain.verdict import LIMITS, Limit, judge_signs
-from evermap.types import AssociationEvidence, Cause, Landmarks, Recording, VerdictKind
+from evermap.types import (
+    AssociationEvidence,
+    Cause,
+    ChangeKind,
+    Landmarks,
+    MapChange,
+    ParameterEstimate,
+    Recording,
+    SlamResult,
+    VerdictKind,
+)
 from evermap.viz.verdict_words import cause_text, further_causes
 from evermap_studies.worlds.lasers import LaserWorld, simulate_laser
 
@@ -102,3 +112,86 @@ def test_runs_end_with_a_verdict() -> None:
         verdict = run_slam(recording, prior_map=other).verdict
         assert verdict is not None
         assert verdict.kind is VerdictKind.MAP_OUTDATED, verdict.message
+
+
+def alarms(result: SlamResult, recording: Recording, given: Landmarks | None = None) -> set[str]:
+    """Return the codes of the signs of a run that are beyond their limits."""
+    return {one.code for one in judge_signs(measure_signs(result, recording, given)).symptoms if one.is_alarming}
+
+
+def test_lengths_that_differ_are_weak_until_a_map_says_which_are_right() -> None:
+    recording, survey = recorded()
+    driven = recording.odometry
+    long = replace(recording, odometry=replace(driven, forward_mps=1.08 * driven.forward_mps))
+    verdict = run_slam(long).verdict
+    assert verdict is not None
+    assert verdict.kind is VerdictKind.WEAK
+    assert "differ by 7." in verdict.message
+    assert "sigma_odometer_scale" in verdict.message
+    in_map = run_slam(long, prior_map=survey)
+    assert "scale" not in alarms(in_map, long, survey)
+
+
+def test_a_scale_far_from_what_is_stated_is_weak_until_a_map_says_which_is_right() -> None:
+    recording, survey = recorded()
+    scale = ParameterEstimate("odometry_scale", 0.984, 0.002, 1.0, 0.005, "")
+    for given, expected in ((None, True), (survey, False)):
+        result = run_slam(recording, prior_map=given)
+        other = replace(result, parameters=(*result.parameters, scale))
+        assert ("stated-scale" in alarms(other, recording, given)) is expected
+        assert "stated-scale" not in alarms(result, recording, given)
+
+
+def test_a_long_delay_is_weak_since_nothing_says_whose_it_is() -> None:
+    recording, survey = recorded()
+    result = run_slam(recording, prior_map=survey)
+    for delay_s, expected in ((-0.3, True), (0.3, True), (0.14, False)):
+        parameters = tuple(
+            replace(one, value=delay_s) if one.name == "odometry_delay_s" else one for one in result.parameters
+        )
+        late = replace(result, parameters=parameters)
+        assert ("clocks" in alarms(late, recording, survey)) is expected
+        fixed = tuple(replace(one, fixed=True) for one in parameters)  # stated by who knows it
+        assert "clocks" not in alarms(replace(late, parameters=fixed), recording, survey)
+
+
+def test_a_solution_that_scatters_detections_more_than_odometry_does_is_lost() -> None:
+    recording, _ = recorded()
+    result = run_slam(recording)
+    assert measure_signs(result, recording).over_odometry < 1.0
+    pose = result.trajectory.pose_world_robot.copy()
+    pose[:, 0] *= 0.5  # halves every way along x
+    bent = replace(result, trajectory=replace(result.trajectory, pose_world_robot=pose))
+    assert measure_signs(bent, recording).over_odometry > 1.2
+    assert "over-odometry" in alarms(bent, recording)
+
+
+def test_a_landmark_unexplained_for_long_is_weak_unless_its_change_is_reported() -> None:
+    recording, _ = recorded()
+    result = run_slam(recording)
+    innovations = result.innovations
+    mine = np.flatnonzero(innovations.landmark_id == innovations.landmark_id[0])
+    order = mine[np.argsort(innovations.stamp_s[mine])]
+    for unused, expected in ((order[len(order) // 2 :], True), (order[::4], False), (order[:2], False)):
+        p_inlier = innovations.p_inlier.copy()
+        p_inlier[unused] = 0.0
+        other = replace(result, innovations=replace(innovations, p_inlier=p_inlier))
+        assert ("unexplained" in alarms(other, recording)) is expected
+        identity = int(innovations.landmark_id[0])
+        change = MapChange((identity,), ChangeKind.MOVED, 0.0, 60.0, (1.0, 0.0), 0.0, 0.99)
+        assert "unexplained" not in alarms(replace(other, changes=(change,)), recording)
+
+
+def test_noise_far_beyond_what_is_usual_is_weak() -> None:
+    recording, _ = recorded()
+    result = run_slam(recording)
+    assert not alarms(result, recording)
+    for name, code, most in (
+        ("sigma_bearing_rad", "noise-of-detections", 4.0),
+        ("sigma_turn_per_sqrt_s", "noise-of-odometry", 3.0),
+    ):
+        for ratio, expected in ((0.95 * most, False), (1.05 * most, True)):
+            levels = tuple(
+                replace(one, value=ratio * one.prior_mean) if one.name == name else one for one in result.parameters
+            )
+            assert (code in alarms(replace(result, parameters=levels), recording)) is expected

@@ -186,6 +186,7 @@ class Signs:
         sigma_share: `sigma_m` over the size.
         blind_s, blind_share: longest time without a used detection, in seconds and as a share of the drive.
         common, moved: landmarks of the given map that were seen; the share of them that is reported as changed.
+        displaced: the same share of those that are elsewhere now.
         in_map: whether a given map is the frame of the result; None without one.
         alternatives: explanations nearly as probable as the one reported.
         n_unknown: poses and landmarks of the result that are no numbers.
@@ -224,6 +225,7 @@ class Signs:
     blind_share: float = nan
     common: int = -1
     moved: float = nan
+    displaced: float = nan
     in_map: bool | None = None
     alternatives: int = 0
     n_unknown: int = 0
@@ -261,7 +263,7 @@ def measure_signs(
         named = blind_s = blind_share = nan
     away, name = _farthest_state(result.parameters)
     size_m, sigma_m, most_m = _extent(result)
-    common, moved = _of_map(result, recording, prior_map)
+    common, moved, displaced = _of_map(result, recording, prior_map)
     inlier = result.innovations.p_inlier >= USED
     nis, found = comparable_nis(result.innovations), result.association
     fine = inlier & np.isfinite(nis)
@@ -299,6 +301,7 @@ def measure_signs(
         blind_share=blind_share,
         common=common,
         moved=moved,
+        displaced=displaced,
         in_map=None if prior_map is None else is_in_map,
         alternatives=len(result.alternatives),
         n_unknown=_count_unknown(result),
@@ -516,14 +519,17 @@ def _blind(result: SlamResult) -> tuple[float, float]:
     return longest, longest / lasted if lasted > 0.0 else nan
 
 
-GONE_OR_MOVED = (ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED, ChangeKind.VANISHED)
+ELSEWHERE = (ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED)
 
 
-def _of_map(result: SlamResult, recording: AnyRecording, prior_map: Landmarks | None) -> tuple[int, float]:
-    """Return how many landmarks of a given map were seen, and the share of them that is reported as changed."""
+def _of_map(result: SlamResult, recording: AnyRecording, prior_map: Landmarks | None) -> tuple[int, float, float]:
+    """Return how many landmarks of a given map were seen, and the shares that are reported as changed and elsewhere."""
     if prior_map is None:
-        return -1, nan
+        return -1, nan, nan
     named = np.concatenate([recording.detections.landmark_id, result.innovations.landmark_id])
     common = np.intersect1d(prior_map.landmark_id, named[named != UNKNOWN])
-    changed = [one for change in result.changes if change.kind in GONE_OR_MOVED for one in change.landmark_ids]
-    return len(common), float(np.isin(common, changed).mean()) if len(common) else nan
+    if not len(common):
+        return 0, nan, nan
+    moved = [one for change in result.changes if change.kind in ELSEWHERE for one in change.landmark_ids]
+    gone = [one for change in result.changes if change.kind is ChangeKind.VANISHED for one in change.landmark_ids]
+    return len(common), float(np.isin(common, [*moved, *gone]).mean()), float(np.isin(common, moved).mean())

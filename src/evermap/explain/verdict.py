@@ -109,6 +109,10 @@ LIMITS = (
         "too much of the map is not as it was", "a new map, or the edition of the map that was built",
     ),
     Limit(
+        "map-displaced", "displaced", "{:.0%} of the map's landmarks in view elsewhere", -inf, 1.0 / 3.0, WEAK,
+        "so many moved that it may as well be the others", "a map that was built again, or some landmarks surveyed",
+    ),
+    Limit(
         "scale", "apart", "lengths by odometry and by detections differ by {:.1%}", -inf, 0.05, WEAK,
         "nothing says which of the two measures true metres",
         "a map with surveyed positions, or what is known better: sigma_scale of [sensor] or sigma_odometer_scale of "
@@ -227,7 +231,7 @@ def _symptoms(signs: Signs) -> Iterable[Symptom]:
     """Yield the signs that this run has, each with its range."""
     for limit in LIMITS:
         value = float(getattr(signs, limit.sign))
-        few = limit.sign == "moved" and value * signs.common < FEWEST_MOVED
+        few = limit.sign in ("moved", "displaced") and value * signs.common < FEWEST_MOVED
         if isfinite(value) and not few:
             expected = _range_text(limit)
             yield Symptom(limit.code, f"{limit.text.format(value)}, {expected}", value, limit.least, limit.most)
