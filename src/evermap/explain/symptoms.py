@@ -352,8 +352,11 @@ def _find_share_contradicted(result: SlamResult) -> float:
 
 
 def _count_unexplained(result: SlamResult) -> int:
-    """Return landmarks of which many detections in a row were not used, without a reported change or cause of them."""
-    innovations = result.innovations
+    """Return landmarks of which many detections in a row were not used, where the robot was located, without a change
+    of them that is reported.
+    """
+    located = _poses_at(result.trajectory, result.innovations.stamp_s)[1]
+    innovations = result.innovations[np.flatnonzero(located)]
     known = {one for change in result.changes for one in change.landmark_ids}
     found = 0
     for one in np.setdiff1d(innovations.landmark_id, list(known)).tolist():

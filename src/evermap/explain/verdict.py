@@ -26,7 +26,7 @@ class Limit:
     Attributes:
         code: of the symptom.
         sign: name in `Signs`.
-        text: the value in words; what is expected follows.
+        text: the value in words, and {name} of the calibration state that is farthest off; what is expected follows.
         least, most: the range.
         kind: of the verdict, if nothing worse is found.
         why: what it means where it is beyond.
@@ -124,12 +124,17 @@ LIMITS = (
         "a map with surveyed positions, or the size of tags and the wheel radius measured again",
     ),
     Limit(
+        "stated", "away", "{:.1f} standard deviations from what is stated: {name}", -inf, 4.0, WEAK,
+        "the calibration is not as stated", "what is known of it, in sensor.toml",
+    ),
+    Limit(
         "clocks", "shift", "poses by the other clock are {:.1f} standard deviations away", -inf, 2.0, WEAK,
         "odometry and detections are stamped differently, and nothing says which clock is right",
         "stamps of one clock, or the delay of the odometry taken off its stamps",
     ),
     Limit(
-        "over-odometry", "over_odometry", "detections scatter {:.2f} times as far as by odometry alone", -inf, 1.2, LOST,
+        "over-odometry", "over_odometry", "detections scatter {:.2f} times as far as by odometry alone", -inf, 1.2,
+        LOST,
         "odometry alone explains the detections better than the solution does",
     ),
     Limit(
@@ -137,7 +142,7 @@ LIMITS = (
         "the solution hardly listens to the detections", "calibration of the sensor, or its noise as stated",
     ),
     Limit(
-        "noise-of-odometry", "noise_driven", "odometry {:.1f} times as noisy as is usual", -inf, 3.0, WEAK,
+        "noise-of-odometry", "noise_driven", "odometry {:.1f} times as noisy as is usual", -inf, 6.0, WEAK,
         "the solution hardly follows the odometry", "calibration and clock of the odometry, or the sensor's [mount]",
     ),
     Limit(
@@ -234,7 +239,8 @@ def _symptoms(signs: Signs) -> Iterable[Symptom]:
         few = limit.sign in ("moved", "displaced") and value * signs.common < FEWEST_MOVED
         if isfinite(value) and not few:
             expected = _range_text(limit)
-            yield Symptom(limit.code, f"{limit.text.format(value)}, {expected}", value, limit.least, limit.most)
+            text = limit.text.format(value, name=signs.away_name)
+            yield Symptom(limit.code, f"{text}, {expected}", value, limit.least, limit.most)
 
 
 def _range_text(limit: Limit) -> str:

@@ -281,7 +281,9 @@ def noise_parameters(
         PIXEL: bool((kind == CORNERS).any()),
     }
     return [
-        ParameterEstimate(name, float(noise.levels[row]), 0.0, float(started.levels[row]), np.nan, unit, meaning=meaning)
+        ParameterEstimate(
+            name, float(noise.levels[row]), 0.0, float(started.levels[row]), np.nan, unit, meaning=meaning
+        )
         for row, (name, unit, meaning) in _LEVELS.items()
         if has[row]
     ]
