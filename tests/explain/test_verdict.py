@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from math import inf
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -195,3 +197,55 @@ def test_noise_far_beyond_what_is_usual_is_weak() -> None:
                 replace(one, value=ratio * one.prior_mean) if one.name == name else one for one in result.parameters
             )
             assert (code in alarms(replace(result, parameters=levels), recording)) is expected
+
+
+def test_limits_are_those_of_the_documentation() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "verdict.md").read_text()
+    lines = [line for line in page.split("## Symptoms")[1].split("##")[0].splitlines() if line.startswith("| `")]
+    rows = {cells[1].strip(" `"): cells[3:5] for cells in (line.split("|") for line in lines)}
+    assert set(rows) == {limit.code for limit in LIMITS}
+    for limit in LIMITS:
+        text, kind = rows[limit.code][0], rows[limit.code][1].strip()
+        assert limit.kind == kind
+        assert (limit.least, limit.most) == pytest.approx(read_range(text)), limit.code
+
+
+def read_range(text: str) -> tuple[float, float]:
+    """Return the range that a cell of the documentation states."""
+    numbers = [float(one) / (100.0 if share else 1.0) for one, share in re.findall(r"(-?[\d.]*\d)( %)?", text)]
+    if " to " in text.split(":")[0]:
+        return numbers[0], numbers[1]
+    number = 1.0 / 3.0 if "a third" in text else 0.0 if "none" in text else numbers[0]
+    if "factor" in text:
+        return 1.0 / number, number
+    return (number, inf) if "or more" in text else (-inf, number)
+
+
+def test_two_changed_landmarks_are_changes_and_no_outdated_map() -> None:
+    of_map = replace(GOOD, common=3, in_map=True)
+    for sign, kind in (("moved", VerdictKind.MAP_OUTDATED), ("displaced", VerdictKind.WEAK)):
+        assert judge_signs(replace(of_map, **{sign: 2 / 3})).kind is VerdictKind.SOUND
+        assert judge_signs(replace(of_map, **{sign: 1.0})).kind is kind
+
+
+def test_a_map_that_the_session_does_not_fit_is_outdated_unless_the_solution_is_lost() -> None:
+    for signs, set_aside, words in (
+        (replace(GOOD, common=0), "", "no landmark of the map was seen"),
+        (replace(GOOD, common=9), "too few agree", "not localised in the map: too few agree"),
+        (replace(GOOD, common=9, in_map=False), "", "lies nowhere on the map"),
+    ):
+        found = judge_signs(signs, set_aside=set_aside)
+        assert (found.kind, words in found.message) == (VerdictKind.MAP_OUTDATED, True)
+        assert judge_signs(replace(signs, nis=50.0), set_aside=set_aside).kind is VerdictKind.LOST
+        assert judge_signs(signs, ["ranges in mm"], set_aside=set_aside).kind is VerdictKind.SENSOR_SUSPECT
+    assert judge_signs(replace(GOOD, common=9, in_map=True)).kind is VerdictKind.SOUND
+
+
+def test_the_worst_decides_and_what_is_weak_comes_last() -> None:
+    weak = replace(GOOD, blind_share=0.9)
+    assert judge_signs(weak).kind is VerdictKind.WEAK
+    assert judge_signs(replace(weak, moved=0.9, common=9)).kind is VerdictKind.MAP_OUTDATED
+    assert judge_signs(replace(weak, moved=0.9, common=9, motion=0.9)).kind is VerdictKind.SENSOR_SUSPECT
+    lost = judge_signs(replace(weak, moved=0.9, common=9, motion=0.9, nis=50.0))
+    assert (lost.kind, lost.symptoms[0].is_alarming) == (VerdictKind.LOST, True)
+    assert [one.code for one in lost.symptoms if one.is_alarming] == ["innovations", "odometry", "map-changed", "blind"]
