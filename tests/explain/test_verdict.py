@@ -213,7 +213,7 @@ def test_limits_are_those_of_the_documentation() -> None:
 def read_range(text: str) -> tuple[float, float]:
     """Return the range that a cell of the documentation states."""
     numbers = [float(one) / (100.0 if share else 1.0) for one, share in re.findall(r"(-?[\d.]*\d)( %)?", text)]
-    if " to " in text.split(":")[0]:
+    if " to " in text.split(":", maxsplit=1)[0]:
         return numbers[0], numbers[1]
     number = 1.0 / 3.0 if "a third" in text else 0.0 if "none" in text else numbers[0]
     if "factor" in text:
