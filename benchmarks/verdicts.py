@@ -8,6 +8,7 @@ repeated, and `--judge` judges the rows of a file again without running anything
     python -m benchmarks.verdicts --out rows.jsonl                # all; hours on one core
     python -m benchmarks.verdicts --out rows.jsonl --only robot   # some, by the beginnings of their names
     python -m benchmarks.verdicts --out rows.jsonl --held-out     # worlds of seeds that no limit was set with
+    python -m benchmarks.verdicts --out rows.jsonl --small        # short drives at a low rate, ten minutes; or both
     python -m benchmarks.verdicts --out rows.jsonl --judge        # rates, of all that set limits and of the held-out
 
 A run is bad where poses are worse than odometry alone (by 5 % and 1 cm), or the median NEES of poses or landmarks is
@@ -43,13 +44,17 @@ from evermap.slam.plane import in_its_space
 from evermap.types import UNKNOWN, AnyRecording, Landmarks, SlamResult, SpatialRecording, is_in_space
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
-LONGEST_S = 240
-"""Of a run; a lost one may search for long."""
+LONGEST_S, SMALL_LONGEST_S = 240, 8
+"""CPU time of a run, and of one in a small world; a lost one may search for long."""
 WORSE, SLACK_M, MOST_NEES = 1.05, 0.01, 4.0
 FRESH = 1000
 """Seed from which worlds take no part in setting limits."""
 FRESH_WORLDS = 40
 """Fresh seeds of each kind of world, at most."""
+SMALL_HZ, SMALL_S, SMALL_WORLDS = 2.0, 60.0, 20
+"""Of small worlds: rate of their frames, length of drives, and seeds of each kind, at most."""
+SMALL_SOUND = 4
+"""Seeds of each small world of `evermap reproduce causes` in which nothing is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,20 +259,31 @@ def held_out_cases() -> Iterator[Case]:
     yield from _of_causes(FRESH)
 
 
-def _of_causes(seed: int) -> Iterator[Case]:
+def small_cases(first: int) -> Iterator[Case]:
+    """Yield runs of a second or two in worlds of seeds from `first` on, some of every kind that others have, too."""
+    for seed in range(first, first + SMALL_WORLDS):
+        for name, make, mistakes in _worlds(range(seed, seed + 1), small=True):
+            yield from _of_base(name, make, mistakes)
+    yield from _of_causes(first, small=True)
+
+
+def _of_causes(seed: int, *, small: bool = False) -> Iterator[Case]:
     """Yield a run of every world of `evermap reproduce causes`, and more of those in which nothing is wrong."""
     from evermap_studies.causes.catalogue import World, catalogue
     from evermap_studies.causes.drives import as_recording
     from evermap_studies.causes.judge import make_case
 
     def made(world: World, seed: int) -> tuple[AnyRecording, Landmarks | None]:
+        if small:
+            world = replace(world, make=replace(world.make, frame_hz=min(SMALL_HZ, world.make.frame_hz)))
         given = make_case(world, seed).given
         return as_recording(given), given.places
 
+    label, sound = ("small ", SMALL_SOUND) if small else ("", 3)
     for world in catalogue():
         kind, mistake = "in map" if world.in_map else "alone", "as it is" if not world.cause else world.cause
-        for k in range(3 if world.group == "sound" else 1):
-            name = f"{world.name.replace('/', ' per ')} {seed + k}/{kind}/{mistake}"
+        for k in range(sound if world.group == "sound" else 1):
+            name = f"{world.name.replace('/', ' per ')} {label}{seed + k}/{kind}/{mistake}"
             yield Case(name, lambda world=world, k=k: made(world, seed + k))
 
 
@@ -301,7 +317,7 @@ def _of_base(name: str, make: Made, mistakes: int) -> Iterator[Case]:
         yield Case(f"{name}/in map/{mistake}", lambda mistake=mistake: broken(mistake, "in map"))
 
 
-def _worlds(seeds: range) -> Iterator[tuple[str, Made, int]]:
+def _worlds(seeds: range, *, small: bool = False) -> Iterator[tuple[str, Made, int]]:
     """Yield names, makers, and how many mistakes each is broken by; of fresh seeds some of each kind."""
     from evermap_studies.sim import BuildingConfig, simulate_building
     from evermap_studies.worlds.lasers import LaserWorld, simulate_laser
@@ -309,29 +325,33 @@ def _worlds(seeds: range) -> Iterator[tuple[str, Made, int]]:
 
     def robot(seed: int) -> AnyRecording:
         made = draw_robot(seed)
-        return simulate_robot(replace(made, duration_s=min(made.duration_s, 180.0)), seed)
+        return simulate_robot(replace(made, duration_s=min(made.duration_s, 2.0 * lasting_s if small else 180.0)), seed)
 
+    label, lasting_s = ("small ", SMALL_S) if small else ("", 150.0)
     lasers = {
-        "plain": LaserWorld(duration_s=150.0),
-        "lasting": LaserWorld(duration_s=150.0, lasting_m=0.02, lasting_rad=0.005),
-        "thick": LaserWorld(duration_s=150.0, radius_m=0.1, radius_spread_m=0.03),
-        "late": LaserWorld(duration_s=150.0, delay_s=0.15, scan_s=0.1),
-        "slips": LaserWorld(duration_s=150.0, slips=60.0, noise=0.03, scale=1.03, turn_scale=0.97),
-        "few": LaserWorld(duration_s=150.0, n_landmarks=5, range_max_m=8.0),
-        "misread": LaserWorld(duration_s=150.0, p_wrong=0.03),
+        "plain": LaserWorld(),
+        "lasting": LaserWorld(lasting_m=0.02, lasting_rad=0.005),
+        "thick": LaserWorld(radius_m=0.1, radius_spread_m=0.03),
+        "late": LaserWorld(delay_s=0.15, scan_s=0.1),
+        "slips": LaserWorld(slips=60.0, noise=0.03, scale=1.03, turn_scale=0.97),
+        "few": LaserWorld(n_landmarks=5, range_max_m=8.0),
+        "misread": LaserWorld(p_wrong=0.03),
     }
+    lasers = {name: replace(world, duration_s=lasting_s) for name, world in lasers.items()}
+    if small:
+        lasers = {name: replace(world, rate_hz=SMALL_HZ) for name, world in lasers.items()}
     for seed in seeds:
         number = seed % FRESH
-        yield f"robot {seed}", lambda seed=seed: robot(100 + seed), 2
-        if number < 24:
+        yield f"robot {label}{seed}", lambda seed=seed: robot(100 + seed), 2
+        if number < 24 and not small:
             yield f"patrol {seed}", lambda seed=seed: _patrol(seed), 2
         if number < 3:
             for name, world in lasers.items():
-                yield f"laser {name} {seed}", lambda world=world, seed=seed: simulate_laser(world, 40 + seed), 2
-        if number < 10:
-            config = BuildingConfig(days=1, sessions_per_day=1, patrol_s=(60.0, 165.0)[seed % 2])
+                yield f"laser {name} {label}{seed}", lambda world=world, seed=seed: simulate_laser(world, 40 + seed), 2
+        if number < (3 if small else 10):
+            config = BuildingConfig(days=1, sessions_per_day=1, patrol_s=SMALL_S if small else (60.0, 165.0)[seed % 2])
             yield (
-                f"building {seed}",
+                f"building {label}{seed}",
                 lambda config=config, seed=seed: simulate_building(config, seed=seed).sessions[0],
                 2,
             )
@@ -391,12 +411,12 @@ def _stop(*_: Any) -> None:
     raise TooLongError
 
 
-def run(one: Case) -> dict[str, Any]:
-    """Return the row of a run."""
+def run(one: Case, longest_s: int = LONGEST_S) -> dict[str, Any]:
+    """Return the row of a run, which is given up after some CPU time."""
     began = time.process_time()
     row: dict[str, Any] = {"name": one.name, "broken": one.is_broken}
-    signal.signal(signal.SIGALRM, _stop)
-    signal.alarm(LONGEST_S)
+    signal.signal(signal.SIGPROF, _stop)
+    signal.setitimer(signal.ITIMER_PROF, longest_s)
     try:
         recording, given = one.make()
         named = bool((recording.detections.landmark_id != UNKNOWN).any())
@@ -412,7 +432,7 @@ def run(one: Case) -> dict[str, Any]:
     except Exception as error:  # a defect; the other runs go on
         row["error"] = f"{type(error).__name__}: {error}"
     finally:
-        signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
     return row | {"cpu_s": round(time.process_time() - began, 2)}
 
 
@@ -503,14 +523,14 @@ def rates(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join([*lines, "", *missed])
 
 
-def compute(out: Path, cases: Sequence[Case]) -> None:
+def compute(out: Path, cases: Sequence[Case], longest_s: int = LONGEST_S) -> None:
     """Run what is not in the file yet, a row each."""
     done = {json.loads(line)["name"] for line in out.read_text().splitlines()} if out.is_file() else set()
     with out.open("a") as file:
         for one in cases:
             if one.name in done:
                 continue
-            row = run(one)
+            row = run(one, longest_s)
             file.write(json.dumps(row) + "\n")
             file.flush()
             print(f"{one.name}: {row.get('verdict')} {row.get('error', '')} {row['cpu_s']} s", flush=True)
@@ -525,15 +545,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="beginnings of names")
     parser.add_argument("--held-out", action="store_true", help="worlds of fresh seeds")
+    parser.add_argument("--small", action="store_true", help="short drives at a low rate, of either seeds")
     parser.add_argument("--judge", action="store_true", help="judge the rows that are there")
     given = parser.parse_args(arguments)
     if given.judge:
         print(rates([json.loads(line) for line in given.out.read_text().splitlines()]))
         return 0
-    cases = list(held_out_cases() if given.held_out else all_cases(given.data.resolve()))
+    if given.small:
+        cases = list(small_cases(FRESH if given.held_out else 0))
+    else:
+        cases = list(held_out_cases() if given.held_out else all_cases(given.data.resolve()))
     cases = [one for one in cases if not given.only or one.name.startswith(tuple(given.only))]
     cases.sort(key=lambda one: zlib.crc32(one.name.encode()))  # so that any part of them is a sample of all
-    compute(given.out, cases)
+    compute(given.out, cases, SMALL_LONGEST_S if given.small else LONGEST_S)
     return 0
 
 

@@ -1032,6 +1032,11 @@ class Verdict(Shown):
     symptoms: tuple[Symptom, ...] = ()
     causes: tuple[Cause, ...] = ()
 
+    @property
+    def text(self) -> str:
+        """Return it in one line: 'lost: ...'."""
+        return f"{self.kind}: {self.message}"
+
 
 @dataclass(frozen=True, slots=True)
 class SlamResult(Shown):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from math import inf
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +13,18 @@ import pytest
 from evermap import run_slam
 from evermap.explain.symptoms import Signs, measure_signs
 from evermap.explain.verdict import LIMITS, Limit, judge_signs
-from evermap.types import AssociationEvidence, Cause, Landmarks, Recording, VerdictKind
-from evermap.viz.verdict_words import cause_text, further_causes, verdict_text
+from evermap.types import (
+    AssociationEvidence,
+    Cause,
+    ChangeKind,
+    Landmarks,
+    MapChange,
+    ParameterEstimate,
+    Recording,
+    SlamResult,
+    VerdictKind,
+)
+from evermap.viz.verdict_words import cause_text, further_causes
 from evermap_studies.worlds.lasers import LaserWorld, simulate_laser
 
 GOOD = Signs(n_landmarks=12, n_used=500, nis=2.0, used=0.98, sigma_m=0.02, size_m=10.0)
@@ -60,7 +72,7 @@ def test_every_cause_is_told_once() -> None:
     late = Cause("clock", "front", "stamps of front are 0.12 s late", 0.12, 0.002, 0.99, "stamp_s - 0.12")
     size = Cause("tag-size", "all tags", "tags are 10 % larger", probability=0.99, fix="tag_size_m = 0.176")
     verdict = judge_signs(GOOD, causes=[late, size])
-    lines = [verdict_text(verdict), *map(cause_text, further_causes(verdict))]
+    lines = [verdict.text, *map(cause_text, further_causes(verdict))]
     for cause in (late, size):
         assert sum(cause.message in line and cause.fix in line for line in lines) == 1
 
@@ -106,3 +118,138 @@ def test_runs_end_with_a_verdict() -> None:
         verdict = run_slam(recording, prior_map=other).verdict
         assert verdict is not None
         assert verdict.kind is VerdictKind.MAP_OUTDATED, verdict.message
+
+
+def alarms(result: SlamResult, recording: Recording, given: Landmarks | None = None) -> set[str]:
+    """Return the codes of the signs of a run that are beyond their limits."""
+    return {one.code for one in judge_signs(measure_signs(result, recording, given)).symptoms if one.is_alarming}
+
+
+def test_lengths_that_differ_are_weak_until_a_map_says_which_are_right() -> None:
+    recording, survey = recorded()
+    driven = recording.odometry
+    long = replace(recording, odometry=replace(driven, forward_mps=1.08 * driven.forward_mps))
+    verdict = run_slam(long).verdict
+    assert verdict is not None
+    assert verdict.kind is VerdictKind.WEAK
+    assert "differ by 7." in verdict.message
+    assert "sigma_odometer_scale" in verdict.message
+    in_map = run_slam(long, prior_map=survey)
+    assert "scale" not in alarms(in_map, long, survey)
+
+
+def test_a_scale_far_from_what_is_stated_is_weak_until_a_map_says_which_is_right() -> None:
+    recording, survey = recorded()
+    scale = ParameterEstimate("odometry_scale", 0.984, 0.002, 1.0, 0.005, "")
+    for given, expected in ((None, True), (survey, False)):
+        result = run_slam(recording, prior_map=given)
+        other = replace(result, parameters=(*result.parameters, scale))
+        assert ("stated-scale" in alarms(other, recording, given)) is expected
+        assert "stated-scale" not in alarms(result, recording, given)
+
+
+def test_a_long_delay_is_weak_since_nothing_says_whose_it_is() -> None:
+    recording, survey = recorded()
+    result = run_slam(recording, prior_map=survey)
+    for delay_s, expected in ((-0.3, True), (0.3, True), (0.14, False)):
+        parameters = tuple(
+            replace(one, value=delay_s) if one.name == "odometry_delay_s" else one for one in result.parameters
+        )
+        late = replace(result, parameters=parameters)
+        assert ("clocks" in alarms(late, recording, survey)) is expected
+        fixed = tuple(replace(one, fixed=True) for one in parameters)  # stated by who knows it
+        assert "clocks" not in alarms(replace(late, parameters=fixed), recording, survey)
+
+
+def test_a_solution_that_scatters_detections_more_than_odometry_does_is_lost() -> None:
+    recording, _ = recorded()
+    result = run_slam(recording)
+    assert measure_signs(result, recording).over_odometry < 1.0
+    pose = result.trajectory.pose_world_robot.copy()
+    pose[:, 0] *= 0.5  # halves every way along x
+    bent = replace(result, trajectory=replace(result.trajectory, pose_world_robot=pose))
+    assert measure_signs(bent, recording).over_odometry > 1.2
+    assert "over-odometry" in alarms(bent, recording)
+
+
+def test_a_landmark_unexplained_for_long_is_weak_unless_its_change_is_reported() -> None:
+    recording, _ = recorded()
+    result = run_slam(recording)
+    innovations = result.innovations
+    mine = np.flatnonzero(innovations.landmark_id == innovations.landmark_id[0])
+    order = mine[np.argsort(innovations.stamp_s[mine])]
+    for unused, expected in ((order[len(order) // 2 :], True), (order[::4], False), (order[:2], False)):
+        p_inlier = innovations.p_inlier.copy()
+        p_inlier[unused] = 0.0
+        other = replace(result, innovations=replace(innovations, p_inlier=p_inlier))
+        assert ("unexplained" in alarms(other, recording)) is expected
+        identity = int(innovations.landmark_id[0])
+        change = MapChange((identity,), ChangeKind.MOVED, 0.0, 60.0, (1.0, 0.0), 0.0, 0.99)
+        assert "unexplained" not in alarms(replace(other, changes=(change,)), recording)
+
+
+def test_noise_far_beyond_what_is_usual_is_weak() -> None:
+    recording, _ = recorded()
+    result = run_slam(recording)
+    assert not alarms(result, recording)
+    for name, code, most in (
+        ("sigma_bearing_rad", "noise-of-detections", 4.0),
+        ("sigma_turn_per_sqrt_s", "noise-of-odometry", 6.0),
+    ):
+        for ratio, expected in ((0.95 * most, False), (1.05 * most, True)):
+            levels = tuple(
+                replace(one, value=ratio * one.prior_mean) if one.name == name else one for one in result.parameters
+            )
+            assert (code in alarms(replace(result, parameters=levels), recording)) is expected
+
+
+def test_limits_are_those_of_the_documentation() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "verdict.md").read_text()
+    lines = [line for line in page.split("## Symptoms")[1].split("##")[0].splitlines() if line.startswith("| `")]
+    rows = {cells[1].strip(" `"): cells[3:5] for cells in (line.split("|") for line in lines)}
+    assert set(rows) == {limit.code for limit in LIMITS}
+    for limit in LIMITS:
+        text, kind = rows[limit.code][0], rows[limit.code][1].strip()
+        assert limit.kind == kind
+        assert (limit.least, limit.most) == pytest.approx(read_range(text)), limit.code
+
+
+def read_range(text: str) -> tuple[float, float]:
+    """Return the range that a cell of the documentation states."""
+    numbers = [float(one) / (100.0 if share else 1.0) for one, share in re.findall(r"(-?[\d.]*\d)( %)?", text)]
+    if " to " in text.split(":", maxsplit=1)[0]:
+        return numbers[0], numbers[1]
+    number = 1.0 / 3.0 if "a third" in text else 0.0 if "none" in text else numbers[0]
+    if "factor" in text:
+        return 1.0 / number, number
+    return (number, inf) if "or more" in text else (-inf, number)
+
+
+def test_two_changed_landmarks_are_changes_and_no_outdated_map() -> None:
+    of_map = replace(GOOD, common=3, in_map=True)
+    for sign, kind in (("moved", VerdictKind.MAP_OUTDATED), ("displaced", VerdictKind.WEAK)):
+        assert judge_signs(replace(of_map, **{sign: 2 / 3})).kind is VerdictKind.SOUND
+        assert judge_signs(replace(of_map, **{sign: 1.0})).kind is kind
+
+
+def test_a_map_that_the_session_does_not_fit_is_outdated_unless_the_solution_is_lost() -> None:
+    for signs, set_aside, words in (
+        (replace(GOOD, common=0), "", "no landmark of the map was seen"),
+        (replace(GOOD, common=9), "too few agree", "not localised in the map: too few agree"),
+        (replace(GOOD, common=9, in_map=False), "", "lies nowhere on the map"),
+    ):
+        found = judge_signs(signs, set_aside=set_aside)
+        assert (found.kind, words in found.message) == (VerdictKind.MAP_OUTDATED, True)
+        assert judge_signs(replace(signs, nis=50.0), set_aside=set_aside).kind is VerdictKind.LOST
+        assert judge_signs(signs, ["ranges in mm"], set_aside=set_aside).kind is VerdictKind.SENSOR_SUSPECT
+    assert judge_signs(replace(GOOD, common=9, in_map=True)).kind is VerdictKind.SOUND
+
+
+def test_the_worst_decides_and_what_is_weak_comes_last() -> None:
+    weak = replace(GOOD, blind_share=0.9)
+    assert judge_signs(weak).kind is VerdictKind.WEAK
+    assert judge_signs(replace(weak, moved=0.9, common=9)).kind is VerdictKind.MAP_OUTDATED
+    assert judge_signs(replace(weak, moved=0.9, common=9, motion=0.9)).kind is VerdictKind.SENSOR_SUSPECT
+    lost = judge_signs(replace(weak, moved=0.9, common=9, motion=0.9, nis=50.0))
+    assert (lost.kind, lost.symptoms[0].is_alarming) == (VerdictKind.LOST, True)
+    assert [one.code for one in lost.symptoms if one.is_alarming] == ["innovations", "odometry", "map-changed", "blind"]

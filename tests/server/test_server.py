@@ -95,7 +95,8 @@ def test_a_session_is_uploaded_entered_and_asked_about(fleet: Fleet, zips: list[
     worker = fleet.worker()
     while worker.step():
         pass
-    assert fleet("GET", f"/jobs/{job['id']}").json()["state"] == "entered"
+    entered = fleet("GET", f"/jobs/{job['id']}").json()
+    assert (entered["state"], entered["reason"].split(",")[0]) == ("entered", "sound")
     assert fleet("GET", f"/jobs/{job['id']}").json()["revision"] == 1
     assert fleet("GET", f"/jobs/{job['id']}/payload").status_code == 404
     assert fleet.upload(zips[0]).json()["state"] == "entered"

@@ -412,7 +412,7 @@ def _write(
     from evermap.runs.folder import write_run
     from evermap.runs.summary import RunInfo
     from evermap.viz.change_words import explanations, grew
-    from evermap.viz.verdict_words import cause_text, further_causes, verdict_text
+    from evermap.viz.verdict_words import cause_text, further_causes
 
     info = RunInfo(
         command=command_line(),
@@ -439,7 +439,7 @@ def _write(
     if result.verdict is not None:
         for cause in further_causes(result.verdict):
             echo(f"cause: {cause_text(cause)}")
-        echo(f"verdict: {verdict_text(result.verdict)}")
+        echo(f"verdict: {result.verdict.text}")
 
 
 def main_numbers(summary: Mapping[str, Any]) -> list[tuple[str, str]]:

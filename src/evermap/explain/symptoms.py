@@ -8,7 +8,7 @@ found. Values are numbers; what they should be is decided by `explain.verdict`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import nan
+from math import isnan, nan
 
 import numpy as np
 
@@ -46,6 +46,11 @@ LEAST_MOTION_M = 0.05
 """Motion within a window, below which the robot stands: its relative error says nothing."""
 PER_LANDMARK = 5
 """Detections of a landmark, in each half of the drive, of which a mean says something."""
+LATE_S = 0.15
+"""Delay up to which the odometry is taken to be what is late, by its filters and bridges; a longer one is as well the
+sensor's, whose readings are processed."""
+LEAST_STREAK = 0.2
+"""Share of its detections that a landmark is contradicted by in a row: fewer may be one bad look."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +61,7 @@ class Compared:
         stamp_s, landmark_id, used: (K,) when, of which landmark, and whether it is no outlier.
         range_m: (K,) expected range.
         off: (K, D) detection less expectation over the expected range; of ranges only one number.
+        point_m: (K, D) where detections are in the robot's frame; nan where they have a direction or a range only.
     """
 
     stamp_s: FloatArray
@@ -63,6 +69,7 @@ class Compared:
     used: BoolArray
     range_m: FloatArray
     off: FloatArray
+    point_m: FloatArray
 
     @property
     def misfit(self) -> FloatArray:
@@ -88,18 +95,23 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
         range_m = np.linalg.norm(expected, axis=1)
         blind = without_range(recording)[detection]
         length = np.maximum(np.linalg.norm(read, axis=1), 1e-9)
+        point = np.where(blind[:, None], np.nan, se3.transform(mounts, read))
         read = np.where(blind[:, None], read * (range_m / length)[:, None], read)
     else:
         seen = recording.detections
         expected = _predict_readings(pose, places.position_m[row], recording, result.parameters)
         range_m, bearing = expected[:, 0], seen.bearing_rad[detection]
         known = np.isfinite(bearing) & ~(seen.sigma_bearing_rad[detection] >= ANY_BEARING_RAD)
-        read = _points(seen.range_m[detection], np.where(known, bearing, expected[:, 1]))
+        read = _points(seen.range_m[detection], np.where(known, bearing, np.nan))
+        point = se2.transform(np.array(recording.sensor.mount_robot_sensor, dtype=np.float64), read)
+        read = np.where(known[:, None], read, _points(seen.range_m[detection], expected[:, 1]))
         expected = _points(range_m, expected[:, 1])
     off = (read - expected) / np.maximum(range_m, 1e-9)[:, None]
     good = np.isfinite(off).all(axis=1)
     used = innovations.p_inlier[keep] >= USED
-    return Compared(stamp_s[keep][good], innovations.landmark_id[keep][good], used[good], range_m[good], off[good])
+    return Compared(
+        stamp_s[keep][good], innovations.landmark_id[keep][good], used[good], range_m[good], off[good], point[good]
+    )
 
 
 def _points(range_m: FloatArray, bearing_rad: FloatArray) -> FloatArray:
@@ -154,18 +166,27 @@ class Signs:
         named: share of the detections with an identity, as they were read, that were used.
         misfit, misfit_all: median of what used, and all, detections are off by, over their range.
         contradicted: share of the landmarks (seen often) most of whose detections were not used.
+        unexplained: landmarks of which many detections in a row were not used, and no change of which is reported.
         halves: median over landmarks of how far the first half of the drive has them from the second, in standard
             deviations by the scatter within halves.
         halves_share: the same over the range from which they are seen.
         motion: median difference of odometry and trajectory within a window, as a share of the motion.
         motion_turn_rad: the same of the turns.
         longer: motion by the trajectory over that by odometry.
+        apart: by which share lengths by odometry and by detections differ, where no map says which are right.
+        over_odometry: how far detections of a landmark scatter about their middle, over what they would if the robot
+            had gone as its odometry says (medians): more than 1 where the solution is the worse of the two.
+        noise_seen, noise_driven: largest noise level of detections and odometry over what it started from.
+        shift: distance that the robot goes within the estimated delay of its odometry's clock, over `sigma_m`; nan
+            where the delay is short.
         away, away_name: standard deviations by which the calibration state farthest from its prior is off.
+        away_scale: the same of scales of odometer and ranges, where no map says which are right.
         size_m: extent of trajectory and map.
         sigma_m: median of the standard deviations of positions; `sigma_most_m` the largest.
         sigma_share: `sigma_m` over the size.
         blind_s, blind_share: longest time without a used detection, in seconds and as a share of the drive.
         common, moved: landmarks of the given map that were seen; the share of them that is reported as changed.
+        displaced: the same share of those that are elsewhere now.
         in_map: whether a given map is the frame of the result; None without one.
         alternatives: explanations nearly as probable as the one reported.
         n_unknown: poses and landmarks of the result that are no numbers.
@@ -183,13 +204,20 @@ class Signs:
     misfit: float = nan
     misfit_all: float = nan
     contradicted: float = nan
+    unexplained: int = 0
     halves: float = nan
     halves_share: float = nan
     motion: float = nan
     motion_turn_rad: float = nan
     longer: float = nan
+    apart: float = nan
+    over_odometry: float = nan
+    noise_seen: float = nan
+    noise_driven: float = nan
+    shift: float = nan
     away: float = nan
     away_name: str = ""
+    away_scale: float = nan
     size_m: float = nan
     sigma_m: float = nan
     sigma_most_m: float = nan
@@ -197,6 +225,7 @@ class Signs:
     blind_share: float = nan
     common: int = -1
     moved: float = nan
+    displaced: float = nan
     in_map: bool | None = None
     alternatives: int = 0
     n_unknown: int = 0
@@ -234,10 +263,12 @@ def measure_signs(
         named = blind_s = blind_share = nan
     away, name = _farthest_state(result.parameters)
     size_m, sigma_m, most_m = _extent(result)
-    common, moved = _of_map(result, recording, prior_map)
+    common, moved, displaced = _of_map(result, recording, prior_map)
     inlier = result.innovations.p_inlier >= USED
     nis, found = comparable_nis(result.innovations), result.association
     fine = inlier & np.isfinite(nis)
+    is_in_map = prior_map is not None and result.landmarks.frame == "prior_map"
+    seen, driven = _noise_over_start(result.parameters)
     return Signs(
         n_landmarks=len(result.landmarks),
         n_used=int(inlier.sum()),
@@ -249,13 +280,20 @@ def measure_signs(
         misfit=_median(compared.misfit[compared.used]),
         misfit_all=_median(compared.misfit),
         contradicted=_find_share_contradicted(result),
+        unexplained=_count_unexplained(result),
         halves=halves,
         halves_share=halves_share,
         motion=motion,
         motion_turn_rad=turn,
         longer=longer,
+        apart=nan if is_in_map else abs(longer - 1.0),
+        over_odometry=_over_odometry(compared, result),
+        noise_seen=seen,
+        noise_driven=driven,
+        shift=_shift_by_clock_m(result) / sigma_m if sigma_m > 0.0 else nan,
         away=away,
         away_name=name,
+        away_scale=nan if is_in_map else _farthest_state(_scales(result.parameters))[0],
         size_m=size_m,
         sigma_m=sigma_m,
         sigma_most_m=most_m,
@@ -263,7 +301,8 @@ def measure_signs(
         blind_share=blind_share,
         common=common,
         moved=moved,
-        in_map=None if prior_map is None else result.landmarks.frame == "prior_map",
+        displaced=displaced,
+        in_map=None if prior_map is None else is_in_map,
         alternatives=len(result.alternatives),
         n_unknown=_count_unknown(result),
         dropped=nan if found is None else found.dropped,
@@ -310,6 +349,43 @@ def _find_share_contradicted(result: SlamResult) -> float:
     used = np.bincount(row, result.innovations.p_inlier >= USED, minlength=len(count))
     often = count >= PER_LANDMARK
     return float(np.mean(used[often] < 0.5 * count[often])) if often.any() else nan
+
+
+def _count_unexplained(result: SlamResult) -> int:
+    """Return landmarks of which many detections in a row were not used, where the robot was located, without a change
+    of them that is reported.
+    """
+    located = _poses_at(result.trajectory, result.innovations.stamp_s)[1]
+    innovations = result.innovations[np.flatnonzero(located)]
+    known = {one for change in result.changes for one in change.landmark_ids}
+    found = 0
+    for one in np.setdiff1d(innovations.landmark_id, list(known)).tolist():
+        mine = np.flatnonzero(innovations.landmark_id == one)
+        used = innovations.p_inlier[mine[np.argsort(innovations.stamp_s[mine], kind="stable")]] >= USED
+        edges = np.concatenate([[-1], np.flatnonzero(used), [len(used)]])
+        found += int(np.diff(edges).max()) - 1 >= max(PER_LANDMARK, LEAST_STREAK * len(used))
+    return found
+
+
+def _over_odometry(compared: Compared, result: SlamResult) -> float:
+    """Return the scatter of detections about the middles of their landmarks, over that by odometry alone."""
+    path, other = result.trajectory, result.dead_reckoning
+    if len(path) < 3 or len(other) != len(path) or not np.array_equal(path.stamp_s, other.stamp_s):
+        return nan
+    fine = np.isfinite(compared.point_m).all(axis=1)
+    stamp_s, point_m = compared.stamp_s[fine], compared.point_m[fine]
+    scatter = []
+    for each in (path, other):
+        pose = _poses_at(each, stamp_s)[0]
+        at = (se2 if pose.shape[1] == 3 else se3).transform(pose, point_m)
+        off = np.full(len(at), nan)
+        for one in np.unique(compared.landmark_id[fine]).tolist():
+            mine = np.flatnonzero(compared.landmark_id[fine] == one)
+            if len(mine) >= PER_LANDMARK:
+                off[mine] = np.linalg.norm(at[mine] - np.median(at[mine], axis=0), axis=1)
+        share = off / np.maximum(compared.range_m[fine], 1e-9)
+        scatter.append(_median(share[np.isfinite(share)]))
+    return scatter[0] / scatter[1] if scatter[1] > 0.0 else nan
 
 
 def _between_halves(compared: Compared) -> tuple[float, float]:
@@ -380,6 +456,47 @@ def _farthest_state(parameters: tuple[ParameterEstimate, ...]) -> tuple[float, s
     return max(away, default=(nan, ""))
 
 
+def _scales(parameters: tuple[ParameterEstimate, ...]) -> tuple[ParameterEstimate, ...]:
+    return tuple(each for each in parameters if each.name in SCALES)
+
+
+SCALES = ("odometry_scale", "odometry_forward_scale", "range_scale", "range_slope")
+
+
+def _noise_over_start(parameters: tuple[ParameterEstimate, ...]) -> tuple[float, float]:
+    """Return the largest noise level of detections, and of odometry, over those that the run started from."""
+    seen, driven = nan, nan
+    for each in parameters:
+        if isnan(each.prior_sigma) and each.prior_mean > 0.0:
+            ratio = each.value / each.prior_mean
+            if each.name in OF_DETECTIONS:
+                seen = ratio if isnan(seen) else max(seen, ratio)
+            else:
+                driven = ratio if isnan(driven) else max(driven, ratio)
+    return seen, driven
+
+
+OF_DETECTIONS = (
+    "sigma_range_m", "sigma_bearing_rad", "sigma_corner_px", "direction_noise_factor", "range_noise_factor",
+    "orientation_noise_factor",
+)  # fmt: skip
+"""Names of noise levels of detections; all others are of the odometry."""
+
+
+def _shift_by_clock_m(result: SlamResult) -> float:
+    """Return how far the robot goes, by its usual speed, within a long delay between odometry and detections.
+
+    Poses are those of the detections' clock: if the odometry's is right, they are off by as much.
+    """
+    path = result.trajectory
+    delay = next((each for each in result.parameters if each.name == "odometry_delay_s" and not each.fixed), None)
+    if delay is None or abs(delay.value) < LATE_S or len(path) < 3:
+        return nan
+    dim = 2 if path.pose_world_robot.shape[1] == 3 else 3
+    went = np.linalg.norm(np.diff(path.pose_world_robot[:, :dim], axis=0), axis=1)
+    return abs(delay.value) * float(went.sum()) / max(float(path.stamp_s[-1] - path.stamp_s[0]), 1e-9)
+
+
 def _extent(result: SlamResult) -> tuple[float, float, float]:
     """Return the diagonal of trajectory and map, and median and maximum of the positions' sigmas."""
     path, dim = result.trajectory, result.landmarks.position_m.shape[1]
@@ -405,14 +522,17 @@ def _blind(result: SlamResult) -> tuple[float, float]:
     return longest, longest / lasted if lasted > 0.0 else nan
 
 
-GONE_OR_MOVED = (ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED, ChangeKind.VANISHED)
+ELSEWHERE = (ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED)
 
 
-def _of_map(result: SlamResult, recording: AnyRecording, prior_map: Landmarks | None) -> tuple[int, float]:
-    """Return how many landmarks of a given map were seen, and the share of them that is reported as changed."""
+def _of_map(result: SlamResult, recording: AnyRecording, prior_map: Landmarks | None) -> tuple[int, float, float]:
+    """Return how many landmarks of a given map were seen, and the shares that are reported as changed and elsewhere."""
     if prior_map is None:
-        return -1, nan
+        return -1, nan, nan
     named = np.concatenate([recording.detections.landmark_id, result.innovations.landmark_id])
     common = np.intersect1d(prior_map.landmark_id, named[named != UNKNOWN])
-    changed = [one for change in result.changes if change.kind in GONE_OR_MOVED for one in change.landmark_ids]
-    return len(common), float(np.isin(common, changed).mean()) if len(common) else nan
+    if not len(common):
+        return 0, nan, nan
+    moved = [one for change in result.changes if change.kind in ELSEWHERE for one in change.landmark_ids]
+    gone = [one for change in result.changes if change.kind is ChangeKind.VANISHED for one in change.landmark_ids]
+    return len(common), float(np.isin(common, [*moved, *gone]).mean()), float(np.isin(common, moved).mean())

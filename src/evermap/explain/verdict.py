@@ -26,7 +26,7 @@ class Limit:
     Attributes:
         code: of the symptom.
         sign: name in `Signs`.
-        text: the value in words; what is expected follows.
+        text: the value in words, and {name} of the calibration state that is farthest off; what is expected follows.
         least, most: the range.
         kind: of the verdict, if nothing worse is found.
         why: what it means where it is beyond.
@@ -107,6 +107,48 @@ LIMITS = (
     Limit(
         "map-changed", "moved", "{:.0%} of the map's landmarks in view changed", -inf, 0.5, OUTDATED,
         "too much of the map is not as it was", "a new map, or the edition of the map that was built",
+    ),
+    Limit(
+        "map-displaced", "displaced", "{:.0%} of the map's landmarks in view elsewhere", -inf, 1.0 / 3.0, WEAK,
+        "so many moved that it may as well be the others", "a map that was built again, or some landmarks surveyed",
+    ),
+    Limit(
+        "scale", "apart", "lengths by odometry and by detections differ by {:.1%}", -inf, 0.05, WEAK,
+        "nothing says which of the two measures true metres",
+        "a map with surveyed positions, or what is known better: sigma_scale of [sensor] or sigma_odometer_scale of "
+        "[odometry] in sensor.toml",
+    ),
+    Limit(
+        "stated-scale", "away_scale", "a scale is {:.1f} standard deviations from what is stated", -inf, 3.0, WEAK,
+        "lengths by odometry and by detections differ more than is stated of either",
+        "a map with surveyed positions, or the size of tags and the wheel radius measured again",
+    ),
+    Limit(
+        "stated", "away", "{:.1f} standard deviations from what is stated: {name}", -inf, 4.0, WEAK,
+        "the calibration is not as stated", "what is known of it, in sensor.toml",
+    ),
+    Limit(
+        "clocks", "shift", "poses by the other clock are {:.1f} standard deviations away", -inf, 2.0, WEAK,
+        "odometry and detections are stamped differently, and nothing says which clock is right",
+        "stamps of one clock, or the delay of the odometry taken off its stamps",
+    ),
+    Limit(
+        "over-odometry", "over_odometry", "detections scatter {:.2f} times as far as by odometry alone", -inf, 1.2,
+        LOST,
+        "odometry alone explains the detections better than the solution does",
+    ),
+    Limit(
+        "noise-of-detections", "noise_seen", "detections {:.1f} times as noisy as sensors usually are", -inf, 4.0, WEAK,
+        "the solution hardly listens to the detections", "calibration of the sensor, or its noise as stated",
+    ),
+    Limit(
+        "noise-of-odometry", "noise_driven", "odometry {:.1f} times as noisy as is usual", -inf, 6.0, WEAK,
+        "the solution hardly follows the odometry", "calibration and clock of the odometry, or the sensor's [mount]",
+    ),
+    Limit(
+        "unexplained", "unexplained", "{:.0f} landmarks with many detections in a row unused", -inf, 0.0, WEAK,
+        "a landmark moved during the drive, or is another one, and it was not found which",
+        "another drive past it",
     ),
     Limit(
         "uncertainty", "sigma_share", "positions known to {:.1%} of the size of the place", -inf, 0.05, WEAK,
@@ -194,10 +236,11 @@ def _symptoms(signs: Signs) -> Iterable[Symptom]:
     """Yield the signs that this run has, each with its range."""
     for limit in LIMITS:
         value = float(getattr(signs, limit.sign))
-        few = limit.sign == "moved" and value * signs.common < FEWEST_MOVED
+        few = limit.sign in ("moved", "displaced") and value * signs.common < FEWEST_MOVED
         if isfinite(value) and not few:
             expected = _range_text(limit)
-            yield Symptom(limit.code, f"{limit.text.format(value)}, {expected}", value, limit.least, limit.most)
+            text = limit.text.format(value, name=signs.away_name)
+            yield Symptom(limit.code, f"{text}, {expected}", value, limit.least, limit.most)
 
 
 def _range_text(limit: Limit) -> str:

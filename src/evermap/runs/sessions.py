@@ -96,7 +96,7 @@ class Entered(Shown):
             return ""
         if accept == "weak" and verdict.kind.is_trustworthy:
             return ""
-        return f"{verdict.kind}: {verdict.message}"
+        return verdict.text
 
     @property
     def grown(self) -> IntArray:

@@ -21,6 +21,7 @@ from evermap.runs.sessions import TwiceError, UnbridgedError, enter_session
 from evermap.server.database import AWAY, MOST_TRIES, Database, Job, JobState
 from evermap.server.sites import SiteStores
 from evermap.server.uploads import recording_of
+from evermap.types import SlamResult, VerdictKind
 
 LEASE_S = 60.0
 _PAUSE_S = 0.5
@@ -109,7 +110,7 @@ class Worker:
                             return JobOutcome(JobState.ASIDE, refusal, entered.parent)
                         took_s = time.perf_counter() - start
                         number = entered.commit(store, self._config, command="evermap work", wall_s=took_s)
-                        return JobOutcome(JobState.ENTERED, ", ".join(entered.session.slam.warnings[:3]), number)
+                        return JobOutcome(JobState.ENTERED, _remark(entered.session.slam), number)
                 except StaleRevisionError:  # another process committed meanwhile: again, from the newest
                     continue
         except TwiceError as error:  # a worker died between the commit and saying so, or it came another way
@@ -143,6 +144,13 @@ class Worker:
         finally:
             done.set()
             thread.join()
+
+
+def _remark(entered: SlamResult) -> str:
+    """Return what to say of a session that entered: its verdict, in words where it is not sound, and warnings."""
+    verdict = entered.verdict
+    said = [] if verdict is None else [verdict.kind.value if verdict.kind is VerdictKind.SOUND else verdict.text]
+    return ", ".join([*said, *entered.warnings[:3]])
 
 
 class Crew:

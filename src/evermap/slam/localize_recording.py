@@ -145,7 +145,7 @@ def localize_in_space(
     run = _feed(recording, localizer, frame, step, realtime=realtime, progress=progress)
     spread = np.sqrt(np.diag(localizer.states_covariance))
     kind = seen.kind[usable]
-    parameters = noise_parameters(localizer.noise, kind, np.zeros(len(kind), dtype=np.bool_), driven=driven)
+    parameters = noise_parameters(localizer.noise, noise, kind, np.zeros(len(kind), dtype=np.bool_), driven=driven)
     for row, sensor in enumerate(recording.sensors):
         at = slice(6 * row, 6 * row + 6)
         parameters += mount_parameters(sensor.name, localizer.states[at], spread[at], sigma[at])

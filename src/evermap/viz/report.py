@@ -17,7 +17,7 @@ from evermap.viz.change_words import explanations, grew, near_alternatives
 from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.run_figures import has_prior, quantity
 from evermap.viz.style import NamedFigure
-from evermap.viz.verdict_words import cause_text, further_causes, innovations_text, verdict_text
+from evermap.viz.verdict_words import cause_text, further_causes, innovations_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ def _verdict(result: SlamResult) -> str:
     causes = "".join(f"<li>{escape(cause_text(one))}</li>" for one in further_causes(verdict))
     asked = table(("symptom", "here, and what is expected", ""), rows) if rows else ""
     return (
-        f'<p class="note"><strong>{escape(verdict_text(verdict))}</strong></p>'
+        f'<p class="note"><strong>{escape(verdict.text)}</strong></p>'
         + (f"<ul>{causes}</ul>" if causes else "")
         + (f"<details><summary>Why</summary>{asked}</details>" if asked else "")
     )

@@ -16,11 +16,6 @@ FAR_OFF = 4.0
 """The same beyond which they are too small by more than 40 %."""
 
 
-def verdict_text(verdict: Verdict) -> str:
-    """Return a verdict in one line: 'lost: ...'."""
-    return f"{verdict.kind}: {verdict.message}"
-
-
 def further_causes(verdict: Verdict) -> Sequence[Cause]:
     """Return the causes that the line of the verdict does not have: not sure, or put right by the estimator."""
     return [cause for cause in verdict.causes if cause.message not in verdict.message]

@@ -14,7 +14,7 @@ from evermap.estimate.measurement import frame_of
 from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.calibration import OF_SCALE
-from evermap.slam.space.intake import SpatialIntake, most_of
+from evermap.slam.space.intake import SpatialIntake, most_of, start_noise
 from evermap.slam.space.linearise import (
     ACROSS,
     ALONG,
@@ -243,7 +243,8 @@ def _sizes(told: _Told, count: int) -> FloatArray:
 
 def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
     optimum, problem = told.solved.optimum, told.problem
-    found = noise_parameters(optimum.noise, problem.kind, problem.ray, driven=problem.driven)
+    started = start_noise(problem.settings, driven=problem.driven)
+    found = noise_parameters(optimum.noise, started, problem.kind, problem.ray, driven=problem.driven)
     border = optimum.smoother.factorised(optimum.now).border_covariance()
     *of_sensors, of_scale = np.sqrt(np.diag(border))
     sigma = np.reshape(of_sensors, (-1, STATES))
@@ -264,8 +265,13 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
     return tuple(found)
 
 
-def noise_parameters(noise: SpatialNoise, kind: IntArray, ray: BoolArray, *, driven: bool) -> list[ParameterEstimate]:
-    """Return the noise levels of what there is: detections (M,) of kinds, some of them `ray` only, and odometry."""
+def noise_parameters(
+    noise: SpatialNoise, started: SpatialNoise, kind: IntArray, ray: BoolArray, *, driven: bool
+) -> list[ParameterEstimate]:
+    """Return the noise levels of what there is: detections (M,) of kinds, some of them `ray` only, and odometry.
+
+    Their prior means are the levels that they `started` from.
+    """
     has = {
         TRANSLATION: driven,
         ROTATION: driven,
@@ -275,7 +281,9 @@ def noise_parameters(noise: SpatialNoise, kind: IntArray, ray: BoolArray, *, dri
         PIXEL: bool((kind == CORNERS).any()),
     }
     return [
-        ParameterEstimate(name, float(noise.levels[row]), 0.0, np.nan, np.nan, unit, meaning=meaning)
+        ParameterEstimate(
+            name, float(noise.levels[row]), 0.0, float(started.levels[row]), np.nan, unit, meaning=meaning
+        )
         for row, (name, unit, meaning) in _LEVELS.items()
         if has[row]
     ]
