@@ -15,7 +15,7 @@ import numpy as np
 
 from evermap.geometry import se2, se3
 from evermap.geometry.rigid import rigid
-from evermap.types import FloatArray, Landmarks
+from evermap.types import FloatArray, IntArray, Landmarks
 
 FEWEST = 4
 """Common landmarks that a shape needs: in space three always fit a mirror image."""
@@ -72,7 +72,7 @@ def compare_shapes(found: Landmarks, given: Landmarks) -> Agreement:
 
 
 def _turns(
-    found: Landmarks, given: Landmarks, own: FloatArray, theirs: FloatArray, motion: FloatArray
+    found: Landmarks, given: Landmarks, own: IntArray, theirs: IntArray, motion: FloatArray
 ) -> FloatArray | None:
     """Return (K, N) turns between orientations under motions (K, 7), nan of unknown ones; None if a map has none."""
     if found.rotation is None or given.rotation is None:
