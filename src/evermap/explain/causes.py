@@ -17,7 +17,10 @@ from typing import Any
 import numpy as np
 
 from evermap.geometry import se2, se3
+from evermap.geometry.symmetry import Symmetry
 from evermap.slam import mistakes
+from evermap.slam.check import CORNERS, SIGHTED, find_corner_mistake, read_corners
+from evermap.slam.orientations import find_convention
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -80,6 +83,7 @@ class Suspect:
         of_map: whether it is of the given map.
         pairs: whether it shows in pairs of sightings of one landmark and the odometry between them.
         rows: which landmarks it is of: an 'id', a 'class' or a 'size'; None of all.
+        shows: whether the readings alone say so.
     """
 
     code: str
@@ -93,6 +97,7 @@ class Suspect:
     of_map: bool = False
     pairs: bool = True
     rows: tuple[str, float] | None = None
+    shows: bool = False
 
     @property
     def is_continuous(self) -> bool:
@@ -110,7 +115,7 @@ def list_suspects(inputs: Inputs) -> tuple[Suspect, ...]:
     recording, found = inputs.recording, list[Suspect]()
     found += _in_space(recording) if is_in_space(recording) else _in_plane(recording)
     if inputs.prior_map is not None:
-        found += _of_map()
+        found += _of_map(inputs.prior_map)
     return tuple(found)
 
 
@@ -351,6 +356,16 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
         size = f"{np.nanmedian(own):.12g}" if np.isfinite(own).any() else ""
         name = recording.landmark_names.get(identity, str(identity))
         yield _one_size(name, _stretch_positions, ("id", identity), size)
+    for how in filter(None, [find_corner_mistake(recording)]):
+        yield Suspect(
+            "corner-order", "corners", USUAL_P, partial(_read_corners, how=how), _constant(CORNERS[how].message),
+            _constant(CORNERS[how].fix), shows=True,
+        )  # fmt: skip
+    for convention in filter(None, [find_convention(recording, mistakes.USUAL)]):
+        yield Suspect(
+            "detection-poses", "detections", USUAL_P, partial(_read_detections, convention=convention),
+            _constant(SIGHTED[convention]), _constant("detections.csv: x_m, y_m, z_m, qx, qy, qz, qw"), shows=True,
+        )  # fmt: skip
     if recording.odometry is not None:
         yield _odometry_scale()
         yield _turn_scale()
@@ -365,6 +380,11 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
             _constant("the odometry seems mirrored: y is to the left, turns are counter-clockwise"),
             _constant("odometry.csv: lateral_mps, angular_radps"),
         )  # fmt: skip
+        for mistake in mistakes.POSES:
+            yield Suspect(
+                mistake.code, mistake.field, USUAL_P, partial(_read_poses, convention=mistake.poses),
+                _constant(mistake.message), _constant(_fix_of(mistake)),
+            )  # fmt: skip
     for mistake in mistakes.UNITS_IN_SPACE:
         state = math.log(mistake.lengths)
         if mistake.field == "odometry" and recording.odometry is None:
@@ -424,11 +444,33 @@ def _stretch_positions(inputs: Inputs, state: float, of: tuple[str, float] | Non
     )
 
 
+def _read_corners(inputs: Inputs, _: float, how: str) -> Inputs:
+    """Return the same with the corners read in another way."""
+    recording: Any = inputs.recording
+    return replace(inputs, recording=read_corners(recording, how))
+
+
+def _read_detections(inputs: Inputs, _: float, convention: str) -> Inputs:
+    """Return the same with the poses of the detections read in another convention."""
+    recording: Any = inputs.recording
+    seen = recording.detections
+    pose = mistakes.CONVENTIONS[convention](np.concatenate([seen.position_sensor_m, seen.rotation], axis=1))
+    seen = replace(seen, position_sensor_m=pose[:, :3], rotation=pose[:, 3:])
+    return replace(inputs, recording=replace(recording, detections=seen))
+
+
 def _mirror_drive(inputs: Inputs) -> Inputs:
     """Return the same with the odometry mirrored left to right."""
     recording: Any = inputs.recording
     pose = recording.odometry.pose_world_robot.copy()
     pose[:, [1, 3, 5]] *= -1.0
+    return replace(inputs, recording=replace(recording, odometry=replace(recording.odometry, pose_world_robot=pose)))
+
+
+def _read_poses(inputs: Inputs, _: float, convention: str) -> Inputs:
+    """Return the same with the poses of the odometry read in another convention."""
+    recording: Any = inputs.recording
+    pose = mistakes.CONVENTIONS[convention](recording.odometry.pose_world_robot)
     return replace(inputs, recording=replace(recording, odometry=replace(recording.odometry, pose_world_robot=pose)))
 
 
@@ -572,7 +614,7 @@ def _change_lens(
 # ---- of a given map
 
 
-def _of_map() -> Iterable[Suspect]:
+def _of_map(given: Landmarks) -> Iterable[Suspect]:
     yield Suspect(
         "map-scale", "map", USUAL_P, _stretch_map,
         lambda s: f"true distances are {math.exp(s):.4g} times those of the given map: another scale",
@@ -583,6 +625,8 @@ def _of_map() -> Iterable[Suspect]:
         _constant("the given map is mirrored: y to the right, x and y exchanged, or z downwards"),
         _constant("--prior-map: the sign of y"), of_map=True, pairs=False,
     )  # fmt: skip
+    if given.rotation is not None and np.isfinite(given.rotation).any():
+        yield from _of_map_axes()
     for unit, factor in (
         ("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048), ("inches", 0.0254),
     ):  # fmt: skip
@@ -598,8 +642,61 @@ def _of_map() -> Iterable[Suspect]:
     )  # fmt: skip
 
 
+def _of_map_axes() -> Iterable[Suspect]:
+    """Return what may be wrong with the orientations of tags in a map: other axes, or another order of numbers."""
+    for quaternion in _AXES_TURNED:
+        listed = ", ".join(f"{each:g}" for each in np.round(quaternion, 6) + 0.0)
+        normal = not quaternion[:2].any()
+        more = "; or the corners of the detections start at another one" if normal else ""
+        yield Suspect(
+            "map-axes", "map", USUAL_P if normal else RARE_P,
+            partial(_turn_map, how=partial(_turn_own, by=quaternion)),
+            _constant(f"tags have other axes than in the given map: x, y, z are its {_name_axes(quaternion)}{more}"),
+            _constant(f"--prior-map: each orientation times the quaternion x, y, z, w = {listed}"),
+            of_map=True, pairs=False,
+        )  # fmt: skip
+    for words, how in (
+        ("are in the order w, x, y, z", lambda q: q[:, [1, 2, 3, 0]]),
+        ("are those of the world in the tags' frames", lambda q: q * np.array([-1.0, -1.0, -1.0, 1.0])),
+    ):
+        yield Suspect(
+            "map-axes", "map", USUAL_P, partial(_turn_map, how=how),
+            _constant(f"orientations of the given map {words}"), _constant("--prior-map: qx, qy, qz, qw"),
+            of_map=True, pairs=False,
+        )  # fmt: skip
+
+
+def _name_axes(quaternion: FloatArray) -> str:
+    """Return axes after a rotation in those before it, as 'y, -x, z'."""
+    turned = np.round(se3.transform(se3.turn(quaternion), np.eye(3)), 6)
+    return ", ".join(("-" if axis.sum() < 0.0 else "") + "xyz"[int(np.abs(axis).argmax())] for axis in turned)
+
+
+_AXES_TURNED = sorted(
+    (each for each in Symmetry.generated(("90:x", "90:z")).turns if abs(each[3]) < 1.0 - 1e-9),
+    key=lambda each: bool(each[:2].any()),
+)
+"""Quaternions of the 23 rotations that bring axes to axes, those about the normal of a tag first."""
+
+
+def _turn_own(rotation: FloatArray, by: FloatArray) -> FloatArray:
+    return np.asarray(se3.compose(se3.turn(rotation), se3.turn(by))[:, 3:])
+
+
+def _turn_map(inputs: Inputs, _: float, how: Callable[[FloatArray], FloatArray]) -> Inputs:
+    """Return the same with other orientations of the map's landmarks."""
+    given = inputs.prior_map
+    assert given is not None
+    assert given.rotation is not None
+    return replace(inputs, prior_map=replace(given, rotation=how(given.rotation)))
+
+
 def _stretch_map_by(inputs: Inputs, _: float, factor: float) -> Inputs:
-    return _stretch_map(inputs, math.log(factor))
+    """Return the same with the map in another unit; how well it is known was not read from it, but stated in metres."""
+    stretched = _stretch_map(inputs, math.log(factor))
+    assert inputs.prior_map is not None
+    assert stretched.prior_map is not None
+    return replace(stretched, prior_map=replace(stretched.prior_map, covariance_m2=inputs.prior_map.covariance_m2))
 
 
 def _stretch_map(inputs: Inputs, state: float) -> Inputs:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
@@ -21,6 +22,7 @@ from evermap.explain.causes import Inputs, Suspect, list_suspects, rows_of_kind
 from evermap.explain.evidence import AnySession, Screen, evidence_at, optimum_of, used_rows
 from evermap.explain.linearise import change_by, gain_by, held_by_map
 from evermap.explain.seeds import find_scales, find_shape, find_single_scales
+from evermap.explain.shape import FEWEST, compare_shapes
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import HONEST, find_motion, off, pairs_of
 from evermap.types import Cause, ChangeKind, SlamResult, is_in_space
@@ -47,6 +49,11 @@ SURE = 0.99
 """Probability from which a delay is told as a cause."""
 INLIER, FEWER = 0.5, 0.7
 """Probability from which a detection is no outlier, and share of the outliers that a cause must leave at most."""
+PLACED, BETTER, ELSEWHERE = 0.6, 0.2, 0.3
+"""Share of a map in its place from which it is of what was seen; by how much more that must be without a fault of it;
+and share below which it is of another site."""
+FEWEST_CHANGED, CHANGED = 3, 0.2
+"""Landmarks, and share of those in common with a map, that changed from which the map itself is in doubt."""
 CHANGES = "changes"
 """Symptom of a session in which landmarks changed."""
 OF_LANDMARKS = frozenset({ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED})
@@ -126,7 +133,7 @@ def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tup
     rules, found = config.explain, list[str]()
     seen = result.innovations
     inlier = seen.p_inlier >= INLIER
-    if len(inlier) and float(np.mean(~inlier)) > rules.rejected:
+    if share_rejected(result) > rules.rejected:
         found.append("detections rejected")
     if inlier.any():
         dof = np.full(len(inlier), 2) if seen.dof is None else seen.dof
@@ -187,6 +194,8 @@ def explain(
     base = None if solution is None else _trial(inputs, solution, ())
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
     budget = _Budget(rules.most_solutions)
+    alone = _solve_alone(base, inputs, solve_under, rules.rejected, budget)
+    screens = (partial(_plain, alone=alone), *screens[1:])
     weighed = [] if base is None else [base]
     best = base
     for _ in range(rules.most_causes):
@@ -258,6 +267,12 @@ def _next_cause(
     return winner
 
 
+def share_rejected(result: SlamResult) -> float:
+    """Return the share of the detections that are outliers."""
+    outlier = result.innovations.p_inlier < INLIER
+    return float(np.mean(outlier)) if len(outlier) else 0.0
+
+
 def count_changed(result: SlamResult) -> int:
     """Return the number of landmarks that are told to have changed."""
     return len({one for change in result.changes for one in change.landmark_ids})
@@ -268,16 +283,71 @@ def _relieves(trial: Trial[VisitT], best: Trial[VisitT], config: SlamConfig) -> 
     was, now = best.solution.result, trial.solution.result
     before, after = find_symptoms(was, best.inputs, config), find_symptoms(now, trial.inputs, config)
     changed = [count_changed(result) for result in (was, now)]
-    rejected = [float(np.mean(result.innovations.p_inlier < INLIER)) for result in (was, now)]
+    rejected = [share_rejected(result) for result in (was, now)]
     return len(after) < len(before) or changed[1] < changed[0] or rejected[1] < FEWER * rejected[0]
 
 
+def _solve_alone(
+    base: Trial[VisitT] | None, inputs: Inputs, solve_under: Solve[VisitT], most_rejected: float, budget: _Budget
+) -> SlamResult | None:
+    """Return the session without the given map, which a wrong one bends; None where the map is not in doubt: few of its
+    landmarks are told to have changed, and detections fit.
+    """
+    given = inputs.prior_map
+    if given is None:
+        return None
+    if base is not None:
+        result = base.solution.result
+        if result.trajectory.frame != "prior_map":
+            return result
+        common = int(np.isin(given.landmark_id, inputs.recording.detections.landmark_id).sum())
+        few_changed = count_changed(result) < max(FEWEST_CHANGED, CHANGED * common)
+        if few_changed and share_rejected(result) <= most_rejected:
+            return None
+    budget.left -= 1
+    try:
+        return solve_under(replace(inputs, prior_map=None)).result
+    except EvermapError:
+        return None
+
+
 def _plain(
-    best: Trial[VisitT] | None, inputs: Inputs, suspects: list[Suspect], config: SlamConfig
+    best: Trial[VisitT] | None,
+    inputs: Inputs,
+    suspects: list[Suspect],
+    config: SlamConfig,
+    alone: SlamResult | None = None,
 ) -> list[tuple[float, Suspect, float]]:
-    """Return causes that show without a solution, or in one that fails."""
-    of_map = [(0.0, one, 0.0) for one in suspects if _is_of_map(one, best, config)]
-    return [*_screen_discrete(inputs, suspects, config), *_by_seeds(best, inputs, suspects, config), *of_map]
+    """Return causes that show without a solution, in one that fails, or in one without the map, `alone`."""
+    of_map = _by_shape(alone, inputs, suspects)
+    if of_map is None:
+        of_map = [(0.0, one, 0.0) for one in suspects if _is_of_map(one, best, config)]
+    seeds = _by_seeds(best, inputs, suspects, config)
+    shown = [(math.inf, one, 0.0) for one in suspects if one.shows]
+    return [*shown, *_screen_discrete(inputs, suspects, config), *seeds, *of_map]
+
+
+def _by_shape(alone: SlamResult | None, inputs: Inputs, suspects: Iterable[Suspect]) -> Asked | None:
+    """Return discrete causes of the map after which more of it is in its place; None where its shape says nothing."""
+    if alone is None or inputs.prior_map is None:
+        return None
+    as_given = compare_shapes(alone.landmarks, inputs.prior_map)
+    if as_given.n_common < FEWEST:
+        return None
+    found, elsewhere, placed = Asked(), Asked(), as_given.placed
+    for suspect in suspects:
+        if not suspect.of_map or suspect.is_continuous:
+            continue
+        undone = suspect.undo(inputs, 0.0).prior_map
+        if undone is None:
+            elsewhere.append((0.0, suspect, 0.0))
+            continue
+        now = compare_shapes(alone.landmarks, undone)
+        placed = max(placed, now.placed)
+        if now.placed >= PLACED and now.share > as_given.share + BETTER:
+            found.append((now.share + suspect.p, suspect, 0.0))
+    found.sort(key=lambda each: -each[0])
+    return found if placed > ELSEWHERE else elsewhere
 
 
 def _without_needless(
@@ -304,7 +374,7 @@ def _without_needless(
 
 def _is_of_map(suspect: Suspect, best: Trial[VisitT] | None, config: SlamConfig) -> bool:
     """Return whether a discrete cause of the map is asked: where most of the map does not hold, or it was not found."""
-    if not suspect.of_map or suspect.is_continuous:
+    if not suspect.of_map or suspect.is_continuous or suspect.code == "map-axes":
         return False
     if best is None:
         return True

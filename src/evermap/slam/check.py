@@ -9,9 +9,9 @@ near enough to be mistaken for that.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 
@@ -20,7 +20,8 @@ from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.show import Shown
 from evermap.slam.cleaning import clean, spikes
-from evermap.slam.mistakes import USUAL, Finding, find_motion
+from evermap.slam.mistakes import HONEST, USUAL, Finding, find_motion, off, pairs_of
+from evermap.slam.orientations import find_convention
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -41,6 +42,50 @@ from evermap.valid import WITHOUT_IDS, check_landmarks, strangers, validate
 DEFAULTS = SlamConfig()
 OUTSIDE = 0.05
 """Share of the image size by which undistorted corners of tags may lie outside of the image."""
+FEWEST_TAGS, NEARLY_ALL = 10, 0.9
+"""Tags of a camera that show the order of its corners, and share of them that must be listed clockwise."""
+FAR_LESS = 0.5
+"""Difference of pairs of sightings, over that by the usual mistake, at which it is another one."""
+
+
+class _Corners(NamedTuple):
+    """How corners are read (M, 4, 2) that were written in another way, in images of a size (M, 1, 2), and its words."""
+
+    read: Callable[[FloatArray, FloatArray], FloatArray]
+    message: str
+    fix: str
+
+
+CORNERS = {
+    "reversed": _Corners(
+        lambda corner, _: corner[:, ::-1],
+        "corners of tags are listed clockwise, as by OpenCV's ArUco: counter-clockwise from the lower left is expected "
+        "(u0_px, v0_px)",
+        "detections.csv: corners in the order 3, 2, 1, 0",
+    ),
+    "exchanged": _Corners(
+        lambda corner, _: corner[..., ::-1],
+        "rows and columns of corners seem to be exchanged: u is to the right, v down (u0_px, v0_px)",
+        "detections.csv: u and v exchanged",
+    ),
+    "upwards": _Corners(
+        lambda corner, size: corner * [1.0, -1.0] + size * [0.0, 1.0],
+        "rows of corners seem to be counted upwards: v is down from the upper edge of the image (v0_px)",
+        "detections.csv: v = height - v",
+    ),
+    "leftwards": _Corners(
+        lambda corner, size: corner * [-1.0, 1.0] + size * [1.0, 0.0],
+        "images seem to be mirrored: u is to the right (u0_px)",
+        "detections.csv: u = width - u",
+    ),
+}
+"""Ways in which tags look as if seen from behind, the commonest first."""
+SIGHTED = {
+    "w first": "quaternions of the detections seem to be in the order w, x, y, z: x, y, z, w is expected (detections)",
+    "inverse": "poses of the detections seem to be those of the sensor in the landmark's frame, not of the landmark in "
+    "the sensor's (detections)",
+}
+"""What a convention of poses says of detections."""
 _OTHER_UNIT = "another unit than metres, or a wrong limit"
 _OTHER_SIGN = "another unit or sign, or wrong limits"
 
@@ -96,7 +141,7 @@ def find_misreadings(recording: AnyRecording, settings: SlamConfig) -> list[Find
     That is all but what the estimator leaves out, and says so itself.
     """
     found = [*find_motion(recording, settings.check)]
-    found += _limits_in_space(recording) if is_in_space(recording) else _limits(recording)
+    found += _limits_in_space(recording, settings) if is_in_space(recording) else _limits(recording)
     if settings.unknown_ids is not True:
         found += _identities(recording, settings.check)
     if is_in_space(recording) and recording.odometry is not None and all(finding.usable for finding in found):
@@ -263,12 +308,14 @@ def _beyond(recording: SpatialRecording) -> tuple[BoolArray, BoolArray]:
     return np.asarray(far), np.asarray(outside.any(axis=(1, 2)))
 
 
-def _limits_in_space(recording: SpatialRecording) -> list[Finding]:
+def _limits_in_space(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:
     """Readings beyond what a sensor is said to reach or to show, and corners that no calibration goes with."""
     detections, (far, aside) = recording.detections, _beyond(recording)
     most = f"up to {_ranges(recording)[far].max(initial=0.0):.4g} m"
     other = "the calibration is for another resolution"
     found = [
+        *_find_corner_order(recording, settings.check),
+        *_find_pose_convention(recording, settings.check),
         *_outside("beyond-range", far, f"detections are beyond range_max_m, {most}", _OTHER_UNIT),
         *_outside("beyond-view", aside, "tags have corners outside of the image", other),
     ]
@@ -279,6 +326,54 @@ def _limits_in_space(recording: SpatialRecording) -> list[Finding]:
         unused = f"the corners of {int(blind.sum())} tags are not used, only their poses"
         found.append(Finding("no-calibration", f"camera '{name}' has no calibration: {unused}"))
     return found
+
+
+def find_corner_mistake(recording: SpatialRecording, settings: CheckConfig = USUAL) -> str:
+    """Return how pixels of corners were written, a key of `CORNERS`, if tags are seen from behind; '' if not.
+
+    Seen from the front, which is the only way to see it, no tag is listed counter-clockwise and looks clockwise. What
+    did that, the order of the corners or an axis of the image, shows in whether landmarks stand still.
+    """
+    if not is_clockwise(recording).any():
+        return ""
+    losses = {}
+    for name in CORNERS:
+        pairs = pairs_of(read_corners(recording, name), settings)
+        losses[name] = np.inf if pairs is None else float(np.median(off(pairs.residual(HONEST))))
+    best = min(losses, key=lambda name: losses[name])
+    usual = next(iter(CORNERS))
+    return best if losses[best] < FAR_LESS * losses[usual] else usual
+
+
+def is_clockwise(recording: SpatialRecording) -> BoolArray:
+    """Return (M,) which tags have their corners in clockwise order, by cameras nearly all of whose tags have."""
+    corner, clockwise = recording.detections.corner_px, np.zeros(len(recording.detections), dtype=np.bool_)
+    following = np.roll(corner, -1, axis=1)
+    area_px2 = (corner[..., 0] * following[..., 1] - corner[..., 1] * following[..., 0]).sum(axis=1)  # v points down
+    for row in range(len(recording.sensors)):
+        mine = (recording.detections.sensor == row) & np.isfinite(area_px2)
+        if mine.sum() >= FEWEST_TAGS and np.mean(area_px2[mine] > 0.0) > NEARLY_ALL:
+            clockwise |= mine
+    return clockwise
+
+
+def read_corners(recording: SpatialRecording, how: str) -> SpatialRecording:
+    """Return a recording with the corners of cameras that list them clockwise read in another way, of `CORNERS`."""
+    seen, clockwise = recording.detections, is_clockwise(recording)
+    size = np.array([sensor.resolution_px or (0, 0) for sensor in recording.sensors], dtype=np.float64)[seen.sensor]
+    corner = seen.corner_px.copy()
+    corner[clockwise] = CORNERS[how].read(corner[clockwise], size[clockwise, None])
+    return replace(recording, detections=replace(seen, corner_px=corner))
+
+
+def _find_pose_convention(recording: SpatialRecording, settings: CheckConfig) -> list[Finding]:
+    convention = find_convention(recording, settings)
+    return [Finding("detection-poses", SIGHTED[convention], usable=False)] if convention else []
+
+
+def _find_corner_order(recording: SpatialRecording, settings: CheckConfig) -> list[Finding]:
+    how = find_corner_mistake(recording, settings)
+    return [Finding("corner-order", CORNERS[how].message, usable=False)] if how else []
 
 
 def _left_out(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:

@@ -10,7 +10,7 @@ noise, which tells nothing.
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Callable, Container
 from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
@@ -47,6 +47,7 @@ class Mistake:
         turn, forward: factors on the turn rate and the forward speed.
         delay_s: odometry stamps are so much later than the motion.
         turned: quaternion that turns positions in the sensor's frame.
+        poses: how poses of the odometry were written, a key of `CONVENTIONS`; '' as they are read.
         field: column, or table, that is wrong.
     """
 
@@ -59,6 +60,7 @@ class Mistake:
     forward: float = 1.0
     delay_s: float = 0.0
     turned: tuple[float, ...] = tuple(se3.NO_TURN)
+    poses: str = ""
     field: str = ""
 
     def after(self, other: Mistake) -> Mistake:
@@ -76,6 +78,7 @@ class Mistake:
             self.forward * other.forward,
             self.delay_s + other.delay_s,
             turned,
+            self.poses or other.poses,
             self.field,
         )
 
@@ -159,6 +162,27 @@ AXES = tuple(
         ("x ahead and z up", "z ahead and y down", (0.5, -0.5, 0.5, 0.5)),
         ("z ahead and y down", "x ahead and z up", (-0.5, 0.5, -0.5, 0.5)),
     )
+)
+CONVENTIONS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "": lambda pose: pose,
+    "w first": lambda pose: pose[..., [0, 1, 2, 4, 5, 6, 3]],
+    "inverse": lambda pose: np.asarray(se3.inverse(pose)),
+}
+"""Ways to write poses (..., 7), and how each is read: position and quaternion x, y, z, w of the robot in the world."""
+POSES = (
+    Mistake(
+        "odometry-poses",
+        "quaternions of the odometry seem to be in the order w, x, y, z: x, y, z, w is expected (odometry)",
+        poses="w first",
+        field="odometry",
+    ),
+    Mistake(
+        "odometry-poses",
+        "poses of the odometry seem to be those of the world in the robot's frame, not of the robot in the world "
+        "(odometry)",
+        poses="inverse",
+        field="odometry",
+    ),
 )
 _DELAYS_S = (*np.arange(1.0, 10.0, 0.5).tolist(), *np.arange(10.0, 61.0, 1.0).tolist())
 AT_ONCE = 32
@@ -382,7 +406,7 @@ class PlanarPairs:
 class SpatialPairs:
     """Pairs of sightings in space."""
 
-    units, angles = UNITS_IN_SPACE, AXES
+    units, angles = UNITS_IN_SPACE, (*AXES, *POSES)
     why_longer = "another unit of detections or odometry, or a wrong size of tags (tag_size_m)"
     speeds = "odometry"
 
@@ -436,15 +460,20 @@ class SpatialPairs:
 
     def _motions(self, mistakes: tuple[Mistake, ...]) -> FloatArray:
         """(M, P, 7) motions of the sensor from the second sighting to the first, by odometry."""
-        stamp_s, pose = self._odometry.stamp_s, self._odometry.pose_world_robot
-        delay_s, which = np.unique([each.delay_s for each in mistakes], return_inverse=True)
-        start, stop = (
-            se3.compose(
-                se3.interpolate(stamp_s, pose, (one_s + delay_s[:, None]).ravel()).reshape(len(delay_s), -1, 7), mount
+        stamp_s, motion = self._odometry.stamp_s, np.empty((len(mistakes), len(self._stamp_s[0]), 7))
+        for poses in {each.poses for each in mistakes}:
+            rows = [row for row, each in enumerate(mistakes) if each.poses == poses]
+            pose = CONVENTIONS[poses](self._odometry.pose_world_robot)
+            delay_s, which = np.unique([mistakes[row].delay_s for row in rows], return_inverse=True)
+            start, stop = (
+                se3.compose(
+                    se3.interpolate(stamp_s, pose, (one_s + delay_s[:, None]).ravel()).reshape(len(delay_s), -1, 7),
+                    mount,
+                )
+                for one_s, mount in zip(self._stamp_s, self._mount, strict=True)
             )
-            for one_s, mount in zip(self._stamp_s, self._mount, strict=True)
-        )
-        return np.asarray(se3.between(stop, start)[which])
+            motion[rows] = se3.between(stop, start)[which]
+        return motion
 
 
 Pairs: TypeAlias = PlanarPairs | SpatialPairs

@@ -1,4 +1,4 @@
-"""Orientations that were not measured: defaults of messages, and those that turn with the robot.
+"""Orientations that were not measured, as defaults of messages and those that turn with the robot; other conventions.
 
 A point detector fills the orientation of its message with ROS's default (0, 0, 0, 1), or with a constant. Taken for
 measurements they say that landmarks turn as the robot does: dead reckoning is better. An orientation that was measured
@@ -13,7 +13,7 @@ import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se3
-from evermap.slam.mistakes import sighting_pairs
+from evermap.slam.mistakes import CONVENTIONS, sighting_pairs
 from evermap.types import AnyRecordingT, BoolArray, SpatialRecording, is_in_space
 
 SAME = 1e-6
@@ -23,6 +23,9 @@ TURNED_RAD = 0.3
 WITH_ROBOT = 0.3
 """Share of the robot's turn by which orientations in the sensor's frame change that do not see it; it must be the
 median, as must the rest of the turn in the world."""
+STILL_RAD, SHARE_LEFT = 0.35, 0.4
+"""Turn of a landmark between two sightings, by orientations as they are read, from which another convention is asked;
+and share of it that is left at most where the other one is right."""
 
 
 def without_unmeasured(recording: AnyRecordingT, settings: CheckConfig) -> AnyRecordingT:
@@ -36,10 +39,7 @@ def without_unmeasured(recording: AnyRecordingT, settings: CheckConfig) -> AnyRe
         return recording
     seen = recording.detections
     warnings: list[str] = []
-    asked = np.isfinite(seen.rotation).all(axis=1) & ~np.isfinite(seen.corner_px[:, 0, 0])
-    asked &= ~np.isfinite(seen.size_m).all(axis=1)
-    symmetric = [row for row, name in enumerate(recording.class_names) if name in recording.symmetries]
-    asked &= ~np.isin(seen.class_id, symmetric)
+    asked = _oriented(recording)
     drop = np.zeros(len(seen), dtype=np.bool_)
     for row, sensor in enumerate(recording.sensors):
         mine = asked & (seen.sensor == row)
@@ -55,6 +55,48 @@ def without_unmeasured(recording: AnyRecordingT, settings: CheckConfig) -> AnyRe
         sigma_rad=np.where(drop, np.nan, seen.sigma_rad),
     )
     return replace(recording, detections=left, warnings=(*recording.warnings, *warnings))
+
+
+def find_convention(recording: SpatialRecording, settings: CheckConfig) -> str:
+    """Return the convention (`mistakes.CONVENTIONS`) of detections by which landmarks do not turn.
+
+    It is '' if that is the one in which they are read, if none is, or if it is that of the odometry.
+    """
+    odometry, seen = recording.odometry, recording.detections
+    if odometry is None:
+        return ""
+    asked = _oriented(recording)
+    first, second = sighting_pairs(recording, settings)
+    some = asked[first] & asked[second]
+    first, second = first[some], second[some]
+    stamp_s = recording.frames.stamp_s[seen.frame]
+    mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])[seen.sensor]
+    robot = se3.interpolate(odometry.stamp_s, odometry.pose_world_robot, stamp_s)
+    much = se3.angle_between(robot[first], robot[second]) > TURNED_RAD
+    first, second = first[much], second[much]
+    if len(first) < settings.fewest:
+        return ""
+    pose = np.concatenate([seen.position_sensor_m, seen.rotation], axis=1)
+    turned = {}
+    for driven, seen_as in [
+        ("", ""),
+        *(("", name) for name in CONVENTIONS if name),
+        *((name, "") for name in CONVENTIONS),
+    ]:
+        track = se3.compose(CONVENTIONS[driven](robot), mount)
+        one, other = (se3.compose(track[rows], CONVENTIONS[seen_as](pose[rows])) for rows in (first, second))
+        turned[driven, seen_as] = float(np.median(se3.angle_between(one, other)))
+    best, given = min(turned, key=lambda ways: turned[ways]), turned["", ""]
+    return best[1] if given > STILL_RAD and turned[best] < SHARE_LEFT * given else ""
+
+
+def _oriented(recording: SpatialRecording) -> BoolArray:
+    """Return (M,) which detections have an orientation of their own: no boxes, and no tags by their corners."""
+    seen = recording.detections
+    asked = np.isfinite(seen.rotation).all(axis=1) & ~np.isfinite(seen.corner_px[:, 0, 0])
+    asked &= ~np.isfinite(seen.size_m).all(axis=1)
+    symmetric = [row for row, name in enumerate(recording.class_names) if name in recording.symmetries]
+    return np.asarray(asked & ~np.isin(seen.class_id, symmetric))
 
 
 def _why_unmeasured(recording: SpatialRecording, mine: BoolArray, settings: CheckConfig) -> str:

@@ -1,0 +1,202 @@
+"""Other conventions of poses, corners and maps: named by the readings, or by the shape of the map, and no changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from evermap import check_recording, run_slam
+from evermap.explain.shape import compare_shapes
+from evermap.slam.check import find_corner_mistake
+from evermap.slam.mistakes import USUAL
+from evermap.slam.orientations import find_convention
+from evermap.types import FloatArray, Landmarks, SpatialRecording
+
+from .worlds import World
+
+WIDTH, HEIGHT = 1280, 800
+
+
+def w_first(quaternion: FloatArray) -> FloatArray:
+    """As written in the order w, x, y, z."""
+    return quaternion[..., [3, 0, 1, 2]]
+
+
+def inverse(pose: FloatArray) -> FloatArray:
+    """By matrices: the world in the frame of what the pose is of."""
+    turn = Rotation.from_quat(pose[:, 3:]).inv()
+    return np.column_stack([-turn.apply(pose[:, :3]), turn.as_quat()])
+
+
+def with_odometry(recording: SpatialRecording, pose: FloatArray) -> SpatialRecording:
+    assert recording.odometry is not None
+    return replace(recording, odometry=replace(recording.odometry, pose_world_robot=pose))
+
+
+def with_sightings(recording: SpatialRecording, pose: FloatArray) -> SpatialRecording:
+    seen = replace(recording.detections, position_sensor_m=pose[:, :3], rotation=pose[:, 3:])
+    return replace(recording, detections=seen)
+
+
+def with_corners(recording: SpatialRecording, corner_px: FloatArray) -> SpatialRecording:
+    return replace(recording, detections=replace(recording.detections, corner_px=corner_px))
+
+
+@pytest.fixture(scope="module")
+def corners() -> SpatialRecording:
+    return World(seed=11).space()
+
+
+@pytest.fixture(scope="module")
+def poses() -> SpatialRecording:
+    return World(seed=11).space(corners=False)
+
+
+CORNERS = {
+    "reversed": ("clockwise", lambda px: px[:, ::-1]),
+    "exchanged": ("exchanged", lambda px: px[..., ::-1]),
+    "upwards": ("upwards", lambda px: px * [1.0, -1.0] + [0.0, HEIGHT]),
+    "leftwards": ("mirrored", lambda px: px * [-1.0, 1.0] + [WIDTH, 0.0]),
+}
+
+
+@pytest.mark.parametrize("how", CORNERS)
+def test_corners_that_are_written_in_another_way_are_named(how: str, corners: SpatialRecording) -> None:
+    word, write = CORNERS[how]
+    wrong = with_corners(corners, write(corners.detections.corner_px))
+    assert find_corner_mistake(wrong) == how
+    (found,) = [finding for finding in check_recording(wrong).findings if finding.code == "corner-order"]
+    assert word in found.message
+    assert not found.usable
+
+
+def test_corners_as_they_should_be_are_no_mistake(corners: SpatialRecording) -> None:
+    assert find_corner_mistake(corners) == ""
+    few = corners.detections.corner_px.copy()
+    few[::8] = few[::8, ::-1]  # an eighth is misread, as of reflections
+    assert find_corner_mistake(with_corners(corners, few)) == ""
+
+
+@pytest.mark.parametrize("convention", ["w first", "inverse"])
+def test_poses_of_detections_in_another_convention_are_named(convention: str, poses: SpatialRecording) -> None:
+    seen = poses.detections
+    pose = np.column_stack([seen.position_sensor_m, seen.rotation])
+    pose = inverse(pose) if convention == "inverse" else np.column_stack([pose[:, :3], w_first(pose[:, 3:])])
+    wrong = with_sightings(poses, pose)
+    assert find_convention(wrong, USUAL) == convention
+    assert find_convention(poses, USUAL) == ""
+
+
+def test_rough_orientations_are_no_convention(poses: SpatialRecording) -> None:
+    rng = np.random.default_rng(0)
+    rough = Rotation.from_quat(poses.detections.rotation) * Rotation.from_rotvec(
+        rng.normal(0.0, 0.35, (len(poses.detections), 3))
+    )
+    wrong = replace(poses, detections=replace(poses.detections, rotation=rough.as_quat()))
+    assert find_convention(wrong, USUAL) == ""
+
+
+@pytest.mark.parametrize("kind", ["corners", "poses"])
+@pytest.mark.parametrize(("convention", "word"), [("w first", "w, x, y, z"), ("inverse", "of the world")])
+def test_poses_of_the_odometry_in_another_convention_are_named(
+    kind: str, convention: str, word: str, corners: SpatialRecording, poses: SpatialRecording
+) -> None:
+    recording = corners if kind == "corners" else poses
+    assert recording.odometry is not None
+    pose = recording.odometry.pose_world_robot
+    pose = inverse(pose) if convention == "inverse" else np.column_stack([pose[:, :3], w_first(pose[:, 3:])])
+    (found,) = [one for one in check_recording(with_odometry(recording, pose)).findings if not one.usable]
+    assert (found.code, word in found.message) == ("odometry-poses", True)
+
+
+def map_faults(survey: Landmarks) -> dict[str, Landmarks]:
+    """What is wrong with a map, each by itself."""
+    at, rotation = survey.position_m, survey.rotation
+    assert rotation is not None
+    turn = Rotation.from_quat(rotation)
+    mirrored = np.array([1.0, -1.0, 1.0])
+    return {
+        "w first": replace(survey, rotation=w_first(rotation)),
+        "tags turned": replace(survey, rotation=(turn * Rotation.from_euler("z", 90, degrees=True)).as_quat()),
+        "x out of the tag": replace(survey, rotation=(turn * Rotation.from_euler("y", 90, degrees=True)).as_quat()),
+        "mirrored": replace(survey, position_m=at * mirrored),
+        "millimetres": replace(survey, position_m=at * 1000.0),
+        "feet": replace(survey, position_m=at / 0.3048),
+    }
+
+
+def test_shapes_agree_in_any_frame_and_with_few_changes() -> None:
+    world = World(seed=1)
+    survey = world.map_in_space()
+    turn = Rotation.from_euler("xyz", [0.3, -0.2, 2.0])
+    assert survey.rotation is not None
+    elsewhere = replace(
+        survey,
+        position_m=turn.apply(survey.position_m) + [5.0, -3.0, 1.0],
+        rotation=(turn * Rotation.from_quat(survey.rotation)).as_quat(),
+    )
+    assert compare_shapes(survey, elsewhere).share == 1.0
+    moved = elsewhere.position_m.copy()
+    moved[:4] += [1.0, 0.5, 0.0]
+    found = compare_shapes(survey, replace(elsewhere, position_m=moved))
+    assert found.placed == pytest.approx(12 / 16)
+
+
+@pytest.mark.parametrize("fault", map_faults(World().map_in_space()))
+def test_a_fault_of_a_map_shows_in_its_shape(fault: str) -> None:
+    survey = World().map_in_space()
+    found = compare_shapes(survey, map_faults(survey)[fault])
+    turned = fault in ("w first", "tags turned", "x out of the tag")
+    assert (found.placed == 1.0) == turned
+    assert found.share < 0.75
+
+
+NAMED = {
+    "w first": ("map-axes", "w, x, y, z"),
+    "tags turned": ("map-axes", "-y, x, z; or the corners"),
+    "x out of the tag": ("map-axes", "z, y, -x"),
+    "mirrored": ("map-mirrored", "mirrored"),
+    "millimetres": ("map-unit", "millimetres"),
+    "feet": ("map-unit", "feet"),
+}
+
+
+@pytest.mark.parametrize("kind", ["corners", "poses"])
+@pytest.mark.parametrize("fault", NAMED)
+@pytest.mark.slow
+def test_a_fault_of_a_map_is_named_and_moves_nothing(
+    fault: str, kind: str, corners: SpatialRecording, poses: SpatialRecording
+) -> None:
+    recording = corners if kind == "corners" else poses
+    result = run_slam(recording, prior_map=map_faults(World().map_in_space())[fault].as_prior(0.01))
+    code, word = NAMED[fault]
+    (cause,) = result.causes
+    assert (cause.code, cause.subject) == (code, "map")
+    assert word in cause.message
+    assert result.changes == ()
+
+
+@pytest.mark.slow
+def test_another_edition_is_no_fault_and_half_of_it_moved_is(corners: SpatialRecording) -> None:
+    survey = World().map_in_space()
+    assert survey.rotation is not None
+    turn = Rotation.from_euler("z", 40, degrees=True)
+    shifted = replace(
+        survey,
+        position_m=turn.apply(survey.position_m) + [30.0, -7.0, 0.0],
+        rotation=(turn * Rotation.from_quat(survey.rotation)).as_quat(),
+    )
+    result = run_slam(corners, prior_map=shifted.as_prior(0.01))
+    assert (result.causes, result.changes) == ((), ())
+
+
+@pytest.mark.slow
+def test_corners_in_the_order_of_opencv_are_put_right(corners: SpatialRecording) -> None:
+    wrong = with_corners(corners, corners.detections.corner_px[:, ::-1])
+    result = run_slam(wrong, prior_map=World().map_in_space().as_prior(0.01))
+    (cause,) = result.causes
+    assert (cause.code, cause.fix) == ("corner-order", "detections.csv: corners in the order 3, 2, 1, 0")
+    assert result.changes == ()
