@@ -33,8 +33,8 @@ USUAL_P, RARE_P, UNIT_P = 1e-3, 1e-4, 1e-3
 """Probabilities beforehand of a cause that is met every day in bug reports, of one that is not, and of a unit."""
 SCALE, ONE_TAG, TURN, MAP_SCALE = 0.15, 0.3, 0.15, 0.1
 """Standard deviations of logarithms: of all ranges or speeds, of the size of one tag, of turns, of a map."""
-DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL = 0.5, 0.2, 0.3, 0.1
-"""Standard deviations of a delay, of a mount's position and turn, and of the logarithm of a focal length."""
+DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL, DISTORTION = 0.5, 0.2, 0.3, 0.1, 0.2
+"""Standard deviations of a delay, of a mount's position and turn, of the logarithm of a focal length, and of k1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,20 +45,18 @@ class Inputs:
         recording: with identities, as it is estimated.
         prior_map: that was given; None without.
         stretched: (M,) logarithm of the volume by which each detection's numbers were stretched since they were read.
-        stretched_step: the same of the odometry between two poses.
         stretched_place: the same of a place of the map.
     """
 
     recording: AnyRecording
     prior_map: Landmarks | None
     stretched: FloatArray
-    stretched_step: float
     stretched_place: float
 
     @classmethod
     def of(cls, recording: AnyRecording, prior_map: Landmarks | None) -> Inputs:
         """Return the inputs as given."""
-        return cls(recording, prior_map, np.zeros(len(recording.detections)), 0.0, 0.0)
+        return cls(recording, prior_map, np.zeros(len(recording.detections)), 0.0)
 
 
 Undo = Callable[[Inputs, float], Inputs]
@@ -254,13 +252,11 @@ def _stretch_speeds(inputs: Inputs, state: float) -> Inputs:
         odometry = replace(
             driven_flat, forward_mps=driven_flat.forward_mps * factor, lateral_mps=driven_flat.lateral_mps * factor
         )
-    step = inputs.stretched_step + recording.dim * state
-    return replace(inputs, recording=replace(recording, odometry=odometry), stretched_step=step)
+    return replace(inputs, recording=replace(recording, odometry=odometry))
 
 
 def _stretch_turns(inputs: Inputs, state: float) -> Inputs:
-    turned = _turn_by(inputs, math.exp(state))
-    return replace(turned, stretched_step=turned.stretched_step + state * (3 if is_in_space(inputs.recording) else 1))
+    return _turn_by(inputs, math.exp(state))
 
 
 def _turn_by(inputs: Inputs, factor: float) -> Inputs:
@@ -318,7 +314,6 @@ def _undo_in_plane(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Input
         inputs,
         recording=replace(recording, detections=detections, odometry=odometry),
         stretched=inputs.stretched + stretch,
-        stretched_step=inputs.stretched_step + math.log(abs(mistake.turn)),
     )
 
 
@@ -540,7 +535,17 @@ def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspe
             listed = ", ".join(f"{each:g}" for each in swapped)
             yield lens("intrinsics", words, f"[camera.{name}] intrinsics = [{listed}]", USUAL_P, intrinsics=swapped)
     if not any(sensor.distortion):
+        yield Suspect(
+            "distortion", name, USUAL_P, partial(_change_lens, rows=row, how=_bent),
+            lambda s: f"{name}: the lens distorts, k1 is about {s:.3g}, and none is stated: corners are not undistorted",
+            lambda s: f'[camera.{name}] model = "radtan", distortion = [{s:.3g}, {s * s:.3g}, 0, 0], or calibrate',
+            DISTORTION, pairs=False,
+        )  # fmt: skip
         return
+    yield lens(
+        "distortion", "the sign of k1 seems wrong", f"[camera.{name}] distortion = [{-sensor.distortion[0]:g}, ...]",
+        RARE_P, distortion=(-sensor.distortion[0], *sensor.distortion[1:]),
+    )  # fmt: skip
     yield lens(
         "distortion", "corners seem to be undistorted already", f'[camera.{name}] model = "pinhole"', USUAL_P,
         distortion=(), distortion_model="pinhole",
@@ -557,6 +562,11 @@ def _zoomed(sensor: SpatialSensor, state: float) -> dict[str, Any]:
     assert sensor.intrinsics is not None
     fx, fy, cx, cy = sensor.intrinsics
     return {"intrinsics": (fx * math.exp(state), fy * math.exp(state), cx, cy)}
+
+
+def _bent(_: SpatialSensor, state: float) -> dict[str, Any]:
+    """Return the distortion of a lens with this k1: of those that bend lines much, k2 is about its square."""
+    return {"distortion": (state, state**2, 0.0, 0.0), "distortion_model": "radtan"}
 
 
 def _change_lens(

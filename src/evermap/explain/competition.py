@@ -15,15 +15,16 @@ from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
 
-from evermap.config import SlamConfig
+from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.causes import Inputs, Suspect, list_suspects, rows_of_kind
 from evermap.explain.evidence import AnySession, Screen, evidence_at, optimum_of, used_rows
 from evermap.explain.linearise import change_by, gain_by, held_by_map
 from evermap.explain.seeds import find_scales, find_shape, find_single_scales
+from evermap.explain.symptoms import compare_odometry
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import HONEST, find_motion, off, pairs_of
-from evermap.types import Cause, ChangeKind, SlamResult, is_in_space
+from evermap.types import Cause, ChangeKind, ParameterEstimate, SlamResult, is_in_space
 
 VisitT = TypeVar("VisitT")
 NEAR = 2.0
@@ -43,6 +44,8 @@ STRETCHES = frozenset({"tag-size", "range-scale"})
 """Causes that stretch detections: of some landmarks as of all."""
 AGREE = 0.25
 """Share of what one of ranges, odometry and map is off by, up to which the other two agree with each other."""
+ODOMETRY_OFF = 0.3
+"""Share of the motion by which odometry is off from which it is asked why, as by the verdict."""
 SURE = 0.99
 """Probability from which a delay is told as a cause."""
 INLIER, FEWER = 0.5, 0.7
@@ -154,6 +157,8 @@ def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tup
             found.append("map")
     if not found and any(not finding.usable for finding in find_motion(inputs.recording, config.check)):
         found.append("pairs")
+    if not found and compare_odometry(result)[0] > ODOMETRY_OFF:
+        found.append("odometry")
     return tuple(found)
 
 
@@ -181,8 +186,9 @@ def explain(
         symptoms = find_symptoms(solution.result, inputs, config)
         if not symptoms:
             sound = Trial(inputs, solution, (), math.nan, 1.0)
-            return Explained(sound, find_delays(solution.result, rules.late_s))
-        if symptoms == (CHANGES,):  # calibrations that differ little would show in innovations, too
+            return Explained(sound, find_put_right(solution.result, inputs, rules))
+        few = count_changed(solution.result) <= rules.map_changed * len(solution.result.landmarks)
+        if symptoms == (CHANGES,) and few:  # calibrations that differ little would show in innovations, too
             screens = screens[:1]
     base = None if solution is None else _trial(inputs, solution, ())
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
@@ -198,12 +204,50 @@ def explain(
             break
     if best is None:
         return None
-    causes = (*_causes(best, weighed, base), *find_delays(best.solution.result, rules.late_s))
-    return Explained(best, causes, tuple(weighed))
+    causes = _causes(best, weighed, base)
+    named = {cause.code for cause in causes}
+    others = find_put_right(best.solution.result, best.inputs, rules)
+    return Explained(best, (*causes, *(one for one in others if one.code not in named)), tuple(weighed))
 
 
-def find_delays(result: SlamResult, late_s: float) -> tuple[Cause, ...]:
-    """Return clocks that the estimator itself found to be late by so much, which the solution has put right."""
+def find_put_right(result: SlamResult, inputs: Inputs, rules: ExplainConfig) -> tuple[Cause, ...]:
+    """Return what the estimator itself found, and has put right in its solution: late clocks, and scales that are
+    farther from what is stated than is usual, where a map or a data sheet says which of the two that show together it
+    is.
+    """
+    return (*_find_delays(result, rules.late_s), *_find_own_scales(result, inputs, rules.states))
+
+
+def _find_own_scales(result: SlamResult, inputs: Inputs, farthest: float) -> list[Cause]:
+    """Return scales that are calibration states, so many of their prior's standard deviations from what is stated."""
+    found, own = list[Cause](), {state.name: state for state in result.parameters}
+    suspects = {one.code: one for one in list_suspects(inputs) if one.code in OWN_STATES}
+    for code, suspect in suspects.items():
+        for name, sign in OWN_STATES[code]:
+            state = own.get(name)
+            if state is None or state.fixed or (state.shown_with and state.evident) or not state.p_needed > SURE:
+                continue
+            if not abs(state.value - state.prior_mean) > farthest * max(state.prior_sigma, state.sigma):
+                continue
+            ratio = _ratio_of(state)
+            log, sigma = sign * math.log(ratio), state.sigma / ratio
+            value = suspect.shown(log)
+            found.append(
+                Cause(
+                    code, suspect.subject, suspect.say(log), value, sigma * value, min(state.p_needed, 1.0),
+                    suspect.fix(log),
+                )
+            )  # fmt: skip
+    return found
+
+
+def _ratio_of(state: ParameterEstimate) -> float:
+    """Return a scale as a ratio: the slope of ranges is less one."""
+    return state.value + (1.0 if state.name == "range_slope" else 0.0)
+
+
+def _find_delays(result: SlamResult, late_s: float) -> tuple[Cause, ...]:
+    """Return clocks that are late by so much."""
     found = list[Cause]()
     for state in result.parameters:
         name = state.name.removesuffix("_delay_s")
@@ -540,14 +584,12 @@ def _trial(inputs: Inputs, solution: SessionSolution[VisitT], taken: tuple[Taken
     optimum = optimum_of(session, solution.result.changes)
     used = used_rows(session)
     if isinstance(session, Solved):
-        problem_s, places = session.outcome.problem.stamp_s, 0
+        places = 0
         if session.outcome.aligned and session.prepared.prior_map is not None:
             places = int(session.prepared.prior_map.given.sum())
     else:
-        problem = session.solved.optimum.smoother.problem
-        problem_s, places = problem.stamp_s, len(problem.prior.place)
-    volume = float(inputs.stretched[used].sum()) + inputs.stretched_step * (len(problem_s) - 1)
-    volume += inputs.stretched_place * places
+        places = len(session.solved.optimum.smoother.problem.prior.place)
+    volume = float(inputs.stretched[used].sum()) + inputs.stretched_place * places
     left_out = len(inputs.stretched) - len(used)
     seen = optimum.detections
     outlier = float(np.mean(np.where(np.isfinite(seen.log_odds), seen.log_nominal - seen.log_odds, 0.0)))
@@ -558,7 +600,7 @@ def _trial(inputs: Inputs, solution: SessionSolution[VisitT], taken: tuple[Taken
 OWN_STATES = {
     "odometry-scale": (("odometry_forward_scale", 1.0), ("odometry_scale", 1.0)),
     "turn-scale": (("odometry_turn_scale", 1.0),),
-    "range-scale": (("range_scale", -1.0),),
+    "range-scale": (("range_scale", -1.0), ("range_slope", -1.0)),
 }
 """Calibration states that are the same number as a cause's, and the sign with which their logarithms add to it."""
 
@@ -569,7 +611,10 @@ def in_given_units(trial: Trial[VisitT]) -> SlamResult:
         name: math.exp(sign * one.state) for one in trial.taken for name, sign in OWN_STATES.get(one.suspect.code, ())
     }
     states = [
-        replace(state, value=state.value * factor[state.name], sigma=state.sigma * factor[state.name])
+        replace(
+            state, value=state.value + (factor[state.name] - 1.0) * _ratio_of(state),
+            sigma=state.sigma * factor[state.name],
+        )
         if state.name in factor else state
         for state in trial.solution.result.parameters
     ]  # fmt: skip
@@ -581,9 +626,9 @@ def _with_own_state(taken: Taken, result: SlamResult) -> tuple[float, float]:
     state, sigma = taken.state, taken.information**-0.5 if taken.information > 0.0 else math.nan
     own = {one.name: one for one in result.parameters}
     for name, sign in OWN_STATES.get(taken.suspect.code, ()):
-        if name in own and not own[name].fixed and own[name].value > 0.0:
-            state += sign * math.log(own[name].value)
-            sigma = min(sigma, own[name].sigma / own[name].value) if own[name].sigma > 0.0 else sigma
+        if name in own and not own[name].fixed and (ratio := _ratio_of(own[name])) > 0.0:
+            state += sign * math.log(ratio)
+            sigma = min(sigma, own[name].sigma / ratio) if own[name].sigma > 0.0 else sigma
     return state, sigma
 
 

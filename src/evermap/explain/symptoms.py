@@ -26,6 +26,7 @@ from evermap.types import (
     Landmarks,
     ParameterEstimate,
     Recording,
+    SensorKind,
     SlamResult,
     Trajectory,
     is_in_space,
@@ -161,6 +162,7 @@ class Signs:
         motion_turn_rad: the same of the turns.
         longer: motion by the trajectory over that by odometry.
         away, away_name: standard deviations by which the calibration state farthest from its prior is off.
+        metre: logarithm by which ranges and odometry differ on all lengths, where nothing says which is right.
         size_m: extent of trajectory and map.
         sigma_m: median of the standard deviations of positions; `sigma_most_m` the largest.
         sigma_share: `sigma_m` over the size.
@@ -190,6 +192,7 @@ class Signs:
     longer: float = nan
     away: float = nan
     away_name: str = ""
+    metre: float = nan
     size_m: float = nan
     sigma_m: float = nan
     sigma_most_m: float = nan
@@ -225,7 +228,7 @@ def measure_signs(
         as_read: the recording with the identities that it was read with; None where they are the same.
     """
     compared = compare_detections(recording, result)
-    motion, turn, longer = _by_odometry(result)
+    motion, turn, longer = compare_odometry(result)
     halves, halves_share = _between_halves(compared)
     used, worst = _count_shares_used(result.innovations)
     blind_s, blind_share = _blind(result)
@@ -256,6 +259,7 @@ def measure_signs(
         longer=longer,
         away=away,
         away_name=name,
+        metre=_find_undecided_scale(result, recording),
         size_m=size_m,
         sigma_m=sigma_m,
         sigma_most_m=most_m,
@@ -332,7 +336,7 @@ def _between_halves(compared: Compared) -> tuple[float, float]:
     return (float(np.median(ratio)), float(np.median(share))) if len(ratio) >= 3 else (nan, nan)
 
 
-def _by_odometry(result: SlamResult) -> tuple[float, float, float]:
+def compare_odometry(result: SlamResult) -> tuple[float, float, float]:
     """Return by how much odometry and trajectory differ within windows, as a share of the motion, in angle, in length.
 
     All are medians over windows in which either moved.
@@ -378,6 +382,20 @@ def _farthest_state(parameters: tuple[ParameterEstimate, ...]) -> tuple[float, s
     free = [each for each in parameters if not each.fixed and each.prior_sigma > 0.0]
     away = [(abs(each.value - each.prior_mean) / each.prior_sigma, each.name) for each in free]
     return max(away, default=(nan, ""))
+
+
+def _find_undecided_scale(result: SlamResult, recording: AnyRecording) -> float:
+    """Return the logarithm by which ranges and odometry differ; nan where a data sheet, a map or a laser says which one
+    is off.
+    """
+    pair = next((pair for pair in result.undecided if pair.one.name.endswith("scale")), None)
+    sensors = recording.sensors if is_in_space(recording) else (recording.sensor,)
+    if pair is None or any(
+        one.kind is SensorKind.LASER or one.sigma_scale is not None or one.sigma_odometer_scale is not None
+        for one in sensors
+    ):
+        return nan
+    return abs(float(np.log(abs(pair.one.alone))))
 
 
 def _extent(result: SlamResult) -> tuple[float, float, float]:

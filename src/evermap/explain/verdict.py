@@ -113,6 +113,10 @@ LIMITS = (
         "hardly anything ties the poses to each other", "a drive that comes back to landmarks seen before",
     ),
     Limit(
+        "metre", "metre", "ranges and odometry differ by {:.1%} on all lengths", -inf, 0.05, WEAK,
+        "nothing says which of the two is right", "[sensor] sigma_scale or [odometry] sigma_odometer_scale, or a map",
+    ),
+    Limit(
         "landmarks", "n_landmarks", "{:.0f} landmarks", 3.0, inf, WEAK,
         "so few landmarks check each other hardly", "more landmarks",
     ),
