@@ -24,6 +24,7 @@ from evermap.types import (
     FloatArray,
     Landmarks,
     Recording,
+    SpatialOdometry,
     SpatialRecording,
     SpatialSensor,
     is_in_space,
@@ -33,6 +34,10 @@ USUAL_P, RARE_P, UNIT_P = 1e-3, 1e-4, 1e-3
 """Probabilities beforehand of a cause that is met every day in bug reports, of one that is not, and of a unit."""
 SCALE, ONE_TAG, TURN, MAP_SCALE = 0.15, 0.3, 0.15, 0.1
 """Standard deviations of logarithms: of all ranges or speeds, of the size of one tag, of turns, of a map."""
+CENTRE_PX, COEFFICIENT = 30.0, 0.05
+"""Standard deviations of the centre of an image, and of a coefficient of distortion that is stated."""
+SIDEWAYS = 0.1
+"""Way to the side over that ahead from which a robot drives sideways: less is the noise of its odometry."""
 DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL, DISTORTION = 0.5, 0.2, 0.3, 0.1, 0.2
 """Standard deviations of a delay, of a mount's position and turn, of the logarithm of a focal length, and of k1."""
 
@@ -355,11 +360,12 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
             _constant("odometry.csv: angular_radps"),
         )  # fmt: skip
         yield _late_stamps(sensors[0].name if len(sensors) == 1 else "all sensors")
-        yield Suspect(
-            "odometry-mirrored", "odometry", RARE_P, lambda inputs, _: _mirror_drive(inputs),
-            _constant("the odometry seems mirrored: y is to the left, turns are counter-clockwise"),
-            _constant("odometry.csv: lateral_mps, angular_radps"),
-        )  # fmt: skip
+        if _drives_sideways(recording.odometry):  # else only its turns can be mirrored
+            yield Suspect(
+                "odometry-mirrored", "odometry", RARE_P, lambda inputs, _: _mirror_drive(inputs),
+                _constant("the odometry seems mirrored: y is to the left, turns are counter-clockwise"),
+                _constant("odometry.csv: lateral_mps, angular_radps"),
+            )  # fmt: skip
     for mistake in mistakes.UNITS_IN_SPACE:
         state = math.log(mistake.lengths)
         if mistake.field == "odometry" and recording.odometry is None:
@@ -417,6 +423,11 @@ def _stretch_positions(inputs: Inputs, state: float, of: tuple[str, float] | Non
         recording=replace(recording, detections=further),
         stretched=inputs.stretched + 3.0 * state * (mine & read),
     )
+
+
+def _drives_sideways(odometry: SpatialOdometry) -> bool:
+    step = np.abs(se3.between(odometry.pose_world_robot[:-1], odometry.pose_world_robot[1:])[:, :2]).sum(axis=0)
+    return bool(step[1] > SIDEWAYS * step[0])
 
 
 def _mirror_drive(inputs: Inputs) -> Inputs:
@@ -526,6 +537,15 @@ def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspe
         lambda s: f"[camera.{name}] intrinsics = [{fx * math.exp(s):.5g}, {fy * math.exp(s):.5g}, {cx:g}, {cy:g}]",
         FOCAL, lambda s: fx * math.exp(s), pairs=False,
     )  # fmt: skip
+    for place, key in ((2, "cx"), (3, "cy")):
+        stated = sensor.intrinsics[place]
+        yield Suspect(
+            "intrinsics", f"{name} {key}", RARE_P,
+            partial(_change_lens, rows=row, how=partial(_with_number_off, field="intrinsics", place=place)),
+            lambda s, key=key, stated=stated: f"{name}: {key} is {stated + s:.4g} px, not {stated:.4g} px",  # type: ignore[misc]
+            lambda s, key=key, stated=stated: f"[camera.{name}] intrinsics: {key} = {stated + s:.5g}",  # type: ignore[misc]
+            CENTRE_PX, pairs=False,
+        )  # fmt: skip
     if abs(fx - fy) > 1e-3 * fx or abs(cx - cy) > 1e-3 * cx:
         for words, swapped in (
             ("fx and fy seem to be swapped", (fy, fx, cx, cy)), ("cx and cy seem to be swapped", (fx, fy, cy, cx)),
@@ -537,7 +557,7 @@ def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspe
     if not any(sensor.distortion):
         yield Suspect(
             "distortion", name, USUAL_P, partial(_change_lens, rows=row, how=_bent),
-            lambda s: f"{name}: the lens distorts, k1 is about {s:.3g}, and none is stated: corners are not undistorted",
+            lambda s: f"{name}: the lens distorts, but no distortion is stated: k1 is about {s:.3g}",
             lambda s: f'[camera.{name}] model = "radtan", distortion = [{s:.3g}, {s * s:.3g}, 0, 0], or calibrate',
             DISTORTION, pairs=False,
         )  # fmt: skip
@@ -550,6 +570,15 @@ def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspe
         "distortion", "corners seem to be undistorted already", f'[camera.{name}] model = "pinhole"', USUAL_P,
         distortion=(), distortion_model="pinhole",
     )  # fmt: skip
+    for place in range(2):
+        key, stated = f"k{place + 1}", sensor.distortion[place]
+        yield Suspect(
+            "distortion", f"{name} {key}", RARE_P,
+            partial(_change_lens, rows=row, how=partial(_with_number_off, field="distortion", place=place)),
+            lambda s, key=key, stated=stated: f"{name}: {key} is about {stated + s:.3g}, not {stated:.3g}",  # type: ignore[misc]
+            lambda s, key=key, stated=stated: f"[camera.{name}] distortion: {key} = {stated + s:.3g}",  # type: ignore[misc]
+            COEFFICIENT, pairs=False,
+        )  # fmt: skip
     if len(sensor.distortion) >= 4:
         other = "equidistant" if sensor.distortion_model == "radtan" else "radtan"
         yield lens(
@@ -562,6 +591,13 @@ def _zoomed(sensor: SpatialSensor, state: float) -> dict[str, Any]:
     assert sensor.intrinsics is not None
     fx, fy, cx, cy = sensor.intrinsics
     return {"intrinsics": (fx * math.exp(state), fy * math.exp(state), cx, cy)}
+
+
+def _with_number_off(sensor: SpatialSensor, state: float, field: str, place: int) -> dict[str, Any]:
+    """Return intrinsics or distortion with one number another than stated."""
+    numbers = list(getattr(sensor, field))
+    numbers[place] += state
+    return {field: tuple(numbers)}
 
 
 def _bent(_: SpatialSensor, state: float) -> dict[str, Any]:
@@ -602,7 +638,7 @@ def _of_map() -> Iterable[Suspect]:
             _constant(f"--prior-map: lengths x {factor:g}"), of_map=True, pairs=False,
         )  # fmt: skip
     yield Suspect(
-        "map-other-site", "map", RARE_P, lambda inputs, _: replace(inputs, prior_map=None),
+        "map-site", "map", RARE_P, lambda inputs, _: replace(inputs, prior_map=None),
         _constant("the given map is not one of what was seen: another site, or another edition"),
         _constant("--prior-map: leave it out, or give the map of this site"), of_map=True, pairs=False,
     )  # fmt: skip

@@ -24,7 +24,7 @@ from evermap.explain.seeds import find_scales, find_shape, find_single_scales
 from evermap.explain.symptoms import compare_odometry
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import HONEST, find_motion, off, pairs_of
-from evermap.types import Cause, ChangeKind, ParameterEstimate, SlamResult, is_in_space
+from evermap.types import UNKNOWN, Cause, ChangeKind, ParameterEstimate, SlamResult, is_in_space
 
 VisitT = TypeVar("VisitT")
 NEAR = 2.0
@@ -215,7 +215,20 @@ def find_put_right(result: SlamResult, inputs: Inputs, rules: ExplainConfig) -> 
     farther from what is stated than is usual, where a map or a data sheet says which of the two that show together it
     is.
     """
-    return (*_find_delays(result, rules.late_s), *_find_own_scales(result, inputs, rules.states))
+    return (
+        *_find_other_identities(inputs),
+        *_find_delays(result, rules.late_s),
+        *_find_own_scales(result, inputs, rules.states),
+    )
+
+
+def _find_other_identities(inputs: Inputs) -> list[Cause]:
+    """Return that no identity of the given map was seen, where none was."""
+    given, seen = inputs.prior_map, inputs.recording.detections.landmark_id
+    if given is None or not len(given) or not (seen != UNKNOWN).any() or np.isin(given.landmark_id, seen).any():
+        return []
+    message = "no identity that was seen is in the given map: its identities are others, or it is of another site"
+    return [Cause("map-identities", "map", message, probability=1.0, fix="--prior-map: the map with these identities")]
 
 
 def _find_own_scales(result: SlamResult, inputs: Inputs, farthest: float) -> list[Cause]:
@@ -290,7 +303,9 @@ def _next_cause(
         asked = _diverse(screen(best, inputs, suspects, config), rules.most_tried, tried)
         made = (_solve_trial(inputs, taken, suspect, state, solve_under, budget) for suspect, state in asked)
         trials = sorted((trial for trial in made if trial is not None), key=ahead, reverse=True)
-        trials[:REFINED] = [_refined(trial, inputs, taken, solve_under, budget) for trial in trials[:REFINED]]
+        for row, trial in enumerate(trials[:REFINED]):
+            if best is None or ahead(trial) > 0.0:
+                trials[row] = _refined(trial, inputs, taken, solve_under, budget)
         weighed += trials
         for trial in trials:
             if best is not None and not (ahead(trial) > rules.lead_nats and _relieves(trial, best, config)):
@@ -353,12 +368,12 @@ def _is_of_map(suspect: Suspect, best: Trial[VisitT] | None, config: SlamConfig)
     if best is None:
         return True
     result, given = best.solution.result, best.inputs.prior_map
-    if given is None:
+    common = 0 if given is None else np.isin(given.landmark_id, best.inputs.recording.detections.landmark_id).sum()
+    if not common:  # nothing says where it is
         return False
     if result.trajectory.frame != "prior_map":
         return True
     changed = sum(len(change.landmark_ids) for change in result.changes if change.kind in OF_LANDMARKS)
-    common = np.isin(given.landmark_id, best.inputs.recording.detections.landmark_id).sum()
     return bool(changed > config.explain.map_changed * common)
 
 
@@ -535,7 +550,7 @@ def _refined(
 ) -> Trial[VisitT]:
     """Return the trial with the state of its last cause at its optimum, and the information on it."""
     last = trial.taken[-1]
-    suspect = last.suspect
+    suspect, stretch = last.suspect, 1.0
     while suspect.is_continuous:
         session = held_by_map(trial.solution.session)
         screen = Screen.of(optimum_of(session))
@@ -546,7 +561,7 @@ def _refined(
         worth = screen.optimum.worth
         information = suspect.sigma**-2 + (score.information - suspect.sigma**-2) * worth
         trial = _with_last(trial, replace(last, information=information))
-        step = float(np.clip(score.value, -suspect.sigma, suspect.sigma))
+        step = float(np.clip(stretch * score.value, -suspect.sigma, suspect.sigma))
         if abs(step) * math.sqrt(information) < NEAR * 0.5 or budget.left <= 0:
             break
         nearer = _solve_trial(before, taken, suspect, last.state + step, solve_under, budget)
@@ -554,8 +569,11 @@ def _refined(
             break
         nearer = _with_last(nearer, replace(nearer.taken[-1], information=information))
         if nearer.evidence <= trial.evidence:
-            break
-        trial, last = nearer, nearer.taken[-1]
+            if stretch == 1.0:
+                break
+            stretch = 1.0
+            continue
+        trial, last, stretch = nearer, nearer.taken[-1], 2.0 * stretch  # what is rejected yet hides how far it is
     return trial
 
 

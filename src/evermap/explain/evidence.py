@@ -6,8 +6,9 @@ the unknowns, which is the price of every state that was needed (Occam). A detec
 learned or an outlier whose density is that of the *nominal* noise at the squared residual at which both are alike, so
 that neither a wider noise nor fewer detections come for nothing. Landmarks of which no map says anything are somewhere
 within `ROOM_M`. Odometry says where the robot goes, given what was driven: its density is that of motions, whatever its
-scale, as one of velocities would be the larger the longer the drive is said to be. Solutions of the same measurements can be compared, also where the measurements were transformed, if
-the volume of the transformation is counted (`causes.Inputs`).
+scale, as one of velocities would be the larger the longer the drive is said to be. Solutions of the same measurements
+can be compared, also where the measurements were transformed, if the volume of the transformation is counted
+(`causes.Inputs`).
 
 **Score.** A further number changes all residuals by a known direction `d`. With everything else marginalised, the
 information on it is `h = d'd - b'H^-1 b`, `b = J'd`, and the cost falls by `g^2 / 2 h` at `-g / h`, with
