@@ -158,6 +158,28 @@ def test_a_mirrored_map_is_named() -> None:
     assert result.changes == ()
 
 
+def test_a_map_in_millimetres_is_named() -> None:
+    recording, survey = recorded(World(seed=6), "plane")
+    result = run_slam(recording, prior_map=replace(survey, position_m=survey.position_m * 1e3))
+    assert "0.001" in named(result, "map-unit").fix
+    assert result.trajectory.frame == "prior_map"
+    assert result.changes == ()
+
+
+def test_a_map_of_another_site_or_with_other_identities_is_named() -> None:
+    recording, survey = recorded(World(seed=6), "plane")
+    elsewhere = np.random.default_rng(1).uniform(0.0, 12.0, survey.position_m.shape)
+    for given, code in (
+        (replace(survey, position_m=elsewhere), "map-site"),
+        (replace(survey, landmark_id=survey.landmark_id + 100), "map-identities"),
+    ):
+        result = run_slam(recording, prior_map=given)
+        assert named(result, code).subject == "map"
+        assert result.verdict is not None
+        assert result.verdict.kind is VerdictKind.MAP_OUTDATED
+        assert result.changes == ()
+
+
 def test_turns_of_the_wrong_sign_are_named() -> None:
     recording, survey = recorded(World(seed=7), "plane")
     odometry = recording.odometry

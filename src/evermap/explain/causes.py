@@ -51,17 +51,25 @@ class Inputs:
         prior_map: that was given; None without.
         stretched: (M,) logarithm of the volume by which each detection's numbers were stretched since they were read.
         stretched_place: the same of a place of the map.
+        left_out: places of a map that was left out, of landmarks that were seen.
     """
 
     recording: AnyRecording
     prior_map: Landmarks | None
     stretched: FloatArray
     stretched_place: float
+    left_out: int = 0
 
     @classmethod
     def of(cls, recording: AnyRecording, prior_map: Landmarks | None) -> Inputs:
         """Return the inputs as given."""
         return cls(recording, prior_map, np.zeros(len(recording.detections)), 0.0)
+
+    @property
+    def n_common(self) -> int:
+        """Return the number of landmarks of the map whose identities were seen."""
+        given = self.prior_map
+        return 0 if given is None else int(np.isin(given.landmark_id, self.recording.detections.landmark_id).sum())
 
 
 Undo = Callable[[Inputs, float], Inputs]
@@ -638,7 +646,7 @@ def _of_map() -> Iterable[Suspect]:
             _constant(f"--prior-map: lengths x {factor:g}"), of_map=True, pairs=False,
         )  # fmt: skip
     yield Suspect(
-        "map-site", "map", RARE_P, lambda inputs, _: replace(inputs, prior_map=None),
+        "map-site", "map", RARE_P, lambda inputs, _: replace(inputs, prior_map=None, left_out=inputs.n_common),
         _constant("the given map is not one of what was seen: another site, or another edition"),
         _constant("--prior-map: leave it out, or give the map of this site"), of_map=True, pairs=False,
     )  # fmt: skip

@@ -18,7 +18,7 @@ import numpy as np
 from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.causes import Inputs, Suspect, list_suspects, rows_of_kind
-from evermap.explain.evidence import AnySession, Screen, evidence_at, optimum_of, used_rows
+from evermap.explain.evidence import LOG_2PI, ROOM_M, AnySession, Screen, evidence_at, optimum_of, used_rows
 from evermap.explain.linearise import change_by, gain_by, held_by_map
 from evermap.explain.seeds import find_scales, find_shape, find_single_scales
 from evermap.explain.symptoms import compare_odometry
@@ -46,6 +46,8 @@ AGREE = 0.25
 """Share of what one of ranges, odometry and map is off by, up to which the other two agree with each other."""
 ODOMETRY_OFF = 0.3
 """Share of the motion by which odometry is off from which it is asked why, as by the verdict."""
+SHAPE = 5
+"""Landmarks in common from which a map that what was seen lies nowhere on is of another site."""
 SURE = 0.99
 """Probability from which a delay is told as a cause."""
 INLIER, FEWER = 0.5, 0.7
@@ -216,19 +218,26 @@ def find_put_right(result: SlamResult, inputs: Inputs, rules: ExplainConfig) -> 
     is.
     """
     return (
-        *_find_other_identities(inputs),
+        *_find_other_map(result, inputs),
         *_find_delays(result, rules.late_s),
         *_find_own_scales(result, inputs, rules.states),
     )
 
 
-def _find_other_identities(inputs: Inputs) -> list[Cause]:
-    """Return that no identity of the given map was seen, where none was."""
+def _find_other_map(result: SlamResult, inputs: Inputs) -> list[Cause]:
+    """Return that the given map is not of what was seen, where no cause lays the one over the other."""
     given, seen = inputs.prior_map, inputs.recording.detections.landmark_id
-    if given is None or not len(given) or not (seen != UNKNOWN).any() or np.isin(given.landmark_id, seen).any():
+    if given is None or result.trajectory.frame == "prior_map" or not len(given) or not (seen != UNKNOWN).any():
         return []
-    message = "no identity that was seen is in the given map: its identities are others, or it is of another site"
-    return [Cause("map-identities", "map", message, probability=1.0, fix="--prior-map: the map with these identities")]
+    if not inputs.n_common:
+        message = "no identity that was seen is in the given map: its identities are others, or it is of another site"
+        return [
+            Cause("map-identities", "map", message, probability=1.0, fix="--prior-map: the map of these identities")
+        ]
+    if inputs.n_common < SHAPE:
+        return []
+    message = "what was seen lies nowhere on the given map, in no scale, unit or mirror that was tried: another site"
+    return [Cause("map-site", "map", message, probability=1.0, fix="--prior-map: the map of this site")]
 
 
 def _find_own_scales(result: SlamResult, inputs: Inputs, farthest: float) -> list[Cause]:
@@ -368,8 +377,8 @@ def _is_of_map(suspect: Suspect, best: Trial[VisitT] | None, config: SlamConfig)
     if best is None:
         return True
     result, given = best.solution.result, best.inputs.prior_map
-    common = 0 if given is None else np.isin(given.landmark_id, best.inputs.recording.detections.landmark_id).sum()
-    if not common:  # nothing says where it is
+    common = best.inputs.n_common
+    if given is None or not common:  # nothing says where it is
         return False
     if result.trajectory.frame != "prior_map":
         return True
@@ -612,6 +621,9 @@ def _trial(inputs: Inputs, solution: SessionSolution[VisitT], taken: tuple[Taken
     seen = optimum.detections
     outlier = float(np.mean(np.where(np.isfinite(seen.log_odds), seen.log_nominal - seen.log_odds, 0.0)))
     evidence = evidence_at(optimum) + volume + left_out * outlier
+    # a map that what was seen lies nowhere on has its places anywhere
+    anywhere = inputs.left_out if solution.result.trajectory.frame == "prior_map" else inputs.left_out + inputs.n_common
+    evidence -= anywhere * inputs.recording.dim * (math.log(ROOM_M) + 0.5 * LOG_2PI)
     return Trial(inputs, solution, taken, evidence + sum(map(_state_evidence, taken)), optimum.worth)
 
 

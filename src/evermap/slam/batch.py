@@ -54,8 +54,8 @@ STEPS_A_PART, NEAR_GAIN = 10, 0.01
 """Gauss-Newton steps of a part at most; it ends with one that gains so little (nats) for each detection."""
 MOST_WORSE = 1.5
 """Cost of a part for each number that was measured, relative to that of the part before it, up to which it fits."""
-FEWEST_IN_METRE, MOST_OF_METRE = 3, 4.0
-"""Landmarks by which a map says what a metre is, and standard deviations by which that is another, at most."""
+OTHER_METRE = 4.0
+"""Standard deviations of range slope and odometer scale by which the metre of a map is another, at most."""
 NOISE_NEAR, NOISE_CONVERGED = 0.05, 0.02
 """Change of the noise (`NoiseFit.change`) below which it is decided what is needed, and the last rounds stop."""
 FINAL_REVISIONS = 3
@@ -413,15 +413,15 @@ def lay_over_in_metre(
     both = np.flatnonzero(prior_map.given & estimate.known[:count])
     one, other = np.triu_indices(len(both), 1)
     apart = [np.linalg.norm(at[both[one]] - at[both[other]], axis=1) for at in (prior_map.mean, estimate.landmark)]
-    if len(both) < FEWEST_IN_METRE or min(apart[0].min(), apart[1].min()) <= 0.0:
+    if len(both) < rules.fewest or min(apart[0].min(), apart[1].min()) <= 0.0:
         return estimate, prior, laid
     log_scale = float(np.median(np.log(apart[0] / apart[1])))
-    if abs(log_scale) > MOST_OF_METRE * float(np.hypot(prior.sigma[SLOPE], prior.sigma[FORWARD])):
+    if abs(log_scale) > OTHER_METRE * float(np.hypot(prior.sigma[SLOPE], prior.sigma[FORWARD])):
         return estimate, prior, laid
     scale = float(np.exp(log_scale))
     pose, landmark = estimate.pose * [scale, scale, 1.0], estimate.landmark * scale
     scaled = Estimate(pose, landmark, prior.resized(estimate.states, scale))
-    again = lay_over(prior_map, scaled.landmark, rules, fewest=FEWEST_IN_METRE)
+    again = lay_over(prior_map, scaled.landmark, rules, fewest=rules.fewest)
     if not again:
         return estimate, prior, laid
     sigma = prior.sigma.copy()

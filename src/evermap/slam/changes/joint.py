@@ -403,7 +403,7 @@ def without_common_motion(groups: Groups, seen: IntArray, given: GivenMap) -> Gr
     mapped = np.unique(seen)
     mapped = mapped[given.given[mapped]]
     before = [group for group in groups if group.window == 0]
-    if not before or not np.isin(mapped, np.concatenate([group.members for group in before])).all():
+    if not (before and len(mapped)) or not np.isin(mapped, np.concatenate([group.members for group in before])).all():
         return groups
     largest = max(before, key=lambda group: len(group.members))
     return tuple(group for group in groups if group is not largest)
