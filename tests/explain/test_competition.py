@@ -160,7 +160,9 @@ def test_a_mirrored_map_is_named() -> None:
 
 def test_a_map_in_millimetres_is_named() -> None:
     recording, survey = recorded(World(seed=6), "plane")
-    result = run_slam(recording, prior_map=replace(survey, position_m=survey.position_m * 1e3))
+    measured = survey.position_m + np.random.default_rng(6).normal(0.0, 0.005, survey.position_m.shape)
+    given = Landmarks.at(survey.landmark_id, measured * 1e3, sigma_m=0.01)  # no map of millimetres is that good
+    result = run_slam(recording, prior_map=given)
     assert "0.001" in named(result, "map-unit").fix
     assert result.trajectory.frame == "prior_map"
     assert result.changes == ()

@@ -407,13 +407,13 @@ def lay_over_in_metre(
         rules: when an alignment is accepted.
     """
     laid = lay_over(prior_map, estimate.landmark, rules)
-    if laid or not prior.shares_scale:
+    if not prior.shares_scale or laid.agree.all():
         return estimate, prior, laid
     count = len(prior_map.given)
     both = np.flatnonzero(prior_map.given & estimate.known[:count])
     one, other = np.triu_indices(len(both), 1)
     apart = [np.linalg.norm(at[both[one]] - at[both[other]], axis=1) for at in (prior_map.mean, estimate.landmark)]
-    if len(both) < rules.fewest or min(apart[0].min(), apart[1].min()) <= 0.0:
+    if len(both) < max(rules.fewest, 2) or min(apart[0].min(), apart[1].min()) <= 0.0:
         return estimate, prior, laid
     log_scale = float(np.median(np.log(apart[0] / apart[1])))
     if abs(log_scale) > OTHER_METRE * float(np.hypot(prior.sigma[SLOPE], prior.sigma[FORWARD])):
@@ -422,7 +422,7 @@ def lay_over_in_metre(
     pose, landmark = estimate.pose * [scale, scale, 1.0], estimate.landmark * scale
     scaled = Estimate(pose, landmark, prior.resized(estimate.states, scale))
     again = lay_over(prior_map, scaled.landmark, rules, fewest=rules.fewest)
-    if not again:
+    if not again or (laid and np.count_nonzero(again.agree) <= np.count_nonzero(laid.agree)):
         return estimate, prior, laid
     sigma = prior.sigma.copy()
     sigma[SLOPE] = max(sigma[SLOPE], abs(scaled.states[SLOPE] - prior.mean[SLOPE]))
