@@ -14,7 +14,7 @@ from evermap.geometry.rigid import rigid
 from evermap.geometry.se2 import transform as transform_plane
 from evermap.geometry.se3 import transform as transform_space
 from evermap.maps.sessions.planar import PlanarVisit
-from evermap.types import AnyRecording, Cause, Landmarks, SlamResult
+from evermap.types import AnyRecording, Cause, Landmarks, Recording, SensorKind, SlamResult, VerdictKind, is_in_space
 
 from .worlds import SIZE_M, World
 
@@ -81,6 +81,45 @@ def test_another_size_of_all_tags_moves_none(kind: str, code: str, factor: float
     assert error_m(result, recording, in_map=True) < ORACLE * told + SMALL_M
 
 
+def radios(world: World) -> Recording:
+    """The drive with ranges alone."""
+    recording = world.plane()
+    seen = recording.detections
+    by_range = replace(seen, bearing_rad=np.full(len(seen), np.nan))
+    return replace(recording, detections=by_range, sensor=replace(recording.sensor, kind=SensorKind.UWB))
+
+
+@pytest.mark.parametrize("longer", [1.0 / 1.069, 1.07])
+def test_a_map_says_that_ranges_are_of_another_scale(longer: float) -> None:
+    world = World(seed=3, longer=longer)
+    recording, survey = radios(world), world.map_in_plane()
+    result = run_slam(recording, prior_map=survey)
+    cause = named(result, "range-scale")
+    assert cause.value == pytest.approx(longer, rel=0.005)
+    assert cause.fix.startswith("[sensor] sigma_scale")
+    assert result.changes == ()
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+    oracle = radios(World(seed=3))
+    told = error_m(run_slam(oracle, prior_map=survey), oracle, in_map=True)
+    assert error_m(result, recording, in_map=True) < ORACLE * told + SMALL_M
+
+
+def test_without_a_map_ranges_and_odometer_are_told_as_alternatives() -> None:
+    recording = radios(World(seed=3, longer=1.0 / 1.069))
+    result = run_slam(recording)
+    assert result.causes == result.changes == ()
+    assert [{one.name for one in pair} for pair in result.undecided] == [{"range_slope", "odometry_forward_scale"}]
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.WEAK
+    assert "sigma_odometer_scale" in result.verdict.message
+    stated = replace(recording, sensor=replace(recording.sensor, sigma_scale=0.1, sigma_odometer_scale=0.002))
+    trusted = run_slam(stated)
+    assert trusted.verdict is not None
+    assert trusted.verdict.kind is VerdictKind.SOUND
+    assert error_m(trusted, recording, in_map=False) < 0.3 * error_m(result, recording, in_map=False)
+
+
 @pytest.mark.parametrize("kind", ["plane", "corners"])
 @pytest.mark.slow
 def test_another_size_of_one_tag_moves_it_not(kind: str) -> None:
@@ -117,6 +156,30 @@ def test_a_mirrored_map_is_named() -> None:
     result = run_slam(recording, prior_map=mirrored)
     assert named(result, "map-mirrored").fix
     assert result.changes == ()
+
+
+def test_a_map_in_millimetres_is_named() -> None:
+    recording, survey = recorded(World(seed=6), "plane")
+    measured = survey.position_m + np.random.default_rng(6).normal(0.0, 0.005, survey.position_m.shape)
+    given = Landmarks.at(survey.landmark_id, measured * 1e3, sigma_m=0.01)  # no map of millimetres is that good
+    result = run_slam(recording, prior_map=given)
+    assert "0.001" in named(result, "map-unit").fix
+    assert result.trajectory.frame == "prior_map"
+    assert result.changes == ()
+
+
+def test_a_map_of_another_site_or_with_other_identities_is_named() -> None:
+    recording, survey = recorded(World(seed=6), "plane")
+    elsewhere = np.random.default_rng(1).uniform(0.0, 12.0, survey.position_m.shape)
+    for given, code in (
+        (replace(survey, position_m=elsewhere), "map-site"),
+        (replace(survey, landmark_id=survey.landmark_id + 100), "map-identities"),
+    ):
+        result = run_slam(recording, prior_map=given)
+        assert named(result, code).subject == "map"
+        assert result.verdict is not None
+        assert result.verdict.kind is VerdictKind.MAP_OUTDATED
+        assert result.changes == ()
 
 
 def test_turns_of_the_wrong_sign_are_named() -> None:
@@ -170,6 +233,28 @@ def test_wheels_of_another_radius_are_named() -> None:
     result = run_slam(recording, prior_map=survey)
     assert named(result, "odometry-scale").value == pytest.approx(1.05, rel=0.005)
     assert result.changes == ()
+
+
+@pytest.mark.slow
+def test_turns_of_the_wrong_sign_are_named_where_corners_outweigh_them() -> None:
+    recording, survey = recorded(World(seed=7), "corners")
+    assert is_in_space(recording)
+    wrong = replace(recording, odometry=World(seed=7, turns=-1.0).space().odometry)
+    result = run_slam(wrong, prior_map=survey)
+    assert named(result, "turn-sign").fix == "odometry.csv: angular_radps"
+    assert result.changes == ()
+
+
+@pytest.mark.slow
+def test_a_lens_of_which_no_distortion_is_stated_is_named() -> None:
+    recording, survey = recorded(World(seed=8, bent=-0.2), "corners")
+    result = run_slam(recording, prior_map=survey)
+    cause = named(result, "distortion")
+    assert cause.value == pytest.approx(-0.2, abs=0.04)  # k2 is another than its square
+    assert 'model = "radtan"' in cause.fix
+    assert result.changes == ()
+    as_stated = run_slam(recording, without_causes(), prior_map=survey)
+    assert error_m(result, recording, in_map=True) < 0.3 * error_m(as_stated, recording, in_map=True)
 
 
 @pytest.mark.slow

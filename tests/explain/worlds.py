@@ -42,6 +42,7 @@ class World:
         late_s: by which stamps of the detections are late.
         longer: true over reported ranges, or over the stated size of all tags.
         sizes: the same of some landmarks.
+        bent: k1 of the lenses, of which nothing is stated.
         moved: landmarks that are elsewhere than the map has them, by (x, y).
     """
 
@@ -52,6 +53,7 @@ class World:
     turns: float = 1.0
     late_s: float = 0.0
     longer: float = 1.0
+    bent: float = 0.0
     sizes: dict[int, float] = field(default_factory=dict)
     moved: dict[int, tuple[float, float]] = field(default_factory=dict)
 
@@ -190,7 +192,9 @@ class World:
                 continue
             corner = eye.inv().apply(place + tag.apply(CORNERS * SIZE_M * factor) - at)
             fx, fy, cx, cy = FOCAL
-            pixel = corner[:, :2] / corner[:, 2:] * [fx, fy] + [cx, cy]
+            flat = corner[:, :2] / corner[:, 2:]
+            far2 = (flat**2).sum(axis=1, keepdims=True)
+            pixel = flat * (1.0 + self.bent * far2 + 0.8 * self.bent**2 * far2**2) * [fx, fy] + [cx, cy]
             if (pixel < 0.0).any() or (pixel > [1280.0, 800.0]).any() or random.random() > 0.9:
                 continue
             names.append(name)

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evermap.config import Config, SlamConfig
+from evermap.config import Config, LocalizeConfig, SlamConfig
 from evermap.geometry import se2
 from evermap.pipeline import run_slam
-from evermap.slam.batch import Batch, Estimate, _at_states, middles
+from evermap.slam.batch import Batch, Estimate, PriorMap, _at_states, lay_over_in_metre, middles
+from evermap.slam.calibration import FORWARD, SLOPE, CalibrationPrior
 from evermap.slam.intake import beliefs, prepare
 from evermap.slam.method import Static
 from evermap.slam.smoother import Smoother
@@ -118,3 +119,24 @@ def test_medians_are_those_of_numpy() -> None:
     assert np.isnan(found[[2, 5]]).all()
     for j in (0, 1, 3, 4):
         np.testing.assert_allclose(found[j], np.median(at[row == j], axis=0))
+
+
+def test_distances_of_a_map_say_what_a_metre_is() -> None:
+    place = np.random.default_rng(4).uniform(0.0, 40.0, (6, 2))
+    given = PriorMap(place, np.tile(1e4 * np.eye(2), (6, 1, 1)), np.ones(6, dtype=np.bool_))
+    prior = CalibrationPrior.from_settings(calibrated=True)
+
+    def laid_over(longer: float) -> tuple[Estimate, CalibrationPrior, bool]:
+        estimate = Estimate(np.array([[longer, 0.0, 0.0]]), place * longer, prior.mean)
+        found, inside, laid = lay_over_in_metre(given, estimate, prior, LocalizeConfig())
+        return found, inside, bool(laid)
+
+    found, inside, laid = laid_over(1.07)
+    assert laid
+    np.testing.assert_allclose(found.landmark, place, atol=1e-9)
+    assert found.pose[0, 0] == pytest.approx(1.0)
+    assert found.states[SLOPE] == pytest.approx(0.07)
+    assert found.states[FORWARD] == pytest.approx(1.0 / 1.07)
+    assert inside.sigma[SLOPE] == pytest.approx(0.07)  # else the usual one would pull it back
+    assert not laid_over(1.3)[2]  # no sensor is off by so much: it is another map
+    assert laid_over(1.0)[1] is prior

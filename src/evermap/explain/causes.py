@@ -27,6 +27,7 @@ from evermap.types import (
     FloatArray,
     Landmarks,
     Recording,
+    SpatialOdometry,
     SpatialRecording,
     SpatialSensor,
     is_in_space,
@@ -36,8 +37,12 @@ USUAL_P, RARE_P, UNIT_P = 1e-3, 1e-4, 1e-3
 """Probabilities beforehand of a cause that is met every day in bug reports, of one that is not, and of a unit."""
 SCALE, ONE_TAG, TURN, MAP_SCALE = 0.15, 0.3, 0.15, 0.1
 """Standard deviations of logarithms: of all ranges or speeds, of the size of one tag, of turns, of a map."""
-DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL = 0.5, 0.2, 0.3, 0.1
-"""Standard deviations of a delay, of a mount's position and turn, and of the logarithm of a focal length."""
+CENTRE_PX, COEFFICIENT = 30.0, 0.05
+"""Standard deviations of the centre of an image, and of a coefficient of distortion that is stated."""
+SIDEWAYS = 0.1
+"""Way to the side over that ahead from which a robot drives sideways: less is the noise of its odometry."""
+DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL, DISTORTION = 0.5, 0.2, 0.3, 0.1, 0.2
+"""Standard deviations of a delay, of a mount's position and turn, of the logarithm of a focal length, and of k1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,20 +53,26 @@ class Inputs:
         recording: with identities, as it is estimated.
         prior_map: that was given; None without.
         stretched: (M,) logarithm of the volume by which each detection's numbers were stretched since they were read.
-        stretched_step: the same of the odometry between two poses.
         stretched_place: the same of a place of the map.
+        left_out: places of a map that was left out, of landmarks that were seen.
     """
 
     recording: AnyRecording
     prior_map: Landmarks | None
     stretched: FloatArray
-    stretched_step: float
     stretched_place: float
+    left_out: int = 0
 
     @classmethod
     def of(cls, recording: AnyRecording, prior_map: Landmarks | None) -> Inputs:
         """Return the inputs as given."""
-        return cls(recording, prior_map, np.zeros(len(recording.detections)), 0.0, 0.0)
+        return cls(recording, prior_map, np.zeros(len(recording.detections)), 0.0)
+
+    @property
+    def n_common(self) -> int:
+        """Return the number of landmarks of the map whose identities were seen."""
+        given = self.prior_map
+        return 0 if given is None else int(np.isin(given.landmark_id, self.recording.detections.landmark_id).sum())
 
 
 Undo = Callable[[Inputs, float], Inputs]
@@ -259,13 +270,11 @@ def _stretch_speeds(inputs: Inputs, state: float) -> Inputs:
         odometry = replace(
             driven_flat, forward_mps=driven_flat.forward_mps * factor, lateral_mps=driven_flat.lateral_mps * factor
         )
-    step = inputs.stretched_step + recording.dim * state
-    return replace(inputs, recording=replace(recording, odometry=odometry), stretched_step=step)
+    return replace(inputs, recording=replace(recording, odometry=odometry))
 
 
 def _stretch_turns(inputs: Inputs, state: float) -> Inputs:
-    turned = _turn_by(inputs, math.exp(state))
-    return replace(turned, stretched_step=turned.stretched_step + state * (3 if is_in_space(inputs.recording) else 1))
+    return _turn_by(inputs, math.exp(state))
 
 
 def _turn_by(inputs: Inputs, factor: float) -> Inputs:
@@ -323,7 +332,6 @@ def _undo_in_plane(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Input
         inputs,
         recording=replace(recording, detections=detections, odometry=odometry),
         stretched=inputs.stretched + stretch,
-        stretched_step=inputs.stretched_step + math.log(abs(mistake.turn)),
     )
 
 
@@ -375,11 +383,12 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
             _constant("odometry.csv: angular_radps"),
         )  # fmt: skip
         yield _late_stamps(sensors[0].name if len(sensors) == 1 else "all sensors")
-        yield Suspect(
-            "odometry-mirrored", "odometry", RARE_P, lambda inputs, _: _mirror_drive(inputs),
-            _constant("the odometry seems mirrored: y is to the left, turns are counter-clockwise"),
-            _constant("odometry.csv: lateral_mps, angular_radps"),
-        )  # fmt: skip
+        if _drives_sideways(recording.odometry):  # else only its turns can be mirrored
+            yield Suspect(
+                "odometry-mirrored", "odometry", RARE_P, lambda inputs, _: _mirror_drive(inputs),
+                _constant("the odometry seems mirrored: y is to the left, turns are counter-clockwise"),
+                _constant("odometry.csv: lateral_mps, angular_radps"),
+            )  # fmt: skip
         for mistake in mistakes.POSES:
             yield Suspect(
                 mistake.code, mistake.field, USUAL_P, partial(_read_poses, convention=mistake.poses),
@@ -457,6 +466,11 @@ def _read_detections(inputs: Inputs, _: float, convention: str) -> Inputs:
     pose = mistakes.CONVENTIONS[convention](np.concatenate([seen.position_sensor_m, seen.rotation], axis=1))
     seen = replace(seen, position_sensor_m=pose[:, :3], rotation=pose[:, 3:])
     return replace(inputs, recording=replace(recording, detections=seen))
+
+
+def _drives_sideways(odometry: SpatialOdometry) -> bool:
+    step = np.abs(se3.between(odometry.pose_world_robot[:-1], odometry.pose_world_robot[1:])[:, :2]).sum(axis=0)
+    return bool(step[1] > SIDEWAYS * step[0])
 
 
 def _mirror_drive(inputs: Inputs) -> Inputs:
@@ -573,6 +587,15 @@ def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspe
         lambda s: f"[camera.{name}] intrinsics = [{fx * math.exp(s):.5g}, {fy * math.exp(s):.5g}, {cx:g}, {cy:g}]",
         FOCAL, lambda s: fx * math.exp(s), pairs=False,
     )  # fmt: skip
+    for place, key in ((2, "cx"), (3, "cy")):
+        stated = sensor.intrinsics[place]
+        yield Suspect(
+            "intrinsics", f"{name} {key}", RARE_P,
+            partial(_change_lens, rows=row, how=partial(_with_number_off, field="intrinsics", place=place)),
+            lambda s, key=key, stated=stated: f"{name}: {key} is {stated + s:.4g} px, not {stated:.4g} px",  # type: ignore[misc]
+            lambda s, key=key, stated=stated: f"[camera.{name}] intrinsics: {key} = {stated + s:.5g}",  # type: ignore[misc]
+            CENTRE_PX, pairs=False,
+        )  # fmt: skip
     if abs(fx - fy) > 1e-3 * fx or abs(cx - cy) > 1e-3 * cx:
         for words, swapped in (
             ("fx and fy seem to be swapped", (fy, fx, cx, cy)), ("cx and cy seem to be swapped", (fx, fy, cy, cx)),
@@ -582,11 +605,30 @@ def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspe
             listed = ", ".join(f"{each:g}" for each in swapped)
             yield lens("intrinsics", words, f"[camera.{name}] intrinsics = [{listed}]", USUAL_P, intrinsics=swapped)
     if not any(sensor.distortion):
+        yield Suspect(
+            "distortion", name, USUAL_P, partial(_change_lens, rows=row, how=_bent),
+            lambda s: f"{name}: the lens distorts, but no distortion is stated: k1 is about {s:.3g}",
+            lambda s: f'[camera.{name}] model = "radtan", distortion = [{s:.3g}, {s * s:.3g}, 0, 0], or calibrate',
+            DISTORTION, pairs=False,
+        )  # fmt: skip
         return
+    yield lens(
+        "distortion", "the sign of k1 seems wrong", f"[camera.{name}] distortion = [{-sensor.distortion[0]:g}, ...]",
+        RARE_P, distortion=(-sensor.distortion[0], *sensor.distortion[1:]),
+    )  # fmt: skip
     yield lens(
         "distortion", "corners seem to be undistorted already", f'[camera.{name}] model = "pinhole"', USUAL_P,
         distortion=(), distortion_model="pinhole",
     )  # fmt: skip
+    for place in range(2):
+        key, stated = f"k{place + 1}", sensor.distortion[place]
+        yield Suspect(
+            "distortion", f"{name} {key}", RARE_P,
+            partial(_change_lens, rows=row, how=partial(_with_number_off, field="distortion", place=place)),
+            lambda s, key=key, stated=stated: f"{name}: {key} is about {stated + s:.3g}, not {stated:.3g}",  # type: ignore[misc]
+            lambda s, key=key, stated=stated: f"[camera.{name}] distortion: {key} = {stated + s:.3g}",  # type: ignore[misc]
+            COEFFICIENT, pairs=False,
+        )  # fmt: skip
     if len(sensor.distortion) >= 4:
         other = "equidistant" if sensor.distortion_model == "radtan" else "radtan"
         yield lens(
@@ -599,6 +641,18 @@ def _zoomed(sensor: SpatialSensor, state: float) -> dict[str, Any]:
     assert sensor.intrinsics is not None
     fx, fy, cx, cy = sensor.intrinsics
     return {"intrinsics": (fx * math.exp(state), fy * math.exp(state), cx, cy)}
+
+
+def _with_number_off(sensor: SpatialSensor, state: float, field: str, place: int) -> dict[str, Any]:
+    """Return intrinsics or distortion with one number another than stated."""
+    numbers = list(getattr(sensor, field))
+    numbers[place] += state
+    return {field: tuple(numbers)}
+
+
+def _bent(_: SpatialSensor, state: float) -> dict[str, Any]:
+    """Return the distortion of a lens with this k1: of those that bend lines much, k2 is about its square."""
+    return {"distortion": (state, state**2, 0.0, 0.0), "distortion_model": "radtan"}
 
 
 def _change_lens(
@@ -636,7 +690,7 @@ def _of_map(given: Landmarks) -> Iterable[Suspect]:
             _constant(f"--prior-map: lengths x {factor:g}"), of_map=True, pairs=False,
         )  # fmt: skip
     yield Suspect(
-        "map-other-site", "map", RARE_P, lambda inputs, _: replace(inputs, prior_map=None),
+        "map-site", "map", RARE_P, lambda inputs, _: replace(inputs, prior_map=None, left_out=inputs.n_common),
         _constant("the given map is not one of what was seen: another site, or another edition"),
         _constant("--prior-map: leave it out, or give the map of this site"), of_map=True, pairs=False,
     )  # fmt: skip

@@ -16,16 +16,17 @@ from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
 
-from evermap.config import SlamConfig
+from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.causes import Inputs, Suspect, list_suspects, rows_of_kind
-from evermap.explain.evidence import AnySession, Screen, evidence_at, optimum_of, used_rows
+from evermap.explain.evidence import LOG_2PI, ROOM_M, AnySession, Screen, evidence_at, optimum_of, used_rows
 from evermap.explain.linearise import change_by, gain_by, held_by_map
 from evermap.explain.seeds import find_scales, find_shape, find_single_scales
 from evermap.explain.shape import FEWEST, compare_shapes
+from evermap.explain.symptoms import compare_odometry
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import HONEST, find_motion, off, pairs_of
-from evermap.types import Cause, ChangeKind, SlamResult, is_in_space
+from evermap.types import UNKNOWN, Cause, ChangeKind, ParameterEstimate, SlamResult, is_in_space
 
 VisitT = TypeVar("VisitT")
 NEAR = 2.0
@@ -45,6 +46,10 @@ STRETCHES = frozenset({"tag-size", "range-scale"})
 """Causes that stretch detections: of some landmarks as of all."""
 AGREE = 0.25
 """Share of what one of ranges, odometry and map is off by, up to which the other two agree with each other."""
+ODOMETRY_OFF = 0.3
+"""Share of the motion by which odometry is off from which it is asked why, as by the verdict."""
+SHAPE = 5
+"""Landmarks in common from which a map that what was seen lies nowhere on is of another site."""
 SURE = 0.99
 """Probability from which a delay is told as a cause."""
 INLIER, FEWER = 0.5, 0.7
@@ -161,6 +166,8 @@ def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tup
             found.append("map")
     if not found and any(not finding.usable for finding in find_motion(inputs.recording, config.check)):
         found.append("pairs")
+    if not found and compare_odometry(result)[0] > ODOMETRY_OFF:
+        found.append("odometry")
     return tuple(found)
 
 
@@ -188,8 +195,9 @@ def explain(
         symptoms = find_symptoms(solution.result, inputs, config)
         if not symptoms:
             sound = Trial(inputs, solution, (), math.nan, 1.0)
-            return Explained(sound, find_delays(solution.result, rules.late_s))
-        if symptoms == (CHANGES,):  # calibrations that differ little would show in innovations, too
+            return Explained(sound, find_put_right(solution.result, inputs, rules))
+        few = count_changed(solution.result) <= rules.map_changed * len(solution.result.landmarks)
+        if symptoms == (CHANGES,) and few:  # calibrations that differ little would show in innovations, too
             screens = screens[:1]
     base = None if solution is None else _trial(inputs, solution, ())
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
@@ -207,12 +215,70 @@ def explain(
             break
     if best is None:
         return None
-    causes = (*_causes(best, weighed, base), *find_delays(best.solution.result, rules.late_s))
-    return Explained(best, causes, tuple(weighed))
+    causes = _causes(best, weighed, base)
+    named = {cause.code for cause in causes}
+    others = find_put_right(best.solution.result, best.inputs, rules)
+    return Explained(best, (*causes, *(one for one in others if one.code not in named)), tuple(weighed))
 
 
-def find_delays(result: SlamResult, late_s: float) -> tuple[Cause, ...]:
-    """Return clocks that the estimator itself found to be late by so much, which the solution has put right."""
+def find_put_right(result: SlamResult, inputs: Inputs, rules: ExplainConfig) -> tuple[Cause, ...]:
+    """Return what the estimator itself found, and has put right in its solution: late clocks, and scales that are
+    farther from what is stated than is usual, where a map or a data sheet says which of the two that show together it
+    is.
+    """
+    return (
+        *_find_other_map(result, inputs),
+        *_find_delays(result, rules.late_s),
+        *_find_own_scales(result, inputs, rules.states),
+    )
+
+
+def _find_other_map(result: SlamResult, inputs: Inputs) -> list[Cause]:
+    """Return that the given map is not of what was seen, where no cause lays the one over the other."""
+    given, seen = inputs.prior_map, inputs.recording.detections.landmark_id
+    if given is None or result.trajectory.frame == "prior_map" or not len(given) or not (seen != UNKNOWN).any():
+        return []
+    if not inputs.n_common:
+        message = "no identity that was seen is in the given map: its identities are others, or it is of another site"
+        return [
+            Cause("map-identities", "map", message, probability=1.0, fix="--prior-map: the map of these identities")
+        ]
+    if inputs.n_common < SHAPE:
+        return []
+    message = "what was seen lies nowhere on the given map, in no scale, unit or mirror that was tried: another site"
+    return [Cause("map-site", "map", message, probability=1.0, fix="--prior-map: the map of this site")]
+
+
+def _find_own_scales(result: SlamResult, inputs: Inputs, farthest: float) -> list[Cause]:
+    """Return scales that are calibration states, so many of their prior's standard deviations from what is stated."""
+    found, own = list[Cause](), {state.name: state for state in result.parameters}
+    suspects = {one.code: one for one in list_suspects(inputs) if one.code in OWN_STATES}
+    for code, suspect in suspects.items():
+        for name, sign in OWN_STATES[code]:
+            state = own.get(name)
+            if state is None or state.fixed or (state.shown_with and state.evident) or not state.p_needed > SURE:
+                continue
+            if not abs(state.value - state.prior_mean) > farthest * max(state.prior_sigma, state.sigma):
+                continue
+            ratio = _ratio_of(state)
+            log, sigma = sign * math.log(ratio), state.sigma / ratio
+            value = suspect.shown(log)
+            found.append(
+                Cause(
+                    code, suspect.subject, suspect.say(log), value, sigma * value, min(state.p_needed, 1.0),
+                    suspect.fix(log),
+                )
+            )  # fmt: skip
+    return found
+
+
+def _ratio_of(state: ParameterEstimate) -> float:
+    """Return a scale as a ratio: the slope of ranges is less one."""
+    return state.value + (1.0 if state.name == "range_slope" else 0.0)
+
+
+def _find_delays(result: SlamResult, late_s: float) -> tuple[Cause, ...]:
+    """Return clocks that are late by so much."""
     found = list[Cause]()
     for state in result.parameters:
         name = state.name.removesuffix("_delay_s")
@@ -255,7 +321,9 @@ def _next_cause(
         asked = _diverse(screen(best, inputs, suspects, config), rules.most_tried, tried)
         made = (_solve_trial(inputs, taken, suspect, state, solve_under, budget) for suspect, state in asked)
         trials = sorted((trial for trial in made if trial is not None), key=ahead, reverse=True)
-        trials[:REFINED] = [_refined(trial, inputs, taken, solve_under, budget) for trial in trials[:REFINED]]
+        for row, trial in enumerate(trials[:REFINED]):
+            if best is None or ahead(trial) > 0.0:
+                trials[row] = _refined(trial, inputs, taken, solve_under, budget)
         weighed += trials
         for trial in trials:
             if best is not None and not (ahead(trial) > rules.lead_nats and _relieves(trial, best, config)):
@@ -300,8 +368,7 @@ def _solve_alone(
         result = base.solution.result
         if result.trajectory.frame != "prior_map":
             return result
-        common = int(np.isin(given.landmark_id, inputs.recording.detections.landmark_id).sum())
-        few_changed = count_changed(result) < max(FEWEST_CHANGED, CHANGED * common)
+        few_changed = count_changed(result) < max(FEWEST_CHANGED, CHANGED * inputs.n_common)
         if few_changed and share_rejected(result) <= most_rejected:
             return None
     budget.left -= 1
@@ -379,12 +446,12 @@ def _is_of_map(suspect: Suspect, best: Trial[VisitT] | None, config: SlamConfig)
     if best is None:
         return True
     result, given = best.solution.result, best.inputs.prior_map
-    if given is None:
+    common = best.inputs.n_common
+    if given is None or not common:  # nothing says where it is
         return False
     if result.trajectory.frame != "prior_map":
         return True
     changed = sum(len(change.landmark_ids) for change in result.changes if change.kind in OF_LANDMARKS)
-    common = np.isin(given.landmark_id, best.inputs.recording.detections.landmark_id).sum()
     return bool(changed > config.explain.map_changed * common)
 
 
@@ -561,7 +628,7 @@ def _refined(
 ) -> Trial[VisitT]:
     """Return the trial with the state of its last cause at its optimum, and the information on it."""
     last = trial.taken[-1]
-    suspect = last.suspect
+    suspect, stretch = last.suspect, 1.0
     while suspect.is_continuous:
         session = held_by_map(trial.solution.session)
         screen = Screen.of(optimum_of(session))
@@ -572,7 +639,7 @@ def _refined(
         worth = screen.optimum.worth
         information = suspect.sigma**-2 + (score.information - suspect.sigma**-2) * worth
         trial = _with_last(trial, replace(last, information=information))
-        step = float(np.clip(score.value, -suspect.sigma, suspect.sigma))
+        step = float(np.clip(stretch * score.value, -suspect.sigma, suspect.sigma))
         if abs(step) * math.sqrt(information) < NEAR * 0.5 or budget.left <= 0:
             break
         nearer = _solve_trial(before, taken, suspect, last.state + step, solve_under, budget)
@@ -580,8 +647,11 @@ def _refined(
             break
         nearer = _with_last(nearer, replace(nearer.taken[-1], information=information))
         if nearer.evidence <= trial.evidence:
-            break
-        trial, last = nearer, nearer.taken[-1]
+            if stretch == 1.0:
+                break
+            stretch = 1.0
+            continue
+        trial, last, stretch = nearer, nearer.taken[-1], 2.0 * stretch  # what is rejected yet hides how far it is
     return trial
 
 
@@ -610,25 +680,26 @@ def _trial(inputs: Inputs, solution: SessionSolution[VisitT], taken: tuple[Taken
     optimum = optimum_of(session, solution.result.changes)
     used = used_rows(session)
     if isinstance(session, Solved):
-        problem_s, places = session.outcome.problem.stamp_s, 0
+        places = 0
         if session.outcome.aligned and session.prepared.prior_map is not None:
             places = int(session.prepared.prior_map.given.sum())
     else:
-        problem = session.solved.optimum.smoother.problem
-        problem_s, places = problem.stamp_s, len(problem.prior.place)
-    volume = float(inputs.stretched[used].sum()) + inputs.stretched_step * (len(problem_s) - 1)
-    volume += inputs.stretched_place * places
+        places = len(session.solved.optimum.smoother.problem.prior.place)
+    volume = float(inputs.stretched[used].sum()) + inputs.stretched_place * places
     left_out = len(inputs.stretched) - len(used)
     seen = optimum.detections
     outlier = float(np.mean(np.where(np.isfinite(seen.log_odds), seen.log_nominal - seen.log_odds, 0.0)))
     evidence = evidence_at(optimum) + volume + left_out * outlier
+    # a map that what was seen lies nowhere on has its places anywhere
+    anywhere = inputs.left_out if solution.result.trajectory.frame == "prior_map" else inputs.left_out + inputs.n_common
+    evidence -= anywhere * inputs.recording.dim * (math.log(ROOM_M) + 0.5 * LOG_2PI)
     return Trial(inputs, solution, taken, evidence + sum(map(_state_evidence, taken)), optimum.worth)
 
 
 OWN_STATES = {
     "odometry-scale": (("odometry_forward_scale", 1.0), ("odometry_scale", 1.0)),
     "turn-scale": (("odometry_turn_scale", 1.0),),
-    "range-scale": (("range_scale", -1.0),),
+    "range-scale": (("range_scale", -1.0), ("range_slope", -1.0)),
 }
 """Calibration states that are the same number as a cause's, and the sign with which their logarithms add to it."""
 
@@ -639,7 +710,10 @@ def in_given_units(trial: Trial[VisitT]) -> SlamResult:
         name: math.exp(sign * one.state) for one in trial.taken for name, sign in OWN_STATES.get(one.suspect.code, ())
     }
     states = [
-        replace(state, value=state.value * factor[state.name], sigma=state.sigma * factor[state.name])
+        replace(
+            state, value=state.value + (factor[state.name] - 1.0) * _ratio_of(state),
+            sigma=state.sigma * factor[state.name],
+        )
         if state.name in factor else state
         for state in trial.solution.result.parameters
     ]  # fmt: skip
@@ -651,9 +725,9 @@ def _with_own_state(taken: Taken, result: SlamResult) -> tuple[float, float]:
     state, sigma = taken.state, taken.information**-0.5 if taken.information > 0.0 else math.nan
     own = {one.name: one for one in result.parameters}
     for name, sign in OWN_STATES.get(taken.suspect.code, ()):
-        if name in own and not own[name].fixed and own[name].value > 0.0:
-            state += sign * math.log(own[name].value)
-            sigma = min(sigma, own[name].sigma / own[name].value) if own[name].sigma > 0.0 else sigma
+        if name in own and not own[name].fixed and (ratio := _ratio_of(own[name])) > 0.0:
+            state += sign * math.log(ratio)
+            sigma = min(sigma, own[name].sigma / ratio) if own[name].sigma > 0.0 else sigma
     return state, sigma
 
 

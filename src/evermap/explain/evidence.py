@@ -5,8 +5,10 @@ interpolation*): what the measurements and the priors are worth there, and half 
 the unknowns, which is the price of every state that was needed (Occam). A detection is an inlier of the noise that was
 learned or an outlier whose density is that of the *nominal* noise at the squared residual at which both are alike, so
 that neither a wider noise nor fewer detections come for nothing. Landmarks of which no map says anything are somewhere
-within `ROOM_M`. Solutions of the same measurements can be compared, also where the measurements were transformed, if
-the volume of the transformation is counted (`causes.Inputs`).
+within `ROOM_M`. Odometry says where the robot goes, given what was driven: its density is that of motions, whatever its
+scale, as one of velocities would be the larger the longer the drive is said to be. Solutions of the same measurements
+can be compared, also where the measurements were transformed, if the volume of the transformation is counted
+(`causes.Inputs`).
 
 **Score.** A further number changes all residuals by a known direction `d`. With everything else marginalised, the
 information on it is `h = d'd - b'H^-1 b`, `b = J'd`, and the cost falls by `g^2 / 2 h` at `-g / h`, with
@@ -25,7 +27,6 @@ from evermap.estimate.graph import Graph, Linear
 from evermap.estimate.sparse.elimination import numbers_of
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.slam import intake
-from evermap.slam.calibration import FORWARD
 from evermap.slam.changes.gain import PLANE, log_onset, log_prior
 from evermap.slam.correlation import Lasting
 from evermap.slam.estimate import Solved
@@ -43,8 +44,6 @@ ROOM_M, ROOM_RAD = 20.0, math.pi
 """Standard deviations of where a landmark is of which nothing is known, and of its turn."""
 LEAST_INFORMATION = 1e-6
 """Information of the border's priors, at least: that on delays may be less than none."""
-TURN, LEAST_SCALE = FORWARD + 1, 1e-3
-"""Calibration state of the turns, and the least scale of which a logarithm is taken."""
 ODOMETRY, DETECTIONS, START, REST = 0, 1, 2, 3
 """Blocks of a graph, the same in the plane and in space."""
 
@@ -174,9 +173,6 @@ def _in_plane(solved: Solved, changes: tuple[MapChange, ...]) -> Optimum:
     table = solved.settings.changes
     prices = sum(_price(change, len(problem.landmark_mean), PLANE, log_prior, table) for change in changes)
     log_priors += _odometry_peak(graph, now, 3, slice(3, 6))
-    # the residuals are those of motions, the velocities were measured: times their scales they are motions
-    scales = np.maximum(state.states[[FORWARD, FORWARD, TURN]], LEAST_SCALE)
-    log_priors += (n - 1) * float(np.log(scales).sum())
     worth = _worth(smoother.lasting(state), problem.stamp_s[problem.pose_row], problem.landmark_row)
     return Optimum(replace(graph, held=held), now, state, seen, log_priors, prices, worth)
 

@@ -26,6 +26,7 @@ from evermap.types import (
     Landmarks,
     ParameterEstimate,
     Recording,
+    SensorKind,
     SlamResult,
     Trajectory,
     is_in_space,
@@ -173,7 +174,8 @@ class Signs:
         motion: median difference of odometry and trajectory within a window, as a share of the motion.
         motion_turn_rad: the same of the turns.
         longer: motion by the trajectory over that by odometry.
-        apart: by which share lengths by odometry and by detections differ, where no map says which are right.
+        apart: by which share lengths by odometry and by detections differ, where no map, laser or data sheet says which
+            are right.
         over_odometry: how far detections of a landmark scatter about their middle, over what they would if the robot
             had gone as its odometry says (medians): more than 1 where the solution is the worse of the two.
         noise_seen, noise_driven: largest noise level of detections and odometry over what it started from.
@@ -254,7 +256,7 @@ def measure_signs(
         as_read: the recording with the identities that it was read with; None where they are the same.
     """
     compared = compare_detections(recording, result)
-    motion, turn, longer = _by_odometry(result)
+    motion, turn, longer = compare_odometry(result)
     halves, halves_share = _between_halves(compared)
     used, worst = _count_shares_used(result.innovations)
     blind_s, blind_share = _blind(result)
@@ -286,7 +288,7 @@ def measure_signs(
         motion=motion,
         motion_turn_rad=turn,
         longer=longer,
-        apart=nan if is_in_map else abs(longer - 1.0),
+        apart=nan if is_in_map or _is_length_stated(recording) else abs(longer - 1.0),
         over_odometry=_over_odometry(compared, result),
         noise_seen=seen,
         noise_driven=driven,
@@ -408,7 +410,7 @@ def _between_halves(compared: Compared) -> tuple[float, float]:
     return (float(np.median(ratio)), float(np.median(share))) if len(ratio) >= 3 else (nan, nan)
 
 
-def _by_odometry(result: SlamResult) -> tuple[float, float, float]:
+def compare_odometry(result: SlamResult) -> tuple[float, float, float]:
     """Return by how much odometry and trajectory differ within windows, as a share of the motion, in angle, in length.
 
     All are medians over windows in which either moved.
@@ -495,6 +497,15 @@ def _shift_by_clock_m(result: SlamResult) -> float:
     dim = 2 if path.pose_world_robot.shape[1] == 3 else 3
     went = np.linalg.norm(np.diff(path.pose_world_robot[:, :dim], axis=0), axis=1)
     return abs(delay.value) * float(went.sum()) / max(float(path.stamp_s[-1] - path.stamp_s[0]), 1e-9)
+
+
+def _is_length_stated(recording: AnyRecording) -> bool:
+    """Return whether a laser measures lengths, or a data sheet says how well ranges or odometry do."""
+    sensors = recording.sensors if is_in_space(recording) else (recording.sensor,)
+    return any(
+        one.kind is SensorKind.LASER or one.sigma_scale is not None or one.sigma_odometer_scale is not None
+        for one in sensors
+    )
 
 
 def _extent(result: SlamResult) -> tuple[float, float, float]:

@@ -23,7 +23,7 @@ from evermap.estimate.measurement import Tied
 from evermap.estimate.sparse.system import Slices, exhausted
 from evermap.geometry import se2, se3
 from evermap.slam.bridge import dead_reckoned
-from evermap.slam.calibration import CalibrationPrior, needed, seated
+from evermap.slam.calibration import FORWARD, SLOPE, CalibrationPrior, needed, seated
 from evermap.slam.method import Explanation, Method
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
@@ -54,6 +54,8 @@ STEPS_A_PART, NEAR_GAIN = 10, 0.01
 """Gauss-Newton steps of a part at most; it ends with one that gains so little (nats) for each detection."""
 MOST_WORSE = 1.5
 """Cost of a part for each number that was measured, relative to that of the part before it, up to which it fits."""
+OTHER_METRE = 4.0
+"""Standard deviations of range slope and odometer scale by which the metre of a map is another, at most."""
 NOISE_NEAR, NOISE_CONVERGED = 0.05, 0.02
 """Change of the noise (`NoiseFit.change`) below which it is decided what is needed, and the last rounds stop."""
 FINAL_REVISIONS = 3
@@ -193,9 +195,11 @@ class Batch:
         """
         problem, estimate, noise, _ = part
         estimate = _with_measured_places(problem, estimate)
-        if prior_map is not None and (laid := lay_over(prior_map, estimate.landmark, self._settings.localize)):
-            problem, estimate = entered(problem, estimate, prior_map, self._prior, laid.motion)
-            return self.finished(problem, estimate, noise, aligned=True)
+        if prior_map is not None:
+            estimate, prior, laid = lay_over_in_metre(prior_map, estimate, self._prior, self._settings.localize)
+            if laid:
+                problem, estimate = entered(problem, estimate, prior_map, prior, laid.motion)
+                return self.finished(problem, estimate, noise, aligned=True)
         if framed:
             problem, estimate = _in_measured_frame(problem, estimate, framed, self._prior)
             return self.finished(problem, estimate, noise, aligned=True)
@@ -385,6 +389,44 @@ def lay_over(
     matches = Matches.of(landmark[both], prior_map.mean[both])
     spread = np.linalg.inv(prior_map.information[both]) + SIGMA_M**2 * np.eye(2)
     return accept_alignment(matches, rules, fewest=fewest, spread_m=spread_m, covariance_m2=spread)
+
+
+def lay_over_in_metre(
+    prior_map: PriorMap, estimate: Estimate, prior: CalibrationPrior, rules: LocalizeConfig
+) -> tuple[Estimate, CalibrationPrior, Acceptance]:
+    """Return values whose landmarks lie over a prior map (`lay_over`), the prior in the map, and how they lie.
+
+    Where only the product of range slope and odometer scale shows, the metre of the values is a guess, and the map says
+    what it is: by the distances between its landmarks, of which one more must agree then. A sensor whose ranges are so
+    much longer than the map's is no better than that, whatever is usual of its kind.
+
+    Args:
+        prior_map: the map.
+        estimate: values, in the metre of `prior`.
+        prior: of the calibration states, as the user means it.
+        rules: when an alignment is accepted.
+    """
+    laid = lay_over(prior_map, estimate.landmark, rules)
+    if not prior.shares_scale or laid.agree.all():
+        return estimate, prior, laid
+    count = len(prior_map.given)
+    both = np.flatnonzero(prior_map.given & estimate.known[:count])
+    one, other = np.triu_indices(len(both), 1)
+    apart = [np.linalg.norm(at[both[one]] - at[both[other]], axis=1) for at in (prior_map.mean, estimate.landmark)]
+    if len(both) < max(rules.fewest, 2) or min(apart[0].min(), apart[1].min()) <= 0.0:
+        return estimate, prior, laid
+    log_scale = float(np.median(np.log(apart[0] / apart[1])))
+    if abs(log_scale) > OTHER_METRE * float(np.hypot(prior.sigma[SLOPE], prior.sigma[FORWARD])):
+        return estimate, prior, laid
+    scale = float(np.exp(log_scale))
+    pose, landmark = estimate.pose * [scale, scale, 1.0], estimate.landmark * scale
+    scaled = Estimate(pose, landmark, prior.resized(estimate.states, scale))
+    again = lay_over(prior_map, scaled.landmark, rules, fewest=rules.fewest)
+    if not again or (laid and np.count_nonzero(again.agree) <= np.count_nonzero(laid.agree)):
+        return estimate, prior, laid
+    sigma = prior.sigma.copy()
+    sigma[SLOPE] = max(sigma[SLOPE], abs(scaled.states[SLOPE] - prior.mean[SLOPE]))
+    return scaled, replace(prior, sigma=sigma), again
 
 
 def entered(

@@ -15,7 +15,7 @@ from worlds import Move, Session, landmark_rmse, make_session, pose_rmse
 from evermap.config import ChangesConfig, SlamConfig
 from evermap.estimate.sparse.system import Slices
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
-from evermap.slam.changes.joint import Joint
+from evermap.slam.changes.joint import Joint, without_common_motion
 from evermap.slam.method import Explanation
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import StreamingSlam
@@ -50,6 +50,19 @@ def count_exact(seeds: range, *moves: Move, **options: object) -> int:
 @pytest.mark.parametrize("moves", [(), (BEFORE,), (WITHIN,)])
 def test_one_session_of_each_kind(moves: tuple[Move, ...]) -> None:
     assert count_exact(range(1), *moves) == 1
+
+
+def test_a_motion_of_all_of_the_map_that_was_seen_is_no_change() -> None:
+    given = GivenMap(np.zeros((6, 2)), np.tile(np.eye(2), (6, 1, 1)), np.arange(6) < 5)
+    seen, turn = np.array([0, 1, 1, 2, 3, 5]), np.array([0.0, 0.0, 0.7])
+    whole = MovedGroup(np.array([0, 1, 2, 3]), True, turn, 0)
+    most, rest = MovedGroup(np.array([0, 1, 2]), False, turn, 0), MovedGroup(np.array([3]), False, turn, 0)
+    later = MovedGroup(np.array([3]), False, turn, 2)
+    assert without_common_motion((whole,), seen, given) == ()
+    assert without_common_motion((rest, most), seen, given) == (rest,)
+    assert without_common_motion((most, later), seen, given) == (most, later)  # 3 stood where the map has it
+    assert without_common_motion((whole,), np.append(seen, 4), given) == (whole,)
+    assert without_common_motion((whole,), seen, GivenMap.empty(6)) == (whole,)
 
 
 @pytest.mark.parametrize("with_map", [True, False])

@@ -86,6 +86,9 @@ class Joint(Method):
         """Return the problem with the map believed to 1 m: a wrong one bends the solution or looks noisy."""
         if self._given is None or not self._in_map(problem):
             return problem, estimate
+        # what the map says of the metre is no change
+        sigma = np.maximum(self._calibration.sigma, problem.prior.sigma)
+        self._calibration = replace(self._calibration, sigma=sigma)
         free = replace(
             self._base(problem),
             prior=self._calibration.without_scale(),
@@ -146,7 +149,10 @@ class Joint(Method):
                 return Explanation(problem, estimate, self._current())
             before = self.posterior
             posterior, given = yield from self._weighed(evidence, given, len(bounds) - 1, thorough=final)
-            groups = yield from self._all_timed(posterior.groups, base, estimate, noise, evidence, bounds)
+            told = without_common_motion(posterior.groups, evidence.landmark, given)
+            groups = yield from self._all_timed(told, base, estimate, noise, evidence, bounds)
+            if len(told) < len(posterior.groups):
+                estimate = self._where_most_agree(estimate)
             settled = before is not None and before.map_factor == posterior.map_factor and _same(groups, self._groups)
             self.posterior, self._groups = posterior, groups
             if not in_map and not groups and len(self._landmark) == self._count:
@@ -382,6 +388,25 @@ def _count_hits(group: MovedGroup, base: Problem, used: BoolArray, stamp_s: Floa
     """Detections of the members that are no outliers, since they are at their new places."""
     since_s = -math.inf if group.since_s is None else group.since_s
     return int(np.count_nonzero(used & (stamp_s >= since_s) & np.isin(base.landmark_row, group.members)))
+
+
+def without_common_motion(groups: Groups, seen: IntArray, given: GivenMap) -> Groups:
+    """Return the groups without the largest one where all of the map that was seen moved before the session.
+
+    Then that is the frame: a shift or a rotation of everything is no change.
+
+    Args:
+        groups: that are thought to have moved.
+        seen: landmarks that were seen.
+        given: the map.
+    """
+    mapped = np.unique(seen)
+    mapped = mapped[given.given[mapped]]
+    before = [group for group in groups if group.window == 0]
+    if not (before and len(mapped)) or not np.isin(mapped, np.concatenate([group.members for group in before])).all():
+        return groups
+    largest = max(before, key=lambda group: len(group.members))
+    return tuple(group for group in groups if group is not largest)
 
 
 def _same(groups: Groups, others: Groups) -> bool:
