@@ -166,11 +166,9 @@ def find_two_places(optimum: SpatialOptimum, suspects: IntArray, interval: float
         suspects: rows of places.
         interval: probability of the interval in which the change is reported.
     """
-    most = optimum.now.cost - LEAST_FALL
     free = _without(optimum, suspects)
     at = as_seen(optimum.smoother.problem, free, optimum.smoother.problem.measured)
     found = [two for row in suspects.tolist() if (two := _at_two_places(optimum, free, at, row, interval)) is not None]
-    found = [two for two in found if two.optimum.now.cost < most]
     if not found:
         return None
     best = min(found, key=lambda two: two.optimum.now.cost)
@@ -217,6 +215,8 @@ def _at_two_places(
             voted = oriented(trial, start, np.ones(len(moved)))[[row, after]]
             place[[row, after]] = voted
         found = _settled(trial, start, noise)
+        if found.now.cost > optimum.now.cost - LEAST_FALL:
+            return None
         start = found.estimate
         loss = [losses_at(trial, start, noise, mine, own) for own in (row, after)]
         cut, (low, high) = find_instant(loss[0] - loss[1], stamp_s, interval)
