@@ -32,16 +32,16 @@ from evermap.slam.correlation import Lasting
 from evermap.slam.estimate import Solved
 from evermap.slam.linearise import PlacePriors, detection_residuals
 from evermap.slam.smoother import Smoother
-from evermap.slam.space.against_map import MapComparison
+from evermap.slam.space.against_map import log_map_density
 from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PIXEL, POSE, ROWS
-from evermap.slam.space.problem import ANY_RAD, SpatialProblem
+from evermap.slam.space.marginal import ROOM
+from evermap.slam.space.problem import SpatialProblem
 from evermap.slam.space.solve import SpatialSolved
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 
 LOG_2PI = math.log(2.0 * math.pi)
-ROOM_M, ROOM_RAD = 20.0, math.pi
-"""Standard deviations of where a landmark is of which nothing is known, and of its turn."""
+ROOM_M, ROOM_RAD = ROOM
 LEAST_INFORMATION = 1e-6
 """Information of the border's priors, at least: that on delays may be less than none."""
 ODOMETRY, DETECTIONS, START, REST = 0, 1, 2, 3
@@ -190,7 +190,7 @@ def _in_space(session: SpatialSession) -> Optimum:
     )  # fmt: skip
     n, count, sigma = len(problem.stamp_s), len(problem.oriented), problem.start_sigma
     log_priors = -float(np.log(sigma).sum()) - 3.0 * LOG_2PI
-    extra, prices = _map_terms(problem, session.solved.from_map, state.place)
+    extra, prices = log_map_density(problem, session.solved.from_map, state.place)
     free = np.ones(count, dtype=np.bool_)
     free[problem.prior.place] = False
     begin, held = graph.structure.system.tree.begin, graph.held.copy()
@@ -220,43 +220,6 @@ def _log_peaks(problem: SpatialProblem, level: FloatArray) -> FloatArray:
     corners = np.full_like(corners, -8.0 * math.log(level[PIXEL]))
     log = np.where(kind == CORNERS, corners, position + np.where(kind == POSE, turn, 0.0))
     return np.asarray(log - 0.5 * ROWS[kind] * LOG_2PI)
-
-
-def _map_terms(problem: SpatialProblem, compared: MapComparison | None, place: FloatArray) -> tuple[float, float]:
-    """Return the log density of what a map says at its best, with the cost of places that do not stand put right, and
-    the log prior probability of those.
-    """
-    prior, settings = problem.prior, problem.settings.map
-    density = prices = 0.0
-    groups = () if compared is None else compared.groups
-    grouped = {int(row): k for k, group in enumerate(groups) for row in group.members}
-    met: set[int] = set()
-    for k, row in enumerate(prior.place.tolist()):
-        dim = 6 if problem.oriented[row] else 3
-        told = prior.sigma[k, :dim] < ANY_RAD
-        off = problem.off_map(np.array([k]), place[row][None], oriented=dim == 6)[0]
-        log_sigma = np.log(prior.sigma[k, :dim])
-        if prior.weight[k] >= problem.settings.inlier:
-            density -= float(log_sigma.sum()) + 0.5 * dim * LOG_2PI
-            density += 0.5 * (prior.weight[k] - 1.0) * float(np.sum((off / prior.sigma[k, :dim]) ** 2))
-            prices += math.log1p(-settings.p_moved)
-            continue
-        density += 0.5 * prior.weight[k] * float(np.sum((off / prior.sigma[k, :dim]) ** 2))
-        group = grouped.get(k)
-        if group is not None and group in met:  # it went along: at its place in the group
-            density -= float(log_sigma.sum()) + 0.5 * dim * LOG_2PI
-            prices -= math.log(2.0)
-            continue
-        if group is not None:
-            met.add(group)
-        prices += math.log(settings.p_moved)
-        scales = [(m, rad) for m in settings.moved_m for rad in settings.moved_rad[: None if dim == 6 else 1]]
-        wide = []
-        for m, rad in scales:
-            spread = np.where(told, np.hypot(prior.sigma[k, :dim], np.array([m] * 3 + [rad] * (dim - 3))), ANY_RAD)
-            wide.append(-float(np.log(spread).sum() + 0.5 * np.sum((off / spread) ** 2)) - 0.5 * dim * LOG_2PI)
-        density += float(np.logaddexp.reduce(wide)) - math.log(len(scales))
-    return density, prices
 
 
 def _odometry_peak(graph: Graph[Any], now: Linear, dim: int, by_second: slice) -> float:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from evermap.config import SpaceConfig
+from evermap.geometry import se3
+from evermap.slam.space.intake import prepare_space
 from evermap.types import (
     Frames,
     Landmarks,
@@ -15,6 +19,7 @@ from evermap.types import (
     SpatialRecording,
     SpatialSensor,
     Trajectory,
+    rows_of,
 )
 
 FOCAL, CENTRE, SIZE_M = 500.0, (320.0, 240.0), 0.2
@@ -37,6 +42,15 @@ class World:
     """Where the tags are."""
 
 
+class Move(NamedTuple):
+    """A tag that is moved by `by_m`, and turned about its own vertical axis, at an instant of a drive."""
+
+    tag: int
+    at_s: float
+    by_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn_rad: float = 0.0
+
+
 def poses(at: np.ndarray, turn: Rotation) -> np.ndarray:
     return np.hstack([at, turn.as_quat()])
 
@@ -51,6 +65,8 @@ def tagged_corridor(
     p_wrong: float = 0.0,
     odometry: bool = True,
     rename: dict[int, int] | None = None,
+    moves: tuple[Move, ...] = (),
+    there_and_back: bool = True,
 ) -> World:
     """Make a world and a drive through it.
 
@@ -63,18 +79,29 @@ def tagged_corridor(
         p_wrong: share of detections with the identity of another tag.
         odometry: whether there is any.
         rename: identities that tags carry instead of their own.
+        moves: tags that are moved during the drive; `World.tags` is where they are before.
+        there_and_back: whether the robot returns.
     """
     random = np.random.default_rng(seed)
     place = np.column_stack([np.linspace(0.0, 15.0, n_tags), np.full(n_tags, 2.0), random.uniform(0.0, 0.8, n_tags)])
     # a tag's z points into the wall, away from who looks at it; some are tilted
     facing = MOUNT * Rotation.from_rotvec(random.normal(0.0, 0.25, (n_tags, 3)))
     stamp_s = np.linspace(0.0, 40.0, n_frames)
-    along = 7.5 - 8.0 * np.cos(2.0 * np.pi * stamp_s / stamp_s[-1])
+    along = 7.5 - 8.0 * np.cos((2.0 if there_and_back else 1.0) * np.pi * stamp_s / stamp_s[-1])
     at = np.column_stack([along, 0.3 * np.sin(stamp_s), 0.1 * np.sin(0.7 * stamp_s)])
     turn = Rotation.from_euler(
         "xyz", np.column_stack([0.05 * np.sin(stamp_s), 0.05 * np.cos(stamp_s), 0.2 * np.sin(0.5 * stamp_s)])
     )
     frame, tag, corner = _seen(at, turn, place, facing)
+    for move in moves:
+        of = np.arange(n_tags) == move.tag
+        turned = facing * Rotation.from_rotvec(of[:, None] * [0.0, move.turn_rad, 0.0])
+        there = _seen(at, turn, place + of[:, None] * np.array(move.by_m), turned)
+        old = (tag != move.tag) | (stamp_s[frame] < move.at_s)
+        new = (there[1] == move.tag) & (stamp_s[there[0]] >= move.at_s)
+        parts = [np.concatenate([a[old], b[new]]) for a, b in zip((frame, tag, corner), there, strict=True)]
+        order = np.lexsort((parts[1], parts[0]))
+        frame, tag, corner = (part[order] for part in parts)
     corner = corner + random.normal(0.0, sigma_px, corner.shape)
     identity = np.arange(n_tags) if rename is None else np.array([rename.get(k, k) for k in range(n_tags)])
     said = identity[tag]
@@ -187,6 +214,27 @@ def as_directions(world: World, seed: int, sigma_px: float = 0.5) -> SpatialReco
         tag_size_m=np.full(len(seen), np.nan),
     )
     return replace(recording, detections=directions)
+
+
+def as_poses(world: World, seed: int, sigma_m: float = 0.01, sigma_rad: float = 0.02) -> SpatialRecording:
+    """The same drive, of every tag its pose as it follows from the corners, with errors beside."""
+    recording, random, intake = (
+        world.recording,
+        np.random.default_rng(seed),
+        prepare_space(world.recording, SpaceConfig()),
+    )
+    some, count = intake.used, len(intake.used)
+    error = np.repeat([sigma_m, sigma_rad], 3) * random.normal(size=(count, 6))
+    measured = se3.retract(intake.problem.measured, error)
+    detections = replace(
+        rows_of(recording.detections, some),
+        position_sensor_m=measured[:, :3],
+        rotation=measured[:, 3:],
+        covariance_sensor_m2=np.tile(sigma_m**2 * np.eye(3), (count, 1, 1)),
+        sigma_rad=np.full(count, sigma_rad),
+        corner_px=np.full((count, 4, 2), np.nan),
+    )
+    return replace(recording, detections=detections)
 
 
 def _seen(

@@ -97,7 +97,8 @@ class SpatialVisit:
     @functools.cached_property
     def located(self) -> tuple[BoolArray, BoolArray]:
         """(N,) poses and (P,) places of which it is known where they are."""
-        return located(self.optimum.smoother.problem, self.optimum.now)
+        found, placed = located(self.optimum.smoother.problem, self.optimum.now)
+        return found, placed & ~self.solved.left
 
     @property
     def path_m(self) -> FloatArray:
@@ -370,7 +371,7 @@ def _numbered(intake: SpatialIntake, solved: SpatialSolved, living: LivingMap) -
     number, place = solved.number.copy(), solved.optimum.estimate.place
     for row, names in enumerate(names_of(intake)):
         known = np.flatnonzero(np.isin(names, living.members.landmark_id))
-        mine = np.flatnonzero(solved.identity == row)
+        mine = np.flatnonzero((solved.identity == row) & ~solved.left)
         if len(mine) == 1 and not (known > 0).any():
             continue
         site = living.site_of()[np.searchsorted(living.members.landmark_id, names[known])]

@@ -187,16 +187,27 @@ def parting_time(
             problem.reading[mine], sigma, noise.outlier_log_odds, loss[k],
         )  # fmt: skip
     stamp_s = stamp_s[mine]
-    # log likelihood of the change just before detection k, for k = 1 .. n - 1: both places were seen
-    log_likelihood = -np.cumsum(loss[0] - loss[1])[:-1]
+    first, (low, high) = find_instant(loss[0] - loss[1], stamp_s, interval)
+    return float(stamp_s[first]), (float(stamp_s[low]), float(stamp_s[high]))
+
+
+def find_instant(gain: FloatArray, stamp_s: FloatArray, interval: float) -> tuple[int, tuple[int, int]]:
+    """Return the first reading at a new place, and two between which the change happened with probability `interval`.
+
+    Args:
+        gain: (n,) nats that each reading gains at the new place, in order of time; n is at least 2.
+        stamp_s: (n,) their stamps.
+        interval: probability that the change was between the two.
+    """
+    # log likelihood of the change just before reading k, for k = 1 .. n - 1: both places were seen
+    log_likelihood = -np.cumsum(gain)[:-1]
     weight = np.exp(log_likelihood - log_likelihood.max())
-    # between two detections every instant is as likely as another
+    # between two readings every instant is as likely as another
     weight *= np.maximum(np.diff(stamp_s), 1e-9)
     cumulated = np.cumsum(weight) / weight.sum()
-    best = int(np.argmax(weight))
     low = int(np.searchsorted(cumulated, 0.5 * (1.0 - interval)))
     high = min(int(np.searchsorted(cumulated, 0.5 * (1.0 + interval))), len(weight) - 1)
-    return float(stamp_s[best + 1]), (float(stamp_s[low]), float(stamp_s[high + 1]))
+    return int(np.argmax(weight)) + 1, (low, high + 1)
 
 
 @kernel

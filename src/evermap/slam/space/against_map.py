@@ -6,6 +6,7 @@ places and the session fixed, its position is Gaussian in both cases, so the odd
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ SETTLED = 0.01
 """Change of all probabilities that ends it."""
 LOOSE = 1.0 / 20.0**2
 """Information of a session by itself in directions of which it says nothing [1/m^2, 1/rad^2]."""
+LOG_2PI = math.log(2.0 * math.pi)
 LEAST_INFORMATION = 1.0 / 25.0
 """Of a place by the others alone: it is somewhere within 5 m, or 5 rad."""
 
@@ -279,3 +281,40 @@ def _accuracy(found: MapComparison, stated: FloatArray, problem: SpatialProblem)
         total += found.p_stands[k] * float(np.minimum(excess, 16.0)[said].sum())
         count += found.p_stands[k] * float(said.sum())
     return float(np.sqrt(total / count))
+
+
+def log_map_density(problem: SpatialProblem, compared: MapComparison | None, place: FloatArray) -> tuple[float, float]:
+    """Return the log density of what a map says at its best, with the cost of places that do not stand put right, and
+    the log prior probability of those.
+    """
+    prior, settings = problem.prior, problem.settings.map
+    density = prices = 0.0
+    groups = () if compared is None else compared.groups
+    grouped = {int(row): k for k, group in enumerate(groups) for row in group.members}
+    met: set[int] = set()
+    for k, row in enumerate(prior.place.tolist()):
+        dim = 6 if problem.oriented[row] else 3
+        told = prior.sigma[k, :dim] < ANY_RAD
+        off = problem.off_map(np.array([k]), place[row][None], oriented=dim == 6)[0]
+        log_sigma = np.log(prior.sigma[k, :dim])
+        if prior.weight[k] >= problem.settings.inlier:
+            density -= float(log_sigma.sum()) + 0.5 * dim * LOG_2PI
+            density += 0.5 * (prior.weight[k] - 1.0) * float(np.sum((off / prior.sigma[k, :dim]) ** 2))
+            prices += math.log1p(-settings.p_moved)
+            continue
+        density += 0.5 * prior.weight[k] * float(np.sum((off / prior.sigma[k, :dim]) ** 2))
+        group = grouped.get(k)
+        if group is not None and group in met:  # it went along: at its place in the group
+            density -= float(log_sigma.sum()) + 0.5 * dim * LOG_2PI
+            prices -= math.log(2.0)
+            continue
+        if group is not None:
+            met.add(group)
+        prices += math.log(settings.p_moved)
+        scales = [(m, rad) for m in settings.moved_m for rad in settings.moved_rad[: None if dim == 6 else 1]]
+        wide = []
+        for m, rad in scales:
+            spread = np.where(told, np.hypot(prior.sigma[k, :dim], np.array([m] * 3 + [rad] * (dim - 3))), ANY_RAD)
+            wide.append(-float(np.log(spread).sum() + 0.5 * np.sum((off / spread) ** 2)) - 0.5 * dim * LOG_2PI)
+        density += float(np.logaddexp.reduce(wide)) - math.log(len(scales))
+    return density, prices

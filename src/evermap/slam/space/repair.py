@@ -198,6 +198,21 @@ def _better_poses(problem: SpatialProblem, estimate: SpatialEstimate, noise: Spa
 
 def _cost_of_frames(problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNoise) -> FloatArray:
     """(N,) negative log likelihood of the detections in each frame, up to a constant."""
+    loss = problem.share * _losses(problem, estimate, noise)
+    return np.bincount(problem.pose_row, loss, minlength=len(estimate.pose)).astype(np.float64)
+
+
+def losses_at(
+    problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNoise, some: IntArray, row: int
+) -> FloatArray:
+    """Return (K,) negative log likelihoods of some detections (K,) if they were of the place in a row."""
+    place = problem.place.copy()
+    place[some] = row
+    return _losses(replace(problem, place=place), estimate, noise)[some]
+
+
+def _losses(problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNoise) -> FloatArray:
+    """(M,) negative log likelihood of each detection, up to a constant."""
     seen = problem.sightings
     values, weight = np.empty(int(seen.first[-1])), np.empty(len(seen.kind))
     residual = np.zeros((len(seen.kind), 8))
@@ -206,15 +221,16 @@ def _cost_of_frames(problem: SpatialProblem, estimate: SpatialEstimate, noise: S
         False, values, weight, residual,
     )  # fmt: skip
     squared = (residual**2).sum(axis=1)
-    d = 0.5 * squared - seen.log_odds[seen.kind]
-    loss = 0.5 * squared - np.logaddexp(0.0, d)
-    return np.bincount(problem.pose_row, problem.share * loss, minlength=len(estimate.pose)).astype(np.float64)
+    return np.asarray(0.5 * squared - np.logaddexp(0.0, 0.5 * squared - seen.log_odds[seen.kind]))
 
 
-def rejoined(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, SpatialEstimate] | None:
+def rejoined(
+    optimum: SpatialOptimum, identity: IntArray, apart: BoolArray
+) -> tuple[SpatialProblem, SpatialEstimate] | None:
     """Return the problem with landmarks of one identity put together that came to be at one place; None without any.
 
-    The same where the first of them is not seen any more, or this one hardly ever.
+    The same where the first of them is not seen any more, or this one hardly ever. Places `apart` (P,) stay: one
+    landmark was there for a while.
     """
     problem, estimate = optimum.smoother.problem, optimum.estimate
     settings, least_seen = problem.settings.repair, problem.settings.map.least_seen
@@ -223,6 +239,8 @@ def rejoined(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProble
     held = np.isin(np.arange(len(at)), problem.prior.place)
     for row in range(int(identity.max(initial=-1)) + 1, len(identity)):
         own = int(identity[row])
+        if apart[row]:
+            continue
         near = np.linalg.norm(at[row, :3] - at[own, :3]) < settings.together_m
         if near or hits[row] < settings.fewest or (hits[own] < least_seen and not held[own]):
             at[own] = at[row] if hits[row] > hits[own] else at[own]

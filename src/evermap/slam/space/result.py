@@ -28,6 +28,7 @@ from evermap.slam.space.linearise import (
     STATES,
     TRANSLATION,
 )
+from evermap.slam.space.moved_within import MovedWithin
 from evermap.slam.space.problem import SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear
 from evermap.slam.space.solve import SpatialSolved
@@ -88,6 +89,7 @@ def concluded_in_space(
     optimum, problem = solved.optimum, solved.optimum.smoother.problem
     frame = "prior_map" if len(problem.prior.place) else frame_of(problem.measurements, scratch)
     found, placed = located(problem, optimum.now)
+    placed &= ~solved.left
     spread = optimum.smoother.spread(optimum.now)
     told = _Told(recording, intake, solved, problem, spread, frame, intake.start_s + problem.stamp_s, placed)
     motion = Movement.of(told.stamp_s, problem, optimum.estimate, recording.sensors, found, placed)
@@ -97,7 +99,7 @@ def concluded_in_space(
     called = [names.get(one, str(one)) for one in identities.tolist()]
     warnings, inlier = [*intake.warnings, *disagree], problem.settings.inlier
     used = problem.place[optimum.now.weight > inlier]
-    left_out = [called[k] for k in np.setdiff1d(used, np.flatnonzero(placed))]
+    left_out = [called[k] for k in np.setdiff1d(used, np.flatnonzero(placed | solved.left))]
     if left_out:
         warnings.append(f"landmarks left out, since nothing connects them to the others: {', '.join(left_out)}")
     if not found.all():
@@ -376,14 +378,36 @@ def _path(told: _Told, pose: FloatArray, covariance: FloatArray, of: BoolArray |
     return Trajectory(told.stamp_s[of], pose, covariance, frame=told.frame, clock=told.recording.clock)
 
 
+def _change_within(told: _Told, move: MovedWithin, identities: IntArray) -> MapChange:
+    """A move during the session."""
+    problem, optimum = told.problem, told.solved.optimum
+    before, after = optimum.estimate.place[[move.before, move.after]]
+    turned = bool(problem.oriented[move.after])
+    used = (optimum.now.weight > problem.settings.inlier) & (problem.place == move.after)
+    start_s = told.intake.start_s
+    return MapChange(
+        landmark_ids=(int(identities[move.after]),),
+        kind=ChangeKind.MOVED,
+        stamp_from_s=start_s + move.between_s[0],
+        stamp_to_s=start_s + move.between_s[1],
+        displacement_m=tuple((after - before)[:3].tolist()),
+        rotation_rad=float(problem.symmetries[np.array([move.after])].angle_between(before[None], after[None])[0])
+        if turned
+        else 0.0,
+        probability=move.probability,
+        n_hits=int(np.count_nonzero(used)),
+    )
+
+
 def _changes(told: _Told, identities: IntArray, names: Mapping[int, str]) -> tuple[MapChange, ...]:
-    """Return landmarks that moved relative to the given map, the most certain first."""
+    """Return landmarks that moved during the session, and relative to the given map, the most certain first."""
     found = told.solved.from_map
-    if found is None:
-        return ()
     problem, optimum = told.problem, told.solved.optimum
     used = optimum.now.weight > problem.settings.inlier
-    changes, together = [], [group for group in found.groups if len(group.members) > 1]
+    changes = [_change_within(told, move, identities).named(names) for move in told.solved.moves]
+    if found is None:
+        return tuple(changes)
+    together = [group for group in found.groups if len(group.members) > 1]
     for group in sorted(together, key=lambda group: -group.probability):
         places = problem.prior.place[group.members]
         shift = (optimum.estimate.place[places, :3] - problem.prior.pose[group.members, :3]).mean(axis=0)

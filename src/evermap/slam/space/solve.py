@@ -22,16 +22,17 @@ from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
 from evermap.geometry.upright import is_level
 from evermap.slam.calibration import priced
-from evermap.slam.space.against_map import MapComparison, MovedTogether, compared
+from evermap.slam.space.against_map import MapComparison
 from evermap.slam.space.delays import Delays, with_delays
 from evermap.slam.space.drift import Drift, drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
+from evermap.slam.space.explanation import explain_places
 from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import CORNERS, POINT, STATES
 from evermap.slam.space.marginal import log_marginal_likelihood
-from evermap.slam.space.moved_groups import find_moved_groups
+from evermap.slam.space.moved_within import MovedWithin, superseded
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
-from evermap.slam.space.repair import rejoined, repaired, split, unjumped
+from evermap.slam.space.repair import repaired
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.starts import by_constellations, lost_frames
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
@@ -43,8 +44,7 @@ HELD = np.full(6, 1e-4)
 """And without a map."""
 MOST_TRIED = 200
 GROSS_M = 1.0
-SPLITS = 2
-"""Poses tried for a start, the scale of its loss [m], and times that landmarks are split."""
+"""Poses tried for a start, and the scale of its loss [m]."""
 SLACK_M, SLACK_RAD = 0.15, 0.15
 """What places of a map in the making are off by."""
 STILL_M, STILL_RAD = 0.03, 0.03
@@ -81,6 +81,7 @@ class SpatialSolved:
         online_pose: (N, 7) poses as each frame had them.
         online_spread: (N, 2) roughly how far off these may be [m, rad].
         step_s: (N,) seconds that each frame took.
+        moves: landmarks that moved during the session.
     """
 
     optimum: SpatialOptimum
@@ -91,6 +92,12 @@ class SpatialSolved:
     online_pose: FloatArray
     online_spread: FloatArray
     step_s: FloatArray
+    moves: tuple[MovedWithin, ...] = ()
+
+    @property
+    def left(self) -> BoolArray:
+        """(P,) places that their landmarks have left."""
+        return superseded(self.moves, len(self.identity))
 
 
 def solve_space(
@@ -112,7 +119,6 @@ def solve_space(
     """
     problem, stated = _with_map(intake, prior_map)
     problem, framed = _without_frames(problem)
-    identity = np.arange(len(intake.landmark_id))
     settings = problem.settings
     noise = start_noise(settings, driven=problem.driven)
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
@@ -147,23 +153,8 @@ def solve_space(
         if problem.ranges_share > 0.0 and not metric:
             optimum = _in_shared_metre(optimum)
         problem = optimum.smoother.problem
-    if problem.driven and len(problem.prior.place):
-        optimum = unjumped(optimum)
-        problem = optimum.smoother.problem
-    for _ in range(SPLITS):
-        found = split(optimum, identity, intake.boxes)
-        if found is None:
-            break
-        problem, estimate, identity = found
-        optimum = repaired(converged(problem, estimate, optimum.noise, heavy_rounds=0))
-    if (together := rejoined(optimum, identity)) is not None:
-        optimum = converged(*together, optimum.noise, heavy_rounds=0)
-    from_map = None
-    if len(stated):
-        groups: tuple[MovedTogether, ...] = ()
-        if changes is not None:
-            optimum, groups = find_moved_groups(optimum, stated, changes)
-        optimum, from_map = compared(optimum, stated, groups)
+    explanation = explain_places(optimum, intake.boxes, stated, changes)
+    optimum, identity, problem = explanation.optimum, explanation.identity, explanation.optimum.smoother.problem
     smoother, sober = optimum.smoother.counted(optimum.estimate, optimum.now, counted), optimum.noise
     if drift is not None and counted is None and not problem.steady:
         goes = (drift.translation or 0.0) * drift.doubt, (drift.rotation or 0.0) * drift.doubt
@@ -173,7 +164,10 @@ def solve_space(
     optimum = replace(
         optimum, smoother=smoother, now=now, fitted=fitted
     )  # for covariances, which are no better than all this
-    return SpatialSolved(optimum, identity, times_of(identity), from_map, delays, stepwise.pose, spread, step_s)
+    number, from_map = times_of(identity), explanation.from_map
+    for move in reversed(explanation.moves):  # the landmark is where it was last
+        number[[move.before, move.after]] = min(number[move.before], number[move.after])
+    return SpatialSolved(optimum, identity, number, from_map, delays, stepwise.pose, spread, step_s, explanation.moves)
 
 
 def fit_to_map(intake: SpatialIntake, prior_map: Landmarks | None, *, surveyed: bool = False) -> SpatialIntake:

@@ -71,7 +71,8 @@ class SolvedRobot:
     @property
     def identity(self) -> IntArray:
         """(P,) ids of its places; -1 of a second one with the same id, which is its own."""
-        return np.where(self.solved.number == 1, self.intake.landmark_id[self.solved.identity], -1)
+        first = (self.solved.number == 1) & ~self.solved.left
+        return np.where(first, self.intake.landmark_id[self.solved.identity], -1)
 
 
 def solve_space_together(

@@ -1,0 +1,142 @@
+"""What the places of a solved session are: landmarks that stand, moved, or share an identity; alone and in a map.
+
+First without a landmark that moved while the robot drove. Where that leaves a symptom, one such landmark is added as
+long as everything is more probable with it, all else being decided anew (`moved_within`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.config import ChangesConfig
+from evermap.slam.correlation import Lasting
+from evermap.slam.space.against_map import MapComparison, MovedTogether, compared, log_map_density
+from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.space.marginal import log_marginal_likelihood
+from evermap.slam.space.moved_groups import find_moved_groups
+from evermap.slam.space.moved_within import ROUNDS, MovedWithin, find_two_places, list_suspects
+from evermap.slam.space.problem import SpatialNoise
+from evermap.slam.space.repair import rejoined, repaired, split, unjumped
+from evermap.types import BoolArray, FloatArray, IntArray
+
+SPLITS = 2
+"""Times that landmarks are split."""
+MOST_PLACES = 2
+"""Places of one landmark that a move explains."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialExplanation:
+    """What the places of a session are.
+
+    Attributes:
+        optimum: the solution under it.
+        identity: (P,) rows of landmarks that the places are of.
+        moves: landmarks that moved during the session.
+        from_map: what of the given map stands; None without a map.
+    """
+
+    optimum: SpatialOptimum
+    identity: IntArray
+    moves: tuple[MovedWithin, ...]
+    from_map: MapComparison | None
+
+
+def explain_places(
+    optimum: SpatialOptimum, whole: BoolArray, stated: FloatArray, changes: ChangesConfig | None
+) -> SpatialExplanation:
+    """Return the most probable explanation of the places of a session.
+
+    Args:
+        optimum: one place for each landmark.
+        whole: (L,) landmarks that were followed, and are one each.
+        stated: (K, 6) standard deviations of the places of a map; none without.
+        changes: settings of the search for landmarks of the map that moved together; None asks each by itself.
+    """
+    begun, identity = optimum, np.arange(len(optimum.smoother.problem.oriented))
+    found = _explained(begun, identity, (), whole, stated, changes)
+    asked, interval = ~whole, (changes or ChangesConfig()).interval
+    gain_nats = optimum.smoother.problem.settings.repair.gain_nats
+    for _ in range(ROUNDS):
+        suspects = list_suspects(found.optimum, found.identity, asked, _off_map(found))
+        if not len(suspects) or (two := find_two_places(begun, suspects, interval)) is None:
+            break
+        landmark, larger = int(identity[two.before]), np.append(identity, identity[two.before])
+        asked = asked & (np.arange(len(asked)) != landmark)
+        is_one = two.nats > gain_nats  # else there are two with one identity
+        move = MovedWithin(two.before, two.after, two.since_s, two.between_s, 1.0)
+        trial = _explained(two.optimum, larger, (*found.moves, move) if is_one else found.moves, whole, stated, changes)
+        if np.count_nonzero(_seen_places(trial) & (trial.identity == landmark)) > MOST_PLACES:  # seen there in turns
+            continue
+        lasting = trial.optimum.smoother.lasting(trial.optimum.now)
+        after, before = (_log_evidence(one, found.optimum.noise, lasting) for one in (trial, found))
+        nats = after - before + (two.nats if is_one else 0.0)
+        if nats > gain_nats:
+            if is_one:
+                probability = 1.0 / (1.0 + math.exp(-min(nats, two.nats)))
+                trial = replace(trial, moves=(*found.moves, move._replace(probability=probability)))
+            found, begun, identity = trial, two.optimum, larger
+    return found
+
+
+def _explained(
+    optimum: SpatialOptimum,
+    identity: IntArray,
+    moves: tuple[MovedWithin, ...],
+    whole: BoolArray,
+    stated: FloatArray,
+    changes: ChangesConfig | None,
+) -> SpatialExplanation:
+    """The explanation with these moves: what moved before the session, and identities of several landmarks."""
+    problem = optimum.smoother.problem
+    if problem.driven and len(problem.prior.place):
+        optimum = unjumped(optimum)
+    for _ in range(SPLITS):
+        parts = split(optimum, identity, whole)
+        if parts is None:
+            break
+        problem, estimate, identity = parts
+        optimum = repaired(converged(problem, estimate, optimum.noise, heavy_rounds=0))
+    apart = np.isin(np.arange(len(identity)), [row for move in moves for row in (move.before, move.after)])
+    if (together := rejoined(optimum, identity, apart)) is not None:
+        optimum = converged(*together, optimum.noise, heavy_rounds=0)
+    if not len(stated):
+        return SpatialExplanation(optimum, identity, moves, None)
+    groups: tuple[MovedTogether, ...] = ()
+    if changes is not None:
+        optimum, groups = find_moved_groups(optimum, stated, changes)
+    optimum, from_map = compared(optimum, stated, groups)
+    return SpatialExplanation(optimum, identity, moves, from_map)
+
+
+def _log_evidence(explanation: SpatialExplanation, begun: SpatialNoise, lasting: Lasting) -> float:
+    """The log evidence of an explanation, up to a constant of the measurements.
+
+    Args:
+        explanation: the explanation.
+        begun: noise by which outliers are compared.
+        lasting: how long errors of detections last.
+    """
+    optimum, identity = explanation.optimum, explanation.identity
+    problem, seen = optimum.smoother.problem, _seen_places(explanation)
+    found = log_marginal_likelihood(optimum, begun, lasting, in_room=True)
+    if len(problem.prior.place):
+        found += sum(log_map_density(problem, explanation.from_map, optimum.estimate.place))
+    twice = np.count_nonzero(seen) - len(np.unique(identity[seen]))
+    return found + twice * math.log(problem.settings.map.p_moved)
+
+
+def _off_map(explanation: SpatialExplanation) -> IntArray:
+    """Rows of landmarks that are not where the map has them."""
+    if explanation.from_map is None:
+        return np.zeros(0, dtype=np.int64)
+    problem = explanation.optimum.smoother.problem
+    return problem.prior.place[explanation.from_map.p_stands < 1.0 - problem.settings.map.p_told]
+
+
+def _seen_places(explanation: SpatialExplanation) -> BoolArray:
+    """(P,) places of which there are detections."""
+    return np.bincount(explanation.optimum.smoother.problem.place, minlength=len(explanation.identity)) > 0
