@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from evermap import check_recording, run_slam
 from evermap.explain.shape import compare_shapes
-from evermap.slam.check import find_corner_mistake
+from evermap.slam.check import find_corner_mistake, is_clockwise
 from evermap.slam.mistakes import USUAL
 from evermap.slam.orientations import find_convention
 from evermap.types import FloatArray, Landmarks, SpatialRecording
@@ -56,7 +56,6 @@ def poses() -> SpatialRecording:
 
 
 CORNERS = {
-    "reversed": ("clockwise", lambda px: px[:, ::-1]),
     "exchanged": ("exchanged", lambda px: px[..., ::-1]),
     "upwards": ("upwards", lambda px: px * [1.0, -1.0] + [0.0, HEIGHT]),
     "leftwards": ("mirrored", lambda px: px * [-1.0, 1.0] + [WIDTH, 0.0]),
@@ -71,6 +70,12 @@ def test_corners_that_are_written_in_another_way_are_named(how: str, corners: Sp
     (found,) = [finding for finding in check_recording(wrong).findings if finding.code == "corner-order"]
     assert word in found.message
     assert not found.usable
+
+
+def test_corners_all_listed_clockwise_are_no_mistake_by_themselves(corners: SpatialRecording) -> None:
+    wrong = with_corners(corners, corners.detections.corner_px[:, ::-1])
+    assert is_clockwise(wrong).all()
+    assert find_corner_mistake(wrong) == ""
 
 
 def test_corners_as_they_should_be_are_no_mistake(corners: SpatialRecording) -> None:

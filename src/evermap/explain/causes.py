@@ -19,7 +19,7 @@ import numpy as np
 from evermap.geometry import se2, se3
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam import mistakes
-from evermap.slam.check import CORNERS, SIGHTED, find_corner_mistake, read_corners
+from evermap.slam.check import CLOCKWISE, CORNERS, SIGHTED, find_corner_mistake, is_clockwise, read_corners
 from evermap.slam.orientations import find_convention
 from evermap.types import (
     UNKNOWN,
@@ -364,7 +364,7 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
         size = f"{np.nanmedian(own):.12g}" if np.isfinite(own).any() else ""
         name = recording.landmark_names.get(identity, str(identity))
         yield _one_size(name, _stretch_positions, ("id", identity), size)
-    for how in filter(None, [find_corner_mistake(recording)]):
+    for how in [find_corner_mistake(recording) or CLOCKWISE] if is_clockwise(recording).any() else []:
         yield Suspect(
             "corner-order", "corners", USUAL_P, partial(_read_corners, how=how), _constant(CORNERS[how].message),
             _constant(CORNERS[how].fix), shows=True,

@@ -78,7 +78,7 @@ def _turns(
     if found.rotation is None or given.rotation is None:
         return None
     ours, others = found.rotation[own], given.rotation[theirs]
-    known = np.isfinite(ours).all(axis=1) & np.isfinite(others).all(axis=1)
+    known = np.asarray(np.isfinite(ours).all(axis=1) & np.isfinite(others).all(axis=1))
     if not known.any():
         return None
     turned = np.full((len(motion), len(known)), np.nan)

@@ -45,7 +45,7 @@ OUTSIDE = 0.05
 FEWEST_TAGS, NEARLY_ALL = 10, 0.9
 """Tags of a camera that show the order of its corners, and share of them that must be listed clockwise."""
 FAR_LESS = 0.5
-"""Difference of pairs of sightings, over that by the usual mistake, at which it is another one."""
+"""Difference of pairs of sightings, over that of corners as they are read, at which they were written otherwise."""
 
 
 class _Corners(NamedTuple):
@@ -56,8 +56,9 @@ class _Corners(NamedTuple):
     fix: str
 
 
+CLOCKWISE = "clockwise"
 CORNERS = {
-    "reversed": _Corners(
+    CLOCKWISE: _Corners(
         lambda corner, _: corner[:, ::-1],
         "corners of tags are listed clockwise, as by OpenCV's ArUco: counter-clockwise from the lower left is expected "
         "(u0_px, v0_px)",
@@ -329,20 +330,20 @@ def _limits_in_space(recording: SpatialRecording, settings: SlamConfig) -> list[
 
 
 def find_corner_mistake(recording: SpatialRecording, settings: CheckConfig = USUAL) -> str:
-    """Return how pixels of corners were written, a key of `CORNERS`, if tags are seen from behind; '' if not.
+    """Return how pixels of corners were written, a key of `CORNERS`, if landmarks stand still by that alone; '' if not.
 
-    Seen from the front, which is the only way to see it, no tag is listed counter-clockwise and looks clockwise. What
-    did that, the order of the corners or an axis of the image, shows in whether landmarks stand still.
+    It is asked where tags look as if seen from behind. Corners that are all listed the other way round are no mistake
+    by themselves: the normals of the tags point into the wall, as they may in a map, too.
     """
-    if not is_clockwise(recording).any():
+    before = pairs_of(recording, settings) if is_clockwise(recording).any() else None
+    if before is None:
         return ""
     losses = {}
     for name in CORNERS:
         pairs = pairs_of(read_corners(recording, name), settings)
         losses[name] = np.inf if pairs is None else float(np.median(off(pairs.residual(HONEST))))
     best = min(losses, key=lambda name: losses[name])
-    usual = next(iter(CORNERS))
-    return best if losses[best] < FAR_LESS * losses[usual] else usual
+    return best if losses[best] < FAR_LESS * float(np.median(off(before.residual(HONEST)))) else ""
 
 
 def is_clockwise(recording: SpatialRecording) -> BoolArray:
