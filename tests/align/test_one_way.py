@@ -59,5 +59,5 @@ def test_known_identities_are_laid_over_a_map_by_align_alone() -> None:
     # starts of a search that is judged by all measurements
     assert proposed == {
         "maps/sessions/overlay.py", "maps/sessions/placing.py", "slam/batch.py", "slam/changes/joint.py",
-        "slam/space/moved_groups.py", "slam/space/solve.py",
+        "slam/space/map_consensus.py", "slam/space/moved_groups.py", "slam/space/solve.py",
     }  # fmt: skip

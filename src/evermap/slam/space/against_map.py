@@ -23,7 +23,7 @@ from evermap.types import FloatArray, IntArray
 ROUNDS = 12
 FARTHEST = 0.25
 """Squared distances, as a share of the largest one, of places that are let go together."""
-WORSE, P_WORSE = 2.0, 0.05
+ERRORS = ((1.0, 0.95), (2.0, 0.05))
 """Times that a place which stands is farther off than session and map know, and how often: systematic errors of a
 detector, of stamps, or of the map itself."""
 SETTLED = 0.01
@@ -163,8 +163,7 @@ def log_density_in_map(problem: SpatialProblem, place: FloatArray, stated: Float
 
 def _log_stands(off: FloatArray, covariance: FloatArray) -> float:
     """Return the log density of a place that stands."""
-    usual, worse = (_log_density(off, times**2 * covariance) for times in (1.0, WORSE))
-    return float(np.logaddexp(np.log1p(-P_WORSE) + usual, np.log(P_WORSE) + worse))
+    return float(np.logaddexp.reduce([np.log(p) + _log_density(off, times**2 * covariance) for times, p in ERRORS]))
 
 
 def _log_moved(off: FloatArray, covariance: FloatArray, settings: MapInSpaceConfig) -> float:
