@@ -42,9 +42,9 @@ def off_m(found: SpatialSolved, recording: SpatialRecording) -> float:
     return float(np.median(np.linalg.norm(found.optimum.estimate.pose[:, :3] - true[:, :3], axis=1)))
 
 
-@pytest.mark.parametrize(("seed", "count"), [(1, 8), (2, 10), (4, 10)])
+@pytest.mark.parametrize(("seed", "count"), [(0, 12), (4, 12)])
 def test_who_moved_is_found_without_odometry_where_many_did(seed, count):
-    recording = Rig(seed, bias_px=0.3).walk()
+    recording = Rig(seed, bias_px=0.3, gaps=4, turns=6).walk()
     known, moved = edited(recording.true_landmarks, seed, count)
     name, seen = np.unique(recording.detections.landmark_id, return_counts=True)
     found, p_moved = solved(recording, known)
