@@ -10,6 +10,7 @@ SOURCE = Path(__file__).resolve().parents[2] / "src" / "evermap"
 OWN_FITS = {
     # fits to pairs that are known: nothing is chosen, nothing accepted
     "estimate/measurements/gnss.py": "fixes and poses of the same instants",
+    "explain/shape.py": "how much of a map is in its place in any frame: nothing is placed by it",
     "maps/bodies.py": "how a body moved whose members are known",
     "maps/diff.py": "the same, between two revisions",
     "maps/sessions/gaussian.py": "the ratio of the sizes of two maps",
@@ -59,5 +60,5 @@ def test_known_identities_are_laid_over_a_map_by_align_alone() -> None:
     # starts of a search that is judged by all measurements
     assert proposed == {
         "maps/sessions/overlay.py", "maps/sessions/placing.py", "slam/batch.py", "slam/changes/joint.py",
-        "slam/space/moved_groups.py", "slam/space/solve.py",
+        "slam/space/map_consensus.py", "slam/space/moved_groups.py", "slam/space/solve.py",
     }  # fmt: skip

@@ -61,6 +61,8 @@ FEWEST_CHANGED, CHANGED = 3, 0.2
 """Landmarks, and share of those in common with a map, that changed from which the map itself is in doubt."""
 CHANGES = "changes"
 """Symptom of a session in which landmarks changed."""
+OF_NOISE = "_noise_factor", "sigma_corner_px"
+"""Ends of the names of noise levels."""
 OF_LANDMARKS = frozenset({ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED})
 
 
@@ -155,8 +157,8 @@ def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tup
         if not state.fixed and state.prior_sigma > 0.0:
             if abs(state.value - state.prior_mean) > rules.states * state.prior_sigma:
                 found.append(state.name)
-        elif (state.name.endswith("_noise_factor") and state.value > rules.noise) or (
-            state.name == "sigma_corner_px" and state.value > rules.noise * config.space.sigma_px
+        elif (state.name.endswith(OF_NOISE[0]) and state.value > rules.noise) or (
+            state.name == OF_NOISE[1] and state.value > rules.noise * config.space.sigma_px
         ):
             found.append(state.name)
     if inputs.prior_map is not None:
@@ -350,6 +352,8 @@ def _relieves(trial: Trial[VisitT], best: Trial[VisitT], config: SlamConfig) -> 
     """Return whether a trial has fewer symptoms, fewer landmarks that are told to have changed, or rejects far less."""
     was, now = best.solution.result, trial.solution.result
     before, after = find_symptoms(was, best.inputs, config), find_symptoms(now, trial.inputs, config)
+    if any(symptom.endswith(OF_NOISE) for symptom in after if symptom not in before):
+        return False  # under a sensor that measures hardly anything all else fits
     changed = [count_changed(result) for result in (was, now)]
     rejected = [share_rejected(result) for result in (was, now)]
     return len(after) < len(before) or changed[1] < changed[0] or rejected[1] < FEWER * rejected[0]

@@ -105,7 +105,7 @@ def test_what_moved_before_the_drive_and_what_moved_within_it_are_told_apart():
     assert told[8].displacement_m == pytest.approx(before, abs=0.05)
 
 
-@pytest.mark.parametrize("seed", [6, 7, 8])
+@pytest.mark.parametrize("seed", [6, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (7, 8))])
 @pytest.mark.parametrize("corners", [True, False])
 def test_two_tags_with_one_identity_that_are_seen_in_turns_did_not_move(seed, corners):
     world = tagged_corridor(seed, rename={10: 1})
@@ -115,7 +115,7 @@ def test_two_tags_with_one_identity_that_are_seen_in_turns_did_not_move(seed, co
     assert "1#3" not in result.landmarks.names.values()
 
 
-@pytest.mark.parametrize("seed", [6, 7, 8])
+@pytest.mark.parametrize("seed", [6, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (7, 8))])
 @pytest.mark.parametrize("corners", [True, False])
 def test_two_tags_with_one_identity_are_two_where_no_look_shows_that_one_left(seed, corners):
     """One way, each is passed once: the first one may still be there, for all that was seen."""

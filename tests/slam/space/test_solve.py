@@ -336,6 +336,7 @@ def test_a_delay_is_as_uncertain_as_it_says_where_the_odometry_is_noisy(late_s):
     assert np.abs(np.mean(off)) < 1.5
 
 
+@pytest.mark.slow
 def test_a_late_camera_is_found_by_default_and_a_right_one_is_left_alone():
     whole = hall(20, n_points=40, n_frames=400, step_s=0.1, drift=0.01)
     odometry = whole.odometry

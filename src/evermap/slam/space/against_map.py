@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evermap.config import MapInSpaceConfig
 from evermap.geometry import se2, se3
 from evermap.slam.changes.evidence import WindowEvidence
 from evermap.slam.changes.explain import GivenMap
@@ -23,6 +24,9 @@ from evermap.types import FloatArray, IntArray
 ROUNDS = 12
 FARTHEST = 0.25
 """Squared distances, as a share of the largest one, of places that are let go together."""
+ERRORS = ((1.0, 0.95), (2.0, 0.05))
+"""Times that a place which stands is farther off than session and map know, and how often: systematic errors of a
+detector, of stamps, or of the map itself."""
 SETTLED = 0.01
 """Change of all probabilities that ends it."""
 LOOSE = 1.0 / 20.0**2
@@ -89,15 +93,21 @@ def compared(
     for _ in range(ROUNDS):
         factor = _accuracy(found, stated, problem)
         weight = _believed(found, factor * stated, problem.prior.weight)
+        back = bool(np.any((weight >= 0.5) & (problem.prior.weight < 0.5)))
         held = bool(np.any((found.p_stands < 0.5) & (weight >= 0.5)))
         problem = replace(problem, prior=replace(problem.prior, sigma=factor * stated, weight=weight))
-        optimum = converged(problem, optimum.estimate, optimum.noise, heavy_rounds=0)
+        optimum = converged(problem, optimum.estimate, optimum.noise, heavy_rounds=int(back))
         before, found = found, replace(ask(factor * stated), factor=factor)
         if not held and np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED:
             break
     for group in groups:
         found.p_stands[group.members] = 1.0 - group.probability
     return optimum, replace(found, groups=groups)
+
+
+def has_contradictions(optimum: SpatialOptimum) -> bool:
+    """Tell whether any place of the map seems to be elsewhere."""
+    return bool((_asked(optimum, optimum.smoother.problem.prior.sigma).p_stands < 0.5).any())
 
 
 def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
@@ -114,6 +124,7 @@ def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
     problem, prior = optimum.smoother.problem, optimum.smoother.problem.prior
     settings = problem.settings.map
     spread = optimum.smoother.spread(optimum.now)
+    misread = _log_misread(optimum)
     count, n = len(prior.place), len(problem.stamp_s)
     p_stands, off, covariance = np.ones(count), np.zeros((count, 6)), np.zeros((count, 6, 6))
     for k, place in enumerate(prior.place):
@@ -125,14 +136,57 @@ def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
         values, vectors = np.linalg.eigh(own - np.diag(prior.weight[k] / prior.sigma[k, :dim] ** 2))
         alone = np.linalg.inv((vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T)
         mean = alone @ (own @ mean)
-        stands = _log_density(mean, alone + np.diag(sigma[k, :dim] ** 2))
-        scales = [(m, rad) for m in settings.moved_m for rad in settings.moved_rad[: None if dim == 6 else 1]]
-        wide = [np.diag(sigma[k, :dim] ** 2 + np.array([m] * 3 + [rad] * (dim - 3)) ** 2) for m, rad in scales]
-        moved = np.logaddexp.reduce([_log_density(mean, alone + extra) for extra in wide]) - np.log(len(scales))
+        wide = np.asarray(alone + np.diag(sigma[k, :dim] ** 2), dtype=np.float64)
+        stands, moved = np.logaddexp(_log_stands(mean, wide), misread[place]), _log_moved(mean, wide, settings)
         odds = moved - stands + np.log(settings.p_moved / (1.0 - settings.p_moved))
         p_stands[k] = 1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0)))
         off[k, :dim], covariance[k, :dim, :dim] = mean, alone
     return MapComparison(p_stands, off, covariance, 1.0)
+
+
+def log_density_in_map(problem: SpatialProblem, place: FloatArray, stated: FloatArray) -> float:
+    """Return the log density of places (P, 7) that were seen, in a map of which they stand or moved, up to a constant.
+
+    Args:
+        problem: with the map.
+        place: the places.
+        stated: (K, 6) standard deviations of the map's places.
+    """
+    settings, prior, total = problem.settings.map, problem.prior, 0.0
+    seen = np.bincount(problem.place, minlength=len(place))[prior.place] > 0
+    for k in np.flatnonzero(seen).tolist():
+        row = int(prior.place[k])
+        off = problem.off_map(np.array([k]), place[row][None], oriented=bool(problem.oriented[row]))[0]
+        spread = np.diag(np.maximum(stated[k, : len(off)], settings.loose_m) ** 2)
+        stands, moved = _log_density(off, spread), _log_moved(off, spread, settings)
+        total += float(np.logaddexp(np.log1p(-settings.p_moved) + stands, np.log(settings.p_moved) + moved))
+    return total
+
+
+def _log_stands(off: FloatArray, covariance: FloatArray) -> float:
+    """Return the log density of a place that stands."""
+    return float(np.logaddexp.reduce([np.log(p) + _log_density(off, times**2 * covariance) for times, p in ERRORS]))
+
+
+def _log_moved(off: FloatArray, covariance: FloatArray, settings: MapInSpaceConfig) -> float:
+    """Return the log density of a place that moved by any of the usual distances and turns."""
+    dim = len(off)
+    scales = [(m, rad) for m in settings.moved_m for rad in settings.moved_rad[: None if dim == 6 else 1]]
+    wide = [np.diag(np.array([m] * 3 + [rad] * (dim - 3)) ** 2) for m, rad in scales]
+    return float(np.logaddexp.reduce([_log_density(off, covariance + by) for by in wide]) - np.log(len(scales)))
+
+
+def _log_misread(optimum: SpatialOptimum) -> FloatArray:
+    """Return (P,) log densities, as of `_log_density`, of all inliers of a place being of something else.
+
+    That is what outliers cost, over the density that the sightings have at the place where they agree. It is for places
+    that were seen once or twice: many wrong identities don't agree on a place.
+    """
+    problem, now = optimum.smoother.problem, optimum.now
+    log_odds = problem.sightings.log_odds[problem.kind]
+    price = np.bincount(problem.place, now.weight * log_odds, minlength=len(problem.oriented))
+    peak = np.array([np.linalg.slogdet(one)[1] for one in optimum.smoother.information_of_places(now)])
+    return np.asarray(0.5 * peak - price)
 
 
 class Alone(NamedTuple):

@@ -193,6 +193,18 @@ class SpatialSmoother:
         """Return (N - 1, 6, 14) odometry, linearised and whitened: by both poses, its scale, and the right side."""
         return now.values[self.structure.values_of(ODOMETRY)].reshape(-1, 6, OF_STEP)
 
+    def information_of_places(self, now: SpatialLinear) -> list[FloatArray]:
+        """Return for each place the (3, 3) or (6, 6) information that its detections hold on it, at fixed poses."""
+        seen, dims = self._seen, np.where(self.problem.oriented, 6, 3)
+        values, found = now.values[self.structure.values_of(SIGHTINGS)], np.zeros((len(dims), 6, 6))
+        for kind, n_rows in enumerate(ROWS.tolist()):
+            for dim in (3, 6):
+                some = np.flatnonzero((seen.kind == kind) & (dims[seen.place] == dim))
+                at = seen.first[some][:, None] + np.arange(n_rows * (OF_SIGHTING + dim))
+                rows = values[at].reshape(len(some), n_rows, OF_SIGHTING + dim)[..., 6 : 6 + dim]
+                np.add.at(found[:, :dim, :dim], seen.place[some], np.swapaxes(rows, 1, 2) @ rows)
+        return [one[:dim, :dim] for one, dim in zip(found, dims.tolist(), strict=True)]
+
     def lasting(self, now: SpatialLinear) -> Lasting:
         """Return how long errors of detections last, by their residuals there."""
         problem = self.problem

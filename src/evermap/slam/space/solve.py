@@ -22,13 +22,14 @@ from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
 from evermap.geometry.upright import is_level
 from evermap.slam.calibration import priced
-from evermap.slam.space.against_map import MapComparison
+from evermap.slam.space.against_map import MapComparison, has_contradictions
 from evermap.slam.space.delays import Delays, with_delays
 from evermap.slam.space.drift import Drift, drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
 from evermap.slam.space.explanation import explain_places
 from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import CORNERS, POINT, STATES
+from evermap.slam.space.map_consensus import cost_in_map, start_by_consensus
 from evermap.slam.space.marginal import log_marginal_likelihood
 from evermap.slam.space.moved_within import MovedWithin, superseded
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
@@ -143,6 +144,8 @@ def solve_space(
             estimate = _or_better(begun, [_graduated(problem, noise, estimate)]).estimate
     problem, estimate = _in_measured_frame(problem, estimate, framed)
     optimum, delays = with_delays(converged(problem, estimate, noise))
+    if len(stated) and of_points and not problem.driven and (_is_doubtful(optimum) or has_contradictions(optimum)):
+        optimum = _or_by_consensus(optimum, stated)
     optimum = repaired(optimum)
     if scale_in_map > 0.0:
         optimum = _with_scale_of_map(optimum, scale_in_map)
@@ -380,6 +383,20 @@ def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[Spati
     stated[:, :3] = stated[:, :3].max(axis=1, keepdims=True)
     prior = PlacePrior(place.astype(np.int64), pose, np.maximum(stated, settings.loose_m), np.ones(len(rows)))
     return replace(problem, prior=prior, start_sigma=FREE), stated
+
+
+def _or_by_consensus(optimum: SpatialOptimum, stated: FloatArray) -> SpatialOptimum:
+    """Return the optimum, or a more probable one from the session by itself laid over the map."""
+    problem = optimum.smoother.problem
+    free = replace(problem, prior=PlacePrior.none(), start_sigma=HELD)
+    noise = start_noise(problem.settings, driven=problem.driven)
+    estimate, _ = _likeliest(free, noise, by_constellations(free, noise, 1))
+    alone = converged(free, estimate, noise)
+    found = start_by_consensus(problem, alone, stated)
+    gain_nats = problem.settings.repair.gain_nats
+    if found is None or found[1] > cost_in_map(optimum, stated, alone.noise) - gain_nats:
+        return optimum
+    return found[0]
 
 
 def _is_doubtful(optimum: SpatialOptimum) -> bool:
