@@ -89,6 +89,7 @@ def test_one_feature_and_rosen_s_algorithm_believe_the_same(run: ModuleType) -> 
         assert case.work() == pytest.approx(case.peers["Python"](), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_selectors_of_the_race_are_after_the_same_sequence(run: ModuleType) -> None:
     looks = run.selectors.landmarks(30)
     joint = {

@@ -64,6 +64,7 @@ def test_a_map_of_another_place_is_not_entered():
     assert any("prior map" in warning for warning in result.warnings)
 
 
+@pytest.mark.slow
 def test_a_small_map_is_enough_without_identities(tmp_path):
     """Six landmarks, one of them moved: the others have their identities."""
     folder = write_template(tmp_path / "template")

@@ -326,6 +326,7 @@ def test_deleted_boxes_stay_away_and_large_maps_are_the_same(days: Days) -> None
     np.testing.assert_allclose(parts.living.landmarks().size_m, sessions[1].living.landmarks().size_m, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_store_takes_each_session_once_and_late_ones_in_order(days: Days, tmp_path: Path) -> None:
     made, sessions = days[1, False]
     drives = recordings(made, 1)

@@ -227,7 +227,14 @@ def test_turned_by_the_mount() -> None:
     np.testing.assert_allclose((ahead * Rotation.from_quat(SpatialPairs.angles[1].turned)).magnitude(), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("mistake", ["positions in mm", "odometry in mm", "x ahead"])
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        "x ahead",
+        pytest.param("positions in mm", marks=pytest.mark.slow),
+        pytest.param("odometry in mm", marks=pytest.mark.slow),
+    ],
+)
 def test_a_mistake_is_refused_by_its_name_before_anything_enters_a_map(mistake: str, tmp_path: Path) -> None:
     spoil, _, words = MISTAKES[mistake]
     write_native(spoil(room()), tmp_path / "room")

@@ -158,6 +158,7 @@ def test_what_means_nothing_in_space_is_told(folder: Path, name: str, text: str,
     assert [word for word in (name, *words) if word not in error.value.one_line()] == []
 
 
+@pytest.mark.slow
 def test_settings_of_the_sensor_hold_in_space() -> None:
     given = (SpatialSensor(), SpatialSensor("other", range_max_m=3.0))
     changed = SensorConfig(kind="laser", range_max_m=5.0, sigma_position_m=0.1).applied_in_space(given)

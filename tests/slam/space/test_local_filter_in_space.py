@@ -98,7 +98,7 @@ class _Dense:
         self.covariance = rest @ self.covariance @ rest.T + gain @ gain.T
 
 
-@pytest.mark.parametrize("considered", [False, True])
+@pytest.mark.parametrize("considered", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_it_is_the_kalman_filter_of_pose_mounts_scale_points_and_tags(considered: bool) -> None:
     random, count = np.random.default_rng(7), 6
     true = _places(random, count)

@@ -48,6 +48,7 @@ def solved(recording: SpatialRecording) -> tuple[SpatialSolved, float, float]:
     return found, error(found.optimum.estimate.pose, true), error(from_the_truth(recording, intake), true)
 
 
+@pytest.mark.slow
 def test_points_without_odometry_are_mapped_as_from_the_truth():
     """Fast turns, two gaps, a third of the points in view missed. In the order of time it was 1 m and more."""
     found = np.array([solved(Rig(seed).walk())[1:] for seed in range(5)])

@@ -289,6 +289,7 @@ def test_a_drive_with_gravity_has_z_up() -> None:
     assert angle(up.direction, np.array([0.0, 0.0, 1.0])) < 2.0 * up.sigma_rad
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_the_hall_of_tags_is_level(shared_data: Path) -> None:
     recording = read_recording(shared_data / "tagslam" / "test_13")
@@ -298,6 +299,7 @@ def test_the_hall_of_tags_is_level(shared_data: Path) -> None:
     assert angle(up.direction, true_up(recording, result)) < 3.0 * up.sigma_rad
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_a_camera_around_objects_on_a_table_leaves_up_unknown(shared_data: Path) -> None:
     assert not run_slam(read_recording(shared_data / "ycbv" / "0014")).landmarks.up.is_known

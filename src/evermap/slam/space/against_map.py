@@ -24,9 +24,6 @@ from evermap.types import FloatArray, IntArray
 ROUNDS = 12
 FARTHEST = 0.25
 """Squared distances, as a share of the largest one, of places that are let go together."""
-ERRORS = ((1.0, 0.95), (2.0, 0.05))
-"""Times that a place which stands is farther off than session and map know, and how often: systematic errors of a
-detector, of stamps, or of the map itself."""
 SETTLED = 0.01
 """Change of all probabilities that ends it."""
 LOOSE = 1.0 / 20.0**2
@@ -137,7 +134,7 @@ def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
         alone = np.linalg.inv((vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T)
         mean = alone @ (own @ mean)
         wide = np.asarray(alone + np.diag(sigma[k, :dim] ** 2), dtype=np.float64)
-        stands, moved = np.logaddexp(_log_stands(mean, wide), misread[place]), _log_moved(mean, wide, settings)
+        stands, moved = np.logaddexp(_log_density(mean, wide), misread[place]), _log_moved(mean, wide, settings)
         odds = moved - stands + np.log(settings.p_moved / (1.0 - settings.p_moved))
         p_stands[k] = 1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0)))
         off[k, :dim], covariance[k, :dim, :dim] = mean, alone
@@ -161,11 +158,6 @@ def log_density_in_map(problem: SpatialProblem, place: FloatArray, stated: Float
         stands, moved = _log_density(off, spread), _log_moved(off, spread, settings)
         total += float(np.logaddexp(np.log1p(-settings.p_moved) + stands, np.log(settings.p_moved) + moved))
     return total
-
-
-def _log_stands(off: FloatArray, covariance: FloatArray) -> float:
-    """Return the log density of a place that stands."""
-    return float(np.logaddexp.reduce([np.log(p) + _log_density(off, times**2 * covariance) for times, p in ERRORS]))
 
 
 def _log_moved(off: FloatArray, covariance: FloatArray, settings: MapInSpaceConfig) -> float:
