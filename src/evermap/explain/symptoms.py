@@ -261,8 +261,9 @@ def measure_signs(
     used, worst = _count_shares_used(result.innovations)
     blind_s, blind_share = _blind(result)
     named = _find_share_named(result.innovations, as_read or recording)
+    contradicted = _find_share_contradicted(result)
     if result.trajectory is result.online:  # a localiser leaves out what it has not recognised yet, and knows no later
-        named = blind_s = blind_share = nan
+        named = contradicted = blind_s = blind_share = nan
     away, name = _farthest_state(result.parameters)
     size_m, sigma_m, most_m = _extent(result)
     common, moved, displaced = _of_map(result, recording, prior_map)
@@ -281,7 +282,7 @@ def measure_signs(
         named=named,
         misfit=_median(compared.misfit[compared.used]),
         misfit_all=_median(compared.misfit),
-        contradicted=_find_share_contradicted(result),
+        contradicted=contradicted,
         unexplained=_count_unexplained(result),
         halves=halves,
         halves_share=halves_share,
