@@ -253,25 +253,27 @@ def _find_other_map(result: SlamResult, inputs: Inputs) -> list[Cause]:
 
 def _find_own_scales(result: SlamResult, inputs: Inputs, farthest: float) -> list[Cause]:
     """Return scales that are calibration states, so many of their prior's standard deviations from what is stated."""
-    found, own = list[Cause](), {state.name: state for state in result.parameters}
-    suspects = {one.code: one for one in list_suspects(inputs) if one.code in OWN_STATES}
-    for code, suspect in suspects.items():
+    far = {state.name: state for state in result.parameters if _is_far_off(state, farthest)}
+    if not any(name in far for own in OWN_STATES.values() for name, _ in own):
+        return []  # as of nearly all runs: what else may be wrong is not looked for
+    found = list[Cause]()
+    for code, suspect in {one.code: one for one in list_suspects(inputs) if one.code in OWN_STATES}.items():
         for name, sign in OWN_STATES[code]:
-            state = own.get(name)
-            if state is None or state.fixed or (state.shown_with and state.evident) or not state.p_needed > SURE:
+            if name not in far:
                 continue
-            if not abs(state.value - state.prior_mean) > farthest * max(state.prior_sigma, state.sigma):
-                continue
+            state = far[name]
             ratio = _ratio_of(state)
             log, sigma = sign * math.log(ratio), state.sigma / ratio
-            value = suspect.shown(log)
-            found.append(
-                Cause(
-                    code, suspect.subject, suspect.say(log), value, sigma * value, min(state.p_needed, 1.0),
-                    suspect.fix(log),
-                )
-            )  # fmt: skip
+            value, p = suspect.shown(log), min(state.p_needed, 1.0)
+            found.append(Cause(code, suspect.subject, suspect.say(log), value, sigma * value, p, suspect.fix(log)))
     return found
+
+
+def _is_far_off(state: ParameterEstimate, farthest: float) -> bool:
+    """Return whether a state is needed for certain, known which of two it is, and so far from what is stated."""
+    if state.fixed or (state.shown_with and state.evident) or not state.p_needed > SURE:
+        return False
+    return abs(state.value - state.prior_mean) > farthest * max(state.prior_sigma, state.sigma)
 
 
 def _ratio_of(state: ParameterEstimate) -> float:
