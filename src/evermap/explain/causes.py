@@ -292,7 +292,7 @@ def _turn_by(inputs: Inputs, factor: float) -> Inputs:
     pose[0] = path.pose_world_robot[0]
     for row, by in enumerate(se3.exp(step)):
         pose[row + 1] = se3.compose(pose[row], by)
-    return replace(inputs, recording=replace(recording, odometry=replace(path, pose_world_robot=pose)))
+    return _with_poses(inputs, pose)
 
 
 def _shift_stamps(inputs: Inputs, state: float) -> Inputs:
@@ -478,13 +478,18 @@ def _mirror_drive(inputs: Inputs) -> Inputs:
     recording: Any = inputs.recording
     pose = recording.odometry.pose_world_robot.copy()
     pose[:, [1, 3, 5]] *= -1.0
-    return replace(inputs, recording=replace(recording, odometry=replace(recording.odometry, pose_world_robot=pose)))
+    return _with_poses(inputs, pose)
 
 
 def _read_poses(inputs: Inputs, _: float, convention: str) -> Inputs:
     """Return the same with the poses of the odometry read in another convention."""
     recording: Any = inputs.recording
-    pose = mistakes.CONVENTIONS[convention](recording.odometry.pose_world_robot)
+    return _with_poses(inputs, mistakes.CONVENTIONS[convention](recording.odometry.pose_world_robot))
+
+
+def _with_poses(inputs: Inputs, pose: FloatArray) -> Inputs:
+    """Return the same with other poses (N, 7) of the odometry."""
+    recording: Any = inputs.recording
     return replace(inputs, recording=replace(recording, odometry=replace(recording.odometry, pose_world_robot=pose)))
 
 
@@ -513,9 +518,9 @@ def _of_mount(row: int, sensor: SpatialSensor, *, many: bool, driven: bool) -> I
         )  # fmt: skip
 
 
-def _turn_within(mount: FloatArray, by: FloatArray) -> FloatArray:
-    """Return a mount with the sensor's axes turned."""
-    return np.asarray(se3.compose(mount, by))
+def _turn_within(pose: FloatArray, by: FloatArray) -> FloatArray:
+    """Return the mount of a sensor, or the poses of tags (K, 7), with their axes turned."""
+    return np.asarray(se3.compose(pose, by))
 
 
 def _make_turn(axis: int, angle_rad: float, *, of_robot: bool) -> Callable[[FloatArray], FloatArray]:
@@ -537,8 +542,8 @@ _FLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
     ("mounted upside down: its image is turned by 180 degrees", _make_turn(2, math.pi, of_robot=False)),
     ("turned by 90 degrees to the left of its stated mount", _make_turn(2, 0.5 * math.pi, of_robot=True)),
     ("turned by 90 degrees to the right of its stated mount", _make_turn(2, -0.5 * math.pi, of_robot=True)),
-    ("to have its mount stated inversely: the robot in the sensor's frame", lambda m: np.asarray(se3.inverse(m))),
-    ("to have its quaternion stated as w, x, y, z", lambda m: np.concatenate([m[:3], m[4:], m[3:4]])),
+    ("to have its mount stated inversely: the robot in the sensor's frame", mistakes.CONVENTIONS["inverse"]),
+    ("to have its quaternion stated as w, x, y, z", mistakes.CONVENTIONS["w first"]),
     ("mounted on the other side: the sign of y", lambda m: m * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 1.0])),
 )  # fmt: skip
 _OFTEN = frozenset(words for words, _ in _FLIPS[:2])
@@ -704,17 +709,16 @@ def _of_map_axes() -> Iterable[Suspect]:
         more = "; or the corners of the detections start at another one" if normal else ""
         yield Suspect(
             "map-axes", "map", USUAL_P if normal else RARE_P,
-            partial(_turn_map, how=partial(_turn_own, by=quaternion)),
+            partial(_turn_map, how=partial(_turn_within, by=se3.turn(quaternion))),
             _constant(f"tags have other axes than in the given map: x, y, z are its {_name_axes(quaternion)}{more}"),
             _constant(f"--prior-map: each orientation times the quaternion x, y, z, w = {listed}"),
             of_map=True, pairs=False,
         )  # fmt: skip
-    for words, how in (
-        ("are in the order w, x, y, z", lambda q: q[:, [1, 2, 3, 0]]),
-        ("are those of the world in the tags' frames", lambda q: q * np.array([-1.0, -1.0, -1.0, 1.0])),
-    ):
+    for convention, words in (
+        ("w first", "are in the order w, x, y, z"), ("inverse", "are those of the world in the tags' frames"),
+    ):  # fmt: skip
         yield Suspect(
-            "map-axes", "map", USUAL_P, partial(_turn_map, how=how),
+            "map-axes", "map", USUAL_P, partial(_turn_map, how=mistakes.CONVENTIONS[convention]),
             _constant(f"orientations of the given map {words}"), _constant("--prior-map: qx, qy, qz, qw"),
             of_map=True, pairs=False,
         )  # fmt: skip
@@ -733,16 +737,12 @@ _AXES_TURNED = sorted(
 """Quaternions of the 23 rotations that bring axes to axes, those about the normal of a tag first."""
 
 
-def _turn_own(rotation: FloatArray, by: FloatArray) -> FloatArray:
-    return np.asarray(se3.compose(se3.turn(rotation), se3.turn(by))[:, 3:])
-
-
 def _turn_map(inputs: Inputs, _: float, how: Callable[[FloatArray], FloatArray]) -> Inputs:
     """Return the same with other orientations of the map's landmarks."""
     given = inputs.prior_map
     assert given is not None
     assert given.rotation is not None
-    return replace(inputs, prior_map=replace(given, rotation=how(given.rotation)))
+    return replace(inputs, prior_map=replace(given, rotation=how(se3.turn(given.rotation))[:, 3:]))
 
 
 def _stretch_map_by(inputs: Inputs, _: float, factor: float) -> Inputs:
