@@ -39,7 +39,7 @@ class Edited:
     wrong: dict[int, str]
 
 
-def edited(make: Make, seed: int, off_m: tuple[float, ...] = OFF_M) -> Edited:
+def edit_map(make: Make, seed: int, off_m: tuple[float, ...] = OFF_M) -> Edited:
     """Return a drive in a map with mistakes."""
     drive = simulate(make, seed, in_map=True)
     recording, given = as_recording(drive), drive.places
@@ -71,7 +71,7 @@ def edited(make: Make, seed: int, off_m: tuple[float, ...] = OFF_M) -> Edited:
 
 def measure(name: str, seed: int, profile: str | None = None) -> str:
     """Return a line: CPU seconds, and what was found and what not."""
-    world = edited(MAKES[name], seed)
+    world = edit_map(MAKES[name], seed)
     in_space = is_in_space(world.recording)
     warm_up(search=not in_space, in_space=in_space)
     began = time.process_time()

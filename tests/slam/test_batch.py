@@ -126,17 +126,17 @@ def test_distances_of_a_map_say_what_a_metre_is() -> None:
     given = PriorMap(place, np.tile(1e4 * np.eye(2), (6, 1, 1)), np.ones(6, dtype=np.bool_))
     prior = CalibrationPrior.from_settings(calibrated=True)
 
-    def laid_over(longer: float) -> tuple[Estimate, CalibrationPrior, bool]:
+    def lay_stretched(longer: float) -> tuple[Estimate, CalibrationPrior, bool]:
         estimate = Estimate(np.array([[longer, 0.0, 0.0]]), place * longer, prior.mean)
         found, inside, laid = lay_over_in_metre(given, estimate, prior, LocalizeConfig())
         return found, inside, bool(laid)
 
-    found, inside, laid = laid_over(1.07)
+    found, inside, laid = lay_stretched(1.07)
     assert laid
     np.testing.assert_allclose(found.landmark, place, atol=1e-9)
     assert found.pose[0, 0] == pytest.approx(1.0)
     assert found.states[SLOPE] == pytest.approx(0.07)
     assert found.states[FORWARD] == pytest.approx(1.0 / 1.07)
     assert inside.sigma[SLOPE] == pytest.approx(0.07)  # else the usual one would pull it back
-    assert not laid_over(1.3)[2]  # no sensor is off by so much: it is another map
-    assert laid_over(1.0)[1] is prior
+    assert not lay_stretched(1.3)[2]  # no sensor is off by so much: it is another map
+    assert lay_stretched(1.0)[1] is prior

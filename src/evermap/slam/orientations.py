@@ -39,7 +39,7 @@ def without_unmeasured(recording: AnyRecordingT, settings: CheckConfig) -> AnyRe
         return recording
     seen = recording.detections
     warnings: list[str] = []
-    asked = _oriented(recording)
+    asked = _has_orientation(recording)
     drop = np.zeros(len(seen), dtype=np.bool_)
     for row, sensor in enumerate(recording.sensors):
         mine = asked & (seen.sensor == row)
@@ -65,7 +65,7 @@ def find_convention(recording: SpatialRecording, settings: CheckConfig) -> str:
     odometry, seen = recording.odometry, recording.detections
     if odometry is None:
         return ""
-    asked = _oriented(recording)
+    asked = _has_orientation(recording)
     first, second = sighting_pairs(recording, settings)
     some = asked[first] & asked[second]
     first, second = first[some], second[some]
@@ -90,7 +90,7 @@ def find_convention(recording: SpatialRecording, settings: CheckConfig) -> str:
     return best[1] if given > STILL_RAD and turned[best] < SHARE_LEFT * given else ""
 
 
-def _oriented(recording: SpatialRecording) -> BoolArray:
+def _has_orientation(recording: SpatialRecording) -> BoolArray:
     """Return (M,) which detections have an orientation of their own: no boxes, and no tags by their corners."""
     seen = recording.detections
     asked = np.isfinite(seen.rotation).all(axis=1) & ~np.isfinite(seen.corner_px[:, 0, 0])

@@ -15,7 +15,7 @@ from evermap.types import Landmarks, SpatialRecording
 from .rigs import Rig
 
 
-def edited(true: Landmarks, seed: int, count: int, least_m: float = 0.4) -> tuple[Landmarks, set[int]]:
+def edit_survey(true: Landmarks, seed: int, count: int, least_m: float = 0.4) -> tuple[Landmarks, set[int]]:
     """The map with some places elsewhere, by up to 2 m, and which."""
     random = np.random.default_rng(seed)
     some = random.choice(len(true), count, replace=False)
@@ -25,7 +25,7 @@ def edited(true: Landmarks, seed: int, count: int, least_m: float = 0.4) -> tupl
     return replace(true.as_prior(0.02), position_m=position), set(true.landmark_id[some].tolist())
 
 
-def solved(recording: SpatialRecording, known: Landmarks) -> tuple[SpatialSolved, dict[int, float]]:
+def solve_in(recording: SpatialRecording, known: Landmarks) -> tuple[SpatialSolved, dict[int, float]]:
     """The solution in the map, and the probability of each that it moved."""
     intake = fit_to_map(prepare_space(recording, Config().slam.space), known, surveyed=True)
     found = solve_space(intake, known)
@@ -45,9 +45,9 @@ def off_m(found: SpatialSolved, recording: SpatialRecording) -> float:
 @pytest.mark.parametrize(("seed", "count"), [(0, 12), (4, 12)])
 def test_who_moved_is_found_without_odometry_where_many_did(seed, count):
     recording = Rig(seed, bias_px=0.3, gaps=4, turns=6).walk()
-    known, moved = edited(recording.true_landmarks, seed, count)
+    known, moved = edit_survey(recording.true_landmarks, seed, count)
     name, seen = np.unique(recording.detections.landmark_id, return_counts=True)
-    found, p_moved = solved(recording, known)
+    found, p_moved = solve_in(recording, known)
     assert {one for one, p in p_moved.items() if p > 0.5} == moved & set(name[seen >= 3].tolist())
     assert off_m(found, recording) < 0.1
 
@@ -64,6 +64,6 @@ def test_a_wrong_identity_that_was_seen_once_is_no_move():
     name[other] = stranger
     once = replace(recording, detections=replace(seen, landmark_id=name)[keep])
     known = recording.true_landmarks.as_prior(0.02)
-    _, p_moved = solved(once, known)
+    _, p_moved = solve_in(once, known)
     assert p_moved[stranger] < 0.2
     assert max(p_moved.values()) < 0.2

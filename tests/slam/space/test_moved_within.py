@@ -26,7 +26,7 @@ def robot_error(recording: SpatialRecording, result: SlamResult) -> float:
     return float(np.sqrt(np.mean(found.position_error_m**2)))
 
 
-def told_apart(recording: SpatialRecording, moves: tuple[Move, ...]) -> SpatialRecording:
+def rename_moved(recording: SpatialRecording, moves: tuple[Move, ...]) -> SpatialRecording:
     """The recording of somebody who knows: what was moved has another identity from then on."""
     seen, names = recording.detections, recording.detections.landmark_id.copy()
     for move in moves:
@@ -48,7 +48,7 @@ def check_moves(world: World, recording: SpatialRecording, moves: tuple[Move, ..
         start_s = recording.frames.stamp_s[0]
         assert change.stamp_from_s - start_s <= move.at_s <= change.stamp_to_s - start_s
     assert not any("#2" in warning for warning in result.warnings)
-    known = run_slam(told_apart(recording, moves), prior_map=given)
+    known = run_slam(rename_moved(recording, moves), prior_map=given)
     assert robot_error(recording, result) < 1.2 * robot_error(recording, known)
     return result
 

@@ -17,7 +17,7 @@ from evermap.slam.space.against_map import MapComparison, MovedTogether, compare
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.marginal import log_marginal_likelihood
 from evermap.slam.space.moved_groups import find_moved_groups
-from evermap.slam.space.moved_within import ROUNDS, MovedWithin, find_two_places, list_suspects
+from evermap.slam.space.moved_within import ROUNDS, MovedWithin, find_two_places, list_movers
 from evermap.slam.space.problem import SpatialNoise
 from evermap.slam.space.repair import rejoined, repaired, split, unjumped
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -57,19 +57,23 @@ def explain_places(
         changes: settings of the search for landmarks of the map that moved together; None asks each by itself.
     """
     begun, identity = optimum, np.arange(len(optimum.smoother.problem.oriented))
-    found = _explained(begun, identity, (), whole, stated, changes)
+    found = _explain_with(begun, identity, (), whole, stated, changes)
     asked, interval = ~whole, (changes or ChangesConfig()).interval
     gain_nats = optimum.smoother.problem.settings.repair.gain_nats
     for _ in range(ROUNDS):
-        suspects = list_suspects(found.optimum, found.identity, asked, _off_map(found))
+        suspects = list_movers(found.optimum, found.identity, asked, _off_map(found))
         if not len(suspects) or (two := find_two_places(begun, suspects, interval)) is None:
             break
         landmark, larger = int(identity[two.before]), np.append(identity, identity[two.before])
         asked = asked & (np.arange(len(asked)) != landmark)
         is_one = two.nats > gain_nats  # else there are two with one identity
         move = MovedWithin(two.before, two.after, two.since_s, two.between_s, 1.0)
-        trial = _explained(two.optimum, larger, (*found.moves, move) if is_one else found.moves, whole, stated, changes)
-        if np.count_nonzero(_seen_places(trial) & (trial.identity == landmark)) > MOST_PLACES:  # seen there in turns
+        trial = _explain_with(
+            two.optimum, larger, (*found.moves, move) if is_one else found.moves, whole, stated, changes
+        )
+        if (
+            np.count_nonzero(_find_seen_places(trial) & (trial.identity == landmark)) > MOST_PLACES
+        ):  # seen there in turns
             continue
         lasting = trial.optimum.smoother.lasting(trial.optimum.now)
         after, before = (_log_evidence(one, found.optimum.noise, lasting) for one in (trial, found))
@@ -82,7 +86,7 @@ def explain_places(
     return found
 
 
-def _explained(
+def _explain_with(
     optimum: SpatialOptimum,
     identity: IntArray,
     moves: tuple[MovedWithin, ...],
@@ -121,7 +125,7 @@ def _log_evidence(explanation: SpatialExplanation, begun: SpatialNoise, lasting:
         lasting: how long errors of detections last.
     """
     optimum, identity = explanation.optimum, explanation.identity
-    problem, seen = optimum.smoother.problem, _seen_places(explanation)
+    problem, seen = optimum.smoother.problem, _find_seen_places(explanation)
     found = log_marginal_likelihood(optimum, begun, lasting, in_room=True)
     if len(problem.prior.place):
         found += sum(log_map_density(problem, explanation.from_map, optimum.estimate.place))
@@ -137,6 +141,6 @@ def _off_map(explanation: SpatialExplanation) -> IntArray:
     return problem.prior.place[explanation.from_map.p_stands < 1.0 - problem.settings.map.p_told]
 
 
-def _seen_places(explanation: SpatialExplanation) -> BoolArray:
+def _find_seen_places(explanation: SpatialExplanation) -> BoolArray:
     """(P,) places of which there are detections."""
     return np.bincount(explanation.optimum.smoother.problem.place, minlength=len(explanation.identity)) > 0

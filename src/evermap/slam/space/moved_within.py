@@ -95,7 +95,7 @@ def superseded(moves: tuple[MovedWithin, ...], count: int) -> BoolArray:
     return left
 
 
-def list_suspects(optimum: SpatialOptimum, identity: IntArray, asked: BoolArray, off_map: IntArray) -> IntArray:
+def list_movers(optimum: SpatialOptimum, identity: IntArray, asked: BoolArray, off_map: IntArray) -> IntArray:
     """Return rows of landmarks that may have moved within the session, the likeliest first; none without a symptom.
 
     Args:
@@ -124,7 +124,7 @@ def _is_parted(optimum: SpatialOptimum, row: int) -> bool:
     """Tell whether the sightings of a place are of two places in turn."""
     problem = optimum.smoother.problem
     at = as_seen(problem, optimum.estimate, problem.measured)[problem.place == row]
-    return _parted(at, bool(problem.oriented[row]), problem.settings.repair.fewest) is not None
+    return _part_in_two(at, bool(problem.oriented[row]), problem.settings.repair.fewest) is not None
 
 
 def _frames_beside_jumps(optimum: SpatialOptimum) -> BoolArray:
@@ -192,7 +192,7 @@ def _at_two_places(
     mine = np.flatnonzero(problem.place == row)
     if len(mine) < 2 * settings.repair.fewest:
         return None
-    parted = _parted(at[mine], bool(problem.oriented[row]), settings.repair.fewest)
+    parted = _part_in_two(at[mine], bool(problem.oriented[row]), settings.repair.fewest)
     if parted is None:
         return None
     cut, old, new = parted
@@ -214,7 +214,7 @@ def _at_two_places(
         if found is optimum:  # a single sighting may have either orientation
             voted = oriented(trial, start, np.ones(len(moved)))[[row, after]]
             place[[row, after]] = voted
-        found = _settled(trial, start, noise)
+        found = _settle(trial, start, noise)
         if found.now.cost > optimum.now.cost - LEAST_FALL:
             return None
         start = found.estimate
@@ -239,10 +239,10 @@ def _without(optimum: SpatialOptimum, rows: IntArray) -> SpatialEstimate:
     """The values without the detections of some places."""
     problem = optimum.smoother.problem
     share = np.where(np.isin(problem.place, rows), UNUSED, problem.share)
-    return _settled(replace(problem, share=share), optimum.estimate, optimum.noise).estimate
+    return _settle(replace(problem, share=share), optimum.estimate, optimum.noise).estimate
 
 
-def _settled(problem: SpatialProblem, start: SpatialEstimate, noise: SpatialNoise) -> SpatialOptimum:
+def _settle(problem: SpatialProblem, start: SpatialEstimate, noise: SpatialNoise) -> SpatialOptimum:
     """The optimum at given noise levels, first with tails that never let go."""
     smoother = SpatialSmoother(problem, start.pose)
     start, _ = smoother.optimum(start, noise, heavy=True, iterations=STEPS)
@@ -250,7 +250,7 @@ def _settled(problem: SpatialProblem, start: SpatialEstimate, noise: SpatialNois
     return SpatialOptimum(estimate, noise, smoother, now)
 
 
-def _parted(at: FloatArray, has_turn: bool, fewest: int) -> tuple[int, FloatArray, FloatArray] | None:
+def _part_in_two(at: FloatArray, has_turn: bool, fewest: int) -> tuple[int, FloatArray, FloatArray] | None:
     """The first sighting (of N, 7, in order of time) at a new place, and the two places (7,); None if it is one.
 
     By the least sum of distances from the middle sighting before and after. How far sightings of one place are apart is
