@@ -11,6 +11,8 @@ from benchmarks import fuzz
 FILES = 40
 FEWER = 12
 """Files of kinds that take long to read, in the quick tests."""
+LONG = ("bags", "models")
+"""Beginnings of their names."""
 KINDS = [
     "maps", "old-maps", "models", "config", "looks-csv", "looks-parquet", "detections-csv", "detections-parquet",
     "lifetimes-csv", "lifetimes-parquet", "landmarks-csv", "landmarks-parquet", "landmarks-geojson", "recording-zip",
@@ -28,8 +30,8 @@ def test_the_slice_has_every_kind(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "files"),
-    [(name, FEWER if name.startswith("bags") else FILES) for name in KINDS]
-    + [pytest.param(name, FILES, marks=pytest.mark.slow) for name in KINDS if name.startswith("bags")],
+    [(name, FEWER if name.startswith(LONG) else FILES) for name in KINDS]
+    + [pytest.param(name, FILES, marks=pytest.mark.slow) for name in KINDS if name.startswith(LONG)],
 )
 def test_mutated_files_give_a_line_or_what_was_written(name: str, files: int, tmp_path: Path) -> None:
     kind = fuzz.kinds(tmp_path)[name]()

@@ -93,7 +93,7 @@ def told(recording: SpatialRecording) -> tuple[list[str], str]:
 
 
 @pytest.mark.parametrize(("spoil", "code", "words"), MISTAKES.values(), ids=MISTAKES)
-@pytest.mark.parametrize(("world", "seed"), [(room, 1), (corridor, 2)])
+@pytest.mark.parametrize(("world", "seed"), [pytest.param(room, 1, marks=pytest.mark.slow), (corridor, 2)])
 def test_one_mistake_is_told_by_its_name(
     world: Callable[[int], SpatialRecording], seed: int, spoil: Spoil, code: str, words: str
 ) -> None:

@@ -78,6 +78,7 @@ def test_lengths_that_are_not_known_are_in_every_covariance() -> None:
     assert last[1] > last[0]
 
 
+@pytest.mark.slow
 def test_a_data_sheet_frees_the_mount() -> None:
     off = np.array([0.1, -0.1, 0.0, 0.02, 0.03, 0.05])
     stated = tuple(se3.exp(off).tolist())

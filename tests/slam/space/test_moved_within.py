@@ -55,7 +55,7 @@ def check_moves(world: World, recording: SpatialRecording, moves: tuple[Move, ..
 
 @pytest.mark.parametrize("mapped", [False, True])
 @pytest.mark.parametrize("corners", [True, False])
-@pytest.mark.parametrize("move", [FAR, TURN])
+@pytest.mark.parametrize("move", [FAR, pytest.param(TURN, marks=pytest.mark.slow)])
 def test_a_tag_that_is_moved_is_one_tag_that_moved(move, corners, mapped):
     world = tagged_corridor(1, moves=(move,))
     result = check_moves(world, world.recording if corners else as_poses(world, 1), (move,), mapped=mapped)
@@ -64,7 +64,7 @@ def test_a_tag_that_is_moved_is_one_tag_that_moved(move, corners, mapped):
         assert at == pytest.approx(world.tags.position_m[[move.tag]] + move.by_m, abs=0.05)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_move_by_less_than_another_landmark_would_be_away_is_found_by_corners(seed):
     world = tagged_corridor(seed, moves=(NEAR,))
     check_moves(world, world.recording, (NEAR,), mapped=False)
@@ -125,7 +125,7 @@ def test_two_tags_with_one_identity_are_two_where_no_look_shows_that_one_left(se
     assert "1#2" in result.landmarks.names.values()
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("late_s", [0.0, 0.2])
 def test_nothing_moved_where_the_camera_is_late_or_identities_are_wrong(seed, late_s):
     world = tagged_corridor(seed, p_wrong=0.03)

@@ -55,6 +55,7 @@ def test_a_drive_with_odometry_is_mapped_from_scratch(seed):
     assert result.landmarks.rotation is not None
 
 
+@pytest.mark.slow
 def test_a_wrong_metre_of_the_odometry_is_found_where_it_is_not_believed():
     config, off, wrong = Config(slam={"space": {"scale_sigma": 0.03}}), [], []
     for seed in range(6):

@@ -74,7 +74,7 @@ def test_velocities_that_drift_in_turning_are_worth_what_they_are(seed):
     assert found.optimum.noise.rotation == pytest.approx(0.015, rel=0.2)
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_velocities_that_miss_half_of_each_fast_turn_lose_no_sightings(seed):
     found, ours, least = solved(Rig(seed, drift=0.03, missed=0.5).walk())
     assert ours < 1.1 * least + SLACK_M
