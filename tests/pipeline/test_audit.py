@@ -20,7 +20,7 @@ from evermap.io import read_recording
 from evermap.io.map_formats import MAP_FORMATS, SurveyFile, correct_map, read_landmarks, read_map_file, write_map
 from evermap.pipeline import run_slam
 from evermap.runs import audit as audit_module
-from evermap.runs.audit import Audit, EntryState, audit_map, in_order, join_drives
+from evermap.runs.audit import Audit, AuditEntry, EntryState, audit_map, in_order, join_drives
 from evermap.runs.audit_report import audit_dict, conclude, entry_row, listed_rows, quiet_lines, write_audit
 from evermap.runs.summary import RunInfo
 from evermap.types import (
@@ -440,6 +440,13 @@ def test_a_place_that_is_read_twice_only_is_not_called_wrong(monkeypatch) -> Non
 @functools.cache
 def solved_corridor() -> SlamResult:
     return run_slam(corridor(2).recording, prior_map=surveyed(corridor(2)).as_prior(0.01))
+
+
+@pytest.mark.parametrize(("sigma_m", "text"), [(0.024, "± 0.02 m"), (0.0032, "± 0.003 m"), (1e-6, "± 0.001 m")])
+def test_no_deviation_is_printed_as_nothing(sigma_m: float, text: str) -> None:
+    way, nan = np.array([1.0, 0.0]), np.nan
+    entry = AuditEntry(3, "3", EntryState.WRONG, 1.0, way, sigma_m, nan, nan, nan, 0.0, 9, 0, 1, way, np.eye(2))
+    assert text in entry_row(entry, Clock.RECORDING)[2]
 
 
 def test_the_report_says_all_of_it(tmp_path: Path) -> None:

@@ -113,16 +113,21 @@ def conclude(audit: Audit) -> tuple[str, str]:
     return "wrong", f"{said}; {of}{rest}"
 
 
+def _format_sigma(sigma_m: float) -> str:
+    """Return a standard deviation in centimetres, in millimetres where it is below one: never as nothing."""
+    return f"{sigma_m:.2f}" if not sigma_m < 0.01 else f"{max(sigma_m, 0.001):.3f}"
+
+
 def entry_row(entry: AuditEntry, clock: Clock) -> tuple[str, ...]:
     """Return the cells of an entry, under `HEAD`."""
     moved = entry.state in (EntryState.WRONG, EntryState.STALE, EntryState.EXCHANGED, EntryState.UNDECIDED)
     known = moved and math.isfinite(entry.distance_m)
     way = ", ".join(f"{round(metres, 2) + 0.0:+.2f}" for metres in entry.displacement_m.tolist())
-    far = f"{entry.distance_m:.2f} ± {entry.sigma_m:.2f} m ({way})" if known else "-"
+    far = f"{entry.distance_m:.2f} ± {_format_sigma(entry.sigma_m)} m ({way})" if known else "-"
     turned = known and math.isfinite(entry.turn_rad)
     turn = f"{math.degrees(entry.turn_rad):.1f} ± {math.degrees(entry.turn_sigma_rad):.1f}°" if turned else "-"
     if entry.state is EntryState.MISSING:
-        far = f"at ({', '.join(f'{metres:.2f}' for metres in entry.position_m)}) ± {entry.sigma_m:.2f} m"
+        far = f"at ({', '.join(f'{metres:.2f}' for metres in entry.position_m)}) ± {_format_sigma(entry.sigma_m)} m"
     seen = f"{entry.n_hits} ×" + (f", missed {entry.n_misses} ×" if entry.n_misses and not entry.n_hits else "")
     if entry.n_drives > 1:
         seen += f" in {entry.n_drives} drives"

@@ -34,7 +34,7 @@ _COLOURS = {
 }  # fmt: skip
 _MARKS = {"gone": "x", "missing": "P", "undecided": "s", "unseen": "o", "right": "o"}
 _MEANING = {
-    "wrong": "elsewhere since the first drive", "stale": "moved since an earlier drive",
+    "wrong": "elsewhere since the first drive", "stale": "moved since it was right",
     "exchanged": "in each other's place", "gone": "looked for, not there", "missing": "not in the map",
     "undecided": "undecided", "unseen": "never looked at", "right": "where the map has it",
 }  # fmt: skip
