@@ -52,6 +52,14 @@ Gap = Annotated[
     option("A longer time between two frames counts as a gap without looks [s].", default="ten times the usual"),
 ]
 Scene = Annotated[bool, option("--scene/--no-scene", "Write scene.rrd for the rerun viewer.")]
+State = Annotated[
+    Path | None,
+    option(
+        "Continue where this file was written, if it exists, and write it at the end: the next day, the next robot.",
+        metavar="FILE",
+        default="start afresh",
+    ),
+]
 Example = Annotated[Path | None, option("Write a commented example table and exit.", metavar="FILE", default=False)]
 
 HELP = """\
@@ -84,6 +92,7 @@ Examples:
   evermap track --init detections.csv
   evermap track detections.csv --range-m 12 --out out/yard
   evermap track kitti_tracking/0000 --out out/0000
+  evermap track tuesday.csv --range-m 12 --state yard.state --out out/tuesday
   evermap survival fit out/yard/lifetimes.csv --by class --estimator best
 """
 
@@ -97,6 +106,7 @@ def track(
     confusion: Confusion = None,
     min_score: MinScore = None,
     gap_s: Gap = None,
+    state: State = None,
     scene: Scene = False,
     config: ConfigFile = None,
     settings: Settings = None,
@@ -119,7 +129,8 @@ def track(
     if input is None:
         raise ConfigError("a table is needed", field="input", hint="--init detections.csv writes an example")
     out = out or default_out(input.name)
-    summary = _run(input, confusion, chosen, out, scene=scene, force=force, inputs=[input, confusion, config])
+    inputs = [input, confusion, config, state]
+    summary = _run(input, confusion, chosen, out, state=state, scene=scene, force=force, inputs=inputs)
     if as_json:
         print_json(summary)
     else:
@@ -153,6 +164,7 @@ def _run(
     config: TrackConfig,
     out: Path,
     *,
+    state: Path | None,
     scene: bool,
     force: bool,
     inputs: Sequence[str | Path | None],
@@ -162,7 +174,7 @@ def _run(
     from evermap.runs.summary import RunInfo
     from evermap.runs.track.detections import read_confusion, read_input
     from evermap.runs.track.write import write_track
-    from evermap.tracking.run import check_choices, run_track
+    from evermap.tracking.run import check_choices, make_tracker, run_track
     from evermap.tracking.run import warm_up as compile_kernels
 
     check_replaceable(out, force=force, inputs=inputs)  # better now than after the run
@@ -171,11 +183,15 @@ def _run(
     confusion = None if confusion_path is None else read_confusion(confusion_path, table.class_names)
     info = RunInfo(command=command_line(), read_s=time.perf_counter() - start)
     check_choices(config, table)  # compiling takes a while: first say what is missing
+    known = state if state is not None and state.exists() else None
+    tracker = make_tracker(table, config, confusion=confusion, state=known)
     warm_up(compile_kernels)
     with progress_bar(f"{path.name}: tracking", speed=False) as progress:
-        result = run_track(table, config, confusion=confusion, progress=progress)
+        result = run_track(table, config, tracker=tracker, progress=progress)
     with progress_bar(f"{path.name}: writing", speed=False) as progress:
         summary = write_track(out, result, info=info, scene=scene, force=force, inputs=inputs, progress=progress)
+    if state is not None:
+        tracker.save(state)
     for remark in summary["warnings"]:
         warn(remark)
     return summary

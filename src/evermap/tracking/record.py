@@ -7,6 +7,7 @@ found moved or gone at `gone_s`. What that says of lifetimes is in `survival.cen
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -207,6 +208,19 @@ class SpellLog:
         """Note rows of the working set whose objects are gone."""
         if len(rows):
             self._parts.append(_spells(stored, rows, stored.class_id, stored.position, gone_s))
+
+    def columns(self) -> dict[str, Any]:
+        """Return what `restore` takes."""
+        ended = self._ended()
+        return {item.name: getattr(ended, item.name) for item in fields(StaticSpells)}
+
+    def restore(self, columns: Mapping[str, Any]) -> None:
+        """Take over the spells that `columns` gave."""
+        self._parts = [StaticSpells(**{item.name: columns[item.name] for item in fields(StaticSpells)})]
+
+    def _ended(self) -> StaticSpells:
+        whole, real = np.zeros(0, dtype=np.int64), np.zeros(0)
+        return StaticSpells(whole, whole, np.zeros((0, 3)), real, real, real, real).joined(*self._parts)
 
     def with_open(self, t: Tracklets, n: int, working_set: WorkingSet) -> StaticSpells:
         """Return ended tracklets, and those that go on: of the first `n` tracklets, and of the working set."""

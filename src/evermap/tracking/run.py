@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from evermap.config import DEFAULT_PRIOR, TrackConfig
-from evermap.errors import ConfigError, DataError
+from evermap.errors import ConfigError, DataError, InputError
 from evermap.existence.models import priors_of
 from evermap.io.text import counted, quote
 from evermap.show import Shown, draw
@@ -128,6 +129,7 @@ def run_track(
     config: TrackConfig | None = None,
     *,
     confusion: FloatArray | None = None,
+    tracker: Tracker | None = None,
     progress: Callable[[float, float], None] | None = None,
 ) -> TrackResult:
     """Track all frames of a table.
@@ -136,6 +138,8 @@ def run_track(
         table: of `read_detections`.
         config: the choices.
         confusion: (C, C) `P(detected class | true class)`, a row a true class; equal mistakes where None.
+        tracker: of `make_tracker`, which goes on where it was and is changed; a new one where None. The spells and
+            lifetimes of the result are then those of all its tables.
         progress: told after every hundredth frame what is done, and how many there are.
 
     Raises:
@@ -144,16 +148,9 @@ def run_track(
     """
     config = config or TrackConfig()
     check_choices(config, table)
-    names = table.class_names
-    tracker = Tracker(
-        config.model_copy(update={"class_speed_mps": _speeds(config, names)}),
-        n_classes=len(names),
-        confusion=confusion,
-        n_appearance=0 if table.appearance is None else table.appearance.shape[1],
-        boxes=table.box is not None,
-        scored=table.score is not None,
-        priors=_priors(config, names),
-    )
+    if tracker is None:
+        tracker = make_tracker(table, config, confusion=confusion)
+    table = _with_classes(table, tracker.class_names)
     start = perf_counter()
     recorder, track_of_detection, n_gaps = _follow(tracker, table, config, progress)
     tracks = recorder.tracks() if table.score is None else recorder.at_once(config.p_dead)
@@ -181,6 +178,69 @@ def run_track(
         seconds=perf_counter() - start,
         warnings=tuple(_remarks(table, config, spells)),
     )
+
+
+def make_tracker(
+    table: DetectionTable,
+    config: TrackConfig | None = None,
+    *,
+    confusion: FloatArray | None = None,
+    state: str | Path | None = None,
+) -> Tracker:
+    """Return the tracker of a table, new or as it was saved.
+
+    Args:
+        table: says which classes there are, and whether detections are boxes, have scores and appearances.
+        config, confusion: as `run_track`.
+        state: file of `Tracker.save`, of an earlier day or another robot of the same world; a new tracker where None.
+
+    Raises:
+        ConfigError: choices that do not fit the table.
+        InputError: no such file; a table before its end, or of detections of another kind.
+    """
+    config = config or TrackConfig()
+    names = table.class_names
+    about = _kind_of(table)
+    if state is not None:
+        saved = Tracker.load(state)
+        if saved.kind != about:
+            raise InputError(f"detections {_in_words(about)}, and those of the state are {_in_words(saved.kind)}",
+                             path=Path(table.source), hint="another --state")  # fmt: skip
+        if table.n_frames and table.stamp_s[0] <= saved.stamp_s:
+            problem = f"begins at {table.stamp_s[0]:.3f} s, and the state ends at {saved.stamp_s:.3f} s"
+            raise InputError(problem, path=Path(table.source), hint="tables in the order of their stamps, one clock")
+        names = (*saved.class_names, *(name for name in names if name not in saved.class_names))
+    settings = config.model_copy(update={"class_speed_mps": _speeds(config, names)})
+    priors = _priors(config, names)
+    if state is not None:
+        return Tracker.load(state, settings, class_names=names, confusion=confusion, priors=priors)
+    n_appearance, boxes, scored = about
+    return Tracker(
+        settings, n_classes=len(names), confusion=confusion, n_appearance=n_appearance, boxes=boxes, scored=scored,
+        priors=priors, class_names=names,
+    )  # fmt: skip
+
+
+def _kind_of(table: DetectionTable) -> tuple[int, bool, bool]:
+    """As `Tracker.kind`, of a table."""
+    return 0 if table.appearance is None else table.appearance.shape[1], table.box is not None, table.score is not None
+
+
+def _in_words(kind: tuple[int, bool, bool]) -> str:
+    n_appearance, boxes, scored = kind
+    words = ["boxes" if boxes else "points", "with scores" if scored else "without scores"]
+    return " ".join([*words, f"and appearances of {n_appearance} numbers"] if n_appearance else words)
+
+
+def _with_classes(table: DetectionTable, names: tuple[str, ...]) -> DetectionTable:
+    """The same detections of classes by other numbers: InputError for a class that is not among the names."""
+    if table.class_names == names:
+        return table
+    if missing := [name for name in table.class_names if name not in names]:
+        raise InputError(f"class {quote(missing[0])} is unknown to the tracker", path=Path(table.source))
+    into = np.array([names.index(name) for name in table.class_names], dtype=np.int64)
+    class_id = np.where(table.class_id == UNKNOWN, UNKNOWN, into[table.class_id])
+    return replace(table, class_names=names, class_id=class_id)
 
 
 def _priors(config: TrackConfig, class_names: Sequence[str]) -> tuple[LifetimePrior, ...]:
@@ -215,6 +275,10 @@ def _follow(
     step_s = _usual_step_s(table)
     gap_s = config.gap_s or config.gap_steps * step_s
     recorder, found, n_gaps = Recorder(), np.full(len(table), UNKNOWN), 0
+    if np.isfinite(tracker.stamp_s) and table.stamp_s[0] - tracker.stamp_s > gap_s:
+        n_gaps += 1
+        events = _close_eyes(tracker, np.zeros(3), tracker.stamp_s, float(table.stamp_s[0]), min(step_s, gap_s))
+        recorder.events.extend(events)
     p_real = None if table.score is None else p_real_of(table.score, config.score_midpoint, config.score_scale)
     for k, stamp_s in enumerate(table.stamp_s.tolist()):
         rows = slice(int(table.first[k]), int(table.first[k + 1]))

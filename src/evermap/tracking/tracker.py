@@ -7,17 +7,21 @@ detection; and delete those that should have been seen and were not.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from evermap.config import TrackerConfig
 from evermap.errors import ConfigError, InputError
+from evermap.io.text import quote
 from evermap.show import Shown, draw
 from evermap.survival import GeneralPurpose, LifetimePrior
+from evermap.survival.text import prior_from_dict, prior_to_dict
 from evermap.tracking.frame import Frame, appearances, boxes, classes, covariances, positions, probabilities
 from evermap.tracking.record import Event, Followed, SpellLog, StaticSpells
+from evermap.tracking.state_file import Parts, read_state, write_state
 from evermap.tracking.tracklets import (
     ALIVE,
     N_DETECTED,
@@ -57,9 +61,10 @@ class Tracker(Shown):
         boxes: whether detections are boxes rather than points.
         scored: whether detections come with probabilities to be real.
         priors: lifetimes at rest, one for all classes or one a class; one that knows nothing where None.
+        class_names: names of the classes, kept with a saved state; as many as there are numbers where None.
 
     Raises:
-        ConfigError: a matrix or priors that do not fit the classes.
+        ConfigError: a matrix, priors or names that do not fit the classes.
     """
 
     def __init__(
@@ -72,6 +77,7 @@ class Tracker(Shown):
         boxes: bool = False,
         scored: bool = False,
         priors: LifetimePrior | Sequence[LifetimePrior] | None = None,
+        class_names: Sequence[str] | None = None,
     ) -> None:
         from scipy.special import chdtri
 
@@ -83,7 +89,11 @@ class Tracker(Shown):
         self.settings = s = settings or TrackerConfig()
         self._n_classes, self._n_appearance = n_classes, n_appearance
         self._boxes, self._scored = boxes, scored
-        lifetimes = _as_priors(priors, n_classes, s.leave_rates_hz)
+        self.class_names = tuple(map(str, range(n_classes)) if class_names is None else class_names)
+        if len(self.class_names) != n_classes or len(set(self.class_names)) != n_classes:
+            raise ConfigError(f"{len(set(self.class_names))} names for {n_classes} classes", field="class_names")
+        self._confusion = confusion
+        self._lifetimes = lifetimes = _as_priors(priors, n_classes, s.leave_rates_hz)
         self._likelihood: association.Likelihood = _numbers(
             association.Likelihood,
             s,
@@ -122,6 +132,117 @@ class Tracker(Shown):
         self._views = ViewMemory(float(np.log(1.0 / s.p_empty)))
         self._spells = SpellLog()
         self._tables(ROOM)
+
+    def save(self, path: str | Path) -> Path:
+        """Write all that the tracker knows: what is followed, what rests out of view, spells that have ended, and views.
+
+        Views other than balls and sectors are left out: what they saw empty is not known to a tracker that goes on.
+
+        Args:
+            path: one file (NumPy's .npz, under any name), which replaces an older one at once. Returned.
+
+        Raises:
+            ConfigError: a lifetime that does not consist of numbers.
+            InputError: the file cannot be written.
+        """
+        t, n = self._tracklets, self._n
+        about = {
+            "settings": {name: value for name, value in self.settings.to_dict().items() if name in _SETTINGS},
+            "class_names": list(self.class_names),
+            "confusion": None if self._confusion is None else np.asarray(self._confusion).tolist(),
+            "priors": [prior_to_dict(prior) for prior in self._lifetimes],
+            "n_appearance": self._n_appearance,
+            "boxes": self._boxes,
+            "scored": self._scored,
+            "next_id": self._next_id,
+            "stamp_s": None if np.isneginf(self._stamp_s) else self._stamp_s,
+        }
+        parts = {
+            "tracklets": {name: getattr(t, name)[:n] for name in t._fields},
+            "working_set": self.working_set.columns(),
+            "spells": self._spells.columns(),
+            "views": self._views.columns(),
+        }
+        return write_state(path, about, parts)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        settings: TrackerConfig | None = None,
+        *,
+        class_names: Sequence[str] | None = None,
+        confusion: FloatArray | None = None,
+        priors: LifetimePrior | Sequence[LifetimePrior] | None = None,
+    ) -> Self:
+        """Return a tracker that goes on where `save` was called, on another day or another robot of the same world.
+
+        Args:
+            path: of `save`.
+            settings, confusion, priors: others than those saved; as they were where None, and of classes that were not
+                known: equal mistakes, and a lifetime that knows nothing.
+            class_names: all names that were saved, in any order, and new ones. An object is of a class that was not
+                known as likely as of the least likely of those that were.
+
+        Raises:
+            InputError: no such file, or not one of `save`.
+            ConfigError: names that were saved are missing, another model of motion, or choices that do not fit.
+        """
+        about, parts = read_state(path)
+        saved = tuple(about["class_names"])
+        names = saved if class_names is None else tuple(class_names)
+        if missing := [name for name in saved if name not in names]:
+            raise ConfigError(f"no class {quote(missing[0])}, which objects are of", field="class_names")
+        into = np.array([names.index(name) for name in saved], dtype=np.int64)
+        chosen = settings or TrackerConfig.model_validate(about["settings"])
+        if priors is None:
+            kept = [prior_from_dict(prior) for prior in about["priors"]]
+            unknown = GeneralPurpose(*chosen.leave_rates_hz)
+            by_name = dict(zip(saved, kept, strict=False))
+            priors = kept if len(kept) == 1 else [by_name.get(name, unknown) for name in names]
+        if confusion is None and about["confusion"] is not None and len(names) == len(saved):
+            order = np.argsort(into)
+            confusion = np.array(about["confusion"])[np.ix_(order, order)]
+        tracker = cls(
+            chosen,
+            n_classes=len(names),
+            confusion=confusion,
+            n_appearance=about["n_appearance"],
+            boxes=about["boxes"],
+            scored=about["scored"],
+            priors=priors,
+            class_names=names,
+        )
+        tracker._restore(parts, into, about)
+        return tracker
+
+    def _restore(self, parts: Parts, into: IntArray, about: Mapping[str, Any]) -> None:
+        """Take over what `save` wrote, of classes that now have the numbers `into`."""
+        columns = dict(parts["tracklets"])
+        if columns["mean"].shape[1:] != self._tracklets.mean.shape[1:]:
+            hint = f"motion={'velocity' if self.settings.order == 3 else 'acceleration'}, as the state was saved with"
+            raise ConfigError("another model of motion than that of the state", field="motion", hint=hint)
+        columns["class_p"] = _among(columns["class_p"], into, self._n_classes)
+        n = len(columns["track_id"])
+        self._reserve(n)
+        for name in self._tracklets._fields:
+            getattr(self._tracklets, name)[:n] = columns[name]
+        self._n, self._next_id = n, about["next_id"]
+        self._stamp_s = -np.inf if about["stamp_s"] is None else about["stamp_s"]
+        stored, spells = parts["working_set"], parts["spells"]
+        self.working_set.restore(stored | {"class_id": into[stored["class_id"]]})
+        self._spells.restore(spells | {"class_id": into[spells["class_id"]]})
+        self._views.restore(parts["views"])
+
+    @property
+    def kind(self) -> tuple[int, bool, bool]:
+        """Length of appearances, whether detections are boxes, and whether they have scores."""
+        return self._n_appearance, self._boxes, self._scored
+
+    @property
+    def stamp_s(self) -> float:
+        """Stamp of the last frame, -inf before the first."""
+        return self._stamp_s
 
     def __len__(self) -> int:
         """Return the number of active tracklets."""
@@ -412,6 +533,17 @@ class Tracker(Shown):
         self._spell_table = SpellTable(
             np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64), np.empty((room, 3)), np.empty((room, 4))
         )
+
+
+_SETTINGS = frozenset(TrackerConfig.model_fields)
+
+
+def _among(class_p: FloatArray, into: IntArray, n_classes: int) -> FloatArray:
+    """(N, n_classes) the same beliefs of classes that now have the numbers `into`, and of others (see `Tracker.load`)."""
+    least = class_p.min(axis=1, initial=1.0)
+    out = np.repeat(least[:, None], n_classes, axis=1)
+    out[:, into] = class_p
+    return np.asarray(out / out.sum(axis=1, keepdims=True))
 
 
 def _numbers(table: Any, s: TrackerConfig, **derived: Any) -> Any:

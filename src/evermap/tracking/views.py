@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
@@ -24,11 +24,14 @@ class View:
         centre_m: (3,) where the sensor is, in the world.
         reach_m: beyond this distance nothing is detected.
         p_detect: for positions (N, 3) in the world, (N,) probabilities to detect an object there.
+        sector_of: probability, heading [rad] and angle [rad] of a sector, an angle of 2 pi of a ball; None for any other
+            view, which is not saved with a tracker.
     """
 
     centre_m: FloatArray
     reach_m: float
     p_detect: Callable[[FloatArray], FloatArray]
+    sector_of: tuple[float, float, float] | None = None
 
     @classmethod
     def of(cls, model: DetectionModel, pose_world_sensor: FloatArray, reach_m: float) -> Self:
@@ -43,7 +46,7 @@ class View:
         def within(position_m: FloatArray) -> FloatArray:
             return np.where(np.linalg.norm(position_m - centre_m, axis=1) <= reach_m, p_detect, 0.0)
 
-        return cls(centre_m, reach_m, within)
+        return cls(centre_m, reach_m, within, (p_detect, 0.0, 2.0 * np.pi))
 
     @classmethod
     def sector(cls, centre_m: FloatArray, reach_m: float, p_detect: float, yaw_rad: float, fov_rad: float) -> Self:
@@ -55,7 +58,7 @@ class View:
             inside = (np.linalg.norm(off, axis=1) <= reach_m) & (np.abs(turn) <= 0.5 * fov_rad)
             return np.where(inside, p_detect, 0.0)
 
-        return cls(centre_m, reach_m, within)
+        return cls(centre_m, reach_m, within, (p_detect, yaw_rad, fov_rad))
 
     def probability(self, position_m: FloatArray) -> FloatArray:
         """Return (N,) `p_detect`, or raise an InputError unless that is one probability a position."""
@@ -130,6 +133,29 @@ class ViewMemory:
                 return stamp
         return -np.inf
 
+    def columns(self) -> dict[str, FloatArray]:
+        """Return what `restore` takes: balls and sectors; without other views, a place is seen empty later."""
+        kept = [entry for entries in self._kept.values() for entry in entries]
+        rows = {
+            name: [
+                [stamp, *view.centre_m.tolist(), view.reach_m, *view.sector_of]
+                for stamp, view in views
+                if view.sector_of is not None
+            ]
+            for name, views in (("recent", self._recent), ("kept", kept), ("last", [self._last] if self._last else []))
+        }
+        numbers = np.array([self._n_in_burst, self._chunk_m, self._reach_m], dtype=np.float64)
+        return {name: np.array(of, dtype=np.float64).reshape(-1, 8) for name, of in rows.items()} | {"numbers": numbers}
+
+    def restore(self, columns: Mapping[str, FloatArray]) -> None:
+        """Take over the views that `columns` gave."""
+        n_in_burst, self._chunk_m, self._reach_m = columns["numbers"].tolist()
+        self._n_in_burst = int(n_in_burst)
+        self._recent.extend(map(_view_of, columns["recent"]))
+        for stamp, view in map(_view_of, columns["kept"]):
+            self._kept.setdefault(self._chunk_of(view.centre_m), []).append((stamp, view))
+        self._last = next(map(_view_of, columns["last"]), None)
+
     def _backwards(self, position_m: FloatArray) -> list[tuple[float, View]]:
         """Views that may show a place, the last first."""
         x, y = self._chunk_of(position_m)
@@ -145,3 +171,12 @@ class ViewMemory:
     def _chunk_of(self, position_m: FloatArray) -> tuple[int, int]:
         chunk = self._chunk_m or 1.0
         return int(np.floor(position_m[0] / chunk)), int(np.floor(position_m[1] / chunk))
+
+
+def _view_of(row: FloatArray) -> tuple[float, View]:
+    """Stamp and view of a row of `ViewMemory.columns`."""
+    stamp_s, x, y, z, reach_m, p_detect, yaw_rad, fov_rad = row.tolist()
+    centre_m = np.array([x, y, z])
+    if fov_rad == 2.0 * np.pi:
+        return stamp_s, View.ball(centre_m, reach_m, p_detect)
+    return stamp_s, View.sector(centre_m, reach_m, p_detect, yaw_rad, fov_rad)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,6 +150,17 @@ class WorkingSet:
         self._chunks.link(rows, self.stored.position, self._chunk_m, self._head, self.stored.following)
         self.widest_m2 = max(self.widest_m2, float(objects.covariance[:, [0, 3, 5]].max(initial=0.0)))
         return rows
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return what `restore` takes: all rows, those that are free, and the widest place."""
+        used = {name: getattr(self.stored, name)[: self._n_used] for name in Stored._fields[:-1]}
+        return used | {"free": np.array(self._free, dtype=np.int64), "widest_m2": np.array(self.widest_m2)}
+
+    def restore(self, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Take over, in an empty set, the objects that `columns` gave, in the same rows."""
+        self.insert_arrays(empty_rows(0, 0)._replace(**{name: columns[name] for name in Stored._fields[:-1]}))
+        self.remove(columns["free"])
+        self.widest_m2 = float(columns["widest_m2"])
 
     def remove(self, rows: IntArray) -> None:
         """Forget rows, each once."""

@@ -1,0 +1,58 @@
+"""A tracker's state as a file: arrays by part and name, in NumPy's .npz, and the choices they were made with as JSON."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evermap.errors import InputError
+from evermap.io.files import write_atomic
+
+VERSION = 1
+ABOUT = "about"
+
+Parts = Mapping[str, Mapping[str, NDArray[Any]]]
+
+
+def write_state(path: str | Path, about: Mapping[str, Any], parts: Parts) -> Path:
+    """Write choices (values of JSON) and arrays by part and name. Returns the path.
+
+    Raises:
+        InputError: the file cannot be written; an older one is untouched.
+    """
+    arrays: dict[str, Any] = {f"{part}.{name}": a for part, columns in parts.items() for name, a in columns.items()}
+    arrays[ABOUT] = np.frombuffer(json.dumps({"version": VERSION, **about}).encode(), dtype=np.uint8)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return write_atomic(path, stream.getvalue())
+
+
+def read_state(path: str | Path) -> tuple[dict[str, Any], dict[str, dict[str, NDArray[Any]]]]:
+    """Return the choices and the arrays, by part and name, of a file that `write_state` wrote.
+
+    Raises:
+        InputError: no such file, another kind of file, or one of a newer version.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            about = json.loads(bytes(file[ABOUT]))
+            parts: dict[str, dict[str, NDArray[Any]]] = {}
+            for key in file.files:
+                part, _, name = key.partition(".")
+                if name:
+                    parts.setdefault(part, {})[name] = file[key]
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", path=Path(path)) from error
+    except (BadZipFile, KeyError, ValueError, EOFError, TypeError, AttributeError) as error:
+        raise InputError("is not a tracker's state", path=Path(path), hint="written by `track --state`") from error
+    if about.get("version") != VERSION:
+        problem = f"is of version {about.get('version')}, and this evermap reads version {VERSION}"
+        raise InputError(problem, path=Path(path), hint="a newer evermap")
+    return about, parts
