@@ -1285,9 +1285,15 @@ class TrackConfig(TrackerConfig):
     range_m: Positive | None = key(None, "range of the sensor [m]; unset: misses are no evidence")
     fov_deg: float | None = key(
         None,
-        "horizontal field of view, ahead of the sensor [deg], with `range_m` and poses; unset: all around",
+        "horizontal field of view, ahead of the sensor [deg], with `range_m` and poses; unset: from the detections",
         gt=0.0,
         le=360.0,
+    )
+    all_around_deg: float = key(
+        225.0, "field of view from which on detections are of a sensor that sees all around [deg]", gt=0.0, le=360.0
+    )
+    p_all_around: Share = key(
+        1e-4, "chance that a sensor that sees all around shows all that close together, below which the view is narrow"
     )
     min_score: float | None = key(None, "minimum score of detections; unset: none")
     gap_s: Positive | None = key(

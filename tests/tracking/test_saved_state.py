@@ -74,7 +74,8 @@ def test_days_in_parts_are_the_days_in_one(yard: DetectionTable, whole: TrackRes
     found = replace(last.spells, class_id=np.array([names.index(other[k]) for k in last.spells.class_id]))
     for item in fields(StaticSpells):
         np.testing.assert_allclose(getattr(found, item.name), getattr(whole.spells, item.name), rtol=1e-12, atol=1e-12)
-    assert last.lifetimes is not None and whole.lifetimes is not None
+    assert last.lifetimes is not None
+    assert whole.lifetimes is not None
     for item in fields(CensoredLifetimes):
         np.testing.assert_array_equal(getattr(last.lifetimes, item.name), getattr(whole.lifetimes, item.name))
     ids = np.concatenate([result.track_of_detection for result in results])
@@ -98,7 +99,8 @@ def test_the_file_is_the_state(yard: DetectionTable, tmp_path: Path) -> None:
         stamp_s = tracker.stamp_s + 0.1
         a, before = tracker.step(stamp_s, where, view=view)
         b, after = again.step(stamp_s, where, view=view)
-        assert a.tolist() == b.tolist() and before == after, k
+        assert a.tolist() == b.tolist(), k
+        assert before == after, k
     np.testing.assert_array_equal(again.followed().p_exists, tracker.followed().p_exists)
 
 
@@ -131,7 +133,7 @@ def test_what_does_not_fit_is_refused_by_name(yard: DetectionTable, tmp_path: Pa
     with pytest.raises(InputError, match="the state ends at"):
         make_tracker(part, CONFIG, state=state)
     later = part_of(yard, 60, 90)
-    with pytest.raises(InputError, match="boxes without scores.*those of the state are points without scores"):
+    with pytest.raises(InputError, match=r"boxes without scores.*those of the state are points without scores"):
         make_tracker(replace(later, box=np.ones((len(later), 4))), CONFIG, state=state)
     with pytest.raises(ConfigError, match="another model of motion"):
         make_tracker(later, CONFIG.model_copy(update={"motion": "velocity"}), state=state)

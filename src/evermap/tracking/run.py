@@ -18,6 +18,7 @@ from evermap.show import Shown, draw
 from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.text import parse_prior
+from evermap.tracking.field_of_view import find_field_of_view
 from evermap.tracking.frame import DetectionTable, p_real_of
 from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
 from evermap.tracking.tracker import Tracker
@@ -27,6 +28,10 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+FEW = 5
+"""So many things by chance are no pattern."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -152,7 +157,7 @@ def run_track(
         tracker = make_tracker(table, config, confusion=confusion)
     table = _with_classes(table, tracker.class_names)
     start = perf_counter()
-    recorder, track_of_detection, n_gaps = _follow(tracker, table, config, progress)
+    recorder, track_of_detection, n_gaps, seen = _follow(tracker, table, config, progress)
     tracks = recorder.tracks() if table.score is None else recorder.at_once(config.p_dead)
     if not (tracks.state != TrackState.BIRTH).any():
         hint = f"fewer detections for confirmation: track.warm_up={max(1, config.warm_up - 1)}"
@@ -176,7 +181,7 @@ def run_track(
         spell_of_lifetime=spell_of_lifetime,
         n_gaps=n_gaps,
         seconds=perf_counter() - start,
-        warnings=tuple(_remarks(table, config, spells)),
+        warnings=(*_remarks(table, config, spells), *seen, *_returned(spells, config.place_sigma_m)),
     )
 
 
@@ -191,7 +196,8 @@ def make_tracker(
 
     Args:
         table: says which classes there are, and whether detections are boxes, have scores and appearances.
-        config, confusion: as `run_track`.
+        config: as of `run_track`.
+        confusion: as of `run_track`.
         state: file of `Tracker.save`, of an earlier day or another robot of the same world; a new tracker where None.
 
     Raises:
@@ -267,8 +273,8 @@ def _check_classes(by_class: Mapping[str, object], class_names: Sequence[str], f
 
 def _follow(
     tracker: Tracker, table: DetectionTable, config: TrackConfig, progress: Callable[[float, float], None] | None
-) -> tuple[Recorder, IntArray, int]:
-    """Frame after frame; between them, where there was no look for long, blind ones."""
+) -> tuple[Recorder, IntArray, int, list[str]]:
+    """Frame after frame; between them, where there was no look for long, blind ones. With remarks on what was seen."""
     noise = table.covariance_m2
     if noise is not None:
         noise = np.where(np.isnan(noise), config.sigma_position_m**2 * np.eye(3), noise)
@@ -279,9 +285,14 @@ def _follow(
         n_gaps += 1
         events = _close_eyes(tracker, np.zeros(3), tracker.stamp_s, float(table.stamp_s[0]), min(step_s, gap_s))
         recorder.events.extend(events)
+    sees = None if config.range_m is None else find_field_of_view(table, config)
     p_real = None if table.score is None else p_real_of(table.score, config.score_midpoint, config.score_scale)
     for k, stamp_s in enumerate(table.stamp_s.tolist()):
         rows = slice(int(table.first[k]), int(table.first[k + 1]))
+        view = None
+        if config.range_m is not None and table.sensor_m is not None:
+            around = table.sensor_m[k], config.range_m, config.p_detect
+            view = View.ball(*around) if sees is None else sees.view(k, *around)
         found[rows], events = tracker.step(
             stamp_s,
             table.position_m[rows],
@@ -290,7 +301,7 @@ def _follow(
             p_real=None if p_real is None else p_real[rows],
             covariance_m2=None if noise is None else noise[rows],
             appearance=None if table.appearance is None else table.appearance[rows],
-            view=_view(table, config, k),
+            view=view,
         )
         recorder.add(tracker.followed(), events)
         if k + 1 < table.n_frames and table.stamp_s[k + 1] - stamp_s > gap_s:
@@ -300,17 +311,7 @@ def _follow(
             recorder.events.extend(_close_eyes(tracker, centre_m, stamp_s, until_s, min(step_s, gap_s)))
         if progress and k % 100 == 99:
             progress(k + 1, table.n_frames)
-    return recorder, found, n_gaps
-
-
-def _view(table: DetectionTable, config: TrackConfig, k: int) -> View | None:
-    """Return the view of frame `k`, if known: a ball around the sensor, or a sector of it."""
-    if config.range_m is None or table.sensor_m is None:
-        return None
-    if config.fov_deg is None or table.sensor_yaw_rad is None:
-        return View.ball(table.sensor_m[k], config.range_m, config.p_detect)
-    yaw_rad, fov_rad = float(table.sensor_yaw_rad[k]), float(np.radians(config.fov_deg))
-    return View.sector(table.sensor_m[k], config.range_m, config.p_detect, yaw_rad, fov_rad)
+    return recorder, found, n_gaps, [sees.remark] if sees is not None and sees.remark else []
 
 
 def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s: float, step_s: float) -> list[Event]:
@@ -354,6 +355,23 @@ def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -
         what = f"{counted(unknown, 'spell')} whose beginning has no bound"
         remarks.append(f"{what}, since the place was not observed before: in spells.csv, not in lifetimes.csv")
     return remarks
+
+
+def _returned(spells: StaticSpells, within_m: float) -> list[str]:
+    """Say so where most stays that ended are followed by another object of that class in that place.
+
+    Such an object has not left: it was missed because it was not looked at.
+    """
+    ended = np.flatnonzero(np.isfinite(spells.gone_s))
+    again = 0
+    for k in ended:
+        near = np.linalg.norm(spells.position_m - spells.position_m[k], axis=1) < within_m
+        new = (spells.track_id != spells.track_id[k]) & (spells.class_id == spells.class_id[k])
+        again += bool((near & new & (spells.first_s >= spells.last_s[k])).any())
+    if again < FEW or again <= 0.5 * len(ended):
+        return []
+    what = f"{again} of {counted(len(ended), 'object')} that left were followed by the like in the very place"
+    return [f"{what}: misses come together; state what the sensor sees (`range_m`, `fov_deg`, poses)"]
 
 
 def warm_up() -> None:

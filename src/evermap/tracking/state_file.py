@@ -1,4 +1,4 @@
-"""A tracker's state as a file: arrays by part and name, in NumPy's .npz, and the choices they were made with as JSON."""
+"""A tracker's state as a file: arrays by part and name, in NumPy's .npz, and the choices of the tracker as JSON."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from evermap.errors import InputError
 from evermap.io.files import write_atomic
 
 VERSION = 1
+"""Of the format; a file of another is refused."""
 ABOUT = "about"
 
 Parts = Mapping[str, Mapping[str, NDArray[Any]]]

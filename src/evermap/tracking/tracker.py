@@ -134,7 +134,7 @@ class Tracker(Shown):
         self._tables(ROOM)
 
     def save(self, path: str | Path) -> Path:
-        """Write all that the tracker knows: what is followed, what rests out of view, spells that have ended, and views.
+        """Write all that the tracker knows: what is followed, what rests out of view, spells that have ended, views.
 
         Views other than balls and sectors are left out: what they saw empty is not known to a tracker that goes on.
 
@@ -179,8 +179,9 @@ class Tracker(Shown):
 
         Args:
             path: of `save`.
-            settings, confusion, priors: others than those saved; as they were where None, and of classes that were not
-                known: equal mistakes, and a lifetime that knows nothing.
+            settings: others than those saved; as they were where None.
+            confusion: the same; equal mistakes where there are new classes.
+            priors: the same; lifetimes that know nothing of new classes.
             class_names: all names that were saved, in any order, and new ones. An object is of a class that was not
                 known as likely as of the least likely of those that were.
 
@@ -230,8 +231,8 @@ class Tracker(Shown):
         self._n, self._next_id = n, about["next_id"]
         self._stamp_s = -np.inf if about["stamp_s"] is None else about["stamp_s"]
         stored, spells = parts["working_set"], parts["spells"]
-        self.working_set.restore(stored | {"class_id": into[stored["class_id"]]})
-        self._spells.restore(spells | {"class_id": into[spells["class_id"]]})
+        self.working_set.restore({**stored, "class_id": into[stored["class_id"]]})
+        self._spells.restore({**spells, "class_id": into[spells["class_id"]]})
         self._views.restore(parts["views"])
 
     @property
@@ -539,7 +540,7 @@ _SETTINGS = frozenset(TrackerConfig.model_fields)
 
 
 def _among(class_p: FloatArray, into: IntArray, n_classes: int) -> FloatArray:
-    """(N, n_classes) the same beliefs of classes that now have the numbers `into`, and of others (see `Tracker.load`)."""
+    """(N, n_classes) the same beliefs of classes that now have the numbers `into`, and of new ones (`Tracker.load`)."""
     least = class_p.min(axis=1, initial=1.0)
     out = np.repeat(least[:, None], n_classes, axis=1)
     out[:, into] = class_p

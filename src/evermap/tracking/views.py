@@ -24,14 +24,14 @@ class View:
         centre_m: (3,) where the sensor is, in the world.
         reach_m: beyond this distance nothing is detected.
         p_detect: for positions (N, 3) in the world, (N,) probabilities to detect an object there.
-        sector_of: probability, heading [rad] and angle [rad] of a sector, an angle of 2 pi of a ball; None for any other
-            view, which is not saved with a tracker.
+        sector_of: probability, heading, angle and angle beside it [rad] of a sector; of a ball an angle of 2 pi; None
+            for any other view, which is not saved with a tracker.
     """
 
     centre_m: FloatArray
     reach_m: float
     p_detect: Callable[[FloatArray], FloatArray]
-    sector_of: tuple[float, float, float] | None = None
+    sector_of: tuple[float, float, float, float] | None = None
 
     @classmethod
     def of(cls, model: DetectionModel, pose_world_sensor: FloatArray, reach_m: float) -> Self:
@@ -46,19 +46,31 @@ class View:
         def within(position_m: FloatArray) -> FloatArray:
             return np.where(np.linalg.norm(position_m - centre_m, axis=1) <= reach_m, p_detect, 0.0)
 
-        return cls(centre_m, reach_m, within, (p_detect, 0.0, 2.0 * np.pi))
+        return cls(centre_m, reach_m, within, (p_detect, 0.0, 2.0 * np.pi, 0.0))
 
     @classmethod
-    def sector(cls, centre_m: FloatArray, reach_m: float, p_detect: float, yaw_rad: float, fov_rad: float) -> Self:
-        """Return such a view of a sensor that looks along `yaw_rad` and sees the angle `fov_rad`, at any height."""
+    def sector(
+        cls,
+        centre_m: FloatArray,
+        reach_m: float,
+        p_detect: float,
+        yaw_rad: float,
+        fov_rad: float,
+        beside_rad: float = 0.0,
+    ) -> Self:
+        """Return such a view of a sensor that looks along `yaw_rad` and sees the angle `fov_rad`, at any height.
+
+        Over an angle of `beside_rad` on either side the probability falls to none, where heading or angle aren't known.
+        """
 
         def within(position_m: FloatArray) -> FloatArray:
             off = position_m - centre_m
             turn = np.remainder(np.arctan2(off[:, 1], off[:, 0]) - yaw_rad + np.pi, 2.0 * np.pi) - np.pi
-            inside = (np.linalg.norm(off, axis=1) <= reach_m) & (np.abs(turn) <= 0.5 * fov_rad)
-            return np.where(inside, p_detect, 0.0)
+            beyond = np.abs(turn) - 0.5 * fov_rad
+            share = np.where(beyond <= 0.0, 1.0, np.clip(1.0 - beyond / max(beside_rad, 1e-12), 0.0, 1.0))
+            return np.where(np.linalg.norm(off, axis=1) <= reach_m, p_detect * share, 0.0)
 
-        return cls(centre_m, reach_m, within, (p_detect, yaw_rad, fov_rad))
+        return cls(centre_m, reach_m, within, (p_detect, yaw_rad, fov_rad, beside_rad))
 
     def probability(self, position_m: FloatArray) -> FloatArray:
         """Return (N,) `p_detect`, or raise an InputError unless that is one probability a position."""
@@ -145,7 +157,7 @@ class ViewMemory:
             for name, views in (("recent", self._recent), ("kept", kept), ("last", [self._last] if self._last else []))
         }
         numbers = np.array([self._n_in_burst, self._chunk_m, self._reach_m], dtype=np.float64)
-        return {name: np.array(of, dtype=np.float64).reshape(-1, 8) for name, of in rows.items()} | {"numbers": numbers}
+        return {name: np.array(of, dtype=np.float64).reshape(-1, 9) for name, of in rows.items()} | {"numbers": numbers}
 
     def restore(self, columns: Mapping[str, FloatArray]) -> None:
         """Take over the views that `columns` gave."""
@@ -175,8 +187,8 @@ class ViewMemory:
 
 def _view_of(row: FloatArray) -> tuple[float, View]:
     """Stamp and view of a row of `ViewMemory.columns`."""
-    stamp_s, x, y, z, reach_m, p_detect, yaw_rad, fov_rad = row.tolist()
+    stamp_s, x, y, z, reach_m, p_detect, *angles = row.tolist()
     centre_m = np.array([x, y, z])
-    if fov_rad == 2.0 * np.pi:
+    if angles[1] == 2.0 * np.pi:
         return stamp_s, View.ball(centre_m, reach_m, p_detect)
-    return stamp_s, View.sector(centre_m, reach_m, p_detect, yaw_rad, fov_rad)
+    return stamp_s, View.sector(centre_m, reach_m, p_detect, *angles)
