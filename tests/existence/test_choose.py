@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import ConfigError, DataError
+from evermap.existence import models
 from evermap.existence.models import KINDS, choose
 from evermap.existence.protocol import Looks
 
@@ -66,3 +67,18 @@ def test_refusals() -> None:
     nothing = np.zeros(0)
     with pytest.raises(DataError, match="no look"):
         choose(Looks(np.zeros(2, dtype=np.int64), nothing, nothing, nothing, nothing))
+
+
+@pytest.mark.parametrize(("gap_d", "rhythm"), [(1.0, True), (20.0, False)])
+def test_visits_weeks_apart_show_no_hours(gap_d: float, rhythm: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is held out that would decide nothing, and no habit of the week is looked for between visits of weeks."""
+    monkeypatch.setattr(models, "KINDS", dict.fromkeys(KINDS, KINDS["two-state"]))
+    n_features, n = 40, 30
+    rng = np.random.default_rng(5)
+    stamp_s = 86400.0 * gap_d * np.arange(n) + np.zeros((n_features, 1))
+    feature = np.repeat(np.arange(n_features), n)
+    looks = Looks.from_rows(feature, stamp_s.ravel(), rng.integers(0, 2, n_features * n), P_ERROR, P_ERROR)
+    choice = choose(looks)
+    assert ("run-length-rhythm" in choice.scores) == rhythm
+    span_s = float(np.ptp(looks.stamp_s))
+    assert choice.held_out_s == pytest.approx(7.0 * 86400.0 if rhythm else 0.2 * span_s)

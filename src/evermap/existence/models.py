@@ -20,7 +20,7 @@ import numpy as np
 from evermap.errors import ConfigError, DataError, EvermapError, InputError, suggestion
 from evermap.existence.lifetimes import Lifetimes
 from evermap.existence.protocol import Looks, PresenceModel
-from evermap.existence.rhythm import WEEK_S
+from evermap.existence.rhythm import DAY_S, WEEK_S
 from evermap.io.files import write_atomic
 from evermap.show import Shown
 from evermap.survival import never_leaves
@@ -31,6 +31,10 @@ Progress = Callable[[float], None]
 HELD_OUT_PART = 0.2
 WEEKS_FOR_A_RHYTHM = 2.0
 WEEKS_TO_HOLD_OUT_ONE = 4.0
+LOOKS_TO_HOLD_OUT = 100
+"""A week with fewer looks says nothing about which kind predicts them."""
+GAP_FOR_A_RHYTHM_S = 1.5 * DAY_S
+"""Looks farther apart (in the median) than a day or so don't show at what hour anything came or left."""
 
 
 def _learned(looks: Looks, *, module: str, **settings: Any) -> PresenceModel:
@@ -67,8 +71,8 @@ class Choice(Shown):
 def choose(looks: Looks, kinds: Sequence[str] | None = None, *, progress: Progress | None = None) -> Choice:
     """Learn the kind of model that predicts the last part of the looks best.
 
-    The last week is held out where there are four or more, else the last fifth. Rhythms are considered from two weeks
-    on.
+    The last week is held out where there are four or more and a hundred looks in it, else the last fifth of the time.
+    Rhythms are considered from two weeks on, where looks at a feature are not much more than a day apart.
 
     Args:
         looks: uncertain looks; no truth.
@@ -86,11 +90,13 @@ def choose(looks: Looks, kinds: Sequence[str] | None = None, *, progress: Progre
     for name in names:
         if name not in KINDS:
             raise ConfigError(f"unknown kind of model '{name}'", field="kind", hint=f"one of {', '.join(KINDS)}")
-    if kinds is None and last - first < WEEKS_FOR_A_RHYTHM * WEEK_S:
+    if kinds is None and not _may_show_rhythm(looks, last - first):
         names = [name for name in names if "rhythm" not in name]
     if len(names) == 1:
         return Choice(names[0], KINDS[names[0]](looks), {}, 0.0)
-    held_out = WEEK_S if last - first >= WEEKS_TO_HOLD_OUT_ONE * WEEK_S else HELD_OUT_PART * (last - first)
+    held_out = HELD_OUT_PART * (last - first)
+    if last - first >= WEEKS_TO_HOLD_OUT_ONE * WEEK_S and (looks.stamp_s >= last - WEEK_S).sum() >= LOOKS_TO_HOLD_OUT:
+        held_out = WEEK_S
     before = looks.taken(looks.stamp_s < last - held_out)
     tell = progress or (lambda _: None)
     scores: dict[str, float] = {}
@@ -102,6 +108,11 @@ def choose(looks: Looks, kinds: Sequence[str] | None = None, *, progress: Progre
     choice = Choice(best, KINDS[best](looks), scores, held_out)
     tell(1.0)
     return choice
+
+
+def _may_show_rhythm(looks: Looks, span_s: float) -> bool:
+    """Whether the times of the looks let a rhythm of the week be known."""
+    return span_s >= WEEKS_FOR_A_RHYTHM * WEEK_S and looks.median_gap_s() <= GAP_FOR_A_RHYTHM_S
 
 
 SCHEMA_VERSION = 1
