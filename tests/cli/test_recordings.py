@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
+from evermap.geometry import se3
 from evermap.io import read_recording
 from evermap_studies.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, looked_at, simulate_building
 
@@ -66,6 +67,34 @@ def test_force_writes_again_and_keeps_what_it_did_not_write(building: Path, tmp_
     assert run("simulate", tmp_path / "out", *SIMULATION).exit_code == 2
     assert run("simulate", tmp_path / "out", *SIMULATION, "--force").exit_code == 0
     assert files(tmp_path / "out") == files(building) | {"notes.txt": b"mine"}
+
+
+def test_a_street_is_written_with_who_stood_where(tmp_path: Path) -> None:
+    out = tmp_path / "street"
+    result = run("simulate", "street", out, "--days", "2", "--sessions-per-day", "2", "--seed", "5", "--json")
+    assert result.exit_code == 0, result.stderr
+    names = json.loads(result.stdout)["sessions"]
+    assert names == ["day00_session00", "day00_session01", "day01_session00", "day01_session01"]
+    with (out / "stays_truth.csv").open(encoding="utf-8", newline="") as file:
+        stays = list(csv.DictReader(file))
+    spans = np.array([[float(stay["from_s"]), float(stay["until_s"])] for stay in stays])
+    places = np.array([[float(stay["x_m"]), float(stay["y_m"])] for stay in stays])
+    one_of_each = {stay["slot"] for stay in stays}
+    for slot in one_of_each:  # one at a time, in turn
+        mine = spans[[stay["slot"] == slot for stay in stays]]
+        assert (mine[1:, 0] >= mine[:-1, 1]).all()
+    for name in names:
+        recording = read_recording(out / name)
+        assert recording.truth is not None
+        assert recording.class_names == ("Car", "Van")
+        np.testing.assert_array_equal(recording.truth.stamp_s, recording.frames.stamp_s)
+        pose = recording.truth.pose_world_robot[recording.detections.frame]
+        at = se3.transform(pose, recording.detections.position_sensor_m)[:, :2]
+        there = (spans[:, 0] <= recording.frames.stamp_s[0]) & (spans[:, 1] > recording.frames.stamp_s[-1])
+        off = np.linalg.norm(at[:, None] - places[None, there], axis=2).min(axis=0)
+        assert off.max() < 0.6  # whoever stands there is seen where it stands
+    assert run("simulate", "street", tmp_path / "no", "--doors").exit_code == 2
+    assert run("simulate", "stret", tmp_path / "no").exit_code == 2
 
 
 @pytest.mark.parametrize("table_format", ["csv", "parquet"])

@@ -1,4 +1,4 @@
-"""`evermap simulate`: recordings of a building in which things come and go, with the whole truth beside them."""
+"""`evermap simulate`: recordings of worlds in which things come and go, with the whole truth beside them."""
 
 from __future__ import annotations
 
@@ -10,16 +10,30 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evermap.cli.terminal import print_json, say
+from evermap.errors import ConfigError, suggestion
 
 if TYPE_CHECKING:
     from evermap_studies.sim import BuildingSimulation
 
+BUILDING, STREET = WORLDS = ("building", "street")
+OF_BUILDINGS = ("patrol_s", "change_rate", "doors", "wing_opens_day", "clutter")
+"""Options that a street does not have."""
+STAYS_FILE = "stays_truth.csv"
 EVENTS_FILE = "changes_truth.jsonl"
 LOOKS_FILE = "looks_truth.csv"
 
 
 def simulate(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write; one folder a session is made in it.")],
+    context: typer.Context,
+    world: Annotated[
+        str, typer.Argument(metavar="WORLD", help="building or street; a folder alone is for a building.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[OUT]", help="Folder to write; one folder a session is made in it.", show_default="./WORLD"
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same recordings.")] = 0,
     days: Annotated[int, typer.Option(min=1, help="Days that the patrols span.")] = 6,
     sessions_per_day: Annotated[int, typer.Option(min=1, help="Patrols a day.")] = 1,
@@ -46,18 +60,37 @@ def simulate(
         typer.Option("--force", help="Write into OUT even if it is not empty; other files stay."),
     ] = False,
 ) -> None:
-    """Record patrols of a simulated building.
+    """Record drives in a simulated building or street.
 
     Every session is a folder in the native format with its true trajectory and landmarks. What changed and when is in
     changes_truth.jsonl; where each landmark stood in every session, and whether the robot really looked there, in
     looks_truth.csv.
 
+    A street has cars and vans that park and leave, some of them in view, and cars that drive along, seen as boxes
+    without identity in space; stays_truth.csv has who stood where, from when until when.
+
     \b
     Example:
       evermap simulate building --days 3 --seed 1
       evermap slam building/day00_session00
-      evermap simulate hard --patrol-s 20 --patrol-s 60 --patrol-s 165 --doors --wing-opens-day 3 --clutter
+      evermap simulate building out/hard --patrol-s 20 --patrol-s 60 --doors --wing-opens-day 3 --clutter
+      evermap simulate street --days 3
     """
+    if world not in WORLDS and out is not None:
+        raise ConfigError(f"no world '{world}'", field="world", hint=suggestion(world, WORLDS))
+    where = out or Path(world)
+    if world == STREET:
+        for name in OF_BUILDINGS:
+            source = context.get_parameter_source(name)
+            if source is not None and source.name == "COMMANDLINE":
+                raise ConfigError("is for buildings", field=f"--{name.replace('_', '-')}", hint="not for a street")
+        names = _write_street(where, days, sessions_per_day, seed, force=force)
+        if as_json:
+            print_json({"out": str(where), "sessions": names, "seed": seed})
+        else:
+            say(f"wrote {len(names)} sessions to {where}; next: evermap slam {where / names[0]} --map street.map")
+        return
+    out = where
     from evermap.io import write_native
     from evermap.runs.folder import RunFolder
     from evermap_studies.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, simulate_building
@@ -87,6 +120,28 @@ def simulate(
             f"wrote {len(names)} sessions and {len(building.events)} changes to {out}; "
             f"next: evermap slam {out / names[0]}"
         )
+
+
+def _write_street(out: Path, days: int, drives_per_day: int, seed: int, *, force: bool) -> list[str]:
+    """Write the drives along a street and who stood where; return their names."""
+    from evermap.io import write_native
+    from evermap.io.files import write_atomic
+    from evermap.runs.folder import RunFolder
+    from evermap_studies.worlds.parking import StreetConfig, simulate_street
+
+    folder = RunFolder(out, force=force, renew=False)
+    config = StreetConfig(days=days, drives_per_day=drives_per_day)
+    street, drives = simulate_street(config, seed)
+    names = [f"day{k // drives_per_day:02d}_session{k % drives_per_day:02d}" for k in range(len(drives))]
+    lines = ["slot,class_id,x_m,y_m,yaw_rad,length_m,width_m,height_m,from_s,until_s\n"]
+    for one in street.spells:
+        numbers = [*street.slot[one.slot].tolist(), *one.size_m, one.from_s, one.until_s]
+        lines.append(f"{one.slot},{street.class_names[one.class_id]},{','.join(map(repr, numbers))}\n")
+    with folder:
+        for name, recording in zip(names, drives, strict=True):
+            write_native(recording, folder.path(name))
+        write_atomic(folder.path(STAYS_FILE), "".join(lines))
+    return names
 
 
 def session_names(building: BuildingSimulation) -> list[str]:

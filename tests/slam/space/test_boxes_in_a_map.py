@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from parking import DAY_S, SPEED_MPS, STEP_S, Faults, Parking, Spell
 from typer.testing import CliRunner
 
 from evermap.cli.main import app
@@ -22,6 +21,7 @@ from evermap.maps.store import open_store
 from evermap.pipeline import run_session
 from evermap.runs.sessions import enter_session
 from evermap.types import ChangeKind, IntArray, MapChange, SpatialRecording
+from evermap_studies.worlds.parking import DAY_S, SPEED_MPS, STEP_S, Faults, Parking, Spell
 
 COMES = (ChangeKind.APPEARED, ChangeKind.RETURNED)
 PARTS = ((0.0, 1.0), (0.2, 1.0), (0.0, 0.85))

@@ -1,12 +1,15 @@
-"""A made street over days: cars that park and leave, some while the robot drives by; all boxes without identity."""
+"""A street over days: cars that park and leave, some while the robot drives by; all boxes without identity."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from evermap.errors import ConfigError
 from evermap.geometry import se3
+from evermap.survival import Exponential, LifetimePrior, LogNormal
 from evermap.types import (
     UNKNOWN,
     BoolArray,
@@ -17,11 +20,17 @@ from evermap.types import (
     SpatialOdometry,
     SpatialRecording,
     SpatialSensor,
+    Trajectory,
 )
 
 STEP_S, SPEED_MPS, REACH_M, DAY_S = 0.1, 8.0, 45.0, 86_400.0
-SIZES_M, SIZE_SPREAD_M = (4.2, 1.7, 1.5), (0.4, 0.08, 0.1)
+CAR, VAN = "Car", "Van"
+SIZES_M = {CAR: (4.2, 1.7, 1.5), VAN: (5.4, 2.0, 2.3)}
+SIZE_SPREAD_M = (0.4, 0.08, 0.1)
 LEAVING_MPS2 = 1.5
+STAYS = LogNormal.from_half_life(36.0 * 3600.0, 1.0), Exponential.from_half_life(6.0 * 3600.0)
+"""Of cars, which stand for days, and of vans, which are gone in the evening."""
+EMPTY = Exponential.from_half_life(8.0 * 3600.0)
 
 
 class Spell(NamedTuple):
@@ -31,6 +40,7 @@ class Spell(NamedTuple):
     from_s: float
     until_s: float
     size_m: tuple[float, ...]
+    class_id: int = 0
 
 
 class Faults(NamedTuple):
@@ -63,14 +73,17 @@ USUAL = Faults()
 
 
 class Parking(NamedTuple):
-    """A street with slots (S, 3) along a path (N, 3), one point each step; and all spells."""
+    """A street with slots (S, 3) along a path (N, 3), one point each step; all spells, and names of classes."""
 
     path: FloatArray
     slot: FloatArray
     spells: list[Spell]
+    class_names: tuple[str, ...] = (CAR,)
 
     @classmethod
-    def of(cls, seed: int, *, n_slots: int = 36, metres: float = 320.0) -> Parking:
+    def of(
+        cls, seed: int, *, n_slots: int = 36, metres: float = 320.0, class_names: tuple[str, ...] = (CAR,)
+    ) -> Parking:
         """Return a street along an S, with no cars yet."""
         rng = np.random.default_rng(seed)
         n = round(metres / (SPEED_MPS * STEP_S))
@@ -86,12 +99,12 @@ class Parking(NamedTuple):
             slot.append(
                 np.column_stack([path[at, :2] + aside[:, None] * normal, heading[at] + rng.normal(0, 0.04, len(at))])
             )
-        return cls(path, np.concatenate(slot), [])
+        return cls(path, np.concatenate(slot), [], class_names)
 
-    def park(self, rng: np.random.Generator, slot: int, from_s: float, until_s: float) -> None:
+    def park(self, rng: np.random.Generator, slot: int, from_s: float, until_s: float, class_id: int = 0) -> None:
         """Let a car stand in a slot."""
-        size = rng.normal(SIZES_M, SIZE_SPREAD_M)
-        self.spells.append(Spell(slot, from_s, until_s, tuple(size.tolist())))
+        size = rng.normal(SIZES_M[self.class_names[class_id]], SIZE_SPREAD_M)
+        self.spells.append(Spell(slot, from_s, until_s, tuple(size.tolist()), class_id))
 
     def standing(self, stamp_s: float) -> set[int]:
         """Return the slots that are taken."""
@@ -124,8 +137,8 @@ class Parking(NamedTuple):
         path = path[::-1] + [0.0, 0.0, np.pi] if back else path
         stamp_s = start_s + np.arange(len(path)) * STEP_S
         pose = upright(path)
-        boxes, size, errors = self._around(rng, path, stamp_s, moving, faults)
-        detections = _seen(rng, pose, boxes, size, errors, faults)
+        boxes, size, errors, class_id = self._around(rng, path, stamp_s, moving, faults)
+        detections = _seen(rng, pose, boxes, size, class_id, errors, faults)
         odometry = _drifted(rng, pose, faults)
         odometry = se3.compose(se3.inverse(odometry[0]), odometry) if origin is None else se3.compose(origin, odometry)
         return SpatialRecording(
@@ -134,13 +147,14 @@ class Parking(NamedTuple):
             Frames(stamp_s),
             detections,
             (SpatialSensor(),),
-            class_names=("Car",),
+            Trajectory(stamp_s, pose, np.zeros((len(pose), 6, 6)), frame="truth"),
+            class_names=self.class_names,
         )
 
     def _around(
         self, rng: np.random.Generator, path: FloatArray, stamp_s: FloatArray, moving: int, faults: Faults
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Boxes (C, F, 3) with sizes (C, 3) and errors (C, 3) that last; nan where they are not there."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+        """Boxes (C, F, 3), nan where they are not there, sizes (C, 3), errors (C, 3) that last, and classes (C,)."""
         found, sizes = [], []
         for one in self.spells:
             place = self.slot[one.slot]
@@ -160,9 +174,11 @@ class Parking(NamedTuple):
             way[there, :2] = path[at[there], :2] + (0.5 if by > 0 else 2.5) * normal[at[there]]
             way[there, 2] = path[at[there], 2] + (0.0 if by > 0 else np.pi)
             found.append(way)
-            sizes.append(tuple(rng.normal(SIZES_M, SIZE_SPREAD_M).tolist()))
+            sizes.append(tuple(rng.normal(SIZES_M[CAR], SIZE_SPREAD_M).tolist()))
+        class_id = np.zeros(len(found), dtype=np.int64)
+        class_id[: len(self.spells)] = [one.class_id for one in self.spells]
         errors = rng.normal(0.0, faults.lasting_m, (len(found), 3))
-        return np.array(found).reshape(-1, len(path), 3), np.array(sizes).reshape(-1, 3), errors
+        return np.array(found).reshape(-1, len(path), 3), np.array(sizes).reshape(-1, 3), errors, class_id
 
 
 def upright(place: FloatArray) -> FloatArray:
@@ -192,7 +208,13 @@ def _shaded(local: FloatArray, seen: BoolArray) -> BoolArray:
 
 
 def _seen(
-    rng: np.random.Generator, pose: FloatArray, boxes: FloatArray, size: FloatArray, errors: FloatArray, faults: Faults
+    rng: np.random.Generator,
+    pose: FloatArray,
+    boxes: FloatArray,
+    size: FloatArray,
+    class_id: IntArray,
+    errors: FloatArray,
+    faults: Faults,
 ) -> SpatialDetections:
     """What is in view, and wrong boxes."""
     with np.errstate(invalid="ignore"):
@@ -213,12 +235,15 @@ def _seen(
     at[turned] = se3.compose(at[turned], upright(np.array([0.0, 0.0, np.pi])))
     at = np.vstack([at, upright(np.column_stack([strange[:, :2], rng.uniform(-3, 3, len(wrong))]))])
     frame = np.concatenate([frame, wrong])
-    sizes = np.vstack([sizes, np.tile(SIZES_M, (len(wrong), 1))])
+    sizes = np.vstack([sizes, np.tile(SIZES_M[CAR], (len(wrong), 1))])
+    classes = np.concatenate([class_id[of], np.zeros(len(wrong), dtype=np.int64)])
     score = np.concatenate([rng.normal(8.0, 1.0, len(of)), rng.normal(2.0, 1.5, len(wrong))])
-    return _table(np.argsort(frame, kind="stable"), frame, at, sizes, score)
+    return _table(np.argsort(frame, kind="stable"), frame, at, sizes, classes, score)
 
 
-def _table(order: IntArray, frame: IntArray, at: FloatArray, size: FloatArray, score: FloatArray) -> SpatialDetections:
+def _table(
+    order: IntArray, frame: IntArray, at: FloatArray, size: FloatArray, class_id: IntArray, score: FloatArray
+) -> SpatialDetections:
     count = len(order)
     unsaid = np.full(count, np.nan)
     return SpatialDetections(
@@ -232,7 +257,76 @@ def _table(order: IntArray, frame: IntArray, at: FloatArray, size: FloatArray, s
         corner_px=np.full((count, 4, 2), np.nan),
         tag_size_m=unsaid,
         size_m=size[order],
-        class_id=np.zeros(count, dtype=np.int64),
+        class_id=class_id[order],
         score=score[order],
         source_line=2 + np.arange(count),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class StreetConfig:
+    """How cars come and go, and when the robot drives by.
+
+    Attributes:
+        days: of drives.
+        drives_per_day: at even times from eight in the morning to eight in the evening.
+        n_slots: places to park, on both sides.
+        van_share: share of vans among those that park.
+        stays: how long cars and vans park.
+        empty: how long a slot is empty.
+        moving: cars that drive along in each drive.
+        faults: of odometry and detector.
+    """
+
+    days: int = 3
+    drives_per_day: int = 1
+    n_slots: int = 36
+    van_share: float = 0.3
+    stays: tuple[LifetimePrior, LifetimePrior] = STAYS
+    empty: LifetimePrior = EMPTY
+    moving: int = 3
+    faults: Faults = USUAL
+
+    def __post_init__(self) -> None:
+        for name, least in (("days", 1), ("drives_per_day", 1), ("n_slots", 2), ("moving", 0)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"must be at least {least}, not {getattr(self, name)}", field=name)
+        if not 0.0 <= self.van_share <= 1.0:
+            raise ConfigError(f"must lie in [0, 1], not {self.van_share}", field="van_share")
+
+    def starts_s(self) -> list[float]:
+        """Return when each drive begins, in seconds from midnight before the first."""
+        hours = np.linspace(8.0, 20.0, self.drives_per_day + 1)[:-1] + 6.0 / self.drives_per_day
+        return [day * DAY_S + hour * 3600.0 for day in range(self.days) for hour in hours.tolist()]
+
+
+class StreetRun(NamedTuple):
+    """A street with all its spells, and the drives along it, in order of time."""
+
+    street: Parking
+    drives: list[SpatialRecording]
+
+
+def simulate_street(config: StreetConfig | None = None, seed: int = 0) -> StreetRun:
+    """Return drives along a street on which cars and vans come and go; the same seed gives the same street.
+
+    Slots are full and empty in turn, from a week before the first drive on, so that ages are what they are in the long
+    run. Where a car leaves or comes during a drive, it is seen to do so.
+    """
+    config = config or StreetConfig()
+    rng = np.random.default_rng(seed)
+    street = Parking.of(seed, n_slots=config.n_slots, class_names=(CAR, VAN))
+    end_s = config.days * DAY_S
+    for slot in range(len(street.slot)):
+        now_s = -7.0 * DAY_S - float(config.empty.quantile(rng.random()))
+        while now_s < end_s:
+            now_s += float(config.empty.quantile(rng.random()))
+            class_id = int(rng.random() < config.van_share)
+            until_s = now_s + float(config.stays[class_id].quantile(rng.random()))
+            street.park(rng, slot, now_s, until_s, class_id)
+            now_s = until_s
+    drives = [
+        street.drive(1000 * seed + k, start_s, faults=config.faults, moving=config.moving)
+        for k, start_s in enumerate(config.starts_s())
+    ]
+    return StreetRun(street, drives)
