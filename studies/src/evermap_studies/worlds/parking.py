@@ -16,6 +16,7 @@ from evermap.types import (
     FloatArray,
     Frames,
     IntArray,
+    Recording,
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
@@ -135,19 +136,19 @@ class Parking(NamedTuple):
         n = len(self.path)
         path = self.path[int(part[0] * n) : int(part[1] * n)]
         path = path[::-1] + [0.0, 0.0, np.pi] if back else path
-        stamp_s = start_s + np.arange(len(path)) * STEP_S
+        stamp_s = start_s + np.arange(len(path), dtype=np.float64) * STEP_S
         pose = upright(path)
         boxes, size, errors, class_id = self._around(rng, path, stamp_s, moving, faults)
         detections = _seen(rng, pose, boxes, size, class_id, errors, faults)
         odometry = _drifted(rng, pose, faults)
         odometry = se3.compose(se3.inverse(odometry[0]), odometry) if origin is None else se3.compose(origin, odometry)
-        return SpatialRecording(
-            f"drive {start_s:.0f}",
-            SpatialOdometry(stamp_s, odometry, np.full((len(stamp_s), 6), np.nan)),
-            Frames(stamp_s),
-            detections,
-            (SpatialSensor(),),
-            Trajectory(stamp_s, pose, np.zeros((len(pose), 6, 6)), frame="truth"),
+        return Recording(
+            name=f"drive {start_s:.0f}",
+            odometry=SpatialOdometry(stamp_s, odometry, np.full((len(stamp_s), 6), np.nan)),
+            frames=Frames(stamp_s),
+            detections=detections,
+            sensors=(SpatialSensor(),),
+            truth=Trajectory(stamp_s, pose, np.zeros((len(pose), 6, 6)), frame="truth"),
             class_names=self.class_names,
         )
 
