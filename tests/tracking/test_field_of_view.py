@@ -88,6 +88,20 @@ def test_what_is_taken_away_is_gone_once_it_is_looked_at(yaw: bool) -> None:
     np.testing.assert_allclose(ended.position_m, RING[4:5], atol=0.05)
 
 
+def test_a_camera_that_looks_aside_sees_what_is_there() -> None:
+    """Its x axis is the robot's: it looks to the left of that."""
+    table = replace(table_of(RING, TURNING, np.radians(80.0), yaw=True, taken=4), sensor_yaw_rad=TURNING - 0.5 * np.pi)
+    result = run_track(table, CONFIG)
+    assert len(result.first_rows()) == len(RING)
+    assert died(result) == 1
+
+
+@pytest.mark.parametrize(("fov_deg", "narrow"), [(200.0, True), (260.0, False)])
+def test_a_view_of_more_than_half_a_turn_is_one_up_to_what_is_stated(fov_deg: float, narrow: bool) -> None:
+    sees = find_field_of_view(table_of(RING, TURNING, np.radians(fov_deg), yaw=False), CONFIG)
+    assert (sees is not None) == narrow
+
+
 def test_a_sensor_that_sees_all_around_has_its_misses() -> None:
     """Nothing is taken for a view that is narrow; an object that goes is gone at once."""
     table = table_of(RING, np.zeros(900), 2.0 * np.pi, yaw=False, taken=4)

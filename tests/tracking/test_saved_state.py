@@ -106,6 +106,11 @@ def test_the_file_is_the_state(yard: DetectionTable, tmp_path: Path) -> None:
 
 def test_a_new_class_is_as_likely_as_the_least_likely_known(tmp_path: Path) -> None:
     tracker = em.Tracker(n_classes=2, class_names=["cart", "pallet"], priors=[em_prior(1e-3), em_prior(1e-5)])
+    left_behind = np.array([[50.0, 0.0, 0.0]])
+    for k in range(60):
+        tracker.step(0.1 * k - 8.0, left_behind, np.array([0]))
+    for k in range(15):
+        tracker.step(0.1 * k - 1.9, np.zeros((0, 3)), view=View.ball(np.zeros(3), 1.0, 0.9))
     for k in range(4):
         tracker.step(0.1 * k, np.zeros((1, 3)), np.array([1]))
     before = tracker.followed().class_p[0]
@@ -114,6 +119,7 @@ def test_a_new_class_is_as_likely_as_the_least_likely_known(tmp_path: Path) -> N
     after = again.followed().class_p[0]
     np.testing.assert_allclose(after[[2, 0]] / after.sum(), before / (1.0 + before[0]), rtol=1e-12)
     assert after[1] == after[2]
+    assert again.working_set.class_p(again.working_set.rows)[0].argmax() == 2  # the cart that was left behind
     for k in range(4, 9):
         again.step(0.1 * k, np.zeros((1, 3)), np.array([1]))
     assert again.followed().class_p[0].argmax() == 1

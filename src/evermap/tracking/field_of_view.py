@@ -62,7 +62,7 @@ def find_field_of_view(table: DetectionTable, config: TrackConfig) -> FieldOfVie
         return None
     sectors = np.array([smallest_sector(bearing[a:b]) for a, b in zip(table.first[:-1], table.first[1:], strict=True)])
     widest = float(sectors[:, 1].max())
-    if widest > np.pi or _chance(sectors, counts, widest) > config.p_all_around:
+    if _chance(sectors, counts, widest) > config.p_all_around:
         return None
     fov = np.where(counts > 0, sectors[:, 1], 0.0)
     beside = np.where(counts > 0, np.maximum(widest - fov, 0.0), 0.0)
@@ -76,7 +76,7 @@ def find_field_of_view(table: DetectionTable, config: TrackConfig) -> FieldOfVie
 def _chance(sectors: FloatArray, counts: IntArray, widest_rad: float) -> float:
     """How often a sensor that sees all around has everything within `widest_rad`, whichever way it is.
 
-    Of m directions by chance `m (w / 2 pi)^(m - 1)` lie within an angle w up to half a turn; and what is seen one way
+    Of m directions by chance `m (w / 2 pi)^(m - 1)` at most lie within an angle w (exactly, up to half a turn); and what is seen one way
     knows nothing of what is seen another way.
     """
     way = np.floor(np.remainder(sectors[:, 0], 2.0 * np.pi) / (2.0 * np.pi) * N_WAYS).astype(np.int64) % N_WAYS
