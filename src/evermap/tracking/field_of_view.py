@@ -76,8 +76,8 @@ def find_field_of_view(table: DetectionTable, config: TrackConfig) -> FieldOfVie
 def _chance(sectors: FloatArray, counts: IntArray, widest_rad: float) -> float:
     """How often a sensor that sees all around has everything within `widest_rad`, whichever way it is.
 
-    Of m directions by chance `m (w / 2 pi)^(m - 1)` at most lie within an angle w (exactly, up to half a turn); and what is seen one way
-    knows nothing of what is seen another way.
+    Of m directions by chance `m (w / 2 pi)^(m - 1)` at most lie within an angle w (exactly, up to half a turn); and
+    what is seen one way knows nothing of what is seen another way.
     """
     way = np.floor(np.remainder(sectors[:, 0], 2.0 * np.pi) / (2.0 * np.pi) * N_WAYS).astype(np.int64) % N_WAYS
     chance = 1.0
