@@ -20,7 +20,7 @@ from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.causes import Inputs, Suspect, list_suspects, rows_of_kind
 from evermap.explain.evidence import LOG_2PI, ROOM_M, AnySession, Screen, evidence_at, optimum_of, used_rows
-from evermap.explain.linearise import change_by, gain_by, held_by_map
+from evermap.explain.linearise import change_by, cost_nearby, gain_by, held_by_map
 from evermap.explain.seeds import find_scales, find_shape, find_single_scales
 from evermap.explain.shape import FEWEST, compare_shapes
 from evermap.explain.symptoms import compare_odometry
@@ -569,10 +569,11 @@ def _screen_continuous(
     # what changes explain, a cause must explain, too
     with_changes = optimum_of(best.solution.session, best.solution.result.changes)
     deficit = evidence_at(with_changes) - evidence_at(screen.optimum)
+    cost = cost_nearby(session)
     for suspect in suspects:
         if not suspect.is_continuous:
             if not (suspect.pairs or suspect.of_map):
-                gain = gain_by(session, inputs, suspect) * screen.optimum.worth + suspect.log_p
+                gain = gain_by(session, cost, inputs, suspect) * screen.optimum.worth + suspect.log_p
                 found += [(gain, suspect, 0.0)] if gain > 0.0 else []
             continue
         if suspect.rows is None or of_all is None:

@@ -140,6 +140,7 @@ class SpatialSmoother:
         iterations: int = 20,
         tolerance: float = 1e-5,
         settled: float = SETTLED,
+        wanted: float = np.inf,
     ) -> tuple[SpatialEstimate, SpatialLinear]:
         """Run damped Gauss-Newton from `start`, until steps are small.
 
@@ -150,11 +151,12 @@ class SpatialSmoother:
             iterations: at most.
             tolerance: largest move (m or rad) that ends it.
             settled: what a step must gain [nats], or it was the last.
+            wanted: cost that is of use; see `Steps`.
 
         Raises:
             NumericalError: no finite optimum.
         """
-        steps = Steps(iterations, tolerance, settled, 0.0, COST_SLACK, FIRST_DAMPING)
+        steps = Steps(iterations, tolerance, settled, 0.0, COST_SLACK, FIRST_DAMPING, wanted)
         solution = exhausted(minimised(self.graph(noise, heavy=heavy), start, steps))
         return solution.state, SpatialLinear(solution.now, self, solution.factorised)
 
