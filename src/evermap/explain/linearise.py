@@ -15,7 +15,7 @@ from evermap.slam.estimate import Solved
 from evermap.slam.intake import prepare
 from evermap.slam.problem import Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.space.estimate import converged
+from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.intake import SpatialIntake, prepare_space
 from evermap.slam.space.problem import PlacePrior, SpatialProblem
 from evermap.slam.space.smoother import SpatialSmoother
@@ -27,6 +27,8 @@ STEP = 0.02
 
 FEW_STEPS = 6
 """Gauss-Newton steps of a first look at a discrete cause."""
+STEPS_NEARBY = 10
+"""Gauss-Newton steps to the optimum nearby under a continuous cause, at most."""
 
 
 def held_by_map(session: AnySession) -> AnySession:
@@ -153,12 +155,33 @@ def gain_by(session: AnySession, before: float, inputs: Inputs, suspect: Suspect
         if moved is None:
             return -np.inf
         smoother = SpatialSmoother(moved, solved.estimate.pose)
-        _, now = smoother.optimum(
-            solved.estimate, solved.noise, heavy=True, iterations=FEW_STEPS, wanted=before
-        )
+        _, now = smoother.optimum(solved.estimate, solved.noise, heavy=True, iterations=FEW_STEPS, wanted=before)
     except EvermapError:
         return -np.inf
     return float(before - now.cost)
+
+
+def solve_nearby(session: AnySession, inputs: Inputs, undone: Inputs) -> SpatialSession | None:
+    """Return a session in space with other inputs, at the same noise and near its values; None if that can't be asked.
+
+    Args:
+        session: the solution of the inputs.
+        inputs: of which it is the solution.
+        undone: other inputs of the same detections and poses.
+    """
+    if isinstance(session, Solved):
+        return None
+    solved = session.solved.optimum
+    try:
+        moved = _problem_of(session, inputs, undone)
+        if moved is None:
+            return None
+        smoother = SpatialSmoother(moved, solved.estimate.pose)
+        estimate, now = smoother.optimum(solved.estimate, solved.noise, heavy=False, iterations=STEPS_NEARBY)
+    except EvermapError:
+        return None
+    optimum = SpatialOptimum(estimate, solved.noise, smoother, now)
+    return SpatialSession(session.intake, replace(session.solved, optimum=optimum))
 
 
 def _with_measurements(problem: SpatialProblem, intake: SpatialIntake) -> SpatialProblem:

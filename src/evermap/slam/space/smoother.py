@@ -173,6 +173,26 @@ class SpatialSmoother:
         factorised = now.before if nearly and now.before is not None else self.factorised(now)
         return exhausted(factorised.spread(len(self.problem.increment)))
 
+    def find_nis(self, now: SpatialLinear, spread: Spread) -> FloatArray:
+        """Return (M,) NIS of all detections, each as if it had not been used, from residuals r and their leverage.
+
+        With H = J S J' of whitened Jacobians and the covariance S, and the weight w:
+        r' (1 - w H)^-1 (1 - w H + H)^-1 r.
+        """
+        problem, nis = self.problem, np.zeros(len(self.problem.kind))
+        first = spread.of_factors_first[len(problem.increment) :]
+        for kind in range(3):
+            some, rows = np.flatnonzero(problem.kind == kind), int(ROWS[kind])
+            if not len(some):
+                continue
+            at = first[some][:, None] + np.arange(rows * rows)
+            weight = np.maximum((now.weight * problem.share)[some], 1e-6)[:, None, None]
+            used = spread.of_factors[at].reshape(-1, rows, rows)
+            rest = (1.0 + 1e-9) * np.eye(rows) - used
+            r = now.residual[some, :rows, None]
+            nis[some] = (np.linalg.solve(rest, r) * np.linalg.solve(rest + used / weight, r)).sum(axis=(1, 2))
+        return np.maximum(nis, 0.0)
+
     def residual_of(self, now: Linear) -> FloatArray:
         """Return (M, 8) whitened residuals of detections, by the right sides of their factors."""
         seen, values = self._seen, now.values[self.structure.values_of(SIGHTINGS)]
