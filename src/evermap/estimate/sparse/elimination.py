@@ -22,6 +22,8 @@ TINY = 1e-12
 BLOCK = 4
 """Rows that are eliminated at once: as many as fit into registers beside what they change."""
 
+PRODUCT = 4
+"""Rows of a factor from which on its information is summed before it is written to where it belongs."""
 LARGE_FACTOR = 64
 """Rows of a factor from which on `eliminate_large` computes its information by BLAS, and `spread` nothing."""
 
@@ -61,6 +63,7 @@ class Elimination(NamedTuple):
         where, whose: where each of these begins, and the front that it is of.
         n_waiting: (1,) how many.
         front: room for the largest front and its right side.
+        product: the same for the information of a factor.
     """
 
     stored: FloatArray
@@ -70,6 +73,7 @@ class Elimination(NamedTuple):
     whose: IntArray
     n_waiting: IntArray
     front: FloatArray
+    product: FloatArray
 
     @classmethod
     def of(cls, tree: Tree) -> Elimination:
@@ -83,6 +87,7 @@ class Elimination(NamedTuple):
             np.empty(count, dtype=np.int64),
             np.zeros(1, dtype=np.int64),
             np.zeros((largest, largest + 1)),
+            np.empty((largest, largest + 1)),
         )
 
     def border(self, tree: Tree) -> FloatArray:
@@ -186,32 +191,78 @@ def _gather(
         if factors.rows[f] >= below:
             continue
         width = _of_factor(tree, factors, f, index)
-        begin = tree.value_first[f]
-        for _ in range(factors.rows[f]):
-            b = values[begin + width]
-            for a in range(width):
-                value, i = values[begin + a], index[a]
-                if value == 0.0:
-                    continue
-                front[i, size] += value * b
-                for c in range(a, width):
-                    j2 = index[c]
-                    if i <= j2:
-                        front[i, j2] += value * values[begin + c]
-                    else:
-                        front[j2, i] += value * values[begin + c]
-            begin += width + 1
+        if factors.rows[f] < PRODUCT:
+            _add_rows(values, tree.value_first[f], factors.rows[f], width, index, front, size)
+        else:
+            _add_product(values, tree.value_first[f], factors.rows[f], width, index, front, size, state.product)
     while n_waiting > 0 and tree.parent[whose[n_waiting - 1]] == node:
         n_waiting -= 1
         child = whose[n_waiting]
         left = _passed_on(tree, child, index)
-        at = where[n_waiting]
-        for i in range(left):
-            for j in range(i, left):
-                front[index[i], index[j]] += waiting[at + j]
-            front[index[i], size] += waiting[at + left]
-            at += left + 1
+        _add_passed_on(waiting, where[n_waiting], left, index, front, size)
     state.n_waiting[0] = n_waiting
+
+
+@kernel
+def _add_rows(values: FloatArray, begin: int, rows: int, width: int, index: Any, front: FloatArray, size: int) -> None:
+    """Add the information of a factor's rows to a front, in whose rows and columns `index` (width,) they belong.
+
+    Positions are unsigned here and below: of a signed one machine code asks each time whether it counts from the end.
+    """
+    at, count, one = np.uint64(begin), np.uint64(width), np.uint64(1)
+    for _ in range(rows):
+        for a in range(count):
+            value, i = values[at + a], np.uint64(index[a])
+            if value == 0.0:
+                continue
+            for c in range(a, count):
+                j = np.uint64(index[c])
+                front[min(i, j), max(i, j)] += value * values[at + c]
+            front[i, size] += value * values[at + count]
+        at += count + one
+
+
+@kernel
+def _add_product(
+    values: FloatArray, begin: int, rows: int, width: int, index: Any, front: FloatArray, size: int, product: FloatArray
+) -> None:
+    """Add the information of a factor to a front as `_add_rows` does, summed over its rows in `product` before."""
+    at, count, one = np.uint64(begin), np.uint64(width), np.uint64(1)
+    step = count + one
+    for a in range(count):
+        for c in range(a, step):
+            product[a, c] = 0.0
+    for _ in range(rows // 2):
+        below = at + step
+        for a in range(count):
+            x, y = values[at + a], values[below + a]
+            if x != 0.0 or y != 0.0:
+                for c in range(a, step):
+                    product[a, c] += x * values[at + c] + y * values[below + c]
+        at = below + step
+    if rows % 2:
+        for a in range(count):
+            x = values[at + a]
+            for c in range(a, step):
+                product[a, c] += x * values[at + c]
+    for a in range(count):
+        i = np.uint64(index[a])
+        for c in range(a, count):
+            j = np.uint64(index[c])
+            front[min(i, j), max(i, j)] += product[a, c]
+        front[i, size] += product[a, count]
+
+
+@kernel
+def _add_passed_on(waiting: FloatArray, begin: int, left: int, index: Any, front: FloatArray, size: int) -> None:
+    """Add what a child passes on to a front, in whose rows and columns `index` (left,) it belongs."""
+    at, count, one = np.uint64(begin), np.uint64(left), np.uint64(1)
+    for i in range(count):
+        to = np.uint64(index[i])
+        for j in range(i, count):
+            front[to, np.uint64(index[j])] += waiting[at + j]
+        front[to, size] += waiting[at + count]
+        at += count + one
 
 
 @kernel
@@ -219,22 +270,22 @@ def _store(tree: Tree, state: Elimination, node: int) -> None:
     """Keep the rows of an eliminated front, and what waits for its parent."""
     stored, right, waiting, where, front = state.stored, state.right, state.waiting, state.where, state.front
     size, own, n_waiting = tree.size[node], tree.own[node], state.n_waiting[0]
-    at = tree.stored[node]
-    for i in range(own):
-        for j in range(i, size):
-            stored[at + j] = front[i, j]
-        at += size
     for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
         v = tree.variable[k]
         for a in range(tree.dim[v]):
             right[tree.begin[v] + a] = front[tree.at[k] + a, size]
-    left, at = size - own, where[n_waiting]
+    at, first, count, one = np.uint64(tree.stored[node]), np.uint64(own), np.uint64(size), np.uint64(1)
+    for i in range(first):
+        for j in range(i, count):
+            stored[at + j] = front[i, j]
+        at += count
+    at, left = np.uint64(where[n_waiting]), count - first
     for i in range(left):
-        for j in range(i, left + 1):
-            waiting[at + j] = front[own + i, own + j]
-        at += left + 1
+        for j in range(i, left + one):
+            waiting[at + j] = front[first + i, first + j]
+        at += left + one
     state.whose[n_waiting] = node
-    where[n_waiting + 1] = at
+    where[n_waiting + 1] = np.int64(at)
     state.n_waiting[0] = n_waiting + 1
 
 
@@ -348,7 +399,7 @@ def spread(
     for node in range(low, high):
         largest = max(largest, tree.size[node])
     index = np.empty(largest + 1, np.int64)
-    part = np.empty(largest)
+    part, tied = np.empty(largest), np.empty((largest, largest))
     for node in range(low, high):
         size, own = tree.size[node], tree.own[node]
         cov = held[way[node] : way[node] + size * size].reshape(size, size)
@@ -382,26 +433,39 @@ def spread(
             if factors.rows[f] >= LARGE_FACTOR:
                 continue
             width = _of_factor(tree, factors, f, index)
-            for r in range(factors.rows[f]):
-                begin = tree.value_first[f] + r * (width + 1)
+            for a in range(width):
                 for c in range(width):
-                    part[c] = 0.0
-                for a in range(width):
-                    value = values[begin + a]
-                    if value != 0.0:
-                        for c in range(width):
-                            part[c] += value * cov[index[a], index[c]]
-                for other in range(r + 1):
-                    begin = tree.value_first[f] + other * (width + 1)
-                    total = 0.0
-                    for c in range(width):
-                        total += part[c] * values[begin + c]
-                    out.of_factors[of_first[f] + r * factors.rows[f] + other] = total
-                    out.of_factors[of_first[f] + other * factors.rows[f] + r] = total
+                    tied[a, c] = cov[np.uint64(index[a]), np.uint64(index[c])]
+            _spread_factor(values, tree.value_first[f], factors.rows[f], width, tied, part, out.of_factors, of_first[f])
             if f < n_pairs:
                 for a in range(a_dim):
                     for b in range(b_dim):
                         out.pairs[f, a, b] = cov[index[a], index[a_dim + b]]
+
+
+@kernel
+def _spread_factor(
+    values: FloatArray, begin: int, rows: int, width: int, tied: FloatArray, part: FloatArray, out: FloatArray, to: int
+) -> None:
+    """Write `A S A'` (rows, rows) of a factor's Jacobian, whose values begin there, and the covariance `tied`."""
+    at, count, step = np.uint64(begin), np.uint64(width), np.uint64(width + 1)
+    for r in range(rows):
+        for c in range(count):
+            part[c] = 0.0
+        for a in range(count):
+            value = values[at + a]
+            if value != 0.0:
+                for c in range(count):
+                    part[c] += value * tied[a, c]
+        other = np.uint64(begin)
+        for q in range(r + 1):
+            total = 0.0
+            for c in range(count):
+                total += part[c] * values[other + c]
+            out[to + r * rows + q] = total
+            out[to + q * rows + r] = total
+            other += step
+        at += step
 
 
 @kernel
