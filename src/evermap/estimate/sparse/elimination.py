@@ -407,13 +407,9 @@ def spread(
         if node > 0:
             up = tree.parent[node]
             above = held[way[up] : way[up] + tree.size[up] ** 2].reshape(tree.size[up], tree.size[up])
-            for i in range(left):
-                for j in range(left):
-                    cov[own + i, own + j] = above[index[i], index[j]]
+            _take(above, index, left, cov, own)
         else:
-            for i in range(left):
-                for j in range(left):
-                    cov[own + i, own + j] = border[index[i], index[j]]
+            _take(border, index, left, cov, own)
         _spread_rows(cov, part, stored[tree.stored[node] : tree.stored[node + 1]].reshape(own, size), own, size)
         for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
             v, at = tree.variable[k], tree.at[k]
@@ -433,14 +429,22 @@ def spread(
             if factors.rows[f] >= LARGE_FACTOR:
                 continue
             width = _of_factor(tree, factors, f, index)
-            for a in range(width):
-                for c in range(width):
-                    tied[a, c] = cov[np.uint64(index[a]), np.uint64(index[c])]
+            _take(cov, index, width, tied, 0)
             _spread_factor(values, tree.value_first[f], factors.rows[f], width, tied, part, out.of_factors, of_first[f])
             if f < n_pairs:
                 for a in range(a_dim):
                     for b in range(b_dim):
                         out.pairs[f, a, b] = cov[index[a], index[a_dim + b]]
+
+
+@kernel
+def _take(whole: FloatArray, index: Any, count: int, out: FloatArray, first: int) -> None:
+    """Copy the rows and columns `index` (count,) of a matrix to those of another one from `first` on."""
+    begin, end = np.uint64(first), np.uint64(count)
+    for i in range(end):
+        row = np.uint64(index[i])
+        for j in range(end):
+            out[begin + i, begin + j] = whole[row, np.uint64(index[j])]
 
 
 @kernel
@@ -471,22 +475,26 @@ def _spread_factor(
 @kernel
 def _spread_rows(cov: FloatArray, row: FloatArray, rows: FloatArray, own: int, size: int) -> None:
     """Fill in the covariance of a front's own numbers, from the last to the first, beside that of those passed on."""
-    for i in range(own - 1, -1, -1):
-        for j in range(i + 1, size):
+    end, block, one = np.uint64(size), np.uint64(BLOCK), np.uint64(1)
+    for back in range(own):
+        i = np.uint64(own - 1 - back)
+        first = i + one
+        for j in range(first, end):
             row[j] = 0.0
-        p = i + 1
-        while p + BLOCK <= size:
-            m0, m1, m2, m3 = rows[i, p], rows[i, p + 1], rows[i, p + 2], rows[i, p + 3]
+        p = first
+        while p + block <= end:
+            m0, m1, m2, m3 = rows[i, p], rows[i, p + one], rows[i, p + one + one], rows[i, p + block - one]
             if m0 != 0.0 or m1 != 0.0 or m2 != 0.0 or m3 != 0.0:
-                for j in range(i + 1, size):
-                    row[j] -= m0 * cov[p, j] + m1 * cov[p + 1, j] + m2 * cov[p + 2, j] + m3 * cov[p + 3, j]
-            p += BLOCK
-        for q in range(p, size):
-            for j in range(i + 1, size):
+                p1, p2, p3 = p + one, p + one + one, p + block - one
+                for j in range(first, end):
+                    row[j] -= m0 * cov[p, j] + m1 * cov[p1, j] + m2 * cov[p2, j] + m3 * cov[p3, j]
+            p += block
+        for q in range(p, end):
+            for j in range(first, end):
                 row[j] -= rows[i, q] * cov[q, j]
         scale = 1.0 / rows[i, i]
         total = scale
-        for j in range(i + 1, size):
+        for j in range(first, end):
             value = row[j] * scale
             cov[i, j] = value
             cov[j, i] = value
