@@ -292,35 +292,37 @@ def _store(tree: Tree, state: Elimination, node: int) -> None:
 @kernel
 def _eliminate_rows(front: FloatArray, diagonal: FloatArray, own: int, size: int) -> None:
     """Make the first `own` rows of the upper triangle those of a Cholesky factor, and the rest its complement."""
-    for first in range(0, own, BLOCK):
-        last = min(first + BLOCK, own)
+    end, stop, one = np.uint64(own), np.uint64(size + 1), np.uint64(1)
+    for begin in range(0, own, BLOCK):
+        first = np.uint64(begin)
+        last = min(first + np.uint64(BLOCK), end)
         for k in range(first, last):
             for p in range(first, k):
                 m = front[p, k]
                 if m != 0.0:
-                    for j in range(k, size + 1):
+                    for j in range(k, stop):
                         front[k, j] -= m * front[p, j]
             scale = 1.0 / math.sqrt(max(front[k, k], TINY * diagonal[k] + 1e-300))
-            for j in range(k, size + 1):
+            for j in range(k, stop):
                 front[k, j] *= scale
             front[k, k] = 1.0 / scale
-        if last - first == BLOCK:
-            for i in range(last, size):
-                m0, m1, m2, m3 = front[first, i], front[first + 1, i], front[first + 2, i], front[first + 3, i]
+        if last == first + np.uint64(BLOCK):
+            second = first + one
+            third = second + one
+            fourth = third + one
+            for i in range(last, stop - one):
+                m0, m1, m2, m3 = front[first, i], front[second, i], front[third, i], front[fourth, i]
                 if m0 != 0.0 or m1 != 0.0 or m2 != 0.0 or m3 != 0.0:
-                    for j in range(i, size + 1):
+                    for j in range(i, stop):
                         front[i, j] -= (
-                            m0 * front[first, j]
-                            + m1 * front[first + 1, j]
-                            + m2 * front[first + 2, j]
-                            + m3 * front[first + 3, j]
+                            m0 * front[first, j] + m1 * front[second, j] + m2 * front[third, j] + m3 * front[fourth, j]
                         )
         else:
             for k in range(first, last):
-                for i in range(last, size):
+                for i in range(last, stop - one):
                     m = front[k, i]
                     if m != 0.0:
-                        for j in range(i, size + 1):
+                        for j in range(i, stop):
                             front[i, j] -= m * front[k, j]
 
 
