@@ -148,13 +148,16 @@ Asked: TypeAlias = list[tuple[float, Suspect, float]]
 """Causes with what they gain [nats] and the state that is tried first."""
 
 
-def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tuple[str, ...]:
+def find_symptoms(
+    result: SlamResult, inputs: Inputs, config: SlamConfig, *, is_read_well: bool = False
+) -> tuple[str, ...]:
     """Return why causes other than changes are asked: short names; none where all is well.
 
     Args:
         result: of the session as given.
         inputs: of it.
         config: thresholds are those of `slam.explain` and `slam.check`.
+        is_read_well: whether pairs of sightings are known to show no mistake.
     """
     rules, found = config.explain, list[str]()
     seen = result.innovations
@@ -184,7 +187,7 @@ def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tup
         common = np.isin(inputs.prior_map.landmark_id, own)
         if result.trajectory.frame != "prior_map" or not common.any():
             found.append("map")
-    if not found and any(not finding.usable for finding in find_motion(inputs.recording, config.check)):
+    if not (found or is_read_well) and any(not finding.usable for finding in find_motion(inputs.recording, config.check)):
         found.append("pairs")
     if not found and compare_odometry(result)[0] > ODOMETRY_OFF:
         found.append("odometry")
@@ -197,6 +200,8 @@ def explain(
     solve_under: Solve[VisitT],
     config: SlamConfig,
     say: Callable[[str], None] = lambda _: None,
+    *,
+    is_read_well: bool = False,
 ) -> Explained[VisitT] | None:
     """Return the solution under the causes that explain a session best; None where nothing can be solved.
 
@@ -206,13 +211,14 @@ def explain(
         solve_under: solves other inputs.
         config: settings of the estimator.
         say: told what is done.
+        is_read_well: as of `find_symptoms`, of the inputs as given.
 
     Without symptoms the solution is returned as it is.
     """
     rules = config.explain
     screens: tuple[Callable[..., Asked], ...] = (_plain, _screen_continuous)  # what costs nothing first
     if solution is not None:
-        symptoms = find_symptoms(solution.result, inputs, config)
+        symptoms = find_symptoms(solution.result, inputs, config, is_read_well=is_read_well)
         if not symptoms:
             sound = Trial(inputs, solution, (), math.nan, 1.0)
             return Explained(sound, find_put_right(solution.result, inputs, rules))
