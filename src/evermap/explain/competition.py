@@ -187,7 +187,9 @@ def find_symptoms(
         common = np.isin(inputs.prior_map.landmark_id, own)
         if result.trajectory.frame != "prior_map" or not common.any():
             found.append("map")
-    if not (found or is_read_well) and any(not finding.usable for finding in find_motion(inputs.recording, config.check)):
+    if not (found or is_read_well) and any(
+        not finding.usable for finding in find_motion(inputs.recording, config.check)
+    ):
         found.append("pairs")
     if not found and compare_odometry(result)[0] > ODOMETRY_OFF:
         found.append("odometry")

@@ -36,10 +36,8 @@ class SquarePoses(NamedTuple):
     information: FloatArray
 
 
-def square_poses(
-    corner_px: FloatArray, size_m: FloatArray, sensor: SpatialSensor, *, coarse: bool = False
-) -> SquarePoses:
-    """Return the poses of square tags, with edges (M,), in the camera's frame; `coarse` ones are not iterated.
+def square_poses(corner_px: FloatArray, size_m: FloatArray, sensor: SpatialSensor) -> SquarePoses:
+    """Return the poses of square tags, with edges (M,), in the camera's frame.
 
     Corners (M, 4, 2) are in the order of `SpatialDetections.corner_px`.
     """
@@ -49,8 +47,7 @@ def square_poses(
         plane = np.where(ray[..., 2:] > 0.0, ray[..., :2] / ray[..., 2:], np.nan)
         start = _infinitesimal(plane, size_m)
     corner_m = CORNERS * size_m[:, None, None]
-    steps = 0 if coarse else _STEPS
-    solved = [_refined(pose, corner_m, corner_px, sensor, steps) for pose in start]
+    solved = [_refined(pose, corner_m, corner_px, sensor) for pose in start]
     pose, error, information = (np.stack(each) for each in zip(*solved, strict=True))
     order = np.argsort(np.where(np.isnan(error), np.inf, error), axis=0, kind="stable")
     rows = np.arange(len(size_m))
@@ -126,14 +123,14 @@ def _position(rotation: FloatArray, plane: FloatArray, size_m: FloatArray) -> Fl
 
 
 def _refined(
-    pose: FloatArray, corner_m: FloatArray, corner_px: FloatArray, sensor: SpatialSensor, steps: int
+    pose: FloatArray, corner_m: FloatArray, corner_px: FloatArray, sensor: SpatialSensor
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Poses (M, 7) at the nearest minimum of the reprojection error, these errors (M,) and information (M, 6, 6)."""
     pose = pose.copy()
     residual, normal, gradient = _linearised(pose, corner_m, corner_px, sensor)
     damping = np.full(len(pose), 1e-6)
     rows = np.flatnonzero(np.isfinite(residual))
-    for _ in range(steps):
+    for _ in range(_STEPS):
         diagonal = np.einsum("mii->mi", normal[rows])
         damped = normal[rows] + np.einsum("mi,ij->mij", damping[rows, None] * diagonal + 1e-12, np.eye(6))
         step = -_solved(damped, gradient[rows][..., None])[..., 0]

@@ -283,14 +283,11 @@ def _where(
         )
         some, plane = some[good], plane[good]
         _, slope = project_each(plane, np.full(len(some), row), recording.sensors)
-        _put(
-            found,
-            some,
-            plane,
-            slope,
-            square_poses(given.corner_px[some], given.tag_size_m[some], sensor, coarse=coarse),
-            settings.corner_m,
-        )
+        if coarse:
+            _put_coarsely(found, some, plane, slope, given.tag_size_m[some])
+        else:
+            poses = square_poses(given.corner_px[some], given.tag_size_m[some], sensor)
+            _put(found, some, plane, slope, poses, settings.corner_m)
     broken = usable & ~(np.isfinite(found.measured).all(axis=1) & np.isfinite(found.covariance).all(axis=(1, 2)))
     near = np.linalg.norm(np.nan_to_num(found.measured[:, :3]), axis=1) < settings.nearest_m
     return found, broken | (usable & near)
@@ -374,6 +371,18 @@ def _put(
     found.sigma_rad[rows] = np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
     gap = 4.0 * (np.nan_to_num(poses.error_px[1][good], nan=1e3) ** 2 - poses.error_px[0][good] ** 2)
     found.other_log_odds[rows] = gap
+
+
+def _put_coarsely(found: _Where, rows: IntArray, plane: FloatArray, slope: FloatArray, size_m: FloatArray) -> None:
+    """Enter tags that are seen by their corners, as far away as these are apart, and turned as the camera."""
+    edge = np.linalg.norm(plane - np.roll(plane, 1, axis=1), axis=2).mean(axis=1)
+    at = plane.mean(axis=1) * (size_m / np.maximum(edge, 1e-12))[:, None]
+    good = np.isfinite(at).all(axis=1)
+    rows = rows[good]
+    found.kind[rows] = CORNERS
+    found.corner[rows], found.corner_root[rows] = plane[good, :, :2], slope[good, :, :, :2]
+    found.measured[rows] = se3.identity(len(rows))
+    found.measured[rows, :3], found.covariance[rows], found.sigma_rad[rows] = at[good], np.eye(3), 1.0
 
 
 def _covariance(recording: SpatialRecording, settings: SpaceConfig) -> FloatArray:
