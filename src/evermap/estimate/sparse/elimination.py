@@ -22,8 +22,6 @@ TINY = 1e-12
 BLOCK = 4
 """Rows that are eliminated at once: as many as fit into registers beside what they change."""
 
-PRODUCT = 4
-"""Rows of a factor from which on its information is summed before it is written to where it belongs."""
 LARGE_FACTOR = 64
 """Rows of a factor from which on `eliminate_large` computes its information by BLAS, and `spread` nothing."""
 
@@ -63,7 +61,6 @@ class Elimination(NamedTuple):
         where, whose: where each of these begins, and the front that it is of.
         n_waiting: (1,) how many.
         front: room for the largest front and its right side.
-        product: the same for the information of a factor.
     """
 
     stored: FloatArray
@@ -73,7 +70,6 @@ class Elimination(NamedTuple):
     whose: IntArray
     n_waiting: IntArray
     front: FloatArray
-    product: FloatArray
 
     @classmethod
     def of(cls, tree: Tree) -> Elimination:
@@ -87,7 +83,6 @@ class Elimination(NamedTuple):
             np.empty(count, dtype=np.int64),
             np.zeros(1, dtype=np.int64),
             np.zeros((largest, largest + 1)),
-            np.empty((largest, largest + 1)),
         )
 
     def border(self, tree: Tree) -> FloatArray:
@@ -191,10 +186,7 @@ def _gather(
         if factors.rows[f] >= below:
             continue
         width = _of_factor(tree, factors, f, index)
-        if factors.rows[f] < PRODUCT:
-            _add_rows(values, tree.value_first[f], factors.rows[f], width, index, front, size)
-        else:
-            _add_product(values, tree.value_first[f], factors.rows[f], width, index, front, size, state.product)
+        _add_rows(values, tree.value_first[f], factors.rows[f], width, index, front, size)
     while n_waiting > 0 and tree.parent[whose[n_waiting - 1]] == node:
         n_waiting -= 1
         child = whose[n_waiting]
@@ -220,37 +212,6 @@ def _add_rows(values: FloatArray, begin: int, rows: int, width: int, index: Any,
                 front[min(i, j), max(i, j)] += value * values[at + c]
             front[i, size] += value * values[at + count]
         at += count + one
-
-
-@kernel
-def _add_product(
-    values: FloatArray, begin: int, rows: int, width: int, index: Any, front: FloatArray, size: int, product: FloatArray
-) -> None:
-    """Add the information of a factor to a front as `_add_rows` does, summed over its rows in `product` before."""
-    at, count, one = np.uint64(begin), np.uint64(width), np.uint64(1)
-    step = count + one
-    for a in range(count):
-        for c in range(a, step):
-            product[a, c] = 0.0
-    for _ in range(rows // 2):
-        below = at + step
-        for a in range(count):
-            x, y = values[at + a], values[below + a]
-            if x != 0.0 or y != 0.0:
-                for c in range(a, step):
-                    product[a, c] += x * values[at + c] + y * values[below + c]
-        at = below + step
-    if rows % 2:
-        for a in range(count):
-            x = values[at + a]
-            for c in range(a, step):
-                product[a, c] += x * values[at + c]
-    for a in range(count):
-        i = np.uint64(index[a])
-        for c in range(a, count):
-            j = np.uint64(index[c])
-            front[min(i, j), max(i, j)] += product[a, c]
-        front[i, size] += product[a, count]
 
 
 @kernel
