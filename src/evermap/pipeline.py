@@ -66,7 +66,10 @@ def run_slam(
         result = run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
         return with_verdict(result, recording, config.slam, findings=found)
     given = Inputs.of(recording, prior_map)
-    visit, result, under = session.explained(given, config, remarks, realtime=realtime, progress=progress)
+    is_read_well = recording.detections is read.detections and all(finding.usable for finding in found)
+    visit, result, under = session.explained(
+        given, config, remarks, realtime=realtime, progress=progress, is_read_well=is_read_well
+    )
     result = replace(session.existing(visit, result, config.living), association=evidence)
     if prior_map is not None:
         result = with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)

@@ -13,6 +13,7 @@ from evermap.errors import NumericalError
 from evermap.geometry.rigid import rigid
 from evermap.geometry.se2 import transform as transform_plane
 from evermap.geometry.se3 import transform as transform_space
+from evermap.maps.sessions import session
 from evermap.maps.sessions.planar import PlanarVisit
 from evermap.types import AnyRecording, Cause, Landmarks, Recording, SensorKind, SlamResult, VerdictKind, is_in_space
 
@@ -61,6 +62,20 @@ def test_nothing_is_asked_of_a_sound_drive(kind: str, mapped: bool) -> None:
     result, plain = (run_slam(recording, config, prior_map=given) for config in (Config(), without_causes()))
     assert result.causes == ()
     np.testing.assert_array_equal(result.trajectory.pose_world_robot, plain.trajectory.pose_world_robot)
+
+
+def test_a_cause_that_cannot_mend_innovations_is_not_solved_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Turns 4 % short earn their price there, but leave innovations wider than was asked for."""
+    world, count, solved = World(seed=8, turns=1.04), list[object](), session.solved
+
+    def counted(*given: object, **named: object) -> object:
+        count.append(given)
+        return solved(*given, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(session, "solved", counted)
+    config = Config.model_validate({"slam": {"explain": {"innovations": 0.01}}})
+    assert run_slam(world.space(corners=True), config, prior_map=world.map_in_space()).causes == ()
+    assert len(count) == 1
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ class Steps(NamedTuple):
         slack: rise of the cost that a step may bring [nats], since weights change with the residuals.
         relative_slack: the same as a share of the cost.
         first_damping: damping with which a step is tried again.
+        wanted: cost that is of use: it ends where no more steps, each as good as the last, would come below.
     """
 
     most: int = 30
@@ -33,6 +34,7 @@ class Steps(NamedTuple):
     slack: float = 0.5
     relative_slack: float = 0.0
     first_damping: float = 1e-6
+    wanted: float = np.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +68,7 @@ def minimised(graph: Graph[State], start: State, steps: Steps, now: Linear | Non
     undamped: Factorised | None = None
     if now is None:
         now = yield from graph.linearised(state)
-    for _ in range(steps.most):
+    for left in reversed(range(steps.most)):
         solved = yield from graph.factorised(now, damping)
         step = yield from solved.solution()
         trial, size = graph.retract(state, step)
@@ -80,6 +82,8 @@ def minimised(graph: Graph[State], start: State, steps: Steps, now: Linear | Non
             if damping > 0.0:
                 undamped = None
             if size < steps.tolerance or (damping == 0.0 and abs(gain) < steps.settled):
+                break
+            if now.cost - left * gain > steps.wanted:
                 break
             damping = 0.0 if damping < steps.first_damping else damping / 10.0
         else:

@@ -19,14 +19,33 @@ import numpy as np
 from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.causes import Inputs, Suspect, list_suspects, rows_of_kind
-from evermap.explain.evidence import LOG_2PI, ROOM_M, AnySession, Screen, evidence_at, optimum_of, used_rows
-from evermap.explain.linearise import change_by, gain_by, held_by_map
+from evermap.explain.evidence import (
+    LOG_2PI,
+    ROOM_M,
+    AnySession,
+    Screen,
+    SpatialSession,
+    evidence_at,
+    optimum_of,
+    used_rows,
+)
+from evermap.explain.linearise import change_by, cost_nearby, gain_by, held_by_map, solve_nearby
 from evermap.explain.seeds import find_scales, find_shape, find_single_scales
 from evermap.explain.shape import FEWEST, compare_shapes
 from evermap.explain.symptoms import compare_odometry
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import HONEST, find_motion, off, pairs_of
-from evermap.types import UNKNOWN, Cause, ChangeKind, ParameterEstimate, SlamResult, is_in_space
+from evermap.types import (
+    UNKNOWN,
+    BoolArray,
+    Cause,
+    ChangeKind,
+    FloatArray,
+    IntArray,
+    ParameterEstimate,
+    SlamResult,
+    is_in_space,
+)
 
 VisitT = TypeVar("VisitT")
 NEAR = 2.0
@@ -59,8 +78,8 @@ PLACED, BETTER, ELSEWHERE = 0.6, 0.2, 0.3
 and share below which it is of another site."""
 FEWEST_CHANGED, CHANGED = 3, 0.2
 """Landmarks, and share of those in common with a map, that changed from which the map itself is in doubt."""
-CHANGES = "changes"
-"""Symptom of a session in which landmarks changed."""
+CHANGES, INNOVATIONS = "changes", "innovations"
+"""Symptoms of a session in which landmarks changed, and of one whose detections scatter wider than they should."""
 OF_NOISE = "_noise_factor", "sigma_corner_px"
 """Ends of the names of noise levels."""
 OF_LANDMARKS = frozenset({ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED})
@@ -129,13 +148,16 @@ Asked: TypeAlias = list[tuple[float, Suspect, float]]
 """Causes with what they gain [nats] and the state that is tried first."""
 
 
-def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tuple[str, ...]:
+def find_symptoms(
+    result: SlamResult, inputs: Inputs, config: SlamConfig, *, is_read_well: bool = False
+) -> tuple[str, ...]:
     """Return why causes other than changes are asked: short names; none where all is well.
 
     Args:
         result: of the session as given.
         inputs: of it.
         config: thresholds are those of `slam.explain` and `slam.check`.
+        is_read_well: whether pairs of sightings are known to show no mistake.
     """
     rules, found = config.explain, list[str]()
     seen = result.innovations
@@ -144,9 +166,8 @@ def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tup
         found.append("detections rejected")
     if inlier.any():
         dof = np.full(len(inlier), 2) if seen.dof is None else seen.dof
-        usual = float(seen.nis[inlier].sum()) / float(dof[inlier].sum())
-        if usual > rules.innovations:
-            found.append("innovations")
+        if _mean_square(seen.nis, dof, inlier) > rules.innovations:
+            found.append(INNOVATIONS)
     if any(change.kind in OF_LANDMARKS for change in result.changes):
         found.append(CHANGES)
     twice = [one for one, name in result.landmarks.names.items() if "#" in str(name)]
@@ -166,7 +187,9 @@ def find_symptoms(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tup
         common = np.isin(inputs.prior_map.landmark_id, own)
         if result.trajectory.frame != "prior_map" or not common.any():
             found.append("map")
-    if not found and any(not finding.usable for finding in find_motion(inputs.recording, config.check)):
+    if not (found or is_read_well) and any(
+        not finding.usable for finding in find_motion(inputs.recording, config.check)
+    ):
         found.append("pairs")
     if not found and compare_odometry(result)[0] > ODOMETRY_OFF:
         found.append("odometry")
@@ -179,6 +202,8 @@ def explain(
     solve_under: Solve[VisitT],
     config: SlamConfig,
     say: Callable[[str], None] = lambda _: None,
+    *,
+    is_read_well: bool = False,
 ) -> Explained[VisitT] | None:
     """Return the solution under the causes that explain a session best; None where nothing can be solved.
 
@@ -188,13 +213,14 @@ def explain(
         solve_under: solves other inputs.
         config: settings of the estimator.
         say: told what is done.
+        is_read_well: as of `find_symptoms`, of the inputs as given.
 
     Without symptoms the solution is returned as it is.
     """
     rules = config.explain
     screens: tuple[Callable[..., Asked], ...] = (_plain, _screen_continuous)  # what costs nothing first
     if solution is not None:
-        symptoms = find_symptoms(solution.result, inputs, config)
+        symptoms = find_symptoms(solution.result, inputs, config, is_read_well=is_read_well)
         if not symptoms:
             sound = Trial(inputs, solution, (), math.nan, 1.0)
             return Explained(sound, find_put_right(solution.result, inputs, rules))
@@ -569,10 +595,13 @@ def _screen_continuous(
     # what changes explain, a cause must explain, too
     with_changes = optimum_of(best.solution.session, best.solution.result.changes)
     deficit = evidence_at(with_changes) - evidence_at(screen.optimum)
+    cost = cost_nearby(session)
+    symptoms = find_symptoms(best.solution.result, inputs, config)
+    of_noise = symptoms == (INNOVATIONS,) and not count_changed(best.solution.result)
     for suspect in suspects:
         if not suspect.is_continuous:
             if not (suspect.pairs or suspect.of_map):
-                gain = gain_by(session, inputs, suspect) * screen.optimum.worth + suspect.log_p
+                gain = gain_by(session, cost, inputs, suspect) * screen.optimum.worth + suspect.log_p
                 found += [(gain, suspect, 0.0)] if gain > 0.0 else []
             continue
         if suspect.rows is None or of_all is None:
@@ -587,9 +616,46 @@ def _screen_continuous(
         if abs(state) < LITTLE * suspect.sigma:  # as sensors are; a fit improves with any further number
             continue
         gain = score.gain * screen.optimum.worth - 0.5 * math.log(max(score.information, 1e-12) * suspect.sigma**2)
-        if gain + suspect.log_p > config.explain.lead_nats and LINEAR * score.gain > deficit:
+        earns = gain + suspect.log_p > config.explain.lead_nats and LINEAR * score.gain > deficit
+        if earns and (not of_noise or _may_relieve(session, inputs, suspect, state, config.explain)):
             found.append((gain + suspect.log_p, suspect, state))
     return sorted(found, key=lambda each: -each[0])
+
+
+def _may_relieve(session: AnySession, inputs: Inputs, suspect: Suspect, state: float, rules: ExplainConfig) -> bool:
+    """Return whether a continuous cause may mend innovations that are wider than they should be.
+
+    It won't where they are as wide at the optimum nearby, at the same noise, of which the cause's state is the best
+    (else another state is tried by whole solutions): what noise would be learned under it only widens them.
+    """
+    undone = suspect.undo(inputs, state)
+    near = solve_nearby(session, inputs, undone)
+    if near is None or isinstance(session, Solved):
+        return True
+    usual, rejected = _find_fit(near)
+    if usual <= rules.innovations or rejected < FEWER * _find_fit(session)[1]:
+        return True
+    screen = Screen.of(optimum_of(near))
+    direction = change_by(near, screen, undone, suspect)
+    if direction is None:
+        return True
+    score, known = screen.score(direction, suspect.sigma**-2, state), suspect.sigma**-2
+    information = known + (score.information - known) * screen.optimum.worth
+    return abs(score.value) * math.sqrt(information) >= NEAR * 0.5
+
+
+def _find_fit(session: SpatialSession) -> tuple[float, float]:
+    """Return the mean squared innovation of a session in space, a number, and the share of detections rejected."""
+    optimum = session.solved.optimum
+    smoother, now = optimum.fitted or (optimum.smoother, optimum.now)
+    inlier = now.weight >= INLIER
+    nis = smoother.find_nis(now, smoother.spread(now))
+    return _mean_square(nis, smoother.problem.dof, inlier), float(np.mean(~inlier))
+
+
+def _mean_square(nis: FloatArray, dof: IntArray, inlier: BoolArray) -> float:
+    """Return the mean squared normalised innovation, a number, of detections that are no outliers."""
+    return float(nis[inlier].sum()) / max(float(dof[inlier].sum()), 1.0)
 
 
 def _without_changes(best: Trial[VisitT]) -> AnySession:

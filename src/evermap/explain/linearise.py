@@ -15,7 +15,7 @@ from evermap.slam.estimate import Solved
 from evermap.slam.intake import prepare
 from evermap.slam.problem import Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.space.estimate import converged
+from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.intake import SpatialIntake, prepare_space
 from evermap.slam.space.problem import PlacePrior, SpatialProblem
 from evermap.slam.space.smoother import SpatialSmoother
@@ -27,6 +27,8 @@ STEP = 0.02
 
 FEW_STEPS = 6
 """Gauss-Newton steps of a first look at a discrete cause."""
+STEPS_NEARBY = 10
+"""Gauss-Newton steps to the optimum nearby under a continuous cause, at most."""
 
 
 def held_by_map(session: AnySession) -> AnySession:
@@ -116,34 +118,70 @@ def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> Spat
         if lens[0] == lens[1]:  # but for mounts all is as it was
             return replace(problem, prior=prior, mount=np.array([each.mount_robot_sensor for each in other.sensors]))
     intake = prepare_space(
-        undone.recording, problem.settings, robust=problem.robust, estimate_noise=problem.estimate_noise
-    )
+        undone.recording, problem.settings, robust=problem.robust, estimate_noise=problem.estimate_noise, coarse=True
+    )  # of tags in an image the residuals are those of the corners
     intake = fit_to_map(intake, undone.prior_map)
     if not (np.array_equal(intake.used, before.used) and len(intake.pose_frame) == len(before.pose_frame)):
         return None
     return replace(_with_measurements(problem, intake), prior=prior)
 
 
-def gain_by(session: AnySession, inputs: Inputs, suspect: Suspect) -> float:
+def cost_nearby(session: AnySession) -> float:
+    """Return the cost of a session in space after few steps with tails that never let go [nats]; nan in the plane."""
+    if isinstance(session, Solved):
+        return np.nan
+    solved = session.solved.optimum
+    smoother = (solved.fitted or (solved.smoother, solved.now))[0]
+    return smoother.optimum(solved.estimate, solved.noise, heavy=True, iterations=FEW_STEPS)[1].cost
+
+
+def gain_by(session: AnySession, before: float, inputs: Inputs, suspect: Suspect) -> float:
     """Return by how much the cost of a session in space falls without a discrete cause, near its values [nats].
 
-    At the same noise, by few steps: a first look, no evidence. It is -inf where that can't be asked.
+    At the same noise, by few steps, and by fewer where these will not do: a first look, no evidence. It is -inf where
+    that can't be asked.
+
+    Args:
+        session: the solution of the inputs.
+        before: its `cost_nearby`.
+        inputs: of which it is the solution.
+        suspect: a discrete cause.
     """
     if isinstance(session, Solved):
         return -np.inf
     solved = session.solved.optimum
-    smoother = (solved.fitted or (solved.smoother, solved.now))[0]
     try:
         moved = _problem_of(session, inputs, suspect.undo(inputs, 0.0))
         if moved is None:
             return -np.inf
-        costs = [
-            each.optimum(solved.estimate, solved.noise, heavy=True, iterations=FEW_STEPS)[1].cost
-            for each in (smoother, SpatialSmoother(moved, solved.estimate.pose))
-        ]
+        smoother = SpatialSmoother(moved, solved.estimate.pose)
+        _, now = smoother.optimum(solved.estimate, solved.noise, heavy=True, iterations=FEW_STEPS, wanted=before)
     except EvermapError:
         return -np.inf
-    return float(costs[0] - costs[1])
+    return float(before - now.cost)
+
+
+def solve_nearby(session: AnySession, inputs: Inputs, undone: Inputs) -> SpatialSession | None:
+    """Return a session in space with other inputs, at the same noise and near its values; None if that can't be asked.
+
+    Args:
+        session: the solution of the inputs.
+        inputs: of which it is the solution.
+        undone: other inputs of the same detections and poses.
+    """
+    if isinstance(session, Solved):
+        return None
+    solved = session.solved.optimum
+    try:
+        moved = _problem_of(session, inputs, undone)
+        if moved is None:
+            return None
+        smoother = SpatialSmoother(moved, solved.estimate.pose)
+        estimate, now = smoother.optimum(solved.estimate, solved.noise, heavy=False, iterations=STEPS_NEARBY)
+    except EvermapError:
+        return None
+    optimum = SpatialOptimum(estimate, solved.noise, smoother, now)
+    return SpatialSession(session.intake, replace(session.solved, optimum=optimum))
 
 
 def _with_measurements(problem: SpatialProblem, intake: SpatialIntake) -> SpatialProblem:

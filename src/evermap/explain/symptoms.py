@@ -14,6 +14,7 @@ import numpy as np
 
 from evermap.estimate.innovations import comparable_nis, lag1_autocorrelation
 from evermap.geometry import se2, se3
+from evermap.slam.association.features import medians
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,
@@ -377,15 +378,13 @@ def _over_odometry(compared: Compared, result: SlamResult) -> float:
         return nan
     fine = np.isfinite(compared.point_m).all(axis=1)
     stamp_s, point_m = compared.stamp_s[fine], compared.point_m[fine]
+    name, row, count = np.unique(compared.landmark_id[fine], return_inverse=True, return_counts=True)
     scatter = []
     for each in (path, other):
         pose = _poses_at(each, stamp_s)[0]
         at = (se2 if pose.shape[1] == 3 else se3).transform(pose, point_m)
-        off = np.full(len(at), nan)
-        for one in np.unique(compared.landmark_id[fine]).tolist():
-            mine = np.flatnonzero(compared.landmark_id[fine] == one)
-            if len(mine) >= PER_LANDMARK:
-                off[mine] = np.linalg.norm(at[mine] - np.median(at[mine], axis=0), axis=1)
+        middle = medians(at, row, len(name))[0][row]
+        off = np.where(count[row] >= PER_LANDMARK, np.linalg.norm(at - middle, axis=1), nan)
         share = off / np.maximum(compared.range_m[fine], 1e-9)
         scatter.append(_median(share[np.isfinite(share)]))
     return scatter[0] / scatter[1] if scatter[1] > 0.0 else nan
@@ -397,18 +396,20 @@ def _between_halves(compared: Compared) -> tuple[float, float]:
     Halves are of the detections of each landmark, in order of time, in the sensor's frame: what calibrations leave is
     in both. In standard deviations of the difference by the scatter within halves, and over the range.
     """
-    ratio, share = list[float](), list[float]()
-    for one in np.unique(compared.landmark_id[compared.used]).tolist():
-        mine = np.flatnonzero((compared.landmark_id == one) & compared.used)
-        if len(mine) < 2 * PER_LANDMARK:
-            continue
-        off = compared.off[mine[np.argsort(compared.stamp_s[mine], kind="stable")]]
-        first, second = off[: len(off) // 2], off[len(off) // 2 :]
-        apart = second.mean(axis=0) - first.mean(axis=0)
-        within = first.var(axis=0, ddof=1) / len(first) + second.var(axis=0, ddof=1) / len(second)
-        ratio.append(float(np.sqrt(np.mean(apart**2 / np.maximum(within, 1e-12)))))
-        share.append(float(np.linalg.norm(apart)))
-    return (float(np.median(ratio)), float(np.median(share))) if len(ratio) >= 3 else (nan, nan)
+    used = np.flatnonzero(compared.used)
+    used = used[np.lexsort((compared.stamp_s[used], compared.landmark_id[used]))]
+    _, row, count = np.unique(compared.landmark_id[used], return_inverse=True, return_counts=True)
+    often = count >= 2 * PER_LANDMARK
+    used, count = used[often[row]], count[often]
+    if len(count) < 3:
+        return nan, nan
+    parts = np.column_stack([count // 2, count - count // 2]).ravel()
+    begin, size, off = np.cumsum(parts) - parts, parts[:, None], compared.off[used]
+    mean = np.add.reduceat(off, begin) / size
+    within = np.add.reduceat((off - np.repeat(mean, parts, axis=0)) ** 2, begin) / ((size - 1) * size)
+    apart, within = mean[1::2] - mean[::2], within[::2] + within[1::2]
+    ratio = np.sqrt(np.mean(apart**2 / np.maximum(within, 1e-12), axis=1))
+    return float(np.median(ratio)), float(np.median(np.linalg.norm(apart, axis=1)))
 
 
 def compare_odometry(result: SlamResult) -> tuple[float, float, float]:

@@ -186,32 +186,44 @@ def _gather(
         if factors.rows[f] >= below:
             continue
         width = _of_factor(tree, factors, f, index)
-        begin = tree.value_first[f]
-        for _ in range(factors.rows[f]):
-            b = values[begin + width]
-            for a in range(width):
-                value, i = values[begin + a], index[a]
-                if value == 0.0:
-                    continue
-                front[i, size] += value * b
-                for c in range(a, width):
-                    j2 = index[c]
-                    if i <= j2:
-                        front[i, j2] += value * values[begin + c]
-                    else:
-                        front[j2, i] += value * values[begin + c]
-            begin += width + 1
+        _add_rows(values, tree.value_first[f], factors.rows[f], width, index, front, size)
     while n_waiting > 0 and tree.parent[whose[n_waiting - 1]] == node:
         n_waiting -= 1
         child = whose[n_waiting]
         left = _passed_on(tree, child, index)
-        at = where[n_waiting]
-        for i in range(left):
-            for j in range(i, left):
-                front[index[i], index[j]] += waiting[at + j]
-            front[index[i], size] += waiting[at + left]
-            at += left + 1
+        _add_passed_on(waiting, where[n_waiting], left, index, front, size)
     state.n_waiting[0] = n_waiting
+
+
+@kernel
+def _add_rows(values: FloatArray, begin: int, rows: int, width: int, index: Any, front: FloatArray, size: int) -> None:
+    """Add the information of a factor's rows to a front, in whose rows and columns `index` (width,) they belong.
+
+    Positions are unsigned here and below: of a signed one machine code asks each time whether it counts from the end.
+    """
+    at, count, one = np.uint64(begin), np.uint64(width), np.uint64(1)
+    for _ in range(rows):
+        for a in range(count):
+            value, i = values[at + a], np.uint64(index[a])
+            if value == 0.0:
+                continue
+            for c in range(a, count):
+                j = np.uint64(index[c])
+                front[min(i, j), max(i, j)] += value * values[at + c]
+            front[i, size] += value * values[at + count]
+        at += count + one
+
+
+@kernel
+def _add_passed_on(waiting: FloatArray, begin: int, left: int, index: Any, front: FloatArray, size: int) -> None:
+    """Add what a child passes on to a front, in whose rows and columns `index` (left,) it belongs."""
+    at, count, one = np.uint64(begin), np.uint64(left), np.uint64(1)
+    for i in range(count):
+        to = np.uint64(index[i])
+        for j in range(i, count):
+            front[to, np.uint64(index[j])] += waiting[at + j]
+        front[to, size] += waiting[at + count]
+        at += count + one
 
 
 @kernel
@@ -219,57 +231,59 @@ def _store(tree: Tree, state: Elimination, node: int) -> None:
     """Keep the rows of an eliminated front, and what waits for its parent."""
     stored, right, waiting, where, front = state.stored, state.right, state.waiting, state.where, state.front
     size, own, n_waiting = tree.size[node], tree.own[node], state.n_waiting[0]
-    at = tree.stored[node]
-    for i in range(own):
-        for j in range(i, size):
-            stored[at + j] = front[i, j]
-        at += size
     for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
         v = tree.variable[k]
         for a in range(tree.dim[v]):
             right[tree.begin[v] + a] = front[tree.at[k] + a, size]
-    left, at = size - own, where[n_waiting]
+    at, first, count, one = np.uint64(tree.stored[node]), np.uint64(own), np.uint64(size), np.uint64(1)
+    for i in range(first):
+        for j in range(i, count):
+            stored[at + j] = front[i, j]
+        at += count
+    at, left = np.uint64(where[n_waiting]), count - first
     for i in range(left):
-        for j in range(i, left + 1):
-            waiting[at + j] = front[own + i, own + j]
-        at += left + 1
+        for j in range(i, left + one):
+            waiting[at + j] = front[first + i, first + j]
+        at += left + one
     state.whose[n_waiting] = node
-    where[n_waiting + 1] = at
+    where[n_waiting + 1] = np.int64(at)
     state.n_waiting[0] = n_waiting + 1
 
 
 @kernel
 def _eliminate_rows(front: FloatArray, diagonal: FloatArray, own: int, size: int) -> None:
     """Make the first `own` rows of the upper triangle those of a Cholesky factor, and the rest its complement."""
-    for first in range(0, own, BLOCK):
-        last = min(first + BLOCK, own)
+    end, stop, one = np.uint64(own), np.uint64(size + 1), np.uint64(1)
+    for begin in range(0, own, BLOCK):
+        first = np.uint64(begin)
+        last = min(first + np.uint64(BLOCK), end)
         for k in range(first, last):
             for p in range(first, k):
                 m = front[p, k]
                 if m != 0.0:
-                    for j in range(k, size + 1):
+                    for j in range(k, stop):
                         front[k, j] -= m * front[p, j]
             scale = 1.0 / math.sqrt(max(front[k, k], TINY * diagonal[k] + 1e-300))
-            for j in range(k, size + 1):
+            for j in range(k, stop):
                 front[k, j] *= scale
             front[k, k] = 1.0 / scale
-        if last - first == BLOCK:
-            for i in range(last, size):
-                m0, m1, m2, m3 = front[first, i], front[first + 1, i], front[first + 2, i], front[first + 3, i]
+        if last == first + np.uint64(BLOCK):
+            second = first + one
+            third = second + one
+            fourth = third + one
+            for i in range(last, stop - one):
+                m0, m1, m2, m3 = front[first, i], front[second, i], front[third, i], front[fourth, i]
                 if m0 != 0.0 or m1 != 0.0 or m2 != 0.0 or m3 != 0.0:
-                    for j in range(i, size + 1):
+                    for j in range(i, stop):
                         front[i, j] -= (
-                            m0 * front[first, j]
-                            + m1 * front[first + 1, j]
-                            + m2 * front[first + 2, j]
-                            + m3 * front[first + 3, j]
+                            m0 * front[first, j] + m1 * front[second, j] + m2 * front[third, j] + m3 * front[fourth, j]
                         )
         else:
             for k in range(first, last):
-                for i in range(last, size):
+                for i in range(last, stop - one):
                     m = front[k, i]
                     if m != 0.0:
-                        for j in range(i, size + 1):
+                        for j in range(i, stop):
                             front[i, j] -= m * front[k, j]
 
 
@@ -348,7 +362,7 @@ def spread(
     for node in range(low, high):
         largest = max(largest, tree.size[node])
     index = np.empty(largest + 1, np.int64)
-    part = np.empty(largest)
+    part, tied = np.empty(largest), np.empty((largest, largest))
     for node in range(low, high):
         size, own = tree.size[node], tree.own[node]
         cov = held[way[node] : way[node] + size * size].reshape(size, size)
@@ -356,13 +370,9 @@ def spread(
         if node > 0:
             up = tree.parent[node]
             above = held[way[up] : way[up] + tree.size[up] ** 2].reshape(tree.size[up], tree.size[up])
-            for i in range(left):
-                for j in range(left):
-                    cov[own + i, own + j] = above[index[i], index[j]]
+            _take(above, index, left, cov, own)
         else:
-            for i in range(left):
-                for j in range(left):
-                    cov[own + i, own + j] = border[index[i], index[j]]
+            _take(border, index, left, cov, own)
         _spread_rows(cov, part, stored[tree.stored[node] : tree.stored[node + 1]].reshape(own, size), own, size)
         for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
             v, at = tree.variable[k], tree.at[k]
@@ -382,22 +392,8 @@ def spread(
             if factors.rows[f] >= LARGE_FACTOR:
                 continue
             width = _of_factor(tree, factors, f, index)
-            for r in range(factors.rows[f]):
-                begin = tree.value_first[f] + r * (width + 1)
-                for c in range(width):
-                    part[c] = 0.0
-                for a in range(width):
-                    value = values[begin + a]
-                    if value != 0.0:
-                        for c in range(width):
-                            part[c] += value * cov[index[a], index[c]]
-                for other in range(r + 1):
-                    begin = tree.value_first[f] + other * (width + 1)
-                    total = 0.0
-                    for c in range(width):
-                        total += part[c] * values[begin + c]
-                    out.of_factors[of_first[f] + r * factors.rows[f] + other] = total
-                    out.of_factors[of_first[f] + other * factors.rows[f] + r] = total
+            _take(cov, index, width, tied, 0)
+            _spread_factor(values, tree.value_first[f], factors.rows[f], width, tied, part, out.of_factors, of_first[f])
             if f < n_pairs:
                 for a in range(a_dim):
                     for b in range(b_dim):
@@ -405,24 +401,63 @@ def spread(
 
 
 @kernel
+def _take(whole: FloatArray, index: Any, count: int, out: FloatArray, first: int) -> None:
+    """Copy the rows and columns `index` (count,) of a matrix to those of another one from `first` on."""
+    begin, end = np.uint64(first), np.uint64(count)
+    for i in range(end):
+        row = np.uint64(index[i])
+        for j in range(end):
+            out[begin + i, begin + j] = whole[row, np.uint64(index[j])]
+
+
+@kernel
+def _spread_factor(
+    values: FloatArray, begin: int, rows: int, width: int, tied: FloatArray, part: FloatArray, out: FloatArray, to: int
+) -> None:
+    """Write `A S A'` (rows, rows) of a factor's Jacobian, whose values begin there, and the covariance `tied`."""
+    at, count, step = np.uint64(begin), np.uint64(width), np.uint64(width + 1)
+    for r in range(rows):
+        for c in range(count):
+            part[c] = 0.0
+        for a in range(count):
+            value = values[at + a]
+            if value != 0.0:
+                for c in range(count):
+                    part[c] += value * tied[a, c]
+        other = np.uint64(begin)
+        for q in range(r + 1):
+            total = 0.0
+            for c in range(count):
+                total += part[c] * values[other + c]
+            out[to + r * rows + q] = total
+            out[to + q * rows + r] = total
+            other += step
+        at += step
+
+
+@kernel
 def _spread_rows(cov: FloatArray, row: FloatArray, rows: FloatArray, own: int, size: int) -> None:
     """Fill in the covariance of a front's own numbers, from the last to the first, beside that of those passed on."""
-    for i in range(own - 1, -1, -1):
-        for j in range(i + 1, size):
+    end, block, one = np.uint64(size), np.uint64(BLOCK), np.uint64(1)
+    for back in range(own):
+        i = np.uint64(own - 1 - back)
+        first = i + one
+        for j in range(first, end):
             row[j] = 0.0
-        p = i + 1
-        while p + BLOCK <= size:
-            m0, m1, m2, m3 = rows[i, p], rows[i, p + 1], rows[i, p + 2], rows[i, p + 3]
+        p = first
+        while p + block <= end:
+            m0, m1, m2, m3 = rows[i, p], rows[i, p + one], rows[i, p + one + one], rows[i, p + block - one]
             if m0 != 0.0 or m1 != 0.0 or m2 != 0.0 or m3 != 0.0:
-                for j in range(i + 1, size):
-                    row[j] -= m0 * cov[p, j] + m1 * cov[p + 1, j] + m2 * cov[p + 2, j] + m3 * cov[p + 3, j]
-            p += BLOCK
-        for q in range(p, size):
-            for j in range(i + 1, size):
+                p1, p2, p3 = p + one, p + one + one, p + block - one
+                for j in range(first, end):
+                    row[j] -= m0 * cov[p, j] + m1 * cov[p1, j] + m2 * cov[p2, j] + m3 * cov[p3, j]
+            p += block
+        for q in range(p, end):
+            for j in range(first, end):
                 row[j] -= rows[i, q] * cov[q, j]
         scale = 1.0 / rows[i, i]
         total = scale
-        for j in range(i + 1, size):
+        for j in range(first, end):
             value = row[j] * scale
             cov[i, j] = value
             cov[j, i] = value

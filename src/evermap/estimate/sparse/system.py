@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Generator
 from dataclasses import dataclass
 from functools import cached_property
@@ -38,14 +39,26 @@ LARGE = 1e7
 """Multiplications of a front, or of the information of one of its factors, from which on BLAS is faster."""
 
 
+class _AtOnce(threading.local):
+    """How many `exhausted` a thread is within."""
+
+    depth = 0
+
+
+_AT_ONCE = _AtOnce()
+
+
 def exhausted(slices: Slices[_Result]) -> _Result:
-    """Return the result of work that is done at once."""
-    while True:
-        try:
+    """Return the result of work that is done at once, in as few slices as it can be."""
+    _AT_ONCE.depth += 1
+    try:
+        while True:
             next(slices)
-        except StopIteration as done:
-            result: _Result = done.value
-            return result
+    except StopIteration as done:
+        result: _Result = done.value
+        return result
+    finally:
+        _AT_ONCE.depth -= 1
 
 
 @dataclass(frozen=True)
@@ -206,8 +219,12 @@ class System:
         return bool(np.all(held == len(tree.border)))
 
     def cuts(self, work: ArrayLike) -> list[tuple[int, int, float]]:
-        """Return ranges of fronts with about a slice of work (T,) each, and the share of a slice that each takes."""
+        """Return ranges of fronts with about a slice of work (T,) each, and the share of a slice that each takes; one
+        for all where nobody waits between slices.
+        """
         total = np.append(0.0, np.cumsum(np.asarray(work, dtype=np.float64))) / SLICE
+        if _AT_ONCE.depth:
+            return [(0, len(total) - 1, float(total[-1]))]
         _, first = np.unique(np.floor(total[:-1]), return_index=True)
         bounds = [*first.tolist(), len(total) - 1]
         return [(low, high, float(total[high] - total[low])) for low, high in pairwise(bounds)]

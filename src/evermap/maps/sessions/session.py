@@ -420,6 +420,7 @@ def explained(
     *,
     realtime: bool = False,
     progress: Progress | None = None,
+    is_read_well: bool = False,
 ) -> tuple[Visit, SlamResult, Inputs]:
     """Return a session solved, its result, and what that is of: as given, or under the causes that explain it better
     (`explain`).
@@ -430,6 +431,7 @@ def explained(
         remarks: on the recording, the first warnings.
         realtime: as of `run_slam`, of the session as given.
         progress: the same.
+        is_read_well: whether pairs of sightings are known to show no mistake.
 
     Raises:
         DataError, NumericalError: as of `run_slam`.
@@ -456,7 +458,7 @@ def explained(
     else:
         if not config.slam.explain.on or as_given.result.interrupted or realtime:
             return as_given.visit, as_given.result, inputs
-        found = explain(inputs, as_given, under, config.slam, told.append)
+        found = explain(inputs, as_given, under, config.slam, told.append, is_read_well=is_read_well)
         assert found is not None
     best = found.best.solution
     if not found.causes:

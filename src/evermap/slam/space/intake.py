@@ -72,6 +72,7 @@ def prepare_space(
     fewest: int = 2,
     robust: bool = True,
     estimate_noise: bool = True,
+    coarse: bool = False,
 ) -> SpatialIntake:
     """Select the usable part: detections of known identity, during the odometry.
 
@@ -82,12 +83,13 @@ def prepare_space(
         fewest: frames with a landmark that it takes.
         robust: whether outliers are down-weighted.
         estimate_noise: whether noise levels are learned.
+        coarse: whether rough poses of tags by their corners will do: they are first values, no residual is of them.
 
     Raises:
         DataError: fewer than `fewest` frames with a landmark of known identity.
     """
     detections, stamps = recording.detections, recording.frames.stamp_s
-    where, usable, moving, warnings = _said(recording, settings, remarks)
+    where, usable, moving, warnings = _said(recording, settings, remarks, coarse=coarse)
     seen_in = frames_of_usable(recording, usable, fewest=fewest)
     pose_frame, used = seen_in if recording.odometry is None else np.flatnonzero(moving), np.flatnonzero(usable)
     landmark_id = landmark_ids(recording, used)
@@ -221,11 +223,11 @@ def _symmetries(recording: SpatialRecording, place: IntArray, used: IntArray, ki
 
 
 def _said(
-    recording: SpatialRecording, settings: SpaceConfig, remarks: tuple[str, ...]
+    recording: SpatialRecording, settings: SpaceConfig, remarks: tuple[str, ...], *, coarse: bool
 ) -> tuple[_Where, BoolArray, BoolArray, list[str]]:
     """Return the measurements, usable detections (M,), frames (F,) during the odometry, and remarks on dropped ones."""
     usable, moving, warnings = usable_detections(recording, remarks)
-    where, broken = _where(recording, usable, settings)
+    where, broken = _where(recording, usable, settings, coarse=coarse)
     if broken.any():
         warnings.append(f"{int(broken.sum())} detections from which no position follows not used")
         usable &= ~broken
@@ -250,8 +252,10 @@ class _Where:
     other_log_odds: FloatArray
 
 
-def _where(recording: SpatialRecording, usable: BoolArray, settings: SpaceConfig) -> tuple[_Where, BoolArray]:
-    """Return the measurements, and the usable detections without any."""
+def _where(
+    recording: SpatialRecording, usable: BoolArray, settings: SpaceConfig, *, coarse: bool = False
+) -> tuple[_Where, BoolArray]:
+    """Return the measurements, and the usable detections without any; `coarse` as for `prepare_space`."""
     given = recording.detections
     count = len(given)
     found = _Where(
@@ -279,14 +283,11 @@ def _where(recording: SpatialRecording, usable: BoolArray, settings: SpaceConfig
         )
         some, plane = some[good], plane[good]
         _, slope = project_each(plane, np.full(len(some), row), recording.sensors)
-        _put(
-            found,
-            some,
-            plane,
-            slope,
-            square_poses(given.corner_px[some], given.tag_size_m[some], sensor),
-            settings.corner_m,
-        )
+        if coarse:
+            _put_coarsely(found, some, plane, slope, given.tag_size_m[some])
+        else:
+            poses = square_poses(given.corner_px[some], given.tag_size_m[some], sensor)
+            _put(found, some, plane, slope, poses, settings.corner_m)
     broken = usable & ~(np.isfinite(found.measured).all(axis=1) & np.isfinite(found.covariance).all(axis=(1, 2)))
     near = np.linalg.norm(np.nan_to_num(found.measured[:, :3]), axis=1) < settings.nearest_m
     return found, broken | (usable & near)
@@ -370,6 +371,18 @@ def _put(
     found.sigma_rad[rows] = np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
     gap = 4.0 * (np.nan_to_num(poses.error_px[1][good], nan=1e3) ** 2 - poses.error_px[0][good] ** 2)
     found.other_log_odds[rows] = gap
+
+
+def _put_coarsely(found: _Where, rows: IntArray, plane: FloatArray, slope: FloatArray, size_m: FloatArray) -> None:
+    """Enter tags that are seen by their corners, as far away as these are apart, and turned as the camera."""
+    edge = np.linalg.norm(plane - np.roll(plane, 1, axis=1), axis=2).mean(axis=1)
+    at = plane.mean(axis=1) * (size_m / np.maximum(edge, 1e-12))[:, None]
+    good = np.isfinite(at).all(axis=1)
+    rows = rows[good]
+    found.kind[rows] = CORNERS
+    found.corner[rows], found.corner_root[rows] = plane[good, :, :2], slope[good, :, :, :2]
+    found.measured[rows] = se3.identity(len(rows))
+    found.measured[rows, :3], found.covariance[rows], found.sigma_rad[rows] = at[good], np.eye(3), 1.0
 
 
 def _covariance(recording: SpatialRecording, settings: SpaceConfig) -> FloatArray:

@@ -252,6 +252,11 @@ class SpatialProblem:
         return np.asarray((self.kind == POSE) & (self.symmetries.axis[self.place] >= 0))
 
     @property
+    def dof(self) -> IntArray:
+        """Return (M,) numbers that each detection measures."""
+        return np.asarray(ROWS[self.kind] - self.ray - self.about_axis, dtype=np.int64)
+
+    @property
     def sightings(self) -> SpatialSightings:
         """Return the detections as the kernel reads them."""
         kinds = self.symmetries.kinds

@@ -24,7 +24,6 @@ from evermap.slam.space.linearise import (
     PIXEL,
     POSE,
     ROTATION,
-    ROWS,
     STATES,
     TRANSLATION,
 )
@@ -335,34 +334,21 @@ def _scales(told: _Told, sigma: float) -> list[ParameterEstimate]:
 
 
 def _innovations(told: _Told, identities: IntArray) -> Innovations:
-    """Return the NIS of all detections, each as if it had not been used, from residuals r and their leverage.
-
-    With H = J S J' of whitened Jacobians and the covariance S, and the weight w: r' (1 - w H)^-1 (1 - w H + H)^-1 r.
-    """
-    optimum, spread = told.solved.optimum, told.spread
-    problem, now = told.problem, optimum.now
-    if optimum.fitted is not None:  # residuals are told by the fit, whatever the covariances count
+    """Return the NIS of all detections, each as if it had not been used."""
+    optimum = told.solved.optimum
+    if optimum.fitted is None:
+        smoother, now, spread = optimum.smoother, optimum.now, told.spread
+    else:  # residuals are told by the fit, whatever the covariances count
         smoother, now = optimum.fitted
-        problem, spread = smoother.problem, smoother.spread(now)
-    first = spread.of_factors_first[len(problem.increment) :]
-    nis = np.zeros(len(problem.kind))
-    for kind in range(3):
-        some, rows = np.flatnonzero(problem.kind == kind), int(ROWS[kind])
-        if not len(some):
-            continue
-        at = first[some][:, None] + np.arange(rows * rows)
-        weight = np.maximum((now.weight * problem.share)[some], 1e-6)[:, None, None]
-        used = spread.of_factors[at].reshape(-1, rows, rows)
-        rest = (1.0 + 1e-9) * np.eye(rows) - used
-        r = now.residual[some, :rows, None]
-        nis[some] = (np.linalg.solve(rest, r) * np.linalg.solve(rest + used / weight, r)).sum(axis=(1, 2))
+        spread = smoother.spread(now)
+    problem = smoother.problem
     return Innovations(
         stamp_s=told.stamp_s[problem.pose_row],
         detection=told.intake.used,
         landmark_id=identities[problem.place],
-        nis=np.maximum(nis, 0.0),
+        nis=smoother.find_nis(now, spread),
         p_inlier=np.clip(now.weight, 0.0, 1.0),
-        dof=(ROWS[problem.kind] - problem.ray - problem.about_axis).astype(np.int64),
+        dof=problem.dof,
     )
 
 

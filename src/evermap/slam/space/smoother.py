@@ -140,6 +140,7 @@ class SpatialSmoother:
         iterations: int = 20,
         tolerance: float = 1e-5,
         settled: float = SETTLED,
+        wanted: float = np.inf,
     ) -> tuple[SpatialEstimate, SpatialLinear]:
         """Run damped Gauss-Newton from `start`, until steps are small.
 
@@ -150,11 +151,12 @@ class SpatialSmoother:
             iterations: at most.
             tolerance: largest move (m or rad) that ends it.
             settled: what a step must gain [nats], or it was the last.
+            wanted: cost that is of use; see `Steps`.
 
         Raises:
             NumericalError: no finite optimum.
         """
-        steps = Steps(iterations, tolerance, settled, 0.0, COST_SLACK, FIRST_DAMPING)
+        steps = Steps(iterations, tolerance, settled, 0.0, COST_SLACK, FIRST_DAMPING, wanted)
         solution = exhausted(minimised(self.graph(noise, heavy=heavy), start, steps))
         return solution.state, SpatialLinear(solution.now, self, solution.factorised)
 
@@ -170,6 +172,26 @@ class SpatialSmoother:
         """Return covariances of all variables and of what each factor ties; `nearly`: a step before will do."""
         factorised = now.before if nearly and now.before is not None else self.factorised(now)
         return exhausted(factorised.spread(len(self.problem.increment)))
+
+    def find_nis(self, now: SpatialLinear, spread: Spread) -> FloatArray:
+        """Return (M,) NIS of all detections, each as if it had not been used, from residuals r and their leverage.
+
+        With H = J S J' of whitened Jacobians and the covariance S, and the weight w:
+        r' (1 - w H)^-1 (1 - w H + H)^-1 r.
+        """
+        problem, nis = self.problem, np.zeros(len(self.problem.kind))
+        first = spread.of_factors_first[len(problem.increment) :]
+        for kind in range(3):
+            some, rows = np.flatnonzero(problem.kind == kind), int(ROWS[kind])
+            if not len(some):
+                continue
+            at = first[some][:, None] + np.arange(rows * rows)
+            weight = np.maximum((now.weight * problem.share)[some], 1e-6)[:, None, None]
+            used = spread.of_factors[at].reshape(-1, rows, rows)
+            rest = (1.0 + 1e-9) * np.eye(rows) - used
+            r = now.residual[some, :rows, None]
+            nis[some] = (np.linalg.solve(rest, r) * np.linalg.solve(rest + used / weight, r)).sum(axis=(1, 2))
+        return np.maximum(nis, 0.0)
 
     def residual_of(self, now: Linear) -> FloatArray:
         """Return (M, 8) whitened residuals of detections, by the right sides of their factors."""

@@ -18,6 +18,7 @@ from evermap.config import ChangesConfig
 from evermap.estimate.measurement import Tied
 from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se3
+from evermap.geometry.group import accumulate
 from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
 from evermap.geometry.upright import is_level
@@ -478,7 +479,7 @@ def incremental(
         noise: how far the robot may be from where the odometry puts it.
         known: (P,) places of a map that is given.
         place: (P, 7) where they are.
-        progress: told after every frame.
+        progress: told after every frame that saw something, and the last.
     """
     n, mount = len(problem.stamp_s), problem.mount[problem.sensor]
     place, known = place.copy(), known.copy()
@@ -489,13 +490,16 @@ def incremental(
     sigma_rad = np.hypot(problem.sigma_rad * noise.pixel, SLACK_RAD)
     turned = problem.oriented[problem.place]
     first = np.searchsorted(problem.pose_row, np.arange(n + 1))
-    pose, unsure_s = np.empty((n, 7)), 1e6 if known.any() else 0.0
-    pose[0], step_s, spread = se3.identity(), np.zeros(n), np.zeros((n, 2))
-    for row in range(n):
+    pose, unsure_s = np.empty((n, 7)), np.zeros(n)
+    driven, lasted_s = accumulate(problem.increment), np.append(0.0, np.cumsum(problem.lasted_s))
+    pose[0], unsure_s[0] = se3.identity(), 1e6 if known.any() else 0.0
+    step_s, last = np.zeros(n), 0
+    for row in np.union1d(np.flatnonzero(np.diff(first)), [0, n - 1]).tolist():
         began = time.perf_counter()
         if row:
-            pose[row] = se3.compose(pose[row - 1], problem.increment[row - 1])
-            unsure_s += problem.lasted_s[row - 1]
+            since = slice(last + 1, row + 1)  # frames up to this one that saw nothing
+            pose[since] = se3.compose(pose[last], se3.between(driven[last], driven[since]))
+            unsure_s[since] = unsure_s[last] + lasted_s[since] - lasted_s[last]
         mine = np.arange(first[row], first[row + 1])
         met = mine[known[problem.place[mine]]]
         if len(met):
@@ -507,22 +511,25 @@ def incremental(
             # no candidate costs less than if it were where all is as seen
             best, least = 0, float(-log_share[:, met].max(axis=0).sum())
             if float(seen(pose[row : row + 1]).sum()) - WORTH > least:
-                within = STILL_M + noise.translation * np.sqrt(unsure_s), STILL_RAD + noise.rotation * np.sqrt(unsure_s)
+                went_s = np.sqrt(unsure_s[row])
+                within = STILL_M + noise.translation * went_s, STILL_RAD + noise.rotation * went_s
                 candidate = _candidates(pose[row], ways[:, met], where, turned[met], alike)
                 cost = _moved(candidate, within) + seen(candidate).sum(axis=1)
                 cost[0] -= WORTH
                 best = int(np.argmin(cost))
                 pose[row] = candidate[best]
-            unsure_s = 0.0 if best else unsure_s
+            unsure_s[row] = 0.0 if best else unsure_s[row]
         new = mine[~known[problem.place[mine]]]
         if len(new):
             place[problem.place[new]] = se3.compose(pose[row], either[0, new])
             known[problem.place[new]] = True
-        spread[row] = SLACK_M + noise.translation * np.sqrt(unsure_s), SLACK_RAD + noise.rotation * np.sqrt(unsure_s)
-        step_s[row] = time.perf_counter() - began
+        step_s[last + 1 if row else 0 : row + 1] = (time.perf_counter() - began) / max(row - last, 1)
+        last = row
         if progress is not None:
             progress(float(problem.stamp_s[row]), float(problem.stamp_s[-1]))
     place[~problem.oriented, 3:] = se3.NO_TURN
+    went_s = np.sqrt(unsure_s)
+    spread = np.column_stack([SLACK_M + noise.translation * went_s, SLACK_RAD + noise.rotation * went_s])
     return SpatialEstimate(pose, place, np.zeros((len(problem.mount), STATES))), spread, step_s
 
 
