@@ -11,19 +11,22 @@ from evermap.estimate.sparse.system import exhausted
 from evermap.explain.causes import Inputs, Suspect
 from evermap.explain.evidence import AnySession, Optimum, Screen, SpatialSession, residuals_of
 from evermap.geometry import se3
+from evermap.geometry.camera import project_each, unproject
 from evermap.slam.estimate import Solved
 from evermap.slam.intake import prepare
 from evermap.slam.problem import Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.space.estimate import converged
 from evermap.slam.space.intake import SpatialIntake, prepare_space
+from evermap.slam.space.linearise import CORNERS
 from evermap.slam.space.problem import PlacePrior, SpatialProblem
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.solve import fit_to_map
-from evermap.types import FloatArray, IntArray, Landmarks, is_in_space
+from evermap.types import FloatArray, IntArray, Landmarks, SpatialRecording, is_in_space
 
-STEP = 0.02
-"""Step of a state, as a share of its standard deviation beforehand: small beside it, large beside rounding."""
+STEP = 1e-4
+"""Step of a state, as a share of its standard deviation beforehand: residuals grow by far less than their noise, since
+those of outliers vanish with their weights; rounding is smaller still."""
 
 FEW_STEPS = 6
 """Gauss-Newton steps of a first look at a discrete cause."""
@@ -109,19 +112,51 @@ def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> Spat
     if undone.prior_map is not inputs.prior_map and undone.prior_map is not None:
         prior = _prior_from(prior, undone.prior_map, before.landmark_id[session.solved.identity])
     one, other = inputs.recording, undone.recording
-    if other.detections is one.detections and other.odometry is one.odometry and other.frames is one.frames:
-        lens = [
-            [(each.intrinsics, each.distortion, each.distortion_model) for each in of.sensors] for of in (one, other)
-        ]
-        if lens[0] == lens[1]:  # but for mounts all is as it was
-            return replace(problem, prior=prior, mount=np.array([each.mount_robot_sensor for each in other.sensors]))
+    same_drive = other.odometry is one.odometry and other.frames is one.frames
+    same_views = other.detections is one.detections and _lenses(other) == _lenses(one)
+    if same_drive and same_views:  # but for mounts all is as it was
+        return replace(problem, prior=prior, mount=np.array([each.mount_robot_sensor for each in other.sensors]))
+    if (problem.kind == CORNERS).all():  # what else a tag's corners say is of no use here, and takes long
+        if same_drive:
+            return replace(_with_views(problem, undone.recording, before.used), prior=prior)
+        if same_views:
+            undone = replace(undone, recording=_without_corners(undone.recording, before.used, problem.measured))
     intake = prepare_space(
         undone.recording, problem.settings, robust=problem.robust, estimate_noise=problem.estimate_noise
     )
     intake = fit_to_map(intake, undone.prior_map)
     if not (np.array_equal(intake.used, before.used) and len(intake.pose_frame) == len(before.pose_frame)):
         return None
+    if (problem.kind == CORNERS).all():
+        return replace(_with_drive(problem, intake.problem), prior=prior)
     return replace(_with_measurements(problem, intake), prior=prior)
+
+
+def _lenses(recording: SpatialRecording) -> list[tuple[object, ...]]:
+    return [(each.intrinsics, each.distortion, each.distortion_model) for each in recording.sensors]
+
+
+def _with_views(problem: SpatialProblem, recording: SpatialRecording, used: IntArray) -> SpatialProblem:
+    """Return a problem with the corners of the detections used, as lenses and sizes of tags are now."""
+    seen, plane = recording.detections, np.ones((len(used), 4, 3))
+    for row, sensor in enumerate(recording.sensors):
+        mine = seen.sensor[used] == row
+        ray = unproject(seen.corner_px[used[mine]], sensor)
+        plane[mine] = ray / ray[..., 2:]
+    slope = project_each(plane, seen.sensor[used], recording.sensors)[1]
+    half_m = 0.5 * seen.tag_size_m[used] * float(np.exp(-problem.ranges_log))
+    return replace(problem, corner=plane[..., :2], corner_root=slope[..., :2], half_m=half_m)
+
+
+def _without_corners(recording: SpatialRecording, used: IntArray, measured: FloatArray) -> SpatialRecording:
+    """Return a recording of tags whose corners are left out for their poses (M, 7), where these are known."""
+    pose = np.full((len(recording.detections), 7), np.nan)
+    pose[used] = measured
+    seen = replace(
+        recording.detections, corner_px=np.full_like(recording.detections.corner_px, np.nan),
+        position_sensor_m=pose[:, :3], rotation=pose[:, 3:],
+    )  # fmt: skip
+    return replace(recording, detections=seen)
 
 
 def gain_by(session: AnySession, inputs: Inputs, suspect: Suspect) -> float:
@@ -148,14 +183,19 @@ def gain_by(session: AnySession, inputs: Inputs, suspect: Suspect) -> float:
 
 def _with_measurements(problem: SpatialProblem, intake: SpatialIntake) -> SpatialProblem:
     """Return a problem with the measurements of another intake, in the metre that it was given since."""
-    other = intake.problem
-    shorter, longer = float(np.exp(-problem.ranges_log)), float(np.exp(problem.odometry_log))
-    path = None if other.path is None else other.path._replace(pose=se3.scaled(other.path.pose, longer))
+    other, shorter = intake.problem, float(np.exp(-problem.ranges_log))
     return replace(
-        problem, stamp_s=other.stamp_s, increment=se3.scaled(other.increment, longer),
-        measured=se3.scaled(other.measured, shorter), measured_root=other.measured_root / shorter,
-        corner=other.corner, corner_root=other.corner_root, half_m=other.half_m * shorter, mount=other.mount, path=path,
+        _with_drive(problem, other), measured=se3.scaled(other.measured, shorter),
+        measured_root=other.measured_root / shorter, corner=other.corner, corner_root=other.corner_root,
+        half_m=other.half_m * shorter, mount=other.mount,
     )  # fmt: skip
+
+
+def _with_drive(problem: SpatialProblem, other: SpatialProblem) -> SpatialProblem:
+    """Return a problem with the stamps and the odometry of another, in the metre that it was given since."""
+    longer = float(np.exp(problem.odometry_log))
+    path = None if other.path is None else other.path._replace(pose=se3.scaled(other.path.pose, longer))
+    return replace(problem, stamp_s=other.stamp_s, increment=se3.scaled(other.increment, longer), path=path)
 
 
 def _prior_from(prior: PlacePrior, given: Landmarks, landmark_id: IntArray) -> PlacePrior:
