@@ -118,12 +118,10 @@ def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> Spat
         return replace(problem, prior=prior, mount=np.array([each.mount_robot_sensor for each in other.sensors]))
     if (problem.kind == CORNERS).all():  # what else a tag's corners say is of no use here, and takes long
         if same_drive:
-            return replace(_with_views(problem, undone.recording, before.used), prior=prior)
+            return replace(_with_views(problem, other, before.used), prior=prior)
         if same_views:
-            undone = replace(undone, recording=_without_corners(undone.recording, before.used, problem.measured))
-    intake = prepare_space(
-        undone.recording, problem.settings, robust=problem.robust, estimate_noise=problem.estimate_noise
-    )
+            other = _without_corners(other, before.used, problem.measured)
+    intake = prepare_space(other, problem.settings, robust=problem.robust, estimate_noise=problem.estimate_noise)
     intake = fit_to_map(intake, undone.prior_map)
     if not (np.array_equal(intake.used, before.used) and len(intake.pose_frame) == len(before.pose_frame)):
         return None

@@ -1,0 +1,128 @@
+"""What a solution tells of what it held as stated: calibrations, stamps that jitter, and breaks of the odometry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evermap import run_slam
+from evermap.config import Config
+from evermap.explain import linearise
+from evermap.explain.causes import Inputs
+from evermap.explain.scores import SIGNIFICANT, SessionScores, score_session
+from evermap.geometry import se3
+from evermap.maps.sessions import session
+from evermap.types import AnyRecording, Frames, Landmarks, Recording, SpatialRecording, VerdictKind
+
+from .worlds import World
+
+
+def scored(recording: AnyRecording, given: Landmarks | None) -> SessionScores:
+    """Return what a session tells that is solved as given."""
+    config = Config.model_validate({"slam": {"explain": {"on": False}}})
+    visit, result, inputs = session.explained(Inputs.of(recording, given), config, ())
+    return score_session(session.solution_of(visit), inputs, result.trajectory)
+
+
+def mounts(recording: SpatialRecording, how: Callable[[np.ndarray], np.ndarray]) -> SpatialRecording:
+    """State all mounts otherwise."""
+    sensors = [
+        replace(one, mount_robot_sensor=tuple(how(np.array(one.mount_robot_sensor)).tolist()))
+        for one in recording.sensors
+    ]
+    return replace(recording, sensors=tuple(sensors))
+
+
+def pitched(mount: np.ndarray) -> np.ndarray:
+    turned = se3.compose(se3.from_angles([0.0, 0.1, 0.0]), se3.turn(mount[3:]))
+    return np.concatenate([mount[:3], turned[3:]])
+
+
+def with_own_frames(recording: SpatialRecording, late_s: float) -> SpatialRecording:
+    """Give each camera its own frames; stamps of the second are late."""
+    seen, stamp_s = recording.detections, recording.frames.stamp_s
+    own = np.stack([stamp_s, stamp_s + late_s]).ravel()
+    order = np.argsort(own, kind="stable")
+    rank = np.argsort(order)[seen.frame + len(stamp_s) * seen.sensor]
+    rows = np.argsort(rank, kind="stable")
+    return replace(recording, frames=Frames(own[order]), detections=replace(seen[rows], frame=rank[rows]))
+
+
+def with_other_lens(recording: SpatialRecording) -> SpatialRecording:
+    fx, fy, cx, cy = recording.sensors[0].intrinsics or (0.0,) * 4
+    other = tuple(replace(one, intrinsics=(1.03 * fx, fy / 1.03, cx, cy)) for one in recording.sensors)
+    return replace(recording, sensors=other)
+
+
+def stamped_on_arrival(recording: Recording) -> Recording:
+    late_s = np.random.default_rng(3).uniform(0.0, 0.15, len(recording.frames))
+    return replace(recording, frames=replace(recording.frames, stamp_s=recording.frames.stamp_s + late_s))
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("kind", ["plane", "corners", "poses"])
+def test_nothing_is_suspected_of_a_sound_drive(kind: str, mapped: bool) -> None:
+    world = World(seed=1)
+    recording: Any = world.plane() if kind == "plane" else world.space(corners=kind == "corners")
+    survey = world.map_in_plane() if kind == "plane" else world.map_in_space()
+    found = scored(recording, survey if mapped else None)
+    assert found.calibrations
+    assert max(one.gain for one in found.calibrations) < SIGNIFICANT
+    assert (found.suspected, found.adrift, found.alternation > 3.0) == (None, 0, False)
+
+
+WRONG: dict[str, tuple[Callable[[SpatialRecording], SpatialRecording], str, float]] = {
+    "mounts": (lambda one: mounts(one, lambda at: at + [0.2, 0, 0, 0, 0, 0, 0]), "all sensors x", -0.2),
+    "pitch": (lambda one: mounts(one, pitched), "all sensors pitch", -0.1),
+    "lens": (with_other_lens, "front, back fx", -2.0 * math.log(1.03)),
+    "late": (lambda one: with_own_frames(one, 0.08), "back", 0.08),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_held_though_it_is_another_is_suspected(name: str) -> None:
+    how, subject, value = WRONG[name]
+    world = World(seed=1)
+    recording = how(world.space())
+    found = scored(recording, world.map_in_space())
+    own = next(one for one in found.calibrations if one.suspect.subject == subject)
+    best = max(found.calibrations, key=lambda one: one.gain)
+    assert best is own
+    assert own.value == pytest.approx(value, rel=0.4)
+    assert own.gain > SIGNIFICANT
+    suspected = found.suspected
+    assert suspected is not None
+    assert suspected.shift > 0.5
+
+
+def test_a_score_does_not_depend_on_the_step_of_its_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = mounts(World(seed=1).space(), lambda at: at + [0.02, 0, 0, 0, 0, 0, 0])
+    found = scored(recording, World().map_in_space())
+    monkeypatch.setattr(linearise, "STEP", 0.2 * linearise.STEP)
+    again = scored(recording, World().map_in_space())
+    assert [one.suspect.subject for one in found.calibrations] == [one.suspect.subject for one in again.calibrations]
+    for one, two in zip(found.calibrations, again.calibrations, strict=True):
+        assert one.gain == pytest.approx(two.gain, rel=0.02, abs=0.02), one.suspect.subject
+
+
+def test_stamps_of_arrival_alternate() -> None:
+    world = World(seed=1)
+    for mapped in (False, True):
+        recording, given = world.plane(), world.map_in_plane() if mapped else None
+        assert not scored(recording, given).alternation > 0.0
+        assert scored(stamped_on_arrival(recording), given).alternation > 3.0
+
+
+def test_runs_are_asked_what_they_held() -> None:
+    world = World(seed=1)
+    right, wrong = world.space(), mounts(world.space(), lambda at: at + [0.05, 0, 0, 0, 0, 0, 0])
+    for recording, kind in ((right, VerdictKind.SOUND), (wrong, VerdictKind.SENSOR_SUSPECT)):
+        verdict = run_slam(recording, prior_map=world.map_in_space()).verdict
+        assert verdict is not None
+        assert verdict.kind is kind, verdict.message
+        assert ("mounts of all sensors are -0.0" in verdict.message) is (recording is wrong)
