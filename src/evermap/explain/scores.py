@@ -35,6 +35,9 @@ SIGNIFICANT = 10.0
 """Gain of a score test [nats]: four and a half standard deviations."""
 USUAL = frozenset({"odometry-scale", "turn-scale"})
 """Calibrations that are off on every robot: they may be so beside any other."""
+USUAL_SHARE = 0.1
+"""Share of its standard deviation beforehand within which a calibration is as stated, as far as that goes: 2 cm of a
+mount, 50 ms of a clock."""
 USUAL_SIGMA = 0.02
 """Standard deviation of the logarithm of these."""
 OF_RANGES = frozenset({"range-scale", "tag-size"})
@@ -83,10 +86,13 @@ class SessionScores:
 
     @property
     def suspected(self) -> CalibrationScore | None:
-        """Return the significant step that moves the poses most; None without one."""
-        return max(
-            (one for one in self.calibrations if one.gain > SIGNIFICANT), key=lambda one: one.shift, default=None
+        """Return the significant step, larger than sensors usually need, that moves the poses most; None without."""
+        told = (
+            one
+            for one in self.calibrations
+            if one.gain > SIGNIFICANT and abs(one.value) > USUAL_SHARE * one.suspect.sigma
         )
+        return max(told, key=lambda one: one.shift, default=None)
 
 
 def score_session(session: AnySession, inputs: Inputs, trajectory: Trajectory) -> SessionScores:
