@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,10 @@ import pytest
 from evermap import run_slam
 from evermap.config import Config
 from evermap.explain import linearise
-from evermap.explain.causes import Inputs
-from evermap.explain.scores import SIGNIFICANT, SessionScores, score_session
+from evermap.explain.causes import Inputs, list_suspects
+from evermap.explain.scores import SIGNIFICANT, CalibrationScore, SessionScores, _count_adrift, score_session
+from evermap.explain.symptoms import Signs, with_scores
+from evermap.explain.verdict import judge_signs
 from evermap.geometry import se3
 from evermap.maps.sessions import session
 from evermap.types import AnyRecording, Frames, Landmarks, Recording, SpatialRecording, VerdictKind
@@ -73,7 +76,7 @@ def test_nothing_is_suspected_of_a_sound_drive(kind: str, mapped: bool) -> None:
     found = scored(recording, survey if mapped else None)
     assert found.calibrations
     assert max(one.gain for one in found.calibrations) < SIGNIFICANT
-    assert (found.suspected, found.adrift, found.alternation > 3.0) == (None, 0, False)
+    assert (found.suspected, found.adrift, found.alternation > 2.5) == (None, 0, False)
 
 
 WRONG: dict[str, tuple[Callable[[SpatialRecording], SpatialRecording], str, float]] = {
@@ -110,12 +113,51 @@ def test_a_score_does_not_depend_on_the_step_of_its_differences(monkeypatch: pyt
         assert one.gain == pytest.approx(two.gain, rel=0.02, abs=0.02), one.suspect.subject
 
 
+def test_the_significant_step_that_moves_poses_most_is_suspected() -> None:
+    names = [one for one in list_suspects(Inputs.of(World(seconds=2.0).space(), None)) if one.code == "mount"]
+    some = [
+        CalibrationScore(names[0], 0.1, 0.01, 10.1, 0.4),
+        CalibrationScore(names[1], -0.021, 0.01, 10.1, 0.6),
+        CalibrationScore(names[2], 0.1, 0.01, 9.9, 3.0),  # by chance
+        CalibrationScore(names[1], -0.019, 0.001, 300.0, 3.0),  # as any robot needs
+    ]
+    assert SessionScores(tuple(some)).suspected is some[1]
+    assert SessionScores(tuple(some[2:])).suspected is None
+    signs = with_scores(Signs(n_landmarks=9, sigma_m=0.01, size_m=9.0), SessionScores(tuple(some), -2.0))
+    assert (signs.held, signs.alternation, signs.adrift) == (0.6, -2.0, 0.0)
+    verdict = judge_signs(signs)
+    assert verdict.kind is VerdictKind.SENSOR_SUSPECT
+    assert f"0.6 standard deviations elsewhere if {names[1].say(-0.021)}" in verdict.message
+    assert judge_signs(replace(signs, held=0.0, held_name="")).kind is VerdictKind.SOUND
+
+
+def test_poses_beside_a_break_hang_on_detections_that_are_used() -> None:
+    def adrift(odometry: list[float], pose_row: list[int], weight: list[float]) -> int:
+        weights = (np.array(odometry), np.array(weight))
+        optimum: Any = SimpleNamespace(now=SimpleNamespace(weights=weights))
+        return _count_adrift(optimum, np.array(pose_row))
+
+    pose_row = [0, 1, 3, 3, 4, 5, 7]
+    whole, used = [1.0] * 7, [1.0] * 7
+    broken = [1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 1.0]  # between the fourth pose and the fifth
+    for odometry, weight, count in (
+        (whole, [0.0] * 7, 0),
+        (broken, used, 0),
+        (broken, [1, 1, 1, 0, 1, 1, 1], 0),  # another detection holds the pose
+        (broken, [1, 1, 0, 0, 1, 1, 1], 1),
+        (broken, [1, 1, 0, 0, 0, 1, 1], 2),
+        (broken, [1, 1, 1, 1, 0, 0, 0], 3),  # up to the end
+        (broken, [0, 1, 1, 1, 1, 1, 0], 0),  # held between the break and them
+    ):
+        assert adrift(odometry, pose_row, [float(one) for one in weight]) == count
+
+
 def test_stamps_of_arrival_alternate() -> None:
     world = World(seed=1)
     for mapped in (False, True):
         recording, given = world.plane(), world.map_in_plane() if mapped else None
         assert not scored(recording, given).alternation > 0.0
-        assert scored(stamped_on_arrival(recording), given).alternation > 3.0
+        assert scored(stamped_on_arrival(recording), given).alternation > 2.5
 
 
 def test_runs_are_asked_what_they_held() -> None:
