@@ -152,6 +152,16 @@ def test_poses_beside_a_break_hang_on_detections_that_are_used() -> None:
         assert adrift(odometry, pose_row, [float(one) for one in weight]) == count
 
 
+def test_a_camera_that_sees_nothing_is_asked_nothing() -> None:
+    world = World(seed=1, seconds=10.0)
+    recording = world.space()
+    seen = recording.detections
+    one_eyed = replace(recording, detections=seen[np.flatnonzero(seen.sensor == 0)])
+    found = scored(one_eyed, world.map_in_space())
+    assert any(one.suspect.code == "focal-length" for one in found.calibrations)
+    assert found.suspected is None
+
+
 def test_stamps_of_arrival_alternate() -> None:
     world = World(seed=1)
     for mapped in (False, True):

@@ -139,6 +139,8 @@ def _with_views(problem: SpatialProblem, recording: SpatialRecording, used: IntA
     seen, plane = recording.detections, np.ones((len(used), 4, 3))
     for row, sensor in enumerate(recording.sensors):
         mine = seen.sensor[used] == row
+        if not mine.any():
+            continue
         ray = unproject(seen.corner_px[used[mine]], sensor)
         plane[mine] = ray / ray[..., 2:]
     slope = project_each(plane, seen.sensor[used], recording.sensors)[1]
