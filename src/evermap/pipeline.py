@@ -73,7 +73,10 @@ def run_slam(
     result = replace(session.existing(visit, result, config.living), association=evidence)
     if prior_map is not None:
         result = with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)
-    return with_verdict(result, under.recording, config.slam, under.prior_map, findings=found, as_read=read)
+    solution = session.solution_of(visit)
+    return with_verdict(
+        result, under.recording, config.slam, under.prior_map, findings=found, as_read=read, session=solution
+    )
 
 
 @single_threaded()

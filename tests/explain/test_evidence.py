@@ -109,3 +109,21 @@ def test_score_is_the_step_of_one_more_number(problem: tuple) -> None:
     step = np.linalg.solve(whole, pull)
     assert score.value == pytest.approx(step[-1], rel=1e-6)
     assert score.information == pytest.approx(1.0 / np.linalg.inv(whole)[-1, -1], rel=1e-6)
+
+
+def test_two_more_numbers_share_what_is_left_of_them_without_all_others(problem: tuple) -> None:
+    graph, dense, measured, information = problem
+    random = np.random.default_rng(6)
+    state = np.linalg.solve(dense.T @ dense + np.diag(information), dense.T @ measured)
+    now = exhausted(graph.linearised(state))
+    empty = DetectionTerms(*(np.zeros(0) for _ in range(5)))
+    screen = Screen.of(Optimum(graph, now, state, empty, 0.0, 0.0, 1.0))
+    directions = random.normal(size=(2, len(measured)))
+    one, two = (screen.column(each) for each in directions)
+    hessian = dense.T @ dense + np.diag(information)
+    moves = np.linalg.solve(hessian, dense.T @ directions.T)
+    left = directions @ directions.T - directions @ dense @ moves
+    found = [[each.information_with(other) for other in (one, two)] for each in (one, two)]
+    np.testing.assert_allclose(found, left, rtol=1e-9)
+    begin = graph.structure.system.tree.begin[: len(state)]
+    np.testing.assert_allclose(one.step()[begin], -moves[:, 0], rtol=1e-7, atol=1e-12)

@@ -194,7 +194,7 @@ def test_noise_far_beyond_what_is_usual_is_weak() -> None:
     assert not alarms(result, recording)
     for name, code, most in (
         ("sigma_bearing_rad", "noise-of-detections", 4.0),
-        ("sigma_turn_per_sqrt_s", "noise-of-odometry", 6.0),
+        ("sigma_turn_per_sqrt_s", "noise-of-odometry", 2.5),
     ):
         for ratio, expected in ((0.95 * most, False), (1.05 * most, True)):
             levels = tuple(

@@ -18,7 +18,7 @@ import numpy as np
 
 from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
-from evermap.explain.causes import Inputs, Suspect, list_suspects, rows_of_kind
+from evermap.explain.causes import LITTLE, Inputs, Suspect, list_suspects, rows_of_kind
 from evermap.explain.evidence import (
     LOG_2PI,
     ROOM_M,
@@ -52,8 +52,6 @@ NEAR = 2.0
 """Standard deviations within which a state is refined no further."""
 FAR = 2.5
 """Standard deviations beforehand beyond which no state is tried at once."""
-LITTLE = 0.1
-"""Standard deviations beforehand within which a state is as is usual of sensors, and no cause."""
 LEAST_SCALE, LEAST_SINGLE = 0.015, 0.05
 """Logarithm of a scale, of all or of one landmark, from which its first value is tried: smaller ones the linear test
 finds."""

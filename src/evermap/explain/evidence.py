@@ -275,6 +275,29 @@ class Score(NamedTuple):
     gain: float
 
 
+class Column(NamedTuple):
+    """A further number at an optimum.
+
+    Attributes:
+        told: (R,) by how much weighted residuals change for a unit.
+        solved: the normal equations with what it asks of all others.
+        border: (B,) the border's step by it.
+    """
+
+    told: FloatArray
+    solved: Factorised
+    border: FloatArray
+
+    def information_with(self, other: Column) -> float:
+        """Return the information that two numbers share, all else marginalised: of a number with itself, on it."""
+        taken = self.solved.own_right @ other.solved.own_right + self.solved.right @ other.border
+        return float(self.told @ other.told - taken)
+
+    def step(self) -> FloatArray:
+        """Return (numbers,) by which a unit of it moves all others."""
+        return exhausted(self.solved.solution())
+
+
 @dataclass(frozen=True)
 class Screen:
     """An optimum, ready to ask what further numbers would do to it.
@@ -305,6 +328,21 @@ class Screen:
         mine[first[DETECTIONS] : first[DETECTIONS + 1]] = some[: first[DETECTIONS + 1] - first[DETECTIONS]]
         return np.repeat(mine, rows)
 
+    def column(self, direction: FloatArray) -> Column:
+        """Return a further number by which residuals (R,), not weighted, change so for a unit."""
+        graph, now = self.optimum.graph, self.optimum.now
+        told = direction * self.root
+        values = now.values.copy()
+        values[self.at] = -told
+        moved = replace(now, values=values, border_right=np.zeros_like(now.border_right))
+        solved = exhausted(graph.factorised(moved))
+        return Column(told, solved, np.asarray(np.linalg.solve(solved.information, solved.right), dtype=np.float64))
+
+    def pull(self, column: Column) -> float:
+        """Return the slope of the cost along a further number, with all else at its optimum."""
+        crossed = column.solved.own_right @ self.solved.own_right + self.solved.right @ column.border
+        return float(column.told @ (self.residual * self.root) - crossed)
+
     def score(self, direction: FloatArray, information: float, off: float = 0.0) -> Score:
         """Return what a number does by which residuals (R,), not weighted, change so.
 
@@ -313,15 +351,7 @@ class Screen:
             information: of its prior.
             off: where it is, from the mean of that.
         """
-        graph, now = self.optimum.graph, self.optimum.now
-        told = direction * self.root
-        values = now.values.copy()
-        values[self.at] = -told
-        moved = replace(now, values=values, border_right=np.zeros_like(now.border_right))
-        solved = exhausted(graph.factorised(moved))
-        border = np.linalg.solve(solved.information, solved.right)
-        taken = float(solved.own_right @ solved.own_right + solved.right @ border)
-        crossed = float(solved.own_right @ self.solved.own_right + self.solved.right @ border)
-        known = max(float(told @ told) - taken, 0.0) + information
-        pull = float(told @ (self.residual * self.root)) - crossed + information * off
+        column = self.column(direction)
+        known = max(column.information_with(column), 0.0) + information
+        pull = self.pull(column) + information * off
         return Score(-pull / known, known, 0.5 * pull**2 / known)

@@ -7,12 +7,13 @@ found. Values are numbers; what they should be is decided by `explain.verdict`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isnan, nan
 
 import numpy as np
 
 from evermap.estimate.innovations import comparable_nis, lag1_autocorrelation
+from evermap.explain.scores import SessionScores
 from evermap.geometry import se2, se3
 from evermap.slam.association.features import medians
 from evermap.types import (
@@ -27,7 +28,6 @@ from evermap.types import (
     Landmarks,
     ParameterEstimate,
     Recording,
-    SensorKind,
     SlamResult,
     Trajectory,
     is_in_space,
@@ -175,8 +175,8 @@ class Signs:
         motion: median difference of odometry and trajectory within a window, as a share of the motion.
         motion_turn_rad: the same of the turns.
         longer: motion by the trajectory over that by odometry.
-        apart: by which share lengths by odometry and by detections differ, where no map, laser or data sheet says which
-            are right.
+        apart: by which share lengths by odometry and by detections differ, where no map or data sheet says which are
+            right.
         over_odometry: how far detections of a landmark scatter about their middle, over what they would if the robot
             had gone as its odometry says (medians): more than 1 where the solution is the worse of the two.
         noise_seen, noise_driven: largest noise level of detections and odometry over what it started from.
@@ -193,6 +193,10 @@ class Signs:
         in_map: whether a given map is the frame of the result; None without one.
         alternatives: explanations nearly as probable as the one reported.
         n_unknown: poses and landmarks of the result that are no numbers.
+        held, held_name: by how many of their standard deviations one step of a calibration that is held as stated moves
+            the poses, of those that are significant (`explain.scores`), and its words; 0 where none is.
+        alternation: standard deviations by which errors of the odometry alternate from step to step.
+        adrift: poses beside a break of the odometry, whose detections are not used.
         dropped, bent_nats, lead_nats: of detections without identities (`AssociationEvidence`): share of no landmark,
             nats for each landmark met again, and log evidence over odometry alone.
     """
@@ -232,6 +236,10 @@ class Signs:
     in_map: bool | None = None
     alternatives: int = 0
     n_unknown: int = 0
+    held: float = nan
+    held_name: str = ""
+    alternation: float = nan
+    adrift: float = nan
     dropped: float = nan
     bent_nats: float = nan
     lead_nats: float = nan
@@ -240,6 +248,18 @@ class Signs:
     def sigma_share(self) -> float:
         """Return the standard deviation of positions as a share of the size."""
         return self.sigma_m / self.size_m if self.size_m > 0.0 else nan
+
+
+def with_scores(signs: Signs, scores: SessionScores) -> Signs:
+    """Return the signs with what the solution tells of what was held as stated."""
+    suspected = scores.suspected
+    return replace(
+        signs,
+        held=0.0 if suspected is None else suspected.shift,
+        held_name="" if suspected is None else suspected.suspect.say(suspected.value),
+        alternation=scores.alternation,
+        adrift=float(scores.adrift),
+    )
 
 
 def measure_signs(
@@ -502,12 +522,9 @@ def _shift_by_clock_m(result: SlamResult) -> float:
 
 
 def _is_length_stated(recording: AnyRecording) -> bool:
-    """Return whether a laser measures lengths, or a data sheet says how well ranges or odometry do."""
+    """Return whether a data sheet says how well ranges or odometry measure lengths."""
     sensors = recording.sensors if is_in_space(recording) else (recording.sensor,)
-    return any(
-        one.kind is SensorKind.LASER or one.sigma_scale is not None or one.sigma_odometer_scale is not None
-        for one in sensors
-    )
+    return any(one.sigma_scale is not None or one.sigma_odometer_scale is not None for one in sensors)
 
 
 def _extent(result: SlamResult) -> tuple[float, float, float]:

@@ -13,7 +13,10 @@ from dataclasses import dataclass, replace
 from math import inf, isfinite, isnan
 
 from evermap.config import SlamConfig
-from evermap.explain.symptoms import Signs, measure_signs
+from evermap.explain.causes import Inputs
+from evermap.explain.evidence import AnySession
+from evermap.explain.scores import score_session
+from evermap.explain.symptoms import Signs, measure_signs, with_scores
 from evermap.slam.check import far_off
 from evermap.slam.mistakes import Finding
 from evermap.types import AnyRecording, Cause, Landmarks, SlamResult, Symptom, Verdict, VerdictKind
@@ -105,6 +108,15 @@ LIMITS = (
         "units and scale of the odometry, or the size of tags and the unit of ranges",
     ),
     Limit(
+        "held", "held", "poses {:.1f} standard deviations elsewhere if {name}", -inf, 0.5, SUSPECT,
+        "a calibration that was held as stated is another",
+        "the calibration of the sensor measured again, or stated as uncertain in sensor.toml",
+    ),
+    Limit(
+        "alternation", "alternation", "errors of odometry alternate, by {:.1f} standard deviations", -inf, 2.5, SUSPECT,
+        "stamps of the detections are late by another delay each", "stamps of exposure, not of arrival",
+    ),
+    Limit(
         "map-changed", "moved", "{:.0%} of the map's landmarks in view changed", -inf, 0.5, OUTDATED,
         "too much of the map is not as it was", "a new map, or the edition of the map that was built",
     ),
@@ -113,7 +125,7 @@ LIMITS = (
         "so many moved that it may as well be the others", "a map that was built again, or some landmarks surveyed",
     ),
     Limit(
-        "scale", "apart", "lengths by odometry and by detections differ by {:.1%}", -inf, 0.05, WEAK,
+        "scale", "apart", "lengths by odometry and by detections differ by {:.1%}", -inf, 0.04, WEAK,
         "nothing says which of the two measures true metres",
         "a map with surveyed positions, or what is known better: sigma_scale of [sensor] or sigma_odometer_scale of "
         "[odometry] in sensor.toml",
@@ -142,8 +154,12 @@ LIMITS = (
         "the solution hardly listens to the detections", "calibration of the sensor, or its noise as stated",
     ),
     Limit(
-        "noise-of-odometry", "noise_driven", "odometry {:.1f} times as noisy as is usual", -inf, 6.0, WEAK,
+        "noise-of-odometry", "noise_driven", "odometry {:.1f} times as noisy as is usual", -inf, 2.5, WEAK,
         "the solution hardly follows the odometry", "calibration and clock of the odometry, or the sensor's [mount]",
+    ),
+    Limit(
+        "adrift", "adrift", "{:.0f} poses beside a break of the odometry with detections that are not used", -inf, 0.0,
+        WEAK, "odometry broke, and detections do not agree where", "the stretch left out, or two drives",
     ),
     Limit(
         "unexplained", "unexplained", "{:.0f} landmarks with many detections in a row unused", -inf, 0.0, WEAK,
@@ -155,7 +171,7 @@ LIMITS = (
         "hardly anything ties the poses to each other", "a drive that comes back to landmarks seen before",
     ),
     Limit(
-        "landmarks", "n_landmarks", "{:.0f} landmarks", 3.0, inf, WEAK,
+        "landmarks", "n_landmarks", "{:.0f} landmarks", 2.0, inf, WEAK,
         "so few landmarks check each other hardly", "more landmarks",
     ),
     Limit(
@@ -183,9 +199,13 @@ def with_verdict(
     findings: Sequence[Finding] = (),
     set_aside: str = "",
     as_read: AnyRecording | None = None,
+    session: AnySession | None = None,
 ) -> SlamResult:
     """Return the result with its verdict; arguments as of `judge`."""
-    verdict = judge(result, recording, settings, prior_map, findings=findings, set_aside=set_aside, as_read=as_read)
+    verdict = judge(
+        result, recording, settings, prior_map,
+        findings=findings, set_aside=set_aside, as_read=as_read, session=session,
+    )  # fmt: skip
     return replace(result, verdict=verdict)
 
 
@@ -198,6 +218,7 @@ def judge(
     findings: Sequence[Finding] = (),
     set_aside: str = "",
     as_read: AnyRecording | None = None,
+    session: AnySession | None = None,
 ) -> Verdict:
     """Return how far a run can be trusted.
 
@@ -209,10 +230,16 @@ def judge(
         findings: what `slam.check` found odd about the readings alone.
         set_aside: why a session could not be localised in its map; '' where it was, or there is none.
         as_read: the recording with the identities that it was read with; None where they are the same.
+        session: the solution that the result is of. If all else is sound, it is asked what it held as stated.
     """
     signs = measure_signs(result, recording, prior_map, as_read)
     wrong = [finding.message for finding in findings if not finding.usable]
-    return judge_signs(signs, [*wrong, *far_off(result.parameters, settings.check)], result.causes, set_aside)
+    suspicions = [*wrong, *far_off(result.parameters, settings.check)]
+    found = judge_signs(signs, suspicions, result.causes, set_aside)
+    if found.kind is not VerdictKind.SOUND or session is None:
+        return found
+    scores = score_session(session, Inputs.of(recording, prior_map), result.trajectory)
+    return judge_signs(with_scores(signs, scores), suspicions, result.causes, set_aside)
 
 
 def judge_signs(
@@ -239,7 +266,8 @@ def _symptoms(signs: Signs) -> Iterable[Symptom]:
         few = limit.sign in ("moved", "displaced") and value * signs.common < FEWEST_MOVED
         if isfinite(value) and not few:
             expected = _range_text(limit)
-            text = limit.text.format(value, name=signs.away_name)
+            name = signs.held_name if limit.sign == "held" else signs.away_name
+            text = limit.text.format(value, name=name or "any is another")
             yield Symptom(limit.code, f"{text}, {expected}", value, limit.least, limit.most)
 
 

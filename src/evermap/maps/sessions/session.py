@@ -12,7 +12,7 @@ from evermap.errors import DataError, NumericalError
 from evermap.existence.sites import Evidence
 from evermap.explain.causes import Inputs
 from evermap.explain.competition import SessionSolution, explain, in_given_units
-from evermap.explain.evidence import SpatialSession
+from evermap.explain.evidence import AnySession, SpatialSession
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Places, Stays
@@ -442,9 +442,7 @@ def explained(
         result = visit.concluded()
         if not np.isfinite(result.trajectory.pose_world_robot).all():
             raise NumericalError("the solution has poses that are no numbers", hint="check units, mounts and stamps")
-        if isinstance(visit, PlanarVisit):
-            return SessionSolution(visit, visit.solved, result)
-        return SessionSolution(visit, SpatialSession(visit.intake, visit.solved), result)
+        return SessionSolution(visit, solution_of(visit), result)
 
     told = list[str]()
     try:
@@ -464,6 +462,11 @@ def explained(
     if not found.causes:
         return best.visit, best.result, inputs
     return best.visit, replace(in_given_units(found.best), causes=found.causes), found.best.inputs
+
+
+def solution_of(visit: Visit) -> AnySession:
+    """Return what a session's estimate is, as causes are asked of it."""
+    return visit.solved if isinstance(visit, PlanarVisit) else SpatialSession(visit.intake, visit.solved)
 
 
 def with_causes(session: Session, living: LivingMap, config: Config) -> Session:

@@ -1,0 +1,252 @@
+"""What the estimator held as stated, asked at its solution: score tests of calibrations, and how odometry's errors are
+tied in time.
+
+A run may fit its readings well and still be wrong: where a sensor is not as stated, noise levels that are learned take
+in what that does. So every calibration that may be off is one more column at the optimum. It tells by how much a step
+of it would raise the likelihood (Rao's score test, `evidence.Screen`), and how far that step would move the poses, over
+what they are said to be known to. A step that is significant and moves them says that they are not known so well.
+
+Errors of odometry that alternate from step to step are those of poses that jitter along the way, as of stamps that are
+late by another delay each. Noise of odometry is independent from step to step, or lasts. And where odometry broke, the
+poses beside the break hang on it by detections alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from evermap.errors import EvermapError
+from evermap.explain.causes import DELAY_S, FOCAL, LITTLE, MOUNT_M, MOUNT_RAD, USUAL_P, Inputs, Suspect, list_suspects
+from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Column, Optimum, Screen, optimum_of, residuals_of
+from evermap.explain.linearise import change_by
+from evermap.geometry import se3
+from evermap.slam.estimate import Solved
+from evermap.types import FloatArray, IntArray, SpatialRecording, SpatialSensor, Trajectory, is_in_space
+
+Intrinsics: TypeAlias = tuple[float, float, float, float]
+"""Focal lengths and centre of an image [px]."""
+SIGNIFICANT = 10.0
+"""Gain of a score test [nats]: four and a half standard deviations."""
+USUAL = frozenset({"odometry-scale", "turn-scale"})
+"""Calibrations that are off on every robot: they may be so beside any other."""
+USUAL_SIGMA = 0.02
+"""Standard deviation of the logarithm of these."""
+OF_RANGES = frozenset({"range-scale", "tag-size"})
+"""What the estimator in the plane has as states, at a mean of several priors, which is no optimum."""
+INFORMED = 4.0
+"""Times the information of its prior that a session must have on a calibration."""
+KNOWN = 0.5
+"""Mean square of the odometry's whitened residuals from which its errors are seen, not smoothed away."""
+USED = 0.5
+"""Weight from which a step of the odometry, or a detection, counts."""
+FEWEST_STEPS = 30
+"""Steps of which a correlation says something."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationScore:
+    """A calibration that is held as stated, and one step of it from the solution.
+
+    Attributes:
+        suspect: what is held, and its words.
+        value, sigma: the step, and its standard deviation.
+        gain: log likelihood that it gains [nats], errors that last counted once.
+        shift: median of how far poses would move, over the median of their standard deviations.
+    """
+
+    suspect: Suspect
+    value: float
+    sigma: float
+    gain: float
+    shift: float
+
+
+@dataclass(frozen=True, slots=True)
+class SessionScores:
+    """What a session tells of what was held; nothing where it can't be asked.
+
+    Attributes:
+        calibrations: those that were asked.
+        alternation: standard deviations by which errors of odometry alternate from step to step more than by chance.
+        adrift: poses beside a break of the odometry that saw landmarks, and none of it was used.
+    """
+
+    calibrations: tuple[CalibrationScore, ...] = field(default=())
+    alternation: float = math.nan
+    adrift: int = 0
+
+    @property
+    def suspected(self) -> CalibrationScore | None:
+        """Return the significant step, larger than sensors usually need, that moves the poses most; None without."""
+        told = (
+            one for one in self.calibrations if one.gain > SIGNIFICANT and abs(one.value) > LITTLE * one.suspect.sigma
+        )
+        return max(told, key=lambda one: one.shift, default=None)
+
+
+def score_session(session: AnySession, inputs: Inputs, trajectory: Trajectory) -> SessionScores:
+    """Return what a solved session tells of what it held as stated.
+
+    Args:
+        session: the solution.
+        inputs: of which it is the solution.
+        trajectory: of its result, for how well poses are known.
+    """
+    dim = inputs.recording.dim
+    variance = np.trace(trajectory.covariance[:, :dim, :dim], axis1=1, axis2=2)
+    sigma_m = float(np.sqrt(np.median(variance))) if len(variance) else 0.0
+    if not sigma_m > 0.0:
+        return SessionScores()
+    try:
+        screen = Screen.of(optimum_of(session))
+        found = tuple(_score_all(session, screen, inputs, sigma_m))
+    except EvermapError:
+        return SessionScores()
+    solved = session.outcome.problem if isinstance(session, Solved) else session.solved.optimum.smoother.problem
+    adrift = _count_adrift(screen.optimum, solved.pose_row)
+    return SessionScores(found, _measure_alternation(screen.optimum), adrift)
+
+
+def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: float) -> Iterable[CalibrationScore]:
+    """Yield the step of each calibration, what is usual of odometry marginalised."""
+    optimum, dim = screen.optimum, inputs.recording.dim
+    at = optimum.graph.structure.system.tree.begin[: len(optimum.state.pose), None] + np.arange(dim)
+    usual = list[tuple[Column, float, FloatArray]]()
+    for suspect in sorted(_list_calibrations(inputs), key=lambda one: one.code not in USUAL):
+        direction = change_by(session, screen, inputs, suspect)
+        if direction is None:
+            continue
+        column = screen.column(direction)
+        if suspect.code in USUAL:
+            usual.append((column, screen.pull(column), column.step()[at]))
+            continue
+        prior = suspect.sigma**-2
+        known, pull = column.information_with(column), screen.pull(column)
+        if not known > INFORMED * prior:  # nothing but its prior says where it is
+            continue
+        shared = np.array([column.information_with(one) for one, _, _ in usual])
+        between = np.array([[one.information_with(two) for two, _, _ in usual] for one, _, _ in usual])
+        between = between.reshape(len(usual), len(usual)) + USUAL_SIGMA**-2 * np.eye(len(usual))
+        taken = np.linalg.solve(between, shared)
+        known += prior - float(shared @ taken)
+        pull -= float(taken @ [each for _, each, _ in usual])
+        value = -pull / known
+        moved = column.step()[at] - sum((by * step for by, (_, _, step) in zip(taken, usual, strict=True)), np.zeros(1))
+        shift = float(np.median(np.linalg.norm(value * moved, axis=1)))
+        gain = 0.5 * pull**2 / known * optimum.worth
+        yield CalibrationScore(suspect, value, known**-0.5, gain, shift / sigma_m)
+
+
+def _measure_alternation(optimum: Optimum) -> float:
+    """Return by how many standard deviations errors of odometry alternate; nan where detections do not show them."""
+    structure, weight = optimum.graph.structure, optimum.now.weights[ODOMETRY]
+    rows = structure.system.factors.rows[structure.first[ODOMETRY] : structure.first[ODOMETRY + 1]]
+    if len(rows) < FEWEST_STEPS:
+        return math.nan
+    residual = residuals_of(optimum.graph, optimum.now)[1][: rows.sum()].reshape(len(rows), -1)
+    residual = residual * np.sqrt(np.minimum(weight, 1.0))[:, None]
+    residual = residual[:, np.mean(residual**2, axis=0) > KNOWN]
+    product = residual[1:] * residual[:-1]
+    return float(-product.sum() / math.sqrt(max(float((product**2).sum()), 1e-12))) if product.size else math.nan
+
+
+def _count_adrift(optimum: Optimum, pose_row: IntArray) -> int:
+    """Return poses with detections (M,) between a broken step and the next pose of which any detection is used."""
+    broken = np.flatnonzero(optimum.now.weights[ODOMETRY] < USED)
+    seen, used = np.unique(pose_row), np.unique(pose_row[optimum.now.weights[DETECTIONS][: len(pose_row)] >= USED])
+    last = np.concatenate([[-1], used])[np.searchsorted(used, broken, side="right")]
+    after = np.concatenate([used, [np.iinfo(np.int64).max]])[np.searchsorted(used, broken + 1)]
+    between = (seen > last[:, None]) & (seen < after[:, None])
+    return int(np.count_nonzero(between.any(axis=0)))
+
+
+def _list_calibrations(inputs: Inputs) -> Iterable[Suspect]:
+    """Yield all that may be off of a sensor as a whole, of the odometry and of the map."""
+    recording = inputs.recording
+    own = () if is_in_space(recording) else OF_RANGES
+    for suspect in list_suspects(inputs):
+        if suspect.is_continuous and suspect.code not in own and (suspect.rows is None or suspect.rows[0] != "id"):
+            yield suspect
+    if not is_in_space(recording):
+        return
+    if len(recording.sensors) > 1 and recording.odometry is not None:
+        yield from _of_rig(recording)
+    if np.isfinite(recording.detections.corner_px).any():
+        for intrinsics in {one.intrinsics: None for one in recording.sensors if one.intrinsics is not None}:
+            yield _of_pixels(recording, intrinsics)
+
+
+def _of_rig(recording: SpatialRecording) -> Iterable[Suspect]:
+    """Yield what may be off of all sensors together, and the clock of each."""
+    for axis, part in enumerate(("x", "y", "z", "roll", "pitch", "yaw")):
+        unit, sigma = ("rad", MOUNT_RAD) if axis > 2 else ("m", MOUNT_M)
+        yield Suspect(
+            "mount", f"all sensors {part}", USUAL_P, partial(_move_rig, axis=axis),
+            lambda s, part=part, unit=unit: f"mounts of all sensors are {s:.3g} {unit} off in {part} of the robot",  # type: ignore[misc]
+            lambda _: "[camera.*.mount]", sigma,
+        )  # fmt: skip
+    for row, sensor in enumerate(recording.sensors):
+        name = sensor.name
+        yield Suspect(
+            "clock", name, USUAL_P, partial(_shift_sensor, sensor=row),
+            lambda s, name=name: f"stamps of {name} are {abs(s):.3g} s {'late' if s > 0 else 'early'}",  # type: ignore[misc]
+            lambda s, name=name: f"detections.csv of {name}: stamp_s {'-' if s > 0 else '+'} {abs(s):.3g}",  # type: ignore[misc]
+            DELAY_S,
+        )  # fmt: skip
+
+
+def _of_pixels(recording: SpatialRecording, intrinsics: Intrinsics) -> Suspect:
+    """Return that the pixels of cameras that share a calibration are not as wide for their height as stated."""
+    fx, fy, cx, cy = intrinsics
+    name = ", ".join(one.name for one in recording.sensors if one.intrinsics == intrinsics)
+    return Suspect(
+        "intrinsics", f"{name} fx", USUAL_P, partial(_widen_pixels, intrinsics=intrinsics),
+        lambda s: f"{name}: fx over fy is {fx / fy * math.exp(s):.4g}, not {fx / fy:.4g}",
+        lambda s: f"[camera.{name}] intrinsics = "
+        f"[{fx * math.exp(0.5 * s):.5g}, {fy * math.exp(-0.5 * s):.5g}, {cx:g}, {cy:g}]",
+        FOCAL,
+    )  # fmt: skip
+
+
+def _move_rig(inputs: Inputs, state: float, axis: int) -> Inputs:
+    """Return the same with all mounts moved along, or turned about, an axis of the robot."""
+    by = np.zeros(3)
+    by[axis % 3] = state
+    recording: Any = inputs.recording
+    sensors = list[SpatialSensor]()
+    for one in recording.sensors:
+        mount = np.array(one.mount_robot_sensor)
+        if axis < 3:
+            mount[:3] += by
+        else:
+            mount[3:] = se3.compose(se3.from_angles(by), se3.turn(mount[3:]))[3:]
+        sensors.append(replace(one, mount_robot_sensor=tuple(mount.tolist())))
+    return replace(inputs, recording=replace(recording, sensors=tuple(sensors)))
+
+
+def _shift_sensor(inputs: Inputs, state: float, sensor: int) -> Inputs:
+    """Return the same with frames of one sensor earlier by the delay of its stamps."""
+    recording: Any = inputs.recording
+    seen, frames = recording.detections, recording.frames
+    own, others = (
+        np.isin(np.arange(len(frames)), seen.frame[of]) for of in (seen.sensor == sensor, seen.sensor != sensor)
+    )
+    stamp_s = np.where(own & ~others, frames.stamp_s - state, frames.stamp_s)
+    return replace(inputs, recording=replace(recording, frames=replace(frames, stamp_s=stamp_s)))
+
+
+def _widen_pixels(inputs: Inputs, state: float, intrinsics: Intrinsics) -> Inputs:
+    """Return the same with another ratio of the focal lengths of cameras of a calibration."""
+    recording: Any = inputs.recording
+    fx, fy, cx, cy = intrinsics
+    other = (fx * math.exp(0.5 * state), fy * math.exp(-0.5 * state), cx, cy)
+    sensors = tuple(
+        replace(one, intrinsics=other) if one.intrinsics == intrinsics else one for one in recording.sensors
+    )
+    return replace(inputs, recording=replace(recording, sensors=sensors))

@@ -1,0 +1,180 @@
+"""What a solution tells of what it held as stated: calibrations, stamps that jitter, and breaks of the odometry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evermap import run_slam
+from evermap.config import Config
+from evermap.explain import linearise
+from evermap.explain.causes import Inputs, list_suspects
+from evermap.explain.scores import SIGNIFICANT, CalibrationScore, SessionScores, _count_adrift, score_session
+from evermap.explain.symptoms import Signs, with_scores
+from evermap.explain.verdict import judge_signs
+from evermap.geometry import se3
+from evermap.maps.sessions import session
+from evermap.types import AnyRecording, Frames, Landmarks, Recording, SpatialRecording, VerdictKind
+
+from .worlds import World
+
+
+def scored(recording: AnyRecording, given: Landmarks | None) -> SessionScores:
+    """Return what a session tells that is solved as given."""
+    config = Config.model_validate({"slam": {"explain": {"on": False}}})
+    visit, result, inputs = session.explained(Inputs.of(recording, given), config, ())
+    return score_session(session.solution_of(visit), inputs, result.trajectory)
+
+
+def mounts(recording: SpatialRecording, how: Callable[[np.ndarray], np.ndarray]) -> SpatialRecording:
+    """State all mounts otherwise."""
+    sensors = [
+        replace(one, mount_robot_sensor=tuple(how(np.array(one.mount_robot_sensor)).tolist()))
+        for one in recording.sensors
+    ]
+    return replace(recording, sensors=tuple(sensors))
+
+
+def pitched(mount: np.ndarray) -> np.ndarray:
+    turned = se3.compose(se3.from_angles([0.0, 0.1, 0.0]), se3.turn(mount[3:]))
+    return np.concatenate([mount[:3], turned[3:]])
+
+
+def with_own_frames(recording: SpatialRecording, late_s: float) -> SpatialRecording:
+    """Give each camera its own frames; stamps of the second are late."""
+    seen, stamp_s = recording.detections, recording.frames.stamp_s
+    own = np.stack([stamp_s, stamp_s + late_s]).ravel()
+    order = np.argsort(own, kind="stable")
+    rank = np.argsort(order)[seen.frame + len(stamp_s) * seen.sensor]
+    rows = np.argsort(rank, kind="stable")
+    return replace(recording, frames=Frames(own[order]), detections=replace(seen[rows], frame=rank[rows]))
+
+
+def with_other_lens(recording: SpatialRecording) -> SpatialRecording:
+    fx, fy, cx, cy = recording.sensors[0].intrinsics or (0.0,) * 4
+    other = tuple(replace(one, intrinsics=(1.03 * fx, fy / 1.03, cx, cy)) for one in recording.sensors)
+    return replace(recording, sensors=other)
+
+
+def stamped_on_arrival(recording: Recording) -> Recording:
+    late_s = np.random.default_rng(3).uniform(0.0, 0.15, len(recording.frames))
+    return replace(recording, frames=replace(recording.frames, stamp_s=recording.frames.stamp_s + late_s))
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("kind", ["plane", "corners", "poses"])
+def test_nothing_is_suspected_of_a_sound_drive(kind: str, mapped: bool) -> None:
+    world = World(seed=1)
+    recording: Any = world.plane() if kind == "plane" else world.space(corners=kind == "corners")
+    survey = world.map_in_plane() if kind == "plane" else world.map_in_space()
+    found = scored(recording, survey if mapped else None)
+    assert found.calibrations
+    assert max(one.gain for one in found.calibrations) < SIGNIFICANT
+    assert (found.suspected, found.adrift, found.alternation > 2.5) == (None, 0, False)
+
+
+WRONG: dict[str, tuple[Callable[[SpatialRecording], SpatialRecording], str, float]] = {
+    "mounts": (lambda one: mounts(one, lambda at: at + [0.2, 0, 0, 0, 0, 0, 0]), "all sensors x", -0.2),
+    "pitch": (lambda one: mounts(one, pitched), "all sensors pitch", -0.1),
+    "lens": (with_other_lens, "front, back fx", -2.0 * math.log(1.03)),
+    "late": (lambda one: with_own_frames(one, 0.08), "back", 0.08),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_held_though_it_is_another_is_suspected(name: str) -> None:
+    how, subject, value = WRONG[name]
+    world = World(seed=1)
+    recording = how(world.space())
+    found = scored(recording, world.map_in_space())
+    own = next(one for one in found.calibrations if one.suspect.subject == subject)
+    best = max(found.calibrations, key=lambda one: one.gain)
+    assert best is own
+    assert own.value == pytest.approx(value, rel=0.4)
+    assert own.gain > SIGNIFICANT
+    suspected = found.suspected
+    assert suspected is not None
+    assert suspected.shift > 0.5
+
+
+def test_a_score_does_not_depend_on_the_step_of_its_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = mounts(World(seed=1).space(), lambda at: at + [0.02, 0, 0, 0, 0, 0, 0])
+    found = scored(recording, World().map_in_space())
+    monkeypatch.setattr(linearise, "STEP", 0.2 * linearise.STEP)
+    again = scored(recording, World().map_in_space())
+    assert [one.suspect.subject for one in found.calibrations] == [one.suspect.subject for one in again.calibrations]
+    for one, two in zip(found.calibrations, again.calibrations, strict=True):
+        assert one.gain == pytest.approx(two.gain, rel=0.02, abs=0.02), one.suspect.subject
+
+
+def test_the_significant_step_that_moves_poses_most_is_suspected() -> None:
+    names = [one for one in list_suspects(Inputs.of(World(seconds=2.0).space(), None)) if one.code == "mount"]
+    some = [
+        CalibrationScore(names[0], 0.1, 0.01, 10.1, 0.4),
+        CalibrationScore(names[1], -0.021, 0.01, 10.1, 0.6),
+        CalibrationScore(names[2], 0.1, 0.01, 9.9, 3.0),  # by chance
+        CalibrationScore(names[1], -0.019, 0.001, 300.0, 3.0),  # as any robot needs
+    ]
+    assert SessionScores(tuple(some)).suspected is some[1]
+    assert SessionScores(tuple(some[2:])).suspected is None
+    signs = with_scores(Signs(n_landmarks=9, sigma_m=0.01, size_m=9.0), SessionScores(tuple(some), -2.0))
+    assert (signs.held, signs.alternation, signs.adrift) == (0.6, -2.0, 0.0)
+    verdict = judge_signs(signs)
+    assert verdict.kind is VerdictKind.SENSOR_SUSPECT
+    assert f"0.6 standard deviations elsewhere if {names[1].say(-0.021)}" in verdict.message
+    assert judge_signs(replace(signs, held=0.0, held_name="")).kind is VerdictKind.SOUND
+
+
+def test_poses_beside_a_break_hang_on_detections_that_are_used() -> None:
+    def adrift(odometry: list[float], pose_row: list[int], weight: list[float]) -> int:
+        weights = (np.array(odometry), np.array(weight))
+        optimum: Any = SimpleNamespace(now=SimpleNamespace(weights=weights))
+        return _count_adrift(optimum, np.array(pose_row))
+
+    pose_row = [0, 1, 3, 3, 4, 5, 7]
+    whole, used = [1.0] * 7, [1.0] * 7
+    broken = [1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 1.0]  # between the fourth pose and the fifth
+    for odometry, weight, count in (
+        (whole, [0.0] * 7, 0),
+        (broken, used, 0),
+        (broken, [1, 1, 1, 0, 1, 1, 1], 0),  # another detection holds the pose
+        (broken, [1, 1, 0, 0, 1, 1, 1], 1),
+        (broken, [1, 1, 0, 0, 0, 1, 1], 2),
+        (broken, [1, 1, 1, 1, 0, 0, 0], 3),  # up to the end
+        (broken, [0, 1, 1, 1, 1, 1, 0], 0),  # held between the break and them
+    ):
+        assert adrift(odometry, pose_row, [float(one) for one in weight]) == count
+
+
+def test_a_camera_that_sees_nothing_is_asked_nothing() -> None:
+    world = World(seed=1, seconds=10.0)
+    recording = world.space()
+    seen = recording.detections
+    one_eyed = replace(recording, detections=seen[np.flatnonzero(seen.sensor == 0)])
+    found = scored(one_eyed, world.map_in_space())
+    assert any(one.suspect.code == "focal-length" for one in found.calibrations)
+    assert found.suspected is None
+
+
+def test_stamps_of_arrival_alternate() -> None:
+    world = World(seed=1)
+    for mapped in (False, True):
+        recording, given = world.plane(), world.map_in_plane() if mapped else None
+        assert not scored(recording, given).alternation > 0.0
+        assert scored(stamped_on_arrival(recording), given).alternation > 2.5
+
+
+def test_runs_are_asked_what_they_held() -> None:
+    world = World(seed=1)
+    right, wrong = world.space(), mounts(world.space(), lambda at: at + [0.05, 0, 0, 0, 0, 0, 0])
+    for recording, kind in ((right, VerdictKind.SOUND), (wrong, VerdictKind.SENSOR_SUSPECT)):
+        verdict = run_slam(recording, prior_map=world.map_in_space()).verdict
+        assert verdict is not None
+        assert verdict.kind is kind, verdict.message
+        assert ("mounts of all sensors are -0.0" in verdict.message) is (recording is wrong)
