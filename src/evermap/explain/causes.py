@@ -44,7 +44,7 @@ SIDEWAYS = 0.1
 DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL, DISTORTION = 0.5, 0.2, 0.3, 0.1, 0.2
 """Standard deviations of a delay, of a mount's position and turn, of the logarithm of a focal length, and of k1."""
 LITTLE = 0.1
-"""Standard deviations beforehand within which a state is as is usual of sensors, and no cause: 2 cm of a mount, 50 ms."""
+"""Standard deviations beforehand within which a state is as is usual of sensors: 2 cm of a mount, 50 ms of a clock."""
 
 
 @dataclass(frozen=True, slots=True)
