@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from evermap import check_recording, run_slam
 from evermap.explain.shape import compare_shapes
 from evermap.slam.check import find_corner_mistake, is_clockwise
-from evermap.slam.mistakes import USUAL
+from evermap.slam.mistakes import USUAL, find_motion
 from evermap.slam.orientations import find_convention
-from evermap.types import FloatArray, Landmarks, SpatialRecording
+from evermap.types import FloatArray, Landmarks, SpatialRecording, VerdictKind
 
 from .worlds import World
 
@@ -115,6 +116,77 @@ def test_poses_of_the_odometry_in_another_convention_are_named(
     pose = inverse(pose) if convention == "inverse" else np.column_stack([pose[:, :3], w_first(pose[:, 3:])])
     (found,) = [one for one in check_recording(with_odometry(recording, pose)).findings if not one.usable]
     assert (found.code, word in found.message) == ("odometry-poses", True)
+
+
+@dataclass(frozen=True)
+class Sideways(World):
+    """A robot that turns as it likes, whichever way it drives; what it reports of its motion is written otherwise.
+
+    Attributes:
+        signs: factors on the speeds ahead, to the left, and on turns.
+        exchanged: whether the first two are exchanged after that.
+        slips: true way to the left over that ahead, of which the odometry says nothing.
+    """
+
+    signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    exchanged: bool = False
+    slips: float = 0.0
+
+    def path(self, stamp_s: FloatArray) -> FloatArray:
+        pose = super().path(stamp_s)
+        return pose + np.column_stack([0.0 * pose[:, :2], np.sin(2.0 * np.pi * stamp_s / 9.0)])
+
+    def driven(self, random: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        stamp_s, velocity = super().driven(random)
+        velocity[:, 1] -= self.slips * velocity[:, 0]
+        velocity = velocity * self.signs
+        return stamp_s, velocity[:, [1, 0, 2]] if self.exchanged else velocity
+
+
+DRIVES: dict[str, tuple[dict[str, Any], str, str]] = {
+    "lateral": ({"signs": (1.0, -1.0, 1.0)}, "odometry-axes", "lateral"),
+    "exchanged": ({"exchanged": True}, "odometry-axes", "exchanged"),
+    "forward": ({"signs": (-1.0, 1.0, 1.0)}, "forward-sign", "forward speeds"),
+    "turns": ({"signs": (1.0, 1.0, -1.0)}, "turn-sign", "counter-clockwise"),
+}
+
+
+@pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow), "poses"])
+@pytest.mark.parametrize("how", DRIVES)
+def test_signs_and_axes_of_an_odometry_are_named(how: str, kind: str) -> None:
+    written, code, word = DRIVES[how]
+    world = Sideways(seed=4, **written)
+    recording = world.plane() if kind == "plane" else world.space(corners=kind == "corners")
+    (found,) = find_motion(recording, USUAL)
+    assert (found.code, word in found.message, found.usable) == (code, True, False)
+
+
+def test_a_mirrored_odometry_is_named() -> None:
+    (found,) = find_motion(Sideways(seed=4, signs=(1.0, -1.0, -1.0)).space(corners=False), USUAL)
+    assert found.code == "odometry-mirrored"
+
+
+def test_a_sensor_that_looks_back_is_named_where_the_robot_drives_sideways() -> None:
+    (found,) = find_motion(Sideways(seed=4, signs=(-1.0, -1.0, 1.0)).plane(), USUAL)
+    assert (found.code, "looks backwards" in found.message) == ("forward-sign", True)
+
+
+@pytest.mark.parametrize("world", [World(seed=4), Sideways(seed=4), Sideways(seed=4, slips=0.1), World(drift=0.05)])
+def test_a_drive_as_it_is_has_no_wrong_axes(world: World) -> None:
+    """Neither have one whose wheels slip to the side, nor one of a poor odometry."""
+    assert find_motion(world.plane(), USUAL) == find_motion(world.space(corners=False), USUAL) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["lateral", "exchanged"])
+def test_a_drive_with_other_axes_is_solved_and_moves_nothing(how: str) -> None:
+    written, code, word = DRIVES[how]
+    result = run_slam(Sideways(seed=4, **written).space(corners=False), prior_map=World().map_in_space().as_prior(0.01))
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+    (cause,) = result.causes
+    assert (cause.code, word in cause.message) == (code, True)
+    assert result.changes == ()
 
 
 def map_faults(survey: Landmarks) -> dict[str, Landmarks]:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from evermap.geometry import se2, se3
+from evermap.geometry.group import accumulate
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam import mistakes
 from evermap.slam.check import CLOCKWISE, CORNERS, SIGHTED, find_corner_mistake, is_clockwise, read_corners
@@ -288,11 +289,7 @@ def _turn_by(inputs: Inputs, factor: float) -> Inputs:
     assert path is not None
     step = se3.log(se3.between(path.pose_world_robot[:-1], path.pose_world_robot[1:]))
     step[:, 3:] *= factor
-    pose = np.empty_like(path.pose_world_robot)
-    pose[0] = path.pose_world_robot[0]
-    for row, by in enumerate(se3.exp(step)):
-        pose[row + 1] = se3.compose(pose[row], by)
-    return _with_poses(inputs, pose)
+    return _with_poses(inputs, np.asarray(se3.compose(path.pose_world_robot[:1], accumulate(se3.exp(step)))))
 
 
 def _shift_stamps(inputs: Inputs, state: float) -> Inputs:
@@ -322,8 +319,14 @@ def _undo_in_plane(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Input
     bearing = se2.wrap(mistake.bearing * seen.bearing_rad + mistake.offset_rad)
     stretch = math.log(abs(mistake.bearing))
     sigma = seen.sigma_bearing_rad * abs(mistake.bearing)
+    ahead, aside = (
+        (driven.lateral_mps, driven.forward_mps) if mistake.exchanged else (driven.forward_mps, driven.lateral_mps)
+    )
     odometry = replace(
-        driven, forward_mps=driven.forward_mps * mistake.forward, angular_radps=driven.angular_radps * mistake.turn
+        driven,
+        forward_mps=ahead * mistake.forward,
+        lateral_mps=aside * mistake.lateral,
+        angular_radps=driven.angular_radps * mistake.turn,
     )
     detections = replace(seen, bearing_rad=bearing, sigma_bearing_rad=sigma)
     if (mistake.bearing, mistake.offset_rad) == (1.0, 0.0):
@@ -377,18 +380,14 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
     if recording.odometry is not None:
         yield _odometry_scale()
         yield _turn_scale()
-        yield Suspect(
-            "turn-sign", "odometry", USUAL_P, lambda inputs, _: _turn_by(inputs, -1.0),
-            _constant("turns of the odometry seem to have the wrong sign: counter-clockwise is positive"),
-            _constant("odometry.csv: angular_radps"),
-        )  # fmt: skip
         yield _late_stamps(sensors[0].name if len(sensors) == 1 else "all sensors")
-        if _drives_sideways(recording.odometry):  # else only its turns can be mirrored
-            yield Suspect(
-                "odometry-mirrored", "odometry", RARE_P, lambda inputs, _: _mirror_drive(inputs),
-                _constant("the odometry seems mirrored: y is to the left, turns are counter-clockwise"),
-                _constant("odometry.csv: lateral_mps, angular_radps"),
-            )  # fmt: skip
+        aside = _drives_sideways(recording.odometry)
+        for mistake in mistakes.DRIVES:
+            if mistake.lateral == 1.0 or aside:  # else only its turns can be mirrored
+                yield Suspect(
+                    mistake.code, "odometry", USUAL_P if "sign" in mistake.code else RARE_P,
+                    partial(_read_drive, mistake=mistake), _constant(mistake.message), _constant(_fix_of(mistake)),
+                )  # fmt: skip
         for mistake in mistakes.POSES:
             yield Suspect(
                 mistake.code, mistake.field, USUAL_P, partial(_read_poses, convention=mistake.poses),
@@ -473,12 +472,10 @@ def _drives_sideways(odometry: SpatialOdometry) -> bool:
     return bool(step[1] > SIDEWAYS * step[0])
 
 
-def _mirror_drive(inputs: Inputs) -> Inputs:
-    """Return the same with the odometry mirrored left to right."""
+def _read_drive(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Inputs:
+    """Return the same with the odometry's signs and axes read in another way."""
     recording: Any = inputs.recording
-    pose = recording.odometry.pose_world_robot.copy()
-    pose[:, [1, 3, 5]] *= -1.0
-    return _with_poses(inputs, pose)
+    return _with_poses(inputs, mistakes.read_drive(recording.odometry.pose_world_robot, *mistake.drive))
 
 
 def _read_poses(inputs: Inputs, _: float, convention: str) -> Inputs:

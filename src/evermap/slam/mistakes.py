@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import inf, log, pi
 from typing import Self, TypeAlias
@@ -21,6 +21,7 @@ import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
+from evermap.geometry.group import accumulate
 from evermap.slam.kernels import pair_residuals, reckoned_motions
 from evermap.types import (
     UNKNOWN,
@@ -44,7 +45,8 @@ class Mistake:
         code, message: as in `Finding`.
         lengths: factor on all ranges, or its inverse on all speeds, which is the same.
         bearing, offset_rad: a bearing becomes `bearing * b + offset_rad`.
-        turn, forward: factors on the turn rate and the forward speed.
+        turn, forward, lateral: factors on the turn rate, and on the speeds ahead and to the left.
+        exchanged: whether these two speeds are each other's.
         delay_s: odometry stamps are so much later than the motion.
         turned: quaternion that turns positions in the sensor's frame.
         poses: how poses of the odometry were written, a key of `CONVENTIONS`; '' as they are read.
@@ -58,6 +60,8 @@ class Mistake:
     offset_rad: float = 0.0
     turn: float = 1.0
     forward: float = 1.0
+    lateral: float = 1.0
+    exchanged: bool = False
     delay_s: float = 0.0
     turned: tuple[float, ...] = tuple(se3.NO_TURN)
     poses: str = ""
@@ -68,19 +72,25 @@ class Mistake:
         turned = self.turned
         if other.turned != HONEST.turned:
             turned = tuple(se3.compose(se3.turn(self.turned), se3.turn(other.turned))[3:].tolist())
-        return Mistake(
-            self.code,
-            self.message,
-            self.lengths * other.lengths,
-            self.bearing * other.bearing,
-            self.bearing * other.offset_rad + self.offset_rad,
-            self.turn * other.turn,
-            self.forward * other.forward,
-            self.delay_s + other.delay_s,
-            turned,
-            self.poses or other.poses,
-            self.field,
+        ahead, aside = (other.lateral, other.forward) if self.exchanged else (other.forward, other.lateral)
+        return replace(
+            self,
+            lengths=self.lengths * other.lengths,
+            bearing=self.bearing * other.bearing,
+            offset_rad=self.bearing * other.offset_rad + self.offset_rad,
+            turn=self.turn * other.turn,
+            forward=self.forward * ahead,
+            lateral=self.lateral * aside,
+            exchanged=self.exchanged != other.exchanged,
+            delay_s=self.delay_s + other.delay_s,
+            turned=turned,
+            poses=self.poses or other.poses,
         )
+
+    @property
+    def drive(self) -> tuple[float, float, float, bool]:
+        """Return what it changes of the speeds."""
+        return self.forward, self.lateral, self.turn, self.exchanged
 
 
 HONEST = Mistake("", "")
@@ -138,6 +148,26 @@ ANGLES = (
         forward=-1.0,
         field="forward_mps",
     ),
+    Mistake(
+        "forward-sign",
+        "the robot seems to drive in the opposite direction: forward and lateral speeds have the wrong sign "
+        "(forward_mps, lateral_mps), or the sensor looks backwards ([mount] theta_rad)",
+        forward=-1.0,
+        lateral=-1.0,
+        field="forward_mps",
+    ),
+    Mistake(
+        "odometry-axes",
+        "lateral speeds seem to have the wrong sign: y is to the left (lateral_mps)",
+        lateral=-1.0,
+        field="lateral_mps",
+    ),
+    Mistake(
+        "odometry-axes",
+        "forward and lateral speeds seem to be exchanged: x is ahead, y to the left (forward_mps, lateral_mps)",
+        exchanged=True,
+        field="forward_mps",
+    ),
     *(
         Mistake(
             "bearing-axis",
@@ -184,6 +214,41 @@ POSES = (
         field="odometry",
     ),
 )
+DRIVES = (
+    Mistake(
+        "turn-sign",
+        "turns of the odometry seem to have the wrong sign: counter-clockwise is positive (angular_radps)",
+        turn=-1.0,
+        field="angular_radps",
+    ),
+    Mistake(
+        "forward-sign",
+        "the robot seems to drive in the opposite direction: forward speeds have the wrong sign (forward_mps)",
+        forward=-1.0,
+        field="forward_mps",
+    ),
+    Mistake(
+        "odometry-axes",
+        "lateral motion of the odometry seems to have the wrong sign: y is to the left (lateral_mps)",
+        lateral=-1.0,
+        field="lateral_mps",
+    ),
+    Mistake(
+        "odometry-axes",
+        "forward and lateral motion of the odometry seem to be exchanged: x is ahead, y to the left (forward_mps, "
+        "lateral_mps)",
+        exchanged=True,
+        field="forward_mps",
+    ),
+    Mistake(
+        "odometry-mirrored",
+        "the odometry seems mirrored: y is to the left, turns are counter-clockwise (lateral_mps, angular_radps)",
+        lateral=-1.0,
+        turn=-1.0,
+        field="lateral_mps",
+    ),
+)
+"""Signs and axes of an odometry in space, those that are met more often first."""
 _DELAYS_S = (*np.arange(1.0, 10.0, 0.5).tolist(), *np.arange(10.0, 61.0, 1.0).tolist())
 AT_ONCE = 32
 """Number of corrections that are tried together: arrays of a megabyte."""
@@ -350,7 +415,7 @@ class PlanarPairs:
 
     def __init__(self, recording: Recording, first: IntArray, second: IntArray) -> None:
         detections = recording.detections
-        self._odometry, self._tracks = recording.odometry, dict[tuple[float, float], FloatArray]()
+        self._odometry, self._tracks = recording.odometry, dict[tuple[float, float, float, bool], FloatArray]()
         self._mount = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64)
         stamp_s = recording.frames.stamp_s[detections.frame]
         self._stamp_s = stamp_s[first], stamp_s[second]
@@ -389,24 +454,24 @@ class PlanarPairs:
 
         With `stands` the robot doesn't move.
         """
-        ways = np.array([(each.forward, each.turn, each.delay_s) for each in mistakes])
-        ways, which = np.unique(ways, axis=0, return_inverse=True)
+        ways = dict[tuple[tuple[float, float, float, bool], float], int]()
+        which = np.array([ways.setdefault((each.drive, each.delay_s), len(ways)) for each in mistakes])
         motion = np.zeros((len(ways), len(self._stamp_s[0]), 3))
-        for row, (forward, turn, delay_s) in enumerate(() if stands else ways.tolist()):
-            if (forward, turn) not in self._tracks:
-                self._tracks[forward, turn] = _dead_reckoned(self._odometry, forward, turn)
-            track = self._tracks[forward, turn]
+        for row, (drive, delay_s) in enumerate(() if stands else ways):
+            if drive not in self._tracks:
+                self._tracks[drive] = _dead_reckoned(self._odometry, *drive)
+            track = self._tracks[drive]
             reckoned_motions(*self._stamp_s, delay_s, self._odometry.stamp_s, track, self._mount, motion[row])
         undone = np.array([(each.lengths, each.bearing, each.offset_rad) for each in mistakes])
         found = np.empty((len(mistakes), 2, motion.shape[1]))
-        pair_residuals(motion, which.ravel(), undone, *self._readings, found)
+        pair_residuals(motion, which, undone, *self._readings, found)
         return found
 
 
 class SpatialPairs:
     """Pairs of sightings in space."""
 
-    units, angles = UNITS_IN_SPACE, (*AXES, *POSES)
+    units, angles = UNITS_IN_SPACE, (*AXES, *POSES, *DRIVES)
     why_longer = "another unit of detections or odometry, or a wrong size of tags (tag_size_m)"
     speeds = "odometry"
 
@@ -415,6 +480,7 @@ class SpatialPairs:
 
         assert recording.odometry is not None
         detections, self._odometry = recording.detections, recording.odometry
+        self._tracks = dict[tuple[object, ...], FloatArray]()
         mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])
         stamp_s = recording.frames.stamp_s[detections.frame]
         self._stamp_s = stamp_s[first], stamp_s[second]
@@ -461,9 +527,12 @@ class SpatialPairs:
     def _motions(self, mistakes: tuple[Mistake, ...]) -> FloatArray:
         """(M, P, 7) motions of the sensor from the second sighting to the first, by odometry."""
         stamp_s, motion = self._odometry.stamp_s, np.empty((len(mistakes), len(self._stamp_s[0]), 7))
-        for poses in {each.poses for each in mistakes}:
-            rows = [row for row, each in enumerate(mistakes) if each.poses == poses]
-            pose = CONVENTIONS[poses](self._odometry.pose_world_robot)
+        for way in dict.fromkeys((each.poses, each.drive) for each in mistakes):
+            rows = [row for row, each in enumerate(mistakes) if (each.poses, each.drive) == way]
+            if way not in self._tracks:
+                poses, drive = way
+                self._tracks[way] = read_drive(CONVENTIONS[poses](self._odometry.pose_world_robot), *drive)
+            pose = self._tracks[way]
             delay_s, which = np.unique([mistakes[row].delay_s for row in rows], return_inverse=True)
             start, stop = (
                 se3.compose(
@@ -541,13 +610,24 @@ def _cheapest(loss: FloatArray, step: float) -> IntArray:
     return path
 
 
-def _dead_reckoned(odometry: Odometry, forward: float, turn: float) -> FloatArray:
-    """(N, 3) x, y and unwrapped heading at the odometry's stamps, with factors on speed and turn rate."""
+def read_drive(pose: FloatArray, forward: float, lateral: float, turn: float, exchanged: bool) -> FloatArray:
+    """Return poses (N, 7) of a robot, from the first on, whose speeds were written in another way (`Mistake`)."""
+    if (forward, lateral, turn, exchanged) == HONEST.drive:
+        return pose
+    step = se3.log(se3.between(pose[:-1], pose[1:]))
+    if exchanged:
+        step[:, :2] = step[:, 1::-1]
+    step *= [forward, lateral, 1.0, 1.0, 1.0, turn]
+    return np.asarray(se3.compose(pose[:1], accumulate(se3.exp(step))))
+
+
+def _dead_reckoned(odometry: Odometry, forward: float, lateral: float, turn: float, exchanged: bool) -> FloatArray:
+    """(N, 3) x, y and unwrapped heading at the odometry's stamps, of speeds that were written in another way."""
     step_s = np.diff(odometry.stamp_s)
     turned = np.append(0.0, np.cumsum(turn * odometry.angular_radps[:-1] * step_s))
     heading = turned[:-1] + 0.5 * np.diff(turned)
-    ahead = forward * odometry.forward_mps[:-1] * step_s
-    aside = odometry.lateral_mps[:-1] * step_s
+    speeds = (odometry.lateral_mps, odometry.forward_mps) if exchanged else (odometry.forward_mps, odometry.lateral_mps)
+    ahead, aside = forward * speeds[0][:-1] * step_s, lateral * speeds[1][:-1] * step_s
     x = np.append(0.0, np.cumsum(ahead * np.cos(heading) - aside * np.sin(heading)))
     y = np.append(0.0, np.cumsum(ahead * np.sin(heading) + aside * np.cos(heading)))
     return np.column_stack([x, y, turned])
