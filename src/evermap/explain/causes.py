@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from evermap.slam import mistakes
 from evermap.slam.check import CLOCKWISE, CORNERS, SIGHTED, find_corner_mistake, is_clockwise, read_corners
 from evermap.slam.orientations import find_convention
 from evermap.types import (
+    ANY_BEARING_RAD,
     UNKNOWN,
     AnyRecording,
     FloatArray,
@@ -42,6 +44,8 @@ CENTRE_PX, COEFFICIENT = 30.0, 0.05
 """Standard deviations of the centre of an image, and of a coefficient of distortion that is stated."""
 SIDEWAYS = 0.1
 """Way to the side over that ahead from which a robot drives sideways: less is the noise of its odometry."""
+WITH_BEARINGS = 0.5
+"""Share of the detections without a bearing from which ranges alone must say what is wrong."""
 DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL, DISTORTION = 0.5, 0.2, 0.3, 0.1, 0.2
 """Standard deviations of a delay, of a mount's position and turn, of the logarithm of a focal length, and of k1."""
 
@@ -95,7 +99,7 @@ class Suspect:
         of_map: whether it is of the given map.
         pairs: whether it shows in pairs of sightings of one landmark and the odometry between them.
         rows: which landmarks it is of: an 'id', a 'class' or a 'size'; None of all.
-        shows: whether the readings alone say so.
+        shows: whether the readings alone say so, or nothing else than a solution can.
     """
 
     code: str
@@ -187,10 +191,16 @@ def _in_plane(recording: Recording) -> Iterable[Suspect]:
             lambda s, key=key, axis=axis: f"[mount] {key} = {recording.sensor.mount_robot_sensor[axis] + s:.4g}",  # type: ignore[misc]
             sigma,
         )  # fmt: skip
-    for mistake in (*mistakes.UNITS, *mistakes.ANGLES):
+    bearings = np.mean(recording.detections.sigma_bearing_rad == ANY_BEARING_RAD) < WITH_BEARINGS
+    for mistake in (*mistakes.UNITS, *(mistakes.ANGLES if bearings else ())):
         yield Suspect(
             mistake.code, mistake.field, UNIT_P if mistake.code == "length-unit" else USUAL_P,
             partial(_undo_in_plane, mistake=mistake), _constant(mistake.message), _constant(_fix_of(mistake)),
+        )  # fmt: skip
+    for mistake in () if bearings else mistakes.RANGED:
+        yield Suspect(
+            mistake.code, mistake.field, USUAL_P, partial(_undo_in_plane, mistake=mistake), _constant(mistake.message),
+            _constant(_fix_of(mistake)), pairs=False, shows=True,
         )  # fmt: skip
     for identity in _seen_often(recording):
         yield _one_size(names.get(identity, str(identity)), _stretch_ranges, ("id", identity), "")
@@ -393,6 +403,11 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
                 mistake.code, mistake.field, USUAL_P, partial(_read_poses, convention=mistake.poses),
                 _constant(mistake.message), _constant(_fix_of(mistake)),
             )  # fmt: skip
+    for mistake in () if corners else mistakes.MIRRORS:
+        yield Suspect(
+            mistake.code, mistake.field, RARE_P, partial(_mirror_positions, signs=mistake.mirrored),
+            _constant(mistake.message), _constant("detections.csv: the sign of x_m or y_m"),
+        )  # fmt: skip
     for mistake in mistakes.UNITS_IN_SPACE:
         state = math.log(mistake.lengths)
         if mistake.field == "odometry" and recording.odometry is None:
@@ -407,14 +422,8 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
         )
     for row, sensor in enumerate(sensors):
         yield from _of_mount(row, sensor, many=many, driven=recording.odometry is not None)
-    if many and recording.odometry is not None:  # one driver for all is likelier than as many mistakes
-        for mistake in mistakes.AXES:
-            by = se3.turn(mistake.turned)
-            yield Suspect(
-                mistake.code, "all sensors", USUAL_P,
-                partial(_change_mounts, sensors=range(len(sensors)), how=partial(_turn_within, by=by)),
-                _constant(mistake.message), _constant("[camera.*.mount]"),
-            )  # fmt: skip
+    if many:
+        yield from _of_all_mounts(sensors, driven=recording.odometry is not None)
     cameras = [row for row, sensor in enumerate(sensors) if sensor.intrinsics is not None]
     if not corners:
         return
@@ -467,6 +476,18 @@ def _read_detections(inputs: Inputs, _: float, convention: str) -> Inputs:
     return replace(inputs, recording=replace(recording, detections=seen))
 
 
+def _mirror_positions(inputs: Inputs, _: float, signs: tuple[float, float, float]) -> Inputs:
+    """Return the same with other signs of coordinates of the detections; orientations stay."""
+    recording: Any = inputs.recording
+    seen, by = recording.detections, np.array(signs)
+    seen = replace(
+        seen,
+        position_sensor_m=seen.position_sensor_m * by,
+        covariance_sensor_m2=seen.covariance_sensor_m2 * by[:, None] * by,
+    )
+    return replace(inputs, recording=replace(recording, detections=seen))
+
+
 def _drives_sideways(odometry: SpatialOdometry) -> bool:
     step = np.abs(se3.between(odometry.pose_world_robot[:-1], odometry.pose_world_robot[1:])[:, :2]).sum(axis=0)
     return bool(step[1] > SIDEWAYS * step[0])
@@ -515,6 +536,40 @@ def _of_mount(row: int, sensor: SpatialSensor, *, many: bool, driven: bool) -> I
         )  # fmt: skip
 
 
+def _of_all_mounts(sensors: Sequence[SpatialSensor], *, driven: bool) -> Iterable[Suspect]:
+    """Return what may be wrong with all mounts at once: one driver for all is likelier than as many mistakes."""
+    rows = range(len(sensors))
+    for one, other in combinations(rows, 2):
+        names = f"{sensors[one].name}, {sensors[other].name}"
+        yield Suspect(
+            "mount", names, USUAL_P, partial(_exchange_mounts, one=one, other=other),
+            _constant(f"the mounts of {sensors[one].name} and {sensors[other].name} seem to be exchanged"),
+            _constant(f"[camera.{sensors[one].name}.mount], [camera.{sensors[other].name}.mount]"),
+        )  # fmt: skip
+    if not driven:  # nothing says which way the robot looks
+        return
+    turned = [
+        (each.code, each.message, partial(_turn_within, by=se3.turn(each.turned)), USUAL_P) for each in mistakes.AXES
+    ]
+    flipped = [
+        ("mount-flip", f"all sensors seem {words.replace(' its ', ' their ').replace('mount ', 'mounts ')}", how, USUAL_P if words in _OFTEN else RARE_P)
+        for words, how in _FLIPS
+    ]
+    for code, words, how, p in (*turned, *flipped):
+        yield Suspect(
+            code, "all sensors", p, partial(_change_mounts, sensors=rows, how=how), _constant(words),
+            _constant("[camera.*.mount]"),
+        )  # fmt: skip
+
+
+def _exchange_mounts(inputs: Inputs, _: float, one: int, other: int) -> Inputs:
+    recording: Any = inputs.recording
+    changed = list(recording.sensors)
+    for row, by in ((one, other), (other, one)):
+        changed[row] = replace(changed[row], mount_robot_sensor=recording.sensors[by].mount_robot_sensor)
+    return replace(inputs, recording=replace(recording, sensors=tuple(changed)))
+
+
 def _turn_within(pose: FloatArray, by: FloatArray) -> FloatArray:
     """Return the mount of a sensor, or the poses of tags (K, 7), with their axes turned."""
     return np.asarray(se3.compose(pose, by))
@@ -543,7 +598,7 @@ _FLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
     ("to have its quaternion stated as w, x, y, z", mistakes.CONVENTIONS["w first"]),
     ("mounted on the other side: the sign of y", lambda m: m * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 1.0])),
 )  # fmt: skip
-_OFTEN = frozenset(words for words, _ in _FLIPS[:2])
+_OFTEN = frozenset(_FLIPS[row][0] for row in (0, 1, 4))
 
 
 def _move_mount(inputs: Inputs, state: float, sensor: int, axis: int) -> Inputs:

@@ -49,6 +49,7 @@ class Mistake:
         exchanged: whether these two speeds are each other's.
         delay_s: odometry stamps are so much later than the motion.
         turned: quaternion that turns positions in the sensor's frame.
+        mirrored: signs of their coordinates, before that.
         poses: how poses of the odometry were written, a key of `CONVENTIONS`; '' as they are read.
         field: column, or table, that is wrong.
     """
@@ -64,6 +65,7 @@ class Mistake:
     exchanged: bool = False
     delay_s: float = 0.0
     turned: tuple[float, ...] = tuple(se3.NO_TURN)
+    mirrored: tuple[float, float, float] = (1.0, 1.0, 1.0)
     poses: str = ""
     field: str = ""
 
@@ -84,6 +86,7 @@ class Mistake:
             exchanged=self.exchanged != other.exchanged,
             delay_s=self.delay_s + other.delay_s,
             turned=turned,
+            mirrored=self.mirrored if self.mirrored != HONEST.mirrored else other.mirrored,
             poses=self.poses or other.poses,
         )
 
@@ -181,6 +184,18 @@ ANGLES = (
         for offset in (pi / 2, -pi / 2)
     ),
 )
+RANGED = (
+    Mistake(
+        "forward-sign",
+        "the robot seems to drive in the opposite direction: forward speeds have the wrong sign (forward_mps), or the "
+        "sensor's mount is turned by 180 degrees ([mount])",
+        offset_rad=pi,
+        forward=-1.0,
+        lateral=-1.0,
+        field="forward_mps",
+    ),
+)
+"""Mistakes of robots whose sensor measures ranges alone: the first bearings, which are guessed, follow the odometry."""
 AXES = tuple(
     Mistake(
         "mount-axes",
@@ -193,6 +208,19 @@ AXES = tuple(
         ("z ahead and y down", "x ahead and z up", (-0.5, 0.5, -0.5, 0.5)),
     )
 )
+MIRRORS = tuple(
+    Mistake(
+        "detection-axes",
+        f"{axis} of the detections' positions seems to have the wrong sign, {why} (detections)",
+        mirrored=signs,
+        field="detections",
+    )
+    for axis, why, signs in (
+        ("x", "as in a mirrored image", (-1.0, 1.0, 1.0)),
+        ("y", "as of y upwards; or the sensor is tilted the other way ([mount])", (1.0, -1.0, 1.0)),
+    )
+)
+"""Axes of a camera, one of which points the other way: no rotation of it brings them about."""
 CONVENTIONS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "": lambda pose: pose,
     "w first": lambda pose: pose[..., [0, 1, 2, 4, 5, 6, 3]],
@@ -228,6 +256,14 @@ DRIVES = (
         field="forward_mps",
     ),
     Mistake(
+        "forward-sign",
+        "the robot seems to drive in the opposite direction: forward and lateral speeds have the wrong sign "
+        "(forward_mps, lateral_mps), or the sensors look backwards ([mount])",
+        forward=-1.0,
+        lateral=-1.0,
+        field="forward_mps",
+    ),
+    Mistake(
         "odometry-axes",
         "lateral motion of the odometry seems to have the wrong sign: y is to the left (lateral_mps)",
         lateral=-1.0,
@@ -250,6 +286,9 @@ DRIVES = (
 )
 """Signs and axes of an odometry in space, those that are met more often first."""
 _DELAYS_S = (*np.arange(1.0, 10.0, 0.5).tolist(), *np.arange(10.0, 61.0, 1.0).tolist())
+LEAST_WAY_M, HEAD_ON, FASTER = 0.5, 0.9, 2.0
+"""Of ranges alone: the way between two from which their difference is compared with it, the quantile of the ratio at
+which the robot drives straight to a landmark or away from it, and what that is at least in another unit."""
 AT_ONCE = 32
 """Number of corrections that are tried together: arrays of a megabyte."""
 SHARES = (slice(0, None, 64), *(slice(step // 2, None, step) for step in (64, 32, 16, 8, 4)))
@@ -374,8 +413,13 @@ def pairs_of(recording: AnyRecording, settings: CheckConfig = USUAL) -> Pairs | 
     return (SpatialPairs if is_in_space(recording) else PlanarPairs)(recording, first, second)  # type: ignore[arg-type]
 
 
-def sighting_pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, IntArray]:
-    """Return pairs of rows of detections of one landmark, within a few seconds and during the odometry."""
+def sighting_pairs(
+    recording: AnyRecording, settings: CheckConfig, *, with_bearing: bool = True
+) -> tuple[IntArray, IntArray]:
+    """Return pairs of rows of detections of one landmark, within a few seconds and during the odometry.
+
+    Those in the plane need a bearing, unless it is said that they do not.
+    """
     detections = recording.detections
     stamp_s = recording.frames.stamp_s[detections.frame]
     known = detections.landmark_id != UNKNOWN
@@ -383,7 +427,7 @@ def sighting_pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntA
         from evermap.slam.space.intake import positions_of, without_range
 
         known &= ~without_range(recording) & np.isfinite(positions_of(recording)).all(axis=1)
-    else:
+    elif with_bearing:
         known &= np.isfinite(recording.detections.bearing_rad)
     if not known.any() or recording.odometry is None or len(recording.odometry) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -471,7 +515,7 @@ class PlanarPairs:
 class SpatialPairs:
     """Pairs of sightings in space."""
 
-    units, angles = UNITS_IN_SPACE, (*AXES, *POSES, *DRIVES)
+    units = UNITS_IN_SPACE
     why_longer = "another unit of detections or odometry, or a wrong size of tags (tag_size_m)"
     speeds = "odometry"
 
@@ -487,6 +531,8 @@ class SpatialPairs:
         self._mount = mount[detections.sensor[first]], mount[detections.sensor[second]]
         position = positions_of(recording)
         self._seen = position[first], position[second]
+        by_corners = bool(np.isfinite(detections.corner_px[:, 0, 0]).any())  # of these pixels would be mirrored
+        self.angles = (*AXES, *POSES, *DRIVES, *(() if by_corners else MIRRORS))
 
     def among(self, rows: slice) -> Self:
         """Return some of the pairs."""
@@ -518,7 +564,8 @@ class SpatialPairs:
         motion = se3.identity(*motion.shape[:-1]) if stands else motion
         motion[..., :3] /= np.array([each.lengths for each in mistakes])[:, None, None]
         turned = se3.turn([each.turned for each in mistakes])[:, None]
-        seen, again = (se3.transform(turned, each) for each in self._seen)
+        signs = np.array([each.mirrored for each in mistakes])[:, None]
+        seen, again = (se3.transform(turned, signs * each) for each in self._seen)
         expected = se3.transform(motion, seen)
         far = [np.maximum(np.linalg.norm(each, axis=-1, keepdims=True), 1e-12) for each in (again, expected)]
         apart = [np.log(far[0]) - np.log(far[1]), again / far[0] - expected / far[1]]
@@ -652,7 +699,7 @@ def find_motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]
     """Return mistakes that make static landmarks appear to move."""
     pairs = pairs_of(recording, settings)
     if pairs is None:
-        return []
+        return [] if is_in_space(recording) else _find_unit_of_ranges(recording, settings)
     if pairs.still:
         moved = off(pairs.residual(HONEST)) > 0.1
         if np.sum(moved) < settings.fewest or np.mean(moved) < 0.1:
@@ -685,6 +732,34 @@ def find_motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]
         )
         return [Finding("landmarks-move", message)]
     return found
+
+
+def _find_unit_of_ranges(recording: Recording, settings: CheckConfig) -> list[Finding]:
+    """Return the unit of ranges without bearings, which change faster than the sensor moves in any direction."""
+    first, second = sighting_pairs(recording, settings, with_bearing=False)
+    seen = recording.detections
+    if len(first) < settings.fewest:
+        return []
+    stamp_s, motion = recording.frames.stamp_s[seen.frame], np.empty((len(first), 3))
+    driven, mount = recording.odometry, np.array(recording.sensor.mount_robot_sensor, dtype=np.float64)
+    track = _dead_reckoned(driven, *HONEST.drive)
+    reckoned_motions(stamp_s[first], stamp_s[second], 0.0, driven.stamp_s, track, mount, motion)
+    way_m = np.hypot(motion[:, 0], motion[:, 1])
+    moved = way_m > LEAST_WAY_M
+    faster = np.abs(seen.range_m[second] - seen.range_m[first])[moved] / way_m[moved]
+    landmark = seen.landmark_id[first][moved]
+    fastest = [
+        float(np.quantile(faster[landmark == one], HEAD_ON))
+        for one in np.unique(landmark).tolist()
+        if np.count_nonzero(landmark == one) >= settings.fewest
+    ]
+    usual = float(np.median(fastest)) if fastest else 1.0
+    if usual < FASTER:  # no triangle inequality is broken, but for noise and slip
+        return []
+    for mistake in UNITS:
+        if mistake.field == "range_m" and abs(log(mistake.lengths * usual)) < log(FASTER) / 2.0:
+            return [Finding(mistake.code, mistake.message, usable=False)]
+    return []
 
 
 def unusable(recording: AnyRecording, settings: CheckConfig) -> Finding | None:
