@@ -552,7 +552,7 @@ def _of_all_mounts(sensors: Sequence[SpatialSensor], *, driven: bool) -> Iterabl
         (each.code, each.message, partial(_turn_within, by=se3.turn(each.turned)), USUAL_P) for each in mistakes.AXES
     ]
     flipped = [
-        ("mount-flip", f"all sensors seem {words.replace(' its ', ' their ').replace('mount ', 'mounts ')}", how, USUAL_P if words in _OFTEN else RARE_P)
+        ("mount-flip", f"all sensors seem {words}", how, USUAL_P if words in _OFTEN else RARE_P)
         for words, how in _FLIPS
     ]
     for code, words, how, p in (*turned, *flipped):
@@ -590,12 +590,12 @@ def _make_turn(axis: int, angle_rad: float, *, of_robot: bool) -> Callable[[Floa
 
 
 _FLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
-    ("mounted looking the other way: its yaw is 180 degrees off", _make_turn(2, math.pi, of_robot=True)),
-    ("mounted upside down: its image is turned by 180 degrees", _make_turn(2, math.pi, of_robot=False)),
-    ("turned by 90 degrees to the left of its stated mount", _make_turn(2, 0.5 * math.pi, of_robot=True)),
-    ("turned by 90 degrees to the right of its stated mount", _make_turn(2, -0.5 * math.pi, of_robot=True)),
-    ("to have its mount stated inversely: the robot in the sensor's frame", mistakes.CONVENTIONS["inverse"]),
-    ("to have its quaternion stated as w, x, y, z", mistakes.CONVENTIONS["w first"]),
+    ("mounted looking the other way: the yaw is 180 degrees off", _make_turn(2, math.pi, of_robot=True)),
+    ("mounted upside down: the image is turned by 180 degrees", _make_turn(2, math.pi, of_robot=False)),
+    ("turned by 90 degrees to the left of the stated mount", _make_turn(2, 0.5 * math.pi, of_robot=True)),
+    ("turned by 90 degrees to the right of the stated mount", _make_turn(2, -0.5 * math.pi, of_robot=True)),
+    ("mounted inversely: the pose stated is that of the robot in the sensor's frame", mistakes.CONVENTIONS["inverse"]),
+    ("mounted by a quaternion in the order w, x, y, z", mistakes.CONVENTIONS["w first"]),
     ("mounted on the other side: the sign of y", lambda m: m * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 1.0])),
 )  # fmt: skip
 _OFTEN = frozenset(_FLIPS[row][0] for row in (0, 1, 4))
