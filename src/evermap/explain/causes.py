@@ -548,7 +548,7 @@ def _of_all_mounts(sensors: Sequence[SpatialSensor], *, driven: bool) -> Iterabl
         )  # fmt: skip
     if not driven:  # nothing says which way the robot looks
         return
-    turned = [
+    turned: list[tuple[str, str, Callable[[FloatArray], FloatArray], float]] = [
         (each.code, each.message, partial(_turn_within, by=se3.turn(each.turned)), USUAL_P) for each in mistakes.AXES
     ]
     flipped = [
