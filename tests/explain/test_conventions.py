@@ -337,7 +337,15 @@ def mounted(recording: SpatialRecording, mount: FloatArray) -> SpatialRecording:
     return replace(recording, sensors=tuple(sensors))
 
 
+def tilted(mount: FloatArray) -> FloatArray:
+    """By angles: cameras that look 10 degrees down instead of up."""
+    optical = Rotation.from_euler("ZYX", [-np.pi / 2, 0.0, -np.pi / 2])
+    body = (Rotation.from_quat(mount[:, 3:]) * optical.inv()).as_euler("ZYX")
+    return np.column_stack([mount[:, :3], (Rotation.from_euler("ZYX", body * [1.0, -1.0, 1.0]) * optical).as_quat()])
+
+
 MISTAKES = {
+    "tilted": (tilted, 1.0, "mount-flip", "pitch"),
     "exchanged": (lambda mount: mount[::-1], 1.0, "mount", "exchanged"),
     "inverted": (inverse, 1.0, "mount-flip", "inversely"),
     "millimetres": (lambda mount: mount, 1000.0, "length-unit", "millimetres"),
@@ -349,8 +357,12 @@ MISTAKES = {
 def test_a_mistake_of_all_sensors_is_named(how: str, poses: SpatialRecording) -> None:
     state, factor, code, word = MISTAKES[how]
     seen = poses.detections
-    given = mounted(poses, state(np.array([one.mount_robot_sensor for one in poses.sensors])))
-    given = with_sightings(given, np.column_stack([factor * seen.position_sensor_m, seen.rotation]))
+    # the second camera's frame is turned: two that look in opposite directions are as well exchanged as turned
+    by = Rotation.from_rotvec(np.where(seen.sensor == 1, 0.5, 0.0)[:, None] * [0.0, 1.0, 0.0])
+    pose = [by.inv().apply(factor * seen.position_sensor_m), (by.inv() * Rotation.from_quat(seen.rotation)).as_quat()]
+    mount = np.array([one.mount_robot_sensor for one in poses.sensors])
+    mount[1, 3:] = (Rotation.from_quat(mount[1, 3:]) * Rotation.from_rotvec([0.0, 0.5, 0.0])).as_quat()
+    given = with_sightings(mounted(poses, state(mount)), np.column_stack(pose))
     result = run_slam(given)
     assert result.verdict is not None
     assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
@@ -360,13 +372,16 @@ def test_a_mistake_of_all_sensors_is_named(how: str, poses: SpatialRecording) ->
 
 
 def test_orientations_of_level_cameras_in_another_order_are_named() -> None:
-    """Upright tags before cameras that look a little up turn by little where their quaternions are misread."""
+    """Tags with y up, before cameras that look a little up, turn by little where their quaternions are misread."""
     tilted = World(seed=11).space(corners=False)
-    for noise_rad in (0.0, 0.05):
-        rough = Rotation.from_quat(tilted.detections.rotation) * Rotation.from_rotvec(
+    for noise_rad in (0.0, 0.04):
+        rough = Rotation.from_rotvec(
             np.random.default_rng(1).normal(0.0, noise_rad, (len(tilted.detections), 3))
-        )
-        pose = np.column_stack([tilted.detections.position_sensor_m, rough.as_quat()])
+        ) * Rotation.from_euler("z", np.pi)
+        rotation = (Rotation.from_quat(tilted.detections.rotation) * rough).as_quat()
+        pose = np.column_stack([tilted.detections.position_sensor_m, rotation])
+        first = np.column_stack([pose[:, :3], w_first(rotation)])
+        assert find_convention(with_sightings(tilted, first), USUAL) == "w first"
         back = inverse(pose)
         only_turned = np.column_stack([pose[:, :3], back[:, 3:]])
         assert find_convention(with_sightings(tilted, back), USUAL) == "inverse"

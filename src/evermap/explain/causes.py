@@ -589,6 +589,18 @@ def _make_turn(axis: int, angle_rad: float, *, of_robot: bool) -> Callable[[Floa
     return how
 
 
+def _tilt_back(mount: FloatArray) -> FloatArray:
+    """Return a mount that looks down as far as it looked up, or the reverse; ahead is z of a camera, else x."""
+    axes = se3.rotation_of(mount)
+    ahead = axes[:, 2] if abs(axes[2, 2]) < UPRIGHT else axes[:, 0]
+    up_rad = math.asin(float(np.clip(ahead[2], -1.0, 1.0)))
+    across = np.array([-ahead[1], ahead[0], 0.0]) / max(math.hypot(ahead[0], ahead[1]), 1e-9)
+    by = se3.exp(np.concatenate([np.zeros(3), 2.0 * up_rad * across]))
+    return np.concatenate([mount[:3], se3.compose(by, se3.turn(mount[3:]))[3:]])
+
+
+UPRIGHT = 0.7
+"""Share by which the z axis of a sensor points upwards from which it is none of a camera that looks ahead."""
 _FLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
     ("mounted looking the other way: the yaw is 180 degrees off", _make_turn(2, math.pi, of_robot=True)),
     ("mounted upside down: the image is turned by 180 degrees", _make_turn(2, math.pi, of_robot=False)),
@@ -596,9 +608,10 @@ _FLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
     ("turned by 90 degrees to the right of the stated mount", _make_turn(2, -0.5 * math.pi, of_robot=True)),
     ("mounted inversely: the pose stated is that of the robot in the sensor's frame", mistakes.CONVENTIONS["inverse"]),
     ("mounted by a quaternion in the order w, x, y, z", mistakes.CONVENTIONS["w first"]),
+    ("tilted the other way: the sign of the pitch", _tilt_back),
     ("mounted on the other side: the sign of y", lambda m: m * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 1.0])),
 )  # fmt: skip
-_OFTEN = frozenset(_FLIPS[row][0] for row in (0, 1, 4))
+_OFTEN = frozenset(_FLIPS[row][0] for row in (0, 1, 4, 6))
 
 
 def _move_mount(inputs: Inputs, state: float, sensor: int, axis: int) -> Inputs:
