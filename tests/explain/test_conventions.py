@@ -14,7 +14,7 @@ from evermap.errors import DataError
 from evermap.explain.seeds import find_mount
 from evermap.explain.shape import compare_shapes
 from evermap.slam.check import find_corner_mistake, is_clockwise
-from evermap.slam.mistakes import USUAL, find_motion
+from evermap.slam.mistakes import USUAL, Mistake, find_motion, read_drive
 from evermap.slam.orientations import find_convention
 from evermap.types import FloatArray, Landmarks, Recording, SensorKind, SpatialRecording, VerdictKind
 
@@ -426,3 +426,16 @@ def test_forward_speeds_of_the_wrong_sign_are_named_by_ranges_alone() -> None:
     (cause,) = run_slam(wrong).causes
     assert (cause.code, cause.subject) == ("forward-sign", "forward_mps")
     assert run_slam(recording).causes == ()
+
+
+WAYS = [Mistake("", "", lateral=-1.0, forward=3.6), Mistake("", "", exchanged=True, turn=-1.0)]
+
+
+@pytest.mark.parametrize("first", WAYS)
+@pytest.mark.parametrize("then", WAYS)
+def test_two_mistakes_of_a_drive_are_undone_one_after_the_other(first: Mistake, then: Mistake) -> None:
+    odometry = World(seconds=4.0).space(corners=False).odometry
+    assert odometry is not None
+    pose = odometry.pose_world_robot
+    one_by_one = read_drive(read_drive(pose, *first.drive), *then.drive)
+    np.testing.assert_allclose(read_drive(pose, *then.after(first).drive), one_by_one, atol=1e-9)

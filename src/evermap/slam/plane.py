@@ -87,6 +87,8 @@ def in_its_space(recording: AnyRecording, settings: SlamConfig, *, dim: int | No
     wrong = unusable(recording, settings.check)
     if wrong is not None and not wrong.usable:  # refused by its name there: velocities in mm/s are no velocities
         return recording
+    if wrong is not None and len(recording.sensors) > 1:  # their mounts, which the plane has not, are asked in space
+        return recording
     if find_convention(recording, settings.check):  # of orientations, which the plane leaves out in silence
         return recording
     why = "the odometry is planar and landmarks keep their heights (slam.plane = false: in space)"
