@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from evermap import check_recording, run_slam
+from evermap.errors import DataError
+from evermap.explain.seeds import find_mount
 from evermap.explain.shape import compare_shapes
 from evermap.slam.check import find_corner_mistake, is_clockwise
-from evermap.slam.mistakes import USUAL
+from evermap.slam.mistakes import USUAL, Mistake, find_motion, read_drive
 from evermap.slam.orientations import find_convention
-from evermap.types import FloatArray, Landmarks, SpatialRecording
+from evermap.types import FloatArray, Landmarks, Recording, SensorKind, SpatialRecording, VerdictKind
 
 from .worlds import World
 
@@ -117,6 +120,77 @@ def test_poses_of_the_odometry_in_another_convention_are_named(
     assert (found.code, word in found.message) == ("odometry-poses", True)
 
 
+@dataclass(frozen=True)
+class Sideways(World):
+    """A robot that turns as it likes, whichever way it drives; what it reports of its motion is written otherwise.
+
+    Attributes:
+        signs: factors on the speeds ahead, to the left, and on turns.
+        exchanged: whether the first two are exchanged after that.
+        slips: true way to the left over that ahead, of which the odometry says nothing.
+    """
+
+    signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    exchanged: bool = False
+    slips: float = 0.0
+
+    def path(self, stamp_s: FloatArray) -> FloatArray:
+        pose = super().path(stamp_s)
+        return pose + np.column_stack([0.0 * pose[:, :2], np.sin(2.0 * np.pi * stamp_s / 9.0)])
+
+    def driven(self, random: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        stamp_s, velocity = super().driven(random)
+        velocity[:, 1] -= self.slips * velocity[:, 0]
+        velocity = velocity * self.signs
+        return stamp_s, velocity[:, [1, 0, 2]] if self.exchanged else velocity
+
+
+DRIVES: dict[str, tuple[dict[str, Any], str, str]] = {
+    "lateral": ({"signs": (1.0, -1.0, 1.0)}, "odometry-axes", "lateral"),
+    "exchanged": ({"exchanged": True}, "odometry-axes", "exchanged"),
+    "forward": ({"signs": (-1.0, 1.0, 1.0)}, "forward-sign", "forward speeds"),
+    "turns": ({"signs": (1.0, 1.0, -1.0)}, "turn-sign", "counter-clockwise"),
+}
+
+
+@pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow), "poses"])
+@pytest.mark.parametrize("how", DRIVES)
+def test_signs_and_axes_of_an_odometry_are_named(how: str, kind: str) -> None:
+    written, code, word = DRIVES[how]
+    world = Sideways(seed=4, **written)
+    recording = world.plane() if kind == "plane" else world.space(corners=kind == "corners")
+    (found,) = find_motion(recording, USUAL)
+    assert (found.code, word in found.message, found.usable) == (code, True, False)
+
+
+def test_a_mirrored_odometry_is_named() -> None:
+    (found,) = find_motion(Sideways(seed=4, signs=(1.0, -1.0, -1.0)).space(corners=False), USUAL)
+    assert found.code == "odometry-mirrored"
+
+
+def test_a_sensor_that_looks_back_is_named_where_the_robot_drives_sideways() -> None:
+    (found,) = find_motion(Sideways(seed=4, signs=(-1.0, -1.0, 1.0)).plane(), USUAL)
+    assert (found.code, "looks backwards" in found.message) == ("forward-sign", True)
+
+
+@pytest.mark.parametrize("world", [World(seed=4), Sideways(seed=4), Sideways(seed=4, slips=0.1), World(drift=0.05)])
+def test_a_drive_as_it_is_has_no_wrong_axes(world: World) -> None:
+    """Neither have one whose wheels slip to the side, nor one of a poor odometry."""
+    assert find_motion(world.plane(), USUAL) == find_motion(world.space(corners=False), USUAL) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["lateral", "exchanged"])
+def test_a_drive_with_other_axes_is_solved_and_moves_nothing(how: str) -> None:
+    written, code, word = DRIVES[how]
+    result = run_slam(Sideways(seed=4, **written).space(corners=False), prior_map=World().map_in_space().as_prior(0.01))
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+    (cause,) = result.causes
+    assert (cause.code, word in cause.message) == (code, True)
+    assert result.changes == ()
+
+
 def map_faults(survey: Landmarks) -> dict[str, Landmarks]:
     """What is wrong with a map, each by itself."""
     at, rotation = survey.position_m, survey.rotation
@@ -205,3 +279,166 @@ def test_corners_in_the_order_of_opencv_are_put_right(corners: SpatialRecording)
     (cause,) = result.causes
     assert (cause.code, cause.fix) == ("corner-order", "detections.csv: corners in the order 3, 2, 1, 0")
     assert result.changes == ()
+
+
+def with_ranges_alone(recording: Recording, factor: float = 1.0) -> Recording:
+    """As of radios, in another unit."""
+    seen = recording.detections
+    blind = replace(seen, bearing_rad=np.full(len(seen), np.nan), range_m=factor * seen.range_m)
+    limit_m = recording.sensor.range_max_m * max(factor, 1.0)
+    return replace(
+        recording,
+        detections=blind,
+        sensor=replace(recording.sensor, kind=SensorKind.UWB, range_max_m=limit_m),
+    )
+
+
+@pytest.mark.parametrize(
+    ("factor", "word"), [(1000.0, "millimetres"), (100.0, "centimetres"), (39.37, "inches"), (3.281, "feet")]
+)
+def test_ranges_alone_in_another_unit_are_named(factor: float, word: str) -> None:
+    wrong = with_ranges_alone(World(seed=2).plane(), factor)
+    (found,) = find_motion(wrong, USUAL)
+    assert (found.code, word in found.message, found.usable) == ("length-unit", True, False)
+
+
+def test_ranges_alone_in_centimetres_locate_nothing_and_the_line_says_why() -> None:
+    with pytest.raises(DataError, match="centimetres"):
+        run_slam(with_ranges_alone(World(seed=2).plane(), 100.0))
+
+
+def test_ranges_alone_as_they_should_be_are_in_metres() -> None:
+    """Also those of a robot whose wheels turn half as far, that stands, or one of whose beacons is carried about."""
+    right = with_ranges_alone(World(seed=2).plane())
+    slow = with_ranges_alone(World(seed=2, wheels=1.6).plane())
+    driven, seen = right.odometry, right.detections
+    stands = replace(right, odometry=replace(driven, forward_mps=0.0 * driven.forward_mps))
+    noisy = seen.range_m + np.where(seen.landmark_id == 3, 30.0 * np.sin(right.frames.stamp_s[seen.frame]), 0.0)
+    carried = replace(right, detections=replace(seen, range_m=np.abs(noisy)))
+    for recording in (right, slow, stands, carried):
+        assert find_motion(recording, USUAL) == []
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_coordinate_of_positions_with_the_wrong_sign_is_named(axis: int, poses: SpatialRecording) -> None:
+    seen = poses.detections
+    position = seen.position_sensor_m.copy()
+    position[:, axis] *= -1.0
+    wrong = with_sightings(poses, np.column_stack([position, seen.rotation]))
+    (found,) = find_motion(wrong, USUAL)
+    assert (found.code, found.message[0]) == ("detection-axes", "xy"[axis])
+
+
+def mounted(recording: SpatialRecording, mount: FloatArray) -> SpatialRecording:
+    """With the mounts (S, 7) stated."""
+    sensors = [
+        replace(one, mount_robot_sensor=tuple(by.tolist())) for one, by in zip(recording.sensors, mount, strict=True)
+    ]
+    return replace(recording, sensors=tuple(sensors))
+
+
+def tilted(mount: FloatArray) -> FloatArray:
+    """By angles: cameras that look 10 degrees down instead of up."""
+    optical = Rotation.from_euler("ZYX", [-np.pi / 2, 0.0, -np.pi / 2])
+    body = (Rotation.from_quat(mount[:, 3:]) * optical.inv()).as_euler("ZYX")
+    return np.column_stack([mount[:, :3], (Rotation.from_euler("ZYX", body * [1.0, -1.0, 1.0]) * optical).as_quat()])
+
+
+MISTAKES = {
+    "tilted": (tilted, 1.0, "mount-flip", "pitch"),
+    "exchanged": (lambda mount: mount[::-1], 1.0, "mount", "exchanged"),
+    "inverted": (inverse, 1.0, "mount-flip", "inversely"),
+    "millimetres": (lambda mount: mount, 1000.0, "length-unit", "millimetres"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", MISTAKES)
+def test_a_mistake_of_all_sensors_is_named(how: str, poses: SpatialRecording) -> None:
+    state, factor, code, word = MISTAKES[how]
+    seen = poses.detections
+    # the second camera's frame is turned: two that look in opposite directions are as well exchanged as turned
+    by = Rotation.from_rotvec(np.where(seen.sensor == 1, 0.5, 0.0)[:, None] * [0.0, 1.0, 0.0])
+    pose = [by.inv().apply(factor * seen.position_sensor_m), (by.inv() * Rotation.from_quat(seen.rotation)).as_quat()]
+    mount = np.array([one.mount_robot_sensor for one in poses.sensors])
+    mount[1, 3:] = (Rotation.from_quat(mount[1, 3:]) * Rotation.from_rotvec([0.0, 0.5, 0.0])).as_quat()
+    given = with_sightings(mounted(poses, state(mount)), np.column_stack(pose))
+    result = run_slam(given)
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+    (cause,) = result.causes
+    assert (cause.code, word in cause.message, cause.probability > 0.9) == (code, True, True)
+    assert result.changes == ()
+
+
+def test_orientations_of_level_cameras_in_another_order_are_named() -> None:
+    """Tags with y up, before cameras that look a little up, turn by little where their quaternions are misread."""
+    tilted = World(seed=11).space(corners=False)
+    for noise_rad in (0.0, 0.04):
+        rough = Rotation.from_rotvec(
+            np.random.default_rng(1).normal(0.0, noise_rad, (len(tilted.detections), 3))
+        ) * Rotation.from_euler("z", np.pi)
+        rotation = (Rotation.from_quat(tilted.detections.rotation) * rough).as_quat()
+        pose = np.column_stack([tilted.detections.position_sensor_m, rotation])
+        first = np.column_stack([pose[:, :3], w_first(rotation)])
+        assert find_convention(with_sightings(tilted, first), USUAL) == "w first"
+        back = inverse(pose)
+        only_turned = np.column_stack([pose[:, :3], back[:, 3:]])
+        assert find_convention(with_sightings(tilted, back), USUAL) == "inverse"
+        assert find_convention(with_sightings(tilted, only_turned), USUAL) == ""  # where they are says otherwise
+        assert find_convention(with_sightings(tilted, pose), USUAL) == ""
+
+
+@pytest.mark.parametrize("pitch", [-0.2, 0.2])
+def test_cameras_that_are_tilted_otherwise_have_no_other_convention(pitch: float, poses: SpatialRecording) -> None:
+    tilt = Rotation.from_euler("y", pitch)
+    mount = np.array([one.mount_robot_sensor for one in poses.sensors])
+    turned = (tilt * Rotation.from_quat(mount[:, 3:])).as_quat()
+    assert find_convention(mounted(poses, np.column_stack([mount[:, :3], turned])), USUAL) == ""
+
+
+def with_sensor_at(recording: Recording, x_m: float) -> Recording:
+    sensor = recording.sensor
+    _, y_m, theta_rad = sensor.mount_robot_sensor
+    return replace(recording, sensor=replace(sensor, mount_robot_sensor=(x_m, y_m, theta_rad)))
+
+
+@pytest.mark.parametrize("off_m", [-0.5, 1.0])
+def test_a_sensor_that_sits_elsewhere_is_no_slip(off_m: float) -> None:
+    recording = World(seed=5).plane()
+    result = run_slam(with_sensor_at(recording, recording.sensor.mount_robot_sensor[0] + off_m))
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+    (cause,) = result.causes
+    assert (cause.code, cause.subject) == ("mount", "sensor x_m")
+    assert cause.value == pytest.approx(-off_m, abs=0.05)
+
+
+@pytest.mark.parametrize("world", [World(seed=5), World(seed=5, drift=0.04), Sideways(seed=5), World(wheels=1.1)])
+def test_a_sensor_that_sits_where_it_is_stated_stays(world: World) -> None:
+    assert np.abs(find_mount(world.plane(), USUAL)[0]) < 0.1
+
+
+def test_forward_speeds_of_the_wrong_sign_are_named_by_ranges_alone() -> None:
+    recording = with_ranges_alone(with_sensor_at(World(seed=6).plane(), 0.2))
+    driven = recording.odometry
+    wrong = replace(recording, odometry=replace(driven, forward_mps=-driven.forward_mps))
+    (cause,) = run_slam(wrong).causes
+    assert (cause.code, cause.subject) == ("forward-sign", "forward_mps")
+    assert run_slam(recording).causes == ()
+
+
+WAYS = [Mistake("", "", lateral=-1.0, forward=3.6), Mistake("", "", exchanged=True, turn=-1.0)]
+
+
+@pytest.mark.parametrize("first", WAYS)
+@pytest.mark.parametrize("then", WAYS)
+def test_two_mistakes_of_a_drive_are_undone_one_after_the_other(first: Mistake, then: Mistake) -> None:
+    odometry = World(seconds=4.0).space(corners=False).odometry
+    assert odometry is not None
+    pose = odometry.pose_world_robot
+    one_by_one = read_drive(read_drive(pose, *first.drive), *then.drive)
+    at_once = read_drive(pose, *then.after(first).drive)
+    np.testing.assert_allclose(at_once[:, :3], one_by_one[:, :3], atol=1e-9)
+    turns = [Rotation.from_quat(each[:, 3:]).as_matrix() for each in (at_once, one_by_one)]
+    np.testing.assert_allclose(*turns, atol=1e-9)

@@ -12,16 +12,19 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from evermap.geometry import se2, se3
+from evermap.geometry.group import accumulate
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam import mistakes
 from evermap.slam.check import CLOCKWISE, CORNERS, SIGHTED, find_corner_mistake, is_clockwise, read_corners
 from evermap.slam.orientations import find_convention
 from evermap.types import (
+    ANY_BEARING_RAD,
     UNKNOWN,
     AnyRecording,
     FloatArray,
@@ -41,6 +44,8 @@ CENTRE_PX, COEFFICIENT = 30.0, 0.05
 """Standard deviations of the centre of an image, and of a coefficient of distortion that is stated."""
 SIDEWAYS = 0.1
 """Way to the side over that ahead from which a robot drives sideways: less is the noise of its odometry."""
+WITH_BEARINGS = 0.5
+"""Share of the detections without a bearing from which ranges alone must say what is wrong."""
 DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL, DISTORTION = 0.5, 0.2, 0.3, 0.1, 0.2
 """Standard deviations of a delay, of a mount's position and turn, of the logarithm of a focal length, and of k1."""
 LITTLE = 0.1
@@ -96,7 +101,7 @@ class Suspect:
         of_map: whether it is of the given map.
         pairs: whether it shows in pairs of sightings of one landmark and the odometry between them.
         rows: which landmarks it is of: an 'id', a 'class' or a 'size'; None of all.
-        shows: whether the readings alone say so.
+        shows: whether the readings alone say so, or nothing else than a solution can.
     """
 
     code: str
@@ -188,10 +193,16 @@ def _in_plane(recording: Recording) -> Iterable[Suspect]:
             lambda s, key=key, axis=axis: f"[mount] {key} = {recording.sensor.mount_robot_sensor[axis] + s:.4g}",  # type: ignore[misc]
             sigma,
         )  # fmt: skip
-    for mistake in (*mistakes.UNITS, *mistakes.ANGLES):
+    bearings = np.mean(recording.detections.sigma_bearing_rad == ANY_BEARING_RAD) < WITH_BEARINGS
+    for mistake in (*mistakes.UNITS, *(mistakes.ANGLES if bearings else ())):
         yield Suspect(
             mistake.code, mistake.field, UNIT_P if mistake.code == "length-unit" else USUAL_P,
             partial(_undo_in_plane, mistake=mistake), _constant(mistake.message), _constant(_fix_of(mistake)),
+        )  # fmt: skip
+    for mistake in () if bearings else mistakes.RANGED:
+        yield Suspect(
+            mistake.code, mistake.field, USUAL_P, partial(_undo_in_plane, mistake=mistake), _constant(mistake.message),
+            _constant(_fix_of(mistake)), pairs=False, shows=True,
         )  # fmt: skip
     for identity in _seen_often(recording):
         yield _one_size(names.get(identity, str(identity)), _stretch_ranges, ("id", identity), "")
@@ -290,11 +301,7 @@ def _turn_by(inputs: Inputs, factor: float) -> Inputs:
     assert path is not None
     step = se3.log(se3.between(path.pose_world_robot[:-1], path.pose_world_robot[1:]))
     step[:, 3:] *= factor
-    pose = np.empty_like(path.pose_world_robot)
-    pose[0] = path.pose_world_robot[0]
-    for row, by in enumerate(se3.exp(step)):
-        pose[row + 1] = se3.compose(pose[row], by)
-    return _with_poses(inputs, pose)
+    return _with_poses(inputs, np.asarray(se3.compose(path.pose_world_robot[:1], accumulate(se3.exp(step)))))
 
 
 def _shift_stamps(inputs: Inputs, state: float) -> Inputs:
@@ -324,8 +331,14 @@ def _undo_in_plane(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Input
     bearing = se2.wrap(mistake.bearing * seen.bearing_rad + mistake.offset_rad)
     stretch = math.log(abs(mistake.bearing))
     sigma = seen.sigma_bearing_rad * abs(mistake.bearing)
+    ahead, aside = (
+        (driven.lateral_mps, driven.forward_mps) if mistake.exchanged else (driven.forward_mps, driven.lateral_mps)
+    )
     odometry = replace(
-        driven, forward_mps=driven.forward_mps * mistake.forward, angular_radps=driven.angular_radps * mistake.turn
+        driven,
+        forward_mps=ahead * mistake.forward,
+        lateral_mps=aside * mistake.lateral,
+        angular_radps=driven.angular_radps * mistake.turn,
     )
     detections = replace(seen, bearing_rad=bearing, sigma_bearing_rad=sigma)
     if (mistake.bearing, mistake.offset_rad) == (1.0, 0.0):
@@ -379,23 +392,24 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
     if recording.odometry is not None:
         yield _odometry_scale()
         yield _turn_scale()
-        yield Suspect(
-            "turn-sign", "odometry", USUAL_P, lambda inputs, _: _turn_by(inputs, -1.0),
-            _constant("turns of the odometry seem to have the wrong sign: counter-clockwise is positive"),
-            _constant("odometry.csv: angular_radps"),
-        )  # fmt: skip
         yield _late_stamps(sensors[0].name if len(sensors) == 1 else "all sensors")
-        if _drives_sideways(recording.odometry):  # else only its turns can be mirrored
-            yield Suspect(
-                "odometry-mirrored", "odometry", RARE_P, lambda inputs, _: _mirror_drive(inputs),
-                _constant("the odometry seems mirrored: y is to the left, turns are counter-clockwise"),
-                _constant("odometry.csv: lateral_mps, angular_radps"),
-            )  # fmt: skip
+        aside = _drives_sideways(recording.odometry)
+        for mistake in mistakes.DRIVES:
+            if mistake.lateral == 1.0 or aside:  # else only its turns can be mirrored
+                yield Suspect(
+                    mistake.code, "odometry", USUAL_P if "sign" in mistake.code else RARE_P,
+                    partial(_read_drive, mistake=mistake), _constant(mistake.message), _constant(_fix_of(mistake)),
+                )  # fmt: skip
         for mistake in mistakes.POSES:
             yield Suspect(
                 mistake.code, mistake.field, USUAL_P, partial(_read_poses, convention=mistake.poses),
                 _constant(mistake.message), _constant(_fix_of(mistake)),
             )  # fmt: skip
+    for mistake in () if corners else mistakes.MIRRORS:
+        yield Suspect(
+            mistake.code, mistake.field, RARE_P, partial(_mirror_positions, signs=mistake.mirrored),
+            _constant(mistake.message), _constant("detections.csv: the sign of x_m or y_m"),
+        )  # fmt: skip
     for mistake in mistakes.UNITS_IN_SPACE:
         state = math.log(mistake.lengths)
         if mistake.field == "odometry" and recording.odometry is None:
@@ -410,14 +424,8 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
         )
     for row, sensor in enumerate(sensors):
         yield from _of_mount(row, sensor, many=many, driven=recording.odometry is not None)
-    if many and recording.odometry is not None:  # one driver for all is likelier than as many mistakes
-        for mistake in mistakes.AXES:
-            by = se3.turn(mistake.turned)
-            yield Suspect(
-                mistake.code, "all sensors", USUAL_P,
-                partial(_change_mounts, sensors=range(len(sensors)), how=partial(_turn_within, by=by)),
-                _constant(mistake.message), _constant("[camera.*.mount]"),
-            )  # fmt: skip
+    if many:
+        yield from _of_all_mounts(sensors, driven=recording.odometry is not None)
     cameras = [row for row, sensor in enumerate(sensors) if sensor.intrinsics is not None]
     if not corners:
         return
@@ -470,17 +478,27 @@ def _read_detections(inputs: Inputs, _: float, convention: str) -> Inputs:
     return replace(inputs, recording=replace(recording, detections=seen))
 
 
+def _mirror_positions(inputs: Inputs, _: float, signs: tuple[float, float, float]) -> Inputs:
+    """Return the same with other signs of coordinates of the detections; orientations stay."""
+    recording: Any = inputs.recording
+    seen, by = recording.detections, np.array(signs)
+    seen = replace(
+        seen,
+        position_sensor_m=seen.position_sensor_m * by,
+        covariance_sensor_m2=seen.covariance_sensor_m2 * by[:, None] * by,
+    )
+    return replace(inputs, recording=replace(recording, detections=seen))
+
+
 def _drives_sideways(odometry: SpatialOdometry) -> bool:
     step = np.abs(se3.between(odometry.pose_world_robot[:-1], odometry.pose_world_robot[1:])[:, :2]).sum(axis=0)
     return bool(step[1] > SIDEWAYS * step[0])
 
 
-def _mirror_drive(inputs: Inputs) -> Inputs:
-    """Return the same with the odometry mirrored left to right."""
+def _read_drive(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Inputs:
+    """Return the same with the odometry's signs and axes read in another way."""
     recording: Any = inputs.recording
-    pose = recording.odometry.pose_world_robot.copy()
-    pose[:, [1, 3, 5]] *= -1.0
-    return _with_poses(inputs, pose)
+    return _with_poses(inputs, mistakes.read_drive(recording.odometry.pose_world_robot, *mistake.drive))
 
 
 def _read_poses(inputs: Inputs, _: float, convention: str) -> Inputs:
@@ -520,6 +538,40 @@ def _of_mount(row: int, sensor: SpatialSensor, *, many: bool, driven: bool) -> I
         )  # fmt: skip
 
 
+def _of_all_mounts(sensors: Sequence[SpatialSensor], *, driven: bool) -> Iterable[Suspect]:
+    """Return what may be wrong with all mounts at once: one driver for all is likelier than as many mistakes."""
+    rows = range(len(sensors))
+    for one, other in combinations(rows, 2):
+        names = f"{sensors[one].name}, {sensors[other].name}"
+        yield Suspect(
+            "mount", names, USUAL_P, partial(_exchange_mounts, one=one, other=other),
+            _constant(f"the mounts of {sensors[one].name} and {sensors[other].name} seem to be exchanged"),
+            _constant(f"[camera.{sensors[one].name}.mount], [camera.{sensors[other].name}.mount]"),
+        )  # fmt: skip
+    if not driven:  # nothing says which way the robot looks
+        return
+    turned: list[tuple[str, str, Callable[[FloatArray], FloatArray], float]] = [
+        (each.code, each.message, partial(_turn_within, by=se3.turn(each.turned)), USUAL_P) for each in mistakes.AXES
+    ]
+    flipped = [
+        ("mount-flip", f"all sensors seem {words}", how, USUAL_P if words in _OFTEN else RARE_P)
+        for words, how in _FLIPS
+    ]
+    for code, words, how, p in (*turned, *flipped):
+        yield Suspect(
+            code, "all sensors", p, partial(_change_mounts, sensors=rows, how=how), _constant(words),
+            _constant("[camera.*.mount]"),
+        )  # fmt: skip
+
+
+def _exchange_mounts(inputs: Inputs, _: float, one: int, other: int) -> Inputs:
+    recording: Any = inputs.recording
+    changed = list(recording.sensors)
+    for row, by in ((one, other), (other, one)):
+        changed[row] = replace(changed[row], mount_robot_sensor=recording.sensors[by].mount_robot_sensor)
+    return replace(inputs, recording=replace(recording, sensors=tuple(changed)))
+
+
 def _turn_within(pose: FloatArray, by: FloatArray) -> FloatArray:
     """Return the mount of a sensor, or the poses of tags (K, 7), with their axes turned."""
     return np.asarray(se3.compose(pose, by))
@@ -539,16 +591,29 @@ def _make_turn(axis: int, angle_rad: float, *, of_robot: bool) -> Callable[[Floa
     return how
 
 
+def _tilt_back(mount: FloatArray) -> FloatArray:
+    """Return a mount that looks down as far as it looked up, or the reverse; ahead is z of a camera, else x."""
+    axes = se3.rotation_of(mount)
+    ahead = axes[:, 2] if abs(axes[2, 2]) < UPRIGHT else axes[:, 0]
+    up_rad = math.asin(float(np.clip(ahead[2], -1.0, 1.0)))
+    across = np.array([-ahead[1], ahead[0], 0.0]) / max(math.hypot(ahead[0], ahead[1]), 1e-9)
+    by = se3.exp(np.concatenate([np.zeros(3), 2.0 * up_rad * across]))
+    return np.concatenate([mount[:3], se3.compose(by, se3.turn(mount[3:]))[3:]])
+
+
+UPRIGHT = 0.7
+"""Share by which the z axis of a sensor points upwards from which it is none of a camera that looks ahead."""
 _FLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
-    ("mounted looking the other way: its yaw is 180 degrees off", _make_turn(2, math.pi, of_robot=True)),
-    ("mounted upside down: its image is turned by 180 degrees", _make_turn(2, math.pi, of_robot=False)),
-    ("turned by 90 degrees to the left of its stated mount", _make_turn(2, 0.5 * math.pi, of_robot=True)),
-    ("turned by 90 degrees to the right of its stated mount", _make_turn(2, -0.5 * math.pi, of_robot=True)),
-    ("to have its mount stated inversely: the robot in the sensor's frame", mistakes.CONVENTIONS["inverse"]),
-    ("to have its quaternion stated as w, x, y, z", mistakes.CONVENTIONS["w first"]),
+    ("mounted looking the other way: the yaw is 180 degrees off", _make_turn(2, math.pi, of_robot=True)),
+    ("mounted upside down: the image is turned by 180 degrees", _make_turn(2, math.pi, of_robot=False)),
+    ("turned by 90 degrees to the left of the stated mount", _make_turn(2, 0.5 * math.pi, of_robot=True)),
+    ("turned by 90 degrees to the right of the stated mount", _make_turn(2, -0.5 * math.pi, of_robot=True)),
+    ("mounted inversely: the pose stated is that of the robot in the sensor's frame", mistakes.CONVENTIONS["inverse"]),
+    ("mounted by a quaternion in the order w, x, y, z", mistakes.CONVENTIONS["w first"]),
+    ("tilted the other way: the sign of the pitch", _tilt_back),
     ("mounted on the other side: the sign of y", lambda m: m * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 1.0])),
 )  # fmt: skip
-_OFTEN = frozenset(words for words, _ in _FLIPS[:2])
+_OFTEN = frozenset(_FLIPS[row][0] for row in (0, 1, 4, 6))
 
 
 def _move_mount(inputs: Inputs, state: float, sensor: int, axis: int) -> Inputs:

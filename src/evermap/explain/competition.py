@@ -18,7 +18,7 @@ import numpy as np
 
 from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
-from evermap.explain.causes import LITTLE, Inputs, Suspect, list_suspects, rows_of_kind
+from evermap.explain.causes import LITTLE, MOUNT_M, Inputs, Suspect, list_suspects, rows_of_kind
 from evermap.explain.evidence import (
     LOG_2PI,
     ROOM_M,
@@ -30,11 +30,12 @@ from evermap.explain.evidence import (
     used_rows,
 )
 from evermap.explain.linearise import change_by, cost_nearby, gain_by, held_by_map, solve_nearby
-from evermap.explain.seeds import find_scales, find_shape, find_single_scales
+from evermap.explain.seeds import FALLS, find_mount, find_scales, find_shape, find_single_scales
 from evermap.explain.shape import FEWEST, compare_shapes
 from evermap.explain.symptoms import compare_odometry
+from evermap.slam.check import find_misreadings
 from evermap.slam.estimate import Solved, solve
-from evermap.slam.mistakes import HONEST, find_motion, off, pairs_of
+from evermap.slam.mistakes import HONEST, off, pairs_of
 from evermap.types import (
     UNKNOWN,
     BoolArray,
@@ -57,8 +58,8 @@ LEAST_SCALE, LEAST_SINGLE = 0.015, 0.05
 finds."""
 REFINED = 2
 """Trials whose states are refined: the best ones."""
-FALLS, LINEAR = 0.2, 4.0
-"""Share by which the loss of pairs must fall, and times that a cause may gain what the linear test says."""
+LINEAR = 4.0
+"""Times that a cause may gain what the linear test says."""
 STRETCHES = frozenset({"tag-size", "range-scale"})
 """Causes that stretch detections: of some landmarks as of all."""
 AGREE = 0.25
@@ -80,6 +81,12 @@ CHANGES, INNOVATIONS = "changes", "innovations"
 """Symptoms of a session in which landmarks changed, and of one whose detections scatter wider than they should."""
 OF_NOISE = "_noise_factor", "sigma_corner_px"
 """Ends of the names of noise levels."""
+PLANAR_MOUNT = "sensor x_m", "sensor y_m"
+"""Subjects of causes of where a sensor sits in the plane."""
+SIDEWAYS, SLIPS = "sigma_lateral_per_sqrt_m", 1.5
+"""Name of the level of lateral slip, and times its usual value from which it is asked where the sensor sits."""
+IGNORED, HEARD, IGNORED_NATS = 10.0, 3.0, 100.0
+"""Noise over what is stated from which a sensor is ignored, up to which it is not, and what that is worth [nats]."""
 OF_LANDMARKS = frozenset({ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED})
 
 
@@ -111,6 +118,7 @@ class Trial(Generic[VisitT]):
         taken: the causes.
         evidence: log evidence of the measurements as given, with the prices of all causes and changes.
         worth: share of what the measurements say that is new.
+        noise: largest level of the noise of detections, over what is stated of it.
     """
 
     inputs: Inputs
@@ -118,11 +126,17 @@ class Trial(Generic[VisitT]):
     taken: tuple[Taken, ...]
     evidence: float
     worth: float
+    noise: float = 1.0
 
     def beats(self, other: Trial[VisitT]) -> float:
-        """Return by how much the evidence is larger, as far as measurements are independent [nats]."""
+        """Return by how much the evidence is larger, as far as measurements are independent [nats].
+
+        A solution that ignores a sensor explains nothing of it: one that does not wins.
+        """
         own, others = (sum(one.suspect.log_p for one in trial.taken) for trial in (self, other))
         price = own - others
+        if max(self.noise, other.noise) > IGNORED and min(self.noise, other.noise) < HEARD:
+            return (IGNORED_NATS if self.noise < other.noise else -IGNORED_NATS) + price
         return (self.evidence - other.evidence - price) * min(self.worth, other.worth) + price
 
 
@@ -186,12 +200,22 @@ def find_symptoms(
         if result.trajectory.frame != "prior_map" or not common.any():
             found.append("map")
     if not (found or is_read_well) and any(
-        not finding.usable for finding in find_motion(inputs.recording, config.check)
+        not finding.usable for finding in find_misreadings(inputs.recording, config)
     ):
-        found.append("pairs")
+        found.append("readings")
+    if not found and _is_off_mount(result, inputs, config):
+        found.append("mount")
     if not found and compare_odometry(result)[0] > ODOMETRY_OFF:
         found.append("odometry")
     return tuple(found)
+
+
+def _is_off_mount(result: SlamResult, inputs: Inputs, config: SlamConfig) -> bool:
+    """Return whether a robot in the plane seems to slip to the side, as it does if its sensor sits elsewhere."""
+    slip = next((one for one in result.parameters if one.name == SIDEWAYS), None)
+    if is_in_space(inputs.recording) or slip is None or not slip.value > SLIPS * slip.prior_mean:
+        return False
+    return bool(np.abs(find_mount(inputs.recording, config.check)[:2]).max() > MOUNT_M)
 
 
 def explain(
@@ -512,8 +536,14 @@ def _by_seeds(
             driven = ratio + math.log(states.get("odometry_forward_scale", states.get("odometry_scale", 1.0)))
             of_map = -ratio
         single = find_single_scales(inputs.recording, result)
+    slips = best is not None and _is_off_mount(best.solution.result, inputs, config)
+    mount = find_mount(inputs.recording, config.check) if slips else np.zeros(3)  # type: ignore[arg-type]
     found = list[tuple[float, Suspect, float]]()
     for suspect in suspects:
+        if suspect.code == "mount" and suspect.subject in PLANAR_MOUNT and slips:
+            moved = float(mount[PLANAR_MOUNT.index(suspect.subject)])
+            found += [(math.inf, suspect, moved)] if abs(moved) > MOUNT_M else []
+            continue
         if suspect.rows is not None and suspect.rows[0] == "id":
             state = single.get(int(suspect.rows[1]), math.nan)
         elif suspect.rows is not None:
@@ -763,7 +793,8 @@ def _trial(inputs: Inputs, solution: SessionSolution[VisitT], taken: tuple[Taken
     # a map that what was seen lies nowhere on has its places anywhere
     anywhere = inputs.left_out if solution.result.trajectory.frame == "prior_map" else inputs.left_out + inputs.n_common
     evidence -= anywhere * inputs.recording.dim * (math.log(ROOM_M) + 0.5 * LOG_2PI)
-    return Trial(inputs, solution, taken, evidence + sum(map(_state_evidence, taken)), optimum.worth)
+    noise = max((one.value for one in solution.result.parameters if one.name.endswith(OF_NOISE[0])), default=1.0)
+    return Trial(inputs, solution, taken, evidence + sum(map(_state_evidence, taken)), optimum.worth, noise)
 
 
 OWN_STATES = {

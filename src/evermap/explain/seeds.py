@@ -4,19 +4,21 @@
 * Two sightings of one landmark and the odometry between them: ranges against the odometry.
 * Landmarks of a solution that was not found in a map, against the map: all lengths.
 * Directions from several poses meet at the landmark, which says how far it was: ranges of one landmark.
+* Two sightings of one landmark and the odometry between them, in turns: where the sensor sits on the robot.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
-from evermap.slam.mistakes import Mistake, off, pairs_of
-from evermap.types import UNKNOWN, AnyRecording, FloatArray, IntArray, Landmarks, SlamResult, is_in_space
+from evermap.slam.mistakes import HONEST, Mistake, find_motion, off, pairs_of
+from evermap.types import UNKNOWN, AnyRecording, FloatArray, IntArray, Landmarks, Recording, SlamResult, is_in_space
 
 LARGEST, STEPS = 0.7, 141
 """Largest logarithm of a scale that is tried, and steps from the smallest to that."""
@@ -24,6 +26,8 @@ APART_M, FEWEST_APART = 1.0, 8
 """Distance between two landmarks from which its ratio tells a scale, and how many of these it takes."""
 FEWEST_VIEWS, PARALLAX = 6, 0.02
 """Views of a landmark, and the least share of them that are crosswise, from which directions say how far it is."""
+MOUNT_STEPS, FALLS = 8, 0.2
+"""Steps towards the place of a sensor, and share by which the loss of pairs must fall."""
 MOST_PAIRS = 4000
 """Pairs of a kind that are looked at: more say no more."""
 
@@ -112,6 +116,39 @@ def _against_odometry(recording: AnyRecording, settings: CheckConfig) -> float:
         apart = np.minimum(off(pairs.residual(Mistake("", "", lengths=math.exp(state)))), 10.0)
         losses.append(float(np.log1p((apart / settings.fits) ** 2).sum()))
     return float(tried[int(np.argmin(losses))])
+
+
+def find_mount(recording: Recording, settings: CheckConfig) -> FloatArray:
+    """Return (3,) by how much the mount [m, m, rad] must move for landmarks to stand still; zeros if nothing says so.
+
+    Gauss-Newton steps with Cauchy's weights; a solution would take a sensor that sits elsewhere for lateral slip.
+    """
+    stated, by = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64), np.zeros(3)
+    pairs = pairs_of(recording, settings)
+    if pairs is None or pairs.still or find_motion(recording, settings):
+        return by
+
+    def residual(moved: FloatArray) -> FloatArray:
+        sensor = replace(recording.sensor, mount_robot_sensor=tuple((stated + moved).tolist()))
+        here = pairs_of(replace(recording, sensor=sensor), settings)
+        assert here is not None
+        return np.asarray(here.residual(HONEST)[0])
+
+    def loss(apart: FloatArray) -> float:
+        return float(np.log1p((np.minimum(off(apart), 10.0) / settings.fits) ** 2).sum())
+
+    at = residual(by)
+    before = least = loss(at)
+    for _ in range(MOUNT_STEPS):
+        weight = 1.0 / (1.0 + (off(at) / settings.fits) ** 2)
+        slope = np.stack([(residual(by + step) - at) / 1e-4 for step in 1e-4 * np.eye(3)])
+        normal = np.einsum("ikp,jkp,p->ij", slope, slope, weight)
+        step = np.linalg.lstsq(normal, -np.einsum("ikp,kp,p->i", slope, at, weight), rcond=1e-6)[0]
+        there = residual(by + step)
+        if not loss(there) < least:
+            break
+        by, at, least = by + step, there, loss(there)
+    return by if before - least > max(settings.gain, FALLS * before) else np.zeros(3)
 
 
 def find_shape(result: SlamResult, given: Landmarks) -> float:

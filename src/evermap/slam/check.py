@@ -504,6 +504,11 @@ def screened(
     if not is_in_space(recording):
         recording, told = with_bearings(recording, settings)
         remarks = (*remarks, *told)
+        wrong = next((finding for finding in found if not finding.usable), None)
+        if told and wrong is not None and (recording.detections.landmark_id == UNKNOWN).all():
+            raise DataError(
+                f"{recording.name}: {wrong.message}", hint="ranges in metres: as they are they locate nothing"
+            )
     if settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording):  # the tracker assigns ids
         return recording, remarks, found
     voted = without_contradicted_ids(recording, settings)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import inf, log, pi
 from typing import Self, TypeAlias
@@ -21,6 +21,7 @@ import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
+from evermap.geometry.group import accumulate
 from evermap.slam.kernels import pair_residuals, reckoned_motions
 from evermap.types import (
     UNKNOWN,
@@ -44,9 +45,11 @@ class Mistake:
         code, message: as in `Finding`.
         lengths: factor on all ranges, or its inverse on all speeds, which is the same.
         bearing, offset_rad: a bearing becomes `bearing * b + offset_rad`.
-        turn, forward: factors on the turn rate and the forward speed.
+        turn, forward, lateral: factors on the turn rate, and on the speeds ahead and to the left.
+        exchanged: whether these two speeds are each other's.
         delay_s: odometry stamps are so much later than the motion.
         turned: quaternion that turns positions in the sensor's frame.
+        mirrored: signs of their coordinates, before that.
         poses: how poses of the odometry were written, a key of `CONVENTIONS`; '' as they are read.
         field: column, or table, that is wrong.
     """
@@ -58,8 +61,11 @@ class Mistake:
     offset_rad: float = 0.0
     turn: float = 1.0
     forward: float = 1.0
+    lateral: float = 1.0
+    exchanged: bool = False
     delay_s: float = 0.0
     turned: tuple[float, ...] = tuple(se3.NO_TURN)
+    mirrored: tuple[float, float, float] = (1.0, 1.0, 1.0)
     poses: str = ""
     field: str = ""
 
@@ -68,19 +74,26 @@ class Mistake:
         turned = self.turned
         if other.turned != HONEST.turned:
             turned = tuple(se3.compose(se3.turn(self.turned), se3.turn(other.turned))[3:].tolist())
-        return Mistake(
-            self.code,
-            self.message,
-            self.lengths * other.lengths,
-            self.bearing * other.bearing,
-            self.bearing * other.offset_rad + self.offset_rad,
-            self.turn * other.turn,
-            self.forward * other.forward,
-            self.delay_s + other.delay_s,
-            turned,
-            self.poses or other.poses,
-            self.field,
+        ahead, aside = (other.lateral, other.forward) if self.exchanged else (other.forward, other.lateral)
+        return replace(
+            self,
+            lengths=self.lengths * other.lengths,
+            bearing=self.bearing * other.bearing,
+            offset_rad=self.bearing * other.offset_rad + self.offset_rad,
+            turn=self.turn * other.turn,
+            forward=self.forward * ahead,
+            lateral=self.lateral * aside,
+            exchanged=self.exchanged != other.exchanged,
+            delay_s=self.delay_s + other.delay_s,
+            turned=turned,
+            mirrored=self.mirrored if self.mirrored != HONEST.mirrored else other.mirrored,
+            poses=self.poses or other.poses,
         )
+
+    @property
+    def drive(self) -> tuple[float, float, float, bool]:
+        """Return what it changes of the speeds."""
+        return self.forward, self.lateral, self.turn, self.exchanged
 
 
 HONEST = Mistake("", "")
@@ -138,6 +151,26 @@ ANGLES = (
         forward=-1.0,
         field="forward_mps",
     ),
+    Mistake(
+        "forward-sign",
+        "the robot seems to drive in the opposite direction: forward and lateral speeds have the wrong sign "
+        "(forward_mps, lateral_mps), or the sensor looks backwards ([mount] theta_rad)",
+        forward=-1.0,
+        lateral=-1.0,
+        field="forward_mps",
+    ),
+    Mistake(
+        "odometry-axes",
+        "lateral speeds seem to have the wrong sign: y is to the left (lateral_mps)",
+        lateral=-1.0,
+        field="lateral_mps",
+    ),
+    Mistake(
+        "odometry-axes",
+        "forward and lateral speeds seem to be exchanged: x is ahead, y to the left (forward_mps, lateral_mps)",
+        exchanged=True,
+        field="forward_mps",
+    ),
     *(
         Mistake(
             "bearing-axis",
@@ -151,6 +184,18 @@ ANGLES = (
         for offset in (pi / 2, -pi / 2)
     ),
 )
+RANGED = (
+    Mistake(
+        "forward-sign",
+        "the robot seems to drive in the opposite direction: forward speeds have the wrong sign (forward_mps), or the "
+        "sensor's mount is turned by 180 degrees ([mount])",
+        offset_rad=pi,
+        forward=-1.0,
+        lateral=-1.0,
+        field="forward_mps",
+    ),
+)
+"""Mistakes of robots whose sensor measures ranges alone: the first bearings, which are guessed, follow the odometry."""
 AXES = tuple(
     Mistake(
         "mount-axes",
@@ -163,6 +208,19 @@ AXES = tuple(
         ("z ahead and y down", "x ahead and z up", (-0.5, 0.5, -0.5, 0.5)),
     )
 )
+MIRRORS = tuple(
+    Mistake(
+        "detection-axes",
+        f"{axis} of the detections' positions seems to have the wrong sign, {why} (detections)",
+        mirrored=signs,
+        field="detections",
+    )
+    for axis, why, signs in (
+        ("x", "as in a mirrored image", (-1.0, 1.0, 1.0)),
+        ("y", "as of y upwards; or the sensor is tilted the other way ([mount])", (1.0, -1.0, 1.0)),
+    )
+)
+"""Axes of a camera, one of which points the other way: no rotation of it brings them about."""
 CONVENTIONS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "": lambda pose: pose,
     "w first": lambda pose: pose[..., [0, 1, 2, 4, 5, 6, 3]],
@@ -184,7 +242,53 @@ POSES = (
         field="odometry",
     ),
 )
+DRIVES = (
+    Mistake(
+        "turn-sign",
+        "turns of the odometry seem to have the wrong sign: counter-clockwise is positive (angular_radps)",
+        turn=-1.0,
+        field="angular_radps",
+    ),
+    Mistake(
+        "forward-sign",
+        "the robot seems to drive in the opposite direction: forward speeds have the wrong sign (forward_mps)",
+        forward=-1.0,
+        field="forward_mps",
+    ),
+    Mistake(
+        "forward-sign",
+        "the robot seems to drive in the opposite direction: forward and lateral speeds have the wrong sign "
+        "(forward_mps, lateral_mps), or the sensors look backwards ([mount])",
+        forward=-1.0,
+        lateral=-1.0,
+        field="forward_mps",
+    ),
+    Mistake(
+        "odometry-axes",
+        "lateral motion of the odometry seems to have the wrong sign: y is to the left (lateral_mps)",
+        lateral=-1.0,
+        field="lateral_mps",
+    ),
+    Mistake(
+        "odometry-axes",
+        "forward and lateral motion of the odometry seem to be exchanged: x is ahead, y to the left (forward_mps, "
+        "lateral_mps)",
+        exchanged=True,
+        field="forward_mps",
+    ),
+    Mistake(
+        "odometry-mirrored",
+        "the odometry seems mirrored: y is to the left, turns are counter-clockwise (lateral_mps, angular_radps)",
+        lateral=-1.0,
+        turn=-1.0,
+        field="lateral_mps",
+    ),
+)
+"""Signs and axes of an odometry in space, those that are met more often first."""
 _DELAYS_S = (*np.arange(1.0, 10.0, 0.5).tolist(), *np.arange(10.0, 61.0, 1.0).tolist())
+LEAST_WAY_M, HEAD_ON, FASTER = 0.5, 0.9, 2.0
+"""Of ranges alone: the way between two from which their difference is compared with it, the quantile of the ratio at
+which the robot drives straight to a landmark or away from it, and what that is at least in another unit."""
 AT_ONCE = 32
 """Number of corrections that are tried together: arrays of a megabyte."""
 SHARES = (slice(0, None, 64), *(slice(step // 2, None, step) for step in (64, 32, 16, 8, 4)))
@@ -309,8 +413,13 @@ def pairs_of(recording: AnyRecording, settings: CheckConfig = USUAL) -> Pairs | 
     return (SpatialPairs if is_in_space(recording) else PlanarPairs)(recording, first, second)  # type: ignore[arg-type]
 
 
-def sighting_pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, IntArray]:
-    """Return pairs of rows of detections of one landmark, within a few seconds and during the odometry."""
+def sighting_pairs(
+    recording: AnyRecording, settings: CheckConfig, *, with_bearing: bool = True
+) -> tuple[IntArray, IntArray]:
+    """Return pairs of rows of detections of one landmark, within a few seconds and during the odometry.
+
+    Those in the plane need a bearing, unless it is said that they do not.
+    """
     detections = recording.detections
     stamp_s = recording.frames.stamp_s[detections.frame]
     known = detections.landmark_id != UNKNOWN
@@ -318,7 +427,7 @@ def sighting_pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntA
         from evermap.slam.space.intake import positions_of, without_range
 
         known &= ~without_range(recording) & np.isfinite(positions_of(recording)).all(axis=1)
-    else:
+    elif with_bearing:
         known &= np.isfinite(recording.detections.bearing_rad)
     if not known.any() or recording.odometry is None or len(recording.odometry) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -350,7 +459,7 @@ class PlanarPairs:
 
     def __init__(self, recording: Recording, first: IntArray, second: IntArray) -> None:
         detections = recording.detections
-        self._odometry, self._tracks = recording.odometry, dict[tuple[float, float], FloatArray]()
+        self._odometry, self._tracks = recording.odometry, dict[tuple[float, float, float, bool], FloatArray]()
         self._mount = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64)
         stamp_s = recording.frames.stamp_s[detections.frame]
         self._stamp_s = stamp_s[first], stamp_s[second]
@@ -389,24 +498,24 @@ class PlanarPairs:
 
         With `stands` the robot doesn't move.
         """
-        ways = np.array([(each.forward, each.turn, each.delay_s) for each in mistakes])
-        ways, which = np.unique(ways, axis=0, return_inverse=True)
+        ways = dict[tuple[tuple[float, float, float, bool], float], int]()
+        which = np.array([ways.setdefault((each.drive, each.delay_s), len(ways)) for each in mistakes])
         motion = np.zeros((len(ways), len(self._stamp_s[0]), 3))
-        for row, (forward, turn, delay_s) in enumerate(() if stands else ways.tolist()):
-            if (forward, turn) not in self._tracks:
-                self._tracks[forward, turn] = _dead_reckoned(self._odometry, forward, turn)
-            track = self._tracks[forward, turn]
+        for row, (drive, delay_s) in enumerate(() if stands else ways):
+            if drive not in self._tracks:
+                self._tracks[drive] = _dead_reckoned(self._odometry, *drive)
+            track = self._tracks[drive]
             reckoned_motions(*self._stamp_s, delay_s, self._odometry.stamp_s, track, self._mount, motion[row])
         undone = np.array([(each.lengths, each.bearing, each.offset_rad) for each in mistakes])
         found = np.empty((len(mistakes), 2, motion.shape[1]))
-        pair_residuals(motion, which.ravel(), undone, *self._readings, found)
+        pair_residuals(motion, which, undone, *self._readings, found)
         return found
 
 
 class SpatialPairs:
     """Pairs of sightings in space."""
 
-    units, angles = UNITS_IN_SPACE, (*AXES, *POSES)
+    units = UNITS_IN_SPACE
     why_longer = "another unit of detections or odometry, or a wrong size of tags (tag_size_m)"
     speeds = "odometry"
 
@@ -415,12 +524,15 @@ class SpatialPairs:
 
         assert recording.odometry is not None
         detections, self._odometry = recording.detections, recording.odometry
+        self._tracks = dict[tuple[object, ...], FloatArray]()
         mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])
         stamp_s = recording.frames.stamp_s[detections.frame]
         self._stamp_s = stamp_s[first], stamp_s[second]
         self._mount = mount[detections.sensor[first]], mount[detections.sensor[second]]
         position = positions_of(recording)
         self._seen = position[first], position[second]
+        by_corners = bool(np.isfinite(detections.corner_px[:, 0, 0]).any())  # of these pixels would be mirrored
+        self.angles = (*AXES, *POSES, *DRIVES, *(() if by_corners else MIRRORS))
 
     def among(self, rows: slice) -> Self:
         """Return some of the pairs."""
@@ -452,7 +564,8 @@ class SpatialPairs:
         motion = se3.identity(*motion.shape[:-1]) if stands else motion
         motion[..., :3] /= np.array([each.lengths for each in mistakes])[:, None, None]
         turned = se3.turn([each.turned for each in mistakes])[:, None]
-        seen, again = (se3.transform(turned, each) for each in self._seen)
+        signs = np.array([each.mirrored for each in mistakes])[:, None]
+        seen, again = (se3.transform(turned, signs * each) for each in self._seen)
         expected = se3.transform(motion, seen)
         far = [np.maximum(np.linalg.norm(each, axis=-1, keepdims=True), 1e-12) for each in (again, expected)]
         apart = [np.log(far[0]) - np.log(far[1]), again / far[0] - expected / far[1]]
@@ -461,9 +574,12 @@ class SpatialPairs:
     def _motions(self, mistakes: tuple[Mistake, ...]) -> FloatArray:
         """(M, P, 7) motions of the sensor from the second sighting to the first, by odometry."""
         stamp_s, motion = self._odometry.stamp_s, np.empty((len(mistakes), len(self._stamp_s[0]), 7))
-        for poses in {each.poses for each in mistakes}:
-            rows = [row for row, each in enumerate(mistakes) if each.poses == poses]
-            pose = CONVENTIONS[poses](self._odometry.pose_world_robot)
+        for way in dict.fromkeys((each.poses, each.drive) for each in mistakes):
+            rows = [row for row, each in enumerate(mistakes) if (each.poses, each.drive) == way]
+            if way not in self._tracks:
+                poses, drive = way
+                self._tracks[way] = read_drive(CONVENTIONS[poses](self._odometry.pose_world_robot), *drive)
+            pose = self._tracks[way]
             delay_s, which = np.unique([mistakes[row].delay_s for row in rows], return_inverse=True)
             start, stop = (
                 se3.compose(
@@ -541,13 +657,24 @@ def _cheapest(loss: FloatArray, step: float) -> IntArray:
     return path
 
 
-def _dead_reckoned(odometry: Odometry, forward: float, turn: float) -> FloatArray:
-    """(N, 3) x, y and unwrapped heading at the odometry's stamps, with factors on speed and turn rate."""
+def read_drive(pose: FloatArray, forward: float, lateral: float, turn: float, exchanged: bool) -> FloatArray:
+    """Return poses (N, 7) of a robot, from the first on, whose speeds were written in another way (`Mistake`)."""
+    if (forward, lateral, turn, exchanged) == HONEST.drive:
+        return pose
+    step = se3.log(se3.between(pose[:-1], pose[1:]))
+    if exchanged:
+        step[:, :2] = step[:, 1::-1]
+    step *= [forward, lateral, 1.0, 1.0, 1.0, turn]
+    return np.asarray(se3.compose(pose[:1], accumulate(se3.exp(step))))
+
+
+def _dead_reckoned(odometry: Odometry, forward: float, lateral: float, turn: float, exchanged: bool) -> FloatArray:
+    """(N, 3) x, y and unwrapped heading at the odometry's stamps, of speeds that were written in another way."""
     step_s = np.diff(odometry.stamp_s)
     turned = np.append(0.0, np.cumsum(turn * odometry.angular_radps[:-1] * step_s))
     heading = turned[:-1] + 0.5 * np.diff(turned)
-    ahead = forward * odometry.forward_mps[:-1] * step_s
-    aside = odometry.lateral_mps[:-1] * step_s
+    speeds = (odometry.lateral_mps, odometry.forward_mps) if exchanged else (odometry.forward_mps, odometry.lateral_mps)
+    ahead, aside = forward * speeds[0][:-1] * step_s, lateral * speeds[1][:-1] * step_s
     x = np.append(0.0, np.cumsum(ahead * np.cos(heading) - aside * np.sin(heading)))
     y = np.append(0.0, np.cumsum(ahead * np.sin(heading) + aside * np.cos(heading)))
     return np.column_stack([x, y, turned])
@@ -572,7 +699,7 @@ def find_motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]
     """Return mistakes that make static landmarks appear to move."""
     pairs = pairs_of(recording, settings)
     if pairs is None:
-        return []
+        return [] if is_in_space(recording) else _find_unit_of_ranges(recording, settings)
     if pairs.still:
         moved = off(pairs.residual(HONEST)) > 0.1
         if np.sum(moved) < settings.fewest or np.mean(moved) < 0.1:
@@ -605,6 +732,34 @@ def find_motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]
         )
         return [Finding("landmarks-move", message)]
     return found
+
+
+def _find_unit_of_ranges(recording: Recording, settings: CheckConfig) -> list[Finding]:
+    """Return the unit of ranges without bearings, which change faster than the sensor moves in any direction."""
+    first, second = sighting_pairs(recording, settings, with_bearing=False)
+    seen = recording.detections
+    if len(first) < settings.fewest:
+        return []
+    stamp_s, motion = recording.frames.stamp_s[seen.frame], np.empty((len(first), 3))
+    driven, mount = recording.odometry, np.array(recording.sensor.mount_robot_sensor, dtype=np.float64)
+    track = _dead_reckoned(driven, *HONEST.drive)
+    reckoned_motions(stamp_s[first], stamp_s[second], 0.0, driven.stamp_s, track, mount, motion)
+    way_m = np.hypot(motion[:, 0], motion[:, 1])
+    moved = way_m > LEAST_WAY_M
+    faster = np.abs(seen.range_m[second] - seen.range_m[first])[moved] / way_m[moved]
+    landmark = seen.landmark_id[first][moved]
+    fastest = [
+        float(np.quantile(faster[landmark == one], HEAD_ON))
+        for one in np.unique(landmark).tolist()
+        if np.count_nonzero(landmark == one) >= settings.fewest
+    ]
+    usual = float(np.median(fastest)) if fastest else 1.0
+    if usual < FASTER:  # no triangle inequality is broken, but for noise and slip
+        return []
+    for mistake in UNITS:
+        if mistake.field == "range_m" and abs(log(mistake.lengths * usual)) < log(FASTER) / 2.0:
+            return [Finding(mistake.code, mistake.message, usable=False)]
+    return []
 
 
 def unusable(recording: AnyRecording, settings: CheckConfig) -> Finding | None:

@@ -14,7 +14,7 @@ import numpy as np
 from evermap.config import CheckConfig
 from evermap.geometry import se3
 from evermap.slam.mistakes import CONVENTIONS, sighting_pairs
-from evermap.types import AnyRecordingT, BoolArray, SpatialRecording, is_in_space
+from evermap.types import AnyRecordingT, BoolArray, FloatArray, SpatialRecording, is_in_space
 
 SAME = 1e-6
 """Difference between the numbers of two quaternions that are equal."""
@@ -23,9 +23,9 @@ TURNED_RAD = 0.3
 WITH_ROBOT = 0.3
 """Share of the robot's turn by which orientations in the sensor's frame change that do not see it; it must be the
 median, as must the rest of the turn in the world."""
-STILL_RAD, SHARE_LEFT = 0.35, 0.4
-"""Turn of a landmark between two sightings, by orientations as they are read, from which another convention is asked;
-and share of it that is left at most where the other one is right."""
+TELLS_RAD, SHARE_LEFT = 0.05, 0.7
+"""Difference between two conventions, in the turn of a landmark from one sighting to another, from which these two say
+which is right; and share of the usual turn that is left at most where the other one is."""
 
 
 def without_unmeasured(recording: AnyRecordingT, settings: CheckConfig) -> AnyRecordingT:
@@ -60,7 +60,9 @@ def without_unmeasured(recording: AnyRecordingT, settings: CheckConfig) -> AnyRe
 def find_convention(recording: SpatialRecording, settings: CheckConfig) -> str:
     """Return the convention (`mistakes.CONVENTIONS`) of detections by which landmarks do not turn.
 
-    It is '' if that is the one in which they are read, if none is, or if it is that of the odometry.
+    Nearly all pairs of sightings that can tell it from the one in which they are read must say so, and their positions
+    must not contradict it. It is '' if that is the one in which they are read, if none is, or if it is that of the
+    odometry.
     """
     odometry, seen = recording.odometry, recording.detections
     if odometry is None:
@@ -77,17 +79,23 @@ def find_convention(recording: SpatialRecording, settings: CheckConfig) -> str:
     if len(first) < settings.fewest:
         return ""
     pose = np.concatenate([seen.position_sensor_m, seen.rotation], axis=1)
-    turned = {}
-    for driven, seen_as in [
+    turned, apart_m = dict[tuple[str, str], FloatArray](), dict[tuple[str, str], FloatArray]()
+    for way in [
         ("", ""),
         *(("", name) for name in CONVENTIONS if name),
         *((name, "") for name in CONVENTIONS),
     ]:
-        track = se3.compose(CONVENTIONS[driven](robot), mount)
-        one, other = (se3.compose(track[rows], CONVENTIONS[seen_as](pose[rows])) for rows in (first, second))
-        turned[driven, seen_as] = float(np.median(se3.angle_between(one, other)))
-    best, given = min(turned, key=lambda ways: turned[ways]), turned["", ""]
-    return best[1] if given > STILL_RAD and turned[best] < SHARE_LEFT * given else ""
+        track = se3.compose(CONVENTIONS[way[0]](robot), mount)
+        one, other = (se3.compose(track[rows], CONVENTIONS[way[1]](pose[rows])) for rows in (first, second))
+        turned[way] = se3.angle_between(one, other)
+        apart_m[way] = np.linalg.norm(one[:, :3] - other[:, :3], axis=1)
+    best, given = min(turned, key=lambda way: float(np.median(turned[way]))), ("", "")
+    nearer = turned[given] - turned[best]
+    telling = np.abs(nearer) > TELLS_RAD
+    if np.count_nonzero(telling) < settings.fewest or np.mean(nearer[telling] > 0.0) < settings.agreed:
+        return ""
+    stays = np.median(apart_m[best]) <= np.median(apart_m[given]) * (1.0 + SAME)
+    return best[1] if stays and np.median(turned[best]) < SHARE_LEFT * np.median(turned[given]) else ""
 
 
 def _has_orientation(recording: SpatialRecording) -> BoolArray:

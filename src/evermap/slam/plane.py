@@ -20,7 +20,7 @@ from evermap.config import CheckConfig, SlamConfig
 from evermap.errors import ConfigError
 from evermap.geometry import se2, se3
 from evermap.slam.mistakes import sighting_pairs, unusable
-from evermap.slam.orientations import without_unmeasured
+from evermap.slam.orientations import find_convention, without_unmeasured
 from evermap.slam.space.intake import positions_of, without_range
 from evermap.types import (
     AnyRecording,
@@ -86,6 +86,10 @@ def in_its_space(recording: AnyRecording, settings: SlamConfig, *, dim: int | No
         return recording
     wrong = unusable(recording, settings.check)
     if wrong is not None and not wrong.usable:  # refused by its name there: velocities in mm/s are no velocities
+        return recording
+    if wrong is not None and len(recording.sensors) > 1:  # their mounts, which the plane has not, are asked in space
+        return recording
+    if find_convention(recording, settings.check):  # of orientations, which the plane leaves out in silence
         return recording
     why = "the odometry is planar and landmarks keep their heights (slam.plane = false: in space)"
     return _in_plane(recording, why)

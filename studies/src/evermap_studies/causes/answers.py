@@ -46,7 +46,7 @@ def _answer(verdicts: frozenset[VerdictKind], codes: str, words: str, states: st
 
 _SCALES = "length-unit odometer-scale odometry-scale range-scale scale forward-scale "
 _CLOCKS = "clock delay sensor-delay clock-drift clock-step "
-_MOUNTS = "mount mount-axes mount-angle mount-position sensor-mount "
+_MOUNTS = "mount mount-axes mount-flip mount-angle mount-position sensor-mount "
 _LENSES = "lens focal focal-axes focal-length intrinsics distortion camera-lens calibration "
 _SITES = "map-site another-site other-site map-frame map "
 _ODOMETRY = "odometry-axes odometry-frame axes forward-sign turn-sign "
@@ -109,17 +109,22 @@ ANSWERS = {
     "corner order": _answer(REFUSED, "corner-order corners tag-corners mount-axes tag-axes", "corner"),
     "pose convention": _answer(
         REFUSED,
-        _MOUNTS + "pose-inverse tag-poses quaternion-order orientation tag-axes axes bearing-axis",
+        _MOUNTS + "detection-poses detection-axes pose-inverse tag-poses quaternion-order orientation tag-axes axes "
+        "bearing-axis",
         "invers quaternion axes orientation",
     ),
     "odometry axes": _answer(
-        REFUSED, _ODOMETRY + _MOUNTS + "quaternion-order odometry-inverse", "axes sign odometry quaternion"
+        REFUSED,
+        _ODOMETRY + _MOUNTS + "odometry-poses quaternion-order odometry-inverse",
+        "axes sign odometry quaternion",
     ),
     "jump": _answer(MENDED, "odometry-jumps odometry-jump odometry-break jump break", "jump"),
     "silence": _answer(MENDED, "odometry-silence odometry-silent silence odometry-gap gap odometry-break", "silen gap"),
     "map scale": _answer(OUTDATED, "map-scale map-unit scale", "scale " + _UNITS),
     "map mirror": _answer(OUTDATED, "map-mirror map-mirrored mirrored mirrored-map", "mirror"),
     "map site": _answer(OUTDATED | LOST, _SITES, "site map"),
-    "map axes": _answer(OUTDATED | LOST, _SITES + "map-axes map-mirror mirrored-map map-tag-axes tag-axes", "axes map"),
+    "map axes": _answer(
+        OUTDATED | LOST, _SITES + "map-axes map-mirror map-mirrored mirrored-map map-tag-axes tag-axes", "axes map"
+    ),
 }
 """By the cause of a world. 'anything': a run that isn't called sound, whatever it names."""

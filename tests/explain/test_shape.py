@@ -1,0 +1,92 @@
+"""What counts as in its place when two maps are laid over each other, and as far from what is stated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from evermap.config import ExplainConfig
+from evermap.explain.causes import Inputs
+from evermap.explain.competition import find_put_right
+from evermap.explain.shape import compare_shapes
+from evermap.types import Cause, Landmarks, ParameterEstimate
+
+from .worlds import World
+
+
+def flat(count: int, spread_m: float, sigma_m: float = 0.001) -> Landmarks:
+    """Landmarks on a circle; the root of the mean square from their middle is its radius."""
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False) + 0.3 * np.sin(np.arange(count))
+    at = spread_m * np.column_stack([np.cos(angle), np.sin(angle)])
+    found = Landmarks.at(np.arange(count), at)
+    return replace(found, covariance_m2=np.broadcast_to(sigma_m**2 * np.eye(2), (count, 2, 2)).copy())
+
+
+def with_first_moved(places: Landmarks, by_m: float) -> Landmarks:
+    at = places.position_m.copy()
+    at[0] *= 1.0 + by_m / np.linalg.norm(at[0])
+    return replace(places, position_m=at)
+
+
+@pytest.mark.parametrize(
+    ("spread_m", "sigma_m", "by_m", "stays"),
+    [
+        (10.0, 0.001, 0.4, True),  # between two landmarks the error is halved: 2 % of the spread
+        (10.0, 0.001, 0.8, False),  # 4 %
+        (0.3, 0.001, 0.03, True),  # of a small place, 5 %: 15 mm
+        (0.3, 0.001, 0.06, False),
+        (10.0, 0.3, 2.0, True),  # known to .3 m along each axis only
+        (10.0, 0.3, 3.5, False),
+        (1.0, 1.0, 0.3, True),  # known to a metre, in a place of one: no more than a fifth of it
+        (1.0, 1.0, 0.6, False),
+    ],
+)
+def test_a_landmark_is_in_its_place(spread_m: float, sigma_m: float, by_m: float, stays: bool) -> None:
+    found = flat(12, spread_m, sigma_m)
+    agreement = compare_shapes(found, with_first_moved(found, by_m))
+    assert agreement.placed == (1.0 if stays else pytest.approx(11 / 12))
+
+
+def test_a_shape_needs_four_landmarks() -> None:
+    assert compare_shapes(flat(4, 5.0), flat(4, 5.0)) == (4, 1.0, 1.0)
+    assert compare_shapes(flat(4, 5.0)[:3], flat(4, 5.0)) == (3, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("turned_deg", "share"), [(15.0, 1.0), (25.0, 0.5)])
+def test_a_tag_is_turned_as_in_the_map(turned_deg: float, share: float) -> None:
+    survey = World().map_in_space()
+    assert survey.rotation is not None
+    by = Rotation.from_euler("z", turned_deg, degrees=True)
+    agreement = compare_shapes(survey, replace(survey, rotation=(Rotation.from_quat(survey.rotation) * by).as_quat()))
+    assert agreement == (16, 1.0, share)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "code", "ratio"),
+    [
+        ("range_slope", 0.07, "range-scale", 1.0 / 1.07),
+        ("range_scale", 1.07, "range-scale", 1.0 / 1.07),
+        ("odometry_forward_scale", 0.9, "odometry-scale", 0.9),
+        ("odometry_turn_scale", 1.1, "turn-scale", 1.1),
+    ],
+)
+def test_a_scale_that_the_estimator_found_is_told_as_a_ratio(name: str, value: float, code: str, ratio: float) -> None:
+    """A slope of ranges is what they are longer by; the others are ratios."""
+    recording = World(seconds=4.0).plane()
+    usual = 0.0 if name == "range_slope" else 1.0
+    state = ParameterEstimate(name, value, 0.001, usual, 0.005, "1", p_needed=1.0)
+
+    def put_right(value: float) -> tuple[Cause, ...]:
+        result: Any = SimpleNamespace(
+            parameters=(replace(state, value=value),), trajectory=SimpleNamespace(frame="first_pose")
+        )
+        return find_put_right(result, Inputs.of(recording, None), ExplainConfig())
+
+    (cause,) = put_right(value)
+    assert (cause.code, cause.value) == (code, pytest.approx(ratio))
+    assert put_right(usual + 0.01) == ()
