@@ -244,7 +244,7 @@ class SpatialProblem:
     @property
     def has_range(self) -> BoolArray:
         """Return (M,) detections of points with a measured range."""
-        return (self.kind == POINT) & ~self.ray
+        return np.asarray((self.kind == POINT) & ~self.ray)
 
     @property
     def _ranges(self) -> tuple[FloatArray, FloatArray]:

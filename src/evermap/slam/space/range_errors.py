@@ -41,7 +41,7 @@ def find_range_errors(optimum: SpatialOptimum) -> FloatArray:
         pull[sensor] = -float(counts @ (own * residual).sum(axis=1))
     variance = 1.0 / (information + USUAL**-2)
     found = variance * (pull + information * error)
-    return np.where(0.5 * found**2 / variance > problem.settings.repair.gain_nats, found, 0.0)
+    return np.asarray(np.where(0.5 * found**2 / variance > problem.settings.repair.gain_nats, found, 0.0))
 
 
 def shows_errors(problem: SpatialProblem) -> bool:
