@@ -56,9 +56,9 @@ def _by_error(optimum: SpatialOptimum) -> FloatArray:
     """Return (M, 3) derivatives of whitened residuals by the range error of their sensor; 0 of what has no range."""
     problem, noise = optimum.smoother.problem, optimum.noise
     by = np.einsum("mij,mj->mi", problem.measured_root, problem.range_slope)
-    return -by / noise.levels[[ACROSS, ACROSS, ALONG]]
+    return np.asarray(-by / noise.levels[[ACROSS, ACROSS, ALONG]])
 
 
 def _solved(smoother: SpatialSmoother, now: SpatialLinear) -> FloatArray:
     """Return (M, 3) whitened residuals at the optimum of the linearised problem."""
-    return smoother.after(now, exhausted(smoother.factorised(now).solution())).residual[:, :3]
+    return np.asarray(smoother.after(now, exhausted(smoother.factorised(now).solution())).residual[:, :3])
