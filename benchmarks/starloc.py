@@ -8,6 +8,13 @@ truth to start from. Errors are those of poses that we call located, the same fo
 landmarks after that alignment.
 
     python -m benchmarks.starloc [shared/data/starloc]
+
+With `--sweep` the survey is edited in ways of which the truth is known: entries moved (`moved`: shares and distances of
+EDITS), a part of them at each other's places (`rearranged`), or all of them (`another`: nothing may be told of single
+entries). Every row is a run by `run_slam`, or with `--audit` by `evermap audit`, with what it says of entries that were
+seen three times or more, and gtsam's error with the same survey. Design and held-out sessions and seeds are apart.
+
+    python -m benchmarks.starloc --sweep [--held-out] [--audit] [--only SESSION..] [--kinds KIND..]
 """
 
 from __future__ import annotations
@@ -25,12 +32,14 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 import evermap as em
 from evermap.geometry import se3
 from evermap.io import read_recording
 from evermap.io.rig_toml import CAMERA_FILE
 from evermap.metrics.trajectory import align_poses
+from evermap.runs.audit import audit_map
 from evermap.types import FloatArray, IntArray, Landmarks, SpatialRecording
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "starloc"
@@ -192,13 +201,174 @@ def run(folder: Path = FOLDER) -> Iterator[Row]:
             yield compare(name, recording, known, given, (baseline_m, focal_px))
 
 
+@dataclass(frozen=True, slots=True)
+class Edit:
+    """A way in which a survey is wrong.
+
+    Attributes:
+        kind: `published` as it is, `moved`, `rearranged` or `another`.
+        seed: of it; those of held-out edits differ.
+        share: of the entries.
+        from_m, to_m: distances, as likely in each octave.
+    """
+
+    kind: str
+    seed: int = 0
+    share: float = 0.0
+    from_m: float = 0.1
+    to_m: float = 2.0
+
+    def of(self, survey: Landmarks) -> Landmarks:
+        """Return the survey with this error, beside its own."""
+        random, position, count = np.random.default_rng(self.seed), survey.position_m.copy(), len(survey)
+        some = random.choice(count, round(self.share * count), replace=False)
+        if self.kind == "moved":
+            by = random.normal(size=(len(some), 3))
+            by /= np.linalg.norm(by, axis=1, keepdims=True)
+            position[some] += by * np.exp(random.uniform(np.log(self.from_m), np.log(self.to_m), (len(some), 1)))
+        elif self.kind in ("rearranged", "another"):
+            position[some] = position[np.roll(some, 1)]
+        return replace(survey, position_m=position)
+
+
+DESIGNED = ("eight_s2", "loop-2d_s1", "loop-2d-fast_s2", "loop-3d_s2")
+"""Sessions on which the decision was designed; the others are held out."""
+LARGE_M = 0.3
+"""From which a move is large beside what such a camera sees."""
+FEWEST = 3
+
+
+def edits(*, held_out: bool) -> list[Edit]:
+    """Return the edits of a sweep."""
+    first = 100 if held_out else 0
+    return [
+        Edit("published"),
+        Edit("moved", first + 1, 0.2),
+        Edit("moved", first + 2, 0.4 if held_out else 0.35),
+        Edit("moved", first + 4, 0.05),
+        Edit("moved", first + 6, 0.3, LARGE_M),
+        Edit("rearranged", first + 3, 0.3),
+        Edit("another", first + 5, 1.0),
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class SweepRow:
+    """What a run says of an edited survey.
+
+    Attributes:
+        session, edit: which.
+        right, false, missed: entries told as wrong, of those seen often enough.
+        missed_large: of the missed ones, those farther than `LARGE_M`.
+        sure: false ones told with more than .99, of all that were seen.
+        pose_m: RMSE of poses that we call located, after alignment: ours, and gtsam's with the same survey.
+        nees: of positions, in the map, over its expectation, medians; nan of an audit.
+        cpu_s: of ours.
+        verdict: of the run.
+    """
+
+    session: str
+    edit: Edit
+    right: int
+    false: int
+    missed: int
+    missed_large: int
+    sure: int
+    pose_m: tuple[float, float]
+    nees: float
+    cpu_s: float
+    verdict: str
+
+
+def sweep_one(name: str, recording: SpatialRecording, edit: Edit, rig: tuple[float, float], *, audit: bool) -> SweepRow:
+    """Solve a session in an edited survey, and score what is said of it."""
+    published, truth = recording.true_landmarks, recording.truth
+    assert published is not None
+    assert truth is not None
+    survey = edit.of(published)
+    given = survey.as_prior(SIGMA_SURVEY)
+    off_m = np.linalg.norm(survey.position_m - corrected(published).position_m, axis=1)
+    began, pose_m, nees, verdict = time.process_time(), (np.nan, np.nan), np.nan, ""
+    if audit:
+        found = audit_map(given, [recording])
+        told = {entry.landmark_id: entry.probability for entry in found.faults}
+        verdict = "" if found.is_heard else "not heard"
+        cpu_s = time.process_time() - began
+    else:
+        result = em.run_slam(recording, prior_map=given)
+        cpu_s = time.process_time() - began
+        told = {one: change.probability for change in result.changes for one in change.landmark_ids}
+        verdict = "" if result.verdict is None else result.verdict.kind.value
+        rows = np.searchsorted(recording.frames.stamp_s, result.trajectory.stamp_s - 1e-4)
+        pose, true = result.trajectory.pose_world_robot, truth.pose_world_robot[rows]
+        theirs = by_gtsam(recording, survey, *rig)[0][rows]
+        pose_m = tuple(
+            _rms(se3.transform(align_poses(one, true)[0], one[:, :3]) - true[:, :3]) for one in (pose, theirs)
+        )
+        own = np.einsum("nji,nj->ni", se3.rotation_of(pose), pose[:, :3] - true[:, :3])
+        spread = result.trajectory.covariance[:, :3, :3]
+        nees = float(np.median(np.einsum("ni,nij,nj->n", own, np.linalg.inv(spread), own))) / float(chi2.median(3))
+    hits = dict(
+        zip(*(one.tolist() for one in np.unique(recording.detections.landmark_id, return_counts=True)), strict=True)
+    )
+    seen = np.array([hits.get(one, 0) for one in survey.landmark_id.tolist()])
+    p_wrong = np.array([told.get(one, 0.0) for one in survey.landmark_id.tolist()])
+    wrong, often = off_m > 0.0, seen >= FEWEST
+    says = p_wrong > 0.5
+    return SweepRow(
+        name, edit, int(np.sum(often & wrong & says)), int(np.sum(often & ~wrong & says)),
+        int(np.sum(often & wrong & ~says)), int(np.sum(often & (off_m > LARGE_M) & ~says)),
+        int(np.sum((seen > 0) & ~wrong & (p_wrong > 0.99))), pose_m, nees, cpu_s, verdict,
+    )  # fmt: skip
+
+
+def print_sweep(folder: Path, *, held_out: bool, audit: bool, only: list[str], kinds: list[str]) -> None:
+    """Print every run of a sweep, and the sums by the kind of edit."""
+    print(
+        "| session | edit | right | false | missed | large ones | false > .99 | ours [m] | gtsam | NEES | CPU [s] | |"
+    )
+    print("|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---|")
+    found = list[SweepRow]()
+    for name, recording, baseline_m, focal_px in recordings(folder):
+        if (name in only) if only else ((name in DESIGNED) != held_out):
+            for edit in edits(held_out=held_out):
+                if kinds and edit.kind not in kinds:
+                    continue
+                row = sweep_one(name, recording, edit, (baseline_m, focal_px), audit=audit)
+                found.append(row)
+                said = f"{edit.kind} {100 * edit.share:.0f} % {edit.seed}"
+                print(
+                    f"| {name} | {said} | {row.right} | {row.false} | {row.missed} | {row.missed_large} | {row.sure} "
+                    f"| {row.pose_m[0]:.3f} | {row.pose_m[1]:.3f} | {row.nees:.1f} | {row.cpu_s:.1f} | {row.verdict} |",
+                    flush=True,
+                )
+    for kind in dict.fromkeys(row.edit.kind for row in found):
+        of = [row for row in found if row.edit.kind == kind]
+        right, false, missed, sure = (
+            sum(getattr(row, one) for row in of) for one in ("right", "false", "missed", "sure")
+        )
+        print(
+            f"{kind}: precision {right / max(right + false, 1):.3f}, recall {right / max(right + missed, 1):.3f}, "
+            f"{sure} false with more than .99, {right + missed} wrong entries"
+        )
+
+
 def main() -> None:
     """Print the table, row by row."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path, default=FOLDER)
+    parser.add_argument("--sweep", action="store_true", help="edited surveys")
+    parser.add_argument("--held-out", action="store_true", help="sessions and seeds that nothing was designed on")
+    parser.add_argument("--audit", action="store_true", help="by `evermap audit`")
+    parser.add_argument("--only", nargs="*", default=[], help="sessions")
+    parser.add_argument("--kinds", nargs="*", default=[], help="of edits")
+    chosen = parser.parse_args()
+    if chosen.sweep:
+        print_sweep(chosen.folder, held_out=chosen.held_out, audit=chosen.audit, only=chosen.only, kinds=chosen.kinds)
+        return
     print(TABLE)
     print("|---|---|---:|---:|---:|---:|---:|---:|---:|")
-    for row in run(parser.parse_args().folder):
+    for row in run(chosen.folder):
         (ours, gtsams), (own, their) = row.pose_m, row.landmark_m
         print(
             f"| {row.session} | {row.known} | {row.located} of {row.frames} | {ours:.3f} | {gtsams:.3f} "

@@ -190,11 +190,13 @@ def _with_measurements(problem: SpatialProblem, intake: SpatialIntake) -> Spatia
     other = intake.problem
     shorter, longer = float(np.exp(-problem.ranges_log)), float(np.exp(problem.odometry_log))
     path = None if other.path is None else other.path._replace(pose=se3.scaled(other.path.pose, longer))
-    return replace(
+    found = replace(
         problem, stamp_s=other.stamp_s, increment=se3.scaled(other.increment, longer),
         measured=se3.scaled(other.measured, shorter), measured_root=other.measured_root / shorter,
         corner=other.corner, corner_root=other.corner_root, half_m=other.half_m * shorter, mount=other.mount, path=path,
+        range_error=np.zeros_like(problem.range_error),
     )  # fmt: skip
+    return found.with_range_error(problem.range_error) if problem.range_error.any() else found
 
 
 def _prior_from(prior: PlacePrior, given: Landmarks, landmark_id: IntArray) -> PlacePrior:

@@ -26,7 +26,8 @@ class Rig:
         seed: of everything.
         points: on a ring of 3 to 4 m.
         seconds, rate_hz: how long, and frames in a second.
-        noise_px: of each of the three pixels; `bias_px` of the disparity.
+        noise_px: of each of the three pixels; `bias_px` of the disparity; `point_px` of each point, for all of its
+            detections.
         turns: of 2.5 rad in 0.8 s each.
         gaps: of 2 s in which nothing is seen.
         detected: share of the points in view.
@@ -41,6 +42,7 @@ class Rig:
     rate_hz: float = 8.0
     noise_px: float = 0.5
     bias_px: float = 0.0
+    point_px: float = 0.0
     turns: int = 4
     gaps: int = 2
     detected: float = 0.7
@@ -85,7 +87,10 @@ class Rig:
             visible[(stamp_s > begin) & (stamp_s < begin + 2.0)] = False
         frame, name = np.nonzero(visible)
         plane = inside[frame, name, :2] / depth[frame, name, None] * FOCAL
-        u, v, right = (np.column_stack([plane, plane[:, 0]]) + random.normal(0.0, self.noise_px, (len(frame), 3))).T
+        pixels = np.column_stack([plane, plane[:, 0]]) + random.normal(0.0, self.noise_px, (len(frame), 3))
+        if self.point_px:
+            pixels += random.normal(0.0, self.point_px, (self.points, 3))[name]
+        u, v, right = pixels.T
         disparity = np.maximum(BASELINE_M * FOCAL / depth[frame, name] + u - right + self.bias_px, 2.0)
         z = BASELINE_M * FOCAL / disparity
         slope = np.zeros((len(frame), 3, 3))  # by u, v and the disparity

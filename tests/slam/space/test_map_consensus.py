@@ -67,3 +67,27 @@ def test_a_wrong_identity_that_was_seen_once_is_no_move():
     _, p_moved = solve_in(once, known)
     assert p_moved[stranger] < 0.2
     assert max(p_moved.values()) < 0.2
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_errors_that_detections_share_are_no_moves(seed):
+    """A disparity that is off for all, and pixels that are off for all detections of a point."""
+    recording = Rig(seed, points=30, bias_px=0.7, point_px=0.4, seconds=40.0).walk()
+    known, moved = edit_survey(recording.true_landmarks, seed, 6, least_m=0.8)
+    name, seen = np.unique(recording.detections.landmark_id, return_counts=True)
+    found, p_moved = solve_in(recording, known)
+    assert {one for one, p in p_moved.items() if p > 0.5} == moved & set(name[seen >= 3].tolist())
+    error = found.optimum.smoother.problem.range_error[0]
+    assert -1.6 < error < -0.5  # of a disparity whose standard deviation is 0.5 sqrt(2) px
+
+
+def test_range_errors_are_taken_off_and_put_back_exactly():
+    problem = prepare_space(Rig(3, seconds=10.0).walk(), Config().slam.space).problem
+    off = problem.with_range_error(np.array([-0.6]))
+    depth, was = off.measured[:, 2], problem.measured[:, 2]
+    sigma = 1.0 / np.linalg.norm(problem.measured_root[:, 2], axis=1) / np.linalg.norm(problem.measured[:, :3], axis=1)
+    np.testing.assert_allclose(1.0 / depth, (1.0 - 0.6 * sigma) / was, rtol=1e-12)  # by the disparity
+    np.testing.assert_allclose(off.with_range_error(np.zeros(1)).measured, problem.measured, rtol=1e-12)
+    little = problem.with_range_error(np.array([1e-6]))
+    slope = (problem.measured[:, :3] - little.measured[:, :3]) / 1e-6
+    np.testing.assert_allclose(slope, problem.range_slope, rtol=1e-3)

@@ -7,7 +7,7 @@ places and the session fixed, its position is Gaussian in both cases, so the odd
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.gain import PLACES, POINTS
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT, SpatialProblem
+from evermap.slam.space.range_errors import find_range_errors, shows_errors
 from evermap.types import FloatArray, IntArray
 
 ROUNDS = 12
@@ -26,6 +27,10 @@ FARTHEST = 0.25
 """Squared distances, as a share of the largest one, of places that are let go together."""
 SETTLED = 0.01
 """Change of all probabilities that ends it."""
+SETTLED_ERROR = 0.05
+"""Change of the errors that all ranges of a sensor have in common, in their standard deviations, that ends it."""
+FACTORS, ALIKE = (1.0, 1.4, 2.0), (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
+"""Factors on what a map states, and errors that all detections of a place have in common, over those of one."""
 LOOSE = 1.0 / 20.0**2
 """Information of a session by itself in directions of which it says nothing [1/m^2, 1/rad^2]."""
 LOG_2PI = math.log(2.0 * math.pi)
@@ -59,6 +64,7 @@ class MapComparison:
         covariance: (K, 6, 6) of that.
         factor: by which the map's stated standard deviations were multiplied.
         groups: places that moved together, by the joint search.
+        misread: (K,) log density of all detections of each being of something else.
     """
 
     p_stands: FloatArray
@@ -66,6 +72,19 @@ class MapComparison:
     covariance: FloatArray
     factor: float
     groups: tuple[MovedTogether, ...] = ()
+    misread: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+
+class Accuracy(NamedTuple):
+    """How far places that stand are from where the map has them.
+
+    Attributes:
+        factor: on the standard deviations that the map states.
+        alike: errors that all detections of a place have in common, over those of one detection.
+    """
+
+    factor: float
+    alike: float
 
 
 def compared(
@@ -78,23 +97,27 @@ def compared(
         stated: (K, 6) standard deviations of the map's places.
         groups: places that are known to have moved.
     """
-    problem = optimum.smoother.problem
+    problem, shared, begun = optimum.smoother.problem, _shared_errors(optimum), optimum.noise
 
-    def ask(sigma: FloatArray) -> MapComparison:
-        found = _asked(optimum, sigma)
+    def ask(accuracy: Accuracy) -> MapComparison:
+        found = _asked(optimum, accuracy.factor * stated, accuracy.alike**2 * shared)
         for group in groups:  # other sets of changes are worlds of their own, not this one with half a map
             found.p_stands[group.members] = 0.0
-        return found
+        return replace(found, factor=accuracy.factor)
 
-    found = ask(stated)
+    found = ask(Accuracy(1.0, 0.0))
     for _ in range(ROUNDS):
-        factor = _accuracy(found, stated, problem)
-        weight = _believed(found, factor * stated, problem.prior.weight)
+        accuracy = _accuracy(found, stated, shared, problem)
+        sigma = accuracy.factor * stated
+        weight = _believed(found, sigma, problem.prior.weight)
         back = bool(np.any((weight >= 0.5) & (problem.prior.weight < 0.5)))
         held = bool(np.any((found.p_stands < 0.5) & (weight >= 0.5)))
-        problem = replace(problem, prior=replace(problem.prior, sigma=factor * stated, weight=weight))
-        optimum = converged(problem, optimum.estimate, optimum.noise, heavy_rounds=int(back))
-        before, found = found, replace(ask(factor * stated), factor=factor)
+        problem = replace(problem, prior=replace(problem.prior, sigma=sigma, weight=weight))
+        optimum = converged(problem, optimum.estimate, begun, heavy_rounds=int(back))
+        error = find_range_errors(optimum)
+        held |= bool(np.any(np.abs(error - problem.range_error) > SETTLED_ERROR))
+        problem = problem.with_range_error(error)
+        before, found = found, ask(accuracy)
         if not held and np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED:
             break
     for group in groups:
@@ -104,7 +127,8 @@ def compared(
 
 def has_contradictions(optimum: SpatialOptimum) -> bool:
     """Tell whether any place of the map seems to be elsewhere."""
-    return bool((_asked(optimum, optimum.smoother.problem.prior.sigma).p_stands < 0.5).any())
+    prior = optimum.smoother.problem.prior
+    return bool((_asked(optimum, prior.sigma, np.zeros((len(prior.place), 6, 6))).p_stands < 0.5).any())
 
 
 def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
@@ -116,10 +140,33 @@ def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> Fl
     return np.where(waits, before, np.maximum(found.p_stands, LEAST_WEIGHT))
 
 
-def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
-    """Predict every place from the others and the session."""
+def _shared_errors(optimum: SpatialOptimum) -> FloatArray:
+    """Return the covariances (K, 6, 6) of errors that all detections of a place have in common, if these are as large
+    as those of one detection. With odometry, what lasts is part of what detections are worth.
+    """
+    problem, now = optimum.smoother.problem, optimum.now
+    found = np.zeros((len(problem.prior.place), 6, 6))
+    if not shows_errors(problem):
+        return found
+    count = np.bincount(problem.place, now.weight * problem.share, minlength=len(problem.oriented))
+    information = optimum.smoother.information_of_places(now)
+    for k, place in enumerate(problem.prior.place.tolist()):
+        own = information[place] / max(count[place], 1e-9)
+        found[k, : len(own), : len(own)] = np.linalg.inv(own + LEAST_INFORMATION * np.eye(len(own)))
+    return found
+
+
+def _asked(optimum: SpatialOptimum, sigma: FloatArray, shared: FloatArray) -> MapComparison:
+    """Predict every place from the others and the session.
+
+    Args:
+        optimum: of a problem with a prior map.
+        sigma: (K, 6) standard deviations of the map's places.
+        shared: (K, 6, 6) covariances of errors that all detections of a place have in common.
+    """
     problem, prior = optimum.smoother.problem, optimum.smoother.problem.prior
     settings = problem.settings.map
+    optimum = _with_worth(optimum)
     spread = optimum.smoother.spread(optimum.now)
     misread = _log_misread(optimum)
     count, n = len(prior.place), len(problem.stamp_s)
@@ -133,12 +180,21 @@ def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
         values, vectors = np.linalg.eigh(own - np.diag(prior.weight[k] / prior.sigma[k, :dim] ** 2))
         alone = np.linalg.inv((vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T)
         mean = alone @ (own @ mean)
-        wide = np.asarray(alone + np.diag(sigma[k, :dim] ** 2), dtype=np.float64)
+        wide = np.asarray(alone + np.diag(sigma[k, :dim] ** 2) + shared[k, :dim, :dim], dtype=np.float64)
         stands, moved = np.logaddexp(_log_density(mean, wide), misread[place]), _log_moved(mean, wide, settings)
         odds = moved - stands + np.log(settings.p_moved / (1.0 - settings.p_moved))
         p_stands[k] = 1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0)))
         off[k, :dim], covariance[k, :dim, :dim] = mean, alone
-    return MapComparison(p_stands, off, covariance, 1.0)
+    return MapComparison(p_stands, off, covariance, 1.0, misread=misread[prior.place])
+
+
+def _with_worth(optimum: SpatialOptimum) -> SpatialOptimum:
+    """Return the same values with each detection counted as what it is worth beside others of its place."""
+    smoother = optimum.smoother.counted(optimum.estimate, optimum.now)
+    if smoother is optimum.smoother:
+        return optimum
+    now = smoother.linearised(optimum.estimate, optimum.noise, heavy=False)
+    return replace(optimum, smoother=smoother, now=now)
 
 
 def log_density_in_map(problem: SpatialProblem, place: FloatArray, stated: FloatArray) -> float:
@@ -316,7 +372,26 @@ def _log_density(off: FloatArray, covariance: FloatArray) -> float:
     return float(-0.5 * np.sum(np.linalg.solve(root, off) ** 2) - np.log(np.diag(root)).sum())
 
 
-def _accuracy(found: MapComparison, stated: FloatArray, problem: SpatialProblem) -> float:
+def _accuracy(found: MapComparison, stated: FloatArray, shared: FloatArray, problem: SpatialProblem) -> Accuracy:
+    """Return what fits the unmoved places, with a weak prior at what is stated."""
+    if not shared.any():
+        return Accuracy(_factor(found, stated, problem), 0.0)
+    settings, dims = problem.settings.map, np.where(problem.oriented[problem.prior.place], 6, 3)
+    best, least = Accuracy(1.0, 0.0), -np.inf
+    for factor in FACTORS:
+        for alike in ALIKE:
+            score = -0.5 * settings.pseudo_count * (2.0 * np.log(factor) + factor**-2) - np.log1p(alike**2)
+            for k, dim in enumerate(dims.tolist()):
+                wide = found.covariance[k] + np.diag((factor * stated[k]) ** 2) + alike**2 * shared[k]
+                off, wide = found.off[k, :dim], wide[:dim, :dim]
+                stands = np.logaddexp(_log_density(off, wide), found.misread[k]) + np.log1p(-settings.p_moved)
+                score += np.logaddexp(stands, _log_moved(off, wide, settings) + np.log(settings.p_moved))
+            if score > least:
+                best, least = Accuracy(factor, alike), float(score)
+    return best
+
+
+def _factor(found: MapComparison, stated: FloatArray, problem: SpatialProblem) -> float:
     """Return the factor on the map's stated deviations that fits the unmoved places, with a weak prior at 1."""
     total = count = problem.settings.map.pseudo_count
     for k, place in enumerate(problem.prior.place):

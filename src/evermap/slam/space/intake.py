@@ -130,6 +130,7 @@ def prepare_space(
         delay_sigma_s=np.zeros(len(recording.sensors)),
         whole_s=np.zeros(len(recording.sensors)),
         delay_jitter=np.zeros(len(recording.sensors)),
+        range_error=np.zeros(len(recording.sensors)),
         scale_sigma=scale[0] if driven else 0.0,
         ranges_share=scale[1],
         path=_path(recording, stamps[pose_frame[0]], settings.delay_sigma_s),

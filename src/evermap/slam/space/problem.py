@@ -154,6 +154,8 @@ class SpatialProblem:
         ranges_share: of what ranges and odometer show together, that is the ranges'; see `in_shared_metre`.
         ranges_log: logarithm of ranges over true distances, that was taken off the measurements.
         odometry_log: logarithm of the odometry's scale that was put on its increments.
+        range_error: (S,) errors of the ranges of points, in their standard deviations, that were taken off the
+            measurements; see `range_errors`.
         prior: on places.
         start_sigma: (6,) how firmly the first pose is held where it is.
         path: the odometry, in the time of the poses, from which delays are estimated; None without.
@@ -196,6 +198,7 @@ class SpatialProblem:
     ranges_share: float = 0.0
     ranges_log: float = 0.0
     odometry_log: float = 0.0
+    range_error: FloatArray = field(default_factory=lambda: np.zeros(0))
     start_sigma: FloatArray = field(default_factory=lambda: np.full(6, 1e-4))
     path: OdometryPath | None = None
     velocity_s: float = 1.0
@@ -217,6 +220,38 @@ class SpatialProblem:
                 self.stamp_s, float(delay_s[row]), float(self.whole_s[row]), self.velocity_s
             )
         return back, by_delay
+
+    def with_range_error(self, error: FloatArray) -> SpatialProblem:
+        """Return the problem with other errors of the ranges of points (S,) taken off its measurements.
+
+        An inverse range is off by the error times its own standard deviation: that of a disparity, for a stereo pair.
+        """
+        found, (as_measured_m, sigma_m) = self.measured.copy(), self._ranges
+        wanted_m = as_measured_m**2 / (as_measured_m + error[self.sensor] * sigma_m)
+        some = self.has_range
+        factor = wanted_m / np.linalg.norm(self.measured[:, :3], axis=1)
+        found[some, :3] *= factor[some, None]
+        return replace(self, measured=found, range_error=error)
+
+    @property
+    def range_slope(self) -> FloatArray:
+        """Return (M, 3) by how much nearer detections are, for a range error that is larger by one."""
+        (range_m, sigma_m), error = self._ranges, self.range_error[self.sensor]
+        ray = self.measured[:, :3] / np.linalg.norm(self.measured[:, :3], axis=1, keepdims=True)
+        slope = sigma_m * (range_m / (range_m + error * sigma_m)) ** 2
+        return np.where(self.has_range[:, None], slope[:, None] * ray, 0.0)
+
+    @property
+    def has_range(self) -> BoolArray:
+        """Return (M,) detections of points with a measured range."""
+        return np.asarray((self.kind == POINT) & ~self.ray)
+
+    @property
+    def _ranges(self) -> tuple[FloatArray, FloatArray]:
+        """Return ranges (M,) before their errors were taken off, and their standard deviations (M,)."""
+        sigma_m = 1.0 / np.linalg.norm(self.measured_root[:, 2], axis=1)
+        now_m, error_m = np.linalg.norm(self.measured[:, :3], axis=1), self.range_error[self.sensor] * sigma_m
+        return 0.5 * (now_m + np.sqrt(np.maximum(now_m**2 + 4.0 * now_m * error_m, 0.0))), sigma_m
 
     @property
     def either(self) -> FloatArray:

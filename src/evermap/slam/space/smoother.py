@@ -204,6 +204,15 @@ class SpatialSmoother:
             found[some, k] = -values[seen.first[some] + (k + 1) * width[some] - 1] / scale[some]
         return found
 
+    def with_residuals(self, now: SpatialLinear, more: FloatArray) -> SpatialLinear:
+        """Return the linearised problem with more residuals of detections (M, r), whitened and not weighted."""
+        seen, values = self._seen, now.values.copy()
+        own = values[self.structure.values_of(SIGHTINGS)]
+        scale, width = np.sqrt(now.weight * seen.share), np.diff(seen.first) // ROWS[seen.kind]
+        for k in range(more.shape[1]):
+            own[seen.first[:-1] + (k + 1) * width - 1] -= scale * more[:, k]
+        return SpatialLinear(replace(now.now, values=values), self)
+
     @cached_property
     def sensor_of_pose(self) -> IntArray:
         """(N,) the sensor that saw something from each pose, or from the one before; the first where none did yet."""
