@@ -166,7 +166,8 @@ class ScaledHazard(Lifetime):
         below, times = math.exp(log_s[0]), np.exp(log_s)
         alive = np.exp(self.log_survival(times)) * times
         step = log_s[1] - log_s[0]
-        return below + float(step / 3.0 * (alive[0] + alive[-1] + 4.0 * alive[1:-1:2].sum() + 2.0 * alive[2:-1:2].sum()))
+        simpson = alive[0] + alive[-1] + 4.0 * alive[1:-1:2].sum() + 2.0 * alive[2:-1:2].sum()
+        return below + float(step / 3.0 * simpson)
 
     def _integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
         edges, factors = np.asarray(self.edges_s), np.asarray(self.factors)
