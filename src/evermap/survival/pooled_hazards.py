@@ -36,8 +36,8 @@ EDGES_S = np.concatenate([[0.0], np.geomspace(1.0, 1e9, 37)])
 SLOW = 4.0
 """Length of the slow process over age, in natural logarithms above an hour."""
 HOUR_S = 3600.0
-YOUNG = 2.0
-"""Factor of the distances of ages below an hour: short stops tell little of what is parked."""
+YOUNG = 4.0
+"""Factor of the distances of ages below an hour, for the slow process: short stops tell little of what is parked."""
 SLOW_SCALE, COMMON = 2.5, (0.3, 0.8)
 """Standard deviation of log hazards, and the share of their variance that classes have in common."""
 FAST = ((0.8, 0.1), (0.8, 0.5), (0.8, 1.5), (0.25, 2.0))
@@ -243,7 +243,7 @@ def _scales(edges: tuple[float, ...]) -> tuple[_Scale, ...]:
     where = np.where(age < 0.0, YOUNG * age, age)
     found = []
     for length, fast in FAST:
-        values, vectors = np.linalg.eigh(SLOW_SCALE**2 * _matern(where, SLOW) + fast**2 * _matern(where, length))
+        values, vectors = np.linalg.eigh(SLOW_SCALE**2 * _matern(where, SLOW) + fast**2 * _matern(age, length))
         kept = values > NEGLECTED * values[-1]
         columns = vectors[:, kept] * np.sqrt(values[kept])
         found += [_Scale(columns, common) for common in COMMON]

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from evermap.errors import NumericalError
 from evermap.maps.lives import general_purpose
 from evermap.survival import Exponential, LifetimePrior, LogNormal, Mixture, Weibull
 from evermap.survival.censored import CensoredLifetimes
@@ -163,7 +164,10 @@ def judge(
                     rng = np.random.default_rng([seed, number, truncated, n, run])
                     data = samples(law, n, rng, truncated)
                     for name in names:
-                        curve, prior = ESTIMATORS[name](data)
+                        try:
+                            curve, prior = ESTIMATORS[name](data)
+                        except NumericalError:
+                            continue
                         mean, lower, upper = curve(ages)
                         inside = (lower <= 1.0 - shares) & (1.0 - shares <= upper)
                         seen[name].append((inside, mean - (1.0 - shares), upper - lower, excess(law, prior)))
@@ -172,6 +176,7 @@ def judge(
                     rows.append(
                         {
                             "law": law_name, "truncated": truncated, "n": n, "estimator": name,
+                            "failed": repetitions - len(values),
                             "coverage": inside.mean(axis=0).tolist(), "bias": bias.mean(axis=0).tolist(),
                             "width": width.mean(axis=0).tolist(), "excess": float(loss.mean()),
                         }
