@@ -71,7 +71,7 @@ def test_what_lived_to_be_met_says_nothing_of_ages_before() -> None:
     """Everything is met at two days: the ages before keep their prior, wide as it is, and this is told."""
     law = Weibull(3.0 * DAY_S, 1.6)
     found = learned(followed(law, 200, 20.0 * DAY_S, seed=3, entry_s=2.0 * DAY_S))
-    below_s, _ = found.unseen_s
+    below_s, _ = found.seen_s
     assert 0.3 * DAY_S < below_s <= 2.0 * DAY_S
     _, lower, upper = found.survival(2.0 * DAY_S)
     assert upper - lower > 0.6

@@ -11,7 +11,7 @@ have in common are on a grid, each weighed by Laplace's evidence, so nothing is 
 **What is stated is worth w stays**: in every stretch it has seen `d_k = w P(T in k)` ends at the hazard that it states
 (a power prior, Ibrahim and Chen 2000), to which `v_c = 0` is most probable. The level of `b_c` is chosen such that the
 expected survival without any stay is the stated one, to rounding. Where no stay was at risk, and ages are far from all
-at which one was, the statement is what is left; `Seen` tells these ages.
+at which one was, the statement is what is left; `seen_s` tells these ages.
 """
 
 from __future__ import annotations
@@ -278,8 +278,8 @@ class HazardPosterior(SurvivalEstimate):
     risk: FloatArray
 
     @property
-    def unseen_s(self) -> tuple[float, float]:
-        """Return the age below which, and the age above which, no stay was at risk: there the prior holds."""
+    def seen_s(self) -> tuple[float, float]:
+        """Return the ages between which stays were at risk; below and above, the prior holds. (inf, 0) for none."""
         seen = np.flatnonzero(self.risk > 0.0)
         if not len(seen):
             return np.inf, 0.0
