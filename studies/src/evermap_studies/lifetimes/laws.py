@@ -17,7 +17,7 @@ from evermap.maps.lives import general_purpose
 from evermap.survival import Exponential, LifetimePrior, LogNormal, Mixture, Weibull
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.gaussian_process import gp_fit
-from evermap.survival.parametric_fit import fit_best
+from evermap.survival.parametric_fit import fit
 from evermap.survival.pooled_hazards import StayAges, learn_hazards
 from evermap.types import FloatArray
 
@@ -123,13 +123,13 @@ def process(data: CensoredLifetimes) -> tuple[Curve, LifetimePrior]:
     return found.survival, found.prior()
 
 
-def family(data: CensoredLifetimes) -> tuple[Curve, LifetimePrior]:
-    """Maximum likelihood of the family with the least AIC."""
-    found = fit_best(data)
+def weibull(data: CensoredLifetimes) -> tuple[Curve, LifetimePrior]:
+    """Maximum likelihood of a Weibull model: what a family of one hump makes of the others."""
+    found = fit("weibull", data)
     return (lambda t: (np.exp(found.prior.log_survival(t)), *found.band(t))), found.prior
 
 
-ESTIMATORS = {"pooled hazards": pooled, "Gaussian process": process, "best family": family}
+ESTIMATORS = {"pooled hazards": pooled, "Gaussian process": process, "Weibull model": weibull}
 
 
 def excess(law: Any, prior: LifetimePrior) -> float:
@@ -172,6 +172,8 @@ def judge(
                         inside = (lower <= 1.0 - shares) & (1.0 - shares <= upper)
                         seen[name].append((inside, mean - (1.0 - shares), upper - lower, excess(law, prior)))
                 for name, values in seen.items():
+                    if not values:
+                        continue
                     inside, bias, width, loss = (np.array(column) for column in zip(*values, strict=True))
                     rows.append(
                         {

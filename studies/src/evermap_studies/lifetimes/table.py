@@ -86,7 +86,7 @@ def _laws(table: Mapping[str, Any]) -> str:
         for name in names:
             mine = [r for r in rows if (r["law"], r["truncated"], r["estimator"]) == (law, truncated, name)]
             excess = [f"{row['excess']:.4f}" for row in mine]
-            line += [f"{np.mean([row['coverage'] for row in mine]):.1%}", " / ".join(excess)]
+            line += [f"{np.mean([row['coverage'] for row in mine]):.1%}", " / ".join(excess)] if mine else ["", ""]
         lines.append(line)
     counts = " / ".join(map(str, dict.fromkeys(row["n"] for row in rows)))
     columns = [
