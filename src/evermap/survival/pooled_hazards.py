@@ -40,8 +40,8 @@ YOUNG = 4.0
 """Factor of the distances of ages below an hour, for the slow process: short stops tell little of what is parked."""
 SLOW_SCALE, COMMON = 2.5, (0.3, 0.8)
 """Standard deviation of log hazards, and the share of their variance that classes have in common."""
-FAST = ((0.8, 0.1), (0.8, 0.5), (0.8, 1.5), (0.25, 2.0))
-"""Lengths and standard deviations of the fast process."""
+FAST = ((0.8, 0.1, 0.85), (0.8, 0.5, 0.1), (0.8, 1.5, 0.03), (0.25, 2.0, 0.02))
+"""Lengths and standard deviations of the fast process, and their probabilities: hazards are smooth, as a rule."""
 LEAST_STRETCHES = 14
 """Stretches between the ages of the first and the last ends that were seen."""
 DRAWS = 256
@@ -229,10 +229,12 @@ class _Scale:
     Attributes:
         columns: (K, R) that make log hazards, relative to the stated one, of R independent standard normal numbers.
         common: share of their variance that all classes have in common.
+        p: prior probability of this member.
     """
 
     columns: FloatArray
     common: float
+    p: float
 
 
 @lru_cache(maxsize=16)
@@ -242,11 +244,11 @@ def _scales(edges: tuple[float, ...]) -> tuple[_Scale, ...]:
     age = np.log(np.sqrt(np.maximum(edges_s, 0.25 * ends_s) * ends_s) / HOUR_S)
     where = np.where(age < 0.0, YOUNG * age, age)
     found = []
-    for length, fast in FAST:
+    for length, fast, p in FAST:
         values, vectors = np.linalg.eigh(SLOW_SCALE**2 * _matern(where, SLOW) + fast**2 * _matern(age, length))
         kept = values > NEGLECTED * values[-1]
         columns = vectors[:, kept] * np.sqrt(values[kept])
-        found += [_Scale(columns, common) for common in COMMON]
+        found += [_Scale(columns, common, p / len(COMMON)) for common in COMMON]
     return tuple(found)
 
 
@@ -386,7 +388,7 @@ def learn_hazards(
         values, of_free = _pooled([likelihoods[row] for row in free], scale, base)
         log_evidence.append(values)
         draws.append(of_free)
-    weight = _draw_weights(np.array(log_evidence))
+    weight = _draw_weights(_scales(edges), log_evidence)
     for at, row in enumerate([*free, len(said)]):
         rates = base * np.exp(np.concatenate([each[at] for each in draws]))
         of = np.zeros(len(edges)) if row == len(said) else risk[row]
@@ -397,8 +399,10 @@ def learn_hazards(
     return found
 
 
-def _draw_weights(log_evidence: FloatArray) -> FloatArray:
-    weight = np.exp(log_evidence - log_evidence.max())
+def _draw_weights(scales: Sequence[_Scale], log_evidence: Sequence[float] | None = None) -> FloatArray:
+    """(S,) of the draws of all members of the grid, before any data where no evidence is given."""
+    log_p = np.log([scale.p for scale in scales]) + (0.0 if log_evidence is None else np.array(log_evidence))
+    weight = np.exp(log_p - log_p.max())
     return np.asarray(np.repeat(weight / weight.sum() / DRAWS, DRAWS))
 
 
@@ -510,7 +514,7 @@ def _stated(likelihood: _Likelihood, said: Statement, edges: tuple[float, ...], 
         root: FloatArray = _root(np.linalg.inv(_precision(scale, ends)))
         of_scales.append(one @ root @ scale.columns.T)
     without = np.concatenate(of_scales)
-    even = np.full(len(without), 1.0 / len(without))
+    even = _draw_weights(scales)
     base = _calibrated(said.prior, edges_s, without, even, TRUSTED)
     expected = _expected_hazard(base * np.exp(without), even, edges_s)
     base = _not_impossible(base, likelihood, said, edges_s)
@@ -520,7 +524,7 @@ def _stated(likelihood: _Likelihood, said: Statement, edges: tuple[float, ...], 
         log_evidence.append(evidence)
         one, _ = _normals(len(mode))
         draws.append((mode + one @ _root(covariance)) @ scale.columns.T)
-    v, weight = np.concatenate(draws), _draw_weights(np.array(log_evidence))
+    v, weight = np.concatenate(draws), _draw_weights(scales, log_evidence)
     kept = weight @ np.square(v - weight @ v) / (even @ np.square(without - even @ without))
     stated = 0.0 - np.asarray(said.prior.log_conditional_survival(edges_s, ends_s))
     known = (stated > 0.0) & np.isfinite(stated) & (expected > 0.0)
@@ -590,7 +594,7 @@ def _usual_base(usual: LifetimePrior, edges: tuple[float, ...]) -> FloatArray:
         one, other = _normals(scale.columns.shape[1])
         numbers = np.sqrt(scale.common) * one + np.sqrt(1.0 - scale.common) * other
         draws.append(numbers @ scale.columns.T)
-    even = np.full(DRAWS * len(draws), 1.0 / (DRAWS * len(draws)))
+    even = _draw_weights(_scales(edges))
     return _calibrated(usual, np.asarray(edges), np.concatenate(draws), even)
 
 
