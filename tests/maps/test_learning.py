@@ -202,7 +202,7 @@ def test_learning_does_not_depend_on_how_long_ago_a_class_was_first_seen() -> No
     assert lives.of(0, np.zeros(2)).n_stays == LifetimeConfig().newest
     mean, lower, upper = ClassLives.of(stays, lives).band(0, [2.0 * DAY_S])
     assert lower < np.exp(-1.0) < upper
-    assert upper - lower < 0.25  # 0.11 if all 300 stays were known from beginning to end, whatever their law
+    assert upper - lower < 0.3  # 0.11 if all 300 stays were known from beginning to end, whatever their law
     assert np.exp(lives.of(0, np.zeros(2)).stay.log_survival(2.0 * DAY_S)) == pytest.approx(mean[0], rel=1e-2)
 
 
