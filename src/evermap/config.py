@@ -975,9 +975,6 @@ class LifetimeConfig(Section):
         "candidate numbers of pseudo-ends of a class in its chunks; learned",
         min_length=1,
     )
-    prior_quantiles: Count = key(64, "number of stay lengths that represent a given prior")
-    prior_shortest_s: Positive = key(60.0, "minimum of these lengths [s]")
-    prior_longest_s: Positive = key(1.5e9, "length at which these are censored [s]")
 
 
 class SightConfig(Section):

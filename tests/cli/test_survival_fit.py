@@ -145,6 +145,19 @@ def test_one_sample_and_nobody_gone_have_defined_answers(tmp_path: Path) -> None
     assert "no end was observed" in result.stderr
 
 
+def test_pooled_hazards_tell_where_nothing_was_at_risk(tmp_path: Path) -> None:
+    """Two classes, one of which nobody saw end; both met at an hour of age."""
+    path = tmp_path / "a.csv"
+    rows = [f"{3600 * (2 + k)},{3600 * (3 + k)},3600,cart" for k in range(20)] + ["90000,,3600,wall"] * 5
+    path.write_text("\n".join(["left,right,entry,class_id", *rows]) + "\n")
+    cart, wall = numbers(path, "--estimator", "pooled", "--by", "class")["groups"]
+    assert cart["seen_from_s"] <= 3600.0 < 20 * 3600.0 < cart["seen_to_s"]
+    assert cart["half_gone_s"] < 0.2 * (wall["half_gone_s"] or np.inf)
+    assert all(
+        low <= s <= high for low, s, high in zip(wall["lower_95"], wall["survives"], wall["upper_95"], strict=True)
+    )
+
+
 def test_help_lists_every_estimator() -> None:
     shown = run("--help").stdout.partition("Estimators:")[2].partition("Every result")[0]
     listed = {word.rstrip(",") for line in shown.splitlines() for word in line.split()}

@@ -20,6 +20,7 @@ from evermap.tracking.tracker import Tracker
 from evermap.tracking.views import View
 from evermap.types import UNKNOWN
 from evermap_studies.lifetimes import figures, truth
+from evermap_studies.lifetimes.laws import LAWS
 from evermap_studies.lifetimes.moving import track
 from evermap_studies.lifetimes.rooms import as_values, study_rooms
 from evermap_studies.lifetimes.study import Settings, reproduce
@@ -186,7 +187,9 @@ def test_settings_that_cannot_be_are_refused() -> None:
 def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lifetimes")
     write_rooms(folder, (["A"] * 30 + ["B"] * 50) * 60)
-    settings = Settings(moving=SMALL_MOVING, moving_runs=1, patrols=SMALL_PATROLS, repetitions=1)
+    settings = Settings(
+        moving=SMALL_MOVING, moving_runs=1, patrols=SMALL_PATROLS, repetitions=1, law_repetitions=1, law_counts=(30,)
+    )
     told: list[tuple[float, float]] = []
     table = reproduce(folder / "out", settings, data=folder, progress=lambda done, total: told.append((done, total)))
     return folder / "out", table, told, settings
@@ -200,9 +203,12 @@ def test_everything_is_written(results) -> None:
     written = json.loads((out / "summary.json").read_text())
     assert written["coverage"] == table["coverage"]
     assert set(written["outputs"]) == files
-    assert told[-1] == (3.0, 3.0)
+    assert told[-1] == (4.0, 4.0)
     text = (out / "table.md").read_text()
     assert f"{table['coverage']['chosen family']:.1%}" in text
+    assert {(row["law"], row["truncated"]) for row in table["laws"]} == {
+        (law, t) for law in LAWS for t in (False, True)
+    }
     (parked,) = [value for value in table["moving"] if "class" in value]
     assert f"| forklift | {parked['stays']} |" in text
 

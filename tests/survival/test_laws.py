@@ -26,8 +26,12 @@ CONTINUOUS: dict[str, LifetimePrior] = {
     "periodic": survival.PeriodicHazard(24.0, (0.0, 8.0, 18.0), (0.0, 0.01, 0.002), start_s=11.0),
     "callable": CallableHazard(lambda t: 0.01 / (1.0 + t / 50.0) + 1e-3, horizon_s=1e4),
     "intervals": survival.StepLifetime((0.0, 20.0), (10.0, 400.0), (0.3, 0.7)),
+    "scaled": survival.ScaledHazard(survival.Weibull(300.0, 0.7), (0.0, 30.0, 200.0), (0.5, 3.0, 1.2)),
 }
 SOME_STAY: dict[str, LifetimePrior] = {
+    "scaled, some stay": survival.ScaledHazard(
+        survival.Mixture((survival.never_leaves(), survival.Exponential(0.01)), (0.3, 0.7)), (0.0, 50.0), (2.0, 0.3)
+    ),
     "piecewise, some stay": survival.PiecewiseConstantHazard((0.0, 100.0), (0.01, 0.0)),
     "callable, some stay": CallableHazard(lambda t: np.exp(-t / 100.0) / 100.0, 1e5, rate_after=0.0),
     "mixture, some stay": survival.Mixture((survival.never_leaves(), survival.Exponential(0.01)), (0.3, 0.7)),

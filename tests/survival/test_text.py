@@ -19,6 +19,7 @@ from evermap.survival import (
     Mixture,
     PeriodicHazard,
     PiecewiseConstantHazard,
+    ScaledHazard,
     StepLifetime,
     Uniform,
     Weibull,
@@ -49,6 +50,10 @@ DAY_S = 86400.0
         ("gone-overnight:p=0.3,seen=1,night=22..5:15", gone_daily(0.3, first_seen_hour=1, hours=(22, 5.25))),
         ("gone-by-day:p=.2,seen=9,day=7:30..19", gone_daily(0.2, first_seen_hour=9, hours=(7.5, 19))),
         ("hazard:0s=1/d,3d=0.01/d", PiecewiseConstantHazard((0, 3 * DAY_S), (1 / DAY_S, 0.01 / DAY_S))),
+        (
+            "factors:0s=2,1d=0.5 of 0.25*exponential:mean=1e+2s + 0.75 * never-leaves",
+            ScaledHazard(Mixture((Exponential(0.01), never_leaves()), (0.25, 0.75)), (0.0, DAY_S), (2.0, 0.5)),
+        ),
         (
             "mass:0s..1h=0.3,2d=0.5,never=0.2",
             StepLifetime((0.0, 2 * DAY_S, math.inf), (3600.0, 2 * DAY_S, math.inf), (0.3, 0.5, 0.2)),

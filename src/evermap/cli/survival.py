@@ -64,6 +64,7 @@ Estimators:
   two-exponentials, some-never-leave      some stay briefly, others long; or permanently
   best                                    the family with the smallest AIC
   gp                                      a Gaussian process hazard with credible bands; groups learn from all
+  pooled                                  what maps learn by: the same without a family, and without any end
 
 \b
 Every result is a prior: --json gives its text for `evermap persist --prior`, --out a file for --model.

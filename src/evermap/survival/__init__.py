@@ -2,7 +2,14 @@
 
 from evermap.survival.base import LifetimePrior, Seed
 from evermap.survival.families import Exponential, Gamma, GeneralPurpose, LogNormal, Mixture, Uniform, Weibull
-from evermap.survival.hazards import PeriodicHazard, PiecewiseConstantHazard, StepLifetime, gone_daily, never_leaves
+from evermap.survival.hazards import (
+    PeriodicHazard,
+    PiecewiseConstantHazard,
+    ScaledHazard,
+    StepLifetime,
+    gone_daily,
+    never_leaves,
+)
 from evermap.survival.text import parse_prior
 
 __all__ = [
@@ -14,6 +21,7 @@ __all__ = [
     "Mixture",
     "PeriodicHazard",
     "PiecewiseConstantHazard",
+    "ScaledHazard",
     "Seed",
     "StepLifetime",
     "Uniform",

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError
-from evermap.survival.base import Lifetime, Seed, check_positive, check_rates, check_times
+from evermap.survival.base import Lifetime, LifetimePrior, Seed, check_positive, check_rates, check_times
 from evermap.types import FloatArray
 
 _HOUR_S, _DAY_S = 3600.0, 86400.0
@@ -125,14 +125,119 @@ class PeriodicHazard(Lifetime):
         return np.asarray(np.log(rates[np.minimum(stretch, len(rates) - 1)]))
 
 
+@dataclass(frozen=True, slots=True)
+class ScaledHazard(Lifetime):
+    """`h(t) = factors[i] h0(t)` for `edges_s[i] <= t < edges_s[i + 1]`: what was stated, times what was learned.
+
+    Attributes:
+        prior: the lifetime of hazard `h0`.
+        edges_s: starts of the stretches in seconds, the first 0, strictly increasing.
+        factors: as many, positive.
+    """
+
+    prior: LifetimePrior
+    edges_s: tuple[float, ...]
+    factors: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        _make_floats(self, "edges_s", "factors")
+        _check_edges(self.edges_s)
+        if len(self.factors) != len(self.edges_s):
+            raise ConfigError(
+                f"{len(self.edges_s)} edges need as many factors, not {len(self.factors)}", field="factors"
+            )
+        for factor in self.factors:
+            check_positive(factor, "factors")
+
+    @property
+    def p_never_leaves(self) -> float:
+        for_ever, edge_s = self.prior.p_never_leaves, self.edges_s[-1]
+        if for_ever == 0.0:
+            return 0.0
+        until = float(self._integrated_hazard(np.zeros(1), np.array([edge_s]))[0])
+        after = max(float(self.prior.log_survival(edge_s)) - math.log(for_ever), 0.0)
+        return math.exp(-until - self.factors[-1] * after)
+
+    def mean(self) -> float:
+        if self.p_never_leaves > 0.0:
+            return math.inf
+        reach_s = float(self.quantile(1.0 - 1e-13))
+        log_s = np.linspace(math.log(reach_s) - 40.0, math.log(reach_s), 40_001)
+        below, times = math.exp(log_s[0]), np.exp(log_s)
+        alive = np.exp(self.log_survival(times)) * times
+        step = log_s[1] - log_s[0]
+        simpson = alive[0] + alive[-1] + 4.0 * alive[1:-1:2].sum() + 2.0 * alive[2:-1:2].sum()
+        return below + float(step / 3.0 * simpson)
+
+    def _integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        edges, factors = np.asarray(self.edges_s), np.asarray(self.factors)
+        first, last = (np.searchsorted(edges, t, side="right") - 1 for t in (a, b))
+        one, after = first == last, edges[np.minimum(first + 1, len(edges) - 1)]
+        whole = factors[:-1] * (0.0 - np.asarray(self.prior.log_conditional_survival(edges[:-1], edges[1:])))
+        whole = np.concatenate([[0.0], np.cumsum(whole)])  # up to the start of every stretch
+        begun = factors[first] * self._of_prior(a, np.where(one, b, after))
+        with np.errstate(invalid="ignore"):
+            between = np.where(one, 0.0, whole[last] - whole[np.minimum(first + 1, len(edges) - 1)])
+        ended = factors[last] * self._of_prior(np.where(one, b, edges[last]), b)
+        total = begun + between + ended
+        return np.asarray(np.where(np.isnan(total), np.inf, total))
+
+    def _of_prior(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        return 0.0 - np.asarray(self.prior.log_conditional_survival(a, b))
+
+    def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        edges, log_factor = np.asarray(self.edges_s), np.log(self.factors)
+        first, last = (np.searchsorted(edges, t, side="right") - 1 for t in (a, b))
+        # Within one stretch the prior says it to the last digit, also where only the logarithm can be represented.
+        death, survival = self.prior.log_conditional_death(a, b), self.prior.log_conditional_survival(a, b)
+        tiny = np.asarray(log_factor[first] + np.where(death < -40.0, death, np.log(0.0 - survival)))
+        return np.where(first == last, tiny, np.log(self._integrated_hazard(a, b)))
+
+    def _log_hazard(self, t: FloatArray) -> FloatArray:
+        stretch = np.searchsorted(self.edges_s, t, side="right") - 1
+        return np.asarray(np.log(self.prior.hazard(t)) + np.log(self.factors)[stretch])
+
+
+def scaled(prior: LifetimePrior, edges_s: Sequence[float], factors: Sequence[float]) -> LifetimePrior:
+    """Return the lifetime whose hazard is that of a prior, times factors by age; steps of a hazard stay steps.
+
+    Args:
+        prior: the lifetime.
+        edges_s: (K,) starts of the stretches, the first 0.
+        factors: (K,) positive.
+    """
+    if all(factor == 1.0 for factor in factors):
+        return prior
+    if isinstance(prior, ScaledHazard):
+        edges, both = _refined(prior.edges_s, prior.factors, edges_s, factors)
+        return ScaledHazard(prior.prior, edges, both)
+    if isinstance(prior, PiecewiseConstantHazard):
+        return PiecewiseConstantHazard(*_refined(prior.edges_s, prior.rates, edges_s, factors))
+    return ScaledHazard(prior, tuple(edges_s), tuple(factors))
+
+
+def _refined(
+    edges_s: Sequence[float], values: Sequence[float], other_s: Sequence[float], factors: Sequence[float]
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the edges of two step functions, and their product."""
+    edges = np.union1d(edges_s, other_s)
+    one, other = (np.searchsorted(of, edges, side="right") - 1 for of in (edges_s, other_s))
+    return tuple(edges.tolist()), tuple((np.asarray(values)[one] * np.asarray(factors)[other]).tolist())
+
+
+def _check_edges(edges_s: tuple[float, ...]) -> None:
+    """Raise a ConfigError unless stretches start at 0 and follow each other."""
+    if len(edges_s) == 0 or edges_s[0] != 0.0:
+        raise ConfigError("edges must start at 0", field="edges_s")
+    for row, (left, right) in enumerate(itertools.pairwise(edges_s), start=1):
+        if not (math.isfinite(right) and right > left):
+            raise ConfigError(f"edges must be finite and increase strictly, row {row} is {right!r}", field="edges_s")
+
+
 def _check_steps(prior: PiecewiseConstantHazard | PeriodicHazard) -> None:
     """Make edges and rates tuples of numbers; raise a ConfigError if they do not fit."""
     _make_floats(prior, "edges_s", "rates")
-    if len(prior.edges_s) == 0 or prior.edges_s[0] != 0.0:
-        raise ConfigError("edges must start at 0", field="edges_s")
-    for row, (left, right) in enumerate(itertools.pairwise(prior.edges_s), start=1):
-        if not (math.isfinite(right) and right > left):
-            raise ConfigError(f"edges must be finite and increase strictly, row {row} is {right!r}", field="edges_s")
+    _check_edges(prior.edges_s)
     if len(prior.rates) != len(prior.edges_s):
         raise ConfigError(f"{len(prior.edges_s)} edges need as many rates, not {len(prior.rates)}", field="rates")
     check_rates(prior.rates)

@@ -2,6 +2,7 @@
 
 A form is a name and, after a colon, values: `exponential:half-life=2d`, `name:key=value,key=value`. Weighted forms are
 added to a mixture: `0.3*exponential:half-life=1h + 0.7*never-leaves`. `FORMS` lists all of them with an example each.
+What a map learns about a stated prior is written before it: `factors:0s=1.2,1d=0.8 of weibull:scale=2d,shape=0.7`.
 """
 
 from __future__ import annotations
@@ -16,10 +17,18 @@ from evermap.errors import ConfigError, suggestion
 from evermap.survival.base import LifetimePrior
 from evermap.survival.durations import parse_duration_s, parse_hour, parse_number, parse_positive, parse_rate_hz
 from evermap.survival.families import Exponential, Gamma, GeneralPurpose, LogNormal, Mixture, Uniform, Weibull
-from evermap.survival.hazards import PeriodicHazard, PiecewiseConstantHazard, StepLifetime, gone_daily, never_leaves
+from evermap.survival.hazards import (
+    PeriodicHazard,
+    PiecewiseConstantHazard,
+    ScaledHazard,
+    StepLifetime,
+    gone_daily,
+    never_leaves,
+)
 
 Values = Mapping[str, Any]
 Reader = Callable[[str], Any]
+_FACTORS, _OF = "factors:", " of "
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +68,9 @@ def parse_prior(text: str) -> LifetimePrior:
     Raises:
         ConfigError: says in one line which part is wrong, and the nearest known word.
     """
+    factors, of, rest = text.partition(_OF)
+    if of and factors.strip().startswith(_FACTORS):
+        return _scaled(factors.strip().removeprefix(_FACTORS), parse_prior(rest))
     try:
         parts = [part.strip() for part in re.split(r"(?<![0-9][eE])\+", text)]
         if not all(parts):
@@ -69,6 +81,13 @@ def parse_prior(text: str) -> LifetimePrior:
     except ConfigError as error:
         about = f"{error.field}: " if error.field else ""
         raise ConfigError(f"prior '{text}': {about}{error.problem}", hint=error.hint) from None
+
+
+def _scaled(text: str, prior: LifetimePrior) -> ScaledHazard:
+    """Read factors of a hazard by age."""
+    steps = [item.partition("=") for item in text.split(",")]
+    edges_s = tuple(_time_s(edge.strip()) for edge, _, _ in steps)
+    return ScaledHazard(prior, edges_s, tuple(parse_number(factor) for _, _, factor in steps))
 
 
 def _parse_mixture(parts: Iterable[str]) -> Mixture:
@@ -270,6 +289,10 @@ def prior_text(prior: LifetimePrior) -> str:
         case PiecewiseConstantHazard():
             steps = zip(prior.edges_s, prior.rates, strict=True)
             return "hazard:" + ",".join(f"{float(edge)!r}s={float(rate)!r}/s" for edge, rate in steps)
+        case ScaledHazard():
+            steps = zip(prior.edges_s, prior.factors, strict=True)
+            learned = ",".join(f"{float(edge)!r}s={float(factor)!r}" for edge, factor in steps)
+            return f"{_FACTORS}{learned}{_OF}{prior_text(prior.prior)}"
         case StepLifetime():
             return "mass:" + ",".join(_shares(prior))
         case Mixture():
@@ -290,8 +313,8 @@ def _shares(prior: StepLifetime) -> list[str]:
 CLASSES: Mapping[str, type[Any]] = {
     kind.__name__: kind
     for kind in (
-        Exponential, Gamma, GeneralPurpose, LogNormal, Mixture, PeriodicHazard, PiecewiseConstantHazard, StepLifetime,
-        Uniform, Weibull,
+        Exponential, Gamma, GeneralPurpose, LogNormal, Mixture, PeriodicHazard, PiecewiseConstantHazard,
+        ScaledHazard, StepLifetime, Uniform, Weibull,
     )
 }  # fmt: skip
 """Models that consist of numbers, by name: all but a hazard that is a function of the user's."""

@@ -13,6 +13,7 @@ from evermap.survival.base import LifetimePrior
 from evermap.survival.hazard_regression import HazardDraws
 from evermap.survival.nonparametric import KaplanMeier, Npmle
 from evermap.survival.parametric_fit import ParametricFit
+from evermap.survival.pooled_hazards import HazardPosterior
 from evermap.types import FloatArray
 from evermap.viz.style import CLASS_COLOURS, INK, MUTED, class_looks, drawing, legend_name
 from evermap.viz.time_axis import TimeUnit, label_ages, unit_for
@@ -29,7 +30,7 @@ _DECADES = 7.0
 """Maximum decades of a logarithmic axis of rates."""
 _BOX = "anywhere in a box"
 
-Estimate = Npmle | KaplanMeier | ParametricFit | HazardDraws | LifetimePrior
+Estimate = Npmle | KaplanMeier | ParametricFit | HazardDraws | HazardPosterior | LifetimePrior
 
 
 def plot_lifetimes(
@@ -232,7 +233,7 @@ def _curve(one: Estimate, time_s: FloatArray) -> tuple[FloatArray, tuple[FloatAr
             return one.survival(time_s), one.band(time_s)
         case ParametricFit():
             return np.exp(one.prior.log_survival(time_s)), one.band(time_s)
-        case HazardDraws():
+        case HazardDraws() | HazardPosterior():
             mean, lower, upper = one.survival(time_s)
             return mean, (lower, upper)
         case _:
@@ -248,7 +249,7 @@ def _corners(one: Npmle, time_s: FloatArray) -> FloatArray:
 
 def _prior(one: Estimate) -> LifetimePrior:
     match one:
-        case Npmle() | KaplanMeier() | HazardDraws():
+        case Npmle() | KaplanMeier() | HazardDraws() | HazardPosterior():
             return one.prior()
         case ParametricFit():
             return one.prior

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from evermap.survival.hazard_regression import HazardDraws
     from evermap.survival.nonparametric import KaplanMeier, Npmle
     from evermap.survival.parametric_fit import ParametricFit
+    from evermap.survival.pooled_hazards import HazardPosterior
+
+    Fitted = Npmle | KaplanMeier | ParametricFit | HazardDraws | HazardPosterior
 
 _LATEST_S = 1e13
 LEFT = Quantity("left", 0.0, _LATEST_S, hint="seconds; 0 where it was gone at the first look")
@@ -214,7 +217,7 @@ def _positions(table: Columns) -> FloatArray:
     return np.stack([table.numbers(replace(axis, optional=True)) for axis in (X_M, Y_M)], axis=1)
 
 
-NPMLE, KAPLAN_MEIER, BEST, GP = "npmle", "kaplan-meier", "best", "gp"
+NPMLE, KAPLAN_MEIER, BEST, GP, POOLED = "npmle", "kaplan-meier", "best", "gp", "pooled"
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +233,7 @@ class LifetimeEstimate:
     """
 
     estimator: str
-    fitted: Npmle | KaplanMeier | ParametricFit | HazardDraws
+    fitted: Fitted
     prior: LifetimePrior
     text: str
     numbers: dict[str, Any]
@@ -240,7 +243,7 @@ def estimators() -> tuple[str, ...]:
     """Return all names that `estimate` takes."""
     from evermap.survival.parametric_fit import KINDS
 
-    return (NPMLE, KAPLAN_MEIER, *KINDS, BEST, GP)
+    return (NPMLE, KAPLAN_MEIER, *KINDS, BEST, GP, POOLED)
 
 
 def check_estimator(name: str) -> None:
@@ -252,7 +255,7 @@ def check_estimator(name: str) -> None:
 def estimates(name: str, table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterator[LifetimeEstimate]:
     """Yield the estimate of each group by one of `estimators()`, one after the other, for a progress bar.
 
-    The Gaussian process learns from all groups what they have in common; the others see one group at a time.
+    The Gaussian process and pooled hazards learn from all groups what they share; the others see one group at a time.
 
     Raises:
         ConfigError: an unknown name.
@@ -263,6 +266,9 @@ def estimates(name: str, table: LifetimeTable, groups: Sequence[LifetimeGroup]) 
     if name == GP:
         yield from _gaussian_process(table, groups)
         return
+    if name == POOLED:
+        yield from _pooled(table, groups)
+        return
     for group in groups:
         try:
             yield estimate(name, table.data[group.rows])
@@ -272,7 +278,7 @@ def estimates(name: str, table: LifetimeTable, groups: Sequence[LifetimeGroup]) 
 
 
 def estimate(name: str, data: CensoredLifetimes) -> LifetimeEstimate:
-    """Fit N lifetimes by themselves, by one of `estimators()` but for the Gaussian process.
+    """Fit N lifetimes by themselves, by one of `estimators()` but for the Gaussian process and pooled hazards.
 
     Raises:
         DataError, NumericalError: as `estimates`.
@@ -354,7 +360,28 @@ def _gaussian_process(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> 
         yield _with_prior(GP, draws, draws.prior(), numbers)
 
 
-def _with_prior(
-    name: str, fitted: Npmle | KaplanMeier | ParametricFit | HazardDraws, prior: LifetimePrior, numbers: dict[str, Any]
-) -> LifetimeEstimate:
+def _pooled(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterator[LifetimeEstimate]:
+    """What a map learns from: hazards by age of which groups have a part in common."""
+    from evermap.maps.lives import general_purpose
+    from evermap.survival.pooled_hazards import StayAges, learn_hazards
+
+    group = np.zeros(len(table), dtype=np.int64)
+    for number, one in enumerate(groups):
+        group[one.rows] = number
+    found = learn_hazards(StayAges.of_samples(table.data, group), [None] * len(groups), general_purpose())
+    for posterior in found[:-1]:
+        expected, lower, upper = posterior.survival(posterior.edges_s)
+        seen_s = posterior.seen_s
+        numbers = {
+            "time": posterior.edges_s.tolist(),
+            "survives": expected.tolist(),
+            "lower_95": lower.tolist(),
+            "upper_95": upper.tolist(),
+            "seen_from_s": json_number(seen_s[0]),
+            "seen_to_s": json_number(seen_s[1]),
+        }
+        yield _with_prior(POOLED, posterior, posterior.prior(), numbers)
+
+
+def _with_prior(name: str, fitted: Fitted, prior: LifetimePrior, numbers: dict[str, Any]) -> LifetimeEstimate:
     return LifetimeEstimate(name, fitted, prior, prior_text(prior), numbers)

@@ -1,7 +1,8 @@
 """What is learned about lifetimes, beside the truth (Bateman 2020, chapter 4 and section 5.2).
 
-Three questions: does a tracker in the thesis' simulation learn for how long things park; do the bands of what is
-learned from months of irregular patrols hold the truth as often as they say; and what remains of real stays, known to
+Four questions: does a tracker in the thesis' simulation learn for how long things park; do the bands of what is
+learned from months of irregular patrols hold the truth as often as they say; how far are bands and forecasts from those
+of who knows the law, under six unlike ones, with and without truncation; and what remains of real stays, known to
 the minute, if somebody looks only now and then.
 """
 
@@ -17,7 +18,7 @@ import numpy as np
 from evermap import __version__
 from evermap.errors import ConfigError
 from evermap.types import Progress
-from evermap_studies.lifetimes import figures
+from evermap_studies.lifetimes import figures, laws
 from evermap_studies.lifetimes.moving import TrackedRun, study
 from evermap_studies.lifetimes.rooms import as_values, study_rooms
 from evermap_studies.lifetimes.table import as_markdown
@@ -43,6 +44,8 @@ class Settings:
         moving_runs: of it, whose stays are learned from together.
         patrols: months of patrols.
         repetitions: of them.
+        law_repetitions: samples of each size that are drawn from each of the six laws.
+        law_counts: these sizes.
         seed: of everything random.
     """
 
@@ -50,10 +53,12 @@ class Settings:
     moving_runs: int = 6
     patrols: PatrolWorld = field(default_factory=PatrolWorld)
     repetitions: int = 10
+    law_repetitions: int = 20
+    law_counts: tuple[int, ...] = (30, 100, 400)
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("moving_runs", "repetitions"):
+        for name in ("moving_runs", "repetitions", "law_repetitions"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"must be positive, not {getattr(self, name)}", field=name)
         if self.seed < 0:
@@ -78,7 +83,7 @@ def reproduce(
         force: write into a folder that holds other files, too; they stay.
 
     Returns:
-        `moving`, `truth` and `rooms` (a dictionary a row each), `coverage` by estimator; plain JSON values.
+        `moving`, `truth`, `laws` and `rooms` (a dictionary a row each), `coverage` by estimator; plain JSON values.
 
     Raises:
         InputError: the recording of rooms is missing or malformed.
@@ -89,7 +94,7 @@ def reproduce(
     from evermap_studies.frame import save_all
 
     settings = settings or Settings()
-    total = settings.moving_runs + settings.repetitions + 1.0
+    total = settings.moving_runs + settings.repetitions + 2.0
 
     def tell(done: float) -> None:
         if progress is not None:
@@ -102,6 +107,8 @@ def reproduce(
         truth = judge(
             settings.patrols, settings.repetitions, settings.seed, lambda done: tell(settings.moving_runs + done)
         )
+        by_law = laws.judge(settings.law_counts, settings.law_repetitions, settings.seed)
+        tell(total - 1.0)
         table: dict[str, Any] = {
             "schema_version": SCHEMA_VERSION,
             "evermap": __version__,
@@ -110,6 +117,7 @@ def reproduce(
                 "seed": settings.seed,
                 "moving_runs": settings.moving_runs,
                 "repetitions": settings.repetitions,
+                "law_repetitions": settings.law_repetitions,
                 "objects": settings.patrols.objects,
                 "duration_s": settings.patrols.duration_s,
                 "p_detect": settings.patrols.p_detect,
@@ -119,6 +127,7 @@ def reproduce(
             "coverage": {name: coverage(truth, name) for name in ESTIMATORS},
             "moving": moving,
             "truth": truth,
+            "laws": by_law,
             "rooms": as_values(rooms),
         }
         example = simulate_patrols(settings.patrols, np.random.SeedSequence(settings.seed).spawn(1)[0])

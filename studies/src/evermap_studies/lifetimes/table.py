@@ -23,6 +23,7 @@ DESCRIPTIONS = {
 def as_markdown(table: Mapping[str, Any]) -> str:
     """The whole table as Markdown; no trailing line end."""
     parts = [_verdict(table), "### Months of patrols", _made(table), _by_share(table), _by_group(table)]
+    parts += ["### Six laws", _laws(table)]
     parts += ["### The thesis' simulation", _tracking(table), _parked(table)]
     if table["rooms"]:
         parts += ["### Rooms", _rooms(table)]
@@ -73,6 +74,25 @@ def _by_group(table: Mapping[str, Any]) -> str:
         lines.append(line)
     header = ["class", "place", *(word for name in names for word in (name, "error"))]
     return markdown_table(header, lines, words=(0, 1))
+
+
+def _laws(table: Mapping[str, Any]) -> str:
+    """Coverage of bands, and the loss of forecasts beyond that of who knows the law, over all sizes of samples."""
+    rows = table["laws"]
+    names = list(dict.fromkeys(row["estimator"] for row in rows))
+    lines = []
+    for law, truncated in dict.fromkeys((row["law"], row["truncated"]) for row in rows):
+        line = [law, "yes" if truncated else "no"]
+        for name in names:
+            mine = [r for r in rows if (r["law"], r["truncated"], r["estimator"]) == (law, truncated, name)]
+            excess = [f"{row['excess']:.4f}" for row in mine]
+            line += [f"{np.mean([row['coverage'] for row in mine]):.1%}", " / ".join(excess)] if mine else ["", ""]
+        lines.append(line)
+    counts = " / ".join(map(str, dict.fromkeys(row["n"] for row in rows)))
+    columns = [
+        word for name in names for word in (f"{name}: 95 % bands", f"loss beyond the law's, {counts} stays [nats]")
+    ]
+    return markdown_table(["law", "truncated", *columns], lines, words=(0, 1))
 
 
 def _tracking(table: Mapping[str, Any]) -> str:

@@ -1,0 +1,638 @@
+"""One model of lifetimes: a stated hazard times a smooth factor by age, learned from the stays of all classes together.
+
+    log h_c(age) = log b_c(age) + v_c(age),     v_c = s + own_c
+
+`b_c` is what the user states of class c, else the general-purpose prior; `s` is what all classes share and `own_c` what
+a class has of its own, both Gaussian processes over log age: a slow one, which tells little of days from seconds, and a
+fast one. Hazards are constant over stretches of age, so the likelihood of a stay is exact: entry, arrival between two
+looks, the end between two looks, or none (MATH.md sections 6 and 9). Scales and the share of the variance that classes
+have in common are on a grid, each weighed by Laplace's evidence, so nothing is searched that could fail to be found.
+
+**What is stated is worth w stays**: in every stretch it has seen `d_k = w P(T in k)` ends at the hazard that it states
+(a power prior, Ibrahim and Chen 2000), to which `v_c = 0` is most probable. The level of `b_c` is chosen such that the
+expected survival without any stay is the stated one, to rounding. Where no stay was at risk, and ages are far from all
+at which one was, the statement is what is left; `seen_s` tells these ages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from evermap.survival.base import LifetimePrior, SurvivalEstimate, check_open_share, check_times
+from evermap.survival.censored import CensoredLifetimes
+from evermap.survival.hazard_regression import overlaps
+from evermap.survival.hazards import PiecewiseConstantHazard, scaled
+from evermap.survival.logmath import log_sum_exp
+from evermap.types import BoolArray, FloatArray, IntArray
+
+EDGES_S = np.concatenate([[0.0], np.geomspace(1.0, 1e9, 37)])
+"""Stretches of constant hazard: four to a factor of ten."""
+SLOW = 4.0
+"""Length of the slow process over age, in natural logarithms above an hour."""
+HOUR_S = 3600.0
+YOUNG = 4.0
+"""Factor of the distances of ages below an hour, for the slow process: short stops tell little of what is parked."""
+SLOW_SCALE, COMMON = 2.5, (0.3, 0.8)
+"""Standard deviation of log hazards, and the share of their variance that classes have in common."""
+FAST = ((0.8, 0.1, 0.85), (0.8, 0.5, 0.1), (0.8, 1.5, 0.03), (0.25, 2.0, 0.02))
+"""Lengths and standard deviations of the fast process, and their probabilities: hazards are smooth, as a rule."""
+LEAST_STRETCHES = 14
+"""Stretches between the ages of the first and the last ends that were seen."""
+DRAWS = 256
+"""Draws for each member of the grid; half of them mirror images of the other half."""
+LEAST_SURVIVAL, TRUSTED = 1e-9, 0.02
+"""Survival down to which the expected one is that of the usual prior, and of a stated one: what is left of a stated
+hazard later is its ratio to the expected one, the less, the more was seen at that age."""
+ALIKE = 2
+"""Digits after the first to which stays are alike that are learned from together."""
+_NEWTON, _STEP, _SETTLED = 40, 2.0, 1e-4
+NEGLECTED = 1e-6
+"""Share of the largest variance below which a direction of the process is dropped."""
+_TINY = 1e-300
+_EXACT = 1e-12
+"""Relative error of a stated hazard."""
+
+
+@dataclass(frozen=True, slots=True)
+class StayAges:
+    """N stays by their ages at looks, each with J equally probable instants of arrival.
+
+    Attributes:
+        first_s, last_s, gone_s: (N, J) ages at the first and the last sighting, and at the look that missed it; inf
+            where it goes on.
+        weight: (N,) how many each stands for.
+        group: (N,) class of each.
+        gap_s: (N, 2) two lengths of the gaps between looks from first to last, half of them have each; of one gap where
+            nothing can return unseen.
+        back: (N,) probability that one that leaves is back after one more stay elsewhere.
+        back_rate: (N,) rate in 1/s at which others return.
+    """
+
+    first_s: FloatArray
+    last_s: FloatArray
+    gone_s: FloatArray
+    weight: FloatArray
+    group: IntArray
+    gap_s: FloatArray
+    back: FloatArray
+    back_rate: FloatArray
+
+    @classmethod
+    def of_samples(cls, data: CensoredLifetimes, group: IntArray | None = None) -> Self:
+        """Take censored samples (N rows): entry, left and right bounds of one instant each; ends that were observed
+        lie in a span of a billionth of their age.
+        """
+        last = np.maximum(data.left_s, data.entry_s)
+        gone = np.where(data.exact, data.right_s * (1.0 + 1e-9), data.right_s)
+        n = len(last)
+        return cls(
+            data.entry_s[:, None], last[:, None], gone[:, None], data.weight,
+            np.zeros(n, dtype=np.int64) if group is None else group,
+            np.ones((n, 2)), np.zeros(n), np.zeros(n),
+        )  # fmt: skip
+
+    @classmethod
+    def none(cls) -> Self:
+        """Return no stays."""
+        ages, column = np.zeros((0, 1)), np.zeros(0)
+        return cls(ages, ages, ages, column, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), column, column)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Return all with a weight; rows that are alike to three digits are one."""
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__}
+        weight = columns.pop("weight")
+        some = weight > 0.0
+        if not some.any():
+            return cls.none()
+        table = np.column_stack([*columns.values()])[some]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = 10.0 ** (np.floor(np.log10(np.abs(table))) - ALIKE)
+            alike = np.where(np.isfinite(size) & (size > 0.0), np.rint(table / size) * size, table)
+        _, first, row = np.unique(alike, axis=0, return_index=True, return_inverse=True)
+        kept = {name: column[some][first] for name, column in columns.items()}
+        return cls(weight=np.bincount(row.ravel(), weight[some]).astype(np.float64), **kept)
+
+    def of_group(self, group: int) -> Self:
+        """Return those of one class."""
+        mine = self.group == group
+        return type(self)(*(getattr(self, name)[mine] for name in self.__slots__))
+
+    @property
+    def ended(self) -> BoolArray:
+        """(N,) whether it is known to be gone."""
+        return np.isfinite(self.gone_s[:, 0])
+
+
+class _Likelihood:
+    """Log likelihood of the stays of one class, as a function of the hazards (K,) of the stretches."""
+
+    def __init__(self, stays: StayAges, edges_s: FloatArray) -> None:
+        n, j = stays.first_s.shape
+        self.stays, self.ended = stays, stays.ended
+        last, gone = stays.last_s, np.where(np.isfinite(stays.gone_s), stays.gone_s, stays.last_s)
+        spans = ((np.zeros_like(last), stays.first_s), (stays.first_s, last), (last, gone))
+        self.spent = [overlaps(a.ravel(), b.ravel(), edges_s).reshape(n, j, len(edges_s)) for a, b in spans]
+        both = stays.gap_s.sum(axis=1)
+        self.watched_s = last[:, 0] - stays.first_s[:, 0]
+        self.left_s = (gone - last)[:, 0]
+        self.pairs = np.maximum(self.watched_s / both, 0.5)
+        self.share = stays.gap_s / both[:, None]
+
+    def __call__(self, hazard: FloatArray, slopes: bool = True) -> tuple[float, FloatArray, FloatArray]:
+        """Return the value, and gradient (K,) and second derivative (K, K) by log hazards."""
+        stays, ended = self.stays, self.ended
+        before, during, after = (spent * hazard for spent in self.spent)
+        until, stayed, left = (part.sum(axis=-1) for part in (before, during, after))
+        score, first, second = -until, np.zeros_like(until), np.zeros_like(until)
+        for part in (0, 1):
+            each = (self.share[:, part] / self.pairs)[:, None]
+            value, d1, d2 = _there_again(
+                stayed * each, stays.back[:, None], (stays.back_rate * self.watched_s)[:, None] * each
+            )
+            score = score + self.pairs[:, None] * value
+            first += self.pairs[:, None] * each * d1
+            second += self.pairs[:, None] * each**2 * d2
+        value, of_end, of_end_2 = _ended(left, stays.back[:, None], (stays.back_rate * self.left_s)[:, None])
+        score = score + np.where(ended[:, None], value, 0.0)
+        of_end, of_end_2 = (np.where(ended[:, None], d, 0.0) for d in (of_end, of_end_2))
+        seen, there = log_sum_exp(score), log_sum_exp(-until)
+        total = float(stays.weight @ (seen - there))
+        if not slopes:
+            return total, np.zeros(0), np.zeros(0)
+        w = stays.weight[:, None]
+        p, q = w * np.exp(score - seen[:, None]), w * np.exp(-until - there[:, None])
+        slope = -before + first[..., None] * during + of_end[..., None] * after
+        mean, mean_before = (slope * p[..., None]).sum(axis=1), (before * q[..., None]).sum(axis=1)
+        gradient = mean.sum(axis=0) + mean_before.sum(axis=0)
+        curvature = np.diag(gradient)
+        curvature += _outer(during, p * second) + _outer(after, p * of_end_2)
+        if slope.shape[1] > 1:  # one instant: both are 0
+            per = 1.0 / stays.weight
+            curvature += _outer(slope, p) - (mean * per[:, None]).T @ mean
+            curvature += (mean_before * per[:, None]).T @ mean_before - _outer(before, q)
+        return total, gradient, curvature
+
+
+def _outer(columns: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the weighted sum (K, K) of outer products of rows (N, J, K)."""
+    flat = columns.reshape(-1, columns.shape[-1])
+    return np.asarray((flat * weight.reshape(-1, 1)).T @ flat)
+
+
+def _there_again(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the log probability to be there at the next look, and its derivatives by the integrated hazard of leaving.
+
+    `log (c + l exp(-c - l)) / (c + l)` with `c = back l + come` (`maps.learning`); `-l` where nothing comes back.
+    """
+    plain = (back == 0.0) & (come == 0.0)
+    leave = np.maximum(leave, _TINY)
+    coming = back * leave + come
+    both = coming + leave
+    small = both < 1e-4
+    with np.errstate(all="ignore"):
+        gone = np.exp(-both)
+        top = coming + leave * gone
+        rise = back + gone * (1.0 - (1.0 + back) * leave)
+        bend = -gone * (1.0 + back) * (2.0 - (1.0 + back) * leave)
+        value = np.log(top / both)
+        d1 = rise / top - (1.0 + back) / both
+        d2 = bend / top - (rise / top) ** 2 + ((1.0 + back) / both) ** 2
+    value = np.where(small, -leave + 0.5 * leave * (both - leave), value)
+    d1 = np.where(small, -1.0 - leave + 0.5 * (both + leave * (1.0 + back)), d1)
+    d2 = np.where(small, back, d2)
+    return np.where(plain, -leave, value), np.where(plain, -1.0, d1), np.where(plain, 0.0, d2)
+
+
+def _ended(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the log probability to be gone at the next look, and its derivatives by the integrated hazard."""
+    leave = np.maximum(leave, _TINY)
+    change = (1.0 + back) * leave + come
+    with np.errstate(all="ignore"):
+        value = np.log(leave / change) + np.log(-np.expm1(-change))
+        odds = 1.0 / np.expm1(np.minimum(change, 700.0))
+        d1 = 1.0 / leave - (1.0 + back) / change + (1.0 + back) * odds
+        d2 = -1.0 / leave**2 + ((1.0 + back) / change) ** 2 - (1.0 + back) ** 2 * odds * (1.0 + odds)
+    return value, d1, d2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scale:
+    """One member of the grid.
+
+    Attributes:
+        columns: (K, R) that make log hazards, relative to the stated one, of R independent standard normal numbers.
+        common: share of their variance that all classes have in common.
+        p: prior probability of this member.
+    """
+
+    columns: FloatArray
+    common: float
+    p: float
+
+
+@lru_cache(maxsize=16)
+def _scales(edges: tuple[float, ...]) -> tuple[_Scale, ...]:
+    edges_s = np.asarray(edges)
+    ends_s = np.append(edges_s[1:], 2.0 * edges_s[-1])
+    age = np.log(np.sqrt(np.maximum(edges_s, 0.25 * ends_s) * ends_s) / HOUR_S)
+    where = np.where(age < 0.0, YOUNG * age, age)
+    found = []
+    for length, fast, p in FAST:
+        values, vectors = np.linalg.eigh(SLOW_SCALE**2 * _matern(where, SLOW) + fast**2 * _matern(age, length))
+        kept = values > NEGLECTED * values[-1]
+        columns = vectors[:, kept] * np.sqrt(values[kept])
+        found += [_Scale(columns, common, p / len(COMMON)) for common in COMMON]
+    return tuple(found)
+
+
+def _matern(where: FloatArray, length: float) -> FloatArray:
+    """Return the Matern kernel of smoothness 3/2."""
+    far = np.sqrt(3.0) * np.abs(where[:, None] - where) / length
+    return np.asarray((1.0 + far) * np.exp(-far))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HazardPosterior(SurvivalEstimate):
+    """Posterior of the hazard of one class, as weighted draws.
+
+    Attributes:
+        edges_s: (K,) starts of the stretches in seconds, the first 0; the last hazard holds for ever.
+        rates: (S, K) hazards in 1/s.
+        weight: (S,) of sum 1.
+        said: the lifetime that a user stated; None where nothing was stated.
+        before: (K,) log of the ratio of the stated hazard to the one expected without any stay; 0 where `said` is
+            None, and wherever not nearly all are gone.
+        risk: (K,) number of stays that were at risk in each stretch, as far as they spent time there.
+    """
+
+    edges_s: FloatArray
+    rates: FloatArray
+    weight: FloatArray
+    said: LifetimePrior | None
+    before: FloatArray
+    risk: FloatArray
+
+    @property
+    def seen_s(self) -> tuple[float, float]:
+        """Return the ages between which stays were at risk; below and above, the prior holds. (inf, 0) for none."""
+        seen = np.flatnonzero(self.risk > 0.0)
+        if not len(seen):
+            return np.inf, 0.0
+        low, high = int(seen[0]), int(seen[-1])
+        ends_s = np.append(self.edges_s[1:], np.inf)
+        return float(self.edges_s[low]), float(ends_s[high])
+
+    def survival(self, t: ArrayLike, confidence: float = 0.95) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the expected `P(T > t)`, and its pointwise lower and upper credible bounds.
+
+        Raises:
+            ConfigError: `confidence` is not in (0, 1), or an invalid time.
+        """
+        check_open_share(confidence)
+        times = check_times(t)
+        alive = np.exp(-overlaps(np.zeros(times.size), times.ravel(), self.edges_s) @ self.rates.T)
+        order = np.argsort(alive, axis=1)
+        below = np.cumsum(self.weight[order], axis=1)
+        tail = 0.5 * (1.0 - confidence)
+        rows = np.arange(len(alive))
+        lower, upper = (
+            alive[rows, order[rows, np.minimum((below < share).sum(axis=1), alive.shape[1] - 1)]]
+            for share in (tail, 1.0 - tail)
+        )
+        found = (alive @ self.weight, lower, upper)
+        mean, lower, upper = (np.asarray(values.reshape(times.shape))[()] for values in found)
+        return mean, lower, upper
+
+    def prior(self) -> LifetimePrior:
+        """Return the lifetime whose survival is the expected one at every edge; what was stated keeps its form."""
+        integrated = _expected_hazard(self.rates, self.weight, self.edges_s)
+        ends_s = np.append(self.edges_s[1:], 2.0 * self.edges_s[-1])
+        if self.said is None:
+            return PiecewiseConstantHazard(tuple(self.edges_s), tuple(integrated / (ends_s - self.edges_s)))
+        said = 0.0 - np.asarray(self.said.log_conditional_survival(self.edges_s, ends_s))
+        known = (said > 0.0) & np.isfinite(said) & (integrated > 0.0)
+        factors = np.where(known, integrated / np.where(known, said, 1.0), 1.0) * np.exp(self.before)
+        if np.abs(factors - 1.0).max() < 1e-10:
+            return self.said
+        return scaled(self.said, tuple(self.edges_s.tolist()), tuple(factors.tolist()))
+
+
+def _expected_hazard(rates: FloatArray, weight: FloatArray, edges_s: FloatArray) -> FloatArray:
+    """Return integrals (K,) over the stretches of the hazard of the expected survival."""
+    steps = np.diff(np.append(edges_s, 2.0 * edges_s[-1]))
+    cumulative = np.concatenate([np.zeros((len(rates), 1)), np.cumsum(rates * steps, axis=1)], axis=1)
+    log_expected = log_sum_exp((np.log(np.maximum(weight, _TINY))[:, None] - cumulative).T)
+    return np.asarray(np.maximum(-np.diff(log_expected), 0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Statement:
+    """What a user states of a class, worth some stays; on stretches.
+
+    Attributes:
+        prior: as stated.
+        worth: number of stays.
+    """
+
+    prior: LifetimePrior
+    worth: float
+
+
+def stretches(stays: StayAges) -> FloatArray:
+    """Return edges (K,) in seconds: `EDGES_S`, and finer ones where most ends of a class were seen within few."""
+    edges = EDGES_S
+    for group in np.unique(stays.group[stays.ended]).tolist():
+        of = stays.of_group(group)
+        middle, ended = np.full(len(of.weight), np.nan), of.ended
+        middle[ended] = 0.5 * (of.last_s + of.gone_s)[ended].mean(axis=1)
+        low, high = np.quantile(middle[ended], [0.02, 0.98])
+        finer = np.geomspace(0.9 * max(low, 1.0), 1.1 * max(high, 2.0), LEAST_STRETCHES)
+        near = np.abs(np.log(np.maximum(edges, 1e-3) / finer[:, None])).min(axis=1)
+        edges = np.sort(np.append(edges, finer[near > 0.5 * np.log(finer[1] / finer[0])]))
+    return edges
+
+
+def learn_hazards(
+    stays: StayAges,
+    said: Sequence[Statement | None],
+    usual: LifetimePrior,
+    edges_s: FloatArray | None = None,
+) -> list[HazardPosterior]:
+    """Learn the hazards of C classes, and of one that was never seen, from the stays of all of them.
+
+    Args:
+        stays: of all classes; `group` counts them.
+        said: (C,) what a user states of each; None where nothing.
+        usual: the lifetime of a class of which nothing is known.
+        edges_s: (K,) starts of stretches of constant hazard, the first 0; as `stretches` where None.
+
+    Returns:
+        (C + 1,) posteriors, the last one of a class without stays.
+    """
+    edges_s = stretches(stays) if edges_s is None else np.asarray(edges_s, dtype=np.float64)
+    edges = tuple(edges_s.tolist())
+    free = [row for row, one in enumerate(said) if one is None]
+    likelihoods = [_Likelihood(stays.of_group(row), edges_s) for row in range(len(said))]
+    risk = [_at_risk(one) for one in likelihoods]
+    found: list[HazardPosterior] = [None] * (len(said) + 1)  # type: ignore[list-item]
+    base = _usual_base(usual, edges)
+    log_evidence, draws = [], []
+    for scale in _scales(edges):
+        values, of_free = _pooled([likelihoods[row] for row in free], scale, base)
+        log_evidence.append(values)
+        draws.append(of_free)
+    weight = _draw_weights(_scales(edges), log_evidence)
+    for at, row in enumerate([*free, len(said)]):
+        rates = base * np.exp(np.concatenate([each[at] for each in draws]))
+        of = np.zeros(len(edges)) if row == len(said) else risk[row]
+        found[row] = HazardPosterior(edges_s, rates, weight, None, np.zeros(len(edges)), of)
+    for row, one in enumerate(said):
+        if one is not None:
+            found[row] = _stated(likelihoods[row], one, edges, risk[row])
+    return found
+
+
+def _draw_weights(scales: Sequence[_Scale], log_evidence: Sequence[float] | None = None) -> FloatArray:
+    """(S,) of the draws of all members of the grid, before any data where no evidence is given."""
+    log_p = np.log([scale.p for scale in scales]) + (0.0 if log_evidence is None else np.array(log_evidence))
+    weight = np.exp(log_p - log_p.max())
+    return np.asarray(np.repeat(weight / weight.sum() / DRAWS, DRAWS))
+
+
+def _at_risk(likelihood: _Likelihood) -> FloatArray:
+    """(K,) stays that were at risk in each stretch, between first sighting and the last bound."""
+    during, after = (spent[:, 0] for spent in likelihood.spent[1:])
+    return np.asarray(likelihood.stays.weight @ ((during + after) > 0.0))
+
+
+@lru_cache(maxsize=32)
+def _normals(r: int) -> tuple[FloatArray, FloatArray]:
+    """Return standard normal draws (DRAWS, R) twice, the same for all, each with its mirror image."""
+    rng = np.random.default_rng(0)
+    one, other = (rng.standard_normal((DRAWS // 2, r)) for _ in range(2))
+    return np.concatenate([one, -one]), np.concatenate([other, -other])
+
+
+def _pooled(likelihoods: list[_Likelihood], scale: _Scale, base: FloatArray) -> tuple[float, list[FloatArray]]:
+    """Return the log evidence of a scale and draws (DRAWS, K) of `v` of each class, and of a new one.
+
+    The numbers of a class are those that all share, of variance `common`, plus its own. Own ones are eliminated first.
+    """
+    columns, n, r = scale.columns, len(likelihoods), scale.columns.shape[1]
+    of_shared, of_own = 1.0 / scale.common, 1.0 / (1.0 - scale.common)
+    shared, own = np.zeros(r), np.zeros((n, r))
+
+    def bent(s: FloatArray, v: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        with np.errstate(over="ignore", invalid="ignore"):
+            value, slopes, informations = _slopes(likelihoods, v, base, columns, of_own)
+        value -= 0.5 * of_shared * float(s @ s) + 0.5 * of_own * float(np.square(v - s).sum())
+        return value if np.isfinite(value) else -np.inf, slopes, informations
+
+    best, slopes, informations = bent(shared, own)
+    for _ in range(_NEWTON):
+        slopes = slopes - of_own * (own - shared)
+        inverse = np.linalg.inv(informations + of_own * np.eye(r))
+        matrix = (of_shared + n * of_own) * np.eye(r) - of_own**2 * inverse.sum(axis=0)
+        solved = np.einsum("gij,gj->gi", inverse, slopes)
+        slope = -of_shared * shared + of_own * ((own - shared) + solved).sum(axis=0)
+        step = np.linalg.solve(matrix, slope)
+        steps = solved + of_own * inverse @ step
+        factor = min(1.0, _STEP / max(float(np.abs(steps @ columns.T).max(initial=0.0)), 1e-300))
+        while (after := bent(shared + factor * step, own + factor * steps))[0] < best and factor > 1e-4:
+            factor *= 0.5
+        gain = after[0] - best
+        if gain > 0.0:
+            shared, own = shared + factor * step, own + factor * steps
+            best, slopes, informations = after
+        if gain < _SETTLED:
+            break
+    hessian = informations + of_own * np.eye(r)
+    inverse = np.linalg.inv(hessian)
+    matrix = (of_shared + n * of_own) * np.eye(r) - of_own**2 * inverse.sum(axis=0)
+    evidence = best + 0.5 * r * (np.log(of_shared) + n * np.log(of_own)) - 0.5 * _logdet(matrix)
+    evidence -= 0.5 * sum(_logdet(one) for one in hessian)
+    one, other = _normals(r)
+    common = one @ _root(np.linalg.inv(matrix))
+    draws = [
+        (of + of_own * common @ covariance + other @ _root(covariance)) @ columns.T
+        for of, covariance in zip(own, inverse, strict=True)
+    ]
+    draws.append((shared + common + np.sqrt(1.0 / of_own) * other) @ columns.T)
+    return float(evidence), draws
+
+
+def _slopes(
+    likelihoods: list[_Likelihood], own: FloatArray, base: FloatArray, columns: FloatArray, least: float
+) -> tuple[float, FloatArray, FloatArray]:
+    """Return the log likelihood, gradients (C, R), and informations (C, R, R), positive definite with the prior's."""
+    r, total = columns.shape[1], 0.0
+    gradients, informations = np.zeros((len(own), r)), np.zeros((len(own), r, r))
+    for row, (one, of) in enumerate(zip(likelihoods, own, strict=True)):
+        value, gradient, curvature = one(base * np.exp(columns @ of))
+        total += value
+        gradients[row], informations[row] = gradient @ columns, _usable(-columns.T @ curvature @ columns, least)
+    return total, gradients, informations
+
+
+def _usable(information: FloatArray, least: float) -> FloatArray:
+    """Return the information without its negative directions, if with `least` in all it has any."""
+    try:
+        np.linalg.cholesky(information + 0.5 * least * np.eye(len(information)))
+    except np.linalg.LinAlgError:  # within a wide interval the likelihood may be convex
+        values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    return information
+
+
+def _logdet(matrix: FloatArray) -> float:
+    return float(np.linalg.slogdet(matrix)[1])
+
+
+def _root(covariance: Any) -> FloatArray:
+    """Return the symmetric R with `R R = covariance`."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
+def _stated(likelihood: _Likelihood, said: Statement, edges: tuple[float, ...], risk: FloatArray) -> HazardPosterior:
+    """Return the posterior of a class of which a user states a lifetime."""
+    edges_s = np.asarray(edges)
+    ends_s = np.append(edges_s[1:], 2.0 * edges_s[-1])
+    alive = np.exp(np.asarray(said.prior.log_survival(np.append(edges_s, ends_s[-1]))))
+    ends = said.worth * np.maximum(alive[:-1] - alive[1:], 0.0)
+    scales = [scale for scale in _scales(edges) if scale.common == COMMON[0]]  # it leans on no other class
+    of_scales = []
+    for scale in scales:
+        one, _ = _normals(scale.columns.shape[1])
+        root: FloatArray = _root(np.linalg.inv(_precision(scale, ends)))
+        of_scales.append(one @ root @ scale.columns.T)
+    without = np.concatenate(of_scales)
+    even = _draw_weights(scales)
+    base = _calibrated(said.prior, edges_s, without, even, TRUSTED)
+    expected = _expected_hazard(base * np.exp(without), even, edges_s)
+    base = _not_impossible(base, likelihood, said, edges_s)
+    log_evidence, draws = [], []
+    for scale in scales:
+        evidence, mode, covariance = _alone(likelihood, scale, ends, base)
+        log_evidence.append(evidence)
+        one, _ = _normals(len(mode))
+        draws.append((mode + one @ _root(covariance)) @ scale.columns.T)
+    v, weight = np.concatenate(draws), _draw_weights(scales, log_evidence)
+    kept = weight @ np.square(v - weight @ v) / (even @ np.square(without - even @ without))
+    stated = 0.0 - np.asarray(said.prior.log_conditional_survival(edges_s, ends_s))
+    known = (stated > 0.0) & np.isfinite(stated) & (expected > 0.0)
+    before = np.log(np.where(known, stated, 1.0) / np.where(known, expected, 1.0)) * np.minimum(kept, 1.0)
+    return HazardPosterior(edges_s, base * np.exp(v), weight, said.prior, before, risk)
+
+
+def _precision(scale: _Scale, ends: FloatArray) -> FloatArray:
+    """Return the information (R, R) of the process and of ends (K,) in the stretches."""
+    return np.asarray(np.eye(scale.columns.shape[1]) + (scale.columns.T * ends) @ scale.columns)
+
+
+def _alone(
+    likelihood: _Likelihood, scale: _Scale, ends: FloatArray, base: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
+    """Return log evidence, mode (R,) and covariance of one class with pseudo-ends at the stated hazard."""
+    columns = scale.columns
+
+    def goodness(z: FloatArray) -> float:
+        v = columns @ z
+        with np.errstate(over="ignore", invalid="ignore"):
+            value = likelihood(base * np.exp(v), slopes=False)[0]
+            value += float(ends @ (v - np.expm1(v))) - 0.5 * float(z @ z)
+        return value if np.isfinite(value) else -np.inf
+
+    def bent(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        v = columns @ z
+        _, slope, curvature = likelihood(base * np.exp(v))
+        hessian = _usable(-columns.T @ curvature @ columns, 1.0) + _precision(scale, ends * np.exp(v))
+        return columns.T @ (slope - ends * np.expm1(v)) - z, hessian
+
+    z: FloatArray = np.zeros(columns.shape[1])
+    best = goodness(z)
+    for _ in range(_NEWTON):
+        slope, hessian = bent(z)
+        step = np.linalg.solve(hessian, slope)
+        factor = min(1.0, _STEP / max(float(np.abs(columns @ step).max()), 1e-300))
+        while (after := goodness(z + factor * step)) < best and factor > 1e-6:
+            factor *= 0.5
+        gain = after - best
+        if gain > 0.0:
+            z, best = z + factor * step, after
+        if gain < _SETTLED:
+            break
+    hessian = bent(z)[1]
+    evidence = best + 0.5 * _logdet(_precision(scale, ends)) - 0.5 * _logdet(hessian)
+    return evidence, z, np.asarray(np.linalg.inv(hessian), dtype=np.float64)
+
+
+def _not_impossible(base: FloatArray, likelihood: _Likelihood, said: Statement, edges_s: FloatArray) -> FloatArray:
+    """Return hazards under which every end that was seen is possible.
+
+    A hazard of zero, worth w stays, is one of which w stays have seen no end: one in w in a factor e of age.
+    """
+    after = likelihood.spent[2][likelihood.ended]
+    if not len(after):
+        return base
+    impossible = (after * base).sum(axis=(1, 2)) <= 0.0
+    touched = (after[impossible] > 0.0).any(axis=(0, 1)) & (base <= 0.0)
+    least = 1.0 / (1.0 + said.worth) / np.maximum(edges_s, 0.5 * edges_s[1])
+    return np.where(touched, least, base)
+
+
+def _usual_base(usual: LifetimePrior, edges: tuple[float, ...]) -> FloatArray:
+    draws = []
+    for scale in _scales(edges):
+        one, other = _normals(scale.columns.shape[1])
+        numbers = np.sqrt(scale.common) * one + np.sqrt(1.0 - scale.common) * other
+        draws.append(numbers @ scale.columns.T)
+    even = _draw_weights(_scales(edges))
+    return _calibrated(usual, np.asarray(edges), np.concatenate(draws), even)
+
+
+def _calibrated(
+    prior: LifetimePrior, edges_s: FloatArray, v: FloatArray, weight: FloatArray, least: float = LEAST_SURVIVAL
+) -> FloatArray:
+    """Return hazards (K,) such that the expected survival over draws `v` (S, K) is that of a prior at all edges.
+
+    Beyond the age at which less than `least` survive, which few draws tell, they keep their ratio to the stated ones.
+    """
+    ends_s = np.append(edges_s[1:], 2.0 * edges_s[-1])
+    steps = ends_s - edges_s
+    wanted = np.asarray(prior.log_conditional_survival(edges_s, ends_s))
+    alive = np.asarray(prior.log_survival(edges_s))
+    log_weight, base = np.log(weight), np.zeros(len(edges_s))
+    ratio = 1.0
+    for k in range(len(edges_s)):
+        if wanted[k] == 0.0:
+            continue
+        plain = -wanted[k] / steps[k]
+        if not (alive[k] + wanted[k] > np.log(least) and np.isfinite(wanted[k])):
+            base[k] = ratio * (plain if np.isfinite(plain) else 50.0 / steps[k])
+            continue
+        rise = steps[k] * np.exp(v[:, k])
+        p = np.exp(log_weight - log_sum_exp(log_weight))
+        level = np.log(plain)
+        low, high = level - 30.0, level + 30.0
+        for _ in range(100):  # log expected survival falls with the level
+            gone = np.exp(level) * rise
+            left = float(p @ np.exp(-gone))
+            error = np.log(max(left, _TINY)) - wanted[k]
+            slope = float(p @ (gone * np.exp(-gone))) / max(left, _TINY)
+            if abs(error) < _EXACT * slope:
+                break
+            low, high = (level, high) if error > 0.0 else (low, level)
+            step = error / max(slope, _TINY)
+            level = level + step if low < level + step < high else 0.5 * (low + high)
+        base[k] = np.exp(level)
+        ratio = base[k] / plain
+        log_weight = log_weight - base[k] * rise
+    return base
