@@ -22,9 +22,10 @@ from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.solve import fit_to_map
 from evermap.types import FloatArray, IntArray, Landmarks, is_in_space
 
-STEP = 1e-4
-"""Step of a state, as a share of its standard deviation beforehand: residuals grow by far less than their noise, since
-those of outliers vanish with their weights; rounding is smaller still."""
+STEP, FINE_STEP = 0.02, 1e-4
+"""Steps of a state, as shares of its standard deviation beforehand: one as long as noise, which says how far it is to a
+better state, where what is rejected yet hides the way; and one at which residuals grow by far less than their noise, so
+that those of outliers don't vanish with their weights: the slope at the solution itself. Rounding is smaller still."""
 
 FEW_STEPS = 6
 """Gauss-Newton steps of a first look at a discrete cause."""
@@ -48,7 +49,9 @@ def held_by_map(session: AnySession) -> AnySession:
     return SpatialSession(session.intake, replace(session.solved, optimum=held))
 
 
-def change_by(session: AnySession, screen: Screen, inputs: Inputs, suspect: Suspect) -> FloatArray | None:
+def change_by(
+    session: AnySession, screen: Screen, inputs: Inputs, suspect: Suspect, share: float = STEP
+) -> FloatArray | None:
     """Return (R,) by which residuals at the optimum change with the state of a cause; None if it changes what is used.
 
     Args:
@@ -56,8 +59,9 @@ def change_by(session: AnySession, screen: Screen, inputs: Inputs, suspect: Susp
         screen: of its optimum.
         inputs: of which it is the solution.
         suspect: a continuous cause.
+        share: length of the step, as a share of its standard deviation beforehand.
     """
-    step = STEP * suspect.sigma
+    step = share * suspect.sigma
     try:
         undone = suspect.undo(inputs, step)
         if isinstance(session, Solved):

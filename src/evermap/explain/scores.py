@@ -24,7 +24,7 @@ import numpy as np
 from evermap.errors import EvermapError
 from evermap.explain.causes import DELAY_S, FOCAL, LITTLE, MOUNT_M, MOUNT_RAD, USUAL_P, Inputs, Suspect, list_suspects
 from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Column, Optimum, Screen, optimum_of, residuals_of
-from evermap.explain.linearise import change_by
+from evermap.explain.linearise import FINE_STEP, change_by
 from evermap.geometry import se3
 from evermap.slam.estimate import Solved
 from evermap.types import FloatArray, IntArray, SpatialRecording, SpatialSensor, Trajectory, is_in_space
@@ -119,7 +119,7 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
     at = optimum.graph.structure.system.tree.begin[: len(optimum.state.pose), None] + np.arange(dim)
     usual = list[tuple[Column, float, FloatArray]]()
     for suspect in sorted(_list_calibrations(inputs), key=lambda one: one.code not in USUAL):
-        direction = change_by(session, screen, inputs, suspect)
+        direction = change_by(session, screen, inputs, suspect, FINE_STEP)
         if direction is None:
             continue
         column = screen.column(direction)
