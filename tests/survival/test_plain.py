@@ -9,12 +9,22 @@ from typing import Any
 import pytest
 
 from evermap.errors import ConfigError
-from evermap.survival import LifetimePrior, Mixture, StepLifetime, Uniform, never_leaves, parse_prior
+from evermap.survival import (
+    LifetimePrior,
+    Mixture,
+    ScaledHazard,
+    StepLifetime,
+    Uniform,
+    Weibull,
+    never_leaves,
+    parse_prior,
+)
 from evermap.survival.text import CLASSES, FORMS, prior_from_dict, prior_to_dict
 from evermap_studies.rosen2016.callable_hazard import CallableHazard
 
 PRIORS: list[LifetimePrior] = [
     *(parse_prior(form.example) for form in FORMS.values()),
+    ScaledHazard(Weibull(300.0, 0.7), (0.0, 30.0), (0.5, 3.0)),
     parse_prior("0.3*weibull:scale=0.1s,shape=1e-3+0.7*never-leaves"),
     Mixture((Mixture((Uniform(1 / 3), Uniform(0.1)), (0.5, 0.5)), never_leaves()), (1 / 3, 2 / 3)),
     StepLifetime((0.0, 2.0, 5.0), (1.0, 2.0, math.inf), (0.25, 0.25, 0.5)),

@@ -31,14 +31,16 @@ from evermap.types import FloatArray, IntArray, SpatialRecording, SpatialSensor,
 
 Intrinsics: TypeAlias = tuple[float, float, float, float]
 """Focal lengths and centre of an image [px]."""
-SIGNIFICANT = 10.0
-"""Gain of a score test [nats]: four and a half standard deviations."""
+SIGNIFICANT = 30.0
+"""Gain of a score test [nats]. At the poses that fit best, not averaged over them, a score is not zero in the mean
+where they are uncertain beside the steps between them: 12 nats for a mount in sound drives with a coarse odometry."""
 USUAL = frozenset({"odometry-scale", "turn-scale"})
 """Calibrations that are off on every robot: they may be so beside any other."""
 USUAL_SIGMA = 0.02
 """Standard deviation of the logarithm of these."""
-OF_RANGES = frozenset({"range-scale", "tag-size"})
-"""What the estimator in the plane has as states, at a mean of several priors, which is no optimum."""
+OF_LENGTHS = frozenset({"range-scale", "tag-size", "map-scale"})
+"""What changes all lengths, and so the volume in which each pose lies: at the poses that fit best shorter ones gain, 70
+nats where nothing is wrong. In the plane they are states, at a mean of several priors, which is no optimum."""
 INFORMED = 4.0
 """Times the information of its prior that a session must have on a calibration."""
 KNOWN = 0.5
@@ -169,9 +171,9 @@ def _count_adrift(optimum: Optimum, pose_row: IntArray) -> int:
 def _list_calibrations(inputs: Inputs) -> Iterable[Suspect]:
     """Yield all that may be off of a sensor as a whole, of the odometry and of the map."""
     recording = inputs.recording
-    own = () if is_in_space(recording) else OF_RANGES
     for suspect in list_suspects(inputs):
-        if suspect.is_continuous and suspect.code not in own and (suspect.rows is None or suspect.rows[0] != "id"):
+        of_all = suspect.rows is None or suspect.rows[0] != "id"
+        if suspect.is_continuous and of_all and suspect.code not in OF_LENGTHS:
             yield suspect
     if not is_in_space(recording):
         return

@@ -218,13 +218,13 @@ def test_the_command_tells_the_same(tmp_path: Path) -> None:
 
 def test_turned_by_the_mount() -> None:
     """The rotations of `mount-axes` are those between the two conventions."""
-    from evermap.slam.mistakes import SpatialPairs
+    from evermap.slam.mistakes import AXES
 
-    ahead = Rotation.from_quat(SpatialPairs.angles[0].turned)
+    ahead = Rotation.from_quat(AXES[0].turned)
     np.testing.assert_allclose(
         ahead.apply([[1, 0, 0], [0, 1, 0], [0, 0, 1]]), [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-12
     )
-    np.testing.assert_allclose((ahead * Rotation.from_quat(SpatialPairs.angles[1].turned)).magnitude(), 0.0, atol=1e-12)
+    np.testing.assert_allclose((ahead * Rotation.from_quat(AXES[1].turned)).magnitude(), 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
