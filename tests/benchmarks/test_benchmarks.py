@@ -146,6 +146,7 @@ def test_the_peer_of_the_tracker_filters_as_ours_does(run: ModuleType) -> None:
         np.testing.assert_allclose(reports.position_m, mean[:, :3], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_trackers_of_the_race_are_judged_as_our_own_scores_are(run: ModuleType) -> None:
     race = run.tracking
     scene = race.Scene(27, 3.0, 1)

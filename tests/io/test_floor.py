@@ -125,7 +125,10 @@ def test_only_a_robot_on_a_floor_is_in_the_plane(tmp_path: Path) -> None:
         in_its_space(replace(recording, odometry=None), Config(slam={"plane": True}).slam)
 
 
-@pytest.mark.parametrize(("how", "unit"), [({"unit": 1e3}, "millimetres"), ({"odometry_unit": 1e3}, "millimetres")])
+@pytest.mark.parametrize(
+    ("how", "unit"),
+    [({"unit": 1e3}, "millimetres"), pytest.param({"odometry_unit": 1e3}, "millimetres", marks=pytest.mark.slow)],
+)
 def test_units_of_a_bag_are_checked(how: dict[str, float], unit: str, tmp_path: Path) -> None:
     recording = bag(tmp_path, 0, **how)
     check = check_recording(recording)

@@ -103,7 +103,9 @@ def test_a_right_map_is_called_right_and_stays_as_it_is(seed: int, tmp_path: Pat
     assert correct_map(file, found.corrections()) == file.path.read_bytes()
 
 
-@pytest.mark.parametrize("name", ["wpilib", "tagslam", "fiducials", "csv"])
+@pytest.mark.parametrize(
+    "name", ["wpilib", *(pytest.param(one, marks=pytest.mark.slow) for one in ("tagslam", "fiducials", "csv"))]
+)
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_every_mistake_is_found_and_put_right_and_nothing_else(name: str, seed: int, tmp_path: Path) -> None:
     """One moved by .3 m, one turned by 90 degrees, two exchanged, one taken away, one never looked at, one missing."""

@@ -42,7 +42,7 @@ def off_m(found: SpatialSolved, recording: SpatialRecording) -> float:
     return float(np.median(np.linalg.norm(found.optimum.estimate.pose[:, :3] - true[:, :3], axis=1)))
 
 
-@pytest.mark.parametrize(("seed", "count"), [(0, 12), (4, 12)])
+@pytest.mark.parametrize(("seed", "count"), [pytest.param(0, 12, marks=pytest.mark.slow), (4, 12)])
 def test_who_moved_is_found_without_odometry_where_many_did(seed, count):
     recording = Rig(seed, bias_px=0.3, gaps=4, turns=6).walk()
     known, moved = edit_survey(recording.true_landmarks, seed, count)
@@ -69,7 +69,7 @@ def test_a_wrong_identity_that_was_seen_once_is_no_move():
     assert max(p_moved.values()) < 0.2
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_errors_that_detections_share_are_no_moves(seed):
     """A disparity that is off for all, and pixels that are off for all detections of a point."""
     recording = Rig(seed, points=30, bias_px=0.7, point_px=0.4, seconds=40.0).walk()

@@ -217,7 +217,9 @@ def test_a_wrong_map_is_told_where_it_is_wrong(odometry):
         assert told[tag].probability > 0.95
 
 
-@pytest.mark.parametrize("seed", [11, 12, 14])
+@pytest.mark.parametrize(
+    "seed", [pytest.param(11, marks=pytest.mark.slow), 12, pytest.param(14, marks=pytest.mark.slow)]
+)
 def test_what_was_moved_by_metres_draws_no_others_along(seed):
     """Nor is it another landmark of its identity. The others are moved by less, or not."""
     world = tagged_corridor(seed, drift=0.04, p_wrong=0.03, odometry=seed != 11)
@@ -231,7 +233,7 @@ def test_what_was_moved_by_metres_draws_no_others_along(seed):
     assert not any("#2" in warning for warning in result.warnings)
 
 
-@pytest.mark.parametrize("seed", [21, 22])
+@pytest.mark.parametrize("seed", [21, pytest.param(22, marks=pytest.mark.slow)])
 def test_two_tags_that_were_carried_away_together_do_not_carry_the_robot_away(seed):
     """For some frames the robot sees nothing else, so that the two agree that it is where they had been."""
     world = tagged_corridor(seed)
@@ -364,7 +366,7 @@ def test_a_late_camera_is_found_by_default_and_a_right_one_is_left_alone():
     assert not any(each.name.endswith("delay_s") for each in of_frames.parameters)
 
 
-@pytest.mark.parametrize("late_s", [0.15, -0.3])
+@pytest.mark.parametrize("late_s", [0.15, pytest.param(-0.3, marks=pytest.mark.slow)])
 def test_stamps_that_are_late_are_found(late_s):
     """From the changes of speed of a drive around a hall, with points; and the path is that of the right stamps."""
     recording = hall(1, n_points=40, n_frames=300, drift=0.003)

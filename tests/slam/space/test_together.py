@@ -46,7 +46,7 @@ def landmark_error(recording: SpatialRecording, result) -> float:
     return float(compare_with_truth(recording, result, rate_hz=10.0).landmarks.rmse_m)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_two_robots_know_the_hall_better_than_each_alone(seed):
     recordings = pair(seed)
     alone = [landmark_error(one, run_slam(one)) for one in recordings.values()]
