@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from space.corridors import tagged_corridor
 
 from evermap import run_slam
 from evermap.config import Config
@@ -77,16 +76,6 @@ def test_nothing_is_suspected_of_a_sound_drive(kind: str, mapped: bool) -> None:
     found = scored(recording, survey if mapped else None)
     assert found.calibrations
     assert max(one.gain for one in found.calibrations) < SIGNIFICANT
-    assert (found.suspected, found.adrift, found.alternation > 2.5) == (None, 0, False)
-
-
-@pytest.mark.parametrize("mapped", [False, True])
-@pytest.mark.parametrize("seed", [1, 4])
-def test_poses_that_are_uncertain_beside_their_steps_suspect_nothing(seed: int, mapped: bool) -> None:
-    """Shorter lengths would fit such poses better (tags 20 % smaller: 70 nats), and so would mounts (12 nats)."""
-    world = tagged_corridor(seed, n_tags=16, n_frames=300, drift=0.02)
-    found = scored(world.recording, world.tags.as_prior(0.01) if mapped else None)
-    assert found.calibrations
     assert (found.suspected, found.adrift, found.alternation > 2.5) == (None, 0, False)
 
 
