@@ -97,10 +97,10 @@ def compared(
         stated: (K, 6) standard deviations of the map's places.
         groups: places that are known to have moved.
     """
-    problem, shared, begun = optimum.smoother.problem, _shared_errors(optimum), optimum.noise
+    problem, shared, begun = optimum.smoother.problem, _measure_shared_errors(optimum), optimum.noise
 
     def ask(accuracy: Accuracy) -> MapComparison:
-        found = _asked(optimum, accuracy.factor * stated, accuracy.alike**2 * shared)
+        found = _predict_places(optimum, accuracy.factor * stated, accuracy.alike**2 * shared)
         for group in groups:  # other sets of changes are worlds of their own, not this one with half a map
             found.p_stands[group.members] = 0.0
         return replace(found, factor=accuracy.factor)
@@ -128,7 +128,7 @@ def compared(
 def has_contradictions(optimum: SpatialOptimum) -> bool:
     """Tell whether any place of the map seems to be elsewhere."""
     prior = optimum.smoother.problem.prior
-    return bool((_asked(optimum, prior.sigma, np.zeros((len(prior.place), 6, 6))).p_stands < 0.5).any())
+    return bool((_predict_places(optimum, prior.sigma, np.zeros((len(prior.place), 6, 6))).p_stands < 0.5).any())
 
 
 def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
@@ -140,7 +140,7 @@ def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> Fl
     return np.where(waits, before, np.maximum(found.p_stands, LEAST_WEIGHT))
 
 
-def _shared_errors(optimum: SpatialOptimum) -> FloatArray:
+def _measure_shared_errors(optimum: SpatialOptimum) -> FloatArray:
     """Return the covariances (K, 6, 6) of errors that all detections of a place have in common, if these are as large
     as those of one detection. With odometry, what lasts is part of what detections are worth.
     """
@@ -156,7 +156,7 @@ def _shared_errors(optimum: SpatialOptimum) -> FloatArray:
     return found
 
 
-def _asked(optimum: SpatialOptimum, sigma: FloatArray, shared: FloatArray) -> MapComparison:
+def _predict_places(optimum: SpatialOptimum, sigma: FloatArray, shared: FloatArray) -> MapComparison:
     """Predict every place from the others and the session.
 
     Args:
@@ -216,12 +216,13 @@ def log_density_in_map(problem: SpatialProblem, place: FloatArray, stated: Float
     return total
 
 
-def _log_moved(off: FloatArray, covariance: FloatArray, settings: MapInSpaceConfig) -> float:
-    """Return the log density of a place that moved by any of the usual distances and turns."""
+def _log_moved(off: FloatArray, covariance: FloatArray, settings: MapInSpaceConfig) -> FloatArray:
+    """Return (...,) log densities of a place that moved by any of the usual distances and turns; as `_log_density`."""
     dim = len(off)
     scales = [(m, rad) for m in settings.moved_m for rad in settings.moved_rad[: None if dim == 6 else 1]]
-    wide = [np.diag(np.array([m] * 3 + [rad] * (dim - 3)) ** 2) for m, rad in scales]
-    return float(np.logaddexp.reduce([_log_density(off, covariance + by) for by in wide]) - np.log(len(scales)))
+    wide = np.array([np.diag(np.array([m] * 3 + [rad] * (dim - 3)) ** 2) for m, rad in scales])
+    density = _log_density(off, covariance[..., None, :, :] + wide)
+    return np.asarray(np.logaddexp.reduce(density, axis=-1) - np.log(len(scales)))
 
 
 def _log_misread(optimum: SpatialOptimum) -> FloatArray:
@@ -367,9 +368,11 @@ def evidence_against(optimum: SpatialOptimum, stated: FloatArray) -> AgainstMap:
     return AgainstMap(row, evidence, GivenMap(mean, covariance, np.ones(len(row), dtype=np.bool_)))
 
 
-def _log_density(off: FloatArray, covariance: FloatArray) -> float:
+def _log_density(off: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return (...,) log densities, but for a constant, of an offset (D,) under covariances (..., D, D)."""
     root = np.linalg.cholesky(covariance)
-    return float(-0.5 * np.sum(np.linalg.solve(root, off) ** 2) - np.log(np.diag(root)).sum())
+    apart = np.linalg.solve(root, np.broadcast_to(off[:, None], (*root.shape[:-1], 1)))[..., 0]
+    return np.asarray(-0.5 * np.sum(apart**2, axis=-1) - np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1))
 
 
 def _accuracy(found: MapComparison, stated: FloatArray, shared: FloatArray, problem: SpatialProblem) -> Accuracy:
@@ -377,18 +380,15 @@ def _accuracy(found: MapComparison, stated: FloatArray, shared: FloatArray, prob
     if not shared.any():
         return Accuracy(_factor(found, stated, problem), 0.0)
     settings, dims = problem.settings.map, np.where(problem.oriented[problem.prior.place], 6, 3)
-    best, least = Accuracy(1.0, 0.0), -np.inf
-    for factor in FACTORS:
-        for alike in ALIKE:
-            score = -0.5 * settings.pseudo_count * (2.0 * np.log(factor) + factor**-2) - np.log1p(alike**2)
-            for k, dim in enumerate(dims.tolist()):
-                wide = found.covariance[k] + np.diag((factor * stated[k]) ** 2) + alike**2 * shared[k]
-                off, wide = found.off[k, :dim], wide[:dim, :dim]
-                stands = np.logaddexp(_log_density(off, wide), found.misread[k]) + np.log1p(-settings.p_moved)
-                score += np.logaddexp(stands, _log_moved(off, wide, settings) + np.log(settings.p_moved))
-            if score > least:
-                best, least = Accuracy(factor, alike), float(score)
-    return best
+    factor, alike = (each.ravel() for each in np.meshgrid(FACTORS, ALIKE, indexing="ij"))
+    score = -0.5 * settings.pseudo_count * (2.0 * np.log(factor) + factor**-2) - np.log1p(alike**2)
+    for k, dim in enumerate(dims.tolist()):
+        off, own, said = found.off[k, :dim], found.covariance[k, :dim, :dim], np.diag(stated[k, :dim] ** 2)
+        wide = own + factor[:, None, None] ** 2 * said + alike[:, None, None] ** 2 * shared[k, :dim, :dim]
+        stands = np.logaddexp(_log_density(off, wide), found.misread[k]) + np.log1p(-settings.p_moved)
+        score += np.logaddexp(stands, _log_moved(off, wide, settings) + np.log(settings.p_moved))
+    best = int(np.argmax(score))
+    return Accuracy(float(factor[best]), float(alike[best]))
 
 
 def _factor(found: MapComparison, stated: FloatArray, problem: SpatialProblem) -> float:

@@ -33,10 +33,12 @@ def find_range_errors(optimum: SpatialOptimum) -> FloatArray:
     information, pull = np.zeros(len(error)), np.zeros(len(error))
     counts = now.weight * problem.share
     counts *= smoother.lasting(now).information(problem.stamp_s[problem.pose_row], problem.place)
-    shape, residual = _by_error(optimum), _solved(smoother, now)
+    shape, residual = _by_error(optimum), _find_residuals(smoother, now)
     for sensor in np.unique(problem.sensor[problem.has_range]).tolist():
         own = np.where((problem.sensor == sensor)[:, None], shape, 0.0)
-        left = _solved(smoother, smoother.with_residuals(now, own)) - residual  # what nothing else can make up for
+        left = (
+            _find_residuals(smoother, smoother.with_residuals(now, own)) - residual
+        )  # what nothing else can make up for
         information[sensor] = max(float(counts @ (own * left).sum(axis=1)), 0.0)
         pull[sensor] = -float(counts @ (own * residual).sum(axis=1))
     variance = 1.0 / (information + USUAL**-2)
@@ -59,6 +61,6 @@ def _by_error(optimum: SpatialOptimum) -> FloatArray:
     return np.asarray(-by / noise.levels[[ACROSS, ACROSS, ALONG]])
 
 
-def _solved(smoother: SpatialSmoother, now: SpatialLinear) -> FloatArray:
+def _find_residuals(smoother: SpatialSmoother, now: SpatialLinear) -> FloatArray:
     """Return (M, 3) whitened residuals at the optimum of the linearised problem."""
     return np.asarray(smoother.after(now, exhausted(smoother.factorised(now).solution())).residual[:, :3])
