@@ -211,14 +211,14 @@ class SpellLog:
 
     def columns(self) -> dict[str, Any]:
         """Return what `restore` takes."""
-        ended = self._ended()
+        ended = self._join_ended()
         return {item.name: getattr(ended, item.name) for item in fields(StaticSpells)}
 
     def restore(self, columns: Mapping[str, Any]) -> None:
         """Take over the spells that `columns` gave."""
         self._parts = [StaticSpells(**{item.name: columns[item.name] for item in fields(StaticSpells)})]
 
-    def _ended(self) -> StaticSpells:
+    def _join_ended(self) -> StaticSpells:
         whole, real = np.zeros(0, dtype=np.int64), np.zeros(0)
         return StaticSpells(whole, whole, np.zeros((0, 3)), real, real, real, real).joined(*self._parts)
 

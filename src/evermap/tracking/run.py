@@ -21,6 +21,7 @@ from evermap.survival.text import parse_prior
 from evermap.tracking.field_of_view import find_field_of_view
 from evermap.tracking.frame import DetectionTable, p_real_of
 from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
+from evermap.tracking.state_file import State, read_state
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import TrackState
 from evermap.tracking.views import View
@@ -181,7 +182,7 @@ def run_track(
         spell_of_lifetime=spell_of_lifetime,
         n_gaps=n_gaps,
         seconds=perf_counter() - start,
-        warnings=(*_remarks(table, config, spells), *seen, *_returned(spells, config.place_sigma_m)),
+        warnings=(*_remarks(table, config, spells), *seen, *_describe_returns(spells, config.place_sigma_m)),
     )
 
 
@@ -205,30 +206,35 @@ def make_tracker(
         InputError: no such file; a table before its end, or of detections of another kind.
     """
     config = config or TrackConfig()
-    names = table.class_names
-    about = _kind_of(table)
-    if state is not None:
-        saved = Tracker.load(state)
-        if saved.kind != about:
-            raise InputError(f"detections {_in_words(about)}, and those of the state are {_in_words(saved.kind)}",
-                             path=Path(table.source), hint="another --state")  # fmt: skip
-        if table.n_frames and table.stamp_s[0] <= saved.stamp_s:
-            problem = f"begins at {table.stamp_s[0]:.3f} s, and the state ends at {saved.stamp_s:.3f} s"
-            raise InputError(problem, path=Path(table.source), hint="tables in the order of their stamps, one clock")
+    names, kind = table.class_names, _kind_of(table)
+    saved = None if state is None else read_state(state)
+    if saved is not None:
+        _check_goes_on(table, saved)
         names = (*saved.class_names, *(name for name in names if name not in saved.class_names))
     settings = config.model_copy(update={"class_speed_mps": _speeds(config, names)})
     priors = _priors(config, names)
-    if state is not None:
-        return Tracker.load(state, settings, class_names=names, confusion=confusion, priors=priors)
-    n_appearance, boxes, scored = about
+    if saved is not None:
+        return Tracker.of_state(saved, settings, class_names=names, confusion=confusion, priors=priors)
+    n_appearance, boxes, scored = kind
     return Tracker(
         settings, n_classes=len(names), confusion=confusion, n_appearance=n_appearance, boxes=boxes, scored=scored,
         priors=priors, class_names=names,
     )  # fmt: skip
 
 
+def _check_goes_on(table: DetectionTable, saved: State) -> None:
+    """Raise an InputError unless a tracker may go on with a table: of the same kind, after its last frame."""
+    path, kind = Path(table.source), _kind_of(table)
+    if saved.kind != kind:
+        problem = f"detections {_in_words(kind)}, and those of the state are {_in_words(saved.kind)}"
+        raise InputError(problem, path=path, hint="another --state")
+    if table.n_frames and table.stamp_s[0] <= saved.stamp_s:
+        problem = f"begins at {table.stamp_s[0]:.3f} s, and the state ends at {saved.stamp_s:.3f} s"
+        raise InputError(problem, path=path, hint="tables in the order of their stamps, one clock")
+
+
 def _kind_of(table: DetectionTable) -> tuple[int, bool, bool]:
-    """As `Tracker.kind`, of a table."""
+    """As `State.kind`, of a table."""
     return 0 if table.appearance is None else table.appearance.shape[1], table.box is not None, table.score is not None
 
 
@@ -280,18 +286,17 @@ def _follow(
         noise = np.where(np.isnan(noise), config.sigma_position_m**2 * np.eye(3), noise)
     step_s = _usual_step_s(table)
     gap_s = config.gap_s or config.gap_steps * step_s
-    recorder, found, n_gaps = Recorder(), np.full(len(table), UNKNOWN), 0
-    if np.isfinite(tracker.stamp_s) and table.stamp_s[0] - tracker.stamp_s > gap_s:
-        n_gaps += 1
-        events = _close_eyes(tracker, np.zeros(3), tracker.stamp_s, float(table.stamp_s[0]), min(step_s, gap_s))
-        recorder.events.extend(events)
+    recorder, found, n_gaps, centre_m = Recorder(), np.full(len(table), UNKNOWN), 0, np.zeros(3)
     sees = None if config.range_m is None else find_field_of_view(table, config)
     p_real = None if table.score is None else p_real_of(table.score, config.score_midpoint, config.score_scale)
     for k, stamp_s in enumerate(table.stamp_s.tolist()):
+        if np.isfinite(tracker.stamp_s) and stamp_s - tracker.stamp_s > gap_s:
+            n_gaps += 1
+            recorder.events.extend(_close_eyes(tracker, centre_m, tracker.stamp_s, stamp_s, min(step_s, gap_s)))
         rows = slice(int(table.first[k]), int(table.first[k + 1]))
-        view = None
+        view, centre_m = None, centre_m if table.sensor_m is None else table.sensor_m[k]
         if config.range_m is not None and table.sensor_m is not None:
-            around = table.sensor_m[k], config.range_m, config.p_detect
+            around = centre_m, config.range_m, config.p_detect
             view = View.ball(*around) if sees is None else sees.view(k, *around)
         found[rows], events = tracker.step(
             stamp_s,
@@ -304,11 +309,6 @@ def _follow(
             view=view,
         )
         recorder.add(tracker.followed(), events)
-        if k + 1 < table.n_frames and table.stamp_s[k + 1] - stamp_s > gap_s:
-            n_gaps += 1
-            centre_m = np.zeros(3) if table.sensor_m is None else table.sensor_m[k]
-            until_s = float(table.stamp_s[k + 1])
-            recorder.events.extend(_close_eyes(tracker, centre_m, stamp_s, until_s, min(step_s, gap_s)))
         if progress and k % 100 == 99:
             progress(k + 1, table.n_frames)
     return recorder, found, n_gaps, [sees.remark] if sees is not None and sees.remark else []
@@ -357,7 +357,7 @@ def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -
     return remarks
 
 
-def _returned(spells: StaticSpells, within_m: float) -> list[str]:
+def _describe_returns(spells: StaticSpells, within_m: float) -> list[str]:
     """Say so where most stays that ended are followed by another object of that class in that place.
 
     Such an object has not left: it was missed because it was not looked at.

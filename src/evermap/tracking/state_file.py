@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -22,6 +23,34 @@ ABOUT = "about"
 Parts = Mapping[str, Mapping[str, NDArray[Any]]]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """What a tracker knew.
+
+    Attributes:
+        about: its choices, as values of JSON.
+        parts: arrays, by part and name.
+    """
+
+    about: Mapping[str, Any]
+    parts: Parts
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of their numbers."""
+        return tuple(self.about["class_names"])
+
+    @property
+    def kind(self) -> tuple[int, bool, bool]:
+        """Length of appearances, whether detections are boxes, and whether they have scores."""
+        return self.about["n_appearance"], self.about["boxes"], self.about["scored"]
+
+    @property
+    def stamp_s(self) -> float:
+        """Stamp of the last frame, -inf before the first."""
+        return -np.inf if self.about["stamp_s"] is None else float(self.about["stamp_s"])
+
+
 def write_state(path: str | Path, about: Mapping[str, Any], parts: Parts) -> Path:
     """Write choices (values of JSON) and arrays by part and name. Returns the path.
 
@@ -35,8 +64,8 @@ def write_state(path: str | Path, about: Mapping[str, Any], parts: Parts) -> Pat
     return write_atomic(path, stream.getvalue())
 
 
-def read_state(path: str | Path) -> tuple[dict[str, Any], dict[str, dict[str, NDArray[Any]]]]:
-    """Return the choices and the arrays, by part and name, of a file that `write_state` wrote.
+def read_state(path: str | Path) -> State:
+    """Return what `write_state` wrote.
 
     Raises:
         InputError: no such file, another kind of file, or one of a newer version.
@@ -56,4 +85,4 @@ def read_state(path: str | Path) -> tuple[dict[str, Any], dict[str, dict[str, ND
     if about.get("version") != VERSION:
         problem = f"is of version {about.get('version')}, and this evermap reads version {VERSION}"
         raise InputError(problem, path=Path(path), hint="a newer evermap")
-    return about, parts
+    return State(about, parts)

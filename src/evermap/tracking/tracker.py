@@ -7,7 +7,7 @@ detection; and delete those that should have been seen and were not.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -21,7 +21,7 @@ from evermap.survival import GeneralPurpose, LifetimePrior
 from evermap.survival.text import prior_from_dict, prior_to_dict
 from evermap.tracking.frame import Frame, appearances, boxes, classes, covariances, positions, probabilities
 from evermap.tracking.record import Event, Followed, SpellLog, StaticSpells
-from evermap.tracking.state_file import Parts, read_state, write_state
+from evermap.tracking.state_file import State, read_state, write_state
 from evermap.tracking.tracklets import (
     ALIVE,
     N_DETECTED,
@@ -189,8 +189,20 @@ class Tracker(Shown):
             InputError: no such file, or not one of `save`.
             ConfigError: names that were saved are missing, another model of motion, or choices that do not fit.
         """
-        about, parts = read_state(path)
-        saved = tuple(about["class_names"])
+        return cls.of_state(read_state(path), settings, class_names=class_names, confusion=confusion, priors=priors)
+
+    @classmethod
+    def of_state(
+        cls,
+        state: State,
+        settings: TrackerConfig | None = None,
+        *,
+        class_names: Sequence[str] | None = None,
+        confusion: FloatArray | None = None,
+        priors: LifetimePrior | Sequence[LifetimePrior] | None = None,
+    ) -> Self:
+        """Return the tracker of a state that was read; arguments and errors as of `load`."""
+        about, saved = state.about, state.class_names
         names = saved if class_names is None else tuple(class_names)
         if missing := [name for name in saved if name not in names]:
             raise ConfigError(f"no class {quote(missing[0])}, which objects are of", field="class_names")
@@ -214,11 +226,12 @@ class Tracker(Shown):
             priors=priors,
             class_names=names,
         )
-        tracker._restore(parts, into, about)
+        tracker._restore(state, into)
         return tracker
 
-    def _restore(self, parts: Parts, into: IntArray, about: Mapping[str, Any]) -> None:
+    def _restore(self, state: State, into: IntArray) -> None:
         """Take over what `save` wrote, of classes that now have the numbers `into`."""
+        parts = state.parts
         columns = dict(parts["tracklets"])
         if columns["mean"].shape[1:] != self._tracklets.mean.shape[1:]:
             hint = f"motion={'velocity' if self.settings.order == 3 else 'acceleration'}, as the state was saved with"
@@ -228,17 +241,11 @@ class Tracker(Shown):
         self._reserve(n)
         for name in self._tracklets._fields:
             getattr(self._tracklets, name)[:n] = columns[name]
-        self._n, self._next_id = n, about["next_id"]
-        self._stamp_s = -np.inf if about["stamp_s"] is None else about["stamp_s"]
+        self._n, self._next_id, self._stamp_s = n, state.about["next_id"], state.stamp_s
         stored, spells = parts["working_set"], parts["spells"]
         self.working_set.restore({**stored, "class_id": into[stored["class_id"]]})
         self._spells.restore({**spells, "class_id": into[spells["class_id"]]})
         self._views.restore(parts["views"])
-
-    @property
-    def kind(self) -> tuple[int, bool, bool]:
-        """Length of appearances, whether detections are boxes, and whether they have scores."""
-        return self._n_appearance, self._boxes, self._scored
 
     @property
     def stamp_s(self) -> float:
