@@ -92,7 +92,7 @@ def test_a_street_is_written_with_who_stood_where(tmp_path: Path) -> None:
         at = se3.transform(pose, recording.detections.position_sensor_m)[:, :2]
         there = (spans[:, 0] <= recording.frames.stamp_s[0]) & (spans[:, 1] > recording.frames.stamp_s[-1])
         off = np.linalg.norm(at[:, None] - places[None, there], axis=2).min(axis=0)
-        assert off.max() < 0.6  # whoever stands there is seen where it stands
+        assert off.max() < 0.6  # a parked car is detected at its slot
     assert run("simulate", "street", tmp_path / "no", "--doors").exit_code == 2
     assert run("simulate", "stret", tmp_path / "no").exit_code == 2
 

@@ -198,7 +198,7 @@ class ScaledHazard(Lifetime):
         return np.asarray(np.log(self.prior.hazard(t)) + np.log(self.factors)[stretch])
 
 
-def scaled(prior: LifetimePrior, edges_s: Sequence[float], factors: Sequence[float]) -> LifetimePrior:
+def scale_hazard(prior: LifetimePrior, edges_s: Sequence[float], factors: Sequence[float]) -> LifetimePrior:
     """Return the lifetime whose hazard is that of a prior, times factors by age; steps of a hazard stay steps.
 
     Args:
@@ -209,14 +209,14 @@ def scaled(prior: LifetimePrior, edges_s: Sequence[float], factors: Sequence[flo
     if all(factor == 1.0 for factor in factors):
         return prior
     if isinstance(prior, ScaledHazard):
-        edges, both = _refined(prior.edges_s, prior.factors, edges_s, factors)
+        edges, both = _multiply_steps(prior.edges_s, prior.factors, edges_s, factors)
         return ScaledHazard(prior.prior, edges, both)
     if isinstance(prior, PiecewiseConstantHazard):
-        return PiecewiseConstantHazard(*_refined(prior.edges_s, prior.rates, edges_s, factors))
+        return PiecewiseConstantHazard(*_multiply_steps(prior.edges_s, prior.rates, edges_s, factors))
     return ScaledHazard(prior, tuple(edges_s), tuple(factors))
 
 
-def _refined(
+def _multiply_steps(
     edges_s: Sequence[float], values: Sequence[float], other_s: Sequence[float], factors: Sequence[float]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the edges of two step functions, and their product."""

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from evermap.survival.base import LifetimePrior, SurvivalEstimate, check_open_share, check_times
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazard_regression import overlaps
-from evermap.survival.hazards import PiecewiseConstantHazard, scaled
+from evermap.survival.hazards import PiecewiseConstantHazard, scale_hazard
 from evermap.survival.logmath import log_sum_exp
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -49,8 +49,6 @@ DRAWS = 256
 LEAST_SURVIVAL, TRUSTED = 1e-9, 0.02
 """Survival down to which the expected one is that of the usual prior, and of a stated one: what is left of a stated
 hazard later is its ratio to the expected one, the less, the more was seen at that age."""
-ALIKE = 2
-"""Digits after the first to which stays are alike that are learned from together."""
 _NEWTON, _STEP, _SETTLED = 40, 2.0, 1e-4
 NEGLECTED = 1e-6
 """Share of the largest variance below which a direction of the process is dropped."""
@@ -97,28 +95,6 @@ class StayAges:
             np.ones((n, 2)), np.zeros(n), np.zeros(n),
         )  # fmt: skip
 
-    @classmethod
-    def none(cls) -> Self:
-        """Return no stays."""
-        ages, column = np.zeros((0, 1)), np.zeros(0)
-        return cls(ages, ages, ages, column, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), column, column)
-
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return all with a weight; rows that are alike to three digits are one."""
-        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__}
-        weight = columns.pop("weight")
-        some = weight > 0.0
-        if not some.any():
-            return cls.none()
-        table = np.column_stack([*columns.values()])[some]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            size = 10.0 ** (np.floor(np.log10(np.abs(table))) - ALIKE)
-            alike = np.where(np.isfinite(size) & (size > 0.0), np.rint(table / size) * size, table)
-        _, first, row = np.unique(alike, axis=0, return_index=True, return_inverse=True)
-        kept = {name: column[some][first] for name, column in columns.items()}
-        return cls(weight=np.bincount(row.ravel(), weight[some]).astype(np.float64), **kept)
-
     def of_group(self, group: int) -> Self:
         """Return those of one class."""
         mine = self.group == group
@@ -159,7 +135,7 @@ class _Likelihood:
             score = score + self.pairs[:, None] * value
             first += self.pairs[:, None] * each * d1
             second += self.pairs[:, None] * each**2 * d2
-        value, of_end, of_end_2 = _ended(left, stays.back[:, None], (stays.back_rate * self.left_s)[:, None])
+        value, of_end, of_end_2 = _log_gone(left, stays.back[:, None], (stays.back_rate * self.left_s)[:, None])
         score = score + np.where(ended[:, None], value, 0.0)
         of_end, of_end_2 = (np.where(ended[:, None], d, 0.0) for d in (of_end, of_end_2))
         seen, there = log_sum_exp(score), log_sum_exp(-until)
@@ -210,7 +186,7 @@ def _there_again(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple
     return np.where(plain, -leave, value), np.where(plain, -1.0, d1), np.where(plain, 0.0, d2)
 
 
-def _ended(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _log_gone(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the log probability to be gone at the next look, and its derivatives by the integrated hazard."""
     leave = np.maximum(leave, _TINY)
     change = (1.0 + back) * leave + come
@@ -312,7 +288,7 @@ class HazardPosterior(SurvivalEstimate):
 
     def prior(self) -> LifetimePrior:
         """Return the lifetime whose survival is the expected one at every edge; what was stated keeps its form."""
-        integrated = _expected_hazard(self.rates, self.weight, self.edges_s)
+        integrated = _integrate_expected(self.rates, self.weight, self.edges_s)
         ends_s = np.append(self.edges_s[1:], 2.0 * self.edges_s[-1])
         if self.said is None:
             return PiecewiseConstantHazard(tuple(self.edges_s), tuple(integrated / (ends_s - self.edges_s)))
@@ -321,10 +297,10 @@ class HazardPosterior(SurvivalEstimate):
         factors = np.where(known, integrated / np.where(known, said, 1.0), 1.0) * np.exp(self.before)
         if np.abs(factors - 1.0).max() < 1e-10:
             return self.said
-        return scaled(self.said, tuple(self.edges_s.tolist()), tuple(factors.tolist()))
+        return scale_hazard(self.said, tuple(self.edges_s.tolist()), tuple(factors.tolist()))
 
 
-def _expected_hazard(rates: FloatArray, weight: FloatArray, edges_s: FloatArray) -> FloatArray:
+def _integrate_expected(rates: FloatArray, weight: FloatArray, edges_s: FloatArray) -> FloatArray:
     """Return integrals (K,) over the stretches of the hazard of the expected survival."""
     steps = np.diff(np.append(edges_s, 2.0 * edges_s[-1]))
     cumulative = np.concatenate([np.zeros((len(rates), 1)), np.cumsum(rates * steps, axis=1)], axis=1)
@@ -385,7 +361,7 @@ def learn_hazards(
     base = _usual_base(usual, edges)
     log_evidence, draws = [], []
     for scale in _scales(edges):
-        values, of_free = _pooled([likelihoods[row] for row in free], scale, base)
+        values, of_free = _fit_together([likelihoods[row] for row in free], scale, base)
         log_evidence.append(values)
         draws.append(of_free)
     weight = _draw_weights(_scales(edges), log_evidence)
@@ -395,7 +371,7 @@ def learn_hazards(
         found[row] = HazardPosterior(edges_s, rates, weight, None, np.zeros(len(edges)), of)
     for row, one in enumerate(said):
         if one is not None:
-            found[row] = _stated(likelihoods[row], one, edges, risk[row])
+            found[row] = _fit_stated(likelihoods[row], one, edges, risk[row])
     return found
 
 
@@ -420,7 +396,7 @@ def _normals(r: int) -> tuple[FloatArray, FloatArray]:
     return np.concatenate([one, -one]), np.concatenate([other, -other])
 
 
-def _pooled(likelihoods: list[_Likelihood], scale: _Scale, base: FloatArray) -> tuple[float, list[FloatArray]]:
+def _fit_together(likelihoods: list[_Likelihood], scale: _Scale, base: FloatArray) -> tuple[float, list[FloatArray]]:
     """Return the log evidence of a scale and draws (DRAWS, K) of `v` of each class, and of a new one.
 
     The numbers of a class are those that all share, of variance `common`, plus its own. Own ones are eliminated first.
@@ -501,7 +477,9 @@ def _root(covariance: Any) -> FloatArray:
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
-def _stated(likelihood: _Likelihood, said: Statement, edges: tuple[float, ...], risk: FloatArray) -> HazardPosterior:
+def _fit_stated(
+    likelihood: _Likelihood, said: Statement, edges: tuple[float, ...], risk: FloatArray
+) -> HazardPosterior:
     """Return the posterior of a class of which a user states a lifetime."""
     edges_s = np.asarray(edges)
     ends_s = np.append(edges_s[1:], 2.0 * edges_s[-1])
@@ -515,12 +493,12 @@ def _stated(likelihood: _Likelihood, said: Statement, edges: tuple[float, ...], 
         of_scales.append(one @ root @ scale.columns.T)
     without = np.concatenate(of_scales)
     even = _draw_weights(scales)
-    base = _calibrated(said.prior, edges_s, without, even, TRUSTED)
-    expected = _expected_hazard(base * np.exp(without), even, edges_s)
+    base = _match_survival(said.prior, edges_s, without, even, TRUSTED)
+    expected = _integrate_expected(base * np.exp(without), even, edges_s)
     base = _not_impossible(base, likelihood, said, edges_s)
     log_evidence, draws = [], []
     for scale in scales:
-        evidence, mode, covariance = _alone(likelihood, scale, ends, base)
+        evidence, mode, covariance = _fit_alone(likelihood, scale, ends, base)
         log_evidence.append(evidence)
         one, _ = _normals(len(mode))
         draws.append((mode + one @ _root(covariance)) @ scale.columns.T)
@@ -537,7 +515,7 @@ def _precision(scale: _Scale, ends: FloatArray) -> FloatArray:
     return np.asarray(np.eye(scale.columns.shape[1]) + (scale.columns.T * ends) @ scale.columns)
 
 
-def _alone(
+def _fit_alone(
     likelihood: _Likelihood, scale: _Scale, ends: FloatArray, base: FloatArray
 ) -> tuple[float, FloatArray, FloatArray]:
     """Return log evidence, mode (R,) and covariance of one class with pseudo-ends at the stated hazard."""
@@ -595,10 +573,10 @@ def _usual_base(usual: LifetimePrior, edges: tuple[float, ...]) -> FloatArray:
         numbers = np.sqrt(scale.common) * one + np.sqrt(1.0 - scale.common) * other
         draws.append(numbers @ scale.columns.T)
     even = _draw_weights(_scales(edges))
-    return _calibrated(usual, np.asarray(edges), np.concatenate(draws), even)
+    return _match_survival(usual, np.asarray(edges), np.concatenate(draws), even)
 
 
-def _calibrated(
+def _match_survival(
     prior: LifetimePrior, edges_s: FloatArray, v: FloatArray, weight: FloatArray, least: float = LEAST_SURVIVAL
 ) -> FloatArray:
     """Return hazards (K,) such that the expected survival over draws `v` (S, K) is that of a prior at all edges.

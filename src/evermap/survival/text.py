@@ -70,7 +70,7 @@ def parse_prior(text: str) -> LifetimePrior:
     """
     factors, of, rest = text.partition(_OF)
     if of and factors.strip().startswith(_FACTORS):
-        return _scaled(factors.strip().removeprefix(_FACTORS), parse_prior(rest))
+        return _parse_factors(factors.strip().removeprefix(_FACTORS), parse_prior(rest))
     try:
         parts = [part.strip() for part in re.split(r"(?<![0-9][eE])\+", text)]
         if not all(parts):
@@ -83,7 +83,7 @@ def parse_prior(text: str) -> LifetimePrior:
         raise ConfigError(f"prior '{text}': {about}{error.problem}", hint=error.hint) from None
 
 
-def _scaled(text: str, prior: LifetimePrior) -> ScaledHazard:
+def _parse_factors(text: str, prior: LifetimePrior) -> ScaledHazard:
     """Read factors of a hazard by age."""
     steps = [item.partition("=") for item in text.split(",")]
     edges_s = tuple(_time_s(edge.strip()) for edge, _, _ in steps)

@@ -16,6 +16,7 @@ from evermap.types import (
     SpatialRecording,
     SpatialSensor,
 )
+from evermap_studies.worlds.parking import upright
 
 STEP_S, SPEED_MPS, REACH_M = 0.1, 10.0, 45.0
 SIZE_M = (4.2, 1.7, 1.5)
@@ -55,7 +56,7 @@ def street(
     heading = 0.5 * np.sin(2.0 * np.pi * stamp_s / seconds)
     xy = np.zeros((len(stamp_s), 2))
     xy[1:] = np.cumsum(SPEED_MPS * STEP_S * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)[:-1]
-    pose = _upright(np.column_stack([xy, heading]))
+    pose = upright(np.column_stack([xy, heading]))
     beside = np.linspace(20, len(stamp_s) - 5, n_parked).astype(int)
     aside = np.where(np.arange(n_parked) % 2, 5.0, -5.0) + rng.normal(0.0, 0.5, n_parked)
     normal = np.column_stack([-np.sin(heading), np.cos(heading)])
@@ -68,15 +69,6 @@ def street(
         "street", odometry, Frames(stamp_s), detections, (SpatialSensor(),), class_names=("Car",)
     )
     return Street(recording, pose, parked, way, of)
-
-
-def _upright(place: FloatArray) -> FloatArray:
-    """Poses (..., 7) at x, y and heading, upright."""
-    half = 0.5 * place[..., 2]
-    nothing = np.zeros(place.shape[:-1])
-    return np.stack(
-        [place[..., 0], place[..., 1], nothing, nothing, nothing, np.sin(half), np.cos(half)], axis=-1
-    )  # fmt: skip
 
 
 def _oncoming(xy: FloatArray, heading: FloatArray, normal: FloatArray) -> FloatArray:
@@ -110,7 +102,7 @@ def _seen(
     """Boxes (C, F, 3) ahead of the robot and within its reach, with errors that last for a track and such that do not;
     and what each is of.
     """
-    local = se3.compose(se3.inverse(pose)[None], _upright(boxes))
+    local = se3.compose(se3.inverse(pose)[None], upright(boxes))
     reach = np.linalg.norm(local[..., :3], axis=-1)
     seen = (reach < REACH_M) & (local[..., 0] > 2.0) & (np.abs(local[..., 1]) < 1.2 * local[..., 0])
     seen &= rng.uniform(size=seen.shape) < 0.95

@@ -267,7 +267,7 @@ def estimates(name: str, table: LifetimeTable, groups: Sequence[LifetimeGroup]) 
         yield from _gaussian_process(table, groups)
         return
     if name == POOLED:
-        yield from _pooled(table, groups)
+        yield from _fit_pooled(table, groups)
         return
     for group in groups:
         try:
@@ -360,8 +360,8 @@ def _gaussian_process(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> 
         yield _with_prior(GP, draws, draws.prior(), numbers)
 
 
-def _pooled(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterator[LifetimeEstimate]:
-    """What a map learns from: hazards by age of which groups have a part in common."""
+def _fit_pooled(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterator[LifetimeEstimate]:
+    """Hazards by age of which groups have a part in common."""
     from evermap.maps.lives import general_purpose
     from evermap.survival.pooled_hazards import StayAges, learn_hazards
 
