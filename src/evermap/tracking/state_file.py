@@ -81,7 +81,9 @@ def read_state(path: str | Path) -> State:
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", path=Path(path)) from error
     except (BadZipFile, KeyError, ValueError, EOFError, TypeError, AttributeError) as error:
-        raise InputError("is not a tracker's state", path=Path(path), hint="a file that `evermap track --state` wrote") from error
+        raise InputError(
+            "is not a tracker's state", path=Path(path), hint="a file that `evermap track --state` wrote"
+        ) from error
     if about.get("version") != VERSION:
         problem = f"is of version {about.get('version')}, and this evermap reads version {VERSION}"
         raise InputError(problem, path=Path(path), hint="a newer evermap")
