@@ -78,8 +78,9 @@ format: $(DEVELOPMENT)
 docs: $(RUNTIME) $(DOCUMENTATION)
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict --quiet
 
+# What the pages tell to type; all else of tests/docs is in `make test`.
 docs-check: $(DEVELOPMENT)
-	$(PYTEST) tests/docs -m "slow or not slow"
+	$(PYTEST) tests/docs -m slow
 
 bench: $(DEVELOPMENT)
 	$(VENV)/bin/evermap bench

@@ -36,7 +36,7 @@ def gap_m(result: SlamResult, world: World) -> np.ndarray:
     return np.linalg.norm(result.trajectory.pose_world_robot[:, :3] - world.true_pose[row, :3], axis=1)
 
 
-@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.0, 0.1, 0.4)])
+@pytest.mark.parametrize("turn", [pytest.param((0.0, 0.0, 0.0), marks=pytest.mark.slow), (0.0, 0.1, 0.4)])
 @pytest.mark.parametrize(
     ("seed", "odometry", "points"),
     [(0, True, False), pytest.param(3, True, False, marks=pytest.mark.slow), (5, True, True)],
@@ -65,7 +65,7 @@ def test_without_odometry_no_group_is_told():
     assert sorted(told) == [(tag,) for tag in SHELF]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 3])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 3))])
 def test_a_moved_shelf_that_is_alone_in_view_draws_the_robot_nowhere(seed):
     """For a while the robot sees nothing else: tag by tag, each is where the map has it beside the others."""
     world = tagged_corridor(seed, drift=0.02)

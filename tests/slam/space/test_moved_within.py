@@ -54,7 +54,7 @@ def check_moves(world: World, recording: SpatialRecording, moves: tuple[Move, ..
 
 
 @pytest.mark.parametrize("mapped", [False, True])
-@pytest.mark.parametrize("corners", [True, False])
+@pytest.mark.parametrize("corners", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("move", [FAR, pytest.param(TURN, marks=pytest.mark.slow)])
 def test_a_tag_that_is_moved_is_one_tag_that_moved(move, corners, mapped):
     world = tagged_corridor(1, moves=(move,))
@@ -76,7 +76,7 @@ def test_a_move_within_the_noise_of_poses_is_no_move_before_the_drive():
     check_moves(world, as_poses(world, 6), (NEAR,), mapped=True)
 
 
-@pytest.mark.parametrize(("move", "seed"), [(IN_VIEW, 0), (LATE, 6)])
+@pytest.mark.parametrize(("move", "seed"), [(IN_VIEW, 0), pytest.param(LATE, 6, marks=pytest.mark.slow)])
 def test_the_instant_is_known_where_the_tag_is_in_view(move, seed):
     world = tagged_corridor(seed, moves=(move,))
     (change,) = check_moves(world, world.recording, (move,), mapped=False).changes

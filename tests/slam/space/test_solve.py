@@ -325,7 +325,7 @@ def test_directions_without_odometry_are_left_out():
         run_slam(recording)
 
 
-@pytest.mark.parametrize("late_s", [0.2, -0.2])
+@pytest.mark.parametrize("late_s", [0.2, pytest.param(-0.2, marks=pytest.mark.slow)])
 def test_a_delay_is_as_uncertain_as_it_says_where_the_odometry_is_noisy(late_s):
     off = []
     for seed in (10, 12, 15):
