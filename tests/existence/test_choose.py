@@ -53,6 +53,20 @@ def test_score_is_the_density_of_the_last_fifth_given_the_rest() -> None:
     assert choice.scores["two-state"] == pytest.approx(expected, abs=1e-9)
 
 
+def test_the_chosen_kind_is_learned_on_from_what_was_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[object] = []
+
+    def learned(looks: Looks, start: object = None) -> object:
+        begun.append(start)
+        return KINDS["two-state"](looks)
+
+    monkeypatch.setattr(models, "KINDS", {"two-state": KINDS["two-state"], "run-length": learned})
+    choice = choose(looks_of([200.0, 100.0] * 5, 10.0, 4), ["run-length", "two-state"])
+    assert choice.kind == "run-length"
+    assert begun[0] is None
+    assert begun[1] is not None
+
+
 def test_looks_before_an_instant_keep_their_features() -> None:
     looks = Looks.from_rows([0, 0, 2, 2, 2, 4], [0.0, 9.0, 1.0, 2.0, 8.0, 9.0], 1, 0.1, 0.1, n_features=6)
     before = looks.taken(looks.stamp_s < 5.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import ConfigError, DataError
-from evermap.existence.learn_sojourns import Data, LearnedSojourns, learn, with_lifetimes
+from evermap.existence.learn_sojourns import Data, LearnedSojourns, climb, learn, with_lifetimes
 from evermap.existence.protocol import Instants, Looks
 from evermap.existence.rhythm import BINS, Rhythm, day_shares
 from evermap.existence.run_length import RunLength
@@ -330,3 +330,24 @@ def test_shares_of_days_are_learned_and_later_days_are_added() -> None:
     assert first.model.unusual.still == pytest.approx((3.0 + 0.5) / (30.0 + 2.0), rel=0.15)
     assert both.of_kind.sum() == pytest.approx(56.0)
     assert both.of_kind[1] - first.of_kind[1] == pytest.approx(1.0 + 4 * first.model.unusual.still, abs=0.3)
+
+
+def test_learning_goes_on_from_a_model_of_most_of_the_looks() -> None:
+    """As good as anew, with nothing else tried: no family that lost before, no typical duration from the start."""
+    time, there = truth(Weibull(2.5, 60.0), LogNormal(3.5, 0.4), 7)
+    looks = looks_at(time, there, seed=7)
+    before = learn(looks.taken(looks.stamp_s < 1e6 + 0.8 * SPAN_S))
+    on, anew = learn(looks, start=before.model), learn(looks)
+    assert len(on.candidates) == 1
+    assert on.log_evidence > anew.log_evidence - 1.0
+
+
+def test_a_trial_ends_that_cannot_catch_up() -> None:
+    time, there = truth(Weibull(2.5, 60.0), LogNormal(3.5, 0.4), 7, features=2)
+    data = Data.of(looks_at(time, there, seed=7), STEP_S, np.inf, rhythm=False)
+    start = RunLength(Exponential(1.0 / 60.0), Exponential(1.0 / 60.0), STEP_S)
+    whole = climb(data, start, ("weibull",), 8)
+    with_chance = climb(data, start, ("weibull",), 8, whole.score - 1.0)
+    assert with_chance.score == whole.score
+    hopeless = climb(data, start, ("weibull",), 8, whole.score + 1e4)
+    assert hopeless.expected.log_evidence < whole.expected.log_evidence

@@ -200,8 +200,16 @@ class Ascent(Shown):
         return Candidate(self.name, self.expected.log_evidence, self.freedom, self.score)
 
 
-def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int) -> Ascent:
-    """Iterate expectation and maximisation until the evidence settles; families are chosen in the first rounds."""
+def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int, to_beat: float = -np.inf) -> Ascent:
+    """Iterate expectation and maximisation until the evidence settles; families are chosen in the first rounds.
+
+    Args:
+        data: looks to learn from.
+        model: where to begin.
+        families: lifetimes to choose from.
+        rounds: maximum number of iterations.
+        to_beat: ends, too, where the score stays below this if the evidence keeps growing as in the last round.
+    """
     allowed: list[Sequence[str]] = [families, families]
     level = np.ones((2, data.n_periods))
     expected = data.expect(model, level)
@@ -221,7 +229,10 @@ def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int) ->
         expected = data.expect(model, level)
         if best is None or expected.log_evidence > best.expected.log_evidence:
             best = Ascent(model, fitted, expected, level)
-        if number >= CHOOSING_ROUNDS and expected.log_evidence - before < SETTLED:
+        gain = expected.log_evidence - before
+        if number >= CHOOSING_ROUNDS and gain < SETTLED:
+            break
+        if number and best.score + max(gain, 0.0) * (rounds - 1 - number) < to_beat:
             break
     assert best is not None
     return best
@@ -320,6 +331,7 @@ def learn(
     step_s: float | None = None,
     hypotheses: int = 64,
     restarts: int = 4,
+    start: RunLength | None = None,
     progress: Progress | None = None,
 ) -> LearnedSojourns:
     """Return one model of the comings and goings of all features in `looks`.
@@ -333,6 +345,7 @@ def learn(
         step_s: longest step of time; the median time between looks where None.
         hypotheses: how many the filter keeps.
         restarts: how many typical durations to start from, between a few steps and the whole recording.
+        start: a model learned from most of these looks, to go on from; nothing else is tried then.
         progress: called with the part that is done.
 
     Raises:
@@ -341,25 +354,18 @@ def learn(
     """
     allowed = _allowed(families, rhythm=rhythm)
     step = step_s or looks.median_gap_s()
-    data = Data.of(looks, step, half_life_s, rhythm=False)
+    steady = Data.of(looks, step, half_life_s, rhythm=False)
+    data = Data.of(looks, step, half_life_s, rhythm=True) if rhythm else steady
     tell = progress or (lambda _: None)
-    ascents = [_exponential(data, hypotheses, restarts, tell)]
-    if rhythm or allowed != ("exponential",):
-        # what a model of one family counts looks like that family: each has to be tried from its own counts
-        calendar = Data.of(looks, step, half_life_s, rhythm=True) if rhythm else data
-        trials = []
-        for number, name in enumerate(allowed):
-            trials.append(climb(calendar, ascents[0].model, (name,), _TRIAL_ROUNDS))
-            tell(0.5 + 0.3 * (number + 1) / len(allowed))
-        # hours that look like habits, and habits that look like hours: where there is a rhythm, each start goes on
-        best_first = sorted(trials, key=lambda ascent: -ascent.score)
-        finals = [climb(calendar, trial.model, allowed, _MOST_ROUNDS) for trial in best_first[: 2 if rhythm else 1]]
-        ascents = [*finals, *trials] if rhythm else [*ascents, *trials, *finals]
+    if start is not None:
+        ascents = [climb(data, replace(start, unusual=None), allowed, _MOST_ROUNDS)]
+    else:
+        ascents = _search(steady, data, allowed, hypotheses, restarts, tell)
     ranked = sorted(ascents, key=lambda ascent: -ascent.score)
     candidates: dict[str, Candidate] = {}
     for ascent in ranked:  # the best of each kind
         candidates.setdefault(ascent.name, ascent.candidate)
-    best, of_kind, unusual = _with_unusual_days(calendar, ranked[0]) if rhythm else (ranked[0], np.zeros(0), None)
+    best, of_kind, unusual = _with_unusual_days(data, ranked[0]) if rhythm else (ranked[0], np.zeros(0), None)
     tell(1.0)
     return LearnedSojourns(
         replace(best.model, unusual=unusual),
@@ -371,6 +377,26 @@ def learn(
         best.expected,
         of_kind,
     )
+
+
+def _search(
+    steady: Data, data: Data, allowed: Sequence[str], hypotheses: int, restarts: int, tell: Progress
+) -> list[Ascent]:
+    """Climb with every family from exponential lifetimes, which `steady` looks give, and go on from the best."""
+    simple = _exponential(steady, hypotheses, restarts, tell)
+    # what a model of one family counts looks like that family: each has to be tried from its own counts
+    trials = [] if data.rhythm else [simple]
+    others = [name for name in allowed if data.rhythm or name != "exponential"]
+    if not others:
+        return trials
+    for number, name in enumerate(others):
+        to_beat = max((trial.score for trial in trials), default=-np.inf)
+        trials.append(climb(data, simple.model, (name,), _TRIAL_ROUNDS, to_beat))
+        tell(0.5 + 0.3 * (number + 1) / len(others))
+    # hours that look like habits, and habits that look like hours: where there is a rhythm, each start goes on
+    best_first = sorted(trials, key=lambda ascent: -ascent.score)
+    finals = [climb(data, trial.model, allowed, _MOST_ROUNDS) for trial in best_first[: 2 if data.rhythm else 1]]
+    return [*finals, *trials] if data.rhythm else [*trials, *finals]
 
 
 def _with_unusual_days(data: Data, best: Ascent) -> tuple[Ascent, FloatArray, DayShares]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -25,7 +25,11 @@ from evermap.io.files import write_atomic
 from evermap.show import Shown
 from evermap.survival import never_leaves
 
-Learner = Callable[[Looks], PresenceModel]
+if TYPE_CHECKING:
+    from evermap.existence.run_length import RunLength
+
+Learner = Callable[..., PresenceModel]
+"""Learns from looks, and goes on from a model of its kind where one is given."""
 Progress = Callable[[float], None]
 
 HELD_OUT_PART = 0.2
@@ -37,16 +41,25 @@ GAP_FOR_A_RHYTHM_S = 1.5 * DAY_S
 """Looks farther apart (in the median) than a day or so don't show at what hour anything came or left."""
 
 
-def _learned(looks: Looks, *, module: str, **settings: Any) -> PresenceModel:
-    return cast("PresenceModel", import_module(f"evermap.existence.{module}").learn(looks, **settings).model)
+def _learn_phases(looks: Looks, _start: PresenceModel | None = None, **settings: Any) -> PresenceModel:
+    """Learn phases; these are found anew as quickly as from a model of fewer looks."""
+    from evermap.existence.learn_phases import learn
+
+    return learn(looks, **settings).model
+
+
+def _learn_sojourns(looks: Looks, start: PresenceModel | None = None, **settings: Any) -> PresenceModel:
+    from evermap.existence.learn_sojourns import learn
+
+    return learn(looks, start=cast("RunLength | None", start), **settings).model
 
 
 KINDS: Mapping[str, Learner] = {
-    "two-state": partial(_learned, module="learn_phases", phases="two-state", rhythm=False),
-    "phase-type": partial(_learned, module="learn_phases", rhythm=False),
-    "phase-type-rhythm": partial(_learned, module="learn_phases", rhythm=True),
-    "run-length": partial(_learned, module="learn_sojourns", rhythm=False),
-    "run-length-rhythm": partial(_learned, module="learn_sojourns", rhythm=True),
+    "two-state": partial(_learn_phases, phases="two-state", rhythm=False),
+    "phase-type": partial(_learn_phases, rhythm=False),
+    "phase-type-rhythm": partial(_learn_phases, rhythm=True),
+    "run-length": partial(_learn_sojourns, rhythm=False),
+    "run-length-rhythm": partial(_learn_sojourns, rhythm=True),
 }
 """Kinds of recurrent models, each learned from looks alone; the simpler ones first."""
 
@@ -100,12 +113,13 @@ def choose(looks: Looks, kinds: Sequence[str] | None = None, *, progress: Progre
     before = looks.taken(looks.stamp_s < last - held_out)
     tell = progress or (lambda _: None)
     scores: dict[str, float] = {}
+    models: dict[str, PresenceModel] = {}
     for number, name in enumerate(names):
-        model = KINDS[name](before)
+        model = models[name] = KINDS[name](before)
         scores[name] = float(np.sum(model.track(looks).log_evidence) - np.sum(model.track(before).log_evidence))
         tell((number + 1) / (len(names) + 1))
     best = max(names, key=lambda name: scores[name])
-    choice = Choice(best, KINDS[best](looks), scores, held_out)
+    choice = Choice(best, KINDS[best](looks, models[best]), scores, held_out)
     tell(1.0)
     return choice
 

@@ -2,7 +2,7 @@
 
 Looks are laid out on the time steps of the filter (`lattice`). The backward pass runs through the hypotheses that the
 forward pass kept. To store all of it would take a megabyte for every thousand steps, so the forward pass keeps a
-checkpoint every few thousand steps, and each stretch is run again when the backward pass arrives there.
+checkpoint every few thousand steps, and each stretch but the last is run again when the backward pass arrives there.
 """
 
 from __future__ import annotations
@@ -140,9 +140,10 @@ def expectations(
     stretches = (steps + STRETCH - 1) // STRETCH
     held, space = nothing_held(slots, law), room(slots)
     start, weight, count = held
-    starts, weights = np.zeros((STRETCH, 2, slots)), np.zeros((STRETCH, 1, 2, slots))
-    counts, merges = np.zeros((STRETCH, 2), dtype=np.int64), np.zeros((STRETCH, 2), dtype=np.int64)
-    scales = np.zeros(STRETCH)
+    most = min(steps, STRETCH)
+    starts, weights = np.zeros((most, 2, slots)), np.zeros((most, 1, 2, slots))
+    counts, merges = np.zeros((most, 2), dtype=np.int64), np.zeros((most, 2), dtype=np.int64)
+    scales = np.zeros(most)
     before = RunHypotheses(starts, weights, counts)
     kept_start, kept_weight = np.zeros((stretches + 1, 2, slots)), np.zeros((stretches + 1, 1, 2, slots))
     kept_count = np.zeros((stretches + 1, 2), dtype=np.int64)
@@ -172,8 +173,9 @@ def expectations(
     usual, lived, died, part = (np.empty((2, slots)), np.empty(slots), np.empty(slots), np.empty(slots))
     for c in range(stretches - 1, -1, -1):
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
-        _copy(RunHypotheses(kept_start[c], kept_weight[c], kept_count[c]), held)
-        _forward((a, b), looks, calendar, law, held, space, before, merges, scales)
+        if c < stretches - 1:  # the last stretch is still there
+            _copy(RunHypotheses(kept_start[c], kept_weight[c], kept_count[c]), held)
+            _forward((a, b), looks, calendar, law, held, space, before, merges, scales)
         for k in range(b - 1, a - 1, -1):
             i = k - a
             now, then = stamp_s[k], stamp_s[k + 1]

@@ -23,6 +23,8 @@ from evermap.types import FloatArray
 KNOTS_PER_DOUBLING = 2
 MOST_KNOTS = 40
 MOST_PEAKS = 5
+IN_VAIN = 2
+"""Peaks that do not pay for themselves, after which no more are tried."""
 PEAK_SPREAD = 0.05
 """Spread of a peak to begin with. Then each peak's spread is its own and, as one more event, that of all peaks
 together: a peak of one event would have none else."""
@@ -137,11 +139,13 @@ def smooth(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool = Fals
 
 def peaks(counts: Sojourns, _: Fitted | None = None) -> Fitted:
     """Return some typical durations, each with a small spread, on a wide background; as many as pay for themselves."""
-    best = _mixture(counts, 0)
+    best, paid = _mixture(counts, 0), 0
     for n in range(1, MOST_PEAKS + 1):
         fitted = _mixture(counts, n)
         if fitted.score(counts) > best.score(counts):
-            best = fitted
+            best, paid = fitted, n
+        elif n >= paid + IN_VAIN:
+            break
     return best
 
 
@@ -215,11 +219,12 @@ def _mixture(counts: Sojourns, n: int) -> Fitted:
     for _ in range(_ROUNDS):
         z = (x[:, None] - mean) / spread
         density = share * np.exp(-0.5 * z * z) / spread
-        beyond = share * ndtr(-z)
+        survival = ndtr(-z)
+        beyond = share * survival
         mine = ended[:, None] * density / np.maximum(density.sum(1, keepdims=True), 1e-300)
         open_mine = going[:, None] * beyond / np.maximum(beyond.sum(1, keepdims=True), 1e-300)
         # moments of a normal variable known to lie beyond x
-        ratio = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) / np.maximum(ndtr(-z), 1e-300)
+        ratio = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) / np.maximum(survival, 1e-300)
         expected = mean + spread * ratio
         second = spread**2 * (1.0 + z * ratio) - (spread * ratio) ** 2
         weight = mine.sum(0) + open_mine.sum(0)

@@ -36,6 +36,7 @@ __all__ = [
     "lifetimes",
     "mrclam",
     "nielsen2024",
+    "occupancy",
     "partial_views",
     "presence",
     "robots",
@@ -87,6 +88,20 @@ def soak(hours: Annotated[float, typer.Option(min=0.05, help="Hours of driving."
       evermap reproduce soak --hours 1
     """
     _benchmark("soak").main(["--hours", str(hours), "--seed", str(seed)])
+
+
+def occupancy(
+    table: Annotated[Path, typer.Argument(help="Looks: stamp_s, feature_id, detected.")],
+    season_d: Annotated[float, typer.Option(min=1e-3, help="Days between the beginnings of two seasons.")] = 365.0,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate the dynamic occupancy model of ecology (MacKenzie 2003): sites taken and left between seasons.
+
+    \b
+    Example:
+      evermap reproduce occupancy ../shared/data/crossbill/looks.csv.gz
+    """
+    _benchmark("occupancy").main([str(table), "--season-d", str(season_d), *(["--json"] if as_json else [])])
 
 
 def liars(
