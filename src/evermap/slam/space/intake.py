@@ -18,7 +18,7 @@ from evermap.geometry.symmetry import HINT, Symmetries, Symmetry
 from evermap.slam.intake import frames_of_usable, landmark_ids, usable_detections
 from evermap.slam.space.linearise import CORNERS, POINT, POSE
 from evermap.slam.space.local_filter import SpatialFrame
-from evermap.slam.space.problem import USUAL, OdometryPath, SpatialNoise, SpatialProblem
+from evermap.slam.space.problem import USUAL, OdometryPath, SpatialNoise, SpatialProblem, Swing
 from evermap.types import (
     ANY_RANGE_M2,
     UNKNOWN,
@@ -31,6 +31,8 @@ from evermap.types import (
     rows_of,
 )
 
+SAME_S, OF_FRAMES = 1e-5, 0.8
+"""Difference of stamps that are the same, and share of the odometry's that are a frame's from which all are."""
 HARDLY = 1.0
 """Standard deviation with which it counts, as a share of the range: as good as nothing."""
 
@@ -108,6 +110,7 @@ def prepare_space(
         stamp_s=stamps[pose_frame] - stamps[pose_frame[0]],
         increment=increment,
         lasted_s=np.diff(stamps[pose_frame]) ** (1 if driven else 2),
+        swing=Swing.none(len(pose_frame) - 1),
         driven=driven,
         pose_row=np.searchsorted(pose_frame, detections.frame[used]),
         place=place.astype(np.int64),
@@ -134,6 +137,7 @@ def prepare_space(
         scale_sigma=scale[0] if driven else 0.0,
         ranges_share=scale[1],
         path=_path(recording, stamps[pose_frame[0]], settings.delay_sigma_s),
+        has_clock_of_frames=_has_clock_of_frames(recording.odometry, stamps[pose_frame]),
         measurements=tied,
         start_sigma=np.max([[1e-4] * 6, *(of.kind.first_sigma for of in tied)], axis=0),
         robust=robust,
@@ -472,6 +476,17 @@ def _path(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -> 
     before, after = se3.retract(end, 4.0 * se3.local(inside, end))
     stamp_s = np.concatenate([[first_s - 4.0 * delay_sigma_s], stamp_s, [last_s + 4.0 * delay_sigma_s]])
     return OdometryPath(stamp_s, np.vstack([before, pose, after]))
+
+
+def _has_clock_of_frames(odometry: SpatialOdometry | None, frame_s: FloatArray) -> bool:
+    """Tell whether the odometry has the stamps of the frames (F,) and hardly any others."""
+    if odometry is None:
+        return False
+    own_s = odometry.stamp_s
+    inside = own_s[(own_s >= frame_s[0]) & (own_s <= frame_s[-1])]
+    after = np.clip(np.searchsorted(frame_s, inside), 1, len(frame_s) - 1)
+    off_s = np.minimum(np.abs(frame_s[after] - inside), np.abs(inside - frame_s[after - 1]))
+    return bool(np.mean(off_s < SAME_S) > OF_FRAMES) if len(inside) else True
 
 
 def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
