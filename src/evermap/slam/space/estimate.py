@@ -45,6 +45,7 @@ class SpatialOptimum:
         estimate: the values.
         noise: the levels.
         smoother, now: what covariances are of.
+        sober: levels that covariances are of, where they are no better than other evidence has them; else None.
         fitted: the same as the values were found with, where covariances count errors that last; else None.
     """
 
@@ -53,6 +54,7 @@ class SpatialOptimum:
     smoother: SpatialSmoother
     now: SpatialLinear
     fitted: tuple[SpatialSmoother, SpatialLinear] | None = None
+    sober: SpatialNoise | None = None
 
 
 def converged(

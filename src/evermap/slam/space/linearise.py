@@ -91,7 +91,9 @@ def linearise_odometry(
         increment: (N - 1, 7) measured motions.
         log_scale: logarithm of true over measured distances. It divides the true ones: multiplied by it, those that are
             measured would be found too long by their noise (errors in variables).
-        steps, lever, axes: (N - 1,), (N - 1, 3), (N - 1, 3, 3) of their noise; see `Swing`.
+        steps: (N - 1,) of each; this, `lever` and `axes` are those of `Swing`.
+        lever: (N - 1, 3) of the rotation's noise.
+        axes: (N - 1, 3, 3) along which the translation's noise is independent.
         sigma: (N - 1, 6) their standard deviations: of translations along the axes, given the rotation, and of this.
         log_odds: beyond which half of the squared residual makes a jump of the odometry.
         heavy: tails that never let go, while the estimate may be far off.
@@ -136,7 +138,7 @@ def linearise_odometry(
 
 @kernel
 def _swung(lever: FloatArray, axes: FloatArray, e: FloatArray, j1: FloatArray, j2: FloatArray) -> None:
-    """Replace translations of a residual (6,) and its Jacobians by what is left of them given the rotation, along axes."""
+    """Replace translations of a residual (6,) and its Jacobians by what the rotation leaves of them, along axes."""
     left = np.zeros(3)
     for column in range(13):
         for a in range(3):

@@ -30,9 +30,7 @@ from evermap.slam.space.linearise import (
     PIXEL,
     POINT,
     POSE,
-    ROTATION,
     ROWS,
-    TRANSLATION,
 )
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SIGHTINGS, SpatialLinear, SpatialSmoother
