@@ -16,7 +16,7 @@ from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialPro
 from evermap.types import FloatArray, IntArray
 
 
-class Frames(NamedTuple):
+class PathFrames(NamedTuple):
     """All frames of a recording that a trajectory has, of which some have a pose in the problem.
 
     Attributes:
@@ -63,7 +63,7 @@ class Frames(NamedTuple):
         return np.asarray((amount / np.bincount(after, minlength=len(self.posed)))[after])
 
 
-def bridge(frames: Frames, problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNoise) -> FloatArray:
+def bridge(frames: PathFrames, problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNoise) -> FloatArray:
     """Return poses (F, 7) of all frames: those of the problem, and between them the most probable path of the odometry
     with levels of noise.
     """
@@ -74,7 +74,7 @@ def bridge(frames: Frames, problem: SpatialProblem, estimate: SpatialEstimate, n
 
 
 def bridge_covariance(
-    frames: Frames,
+    frames: PathFrames,
     problem: SpatialProblem,
     estimate: SpatialEstimate,
     noise: SpatialNoise,
@@ -123,7 +123,9 @@ class _Chain:
         unit: true lengths over those of the odometry.
     """
 
-    def __init__(self, frames: Frames, problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNoise) -> None:
+    def __init__(
+        self, frames: PathFrames, problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNoise
+    ) -> None:
         self.unit = float(np.exp(estimate.log_scale))
         driven = se3.scaled(frames.driven, float(np.exp(problem.odometry_log)))
         since = se3.between(driven[frames.posed][frames.before], driven)  # from the last pose on

@@ -16,7 +16,7 @@ from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries, Symmetry
 from evermap.slam.intake import frames_of_usable, frames_with_pose, landmark_ids, usable_detections
-from evermap.slam.space.bridge import Frames
+from evermap.slam.space.bridge import PathFrames
 from evermap.slam.space.linearise import CORNERS, POINT, POSE
 from evermap.slam.space.local_filter import SpatialFrame
 from evermap.slam.space.problem import USUAL, OdometryPath, SpatialNoise, SpatialProblem, Swing
@@ -56,7 +56,7 @@ class SpatialIntake:
 
     problem: SpatialProblem
     start_s: float
-    frames: Frames
+    frames: PathFrames
     used: IntArray
     landmark_id: IntArray
     warnings: tuple[str, ...]
@@ -498,7 +498,7 @@ def _has_clock_of_frames(odometry: SpatialOdometry | None, frame_s: FloatArray) 
     return bool(np.mean(off_s < SAME_S) > OF_FRAMES) if len(inside) else True
 
 
-def _frames(recording: SpatialRecording, seen_in: IntArray, moving: BoolArray) -> Frames:
+def _frames(recording: SpatialRecording, seen_in: IntArray, moving: BoolArray) -> PathFrames:
     """Return the frames of the trajectory: those `seen_in`, or with odometry all during it (F,).
 
     A pose have those with a detection or another measurement, and the ends.
@@ -509,7 +509,7 @@ def _frames(recording: SpatialRecording, seen_in: IntArray, moving: BoolArray) -
         row = np.flatnonzero(moving)
         looked = np.union1d(seen_in, recording.detections.frame[moving[recording.detections.frame]])
         posed = np.searchsorted(row, np.union1d(frames_with_pose(recording, looked, moving), row[[0, -1]]))
-    return Frames(row, stamp_s[row] - stamp_s[row[0]], _driven(recording, stamp_s[row]), posed)
+    return PathFrames(row, stamp_s[row] - stamp_s[row[0]], _driven(recording, stamp_s[row]), posed)
 
 
 def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> FloatArray:

@@ -103,7 +103,7 @@ class Swing(NamedTuple):
         return self._replace(lever_m=factor * self.lever_m, arm_m2=factor**2 * self.arm_m2)
 
     def variance(self, noise: SpatialNoise) -> FloatArray:
-        """Return (K, 6) variances for a unit of time: of translations along the axes given the rotation, and of that."""
+        """Return (K, 6) variances for a unit of time: of translations along the axes, given the rotation; of that."""
         turns = noise.rotation**2
         along = noise.translation**2 + turns * self.arm_m2
         return np.hstack([along, np.full_like(along, turns)])
