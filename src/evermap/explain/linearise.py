@@ -196,6 +196,7 @@ def _with_measurements(problem: SpatialProblem, intake: SpatialIntake) -> Spatia
     path = None if other.path is None else other.path._replace(pose=se3.scaled(other.path.pose, longer))
     found = replace(
         problem, stamp_s=other.stamp_s, increment=se3.scaled(other.increment, longer),
+        swing=other.swing.scaled(longer),
         measured=se3.scaled(other.measured, shorter), measured_root=other.measured_root / shorter,
         corner=other.corner, corner_root=other.corner_root, half_m=other.half_m * shorter, mount=other.mount, path=path,
         range_error=np.zeros_like(problem.range_error),

@@ -51,8 +51,10 @@ def normalised(pose: ArrayLike) -> FloatArray:
 def _normalise(pose: FloatArray) -> FloatArray:
     """Normalise in place."""
     quaternion = pose[..., 3:]
-    # whichever of qw, qz, qy, qx is the first that is not zero outweighs all that follow
-    backwards = np.sign(quaternion) @ [1.0, 2.0, 4.0, 8.0] < 0.0
+    scalar = quaternion[..., 3]
+    backwards = scalar < 0.0
+    if not np.all(scalar):  # whichever of qw, qz, qy, qx is the first that is not zero outweighs all that follow
+        backwards = np.sign(quaternion) @ [1.0, 2.0, 4.0, 8.0] < 0.0
     length = np.sqrt(_dot(quaternion, quaternion))
     quaternion /= np.where(backwards[..., None], -length, length)
     return pose

@@ -85,7 +85,7 @@ def prepare(
     stamps = recording.frames.stamp_s
     usable, moving, warnings = usable_detections(recording, remarks)
     used, seen_in = np.flatnonzero(usable), frames_of_usable(recording, usable, fewest=2)
-    pose_frame, landmark_id = _frames_with_pose(recording, seen_in, moving), landmark_ids(recording, used)
+    pose_frame, landmark_id = frames_with_pose(recording, seen_in, moving), landmark_ids(recording, used)
     start_s = float(odometry_s[0])
     tied, left_out = tie_measurements(
         recording.measurements, stamps[pose_frame], partial(_driven, drive, start_s), landmark_id
@@ -155,7 +155,7 @@ def landmark_ids(recording: AnyRecording, used: IntArray) -> IntArray:
     return np.unique(np.concatenate([recording.detections.landmark_id[used], *measured]))
 
 
-def _frames_with_pose(recording: Recording, seen_in: IntArray, moving: BoolArray) -> IntArray:
+def frames_with_pose(recording: AnyRecording, seen_in: IntArray, moving: BoolArray) -> IntArray:
     """Return rows of the frames that get a pose: those `seen_in`, and the last before each other measurement."""
     stamps, instants = recording.frames.stamp_s, [np.zeros(0)]
     for table in recording.measurements:

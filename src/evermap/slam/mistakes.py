@@ -525,6 +525,7 @@ class SpatialPairs:
         assert recording.odometry is not None
         detections, self._odometry = recording.detections, recording.odometry
         self._tracks = dict[tuple[object, ...], FloatArray]()
+        self._punctual = dict[tuple[object, ...], FloatArray]()
         mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])
         stamp_s = recording.frames.stamp_s[detections.frame]
         self._stamp_s = stamp_s[first], stamp_s[second]
@@ -537,6 +538,7 @@ class SpatialPairs:
     def among(self, rows: slice) -> Self:
         """Return some of the pairs."""
         part = copy(self)
+        part._punctual = {}
         part._stamp_s = self._stamp_s[0][rows], self._stamp_s[1][rows]
         part._mount = self._mount[0][rows], self._mount[1][rows]
         part._seen = self._seen[0][rows], self._seen[1][rows]
@@ -581,6 +583,10 @@ class SpatialPairs:
                 self._tracks[way] = read_drive(CONVENTIONS[poses](self._odometry.pose_world_robot), *drive)
             pose = self._tracks[way]
             delay_s, which = np.unique([mistakes[row].delay_s for row in rows], return_inverse=True)
+            is_punctual = not delay_s.any()  # as most are that are asked, one after the other
+            if is_punctual and way in self._punctual:
+                motion[rows] = self._punctual[way]
+                continue
             start, stop = (
                 se3.compose(
                     se3.interpolate(stamp_s, pose, (one_s + delay_s[:, None]).ravel()).reshape(len(delay_s), -1, 7),
@@ -588,7 +594,10 @@ class SpatialPairs:
                 )
                 for one_s, mount in zip(self._stamp_s, self._mount, strict=True)
             )
-            motion[rows] = se3.between(stop, start)[which]
+            found = se3.between(stop, start)
+            motion[rows] = found[which]
+            if is_punctual:
+                self._punctual[way] = found[0]
         return motion
 
 

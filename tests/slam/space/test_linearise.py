@@ -134,10 +134,12 @@ def test_jacobians_of_odometry_are_those_of_differences():
     pose = se3.exp(random.normal(0.0, 0.5, (2, 6)))
     increment = se3.retract(se3.between(pose[:1], pose[1:]), random.normal(0.0, 0.1, (1, 6)))
     sigma = random.uniform(0.1, 0.5, (1, 6))
+    axes = np.ascontiguousarray(se3.rotation_of(se3.exp(random.normal(0.0, 1.0, (1, 6)))))
+    swing = np.full(1, 3), random.normal(0.0, 1.0, (1, 3)), axes
 
     def at(both, log_scale=0.1):
         values, weight = np.zeros(84), np.zeros(1)
-        linearise_odometry(both, increment, log_scale, sigma, 1e9, False, values, weight)
+        linearise_odometry(both, increment, log_scale, *swing, sigma, 1e9, False, values, weight)
         return values.reshape(6, 14)
 
     block = at(pose)

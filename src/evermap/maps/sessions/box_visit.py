@@ -202,15 +202,13 @@ class BoxVisit(SpatialVisit):
 
     def _detected(self) -> tuple[IntArray, FloatArray]:
         """Rows (N,) of boxes in frames that have a pose, and (N, 3) where they are."""
-        recording, problem = self.taken.recording, self.optimum.smoother.problem
+        recording, frames = self.taken.recording, self.intake.frames
         row_of = np.full(len(recording.frames), -1)
-        row_of[self.intake.pose_frame] = np.arange(len(problem.stamp_s))
+        row_of[frames.row] = np.arange(len(frames.row))
         rows = boxes_of(recording)
         rows = rows[row_of[recording.detections.frame[rows]] >= 0]
         seen = self.taken.gauge.range_scale * recording.detections.position_sensor_m[rows]
-        eye = se3.compose(
-            self.optimum.estimate.pose[row_of[recording.detections.frame[rows]]], mounts_of(recording)[rows]
-        )
+        eye = se3.compose(self.path[row_of[recording.detections.frame[rows]]], mounts_of(recording)[rows])
         return rows, se3.transform(eye, seen)
 
     def _glimpsed(

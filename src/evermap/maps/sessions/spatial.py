@@ -28,6 +28,7 @@ from evermap.sensing import learned
 from evermap.sensing.profile import Assumed, Field, Projection
 from evermap.sensing.visibility import LooksAt
 from evermap.slam.space.against_map import by_itself
+from evermap.slam.space.bridge import bridge
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.intake import SpatialIntake, most_of, prepare_space
 from evermap.slam.space.problem import ANY_RAD, PlacePrior
@@ -100,10 +101,20 @@ class SpatialVisit:
         found, placed = located(self.optimum.smoother.problem, self.optimum.now)
         return found, placed & ~self.solved.left
 
+    @functools.cached_property
+    def path(self) -> FloatArray:
+        """(F, 7) poses of all frames of the trajectory."""
+        return bridge(self.intake.frames, self.optimum.smoother.problem, self.optimum.estimate, self.optimum.noise)
+
     @property
     def path_m(self) -> FloatArray:
-        """(N, 3) of the poses of which it is known where they are."""
-        return self.optimum.estimate.pose[self.located[0], :3]
+        """(F, 3) of the poses of which it is known where they are."""
+        return self.path[self._located_frames, :3]
+
+    @property
+    def _located_frames(self) -> BoolArray:
+        """(F,) frames of which it is known where they are: all with odometry."""
+        return self.located[0][self.intake.frames.before]
 
     @property
     def inlier(self) -> FloatArray:
@@ -231,19 +242,19 @@ class SpatialVisit:
         self, entry: Extended, config: LivingConfig
     ) -> tuple[FloatArray, IntArray, FloatArray, tuple[IntArray, IntArray]]:
         """(V, 7) poses of sensors in the map, (V,) which, (V,) stamps; rows of looks and of places of hits."""
-        problem, optimum = self.optimum.smoother.problem, self.optimum
+        problem, optimum, frames = self.optimum.smoother.problem, self.optimum, self.intake.frames
         n_sensors = len(problem.mount)
-        view = problem.pose_row * n_sensors + problem.sensor
+        view = frames.posed[problem.pose_row] * n_sensors + problem.sensor
         views = np.unique(view)
         if n_sensors == 1 and problem.driven:  # it looked in every frame
-            views = np.arange(len(problem.stamp_s))
-        views = views[self.located[0][views // n_sensors]]
+            views = np.arange(len(frames.row))
+        views = views[self._located_frames[views // n_sensors]]
         row, sensor = views // n_sensors, views % n_sensors
-        eye = se3.compose(optimum.estimate.pose[row], optimum.estimate.mount(problem)[sensor])
+        eye = se3.compose(self.path[row], optimum.estimate.mount(problem)[sensor])
         place_of = entry.places_of(self.landmark_id)
         hit = np.flatnonzero((self.inlier >= config.fit.inlier) & (place_of[problem.place] >= 0) & np.isin(view, views))
         at = np.searchsorted(views, view[hit]), place_of[problem.place[hit]]
-        return eye, sensor, self.intake.start_s + problem.stamp_s[row], at
+        return eye, sensor, self.intake.start_s + frames.stamp_s[row], at
 
     def _model(
         self, sensor: int, position_m: FloatArray, rotation: FloatArray, pose: FloatArray, detected: BoolArray

@@ -50,7 +50,7 @@ from evermap.slam.association.revise import lying_together, may_be_of, most_prob
 from evermap.slam.space.estimate import as_seen, converged, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, prepare_space, without_range
 from evermap.slam.space.linearise import POINT, POSE
-from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem, Swing
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
 from evermap.types import UNKNOWN, AssociationEvidence, BoolArray, FloatArray, IntArray, SpatialRecording
 
@@ -612,7 +612,7 @@ def _thinned(intake: SpatialIntake) -> SpatialProblem:
     stamp_s = problem.stamp_s[kept]
     return replace(
         problem, stamp_s=stamp_s - stamp_s[0], increment=se3.between(pose[:-1], pose[1:]), lasted_s=np.diff(stamp_s),
-        pose_row=np.searchsorted(kept, problem.pose_row), path=None,
+        swing=Swing.none(len(pose) - 1), pose_row=np.searchsorted(kept, problem.pose_row), path=None,
     )  # fmt: skip
 
 

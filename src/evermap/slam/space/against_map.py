@@ -86,6 +86,10 @@ class Accuracy(NamedTuple):
     factor: float
     alike: float
 
+    def between(self, other: Accuracy) -> Accuracy:
+        """Return the accuracy halfway to another one."""
+        return Accuracy(float(np.sqrt(self.factor * other.factor)), 0.5 * (self.alike + other.alike))
+
 
 def compared(
     optimum: SpatialOptimum, stated: FloatArray, groups: tuple[MovedTogether, ...] = ()
@@ -99,16 +103,22 @@ def compared(
     """
     problem, shared, begun = optimum.smoother.problem, _measure_shared_errors(optimum), optimum.noise
 
-    def ask(accuracy: Accuracy) -> MapComparison:
-        found = _predict_places(optimum, accuracy.factor * stated, accuracy.alike**2 * shared)
+    def judge(found: MapComparison, accuracy: Accuracy) -> MapComparison:
+        found = _judged(problem, found, accuracy.factor * stated, accuracy.alike**2 * shared)
         for group in groups:  # other sets of changes are worlds of their own, not this one with half a map
             found.p_stands[group.members] = 0.0
         return replace(found, factor=accuracy.factor)
 
-    found = ask(Accuracy(1.0, 0.0))
+    found = judge(_predict_places(optimum), Accuracy(1.0, 0.0))
+    tried, is_held = list[Accuracy](), False
     for _ in range(ROUNDS):
-        accuracy = _accuracy(found, stated, shared, problem)
+        accuracy = tried[-1] if is_held else _accuracy(found, stated, shared, problem)
+        if accuracy in tried[:-1] and accuracy != tried[-1]:  # each of two makes the other the more probable
+            accuracy, is_held = accuracy.between(tried[-1]), True
+        tried.append(accuracy)
         sigma = accuracy.factor * stated
+        if shared.any():  # else the factor follows from what stands, and settles with it
+            found = judge(found, accuracy)
         weight = _believed(found, sigma, problem.prior.weight)
         back = bool(np.any((weight >= 0.5) & (problem.prior.weight < 0.5)))
         held = bool(np.any((found.p_stands < 0.5) & (weight >= 0.5)))
@@ -117,8 +127,9 @@ def compared(
         error = find_range_errors(optimum)
         held |= bool(np.any(np.abs(error - problem.range_error) > SETTLED_ERROR))
         problem = problem.with_range_error(error)
-        before, found = found, ask(accuracy)
-        if not held and np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED:
+        before, found = found, judge(_predict_places(optimum), accuracy)
+        decided = is_held and np.array_equal(found.p_stands < 0.5, before.p_stands < 0.5)
+        if not held and (decided or np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED):
             break
     for group in groups:
         found.p_stands[group.members] = 1.0 - group.probability
@@ -127,8 +138,9 @@ def compared(
 
 def has_contradictions(optimum: SpatialOptimum) -> bool:
     """Tell whether any place of the map seems to be elsewhere."""
-    prior = optimum.smoother.problem.prior
-    return bool((_predict_places(optimum, prior.sigma, np.zeros((len(prior.place), 6, 6))).p_stands < 0.5).any())
+    problem = optimum.smoother.problem
+    shared = np.zeros((len(problem.prior.place), 6, 6))
+    return bool((_judged(problem, _predict_places(optimum), problem.prior.sigma, shared).p_stands < 0.5).any())
 
 
 def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
@@ -156,21 +168,14 @@ def _measure_shared_errors(optimum: SpatialOptimum) -> FloatArray:
     return found
 
 
-def _predict_places(optimum: SpatialOptimum, sigma: FloatArray, shared: FloatArray) -> MapComparison:
-    """Predict every place from the others and the session.
-
-    Args:
-        optimum: of a problem with a prior map.
-        sigma: (K, 6) standard deviations of the map's places.
-        shared: (K, 6, 6) covariances of errors that all detections of a place have in common.
-    """
+def _predict_places(optimum: SpatialOptimum) -> MapComparison:
+    """Predict every place of the map from the others and the session; none is judged yet."""
     problem, prior = optimum.smoother.problem, optimum.smoother.problem.prior
-    settings = problem.settings.map
     optimum = _with_worth(optimum)
     spread = optimum.smoother.spread(optimum.now)
     misread = _log_misread(optimum)
     count, n = len(prior.place), len(problem.stamp_s)
-    p_stands, off, covariance = np.ones(count), np.zeros((count, 6)), np.zeros((count, 6, 6))
+    off, covariance = np.zeros((count, 6)), np.zeros((count, 6, 6))
     for k, place in enumerate(prior.place):
         own_place = optimum.estimate.place[place][None]
         mean = problem.off_map(np.array([k]), own_place, oriented=bool(problem.oriented[place]))[0]
@@ -179,13 +184,27 @@ def _predict_places(optimum: SpatialOptimum, sigma: FloatArray, shared: FloatArr
         # the map's own information on it is removed; the rest may be weak, but is positive
         values, vectors = np.linalg.eigh(own - np.diag(prior.weight[k] / prior.sigma[k, :dim] ** 2))
         alone = np.linalg.inv((vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T)
-        mean = alone @ (own @ mean)
+        off[k, :dim], covariance[k, :dim, :dim] = alone @ (own @ mean), alone
+    return MapComparison(np.ones(count), off, covariance, 1.0, misread=misread[prior.place])
+
+
+def _judged(problem: SpatialProblem, found: MapComparison, sigma: FloatArray, shared: FloatArray) -> MapComparison:
+    """Return predicted places with the probabilities that they stand.
+
+    Args:
+        problem: with a prior map.
+        found: the predictions.
+        sigma: (K, 6) standard deviations of the map's places.
+        shared: (K, 6, 6) covariances of errors that all detections of a place have in common.
+    """
+    settings, p_stands = problem.settings.map, np.ones(len(found.off))
+    for k, dim in enumerate(np.where(problem.oriented[problem.prior.place], 6, 3).tolist()):
+        mean, alone = found.off[k, :dim], found.covariance[k, :dim, :dim]
         wide = np.asarray(alone + np.diag(sigma[k, :dim] ** 2) + shared[k, :dim, :dim], dtype=np.float64)
-        stands, moved = np.logaddexp(_log_density(mean, wide), misread[place]), _log_moved(mean, wide, settings)
+        stands, moved = np.logaddexp(_log_density(mean, wide), found.misread[k]), _log_moved(mean, wide, settings)
         odds = moved - stands + np.log(settings.p_moved / (1.0 - settings.p_moved))
         p_stands[k] = 1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0)))
-        off[k, :dim], covariance[k, :dim, :dim] = mean, alone
-    return MapComparison(p_stands, off, covariance, 1.0, misread=misread[prior.place])
+    return replace(found, p_stands=p_stands)
 
 
 def _with_worth(optimum: SpatialOptimum) -> SpatialOptimum:

@@ -22,7 +22,7 @@ from evermap.geometry import se3
 from evermap.slam.calibration import priced
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.linearise import MOUNT, STATES
-from evermap.slam.space.problem import OdometryPath, SpatialEstimate, SpatialProblem
+from evermap.slam.space.problem import SpatialEstimate, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
 from evermap.types import BoolArray, FloatArray
 
@@ -32,8 +32,6 @@ LONGEST_S = 2.0
 """Time before and after an instant over which the velocity there is averaged, at most."""
 MOST_ROUNDS, SETTLED = 4, 0.75
 """Times that delays are freed, until the whole steps in them are right to within so many."""
-SAME_S, OF_FRAMES = 1e-5, 0.8
-"""Difference of stamps that are the same, and share of the odometry's that are a frame's from which all are."""
 USUAL = CalibrationConfig()
 
 
@@ -53,7 +51,7 @@ class Delays:
 def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]:
     """Return the optimum with the delays of the sensors' stamps; the same one where all are as stated."""
     problem, sigma_s = optimum.smoother.problem, optimum.smoother.problem.settings.delay_sigma_s
-    if problem.path is None or sigma_s == 0.0 or not problem.driven or _is_of_frames(problem, problem.path):
+    if problem.path is None or sigma_s == 0.0 or not problem.driven or problem.has_clock_of_frames:
         return optimum, None
     count, start, stated = len(problem.mount), optimum.estimate, optimum
     free = _freed(problem, optimum, np.full(count, sigma_s), np.zeros(count))
@@ -92,17 +90,6 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
         jitter = _jitter(smoother, now, 1.0 / (1.0 / variance + free.delay_jitter), sigma_s)
     sober = replace(free, delay_sigma_s=np.where(asked, narrow**-0.5, 0.0))
     return converged(sober, optimum.estimate, optimum.noise, heavy_rounds=0), found
-
-
-def _is_of_frames(problem: SpatialProblem, path: OdometryPath) -> bool:
-    """Tell whether the odometry has the stamps of the frames and hardly any others: it was made from these, as visual
-    odometry is, and has their clock.
-    """
-    stamp_s, own_s = problem.stamp_s, path.stamp_s[1:-1]
-    inside = own_s[(own_s >= stamp_s[0]) & (own_s <= stamp_s[-1])]
-    after = np.clip(np.searchsorted(stamp_s, inside), 1, len(stamp_s) - 1)
-    off_s = np.minimum(np.abs(stamp_s[after] - inside), np.abs(inside - stamp_s[after - 1]))
-    return bool(np.mean(off_s < SAME_S) > OF_FRAMES) if len(inside) else True
 
 
 def _freed(

@@ -45,6 +45,7 @@ class SpatialOptimum:
         estimate: the values.
         noise: the levels.
         smoother, now: what covariances are of.
+        sober: levels that covariances are of, where they are no better than other evidence has them; else None.
         fitted: the same as the values were found with, where covariances count errors that last; else None.
     """
 
@@ -53,6 +54,7 @@ class SpatialOptimum:
     smoother: SpatialSmoother
     now: SpatialLinear
     fitted: tuple[SpatialSmoother, SpatialLinear] | None = None
+    sober: SpatialNoise | None = None
 
 
 def converged(
@@ -103,9 +105,14 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
     # odometry: its whitened residuals are in the right sides of its rows, with the root of their weights
     block = now.values[: 6 * OF_STEP * n_steps].reshape(n_steps, 6, OF_STEP)
     if problem.driven and not problem.steady:  # how fast a robot may move is no noise that shows in how it did
-        for level, rows in ((TRANSLATION, slice(0, 3)), (ROTATION, slice(3, 6))):
-            numbers = 3.0 * float(now.odometry_weight.sum())
-            learn(level, float((block[:, rows, 13] ** 2).sum()), numbers, float(of_steps[:, rows].sum()))
+        swing, numbers = problem.swing, 3.0 * float(now.odometry_weight @ problem.swing.steps)
+        by_turns = noise.rotation**2 * swing.arm_m2 / swing.variance(noise)[:, :3]
+        for level, share in (
+            (TRANSLATION, np.hstack([1.0 - by_turns, np.zeros_like(by_turns)])),
+            (ROTATION, np.hstack([by_turns, np.ones_like(by_turns)])),
+        ):
+            unseen = numbers - float(now.odometry_weight @ share.sum(axis=1))  # of steps within an interval
+            learn(level, float((share * block[:, :, 13] ** 2).sum()), numbers, float((share * of_steps).sum()) + unseen)
     for level, some, rows in (
         (ACROSS, kind != CORNERS, slice(0, 2)),
         (ALONG, (kind != CORNERS) & ~problem.ray, slice(2, 3)),  # ranges that nobody measured fit

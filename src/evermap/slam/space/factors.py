@@ -10,7 +10,7 @@ from evermap.estimate.graph import Room
 from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se3
 from evermap.slam.space.linearise import ROWS, SpatialSightings, linearise_odometry, linearise_sightings
-from evermap.slam.space.problem import SpatialEstimate, SpatialProblem
+from evermap.slam.space.problem import SpatialEstimate, SpatialProblem, Swing
 from evermap.types import FloatArray, IntArray
 
 FACTORS_A_SLICE = 500
@@ -22,13 +22,15 @@ class SpatialOdometryFactors(NamedTuple):
 
     Attributes:
         increment: (N - 1, 7) measured motions.
-        sigma: (N - 1, 6) their standard deviations.
+        swing: of their noise.
+        sigma: (N - 1, 6) their standard deviations; see `Swing.variance`.
         log_odds: beyond which half of the squared residual makes a jump.
         heavy: tails that never let go.
         scale: the variable of the scale.
     """
 
     increment: FloatArray
+    swing: Swing
     sigma: FloatArray
     log_odds: float
     heavy: bool
@@ -58,6 +60,9 @@ class SpatialOdometryFactors(NamedTuple):
                 state.pose,
                 self.increment,
                 state.log_scale,
+                self.swing.steps,
+                self.swing.lever_m,
+                self.swing.axes,
                 self.sigma,
                 self.log_odds,
                 self.heavy,

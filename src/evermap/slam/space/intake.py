@@ -15,10 +15,11 @@ from evermap.geometry import se3
 from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries, Symmetry
-from evermap.slam.intake import frames_of_usable, landmark_ids, usable_detections
+from evermap.slam.intake import frames_of_usable, frames_with_pose, landmark_ids, usable_detections
+from evermap.slam.space.bridge import PathFrames
 from evermap.slam.space.linearise import CORNERS, POINT, POSE
 from evermap.slam.space.local_filter import SpatialFrame
-from evermap.slam.space.problem import USUAL, OdometryPath, SpatialNoise, SpatialProblem
+from evermap.slam.space.problem import USUAL, OdometryPath, SpatialNoise, SpatialProblem, Swing
 from evermap.types import (
     ANY_RANGE_M2,
     UNKNOWN,
@@ -31,6 +32,8 @@ from evermap.types import (
     rows_of,
 )
 
+SAME_S, OF_FRAMES = 1e-5, 0.8
+"""Difference of stamps that are the same, and share of the odometry's that are a frame's from which all are."""
 HARDLY = 1.0
 """Standard deviation with which it counts, as a share of the range: as good as nothing."""
 
@@ -42,10 +45,9 @@ class SpatialIntake:
     Attributes:
         problem: stamps count from `start_s`.
         start_s: stamp of the first pose.
-        pose_frame: (N,) rows of `Frames` that get a pose.
+        frames: those of the trajectory, of which some get a pose.
         used: (M,) rows of the detections that are used, in the order of the problem.
         landmark_id: (P,) ids behind the places.
-        driven_pose: (N, 7) poses by the odometry, from the identity; all identity without.
         warnings: what was left out, counted.
         names: texts behind landmark ids.
         boxes: (P,) landmarks that are boxes at rest.
@@ -54,14 +56,23 @@ class SpatialIntake:
 
     problem: SpatialProblem
     start_s: float
-    pose_frame: IntArray
+    frames: PathFrames
     used: IntArray
     landmark_id: IntArray
-    driven_pose: FloatArray
     warnings: tuple[str, ...]
     names: Mapping[int, str] = field(default_factory=dict)
     boxes: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     scale_in_map: float = 0.0
+
+    @property
+    def pose_frame(self) -> IntArray:
+        """Return (N,) rows of the recording's frames that get a pose."""
+        return self.frames.pose_frame
+
+    @property
+    def driven_pose(self) -> FloatArray:
+        """Return (N, 7) poses by the odometry, from the identity; all identity without."""
+        return self.frames.driven[self.frames.posed]
 
 
 def prepare_space(
@@ -91,14 +102,14 @@ def prepare_space(
     detections, stamps = recording.detections, recording.frames.stamp_s
     where, usable, moving, warnings = _said(recording, settings, remarks, coarse=coarse)
     seen_in = frames_of_usable(recording, usable, fewest=fewest)
-    pose_frame, used = seen_in if recording.odometry is None else np.flatnonzero(moving), np.flatnonzero(usable)
+    frames, used = _frames(recording, seen_in, moving), np.flatnonzero(usable)
+    pose_frame, path_s = frames.pose_frame, stamps[frames.row]
     landmark_id = landmark_ids(recording, used)
     place = np.searchsorted(landmark_id, detections.landmark_id[used])
     some = rows_of(where, used)
     symmetries = _symmetries(recording, place, used, some.kind, len(landmark_id))
     oriented = np.bincount(place, some.kind != POINT, minlength=len(landmark_id)) > 0.0
     driven, by_corners = recording.odometry is not None, 2 * np.count_nonzero(some.kind == CORNERS) > len(some.kind)
-    driven_pose, increment = _driven(recording, stamps[pose_frame])
     scale = scale_between(recording.sensors, settings, settings.scale_sigma if by_corners else 0.0)
     tied, left_out = tie_measurements(
         recording.measurements, stamps[pose_frame], partial(_moved, recording.odometry), landmark_id
@@ -106,8 +117,9 @@ def prepare_space(
     warnings.extend(left_out)
     problem = SpatialProblem(
         stamp_s=stamps[pose_frame] - stamps[pose_frame[0]],
-        increment=increment,
+        increment=se3.between(frames.driven[frames.posed[:-1]], frames.driven[frames.posed[1:]]),
         lasted_s=np.diff(stamps[pose_frame]) ** (1 if driven else 2),
+        swing=Swing.between(frames.posed, np.diff(path_s), frames.driven),
         driven=driven,
         pose_row=np.searchsorted(pose_frame, detections.frame[used]),
         place=place.astype(np.int64),
@@ -134,6 +146,7 @@ def prepare_space(
         scale_sigma=scale[0] if driven else 0.0,
         ranges_share=scale[1],
         path=_path(recording, stamps[pose_frame[0]], settings.delay_sigma_s),
+        has_clock_of_frames=_has_clock_of_frames(recording.odometry, path_s),
         measurements=tied,
         start_sigma=np.max([[1e-4] * 6, *(of.kind.first_sigma for of in tied)], axis=0),
         robust=robust,
@@ -141,7 +154,7 @@ def prepare_space(
         settings=settings,
     )
     return SpatialIntake(
-        problem, float(stamps[pose_frame[0]]), pose_frame, used, landmark_id, driven_pose, tuple(warnings),
+        problem, float(stamps[pose_frame[0]]), frames, used, landmark_id, tuple(warnings),
         recording.landmark_names,
         np.bincount(place, np.isfinite(detections.size_m[used]).all(axis=1), len(landmark_id)) > 0.0,
         settings.map.scale_sigma if driven and recording.sensors[0].sigma_odometer_scale is None else 0.0,
@@ -326,7 +339,7 @@ def _with_ranges(recording: SpatialRecording, where: _Where, usable: BoolArray, 
         blind[rays] = True
         return blind
     mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])
-    pose, _ = _driven(recording, recording.frames.stamp_s)
+    pose = _driven(recording, recording.frames.stamp_s)
     eye = se3.compose(pose[given.frame[rays]], mount[given.sensor[rays]])
     ahead = given.position_sensor_m[rays] / np.linalg.norm(given.position_sensor_m[rays], axis=1, keepdims=True)
     along = np.einsum("mij,mj->mi", se3.rotation_of(eye), ahead)
@@ -474,10 +487,35 @@ def _path(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -> 
     return OdometryPath(stamp_s, np.vstack([before, pose, after]))
 
 
-def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Poses (N, 7) by the odometry, from the identity, and motions (N - 1, 7) between them."""
-    odometry, count = recording.odometry, len(stamp_s)
+def _has_clock_of_frames(odometry: SpatialOdometry | None, frame_s: FloatArray) -> bool:
+    """Tell whether the odometry has the stamps of the frames (F,) and hardly any others."""
+    if odometry is None:
+        return False
+    own_s = odometry.stamp_s
+    inside = own_s[(own_s >= frame_s[0]) & (own_s <= frame_s[-1])]
+    after = np.clip(np.searchsorted(frame_s, inside), 1, len(frame_s) - 1)
+    off_s = np.minimum(np.abs(frame_s[after] - inside), np.abs(inside - frame_s[after - 1]))
+    return bool(np.mean(off_s < SAME_S) > OF_FRAMES) if len(inside) else True
+
+
+def _frames(recording: SpatialRecording, seen_in: IntArray, moving: BoolArray) -> PathFrames:
+    """Return the frames of the trajectory: those `seen_in`, or with odometry all during it (F,).
+
+    A pose have those with a detection or another measurement, and the ends.
+    """
+    stamp_s, row = recording.frames.stamp_s, seen_in
+    posed = np.arange(len(row))
+    if recording.odometry is not None:
+        row = np.flatnonzero(moving)
+        looked = np.union1d(seen_in, recording.detections.frame[moving[recording.detections.frame]])
+        posed = np.searchsorted(row, np.union1d(frames_with_pose(recording, looked, moving), row[[0, -1]]))
+    return PathFrames(row, stamp_s[row] - stamp_s[row[0]], _driven(recording, stamp_s[row]), posed)
+
+
+def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> FloatArray:
+    """Return poses (F, 7) by the odometry, from the identity."""
+    odometry = recording.odometry
     if odometry is None or len(odometry) < 2:
-        return se3.identity(count), se3.identity(count - 1)
+        return se3.identity(len(stamp_s))
     found = se3.interpolate(odometry.stamp_s, odometry.pose_world_robot, stamp_s)
-    return se3.between(found[0], found), se3.between(found[:-1], found[1:])
+    return se3.between(found[0], found)

@@ -81,8 +81,8 @@ class SpatialSightings(NamedTuple):
 
 @kernel
 def linearise_odometry(
-    pose: FloatArray, increment: FloatArray, log_scale: float, sigma: FloatArray, log_odds: float, heavy: bool,
-    values: FloatArray, weight: FloatArray,
+    pose: FloatArray, increment: FloatArray, log_scale: float, steps: IntArray, lever: FloatArray, axes: FloatArray,
+    sigma: FloatArray, log_odds: float, heavy: bool, values: FloatArray, weight: FloatArray,
 ) -> float:  # fmt: skip
     """Linearise the odometry between consecutive poses.
 
@@ -91,8 +91,11 @@ def linearise_odometry(
         increment: (N - 1, 7) measured motions.
         log_scale: logarithm of true over measured distances. It divides the true ones: multiplied by it, those that are
             measured would be found too long by their noise (errors in variables).
-        sigma: (N - 1, 6) their standard deviations.
-        log_odds: beyond which half of the squared residual makes a jump of the odometry.
+        steps: (N - 1,) of each; this, `lever` and `axes` are those of `Swing`.
+        lever: (N - 1, 3) of the rotation's noise.
+        axes: (N - 1, 3, 3) along which the translation's noise is independent.
+        sigma: (N - 1, 6) their standard deviations: of translations along the axes, given the rotation, and of this.
+        log_odds: beyond which half of the squared residual of a step makes a jump of the odometry.
         heavy: tails that never let go, while the estimate may be far off.
         values: filled in: 6 rows by two poses, the scale and the right side each.
         weight: (N - 1,) filled in.
@@ -114,11 +117,14 @@ def linearise_odometry(
             for b in range(3):
                 j1[a, b] *= shrunk
                 j2[a, b] *= shrunk
+        if steps[i] > 1:
+            _swung(lever[i], axes[i], e, j1, j2)
         squared = 0.0
         for a in range(6):
             squared += (e[a] / sigma[i, a]) ** 2
-        weight[i], loss = weigh(squared, log_odds, 6.0 * HEAVY_TAIL if heavy else 0.0, JUMP_SHARE)
-        cost += loss
+        # nothing says at which step of an interval an error was made: along the chain all share it alike
+        weight[i], loss = weigh(squared / steps[i], log_odds, 6.0 * HEAVY_TAIL if heavy else 0.0, JUMP_SHARE)
+        cost += steps[i] * loss
         for a in range(6):
             scale = math.sqrt(weight[i]) / sigma[i, a]
             for b in range(6):
@@ -129,6 +135,29 @@ def linearise_odometry(
             values[at + 13] = -scale * e[a]
             at += 14
     return cost
+
+
+@kernel
+def _swung(lever: FloatArray, axes: FloatArray, e: FloatArray, j1: FloatArray, j2: FloatArray) -> None:
+    """Replace translations of a residual (6,) and its Jacobians by what the rotation leaves of them, along axes."""
+    left = np.zeros(3)
+    for column in range(13):
+        for a in range(3):
+            b, c = (a + 1) % 3, (a + 2) % 3
+            if column < 6:
+                left[a] = j1[a, column] - lever[b] * j1[3 + c, column] + lever[c] * j1[3 + b, column]
+            elif column < 12:
+                left[a] = j2[a, column - 6] - lever[b] * j2[3 + c, column - 6] + lever[c] * j2[3 + b, column - 6]
+            else:
+                left[a] = e[a] - lever[b] * e[3 + c] + lever[c] * e[3 + b]
+        for a in range(3):
+            along = axes[0, a] * left[0] + axes[1, a] * left[1] + axes[2, a] * left[2]
+            if column < 6:
+                j1[a, column] = along
+            elif column < 12:
+                j2[a, column - 6] = along
+            else:
+                e[a] = along
 
 
 @kernel

@@ -30,9 +30,7 @@ from evermap.slam.space.linearise import (
     PIXEL,
     POINT,
     POSE,
-    ROTATION,
     ROWS,
-    TRANSLATION,
 )
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SIGHTINGS, SpatialLinear, SpatialSmoother
@@ -79,9 +77,9 @@ def log_marginal_likelihood(
     kept = now.odometry_weight > OUTLIER
     of_odometry = 0.5 * float((driven[kept] ** 2).sum())
     if problem.driven:
-        of_odometry += 3.0 * int(kept.sum()) * float(np.log(noise.levels[[TRANSLATION, ROTATION]]).sum())
-        jump = problem.settings.jump_log_odds + 3.0 * float(np.log(begun.levels[[TRANSLATION, ROTATION]]).sum())
-        of_odometry += float(np.count_nonzero(~kept)) * jump
+        of_odometry += 0.5 * float(np.log(problem.swing.variance(noise)[kept]).sum())
+        of_odometry += 0.5 * float(np.log(problem.swing.variance(begun)[~kept]).sum())
+        of_odometry += float(problem.swing.steps[~kept].sum()) * problem.settings.jump_log_odds
     priors = _cost_of_priors(smoother, now)
     counted = SpatialSmoother(replace(problem, share=new), optimum.estimate.pose)
     linear = counted.linearised(optimum.estimate, noise, heavy=False)

@@ -56,6 +56,59 @@ class SpatialNoise:
         return float(np.cbrt(self.across**2 * self.along))
 
 
+class Swing(NamedTuple):
+    """How the noise of the odometry's rotation, collected along K intervals, moves where these end.
+
+    What is turned by the noise of a step is turned about where the robot was then. Seen from an interval's end, the
+    noise of its rotation acts at a mean lever, and the variance of the levers about it adds to that of the translation.
+
+    Attributes:
+        steps: (K,) steps of each interval.
+        lever_m: (K, 3) mean position of their ends.
+        axes: (K, 3, 3) columns along which the translation's variances are independent, given the rotation.
+        arm_m2: (K, 3) variance of the translation along these for each unit of that of the rotation.
+    """
+
+    steps: IntArray
+    lever_m: FloatArray
+    axes: FloatArray
+    arm_m2: FloatArray
+
+    @classmethod
+    def none(cls, count: int) -> Swing:
+        """Return that of intervals of a single step each."""
+        axes = np.tile(np.eye(3), (count, 1, 1))
+        return cls(np.ones(count, dtype=np.int64), np.zeros((count, 3)), axes, np.zeros((count, 3)))
+
+    @classmethod
+    def between(cls, ends: IntArray, lasted_s: FloatArray, driven: FloatArray) -> Swing:
+        """Return that of the intervals between rows `ends` (K + 1,) of poses (F, 7) by the odometry, whose steps
+        (F - 1,) lasted so long.
+        """
+        step = np.arange(ends[0] + 1, ends[-1] + 1)
+        row, count = np.searchsorted(ends, step) - 1, len(ends) - 1
+        at = se3.between(driven[ends[1:]][row], driven[step])[:, :3]
+        share = np.maximum(lasted_s[step - 1], 1e-9)
+        share /= np.bincount(row, share, count)[row]
+        lever_m, about = np.zeros((count, 3)), np.zeros((count, 3, 3))
+        np.add.at(lever_m, row, share[:, None] * at)
+        off = at - lever_m[row]
+        np.add.at(about, row, share[:, None, None] * off[:, :, None] * off[:, None, :])
+        size, axes = np.linalg.eigh(about)
+        arm_m2 = np.maximum(size.sum(axis=1, keepdims=True) - size, 0.0)
+        return cls(np.diff(ends), lever_m, axes, arm_m2)
+
+    def scaled(self, factor: float) -> Swing:
+        """Return that of odometry with all lengths times a factor."""
+        return self._replace(lever_m=factor * self.lever_m, arm_m2=factor**2 * self.arm_m2)
+
+    def variance(self, noise: SpatialNoise) -> FloatArray:
+        """Return (K, 6) variances for a unit of time: of translations along the axes, given the rotation; of that."""
+        turns = noise.rotation**2
+        along = noise.translation**2 + turns * self.arm_m2
+        return np.hstack([along, np.full_like(along, turns)])
+
+
 @dataclass(frozen=True, slots=True)
 class PlacePrior:
     """Prior of some places from a given map.
@@ -134,6 +187,7 @@ class SpatialProblem:
         increment: (N - 1, 7) motion by the odometry; identity where there is none.
         lasted_s: (N - 1,) what its variance grows with: the time; without odometry the time squared, at a speed of
             which nothing is known but its size.
+        swing: of the odometry's noise between the poses.
         driven: True if there is odometry.
         steady: True where the noise of that is not learned, but held where it starts.
         pose_row, place, sensor, kind: (M,) which pose saw which place how; sorted by pose.
@@ -159,6 +213,7 @@ class SpatialProblem:
         prior: on places.
         start_sigma: (6,) how firmly the first pose is held where it is.
         path: the odometry, in the time of the poses, from which delays are estimated; None without.
+        has_clock_of_frames: whether the odometry was made of the frames, as visual odometry is, and has their clock.
         velocity_s: time before and after an instant over which its velocity is averaged.
         whole_s: (S,) what of each delay are whole steps of the odometry; see `OdometryPath`.
         delay_jitter: (S,) information that detections seem to hold on the rest of each delay, since the velocity
@@ -172,6 +227,7 @@ class SpatialProblem:
     stamp_s: FloatArray
     increment: FloatArray
     lasted_s: FloatArray
+    swing: Swing
     driven: bool
     pose_row: IntArray
     place: IntArray
@@ -201,6 +257,7 @@ class SpatialProblem:
     range_error: FloatArray = field(default_factory=lambda: np.zeros(0))
     start_sigma: FloatArray = field(default_factory=lambda: np.full(6, 1e-4))
     path: OdometryPath | None = None
+    has_clock_of_frames: bool = False
     velocity_s: float = 1.0
     whole_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     delay_jitter: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -323,6 +380,7 @@ class SpatialProblem:
             measured_root=self.measured_root / shorter,
             half_m=self.half_m * shorter,
             increment=se3.scaled(self.increment, longer),
+            swing=self.swing.scaled(longer),
             path=path,
             ranges_log=ranges,
             odometry_log=driven,

@@ -14,6 +14,7 @@ from evermap.estimate.measurement import frame_of
 from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.calibration import OF_SCALE
+from evermap.slam.space.bridge import bridge, bridge_covariance
 from evermap.slam.space.intake import SpatialIntake, most_of, start_noise
 from evermap.slam.space.linearise import (
     ACROSS,
@@ -107,10 +108,9 @@ def concluded_in_space(
     twice = [called[k] for k in np.flatnonzero((solved.number > 1) & seen & placed)]
     if twice:
         warnings.append(f"identities on several landmarks, distinguished by their places: {', '.join(twice)}")
-    rough = np.repeat(solved.online_spread**2, 3, axis=1)[:, :, None] * np.eye(6)
     return SlamResult(
-        trajectory=_path(told, optimum.estimate.pose[found], _of_poses(told)[found], found),
-        online=_path(told, solved.online_pose, rough),
+        trajectory=_trajectory(told, found),
+        online=_online(told),
         landmarks=_landmarks(told, identities, names),
         parameters=_parameters(told),
         innovations=_innovations(told, identities),
@@ -123,13 +123,23 @@ def concluded_in_space(
     )
 
 
-def _of_poses(told: _Told) -> FloatArray:
-    """Return (N, 6, 6) covariances of poses, with what is not known of the metre."""
-    pose = told.solved.optimum.estimate.pose
-    covariance = told.spread.own[: 36 * len(pose)].reshape(-1, 6, 6).copy()
+def _trajectory(told: _Told, found: BoolArray) -> Trajectory:
+    """Return the poses of all frames, or of those that are found among (N,), with what is not known of the metre."""
+    frames, problem, optimum = told.intake.frames, told.problem, told.solved.optimum
+    # the mean is that of the fit, the covariance counts errors that last
+    pose = bridge(frames, problem, optimum.estimate, optimum.noise)
+    noise, weight = optimum.sober or optimum.noise, optimum.now.odometry_weight
+    covariance = bridge_covariance(frames, problem, optimum.estimate, noise, weight, told.spread)
     away = np.einsum("nji,nj->ni", se3.rotation_of(pose), pose[:, :3])
     covariance[:, :3, :3] += _undivided(told) ** 2 * away[:, :, None] * away[:, None, :]
-    return covariance
+    of = slice(None) if problem.driven else found
+    return _path(told, pose, covariance, of)
+
+
+def _online(told: _Told) -> Trajectory:
+    """Return the newest pose of each frame as it was known then, and roughly how far off that may be."""
+    rough = np.repeat(told.solved.online_spread**2, 3, axis=1)[:, :, None] * np.eye(6)
+    return _path(told, told.solved.online_pose, rough)
 
 
 def numbered(name: str | int, number: int) -> str:
@@ -354,14 +364,15 @@ def _innovations(told: _Told, identities: IntArray) -> Innovations:
 
 def _dead_reckoning(told: _Told) -> Trajectory:
     """Odometry alone from the first pose; nothing without."""
-    pose = told.solved.optimum.estimate.pose
-    count = len(pose) if told.problem.driven else 0
-    return _path(told, se3.compose(pose[:1], told.intake.driven_pose[:count]), np.zeros((count, 6, 6)), slice(count))
+    first = told.solved.optimum.estimate.pose[:1]
+    count = len(told.intake.frames.row) if told.problem.driven else 0
+    return _path(told, se3.compose(first, told.intake.frames.driven), np.zeros((count, 6, 6)), slice(count))
 
 
 def _path(told: _Told, pose: FloatArray, covariance: FloatArray, of: BoolArray | slice = slice(None)) -> Trajectory:
-    """Poses at some of the stamps."""
-    return Trajectory(told.stamp_s[of], pose, covariance, frame=told.frame, clock=told.recording.clock)
+    """Poses of some of the frames."""
+    stamp_s = told.intake.start_s + told.intake.frames.stamp_s
+    return Trajectory(stamp_s[of], pose[of], covariance[of], frame=told.frame, clock=told.recording.clock)
 
 
 def _change_within(told: _Told, move: MovedWithin, identities: IntArray) -> MapChange:

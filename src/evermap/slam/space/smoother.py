@@ -319,14 +319,14 @@ class SpatialSmoother:
         n, count = len(problem.stamp_s), len(problem.oriented)
         sensor = n + count
         root = np.sqrt(np.maximum(problem.lasted_s, 1e-3))
-        sigma = np.repeat(np.column_stack([noise.translation * root, noise.rotation * root]), 3, axis=1)
+        sigma = np.sqrt(problem.swing.variance(noise)) * root[:, None]
         jump = problem.settings.jump_log_odds if problem.driven and problem.robust else NO_JUMP_LOG_ODDS
         heavy = heavy and problem.robust
         first_seen = np.zeros(count, dtype=np.int64)
         first_seen[problem.place[::-1]] = problem.pose_row[::-1]
         prior = problem.prior.place
         return (
-            SpatialOdometryFactors(problem.increment, sigma, jump, heavy, sensor + len(problem.mount)),
+            SpatialOdometryFactors(problem.increment, problem.swing, sigma, jump, heavy, sensor + len(problem.mount)),
             SightingFactors(problem, self._seen, noise.levels, heavy, n, sensor),
             SpatialStartFactor(self._start, problem.start_sigma),
             MapFactors(problem, n + prior, first_seen[prior]),

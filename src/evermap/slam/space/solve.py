@@ -80,9 +80,9 @@ class SpatialSolved:
         number: (P,) which of the landmarks with that identity each is, from 1.
         from_map: what of the given map stands; None without a map.
         delays: how well it is known how late each sensor's stamps are; None where they are trusted.
-        online_pose: (N, 7) poses as each frame had them.
-        online_spread: (N, 2) roughly how far off these may be [m, rad].
-        step_s: (N,) seconds that each frame took.
+        online_pose: (F, 7) poses as each frame had them, also of frames without a pose in the problem.
+        online_spread: (F, 2) roughly how far off these may be [m, rad].
+        step_s: (F,) seconds that each frame took.
         moves: landmarks that moved during the session.
     """
 
@@ -127,7 +127,9 @@ def solve_space(
     known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
     scale_in_map = intake.scale_in_map if len(stated) and problem.scale_sigma == 0.0 else 0.0
     problem, noise, drift, counted = _with_drift(problem, noise, intake.driven_pose, in_map=scale_in_map > 0.0)
-    stepwise, spread, step_s = incremental(problem, noise, known, place, progress)
+    stepwise, unsure_s, step_s = incremental(problem, noise, known, place, progress)
+    frames = intake.frames
+    online = frames.lead_on(stepwise.pose), _rough_spread(frames.since(unsure_s), noise), frames.share_out(step_s)
     estimate, of_points = stepwise, 2 * np.count_nonzero(problem.kind == POINT) > len(problem.kind)
     if problem.driven:
         whole = _along(problem, intake.driven_pose, known, place)
@@ -166,12 +168,12 @@ def solve_space(
     now = smoother.linearised(optimum.estimate, sober, heavy=False)
     fitted = optimum.smoother, optimum.now
     optimum = replace(
-        optimum, smoother=smoother, now=now, fitted=fitted
+        optimum, smoother=smoother, now=now, fitted=fitted, sober=sober
     )  # for covariances, which are no better than all this
     number, from_map = times_of(identity), explanation.from_map
     for move in reversed(explanation.moves):  # the landmark is where it was last
         number[[move.before, move.after]] = min(number[move.before], number[move.after])
-    return SpatialSolved(optimum, identity, number, from_map, delays, stepwise.pose, spread, step_s, explanation.moves)
+    return SpatialSolved(optimum, identity, number, from_map, delays, *online, explanation.moves)
 
 
 def fit_to_map(intake: SpatialIntake, prior_map: Landmarks | None, *, surveyed: bool = False) -> SpatialIntake:
@@ -472,7 +474,8 @@ def _whole(problem: SpatialProblem, driven: FloatArray, known: BoolArray, place:
 def incremental(
     problem: SpatialProblem, noise: SpatialNoise, known: BoolArray, place: FloatArray, progress: Progress | None = None
 ) -> tuple[SpatialEstimate, FloatArray, FloatArray]:
-    """Return poses and places, one frame after the other; their spread (N, 2) [m, rad]; seconds (N,) of each frame.
+    """Return poses and places, one frame after the other; seconds (N,) since poses were known; seconds (N,) that each
+    frame took.
 
     Args:
         problem: the measurements.
@@ -528,9 +531,13 @@ def incremental(
         if progress is not None:
             progress(float(problem.stamp_s[row]), float(problem.stamp_s[-1]))
     place[~problem.oriented, 3:] = se3.NO_TURN
+    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), STATES))), unsure_s, step_s
+
+
+def _rough_spread(unsure_s: FloatArray, noise: SpatialNoise) -> FloatArray:
+    """Return roughly how far off poses may be (F, 2) [m, rad], so long after they were known (F,)."""
     went_s = np.sqrt(unsure_s)
-    spread = np.column_stack([SLACK_M + noise.translation * went_s, SLACK_RAD + noise.rotation * went_s])
-    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), STATES))), spread, step_s
+    return np.column_stack([SLACK_M + noise.translation * went_s, SLACK_RAD + noise.rotation * went_s])
 
 
 def _sigma_m(root: FloatArray) -> FloatArray:

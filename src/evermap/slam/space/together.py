@@ -269,13 +269,15 @@ class SpatialTogether:
         """Return what each robot has of the solution, with covariances by all."""
         graph = Graph(self._blocks(noise, heavy=False), self.structure, self._border, self._held, self._retract)
         factorised = exhausted(graph.factorised(solution.now))
-        spread = exhausted(factorised.spread())
+        steps = np.cumsum([0, *(len(robot.problem.increment) for robot in self.robots)]).tolist()
+        spread = exhausted(factorised.spread(steps[-1]))
         found, count = [], len(self.robots)
         for r, robot in enumerate(self.robots):
             blocks = [k for kind in (ODOMETRY, SIGHTINGS) for k in [kind * count + r]]
             values = np.concatenate([solution.now.values[self.structure.values_of(k)] for k in blocks])
             weights = tuple(solution.now.weights[k] for k in blocks)
-            robot.learn(factorised, spread, self.variable[r], [self.structure.first[k : k + 2] for k in blocks])
+            factors = [self.structure.first[k : k + 2] for k in blocks]
+            robot.learn(factorised, spread, self.variable[r], factors, spread.pairs[steps[r] : steps[r + 1]])
             own = Linear(values, weights, solution.now.cost, np.zeros(0))
             found.append(SpatialOptimum(self.own(solution.state, r), noise[r], robot, SpatialLinear(own, robot)))
         return found
@@ -320,9 +322,16 @@ class _Member(SpatialSmoother):
     """A robot among others: its covariances are those by all."""
 
     def learn(
-        self, factorised: Factorised, spread: Spread, variable: IntArray, factors: Sequence[tuple[int, ...]]
+        self,
+        factorised: Factorised,
+        spread: Spread,
+        variable: IntArray,
+        factors: Sequence[tuple[int, ...]],
+        pairs: FloatArray,
     ) -> None:
-        """Take what it has of the solution of all, by its own variables and the ranges of its factors."""
+        """Take what it has of the solution of all, by its own variables, the ranges of its factors, and covariances
+        `pairs` (N - 1, 6, 6) of consecutive poses.
+        """
         self._joint, self._variable = factorised, variable
         first = spread.own_first
         own = np.concatenate([spread.own[first[k] : first[k + 1]] for k in variable.tolist()])
@@ -330,11 +339,15 @@ class _Member(SpatialSmoother):
         at = spread.of_factors_first
         of_factors = np.concatenate([spread.of_factors[at[low] : at[high]] for low, high in factors])
         sizes = np.concatenate([np.diff(at[low : high + 1]) for low, high in factors])
+        tree, n = factorised.system.tree, len(self.problem.stamp_s)
+        scale = spread.with_border[:, tree.in_border[variable[-1]]]
+        with_scale = np.append(scale[tree.begin[variable[0]] :][: 6 * n], scale[tree.begin[variable[-1]]])[:, None]
         nothing = np.zeros((0, 0))
-        self._spread = Spread(own, own_first, nothing, of_factors, np.append(0, np.cumsum(sizes)), nothing, nothing)
+        of_first = np.append(0, np.cumsum(sizes))
+        self._spread = Spread(own, own_first, with_scale, of_factors, of_first, pairs, nothing)
 
     def spread(self, now: SpatialLinear, *, nearly: bool = False) -> Spread:  # noqa: ARG002
-        """Return covariances of its variables, and of what its odometry and detections tie."""
+        """Return covariances of its variables, of poses with its scale, and of what its odometry and detections tie."""
         return self._spread
 
     def factorised(self, now: SpatialLinear) -> Factorised:  # noqa: ARG002
