@@ -48,6 +48,8 @@ WITH_BEARINGS = 0.5
 """Share of the detections without a bearing from which ranges alone must say what is wrong."""
 DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL, DISTORTION = 0.5, 0.2, 0.3, 0.1, 0.2
 """Standard deviations of a delay, of a mount's position and turn, of the logarithm of a focal length, and of k1."""
+CLOCK_RATE = 0.01
+"""Standard deviation of how much faster one clock runs than another, where they do at all."""
 LITTLE = 0.1
 """Standard deviations beforehand within which a state is as is usual of sensors: 2 cm of a mount, 50 ms of a clock."""
 
@@ -302,6 +304,15 @@ def _turn_by(inputs: Inputs, factor: float) -> Inputs:
     step = se3.log(se3.between(path.pose_world_robot[:-1], path.pose_world_robot[1:]))
     step[:, 3:] *= factor
     return _with_poses(inputs, np.asarray(se3.compose(path.pose_world_robot[:1], accumulate(se3.exp(step)))))
+
+
+def stretch_stamps(inputs: Inputs, state: float) -> Inputs:
+    """Return the same with the frames at the times of a clock that is slower by this share; half of the drive stays."""
+    recording: Any = inputs.recording
+    stamp_s = recording.frames.stamp_s
+    middle_s = 0.5 * (stamp_s[0] + stamp_s[-1])
+    frames = replace(recording.frames, stamp_s=stamp_s - state * (stamp_s - middle_s))
+    return replace(inputs, recording=replace(recording, frames=frames))
 
 
 def _shift_stamps(inputs: Inputs, state: float) -> Inputs:
