@@ -213,9 +213,9 @@ def _count_adrift(optimum: Optimum, pose_row: IntArray) -> int:
 def _list_calibrations(inputs: Inputs) -> Iterable[Suspect]:
     """Yield all that may be off of a sensor as a whole, of the odometry and of the map."""
     recording = inputs.recording
-    for suspect in list_suspects(inputs):
+    for suspect in list_suspects(inputs, discrete=False):
         of_all = suspect.rows is None or suspect.rows[0] != "id"
-        if suspect.is_continuous and of_all and (is_in_space(recording) or suspect.code not in OF_LENGTHS):
+        if of_all and (is_in_space(recording) or suspect.code not in OF_LENGTHS):
             yield suspect
     if recording.odometry is not None:
         yield DRIFT
