@@ -145,6 +145,18 @@ def test_clocks_that_drift_apart_are_suspected(kind: str, faster: float) -> None
     assert f"{'fast' if faster > 0.0 else 'slow'} of that of the odometry" in verdict.message
 
 
+@pytest.mark.parametrize("kind", ["plane", "corners"])
+def test_clocks_are_asked_where_frames_begin_and_end_with_the_odometry(kind: str) -> None:
+    world = World(seed=1, seconds=20.0)
+    recording: Any = world.plane() if kind == "plane" else world.space()
+    driven, frame_s = recording.odometry, recording.frames.stamp_s
+    driven = driven[np.flatnonzero((driven.stamp_s > frame_s[0] - 0.01) & (driven.stamp_s < frame_s[-1] + 0.01))]
+    stamp_s = np.concatenate([frame_s[:1], driven.stamp_s[1:-1], frame_s[-1:]])
+    found = scored(replace(recording, odometry=replace(driven, stamp_s=stamp_s)), None)
+    assert {"clock", "clock-drift"} <= {one.suspect.code for one in found.calibrations}
+    assert found.suspected is None
+
+
 def test_lengths_in_space_are_asked() -> None:
     """Tags are larger than stated, and only the odometry says so."""
     world = World(seed=1, longer=1.05)
