@@ -18,11 +18,11 @@ from evermap.slam.intake import prepare
 from evermap.slam.problem import Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.intake import SpatialIntake, prepare_space
+from evermap.slam.space.intake import SpatialIntake, drive_between, lead_on, prepare_space
 from evermap.slam.space.problem import PlacePrior, SpatialProblem
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.solve import fit_to_map
-from evermap.types import FloatArray, IntArray, Landmarks, is_in_space
+from evermap.types import FloatArray, IntArray, Landmarks, SpatialOdometry, SpatialRecording, is_in_space
 
 STEP, FINE_STEP = 0.02, 1e-4
 """Steps of a state, as shares of its standard deviation beforehand: one as long as noise, which says how far it is to a
@@ -174,12 +174,13 @@ def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> Spat
     if undone.prior_map is not inputs.prior_map and undone.prior_map is not None:
         prior = _prior_from(prior, undone.prior_map, before.landmark_id[session.solved.identity])
     one, other = inputs.recording, undone.recording
-    if other.detections is one.detections and other.odometry is one.odometry and other.frames is one.frames:
-        lens = [
-            [(each.intrinsics, each.distortion, each.distortion_model) for each in of.sensors] for of in (one, other)
-        ]
-        if lens[0] == lens[1]:  # but for mounts all is as it was
-            return replace(problem, prior=prior, mount=np.array([each.mount_robot_sensor for each in other.sensors]))
+    lens = [[(each.intrinsics, each.distortion, each.distortion_model) for each in of.sensors] for of in (one, other)]
+    if other.detections is one.detections and lens[0] == lens[1]:  # but for mounts and motions all is as it was
+        problem = replace(problem, prior=prior, mount=np.array([each.mount_robot_sensor for each in other.sensors]))
+        if other.odometry is one.odometry and other.frames is one.frames:
+            return problem
+        if other.odometry is not None:
+            return _with_motions(problem, other, other.odometry, before.pose_frame)
     intake = prepare_space(
         undone.recording, problem.settings, robust=problem.robust, estimate_noise=problem.estimate_noise, coarse=True
     )  # of tags in an image the residuals are those of the corners
@@ -245,6 +246,22 @@ def solve_nearby(session: AnySession, inputs: Inputs, undone: Inputs) -> Spatial
         return None
     optimum = SpatialOptimum(estimate, solved.noise, smoother, now)
     return SpatialSession(session.intake, replace(session.solved, optimum=optimum))
+
+
+def _with_motions(
+    problem: SpatialProblem, recording: SpatialRecording, driven: SpatialOdometry, pose_frame: IntArray
+) -> SpatialProblem | None:
+    """Return a problem with the odometry, and at the instants, of a recording; None if other frames have poses."""
+    stamp_s = recording.frames.stamp_s
+    during = (stamp_s >= driven.stamp_s[0]) & (stamp_s <= driven.stamp_s[-1])
+    if not np.array_equal(np.flatnonzero(during), pose_frame):
+        return None
+    at_s, longer = stamp_s[pose_frame], float(np.exp(problem.odometry_log))
+    path = lead_on(recording, at_s[0], problem.settings.delay_sigma_s)
+    return replace(
+        problem, stamp_s=at_s - at_s[0], increment=se3.scaled(drive_between(recording, at_s)[1], longer),
+        path=None if path is None else path._replace(pose=se3.scaled(path.pose, longer)),
+    )  # fmt: skip
 
 
 def _with_measurements(problem: SpatialProblem, intake: SpatialIntake) -> SpatialProblem:

@@ -98,7 +98,7 @@ def prepare_space(
     symmetries = _symmetries(recording, place, used, some.kind, len(landmark_id))
     oriented = np.bincount(place, some.kind != POINT, minlength=len(landmark_id)) > 0.0
     driven, by_corners = recording.odometry is not None, 2 * np.count_nonzero(some.kind == CORNERS) > len(some.kind)
-    driven_pose, increment = _driven(recording, stamps[pose_frame])
+    driven_pose, increment = drive_between(recording, stamps[pose_frame])
     scale = scale_between(recording.sensors, settings, settings.scale_sigma if by_corners else 0.0)
     tied, left_out = tie_measurements(
         recording.measurements, stamps[pose_frame], partial(_moved, recording.odometry), landmark_id
@@ -133,7 +133,7 @@ def prepare_space(
         range_error=np.zeros(len(recording.sensors)),
         scale_sigma=scale[0] if driven else 0.0,
         ranges_share=scale[1],
-        path=_path(recording, stamps[pose_frame[0]], settings.delay_sigma_s),
+        path=lead_on(recording, stamps[pose_frame[0]], settings.delay_sigma_s),
         measurements=tied,
         start_sigma=np.max([[1e-4] * 6, *(of.kind.first_sigma for of in tied)], axis=0),
         robust=robust,
@@ -194,7 +194,7 @@ def state_sigmas(sensors: Sequence[SpatialSensor], settings: SpaceConfig, *, dri
 
 def path_of(recording: SpatialRecording, start_s: float) -> OdometryPath | None:
     """Return the odometry, with stamps from an instant on; None without."""
-    return _path(recording, start_s, 0.0)
+    return lead_on(recording, start_s, 0.0)
 
 
 def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
@@ -326,7 +326,7 @@ def _with_ranges(recording: SpatialRecording, where: _Where, usable: BoolArray, 
         blind[rays] = True
         return blind
     mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])
-    pose, _ = _driven(recording, recording.frames.stamp_s)
+    pose, _ = drive_between(recording, recording.frames.stamp_s)
     eye = se3.compose(pose[given.frame[rays]], mount[given.sensor[rays]])
     ahead = given.position_sensor_m[rays] / np.linalg.norm(given.position_sensor_m[rays], axis=1, keepdims=True)
     along = np.einsum("mij,mj->mi", se3.rotation_of(eye), ahead)
@@ -456,7 +456,7 @@ def _scale_sigma(sensor: SpatialSensor, settings: SpaceConfig) -> float:
     return settings.kinds[sensor.kind][0]
 
 
-def _path(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -> OdometryPath | None:
+def lead_on(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -> OdometryPath | None:
     """Return the odometry, led on at both ends for four standard deviations of a delay, at the speed over one there: so
     delays of all sizes are compared alike.
     """
@@ -474,7 +474,7 @@ def _path(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -> 
     return OdometryPath(stamp_s, np.vstack([before, pose, after]))
 
 
-def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+def drive_between(recording: SpatialRecording, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Poses (N, 7) by the odometry, from the identity, and motions (N - 1, 7) between them."""
     odometry, count = recording.odometry, len(stamp_s)
     if odometry is None or len(odometry) < 2:
