@@ -127,3 +127,21 @@ def test_two_more_numbers_share_what_is_left_of_them_without_all_others(problem:
     np.testing.assert_allclose(found, left, rtol=1e-9)
     begin = graph.structure.system.tree.begin[: len(state)]
     np.testing.assert_allclose(one.step()[begin], -moves[:, 0], rtol=1e-7, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [1e-6, 0.3, 30.0])
+def test_the_variance_of_a_slope_is_by_residuals_before_or_after_its_step(problem: tuple, value: float) -> None:
+    """Of a long step few rows would make more of what is linear than there is: of the two the smaller holds."""
+    graph, dense, measured, information = problem
+    state = np.linalg.solve(dense.T @ dense + np.diag(information), dense.T @ measured)
+    now = exhausted(graph.linearised(state))
+    empty = DetectionTerms(*(np.zeros(0) for _ in range(5)))
+    screen = Screen.of(Optimum(graph, now, state, empty, 0.0, 0.0, 1.0))
+    column = screen.column(np.random.default_rng(7).normal(size=len(measured)))
+    begin = graph.structure.system.tree.begin[: len(state)]
+    with_all = column.told + dense @ column.step()[begin]
+    before, after = (with_all * screen.residual) ** 2, (with_all * (screen.residual + value * with_all)) ** 2
+    assert screen.variance(column, value) == pytest.approx(min(before.sum(), after.sum()), rel=1e-4)
+    best = -(with_all @ screen.residual) / (with_all @ with_all)
+    after = (with_all * (screen.residual + best * with_all)) ** 2
+    assert screen.variance(column, best) == pytest.approx(min(before.sum(), after.sum()), rel=1e-4)

@@ -84,6 +84,7 @@ WRONG: dict[str, tuple[Callable[[SpatialRecording], SpatialRecording], str, floa
     "pitch": (lambda one: mounts(one, pitched), "all sensors pitch", -0.1),
     "lens": (with_other_lens, "front, back fx", -2.0 * math.log(1.03)),
     "late": (lambda one: with_own_frames(one, 0.08), "back", 0.08),
+    "early": (lambda one: with_own_frames(one, -0.08), "back", -0.08),
 }
 
 
@@ -101,6 +102,69 @@ def test_what_is_held_though_it_is_another_is_suspected(name: str) -> None:
     suspected = found.suspected
     assert suspected is not None
     assert suspected.shift > 0.5
+
+
+def test_scores_of_true_calibrations_are_standard_normal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if noise of the odometry is as large as its motions, and turns the robot about one of three axes only."""
+    monkeypatch.setattr(scores, "CHANCE", 0.0)
+    seeds = range(8)
+    found: dict[str, list[float]] = {}
+    for seed in seeds:
+        world = World(seed=seed, seconds=20.0, drift=0.1)
+        for one in scored(world.space(), world.map_in_space()).calibrations:
+            score = math.copysign(math.sqrt(2.0 * one.gain), one.value)
+            found.setdefault(f"{one.suspect.code} {one.suspect.subject}", []).append(score)
+    always = {name: np.array(each) for name, each in found.items() if len(each) == len(seeds)}
+    assert {"tag-size all tags", "map-scale map", "clock all sensors", "clock-drift clocks"} <= set(always)
+    for name, each in always.items():
+        assert abs(each.mean()) < 3.5 / math.sqrt(len(each)), (name, each)
+        assert np.mean(each**2) < 4.0, (name, each)
+    assert 0.3 < np.mean(np.concatenate(list(always.values())) ** 2) < 1.3
+
+
+def with_clock(recording: Any, faster: float) -> Any:
+    """Stamp frames by a clock that runs so much faster than that of the odometry, and agrees with it halfway."""
+    stamp_s = recording.frames.stamp_s
+    return replace(recording, frames=replace(recording.frames, stamp_s=stamp_s + faster * (stamp_s - stamp_s.mean())))
+
+
+@pytest.mark.parametrize("faster", [0.004, -0.004])
+@pytest.mark.parametrize("kind", ["plane", "corners"])
+def test_clocks_that_drift_apart_are_suspected(kind: str, faster: float) -> None:
+    world = World(seed=1)
+    recording: Any = with_clock(world.plane() if kind == "plane" else world.space(), faster)
+    survey = world.map_in_plane() if kind == "plane" else world.map_in_space()
+    for given in (None, survey):
+        suspected = scored(recording, given).suspected
+        assert suspected is not None
+        assert suspected.suspect.code == "clock-drift"
+        assert suspected.value == pytest.approx(faster, rel=0.25)
+    verdict = run_slam(recording, prior_map=survey).verdict
+    assert verdict is not None
+    assert verdict.kind is VerdictKind.SENSOR_SUSPECT
+    assert f"{'fast' if faster > 0.0 else 'slow'} of that of the odometry" in verdict.message
+
+
+@pytest.mark.parametrize("kind", ["plane", "corners"])
+def test_clocks_are_asked_where_frames_begin_and_end_with_the_odometry(kind: str) -> None:
+    world = World(seed=1, seconds=20.0)
+    recording: Any = world.plane() if kind == "plane" else world.space()
+    driven, frame_s = recording.odometry, recording.frames.stamp_s
+    driven = driven[np.flatnonzero((driven.stamp_s > frame_s[0] - 0.01) & (driven.stamp_s < frame_s[-1] + 0.01))]
+    stamp_s = np.concatenate([frame_s[:1], driven.stamp_s[1:-1], frame_s[-1:]])
+    found = scored(replace(recording, odometry=replace(driven, stamp_s=stamp_s)), None)
+    assert {"clock", "clock-drift"} <= {one.suspect.code for one in found.calibrations}
+    assert found.suspected is None
+
+
+def test_lengths_in_space_are_asked() -> None:
+    """Tags are larger than stated, and only the odometry says so."""
+    world = World(seed=1, longer=1.05)
+    found = scored(world.space(), None)
+    (own,) = (one for one in found.calibrations if one.suspect.code == "tag-size")
+    assert own.value == pytest.approx(math.log(1.05), rel=0.15)
+    assert own.gain > SIGNIFICANT
+    assert own.shift > 0.5
 
 
 def test_a_score_does_not_depend_on_the_step_of_its_differences(monkeypatch: pytest.MonkeyPatch) -> None:

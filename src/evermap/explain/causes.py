@@ -48,6 +48,8 @@ WITH_BEARINGS = 0.5
 """Share of the detections without a bearing from which ranges alone must say what is wrong."""
 DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL, DISTORTION = 0.5, 0.2, 0.3, 0.1, 0.2
 """Standard deviations of a delay, of a mount's position and turn, of the logarithm of a focal length, and of k1."""
+CLOCK_RATE = 0.01
+"""Standard deviation of how much faster one clock runs than another, where they do at all."""
 LITTLE = 0.1
 """Standard deviations beforehand within which a state is as is usual of sensors: 2 cm of a mount, 50 ms of a clock."""
 
@@ -128,13 +130,18 @@ class Suspect:
         return math.log(self.p)
 
 
-def list_suspects(inputs: Inputs) -> tuple[Suspect, ...]:
-    """Return all causes that may be asked of a recording, and of the map that is given with it."""
+def list_suspects(inputs: Inputs, *, discrete: bool = True) -> tuple[Suspect, ...]:
+    """Return all causes that may be asked of a recording, and of the map that is given with it.
+
+    Args:
+        inputs: the recording and the map.
+        discrete: with all that have no state; some of these are first sought in the readings.
+    """
     recording, found = inputs.recording, list[Suspect]()
-    found += _in_space(recording) if is_in_space(recording) else _in_plane(recording)
+    found += _in_space(recording, discrete=discrete) if is_in_space(recording) else _in_plane(recording)
     if inputs.prior_map is not None:
         found += _of_map(inputs.prior_map)
-    return tuple(found)
+    return tuple(one for one in found if discrete or one.is_continuous)
 
 
 def _constant(text: str) -> Callable[[float], str]:
@@ -304,6 +311,15 @@ def _turn_by(inputs: Inputs, factor: float) -> Inputs:
     return _with_poses(inputs, np.asarray(se3.compose(path.pose_world_robot[:1], accumulate(se3.exp(step)))))
 
 
+def stretch_stamps(inputs: Inputs, state: float) -> Inputs:
+    """Return the same with the frames at the times of a clock that is slower by this share; half of the drive stays."""
+    recording: Any = inputs.recording
+    stamp_s = recording.frames.stamp_s
+    middle_s = 0.5 * (stamp_s[0] + stamp_s[-1])
+    frames = replace(recording.frames, stamp_s=stamp_s - state * (stamp_s - middle_s))
+    return replace(inputs, recording=replace(recording, frames=frames))
+
+
 def _shift_stamps(inputs: Inputs, state: float) -> Inputs:
     """Return the same with the frames earlier by the delay of their stamps."""
     recording: Any = inputs.recording
@@ -353,7 +369,7 @@ def _undo_in_plane(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Input
 # ---- in space
 
 
-def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
+def _in_space(recording: SpatialRecording, *, discrete: bool) -> Iterable[Suspect]:
     seen, sensors = recording.detections, recording.sensors
     sizes = np.unique(np.round(seen.tag_size_m[np.isfinite(seen.tag_size_m)], 6))
     one = f"{sizes[0]:.12g}" if len(sizes) == 1 else ""
@@ -379,16 +395,8 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
         size = f"{np.nanmedian(own):.12g}" if np.isfinite(own).any() else ""
         name = recording.landmark_names.get(identity, str(identity))
         yield _one_size(name, _stretch_positions, ("id", identity), size)
-    for how in [find_corner_mistake(recording) or CLOCKWISE] if is_clockwise(recording).any() else []:
-        yield Suspect(
-            "corner-order", "corners", USUAL_P, partial(_read_corners, how=how), _constant(CORNERS[how].message),
-            _constant(CORNERS[how].fix), shows=True,
-        )  # fmt: skip
-    for convention in filter(None, [find_convention(recording, mistakes.USUAL)]):
-        yield Suspect(
-            "detection-poses", "detections", USUAL_P, partial(_read_detections, convention=convention),
-            _constant(SIGHTED[convention]), _constant("detections.csv: x_m, y_m, z_m, qx, qy, qz, qw"), shows=True,
-        )  # fmt: skip
+    if discrete:
+        yield from _read_otherwise(recording)
     if recording.odometry is not None:
         yield _odometry_scale()
         yield _turn_scale()
@@ -431,6 +439,20 @@ def _in_space(recording: SpatialRecording) -> Iterable[Suspect]:
         return
     for same in {sensors[row].intrinsics: None for row in cameras}:
         yield from _of_lens([row for row in cameras if sensors[row].intrinsics == same], sensors)
+
+
+def _read_otherwise(recording: SpatialRecording) -> Iterable[Suspect]:
+    """Yield conventions of corners and of poses by which detections agree with each other, if others than expected."""
+    for how in [find_corner_mistake(recording) or CLOCKWISE] if is_clockwise(recording).any() else []:
+        yield Suspect(
+            "corner-order", "corners", USUAL_P, partial(_read_corners, how=how), _constant(CORNERS[how].message),
+            _constant(CORNERS[how].fix), shows=True,
+        )  # fmt: skip
+    for convention in filter(None, [find_convention(recording, mistakes.USUAL)]):
+        yield Suspect(
+            "detection-poses", "detections", USUAL_P, partial(_read_detections, convention=convention),
+            _constant(SIGHTED[convention]), _constant("detections.csv: x_m, y_m, z_m, qx, qy, qz, qw"), shows=True,
+        )  # fmt: skip
 
 
 def _all_tags(size: str) -> Suspect:

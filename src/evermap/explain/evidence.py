@@ -44,6 +44,8 @@ LOG_2PI = math.log(2.0 * math.pi)
 ROOM_M, ROOM_RAD = ROOM
 LEAST_INFORMATION = 1e-6
 """Information of the border's priors, at least: that on delays may be less than none."""
+TINY = 1e-3
+"""Share of a step in which all is linear."""
 ODOMETRY, DETECTIONS, START, REST = 0, 1, 2, 3
 """Blocks of a graph, the same in the plane and in space."""
 
@@ -342,6 +344,20 @@ class Screen:
         """Return the slope of the cost along a further number, with all else at its optimum."""
         crossed = column.solved.own_right @ self.solved.own_right + self.solved.right @ column.border
         return float(column.told @ (self.residual * self.root) - crossed)
+
+    def variance(self, column: Column, value: float) -> float:
+        """Return the variance of the slope along a further number, as residuals are, not as they are said to be.
+
+        White's (1980), of rows that are independent: some parts of a motion are less certain than others of which the
+        same noise was learned. Residuals are those at the optimum, or that its step to `value` leaves: where that is
+        long, what is linear goes too far for few rows, and where it is right the first are too large.
+        """
+        graph, state = self.optimum.graph, self.optimum.state
+        there, _ = graph.retract(state, TINY * value * column.step())
+        residual = residuals_of(graph, exhausted(graph.linearised(there)))[1]
+        with_all = column.told + (residual - self.residual) * self.root / (TINY * value)
+        before = self.residual * self.root
+        return min(float(np.sum((with_all * left) ** 2)) for left in (before, before + value * with_all))
 
     def score(self, direction: FloatArray, information: float, off: float = 0.0) -> Score:
         """Return what a number does by which residuals (R,), not weighted, change so.

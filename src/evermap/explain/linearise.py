@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -10,23 +11,27 @@ from evermap.errors import EvermapError
 from evermap.estimate.sparse.system import exhausted
 from evermap.explain.causes import Inputs, Suspect
 from evermap.explain.evidence import AnySession, Optimum, Screen, SpatialSession, residuals_of
-from evermap.geometry import se3
+from evermap.geometry import se2, se3
+from evermap.slam.calibration import DELAY
 from evermap.slam.estimate import Solved
 from evermap.slam.intake import prepare
 from evermap.slam.problem import Problem
 from evermap.slam.smoother import Smoother
+from evermap.slam.space.bridge import PathFrames
 from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.intake import SpatialIntake, prepare_space
-from evermap.slam.space.problem import PlacePrior, SpatialProblem
+from evermap.slam.space.intake import SpatialIntake, drive_through, lead_on, prepare_space
+from evermap.slam.space.problem import PlacePrior, SpatialProblem, Swing
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.solve import fit_to_map
-from evermap.types import FloatArray, IntArray, Landmarks, is_in_space
+from evermap.types import FloatArray, IntArray, Landmarks, SpatialOdometry, SpatialRecording, is_in_space
 
 STEP, FINE_STEP = 0.02, 1e-4
 """Steps of a state, as shares of its standard deviation beforehand: one as long as noise, which says how far it is to a
 better state, where what is rejected yet hides the way; and one at which residuals grow by far less than their noise, so
 that those of outliers don't vanish with their weights: the slope at the solution itself. Rounding is smaller still."""
 
+EDGE_S = 1e-3
+"""Time by which frames may move beyond the ends of the odometry."""
 FEW_STEPS = 6
 """Gauss-Newton steps of a first look at a discrete cause."""
 STEPS_NEARBY = 10
@@ -62,6 +67,61 @@ def change_by(
         share: length of the step, as a share of its standard deviation beforehand.
     """
     step = share * suspect.sigma
+    moved = _residuals_under(session, screen, inputs, suspect, step)
+    return None if moved is None else np.asarray((moved - screen.residual) / step)
+
+
+def change_by_motion(session: AnySession, screen: Screen, inputs: Inputs, suspect: Suspect) -> FloatArray | None:
+    """Return (R,) as `change_by`, of a cause of the odometry or of clocks, with the motions that were estimated.
+
+    What was measured holds its own noise, and so would the change: it would go with the residuals where nothing is
+    wrong (errors in variables). Estimated motions do not, as residuals are independent of the estimate. Stamps move
+    both ways: beyond an instant another motion begins.
+
+    Args:
+        session: the solution of the inputs.
+        screen: of its optimum.
+        inputs: of which it is the solution.
+        suspect: a continuous cause.
+    """
+    step = FINE_STEP * suspect.sigma
+    as_estimated = _driven_as_estimated(session, inputs)
+    later, earlier = (_residuals_under(session, screen, as_estimated, suspect, way) for way in (step, -step))
+    return None if later is None or earlier is None else np.asarray((later - earlier) / (2.0 * step))
+
+
+def _driven_as_estimated(session: AnySession, inputs: Inputs) -> Inputs:
+    """Return inputs with the odometry that the motions of the solution would have given, at the stamps that it has."""
+    recording: Any = inputs.recording
+    driven = recording.odometry
+    if driven is None:
+        return inputs
+    rows = np.concatenate([[0], np.arange(len(driven)), [len(driven) - 1]])
+    driven = driven[rows]  # a little longer, so that frames at its ends may move
+    driven = replace(driven, stamp_s=driven.stamp_s + EDGE_S * np.concatenate([[-1.0], np.zeros(len(rows) - 2), [1.0]]))
+    if isinstance(session, Solved):
+        outcome, prepared = session.outcome, session.prepared
+        pose, knot_s = outcome.graph_estimate.pose, outcome.problem.stamp_s + prepared.start_s
+        rate = se2.log(se2.between(pose[:-1], pose[1:])) / np.diff(knot_s)[:, None]
+        at = driven.stamp_s - outcome.graph_estimate.states[DELAY]
+        forward, lateral, turn = rate[np.clip(np.searchsorted(knot_s, at, side="right") - 1, 0, len(rate) - 1)].T
+        driven = replace(driven, forward_mps=forward, lateral_mps=lateral, angular_radps=turn)
+    else:
+        optimum = session.solved.optimum
+        problem = (optimum.fitted or (optimum.smoother, optimum.now))[0].problem
+        pose, knot_s = optimum.estimate.pose, inputs.recording.frames.stamp_s[session.intake.pose_frame]
+        row = np.clip(np.searchsorted(knot_s, driven.stamp_s, side="right") - 1, 0, len(knot_s) - 2)
+        part = (driven.stamp_s - knot_s[row]) / np.diff(knot_s)[row]  # beyond the ends it goes on as there
+        twist = part[:, None] * se3.log(se3.between(pose[row], pose[row + 1]))
+        at = se3.scaled(se3.compose(pose[row], se3.exp(twist)), float(np.exp(-problem.odometry_log)))
+        driven = replace(driven, pose_world_robot=at)
+    return replace(inputs, recording=replace(recording, odometry=driven))
+
+
+def _residuals_under(
+    session: AnySession, screen: Screen, inputs: Inputs, suspect: Suspect, step: float
+) -> FloatArray | None:
+    """Return (R,) residuals at the optimum under a step of a cause; None if it changes what is used."""
     try:
         undone = suspect.undo(inputs, step)
         if isinstance(session, Solved):
@@ -70,9 +130,8 @@ def change_by(
             moved = _residuals_in_space(session, screen.optimum, inputs, undone)
     except EvermapError:
         return None
-    if moved is None or len(moved) != len(screen.residual) or not np.isfinite(moved).all():
-        return None
-    return np.asarray((moved - screen.residual) / step)
+    usable = moved is not None and len(moved) == len(screen.residual) and np.isfinite(moved).all()
+    return moved if usable else None
 
 
 def _residuals_in_plane(session: Solved, optimum: Optimum, inputs: Inputs, undone: Inputs) -> FloatArray | None:
@@ -116,12 +175,13 @@ def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> Spat
     if undone.prior_map is not inputs.prior_map and undone.prior_map is not None:
         prior = _prior_from(prior, undone.prior_map, before.landmark_id[session.solved.identity])
     one, other = inputs.recording, undone.recording
-    if other.detections is one.detections and other.odometry is one.odometry and other.frames is one.frames:
-        lens = [
-            [(each.intrinsics, each.distortion, each.distortion_model) for each in of.sensors] for of in (one, other)
-        ]
-        if lens[0] == lens[1]:  # but for mounts all is as it was
-            return replace(problem, prior=prior, mount=np.array([each.mount_robot_sensor for each in other.sensors]))
+    lens = [[(each.intrinsics, each.distortion, each.distortion_model) for each in of.sensors] for of in (one, other)]
+    if other.detections is one.detections and lens[0] == lens[1]:  # but for mounts and motions all is as it was
+        problem = replace(problem, prior=prior, mount=np.array([each.mount_robot_sensor for each in other.sensors]))
+        if other.odometry is one.odometry and other.frames is one.frames:
+            return problem
+        if other.odometry is not None:
+            return _with_motions(problem, other, other.odometry, before.frames)
     intake = prepare_space(
         undone.recording, problem.settings, robust=problem.robust, estimate_noise=problem.estimate_noise, coarse=True
     )  # of tags in an image the residuals are those of the corners
@@ -187,6 +247,25 @@ def solve_nearby(session: AnySession, inputs: Inputs, undone: Inputs) -> Spatial
         return None
     optimum = SpatialOptimum(estimate, solved.noise, smoother, now)
     return SpatialSession(session.intake, replace(session.solved, optimum=optimum))
+
+
+def _with_motions(
+    problem: SpatialProblem, recording: SpatialRecording, driven: SpatialOdometry, frames: PathFrames
+) -> SpatialProblem | None:
+    """Return a problem with the odometry, and at the instants, of a recording; None if other frames have poses."""
+    stamp_s = recording.frames.stamp_s
+    during = (stamp_s >= driven.stamp_s[0]) & (stamp_s <= driven.stamp_s[-1])
+    if not np.array_equal(np.flatnonzero(during), frames.row):
+        return None
+    path_s, at_s, longer = stamp_s[frames.row], stamp_s[frames.pose_frame], float(np.exp(problem.odometry_log))
+    through = drive_through(recording, path_s)
+    increment = se3.between(through[frames.posed[:-1]], through[frames.posed[1:]])
+    path = lead_on(recording, at_s[0], problem.settings.delay_sigma_s)
+    return replace(
+        problem, stamp_s=at_s - at_s[0], increment=se3.scaled(increment, longer),
+        swing=Swing.between(frames.posed, np.diff(path_s), through).scaled(longer),
+        path=None if path is None else path._replace(pose=se3.scaled(path.pose, longer)),
+    )  # fmt: skip
 
 
 def _with_measurements(problem: SpatialProblem, intake: SpatialIntake) -> SpatialProblem:

@@ -22,25 +22,40 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from evermap.errors import EvermapError
-from evermap.explain.causes import DELAY_S, FOCAL, LITTLE, MOUNT_M, MOUNT_RAD, USUAL_P, Inputs, Suspect, list_suspects
+from evermap.explain.causes import (
+    CLOCK_RATE,
+    DELAY_S,
+    FOCAL,
+    LITTLE,
+    MOUNT_M,
+    MOUNT_RAD,
+    RARE_P,
+    USUAL_P,
+    Inputs,
+    Suspect,
+    list_suspects,
+    stretch_stamps,
+)
 from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Column, Optimum, Screen, optimum_of, residuals_of
-from evermap.explain.linearise import FINE_STEP, change_by
+from evermap.explain.linearise import FINE_STEP, change_by, change_by_motion
 from evermap.geometry import se3
 from evermap.slam.estimate import Solved
 from evermap.types import FloatArray, IntArray, SpatialRecording, SpatialSensor, Trajectory, is_in_space
 
 Intrinsics: TypeAlias = tuple[float, float, float, float]
 """Focal lengths and centre of an image [px]."""
-SIGNIFICANT = 30.0
-"""Gain of a score test [nats]. At the poses that fit best, not averaged over them, a score is not zero in the mean
-where they are uncertain beside the steps between them: 12 nats for a mount in sound drives with a coarse odometry."""
+SIGNIFICANT = 10.0
+"""Gain of a score test [nats]: 4.5 standard deviations, of thirty or so that are asked of a run."""
 USUAL = frozenset({"odometry-scale", "turn-scale"})
 """Calibrations that are off on every robot: they may be so beside any other."""
+OF_MOTION = USUAL | {"clock", "clock-drift"}
+"""What changes residuals by how the robot moved."""
 USUAL_SIGMA = 0.02
 """Standard deviation of the logarithm of these."""
 OF_LENGTHS = frozenset({"range-scale", "tag-size", "map-scale"})
-"""What changes all lengths, and so the volume in which each pose lies: at the poses that fit best shorter ones gain, 70
-nats where nothing is wrong. In the plane they are states, at a mean of several priors, which is no optimum."""
+"""What changes all lengths. In the plane these are states, at a mean of several priors, which is no optimum."""
+CHANCE = 4.0
+"""Gain [nats] from which its variance is asked, too."""
 INFORMED = 4.0
 """Times the information of its prior that a session must have on a calibration."""
 KNOWN = 0.5
@@ -49,6 +64,14 @@ USED = 0.5
 """Weight from which a step of the odometry, or a detection, counts."""
 FEWEST_STEPS = 30
 """Steps of which a correlation says something."""
+
+
+DRIFT = Suspect(
+    "clock-drift", "clocks", RARE_P, stretch_stamps,
+    lambda s: f"the clock of the detections runs {abs(s):.2%} {'fast' if s > 0 else 'slow'} of that of the odometry",
+    lambda s: f"detections.csv, frames.csv: stamp_s x {1.0 - s:.5g}", CLOCK_RATE,
+)  # fmt: skip
+"""Two clocks that drift apart; at half of the drive they agree, but for the delay that is estimated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +144,10 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
     at = optimum.graph.structure.system.tree.begin[: len(optimum.state.pose), None] + np.arange(dim)
     usual = list[tuple[Column, float, FloatArray]]()
     for suspect in sorted(_list_calibrations(inputs), key=lambda one: one.code not in USUAL):
-        direction = change_by(session, screen, inputs, suspect, FINE_STEP)
+        if suspect.code in OF_MOTION:
+            direction = change_by_motion(session, screen, inputs, suspect)
+        else:
+            direction = change_by(session, screen, inputs, suspect, FINE_STEP)
         if direction is None:
             continue
         column = screen.column(direction)
@@ -140,9 +166,25 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
         pull -= float(taken @ [each for _, each, _ in usual])
         value = -pull / known
         moved = column.step()[at] - sum((by * step for by, (_, _, step) in zip(taken, usual, strict=True)), np.zeros(1))
+        moved = moved + _went_by_clock(session, suspect, dim)
         shift = float(np.median(np.linalg.norm(value * moved, axis=1)))
         gain = 0.5 * pull**2 / known * optimum.worth
+        if gain > CHANCE:
+            gain /= max(screen.variance(column, value) / column.information_with(column), 1.0)
         yield CalibrationScore(suspect, value, known**-0.5, gain, shift / sigma_m)
+
+
+def _went_by_clock(session: AnySession, suspect: Suspect, dim: int) -> FloatArray:
+    """Return how far from the poses (N, d) the robot is by the clock of its odometry, for a unit of its drift."""
+    if suspect is not DRIFT:
+        return np.zeros(dim)
+    if isinstance(session, Solved):
+        pose, stamp_s = session.outcome.graph_estimate.pose, session.outcome.problem.stamp_s
+    else:
+        optimum = session.solved.optimum
+        pose, stamp_s = optimum.estimate.pose, optimum.smoother.problem.stamp_s
+    off_s = stamp_s - 0.5 * (stamp_s[0] + stamp_s[-1])
+    return np.asarray(off_s[:, None] * np.gradient(pose[:, :dim], stamp_s, axis=0))
 
 
 def _measure_alternation(optimum: Optimum) -> float:
@@ -171,10 +213,12 @@ def _count_adrift(optimum: Optimum, pose_row: IntArray) -> int:
 def _list_calibrations(inputs: Inputs) -> Iterable[Suspect]:
     """Yield all that may be off of a sensor as a whole, of the odometry and of the map."""
     recording = inputs.recording
-    for suspect in list_suspects(inputs):
+    for suspect in list_suspects(inputs, discrete=False):
         of_all = suspect.rows is None or suspect.rows[0] != "id"
-        if suspect.is_continuous and of_all and suspect.code not in OF_LENGTHS:
+        if of_all and (is_in_space(recording) or suspect.code not in OF_LENGTHS):
             yield suspect
+    if recording.odometry is not None:
+        yield DRIFT
     if not is_in_space(recording):
         return
     if len(recording.sensors) > 1 and recording.odometry is not None:

@@ -145,7 +145,7 @@ def prepare_space(
         range_error=np.zeros(len(recording.sensors)),
         scale_sigma=scale[0] if driven else 0.0,
         ranges_share=scale[1],
-        path=_path(recording, stamps[pose_frame[0]], settings.delay_sigma_s),
+        path=lead_on(recording, stamps[pose_frame[0]], settings.delay_sigma_s),
         has_clock_of_frames=_has_clock_of_frames(recording.odometry, path_s),
         measurements=tied,
         start_sigma=np.max([[1e-4] * 6, *(of.kind.first_sigma for of in tied)], axis=0),
@@ -207,7 +207,7 @@ def state_sigmas(sensors: Sequence[SpatialSensor], settings: SpaceConfig, *, dri
 
 def path_of(recording: SpatialRecording, start_s: float) -> OdometryPath | None:
     """Return the odometry, with stamps from an instant on; None without."""
-    return _path(recording, start_s, 0.0)
+    return lead_on(recording, start_s, 0.0)
 
 
 def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
@@ -339,7 +339,7 @@ def _with_ranges(recording: SpatialRecording, where: _Where, usable: BoolArray, 
         blind[rays] = True
         return blind
     mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])
-    pose = _driven(recording, recording.frames.stamp_s)
+    pose = drive_through(recording, recording.frames.stamp_s)
     eye = se3.compose(pose[given.frame[rays]], mount[given.sensor[rays]])
     ahead = given.position_sensor_m[rays] / np.linalg.norm(given.position_sensor_m[rays], axis=1, keepdims=True)
     along = np.einsum("mij,mj->mi", se3.rotation_of(eye), ahead)
@@ -469,7 +469,7 @@ def _scale_sigma(sensor: SpatialSensor, settings: SpaceConfig) -> float:
     return settings.kinds[sensor.kind][0]
 
 
-def _path(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -> OdometryPath | None:
+def lead_on(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -> OdometryPath | None:
     """Return the odometry, led on at both ends for four standard deviations of a delay, at the speed over one there: so
     delays of all sizes are compared alike.
     """
@@ -509,10 +509,10 @@ def _frames(recording: SpatialRecording, seen_in: IntArray, moving: BoolArray) -
         row = np.flatnonzero(moving)
         looked = np.union1d(seen_in, recording.detections.frame[moving[recording.detections.frame]])
         posed = np.searchsorted(row, np.union1d(frames_with_pose(recording, looked, moving), row[[0, -1]]))
-    return PathFrames(row, stamp_s[row] - stamp_s[row[0]], _driven(recording, stamp_s[row]), posed)
+    return PathFrames(row, stamp_s[row] - stamp_s[row[0]], drive_through(recording, stamp_s[row]), posed)
 
 
-def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> FloatArray:
+def drive_through(recording: SpatialRecording, stamp_s: FloatArray) -> FloatArray:
     """Return poses (F, 7) by the odometry, from the identity."""
     odometry = recording.odometry
     if odometry is None or len(odometry) < 2:
