@@ -13,7 +13,8 @@ from evermap import check_recording, run_slam
 from evermap.errors import DataError
 from evermap.explain.seeds import find_mount
 from evermap.explain.shape import compare_shapes
-from evermap.slam.check import find_corner_mistake, is_clockwise
+from evermap.io.spatial import with_tag_poses
+from evermap.slam.check import find_corner_mistake, is_clockwise, read_corners
 from evermap.slam.mistakes import USUAL, Mistake, find_motion, read_drive
 from evermap.slam.orientations import find_convention
 from evermap.types import FloatArray, Landmarks, Recording, SensorKind, SpatialRecording, VerdictKind
@@ -73,6 +74,19 @@ def test_corners_that_are_written_in_another_way_are_named(how: str, corners: Sp
     (found,) = [finding for finding in check_recording(wrong).findings if finding.code == "corner-order"]
     assert word in found.message
     assert not found.usable
+
+
+def test_corners_are_read_anew_where_a_reader_filled_in_poses_from_them(corners: SpatialRecording) -> None:
+    _, write = CORNERS["upwards"]
+    wrong = with_corners(corners, write(corners.detections.corner_px))
+    right, filled = (
+        replace(each, detections=with_tag_poses(each.detections, each.sensors, [])) for each in (corners, wrong)
+    )
+    assert find_corner_mistake(filled) == "upwards"
+    assert find_corner_mistake(right) == ""
+    read = read_corners(filled, "upwards").detections
+    assert read.position_sensor_m == pytest.approx(right.detections.position_sensor_m, abs=1e-9)
+    assert read.rotation == pytest.approx(right.detections.rotation, abs=1e-9)
 
 
 def test_corners_all_listed_clockwise_are_no_mistake_by_themselves(corners: SpatialRecording) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from evermap.config import CheckConfig, CleaningConfig, Config, SensorConfig, SlamConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
+from evermap.geometry.square import square_poses
 from evermap.show import Shown
 from evermap.slam.cleaning import clean, spikes
 from evermap.slam.mistakes import HONEST, USUAL, Finding, find_motion, off, pairs_of
@@ -359,12 +360,20 @@ def is_clockwise(recording: SpatialRecording) -> BoolArray:
 
 
 def read_corners(recording: SpatialRecording, how: str) -> SpatialRecording:
-    """Return a recording with the corners of cameras that list them clockwise read in another way, of `CORNERS`."""
+    """Return a recording with the corners of cameras that list them clockwise read in another way, of `CORNERS`.
+
+    Poses of these tags follow from their corners: a reader has filled them in from the corners as they were written.
+    """
     seen, clockwise = recording.detections, is_clockwise(recording)
     size = np.array([sensor.resolution_px or (0, 0) for sensor in recording.sensors], dtype=np.float64)[seen.sensor]
-    corner = seen.corner_px.copy()
+    corner, pose = seen.corner_px.copy(), np.concatenate([seen.position_sensor_m, seen.rotation], axis=1)
     corner[clockwise] = CORNERS[how].read(corner[clockwise], size[clockwise, None])
-    return replace(recording, detections=replace(seen, corner_px=corner))
+    for row, sensor in enumerate(recording.sensors):
+        mine = np.flatnonzero(clockwise & (seen.sensor == row))
+        if sensor.intrinsics is not None and len(mine):
+            pose[mine] = square_poses(corner[mine], seen.tag_size_m[mine], sensor).pose[0]
+    read = replace(seen, corner_px=corner, position_sensor_m=pose[:, :3], rotation=pose[:, 3:])
+    return replace(recording, detections=read)
 
 
 def _find_pose_convention(recording: SpatialRecording, settings: CheckConfig) -> list[Finding]:
