@@ -205,7 +205,7 @@ def find_symptoms(
         found.append("readings")
     if not found and _is_off_mount(result, inputs, config):
         found.append("mount")
-    if not found and compare_odometry(result)[0] > ODOMETRY_OFF:
+    if not found and compare_odometry(result, inputs.recording.odometry)[0] > ODOMETRY_OFF:
         found.append("odometry")
     return tuple(found)
 

@@ -16,7 +16,8 @@ from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries, Symmetry
 from evermap.slam.intake import frames_of_usable, landmark_ids, usable_detections
-from evermap.slam.space.linearise import CORNERS, POINT, POSE
+from evermap.slam.mistakes import find_gaps
+from evermap.slam.space.linearise import CORNERS, JUMP_SHARE, POINT, POSE
 from evermap.slam.space.local_filter import SpatialFrame
 from evermap.slam.space.problem import USUAL, OdometryPath, SpatialNoise, SpatialProblem
 from evermap.types import (
@@ -107,7 +108,7 @@ def prepare_space(
     problem = SpatialProblem(
         stamp_s=stamps[pose_frame] - stamps[pose_frame[0]],
         increment=increment,
-        lasted_s=np.diff(stamps[pose_frame]) ** (1 if driven else 2),
+        lasted_s=_lasted(recording.odometry, stamps[pose_frame]),
         driven=driven,
         pose_row=np.searchsorted(pose_frame, detections.frame[used]),
         place=place.astype(np.int64),
@@ -472,6 +473,19 @@ def _path(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -> 
     before, after = se3.retract(end, 4.0 * se3.local(inside, end))
     stamp_s = np.concatenate([[first_s - 4.0 * delay_sigma_s], stamp_s, [last_s + 4.0 * delay_sigma_s]])
     return OdometryPath(stamp_s, np.vstack([before, pose, after]))
+
+
+def _lasted(odometry: SpatialOdometry | None, stamp_s: FloatArray) -> FloatArray:
+    """Return (N - 1,) what the variance of motions between instants (N,) grows with, as of `SpatialProblem`.
+
+    In a gap of the odometry, between whose ends it is interpolated, the robot may have gone anywhere: as at a jump.
+    """
+    if odometry is None:
+        return np.diff(stamp_s) ** 2
+    lasted = np.diff(stamp_s)
+    for since_s, until_s in find_gaps(odometry).tolist():
+        lasted = lasted + np.diff(np.clip(stamp_s, since_s, until_s)) / JUMP_SHARE
+    return lasted
 
 
 def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
