@@ -304,7 +304,7 @@ _FACTORS = tuple(10.0**power for power in np.arange(-4.0, 4.01, 0.1) if abs(powe
 
 
 SILENT_S, FEW_STEPS = 2.0, 10.0
-"""Time, and usual steps, without a row from which the odometry is silent; or with rows that say that the robot stands."""
+"""Time, and usual steps, without a row from which the odometry is silent, or with rows by which the robot stands."""
 STANDS, MOVED = 1e-3, 0.1
 """Speed up to which the odometry says so [m/s, rad/s], and difference of two sightings from which the robot moved."""
 
