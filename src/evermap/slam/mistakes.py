@@ -15,7 +15,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import inf, log, pi
-from typing import Self, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from evermap.slam.kernels import pair_residuals, reckoned_motions
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
-    AnyRecordingT,
     FloatArray,
     IntArray,
     Odometry,
@@ -710,10 +709,11 @@ def find_silences(recording: AnyRecording, settings: CheckConfig) -> FloatArray:
     quiet_s = np.concatenate([find_gaps(odometry), _find_standstills(recording)])
     if not len(quiet_s):
         return quiet_s
-    blind = not is_in_space(recording) and np.isnan(recording.detections.bearing_rad).mean() > 0.5
+    blind = False
+    if not is_in_space(recording):
+        range_m, blind = recording.detections.range_m, bool(np.isnan(recording.detections.bearing_rad).mean() > 0.5)
     first, second = sighting_pairs(recording, settings, with_bearing=not blind)
     if blind:
-        range_m = recording.detections.range_m
         moves = np.abs(np.log(range_m[second] / range_m[first])) > MOVED
     elif len(first) and (pairs := pairs_of(recording, settings)) is not None:
         moves = off(pairs.residual(HONEST, stands=True)[0]) > MOVED
@@ -748,16 +748,15 @@ def _find_standstills(recording: AnyRecording) -> FloatArray:
     return span_s[span_s[:, 1] - span_s[:, 0] > SILENT_S]
 
 
-def without_silences(recording: AnyRecordingT, silence_s: FloatArray) -> AnyRecordingT:
+def without_silences(recording: Any, silence_s: FloatArray) -> Any:
     """Return a recording without the odometry's rows within silences (K, 2): estimators know what a gap says."""
-    odometry = recording.odometry
-    if odometry is None or not len(silence_s):
+    if not len(silence_s):
         return recording
-    stamp_s, silent = odometry.stamp_s, np.zeros(len(odometry), dtype=np.bool_)
+    stamp_s, silent = recording.odometry.stamp_s, np.zeros(len(recording.odometry), dtype=np.bool_)
     for start_s, stop_s in silence_s.tolist():  # poses hold at both ends, velocities from the first of them on
         silent |= ((stamp_s > start_s) if is_in_space(recording) else (stamp_s >= start_s)) & (stamp_s < stop_s)
     silent[0] = False
-    return replace(recording, odometry=rows_of(odometry, ~silent))  # type: ignore[type-var]
+    return replace(recording, odometry=rows_of(recording.odometry, ~silent))
 
 
 @dataclass(frozen=True, slots=True)
