@@ -249,7 +249,7 @@ def test_a_fault_of_a_map_shows_in_its_shape(fault: str) -> None:
 
 NAMED = {
     "w first": ("map-axes", "w, x, y, z"),
-    "tags turned": ("map-axes", "-y, x, z; or the corners"),
+    "tags turned": ("map-axes", "-y, x, z"),
     "x out of the tag": ("map-axes", "z, y, -x"),
     "mirrored": ("map-mirrored", "mirrored"),
     "millimetres": ("map-unit", "millimetres"),
@@ -267,7 +267,8 @@ def test_a_fault_of_a_map_is_named_and_moves_nothing(
     result = run_slam(recording, prior_map=map_faults(World().map_in_space())[fault].as_prior(0.01))
     code, word = NAMED[fault]
     (cause,) = result.causes
-    assert (cause.code, cause.subject) == (code, "map")
+    same = kind == "corners" and fault == "tags turned"  # as if corners were listed from another one on
+    assert (cause.code, cause.subject) == (("corner-order", "tags") if same else (code, "map"))
     assert word in cause.message
     assert result.changes == ()
 
@@ -293,6 +294,32 @@ def test_corners_in_the_order_of_opencv_are_put_right(corners: SpatialRecording)
     (cause,) = result.causes
     assert (cause.code, cause.fix) == ("corner-order", "detections.csv: corners in the order 3, 2, 1, 0")
     assert result.changes == ()
+
+
+@pytest.mark.parametrize("order", [(1, 0, 3, 2), (1, 2, 3, 0)])
+@pytest.mark.slow
+def test_corners_from_another_one_on_are_named_beside_a_map(order: tuple[int, ...], corners: SpatialRecording) -> None:
+    wrong = with_corners(corners, corners.detections.corner_px[:, list(order)])
+    result = run_slam(wrong, prior_map=World().map_in_space().as_prior(0.01))
+    (cause,) = result.causes
+    back = ", ".join(str(order.index(corner)) for corner in range(4))
+    assert (cause.code, cause.fix) == ("corner-order", f"detections.csv: corners in the order {back}")
+    assert result.changes == ()
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+
+
+def test_clockwise_corners_are_named_where_no_map_has_them_so(corners: SpatialRecording) -> None:
+    wrong = with_corners(corners, corners.detections.corner_px[:, [1, 0, 3, 2]])
+    result = run_slam(wrong)
+    (cause,) = result.causes
+    assert cause.code == "corner-order"
+    assert result.verdict is not None
+    assert (result.verdict.kind, result.verdict.causes) == (VerdictKind.SENSOR_SUSPECT, (cause,))
+    again = run_slam(wrong, prior_map=result.landmarks.as_prior(0.01))
+    assert again.causes == ()
+    assert again.verdict is not None
+    assert again.verdict.kind is VerdictKind.SOUND
 
 
 def with_ranges_alone(recording: Recording, factor: float = 1.0) -> Recording:

@@ -133,7 +133,7 @@ def list_suspects(inputs: Inputs) -> tuple[Suspect, ...]:
     recording, found = inputs.recording, list[Suspect]()
     found += _in_space(recording) if is_in_space(recording) else _in_plane(recording)
     if inputs.prior_map is not None:
-        found += _of_map(inputs.prior_map)
+        found += _of_map(inputs.prior_map, recording)
     return tuple(found)
 
 
@@ -704,7 +704,7 @@ def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspe
     if len(sensor.distortion) >= 4:
         other = "equidistant" if sensor.distortion_model == "radtan" else "radtan"
         yield lens(
-            "lens-model", f"the lens seems to be of the model '{other}'", f'[camera.{name}] model = "{other}"', USUAL_P,
+            "lens", f"the lens seems to be of the model '{other}'", f'[camera.{name}] model = "{other}"', USUAL_P,
             distortion=sensor.distortion[:4], distortion_model=other,
         )  # fmt: skip
 
@@ -740,7 +740,7 @@ def _change_lens(
 # ---- of a given map
 
 
-def _of_map(given: Landmarks) -> Iterable[Suspect]:
+def _of_map(given: Landmarks, recording: AnyRecording) -> Iterable[Suspect]:
     yield Suspect(
         "map-scale", "map", USUAL_P, _stretch_map,
         lambda s: f"true distances are {math.exp(s):.4g} times those of the given map: another scale",
@@ -752,7 +752,7 @@ def _of_map(given: Landmarks) -> Iterable[Suspect]:
         _constant("--prior-map: the sign of y"), of_map=True, pairs=False,
     )  # fmt: skip
     if given.rotation is not None and np.isfinite(given.rotation).any():
-        yield from _of_map_axes()
+        yield from _of_map_axes(recording)
     for unit, factor in (
         ("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048), ("inches", 0.0254),
     ):  # fmt: skip
@@ -768,16 +768,32 @@ def _of_map(given: Landmarks) -> Iterable[Suspect]:
     )  # fmt: skip
 
 
-def _of_map_axes() -> Iterable[Suspect]:
-    """Return what may be wrong with the orientations of tags in a map: other axes, or another order of numbers."""
+def _of_map_axes(recording: AnyRecording) -> Iterable[Suspect]:
+    """Return what may be wrong with the orientations of tags in a map: other axes, or another order of numbers.
+
+    A tag whose corners are listed from another one on is turned about its normal; one whose corners are listed
+    clockwise is turned over. Where corners were read, these are what is wrong.
+    """
+    corners = is_in_space(recording) and bool(np.isfinite(recording.detections.corner_px[:, 0, 0]).any())
+    clockwise = is_in_space(recording) and corners and bool(is_clockwise(recording).any())
     for quaternion in _AXES_TURNED:
         listed = ", ".join(f"{each:g}" for each in np.round(quaternion, 6) + 0.0)
-        normal = not quaternion[:2].any()
-        more = "; or the corners of the detections start at another one" if normal else ""
+        undo = partial(_turn_map, how=partial(_turn_within, by=se3.turn(quaternion)))
+        normal, over = (not np.abs(part).max() > 1e-9 for part in (quaternion[:2], quaternion[2:]))
+        if corners and (over if clockwise else normal):
+            which = "clockwise, as by OpenCV's ArUco, or from another one on" if clockwise else "from another one on"
+            yield Suspect(
+                "corner-order", "tags", USUAL_P, undo,
+                _constant(
+                    f"corners of tags are listed {which}: counter-clockwise from the lower left is expected (u0_px); "
+                    f"or tags have other axes than in the given map: x, y, z are its {_name_axes(quaternion)}"
+                ),
+                _constant(f"detections.csv: corners in the order {_name_order(quaternion)}"), of_map=True, pairs=False,
+            )  # fmt: skip
+            continue
         yield Suspect(
-            "map-axes", "map", USUAL_P if normal else RARE_P,
-            partial(_turn_map, how=partial(_turn_within, by=se3.turn(quaternion))),
-            _constant(f"tags have other axes than in the given map: x, y, z are its {_name_axes(quaternion)}{more}"),
+            "map-axes", "map", USUAL_P if normal else RARE_P, undo,
+            _constant(f"tags have other axes than in the given map: x, y, z are its {_name_axes(quaternion)}"),
             _constant(f"--prior-map: each orientation times the quaternion x, y, z, w = {listed}"),
             of_map=True, pairs=False,
         )  # fmt: skip
@@ -795,6 +811,13 @@ def _name_axes(quaternion: FloatArray) -> str:
     """Return axes after a rotation in those before it, as 'y, -x, z'."""
     turned = np.round(se3.transform(se3.turn(quaternion), np.eye(3)), 6)
     return ", ".join(("-" if axis.sum() < 0.0 else "") + "xyz"[int(np.abs(axis).argmax())] for axis in turned)
+
+
+def _name_order(quaternion: FloatArray) -> str:
+    """Return in which order to list corners of a tag that is turned by a quaternion, as '3, 2, 1, 0'."""
+    corner = np.array([(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)])
+    back = se3.transform(se3.inverse(se3.turn(quaternion)), corner)
+    return ", ".join(str(int(np.argmin(np.linalg.norm(corner - each, axis=1)))) for each in back)
 
 
 _AXES_TURNED = sorted(

@@ -77,6 +77,8 @@ PLACED, BETTER, ELSEWHERE = 0.6, 0.2, 0.3
 and share below which it is of another site."""
 FEWEST_CHANGED, CHANGED = 3, 0.2
 """Landmarks, and share of those in common with a map, that changed from which the map itself is in doubt."""
+AXES_OF_TAGS = frozenset({"map-axes", "corner-order"})
+"""Causes of a map by which only the orientations of its tags are others: its shape says which may be."""
 CHANGES, INNOVATIONS = "changes", "innovations"
 """Symptoms of a session in which landmarks changed, and of one whose detections scatter wider than they should."""
 OF_NOISE = "_noise_factor", "sigma_corner_px"
@@ -495,7 +497,7 @@ def _without_needless(
 
 def _is_of_map(suspect: Suspect, best: Trial[VisitT] | None, config: SlamConfig) -> bool:
     """Return whether a discrete cause of the map is asked: where most of the map does not hold, or it was not found."""
-    if not suspect.of_map or suspect.is_continuous or suspect.code == "map-axes":
+    if not suspect.of_map or suspect.is_continuous or suspect.code in AXES_OF_TAGS:
         return False
     if best is None:
         return True

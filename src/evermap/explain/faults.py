@@ -1,4 +1,5 @@
-"""What the odometry did not see of a drive: jumps, and silences; and whether the solution has put it right.
+"""What readings and one solution show to be wrong without a comparison: jumps and silences of the odometry, and corners
+of tags that are listed clockwise; and whether the solution has put it right.
 
 The estimator bridges both by what is seen: a step that no robot drives is an outlier of the odometry, and within a gap
 it may go anywhere. Where the poses are as well known for all that, the cause is told, and nothing is wrong with the
@@ -14,9 +15,9 @@ from math import degrees, nan
 import numpy as np
 
 from evermap.geometry import se2, se3
-from evermap.slam.check import SILENCE
+from evermap.slam.check import CLOCKWISE, CORNERS, SILENCE, is_clockwise
 from evermap.slam.mistakes import Finding, find_gaps
-from evermap.types import AnyRecording, Cause, FloatArray, IntArray, SlamResult, Trajectory
+from evermap.types import AnyRecording, Cause, FloatArray, IntArray, Landmarks, SlamResult, Trajectory, is_in_space
 
 JUMP_M, JUMP_RAD = 0.2, 0.2
 """Difference of odometry and trajectory within a step that is no noise of it [m, rad]."""
@@ -30,29 +31,45 @@ POORLY, LEAST_M = 5.0, 0.02
 
 
 def find_faults(
-    result: SlamResult, recording: AnyRecording, findings: Sequence[Finding]
+    result: SlamResult, recording: AnyRecording, findings: Sequence[Finding], prior_map: Landmarks | None
 ) -> tuple[tuple[Cause, ...], tuple[Cause, ...]]:
-    """Return causes that leave poses unknown, and those that the solution has put right.
+    """Return causes that leave poses unknown or a new map wrong, and those that the solution has put right.
 
     Args:
         result: of the run.
         recording: as it was estimated, without rows of the odometry that say nothing.
         findings: what `slam.check` found of it.
+        prior_map: that was given, or what a living map expected; it tells in which order corners are.
     """
+    order = _order_of_corners(result, recording, prior_map)
     silent = [finding for finding in findings if finding.code == SILENCE]
     if recording.odometry is None or len(result.trajectory) < 3:
-        return (), ()
+        return order, ()
     gaps_s = find_gaps(recording.odometry)
     jumps = find_jumps(result, gaps_s)
     told = [_jump(*jump, float(recording.odometry.stamp_s[0]), len(jumps)) for jump in jumps[:1]]
     if not silent or not len(gaps_s):
-        return (), tuple(told)
+        return order, tuple(told)
     long_s = float(np.diff(gaps_s, axis=1).sum())
     fix = "odometry: its driver, or its connection"
     silence = Cause(SILENCE, "odometry", silent[0].message, long_s, nan, 1.0, fix)
     if _is_poor(result.trajectory, gaps_s):
-        return (silence,), tuple(told)
-    return (), (silence, *told)
+        return (*order, silence), tuple(told)
+    return order, (silence, *told)
+
+
+def _order_of_corners(result: SlamResult, recording: AnyRecording, prior_map: Landmarks | None) -> tuple[Cause, ...]:
+    """Return that corners of tags are listed clockwise: the normals of all tags point into their walls.
+
+    Poses are as good for all that, and so is a map whose tags are alike.
+    """
+    known = prior_map is not None and prior_map.rotation is not None and np.isfinite(prior_map.rotation).any()
+    if known or not is_in_space(recording) or any(cause.code == "corner-order" for cause in result.causes):
+        return ()
+    if not is_clockwise(recording).any():
+        return ()
+    how = CORNERS[CLOCKWISE]
+    return (Cause("corner-order", "corners", how.message, probability=1.0, fix=how.fix),)
 
 
 def with_mended(result: SlamResult, mended: tuple[Cause, ...]) -> SlamResult:
