@@ -11,7 +11,8 @@ import pytest
 from evermap import check_recording, run_slam
 from evermap.geometry import se3
 from evermap.geometry.group import accumulate
-from evermap.slam.mistakes import USUAL, find_gaps, find_silences, without_silences
+from evermap.slam.gaps import find_gaps
+from evermap.slam.mistakes import USUAL, find_silences, without_silences
 from evermap.types import AnyRecording, SlamResult, VerdictKind
 
 from .worlds import World

@@ -16,7 +16,8 @@ import numpy as np
 
 from evermap.geometry import se2, se3
 from evermap.slam.check import CLOCKWISE, CORNERS, SILENCE, is_clockwise
-from evermap.slam.mistakes import Finding, find_gaps
+from evermap.slam.gaps import find_gaps
+from evermap.slam.mistakes import Finding
 from evermap.types import AnyRecording, Cause, FloatArray, IntArray, Landmarks, SlamResult, Trajectory, is_in_space
 
 JUMP_M, JUMP_RAD = 0.2, 0.2

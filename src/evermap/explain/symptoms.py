@@ -16,7 +16,7 @@ from evermap.estimate.innovations import comparable_nis, lag1_autocorrelation
 from evermap.explain.scores import SessionScores
 from evermap.geometry import se2, se3
 from evermap.slam.association.features import medians
-from evermap.slam.mistakes import find_gaps
+from evermap.slam.gaps import find_gaps
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,

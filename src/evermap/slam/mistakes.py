@@ -22,6 +22,7 @@ import numpy as np
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.group import accumulate
+from evermap.slam.gaps import SILENT_S, find_gaps
 from evermap.slam.kernels import pair_residuals, reckoned_motions
 from evermap.types import (
     UNKNOWN,
@@ -30,7 +31,6 @@ from evermap.types import (
     IntArray,
     Odometry,
     Recording,
-    SpatialOdometry,
     SpatialRecording,
     is_in_space,
     rows_of,
@@ -302,8 +302,6 @@ LEAST_STEP_S = 0.4
 _FACTORS = tuple(10.0**power for power in np.arange(-4.0, 4.01, 0.1) if abs(power) > 0.25)
 
 
-SILENT_S, FEW_STEPS = 2.0, 10.0
-"""Time, and usual steps, without a row from which the odometry is silent, or with rows by which the robot stands."""
 STANDS, MOVED = 1e-3, 0.1
 """Speed up to which the odometry says so [m/s, rad/s], and difference of two sightings from which the robot moved."""
 
@@ -686,15 +684,6 @@ def _dead_reckoned(odometry: Odometry, forward: float, lateral: float, turn: flo
     x = np.append(0.0, np.cumsum(ahead * np.cos(heading) - aside * np.sin(heading)))
     y = np.append(0.0, np.cumsum(ahead * np.sin(heading) + aside * np.cos(heading)))
     return np.column_stack([x, y, turned])
-
-
-def find_gaps(odometry: Odometry | SpatialOdometry) -> FloatArray:
-    """Return (K, 2) from when to when an odometry has no rows, for long beside its usual steps [s]."""
-    step_s = np.diff(odometry.stamp_s)
-    if not len(step_s):
-        return np.zeros((0, 2))
-    row = np.flatnonzero(step_s > max(SILENT_S, FEW_STEPS * float(np.median(step_s))))
-    return np.column_stack([odometry.stamp_s[row], odometry.stamp_s[row + 1]])
 
 
 def find_silences(recording: AnyRecording, settings: CheckConfig) -> FloatArray:

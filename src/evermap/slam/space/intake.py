@@ -15,8 +15,8 @@ from evermap.geometry import se3
 from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries, Symmetry
+from evermap.slam.gaps import find_gaps
 from evermap.slam.intake import frames_of_usable, landmark_ids, usable_detections
-from evermap.slam.mistakes import find_gaps
 from evermap.slam.space.linearise import CORNERS, JUMP_SHARE, POINT, POSE
 from evermap.slam.space.local_filter import SpatialFrame
 from evermap.slam.space.problem import USUAL, OdometryPath, SpatialNoise, SpatialProblem
