@@ -19,6 +19,7 @@ import numpy as np
 
 from evermap.geometry import se2, se3
 from evermap.geometry.group import accumulate
+from evermap.geometry.square import square_poses
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam import mistakes
 from evermap.slam.check import CLOCKWISE, CORNERS, SIGHTED, find_corner_mistake, is_clockwise, read_corners
@@ -42,6 +43,8 @@ SCALE, ONE_TAG, TURN, MAP_SCALE = 0.15, 0.3, 0.15, 0.1
 """Standard deviations of logarithms: of all ranges or speeds, of the size of one tag, of turns, of a map."""
 CENTRE_PX, COEFFICIENT = 30.0, 0.05
 """Standard deviations of the centre of an image, and of a coefficient of distortion that is stated."""
+RESOLUTIONS = 0.5, 2.0, 2.0 / 3.0, 1.5
+"""Sizes of images, over those that a camera was calibrated for, that are met: binned by two, or 720 rows for 1080."""
 SIDEWAYS = 0.1
 """Way to the side over that ahead from which a robot drives sideways: less is the noise of its odometry."""
 WITH_BEARINGS = 0.5
@@ -659,6 +662,13 @@ def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspe
         lambda s: f"[camera.{name}] intrinsics = [{fx * math.exp(s):.5g}, {fy * math.exp(s):.5g}, {cx:g}, {cy:g}]",
         FOCAL, lambda s: fx * math.exp(s), pairs=False,
     )  # fmt: skip
+    for factor in RESOLUTIONS:
+        listed = ", ".join(f"{factor * each:g}" for each in sensor.intrinsics)
+        yield Suspect(
+            "resolution", name, USUAL_P, partial(_change_resolution, rows=row, factor=factor),
+            _constant(f"{name}: corners are of images {factor:.3g} times as large as those of the calibration"),
+            _constant(f"[camera.{name}] intrinsics = [{listed}]"),
+        )  # fmt: skip
     for place, key in ((2, "cx"), (3, "cy")):
         stated = sensor.intrinsics[place]
         yield Suspect(
@@ -707,6 +717,25 @@ def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspe
             "lens", f"the lens seems to be of the model '{other}'", f'[camera.{name}] model = "{other}"', USUAL_P,
             distortion=sensor.distortion[:4], distortion_model=other,
         )  # fmt: skip
+
+
+def _change_resolution(inputs: Inputs, _: float, rows: Sequence[int], factor: float) -> Inputs:
+    """Return the same with the calibration of some cameras for images of another size, and the poses of their tags."""
+    recording: Any = inputs.recording
+    seen, sensors = recording.detections, list(recording.sensors)
+    pose = np.concatenate([seen.position_sensor_m, seen.rotation], axis=1)
+    for row in rows:
+        size = sensors[row].resolution_px
+        sensors[row] = replace(
+            sensors[row],
+            intrinsics=tuple(factor * each for each in sensors[row].intrinsics),
+            resolution_px=None if size is None else (round(factor * size[0]), round(factor * size[1])),
+        )
+        mine = np.flatnonzero((seen.sensor == row) & np.isfinite(seen.corner_px[:, 0, 0]))
+        if len(mine):
+            pose[mine] = square_poses(seen.corner_px[mine], seen.tag_size_m[mine], sensors[row]).pose[0]
+    seen = replace(seen, position_sensor_m=pose[:, :3], rotation=pose[:, 3:])
+    return replace(inputs, recording=replace(recording, detections=seen, sensors=tuple(sensors)))
 
 
 def _zoomed(sensor: SpatialSensor, state: float) -> dict[str, Any]:
