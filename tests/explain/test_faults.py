@@ -131,3 +131,24 @@ def test_a_robot_that_is_carried_is_told_and_the_run_is_sound(make: Any) -> None
     assert result.verdict is not None
     assert result.verdict.kind is VerdictKind.SOUND
     assert result.verdict.causes == (cause,)
+
+
+def test_an_odometry_that_seems_far_too_short_is_asked_about() -> None:
+    """Alone, tags of another size than stated only bend the odometry, which is taken for noisy."""
+    result = run_slam(World(seed=4, longer=1.25).space())
+    (cause,) = result.causes
+    assert cause.code in ("tag-size", "odometry-scale")  # of the two nothing tells which it is
+    assert cause.value == pytest.approx(1.25 if cause.code == "tag-size" else 0.8, rel=0.02)
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+
+
+def test_images_of_another_size_than_those_of_the_calibration_are_named() -> None:
+    recording = in_space()
+    seen = replace(recording.detections, corner_px=0.5 * recording.detections.corner_px)
+    result = run_slam(replace(recording, detections=seen))
+    (cause,) = result.causes
+    assert cause.code == "resolution"
+    assert "0.5 times" in cause.message
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
