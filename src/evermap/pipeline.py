@@ -46,6 +46,7 @@ def run_slam(
         NumericalError: no finite optimum.
     """
     from evermap.explain.causes import Inputs
+    from evermap.explain.faults import find_faults, with_mended
     from evermap.explain.verdict import with_verdict
     from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check, plane
@@ -74,9 +75,12 @@ def run_slam(
     if prior_map is not None:
         result = with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)
     solution = session.solution_of(visit)
-    return with_verdict(
-        result, under.recording, config.slam, under.prior_map, findings=found, as_read=read, session=solution
-    )
+    faults, mended = find_faults(result, under.recording, found, under.prior_map)
+    result = with_verdict(
+        replace(result, causes=(*result.causes, *faults)), under.recording, config.slam, under.prior_map,
+        findings=found, as_read=read, session=solution,
+    )  # fmt: skip
+    return with_mended(result, mended)
 
 
 @single_threaded()
@@ -202,12 +206,15 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
 
 def _add_verdict(entered: Session, before: LivingMap, config: Config, found: tuple[Finding, ...]) -> Session:
     """Return a session with its verdict, beside the map as it was `before` it."""
+    from evermap.explain.faults import find_faults, with_mended
     from evermap.explain.verdict import with_verdict
 
     expected = before.landmarks(p_least=0.0) if len(before.places) else None
     reason = entered.set_aside[0] if entered.set_aside else ""
-    slam = with_verdict(entered.slam, entered.recording, config.slam, expected, findings=found, set_aside=reason)
-    return replace(entered, slam=slam)
+    faults, mended = find_faults(entered.slam, entered.recording, found, expected)
+    slam = replace(entered.slam, causes=(*entered.slam.causes, *faults))
+    slam = with_verdict(slam, entered.recording, config.slam, expected, findings=found, set_aside=reason)
+    return replace(entered, slam=with_mended(slam, mended))
 
 
 @single_threaded()

@@ -13,7 +13,8 @@ from evermap import check_recording, run_slam
 from evermap.errors import DataError
 from evermap.explain.seeds import find_mount
 from evermap.explain.shape import compare_shapes
-from evermap.slam.check import find_corner_mistake, is_clockwise
+from evermap.io.spatial import with_tag_poses
+from evermap.slam.check import find_corner_mistake, is_clockwise, read_corners
 from evermap.slam.mistakes import USUAL, Mistake, find_motion, read_drive
 from evermap.slam.orientations import find_convention
 from evermap.types import FloatArray, Landmarks, Recording, SensorKind, SpatialRecording, VerdictKind
@@ -73,6 +74,19 @@ def test_corners_that_are_written_in_another_way_are_named(how: str, corners: Sp
     (found,) = [finding for finding in check_recording(wrong).findings if finding.code == "corner-order"]
     assert word in found.message
     assert not found.usable
+
+
+def test_corners_are_read_anew_where_a_reader_filled_in_poses_from_them(corners: SpatialRecording) -> None:
+    _, write = CORNERS["upwards"]
+    wrong = with_corners(corners, write(corners.detections.corner_px))
+    right, filled = (
+        replace(each, detections=with_tag_poses(each.detections, each.sensors, [])) for each in (corners, wrong)
+    )
+    assert find_corner_mistake(filled) == "upwards"
+    assert find_corner_mistake(right) == ""
+    read = read_corners(filled, "upwards").detections
+    assert read.position_sensor_m == pytest.approx(right.detections.position_sensor_m, abs=1e-9)
+    assert read.rotation == pytest.approx(right.detections.rotation, abs=1e-9)
 
 
 def test_corners_all_listed_clockwise_are_no_mistake_by_themselves(corners: SpatialRecording) -> None:
@@ -235,7 +249,7 @@ def test_a_fault_of_a_map_shows_in_its_shape(fault: str) -> None:
 
 NAMED = {
     "w first": ("map-axes", "w, x, y, z"),
-    "tags turned": ("map-axes", "-y, x, z; or the corners"),
+    "tags turned": ("map-axes", "-y, x, z"),
     "x out of the tag": ("map-axes", "z, y, -x"),
     "mirrored": ("map-mirrored", "mirrored"),
     "millimetres": ("map-unit", "millimetres"),
@@ -253,7 +267,8 @@ def test_a_fault_of_a_map_is_named_and_moves_nothing(
     result = run_slam(recording, prior_map=map_faults(World().map_in_space())[fault].as_prior(0.01))
     code, word = NAMED[fault]
     (cause,) = result.causes
-    assert (cause.code, cause.subject) == (code, "map")
+    same = kind == "corners" and fault == "tags turned"  # as if corners were listed from another one on
+    assert (cause.code, cause.subject) == (("corner-order", "tags") if same else (code, "map"))
     assert word in cause.message
     assert result.changes == ()
 
@@ -279,6 +294,32 @@ def test_corners_in_the_order_of_opencv_are_put_right(corners: SpatialRecording)
     (cause,) = result.causes
     assert (cause.code, cause.fix) == ("corner-order", "detections.csv: corners in the order 3, 2, 1, 0")
     assert result.changes == ()
+
+
+@pytest.mark.parametrize("order", [(1, 0, 3, 2), (1, 2, 3, 0)])
+@pytest.mark.slow
+def test_corners_from_another_one_on_are_named_beside_a_map(order: tuple[int, ...], corners: SpatialRecording) -> None:
+    wrong = with_corners(corners, corners.detections.corner_px[:, list(order)])
+    result = run_slam(wrong, prior_map=World().map_in_space().as_prior(0.01))
+    (cause,) = result.causes
+    back = ", ".join(str(order.index(corner)) for corner in range(4))
+    assert (cause.code, cause.fix) == ("corner-order", f"detections.csv: corners in the order {back}")
+    assert result.changes == ()
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+
+
+def test_clockwise_corners_are_named_where_no_map_has_them_so(corners: SpatialRecording) -> None:
+    wrong = with_corners(corners, corners.detections.corner_px[:, [1, 0, 3, 2]])
+    result = run_slam(wrong)
+    (cause,) = result.causes
+    assert cause.code == "corner-order"
+    assert result.verdict is not None
+    assert (result.verdict.kind, result.verdict.causes) == (VerdictKind.SENSOR_SUSPECT, (cause,))
+    again = run_slam(wrong, prior_map=result.landmarks.as_prior(0.01))
+    assert again.causes == ()
+    assert again.verdict is not None
+    assert again.verdict.kind is VerdictKind.SOUND
 
 
 def with_ranges_alone(recording: Recording, factor: float = 1.0) -> Recording:

@@ -19,6 +19,7 @@ import numpy as np
 
 from evermap.geometry import se2, se3
 from evermap.geometry.group import accumulate
+from evermap.geometry.square import square_poses
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam import mistakes
 from evermap.slam.check import CLOCKWISE, CORNERS, SIGHTED, find_corner_mistake, is_clockwise, read_corners
@@ -42,6 +43,8 @@ SCALE, ONE_TAG, TURN, MAP_SCALE = 0.15, 0.3, 0.15, 0.1
 """Standard deviations of logarithms: of all ranges or speeds, of the size of one tag, of turns, of a map."""
 CENTRE_PX, COEFFICIENT = 30.0, 0.05
 """Standard deviations of the centre of an image, and of a coefficient of distortion that is stated."""
+RESOLUTIONS = 0.5, 2.0, 2.0 / 3.0, 1.5
+"""Sizes of images, over those that a camera was calibrated for, that are met: binned by two, or 720 rows for 1080."""
 SIDEWAYS = 0.1
 """Way to the side over that ahead from which a robot drives sideways: less is the noise of its odometry."""
 WITH_BEARINGS = 0.5
@@ -140,7 +143,7 @@ def list_suspects(inputs: Inputs, *, discrete: bool = True) -> tuple[Suspect, ..
     recording, found = inputs.recording, list[Suspect]()
     found += _in_space(recording, discrete=discrete) if is_in_space(recording) else _in_plane(recording)
     if inputs.prior_map is not None:
-        found += _of_map(inputs.prior_map)
+        found += _of_map(inputs.prior_map, recording)
     return tuple(one for one in found if discrete or one.is_continuous)
 
 
@@ -681,6 +684,13 @@ def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspe
         lambda s: f"[camera.{name}] intrinsics = [{fx * math.exp(s):.5g}, {fy * math.exp(s):.5g}, {cx:g}, {cy:g}]",
         FOCAL, lambda s: fx * math.exp(s), pairs=False,
     )  # fmt: skip
+    for factor in RESOLUTIONS:
+        listed = ", ".join(f"{factor * each:g}" for each in sensor.intrinsics)
+        yield Suspect(
+            "resolution", name, USUAL_P, partial(_change_resolution, rows=row, factor=factor),
+            _constant(f"{name}: corners are of images {factor:.3g} times as large as those of the calibration"),
+            _constant(f"[camera.{name}] intrinsics = [{listed}]"),
+        )  # fmt: skip
     for place, key in ((2, "cx"), (3, "cy")):
         stated = sensor.intrinsics[place]
         yield Suspect(
@@ -726,9 +736,28 @@ def _of_lens(row: list[int], sensors: Sequence[SpatialSensor]) -> Iterable[Suspe
     if len(sensor.distortion) >= 4:
         other = "equidistant" if sensor.distortion_model == "radtan" else "radtan"
         yield lens(
-            "lens-model", f"the lens seems to be of the model '{other}'", f'[camera.{name}] model = "{other}"', USUAL_P,
+            "lens", f"the lens seems to be of the model '{other}'", f'[camera.{name}] model = "{other}"', USUAL_P,
             distortion=sensor.distortion[:4], distortion_model=other,
         )  # fmt: skip
+
+
+def _change_resolution(inputs: Inputs, _: float, rows: Sequence[int], factor: float) -> Inputs:
+    """Return the same with the calibration of some cameras for images of another size, and the poses of their tags."""
+    recording: Any = inputs.recording
+    seen, sensors = recording.detections, list(recording.sensors)
+    pose = np.concatenate([seen.position_sensor_m, seen.rotation], axis=1)
+    for row in rows:
+        size = sensors[row].resolution_px
+        sensors[row] = replace(
+            sensors[row],
+            intrinsics=tuple(factor * each for each in sensors[row].intrinsics),
+            resolution_px=None if size is None else (round(factor * size[0]), round(factor * size[1])),
+        )
+        mine = np.flatnonzero((seen.sensor == row) & np.isfinite(seen.corner_px[:, 0, 0]))
+        if len(mine):
+            pose[mine] = square_poses(seen.corner_px[mine], seen.tag_size_m[mine], sensors[row]).pose[0]
+    seen = replace(seen, position_sensor_m=pose[:, :3], rotation=pose[:, 3:])
+    return replace(inputs, recording=replace(recording, detections=seen, sensors=tuple(sensors)))
 
 
 def _zoomed(sensor: SpatialSensor, state: float) -> dict[str, Any]:
@@ -762,7 +791,7 @@ def _change_lens(
 # ---- of a given map
 
 
-def _of_map(given: Landmarks) -> Iterable[Suspect]:
+def _of_map(given: Landmarks, recording: AnyRecording) -> Iterable[Suspect]:
     yield Suspect(
         "map-scale", "map", USUAL_P, _stretch_map,
         lambda s: f"true distances are {math.exp(s):.4g} times those of the given map: another scale",
@@ -774,7 +803,7 @@ def _of_map(given: Landmarks) -> Iterable[Suspect]:
         _constant("--prior-map: the sign of y"), of_map=True, pairs=False,
     )  # fmt: skip
     if given.rotation is not None and np.isfinite(given.rotation).any():
-        yield from _of_map_axes()
+        yield from _of_map_axes(recording)
     for unit, factor in (
         ("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048), ("inches", 0.0254),
     ):  # fmt: skip
@@ -790,16 +819,32 @@ def _of_map(given: Landmarks) -> Iterable[Suspect]:
     )  # fmt: skip
 
 
-def _of_map_axes() -> Iterable[Suspect]:
-    """Return what may be wrong with the orientations of tags in a map: other axes, or another order of numbers."""
+def _of_map_axes(recording: AnyRecording) -> Iterable[Suspect]:
+    """Return what may be wrong with the orientations of tags in a map: other axes, or another order of numbers.
+
+    A tag whose corners are listed from another one on is turned about its normal; one whose corners are listed
+    clockwise is turned over. Where corners were read, these are what is wrong.
+    """
+    corners = is_in_space(recording) and bool(np.isfinite(recording.detections.corner_px[:, 0, 0]).any())
+    clockwise = is_in_space(recording) and corners and bool(is_clockwise(recording).any())
     for quaternion in _AXES_TURNED:
         listed = ", ".join(f"{each:g}" for each in np.round(quaternion, 6) + 0.0)
-        normal = not quaternion[:2].any()
-        more = "; or the corners of the detections start at another one" if normal else ""
+        undo = partial(_turn_map, how=partial(_turn_within, by=se3.turn(quaternion)))
+        normal, over = (not np.abs(part).max() > 1e-9 for part in (quaternion[:2], quaternion[2:]))
+        if corners and (over if clockwise else normal):
+            which = "clockwise, as by OpenCV's ArUco, or from another one on" if clockwise else "from another one on"
+            yield Suspect(
+                "corner-order", "tags", USUAL_P, undo,
+                _constant(
+                    f"corners of tags are listed {which}: counter-clockwise from the lower left is expected (u0_px); "
+                    f"or tags have other axes than in the given map: x, y, z are its {_name_axes(quaternion)}"
+                ),
+                _constant(f"detections.csv: corners in the order {_name_order(quaternion)}"), of_map=True, pairs=False,
+            )  # fmt: skip
+            continue
         yield Suspect(
-            "map-axes", "map", USUAL_P if normal else RARE_P,
-            partial(_turn_map, how=partial(_turn_within, by=se3.turn(quaternion))),
-            _constant(f"tags have other axes than in the given map: x, y, z are its {_name_axes(quaternion)}{more}"),
+            "map-axes", "map", USUAL_P if normal else RARE_P, undo,
+            _constant(f"tags have other axes than in the given map: x, y, z are its {_name_axes(quaternion)}"),
             _constant(f"--prior-map: each orientation times the quaternion x, y, z, w = {listed}"),
             of_map=True, pairs=False,
         )  # fmt: skip
@@ -817,6 +862,13 @@ def _name_axes(quaternion: FloatArray) -> str:
     """Return axes after a rotation in those before it, as 'y, -x, z'."""
     turned = np.round(se3.transform(se3.turn(quaternion), np.eye(3)), 6)
     return ", ".join(("-" if axis.sum() < 0.0 else "") + "xyz"[int(np.abs(axis).argmax())] for axis in turned)
+
+
+def _name_order(quaternion: FloatArray) -> str:
+    """Return in which order to list corners of a tag that is turned by a quaternion, as '3, 2, 1, 0'."""
+    corner = np.array([(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)])
+    back = se3.transform(se3.inverse(se3.turn(quaternion)), corner)
+    return ", ".join(str(int(np.argmin(np.linalg.norm(corner - each, axis=1)))) for each in back)
 
 
 _AXES_TURNED = sorted(

@@ -66,6 +66,9 @@ AGREE = 0.25
 """Share of what one of ranges, odometry and map is off by, up to which the other two agree with each other."""
 ODOMETRY_OFF = 0.3
 """Share of the motion by which odometry is off from which it is asked why, as by the verdict."""
+LENGTH_OFF, ODOMETRY_NOISY = 0.13, 2.5
+"""Logarithm of the length of the trajectory over that of the odometry, and its noise over what is usual, from which the
+same is asked: a run that is sound has less."""
 SHAPE = 5
 """Landmarks in common from which a map that what was seen lies nowhere on is of another site."""
 SURE = 0.99
@@ -77,6 +80,8 @@ PLACED, BETTER, ELSEWHERE = 0.6, 0.2, 0.3
 and share below which it is of another site."""
 FEWEST_CHANGED, CHANGED = 3, 0.2
 """Landmarks, and share of those in common with a map, that changed from which the map itself is in doubt."""
+AXES_OF_TAGS = frozenset({"map-axes", "corner-order"})
+"""Causes of a map by which only the orientations of its tags are others: its shape says which may be."""
 CHANGES, INNOVATIONS = "changes", "innovations"
 """Symptoms of a session in which landmarks changed, and of one whose detections scatter wider than they should."""
 OF_NOISE = "_noise_factor", "sigma_corner_px"
@@ -205,9 +210,17 @@ def find_symptoms(
         found.append("readings")
     if not found and _is_off_mount(result, inputs, config):
         found.append("mount")
-    if not found and compare_odometry(result)[0] > ODOMETRY_OFF:
-        found.append("odometry")
+    if not found:
+        apart, _, longer = compare_odometry(result, inputs.recording.odometry)
+        if apart > ODOMETRY_OFF or abs(math.log(max(longer, 1e-9))) > LENGTH_OFF or _is_odometry_noisy(result):
+            found.append("odometry")
     return tuple(found)
+
+
+def _is_odometry_noisy(result: SlamResult) -> bool:
+    """Return whether the odometry in space seems far noisier than is usual."""
+    noise = next((one for one in result.parameters if one.name == "sigma_odometry_m"), None)
+    return noise is not None and noise.prior_mean > 0.0 and noise.value > ODOMETRY_NOISY * noise.prior_mean
 
 
 def _is_off_mount(result: SlamResult, inputs: Inputs, config: SlamConfig) -> bool:
@@ -495,7 +508,7 @@ def _without_needless(
 
 def _is_of_map(suspect: Suspect, best: Trial[VisitT] | None, config: SlamConfig) -> bool:
     """Return whether a discrete cause of the map is asked: where most of the map does not hold, or it was not found."""
-    if not suspect.of_map or suspect.is_continuous or suspect.code == "map-axes":
+    if not suspect.of_map or suspect.is_continuous or suspect.code in AXES_OF_TAGS:
         return False
     if best is None:
         return True

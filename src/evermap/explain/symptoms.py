@@ -16,6 +16,7 @@ from evermap.estimate.innovations import comparable_nis, lag1_autocorrelation
 from evermap.explain.scores import SessionScores
 from evermap.geometry import se2, se3
 from evermap.slam.association.features import medians
+from evermap.slam.gaps import find_gaps
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,
@@ -26,9 +27,11 @@ from evermap.types import (
     Innovations,
     IntArray,
     Landmarks,
+    Odometry,
     ParameterEstimate,
     Recording,
     SlamResult,
+    SpatialOdometry,
     Trajectory,
     is_in_space,
 )
@@ -277,7 +280,7 @@ def measure_signs(
         as_read: the recording with the identities that it was read with; None where they are the same.
     """
     compared = compare_detections(recording, result)
-    motion, turn, longer = compare_odometry(result)
+    motion, turn, longer = compare_odometry(result, recording.odometry)
     halves, halves_share = _between_halves(compared)
     used, worst = _count_shares_used(result.innovations)
     blind_s, blind_share = _blind(result)
@@ -432,10 +435,10 @@ def _between_halves(compared: Compared) -> tuple[float, float]:
     return float(np.median(ratio)), float(np.median(np.linalg.norm(apart, axis=1)))
 
 
-def compare_odometry(result: SlamResult) -> tuple[float, float, float]:
+def compare_odometry(result: SlamResult, odometry: Odometry | SpatialOdometry | None) -> tuple[float, float, float]:
     """Return by how much odometry and trajectory differ within windows, as a share of the motion, in angle, in length.
 
-    All are medians over windows in which either moved.
+    All are medians over windows in which either moved, and in which the odometry has no gap.
     """
     path, other = result.trajectory, result.dead_reckoning
     if len(path) < 3 or len(other) != len(path) or not np.array_equal(path.stamp_s, other.stamp_s):
@@ -446,6 +449,8 @@ def compare_odometry(result: SlamResult) -> tuple[float, float, float]:
     first = (
         first[np.linspace(0, len(first) - 1, min(len(first), 20 * WINDOWS)).astype(np.int64)] if len(first) else first
     )
+    for since_s, until_s in [] if odometry is None else find_gaps(odometry).tolist():
+        first = first[(path.stamp_s[first] >= until_s) | (path.stamp_s[last[first]] <= since_s)]
     if len(first) < 3:
         return nan, nan, nan
     one, two = (_motions(each.pose_world_robot, first, last[first]) for each in (path, other))

@@ -18,9 +18,19 @@ import numpy as np
 from evermap.config import CheckConfig, CleaningConfig, Config, SensorConfig, SlamConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
+from evermap.geometry.square import square_poses
 from evermap.show import Shown
 from evermap.slam.cleaning import clean, spikes
-from evermap.slam.mistakes import HONEST, USUAL, Finding, find_motion, off, pairs_of
+from evermap.slam.mistakes import (
+    HONEST,
+    USUAL,
+    Finding,
+    find_motion,
+    find_silences,
+    off,
+    pairs_of,
+    without_silences,
+)
 from evermap.slam.orientations import find_convention
 from evermap.types import (
     UNKNOWN,
@@ -44,6 +54,8 @@ OUTSIDE = 0.05
 """Share of the image size by which undistorted corners of tags may lie outside of the image."""
 FEWEST_TAGS, NEARLY_ALL = 10, 0.9
 """Tags of a camera that show the order of its corners, and share of them that must be listed clockwise."""
+SILENCE = "odometry-silence"
+"""Code of the finding, and of the cause, that the odometry is silent."""
 FAR_LESS = 0.5
 """Difference of pairs of sightings, over that of corners as they are read, at which they were written otherwise."""
 
@@ -147,6 +159,8 @@ def find_misreadings(recording: AnyRecording, settings: SlamConfig) -> list[Find
         found += _identities(recording, settings.check)
     if is_in_space(recording) and recording.odometry is not None and all(finding.usable for finding in found):
         found += _jumps(recording.odometry, settings.cleaning)
+    if all(finding.usable for finding in found):
+        found += _silences(recording, settings.check)
     return sorted(found, key=lambda finding: finding.usable)
 
 
@@ -359,12 +373,20 @@ def is_clockwise(recording: SpatialRecording) -> BoolArray:
 
 
 def read_corners(recording: SpatialRecording, how: str) -> SpatialRecording:
-    """Return a recording with the corners of cameras that list them clockwise read in another way, of `CORNERS`."""
+    """Return a recording with the corners of cameras that list them clockwise read in another way, of `CORNERS`.
+
+    Poses of these tags follow from their corners: a reader has filled them in from the corners as they were written.
+    """
     seen, clockwise = recording.detections, is_clockwise(recording)
     size = np.array([sensor.resolution_px or (0, 0) for sensor in recording.sensors], dtype=np.float64)[seen.sensor]
-    corner = seen.corner_px.copy()
+    corner, pose = seen.corner_px.copy(), np.concatenate([seen.position_sensor_m, seen.rotation], axis=1)
     corner[clockwise] = CORNERS[how].read(corner[clockwise], size[clockwise, None])
-    return replace(recording, detections=replace(seen, corner_px=corner))
+    for row, sensor in enumerate(recording.sensors):
+        mine = np.flatnonzero(clockwise & (seen.sensor == row))
+        if sensor.intrinsics is not None and len(mine):
+            pose[mine] = square_poses(corner[mine], seen.tag_size_m[mine], sensor).pose[0]
+    read = replace(seen, corner_px=corner, position_sensor_m=pose[:, :3], rotation=pose[:, 3:])
+    return replace(recording, detections=read)
 
 
 def _find_pose_convention(recording: SpatialRecording, settings: CheckConfig) -> list[Finding]:
@@ -409,6 +431,21 @@ def _jumps(odometry: SpatialOdometry, settings: CleaningConfig) -> list[Finding]
         "corrected, or another frame"
     )
     return [Finding("odometry-jumps", message)]
+
+
+def _silences(recording: AnyRecording, settings: CheckConfig) -> list[Finding]:
+    """Times for which the odometry says nothing, or that the robot stands, although it drives."""
+    odometry, silence_s = recording.odometry, find_silences(recording, settings)
+    if odometry is None or not len(silence_s):
+        return []
+    longest = silence_s[int(np.argmax(silence_s[:, 1] - silence_s[:, 0]))]
+    times = "once" if len(silence_s) == 1 else f"{len(silence_s)} times"
+    message = (
+        f"odometry is silent {times} while the robot drives, for {longest[1] - longest[0]:.1f} s from "
+        f"{longest[0] - odometry.stamp_s[0]:.1f} s after its start on: no rows, or rows that say that it stands, "
+        "which are not used"
+    )
+    return [Finding(SILENCE, message)]
 
 
 def _limits(recording: Recording) -> list[Finding]:
@@ -499,6 +536,8 @@ def screened(
         recording = valid(recording, config.sensor, prior_map)
     found = odd(recording, settings)
     remarks = tuple(finding.message for finding in found)
+    if any(finding.code == SILENCE for finding in found):
+        recording = without_silences(recording, find_silences(recording, settings.check))
     if prior_map is not None and settings.unknown_ids is not True and (apart := strangers(prior_map, [recording])):
         remarks = (*remarks, apart)
     if not is_in_space(recording):

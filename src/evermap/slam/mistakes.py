@@ -15,13 +15,14 @@ from copy import copy
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import inf, log, pi
-from typing import Self, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.group import accumulate
+from evermap.slam.gaps import SILENT_S, find_gaps
 from evermap.slam.kernels import pair_residuals, reckoned_motions
 from evermap.types import (
     UNKNOWN,
@@ -32,6 +33,7 @@ from evermap.types import (
     Recording,
     SpatialRecording,
     is_in_space,
+    rows_of,
 )
 
 USUAL = CheckConfig()
@@ -298,6 +300,10 @@ LIKELIEST_BY = 250
 LEAST_STEP_S = 0.4
 """Minimum clock difference that is reported; smaller ones are estimated by the calibration."""
 _FACTORS = tuple(10.0**power for power in np.arange(-4.0, 4.01, 0.1) if abs(power) > 0.25)
+
+
+STANDS, MOVED = 1e-3, 0.1
+"""Speed up to which the odometry says so [m/s, rad/s], and difference of two sightings from which the robot moved."""
 
 
 def _late(delay_s: float) -> Mistake:
@@ -687,6 +693,68 @@ def _dead_reckoned(odometry: Odometry, forward: float, lateral: float, turn: flo
     x = np.append(0.0, np.cumsum(ahead * np.cos(heading) - aside * np.sin(heading)))
     y = np.append(0.0, np.cumsum(ahead * np.sin(heading) + aside * np.cos(heading)))
     return np.column_stack([x, y, turned])
+
+
+def find_silences(recording: AnyRecording, settings: CheckConfig) -> FloatArray:
+    """Return (K, 2) from when to when the odometry has no rows, or says that the robot stands, although it drives [s].
+
+    It drives if most pairs of sightings of several landmarks within such a time have moved in the sensor's view. Where
+    the odometry never says anything, all of it is wrong, and nothing is silent.
+    """
+    odometry = recording.odometry
+    if odometry is None or len(odometry) < 2:
+        return np.zeros((0, 2))
+    quiet_s = np.concatenate([find_gaps(odometry), _find_standstills(recording)])
+    if not len(quiet_s):
+        return quiet_s
+    blind = False
+    if not is_in_space(recording):
+        range_m, blind = recording.detections.range_m, bool(np.isnan(recording.detections.bearing_rad).mean() > 0.5)
+    first, second = sighting_pairs(recording, settings, with_bearing=not blind)
+    if blind:
+        moves = np.abs(np.log(range_m[second] / range_m[first])) > MOVED
+    elif len(first) and (pairs := pairs_of(recording, settings)) is not None:
+        moves = off(pairs.residual(HONEST, stands=True)[0]) > MOVED
+    else:
+        return np.zeros((0, 2))
+    seen_s, landmark = recording.frames.stamp_s[recording.detections.frame], recording.detections.landmark_id[first]
+    driven = np.zeros(len(quiet_s), dtype=np.bool_)
+    for row, (start_s, stop_s) in enumerate(quiet_s.tolist()):
+        own = (seen_s[first] >= start_s) & (seen_s[second] <= stop_s)
+        several = len(np.unique(landmark[own & moves])) > 1
+        driven[row] = np.count_nonzero(own) >= settings.fewest and several and np.mean(moves[own]) > 0.5
+    return quiet_s[driven][np.argsort(quiet_s[driven, 0])]
+
+
+def _find_standstills(recording: AnyRecording) -> FloatArray:
+    """(K, 2) from when to when the odometry says for long that the robot stands [s]; none if it never says else."""
+    odometry = recording.odometry
+    assert odometry is not None
+    step_s = np.diff(odometry.stamp_s)
+    if is_in_space(recording):
+        pose = recording.odometry.pose_world_robot  # type: ignore[union-attr]
+        step = np.abs(se3.local(pose[:-1], pose[1:])).max(axis=1)
+    else:
+        driven = recording.odometry
+        speeds = driven.forward_mps[:-1], driven.lateral_mps[:-1], driven.angular_radps[:-1]
+        step = np.abs(speeds).max(axis=0) * step_s
+    stands = step <= STANDS * step_s
+    if stands.all():
+        return np.zeros((0, 2))
+    bounds = np.diff(np.concatenate([[False], stands, [False]]).astype(np.int64))
+    span_s = odometry.stamp_s[np.column_stack([np.flatnonzero(bounds == 1), np.flatnonzero(bounds == -1)])]
+    return span_s[span_s[:, 1] - span_s[:, 0] > SILENT_S]
+
+
+def without_silences(recording: Any, silence_s: FloatArray) -> Any:
+    """Return a recording without the odometry's rows within silences (K, 2): estimators know what a gap says."""
+    if not len(silence_s):
+        return recording
+    stamp_s, silent = recording.odometry.stamp_s, np.zeros(len(recording.odometry), dtype=np.bool_)
+    for start_s, stop_s in silence_s.tolist():  # poses hold at both ends, velocities from the first of them on
+        silent |= ((stamp_s > start_s) if is_in_space(recording) else (stamp_s >= start_s)) & (stamp_s < stop_s)
+    silent[0] = False
+    return replace(recording, odometry=rows_of(recording.odometry, ~silent))
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,12 +22,14 @@ class PathFrames(NamedTuple):
     Attributes:
         row: (F,) rows of `SpatialRecording.frames`; the first and the last have a pose.
         stamp_s: (F,) since the first pose.
+        lasted_s: (F - 1,) what the variance of each step grows with, as of `SpatialProblem`.
         driven: (F, 7) poses by the odometry, from the identity; all identity without.
         posed: (N,) which of the F have a pose.
     """
 
     row: IntArray
     stamp_s: FloatArray
+    lasted_s: FloatArray
     driven: FloatArray
     posed: IntArray
 
@@ -129,7 +131,7 @@ class _Chain:
         self.unit = float(np.exp(estimate.log_scale))
         driven = se3.scaled(frames.driven, float(np.exp(problem.odometry_log)))
         since = se3.between(driven[frames.posed][frames.before], driven)  # from the last pose on
-        lasted_s = np.maximum(np.diff(frames.stamp_s), 1e-9)
+        lasted_s = np.maximum(frames.lasted_s, 1e-9)
         variance = np.repeat([noise.translation**2, noise.rotation**2], 3)
         begin = np.maximum(np.searchsorted(frames.posed, np.arange(1, len(frames.row))) - 1, 0)
         carried = se3.adjoint(

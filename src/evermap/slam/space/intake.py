@@ -15,9 +15,10 @@ from evermap.geometry import se3
 from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries, Symmetry
+from evermap.slam.gaps import find_gaps
 from evermap.slam.intake import frames_of_usable, frames_with_pose, landmark_ids, usable_detections
 from evermap.slam.space.bridge import PathFrames
-from evermap.slam.space.linearise import CORNERS, POINT, POSE
+from evermap.slam.space.linearise import CORNERS, JUMP_SHARE, POINT, POSE
 from evermap.slam.space.local_filter import SpatialFrame
 from evermap.slam.space.problem import USUAL, OdometryPath, SpatialNoise, SpatialProblem, Swing
 from evermap.types import (
@@ -118,8 +119,8 @@ def prepare_space(
     problem = SpatialProblem(
         stamp_s=stamps[pose_frame] - stamps[pose_frame[0]],
         increment=se3.between(frames.driven[frames.posed[:-1]], frames.driven[frames.posed[1:]]),
-        lasted_s=np.diff(stamps[pose_frame]) ** (1 if driven else 2),
-        swing=Swing.between(frames.posed, np.diff(path_s), frames.driven),
+        lasted_s=_lasted(recording.odometry, stamps[pose_frame]),
+        swing=Swing.between(frames.posed, frames.lasted_s, frames.driven),
         driven=driven,
         pose_row=np.searchsorted(pose_frame, detections.frame[used]),
         place=place.astype(np.int64),
@@ -509,7 +510,22 @@ def _frames(recording: SpatialRecording, seen_in: IntArray, moving: BoolArray) -
         row = np.flatnonzero(moving)
         looked = np.union1d(seen_in, recording.detections.frame[moving[recording.detections.frame]])
         posed = np.searchsorted(row, np.union1d(frames_with_pose(recording, looked, moving), row[[0, -1]]))
-    return PathFrames(row, stamp_s[row] - stamp_s[row[0]], drive_through(recording, stamp_s[row]), posed)
+    at_s = stamp_s[row]
+    lasted_s = _lasted(recording.odometry, at_s)
+    return PathFrames(row, at_s - at_s[0], lasted_s, drive_through(recording, at_s), posed)
+
+
+def _lasted(odometry: SpatialOdometry | None, stamp_s: FloatArray) -> FloatArray:
+    """Return (N - 1,) what the variance of motions between instants (N,) grows with, as of `SpatialProblem`.
+
+    In a gap of the odometry, between whose ends it is interpolated, the robot may have gone anywhere: as at a jump.
+    """
+    if odometry is None:
+        return np.diff(stamp_s) ** 2
+    lasted = np.diff(stamp_s)
+    for since_s, until_s in find_gaps(odometry).tolist():
+        lasted = lasted + np.diff(np.clip(stamp_s, since_s, until_s)) / JUMP_SHARE
+    return lasted
 
 
 def drive_through(recording: SpatialRecording, stamp_s: FloatArray) -> FloatArray:

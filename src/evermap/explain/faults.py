@@ -1,0 +1,135 @@
+"""What readings and one solution show to be wrong without a comparison: jumps and silences of the odometry, and corners
+of tags that are listed clockwise; and whether the solution has put it right.
+
+The estimator bridges both by what is seen: a step that no robot drives is an outlier of the odometry, and within a gap
+it may go anywhere. Where the poses are as well known for all that, the cause is told, and nothing is wrong with the
+run; where they are not, the odometry is suspect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import degrees, nan
+
+import numpy as np
+
+from evermap.geometry import se2, se3
+from evermap.slam.check import CLOCKWISE, CORNERS, SILENCE, is_clockwise
+from evermap.slam.gaps import find_gaps
+from evermap.slam.mistakes import Finding
+from evermap.types import AnyRecording, Cause, FloatArray, IntArray, Landmarks, SlamResult, Trajectory, is_in_space
+
+JUMP_M, JUMP_RAD = 0.2, 0.2
+"""Difference of odometry and trajectory within a step that is no noise of it [m, rad]."""
+TIMES = 10.0
+"""That over what all but a hundredth of the steps differ by."""
+BESIDE = 2
+"""Steps on both sides to which the estimator may have shared out a jump."""
+POORLY, LEAST_M = 5.0, 0.02
+"""Standard deviation of positions during a silence, over the usual one, from which they are not known, and the least
+[m]."""
+
+
+def find_faults(
+    result: SlamResult, recording: AnyRecording, findings: Sequence[Finding], prior_map: Landmarks | None
+) -> tuple[tuple[Cause, ...], tuple[Cause, ...]]:
+    """Return causes that leave poses unknown or a new map wrong, and those that the solution has put right.
+
+    Args:
+        result: of the run.
+        recording: as it was estimated, without rows of the odometry that say nothing.
+        findings: what `slam.check` found of it.
+        prior_map: that was given, or what a living map expected; it tells in which order corners are.
+    """
+    order = _order_of_corners(result, recording, prior_map)
+    silent = [finding for finding in findings if finding.code == SILENCE]
+    if recording.odometry is None or len(result.trajectory) < 3:
+        return order, ()
+    gaps_s = find_gaps(recording.odometry)
+    jumps = find_jumps(result, gaps_s)
+    told = [_jump(*jump, float(recording.odometry.stamp_s[0]), len(jumps)) for jump in jumps[:1]]
+    if not silent or not len(gaps_s):
+        return order, tuple(told)
+    long_s = float(np.diff(gaps_s, axis=1).sum())
+    fix = "odometry: its driver, or its connection"
+    silence = Cause(SILENCE, "odometry", silent[0].message, long_s, nan, 1.0, fix)
+    if _is_poor(result.trajectory, gaps_s):
+        return (*order, silence), tuple(told)
+    return order, (silence, *told)
+
+
+def _order_of_corners(result: SlamResult, recording: AnyRecording, prior_map: Landmarks | None) -> tuple[Cause, ...]:
+    """Return that corners of tags are listed clockwise: the normals of all tags point into their walls.
+
+    Poses are as good for all that, and so is a map whose tags are alike.
+    """
+    known = prior_map is not None and prior_map.rotation is not None and np.isfinite(prior_map.rotation).any()
+    if known or not is_in_space(recording) or any(cause.code == "corner-order" for cause in result.causes):
+        return ()
+    if not is_clockwise(recording).any():
+        return ()
+    how = CORNERS[CLOCKWISE]
+    return (Cause("corner-order", "corners", how.message, probability=1.0, fix=how.fix),)
+
+
+def with_mended(result: SlamResult, mended: tuple[Cause, ...]) -> SlamResult:
+    """Return the result, and its verdict, with causes that the solution has put right: they do not change it."""
+    if not mended:
+        return result
+    verdict = result.verdict
+    if verdict is not None:
+        verdict = replace(verdict, causes=(*verdict.causes, *mended))
+    return replace(result, causes=(*result.causes, *mended), verdict=verdict)
+
+
+def find_jumps(result: SlamResult, gaps_s: FloatArray) -> list[tuple[float, float, float]]:
+    """Return the stamps [s], lengths [m] and turns [rad] of steps that odometry and trajectory differ by, the largest
+    first; a step in gaps (K, 2) of the odometry is none.
+    """
+    path, other = result.trajectory, result.dead_reckoning
+    if len(other) != len(path) or not np.array_equal(path.stamp_s, other.stamp_s):
+        return []
+    last = np.arange(1, len(path))
+    shift_m, turn_rad = _differ(path.pose_world_robot, other.pose_world_robot, last - 1, last)
+    beyond = np.zeros(len(last), dtype=np.bool_)
+    for size, least in ((shift_m, JUMP_M), (turn_rad, JUMP_RAD)):
+        beyond |= size > max(least, TIMES * float(np.quantile(size, 0.99)))
+    for since_s, until_s in gaps_s.tolist():
+        beyond &= (path.stamp_s[1:] <= since_s) | (path.stamp_s[:-1] >= until_s)
+    rows = np.flatnonzero(beyond)
+    rows = rows[np.argsort(-shift_m[rows])]
+    around = np.clip([rows - BESIDE, rows + 1 + BESIDE], 0, len(path) - 1)
+    shift_m, turn_rad = _differ(path.pose_world_robot, other.pose_world_robot, *around)
+    return list(zip(path.stamp_s[rows + 1].tolist(), shift_m.tolist(), turn_rad.tolist(), strict=True))
+
+
+def _differ(pose: FloatArray, other: FloatArray, first: IntArray, last: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return by how much motions of two paths differ [m, rad]."""
+    group, dim = (se2, 2) if pose.shape[1] == 3 else (se3, 3)
+    one, two = (group.between(each[first], each[last]) for each in (pose, other))
+    apart = group.between(two, one)
+    turn_rad = np.abs(se2.wrap(apart[:, 2])) if dim == 2 else se3.angle_between(two, one)
+    return np.linalg.norm(apart[:, :dim], axis=1), np.asarray(turn_rad)
+
+
+def _jump(at_s: float, shift_m: float, turn_rad: float, start_s: float, count: int) -> Cause:
+    more = f", the largest of {count}" if count > 1 else ""
+    message = (
+        f"the robot was displaced by {shift_m:.2g} m and {degrees(turn_rad):.0f} deg against its odometry, "
+        f"{at_s - start_s:.1f} s after its start{more}: an estimate that was corrected, or begins anew, wheels that "
+        "slip, or the robot was carried"
+    )
+    return Cause("odometry-jumps", "odometry", message, shift_m, nan, 1.0, "odometry: steps that the robot did not go")
+
+
+def _is_poor(path: Trajectory, gaps_s: FloatArray) -> bool:
+    """Return whether positions within gaps are far less well known than others."""
+    dim = 2 if path.pose_world_robot.shape[1] == 3 else 3
+    sigma_m = np.sqrt(np.trace(path.covariance[:, :dim, :dim], axis1=1, axis2=2))
+    within = np.zeros(len(path), dtype=np.bool_)
+    for since_s, until_s in gaps_s.tolist():
+        within |= (path.stamp_s > since_s) & (path.stamp_s < until_s)
+    if not within.any() or within.all():
+        return False
+    return bool(np.median(sigma_m[within]) > max(LEAST_M, POORLY * float(np.median(sigma_m[~within]))))
