@@ -28,6 +28,7 @@ from evermap.sensing import learned
 from evermap.sensing.profile import Assumed, Field, Projection
 from evermap.sensing.visibility import LooksAt
 from evermap.slam.space.against_map import by_itself
+from evermap.slam.space.bodies import with_rests
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.intake import SpatialIntake, most_of, prepare_space
 from evermap.slam.space.problem import ANY_RAD, PlacePrior
@@ -288,13 +289,18 @@ def solve_visit(
     progress: Progress | None = None,
 ) -> SpatialVisit:
     """Return a recording with identities solved, by itself or in a map that is given; arguments as of `run_slam`."""
+    intake = fit_to_map(_taken_in(recording, config, remarks), prior_map, surveyed=True)
+    solved = solve_space(intake, prior_map, progress=progress, changes=config.slam.changes)
+    return SpatialVisit(recording, intake, solved)
+
+
+def _taken_in(recording: SpatialRecording, config: Config, remarks: tuple[str, ...]) -> SpatialIntake:
+    """Return a recording as input of the estimator, with the rests of bodies that move."""
     of_slam = config.slam
     intake = prepare_space(
         recording, of_slam.space, remarks, robust=of_slam.robust, estimate_noise=of_slam.estimate_noise
     )
-    intake = fit_to_map(intake, prior_map, surveyed=True)
-    solved = solve_space(intake, prior_map, progress=progress, changes=of_slam.changes)
-    return SpatialVisit(recording, intake, solved)
+    return with_rests(intake, recording, config.track.still)
 
 
 def solve_visits_together(visits: Sequence[SpatialVisit], rules: LocalizeConfig) -> list[SpatialVisit]:
@@ -325,10 +331,7 @@ def localised_in_space(
     """Return a session solved at its alignment with a map, or with the part of a large one that it can observe. The map
     has the session's classes (`session.admitted`).
     """
-    settings, of_slam = config.living, config.slam
-    intake = prepare_space(
-        recording, of_slam.space, remarks, robust=of_slam.robust, estimate_noise=of_slam.estimate_noise
-    )
+    settings, intake = config.living, _taken_in(recording, config, remarks)
     large, named = len(living.places) > settings.whole_places, cliques_of(living, names_of(intake).ravel())
     part = Vicinity.of(living, named, settings).part if large else living
     p_site = aged(part, settings, intake.start_s).p_here

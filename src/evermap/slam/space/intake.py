@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,23 @@ HARDLY = 1.0
 """Standard deviation with which it counts, as a share of the range: as good as nothing."""
 
 
+class Rests(NamedTuple):
+    """Where the landmarks of bodies that move stand in turn: rows (P,), one a place.
+
+    Attributes:
+        landmark: rows of `SpatialIntake.landmark_id` that the places are of.
+        body: its number, `UNKNOWN` of what is on no body that moves.
+        since_s, until_s: first and last stamp of the rest, on the problem's clock.
+        seen_m: (P, 3) how far from the rest the landmark was last seen before it rested again; nan where it was not.
+    """
+
+    landmark: IntArray
+    body: IntArray
+    since_s: FloatArray
+    until_s: FloatArray
+    seen_m: FloatArray
+
+
 @dataclass(frozen=True, slots=True)
 class SpatialIntake:
     """A recording as input of the estimator.
@@ -50,6 +68,7 @@ class SpatialIntake:
         names: texts behind landmark ids.
         boxes: (P,) landmarks that are boxes at rest.
         scale_in_map: standard deviation of the odometry's scale where a given map tells it.
+        rests: of bodies that move; None without any.
     """
 
     problem: SpatialProblem
@@ -62,6 +81,7 @@ class SpatialIntake:
     names: Mapping[int, str] = field(default_factory=dict)
     boxes: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     scale_in_map: float = 0.0
+    rests: Rests | None = None
 
 
 def prepare_space(

@@ -24,6 +24,7 @@ from evermap.geometry.symmetry import Symmetries
 from evermap.geometry.upright import is_level
 from evermap.slam.calibration import priced
 from evermap.slam.space.against_map import MapComparison, has_contradictions
+from evermap.slam.space.bodies import BodyMove, has_left, join_rests, number_moved
 from evermap.slam.space.delays import Delays, with_delays
 from evermap.slam.space.drift import Drift, drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
@@ -37,7 +38,7 @@ from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, Spa
 from evermap.slam.space.repair import repaired
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.starts import by_constellations, lost_frames
-from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Landmarks, Progress
 
 FREE = np.repeat([1e3, ANY_RAD], 3)
 """Deviation by which the first pose is held where a map says where it is [m, rad]. Two points of a map leave it a turn
@@ -84,6 +85,7 @@ class SpatialSolved:
         online_spread: (N, 2) roughly how far off these may be [m, rad].
         step_s: (N,) seconds that each frame took.
         moves: landmarks that moved during the session.
+        bodies: bodies that did, with all landmarks on them.
     """
 
     optimum: SpatialOptimum
@@ -95,11 +97,12 @@ class SpatialSolved:
     online_spread: FloatArray
     step_s: FloatArray
     moves: tuple[MovedWithin, ...] = ()
+    bodies: tuple[BodyMove, ...] = ()
 
     @property
     def left(self) -> BoolArray:
         """(P,) places that their landmarks have left."""
-        return superseded(self.moves, len(self.identity))
+        return superseded(self.moves, len(self.identity)) | has_left(self.bodies, len(self.identity))
 
 
 def solve_space(
@@ -157,7 +160,11 @@ def solve_space(
         if problem.ranges_share > 0.0 and not metric:
             optimum = _in_shared_metre(optimum)
         problem = optimum.smoother.problem
-    explanation = explain_places(optimum, intake.boxes, stated, changes)
+    identity, whole, bodies = np.arange(len(problem.oriented)), intake.boxes, tuple[BodyMove, ...]()
+    if intake.rests is not None:
+        optimum, identity, bodies = join_rests(optimum, intake.rests)
+        whole = whole | np.isin(np.arange(len(whole)), intake.rests.landmark[intake.rests.body != UNKNOWN])
+    explanation = explain_places(optimum, identity, whole, stated, changes)
     optimum, identity, problem = explanation.optimum, explanation.identity, explanation.optimum.smoother.problem
     smoother, sober = optimum.smoother.counted(optimum.estimate, optimum.now, counted), optimum.noise
     if drift is not None and counted is None and not problem.steady:
@@ -171,7 +178,10 @@ def solve_space(
     number, from_map = times_of(identity), explanation.from_map
     for move in reversed(explanation.moves):  # the landmark is where it was last
         number[[move.before, move.after]] = min(number[move.before], number[move.after])
-    return SpatialSolved(optimum, identity, number, from_map, delays, stepwise.pose, spread, step_s, explanation.moves)
+    number = number_moved(number, bodies)
+    return SpatialSolved(
+        optimum, identity, number, from_map, delays, stepwise.pose, spread, step_s, explanation.moves, bodies
+    )
 
 
 def fit_to_map(intake: SpatialIntake, prior_map: Landmarks | None, *, surveyed: bool = False) -> SpatialIntake:
