@@ -184,8 +184,17 @@ class SpatialVisit:
         rotation = self._as_known(row, rotation, laid[row], living)
         return Found(
             names[row], kind[row], laid[row], probability[row], position, covariance,
-            np.full(len(row), UNKNOWN, dtype=np.int64), first[row], last[row], rotation, alone.rotation[row],
+            self._bodies(row), first[row], last[row], rotation, alone.rotation[row],
         )  # fmt: skip
+
+    def _bodies(self, row: IntArray) -> IntArray:
+        """Objects (K,) that places (K,) are on, as stated; `UNKNOWN` for none."""
+        found, stated = np.full(len(row), UNKNOWN), self.recording.objects
+        named = self.intake.landmark_id[self.solved.identity[row]]
+        at = np.searchsorted(stated[:, 0], named)
+        on = (at < len(stated)) & (np.append(stated[:, 0], UNKNOWN)[np.minimum(at, len(stated))] == named)
+        found[on] = stated[at[on], 1]
+        return found
 
     def _as_known(self, row: IntArray, rotation: FloatArray, laid: IntArray, living: LivingMap) -> FloatArray:
         """Orientations (K, 4) of places (K,): of those that look the same the nearest to what the map has, where they

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.config import StillConfig
+from evermap.geometry import se3
 from evermap.slam.space.estimate import SpatialOptimum, as_seen, converged, first_places
 from evermap.slam.space.intake import Rests, SpatialIntake, start_noise
 from evermap.slam.space.problem import SpatialEstimate, SpatialProblem
@@ -34,6 +35,9 @@ ROUNDS = 2
 ELSEWHERE, SLACK_M = 4.0, 0.05
 """Standard deviations by which two places of a rest differ at least, with this error more."""
 
+SAME_M = 0.5
+"""What was seen last within this of its rest has not left it."""
+
 
 class BodyMove(NamedTuple):
     """A body that moved from one rest to another one, or out of view.
@@ -42,13 +46,15 @@ class BodyMove(NamedTuple):
         before: (K,) rows of the places that its landmarks left.
         after: (K,) rows of those at which they were next, the same as before where none was seen.
         between_s: it moved between these two, on the problem's clock.
-        seen_m: (K, 3) displacements at which the landmarks were seen last; nan where they were not.
+        last: which of the landmarks was seen last where no rest follows.
+        seen: (7,) its motion until then; see `Rests`.
     """
 
     before: IntArray
     after: IntArray
     between_s: tuple[float, float]
-    seen_m: FloatArray
+    last: int
+    seen: FloatArray
 
 
 def with_rests(intake: SpatialIntake, recording: SpatialRecording, settings: StillConfig) -> SpatialIntake:
@@ -172,7 +178,7 @@ def _with_places(
     problem, landmark = _by_rest(whole, rest)
     if still.all() and len(landmark) == len(intake.landmark_id):
         return intake
-    stamp_s, at = whole.stamp_s[whole.pose_row], as_seen(whole, estimate, whole.measured)[:, :3]
+    stamp_s, at = whole.stamp_s[whole.pose_row], as_seen(whole, estimate, whole.measured)
     since_s, until_s = np.full(len(landmark), np.inf), np.full(len(landmark), -np.inf)
     np.minimum.at(since_s, problem.place[still], stamp_s[still])
     np.maximum.at(until_s, problem.place[still], stamp_s[still])
@@ -180,14 +186,16 @@ def _with_places(
         body_of, body_of[landmark[len(body_of) :]]
     )
     body = np.where(moving[landmark], body_of[landmark], UNKNOWN)
-    seen_m = np.full((len(landmark), 3), np.nan)
+    seen_s, seen = np.full(len(landmark), np.nan), se3.identity(len(landmark))
     for row in np.flatnonzero((body != UNKNOWN) & np.isfinite(until_s)).tolist():
         next_s = since_s[(landmark == landmark[row]) & (since_s > until_s[row])].min(initial=np.inf)
         later = (whole.place == landmark[row]) & (stamp_s > until_s[row]) & (stamp_s < next_s)
         if later.any():
-            here = np.median(at[still & (problem.place == row)], axis=0)
-            seen_m[row] = at[np.flatnonzero(later)[-1]] - here
-    rests = Rests(landmark, body, since_s, until_s, seen_m)
+            here, last = at[np.flatnonzero(still & (problem.place == row))[-1]], int(np.flatnonzero(later)[-1])
+            seen_s[row], seen[row] = stamp_s[last], se3.between(here, at[last])
+            if not problem.oriented[row]:
+                seen[row] = np.append(at[last, :3] - here[:3], se3.NO_TURN)
+    rests = Rests(landmark, body, since_s, until_s, seen_s, seen)
     return replace(intake, problem=problem.selected(still), used=intake.used[still], rests=rests)
 
 
@@ -212,7 +220,7 @@ def join_rests(
         for rows in _in_turn(mine, rests):
             if groups:
                 a, b = _shared(groups[-1], rows, rests.landmark)
-                was_seen_to_move = np.isfinite(rests.seen_m[groups[-1]]).any()
+                was_seen_to_move = np.isfinite(rests.seen_s[groups[-1]]).any()
                 stands = not was_seen_to_move
                 if len(a):
                     stands = not _is_elsewhere(optimum, spread.own, spread.own_first[n + np.append(a, b)], a, b)
@@ -224,10 +232,11 @@ def join_rests(
         of_bodies.append(groups)
     kept = np.flatnonzero(into == np.arange(len(into)))
     row = np.searchsorted(kept, into)
-    until_s, seen_m = rests.until_s.copy(), rests.seen_m.copy()
+    together = rests._replace(until_s=rests.until_s.copy(), seen_s=rests.seen_s.copy(), seen=rests.seen.copy())
     for k in np.flatnonzero(into != np.arange(len(into))).tolist():
-        until_s[into[k]], seen_m[into[k]] = max(until_s[into[k]], until_s[k]), seen_m[k]
-    moves = [move for groups in of_bodies for move in _moves_of(groups, rests, until_s, seen_m)]
+        together.until_s[into[k]] = max(together.until_s[into[k]], rests.until_s[k])
+        together.seen_s[into[k]], together.seen[into[k]] = rests.seen_s[k], rests.seen[k]
+    moves = [move for groups in of_bodies for move in _moves_of(groups, together)]
     moves = [move._replace(before=row[move.before], after=row[move.after]) for move in moves]
     if len(kept) == len(into):
         return optimum, rests.landmark, tuple(moves)
@@ -274,19 +283,47 @@ def _is_elsewhere(optimum: SpatialOptimum, own: FloatArray, first: IntArray, a: 
     return bool(np.median(off / sigma_m) > ELSEWHERE)
 
 
-def _moves_of(groups: list[IntArray], rests: Rests, until_s: FloatArray, seen_m: FloatArray) -> list[BodyMove]:
+def _moves_of(groups: list[IntArray], rests: Rests) -> list[BodyMove]:
     """How a body moved from rest to rest, and from the last one out of view."""
     found = []
     for k, rows in enumerate(groups):
         later = groups[k + 1] if k + 1 < len(groups) else np.zeros(0, dtype=np.int64)
         a, b = _shared(rows, later, rests.landmark)
         alone = rows[~np.isin(rests.landmark[rows], rests.landmark[later])]
-        if not len(later) and not np.isfinite(seen_m[rows]).any():
+        if not len(later) and not np.isfinite(rests.seen_s[rows]).any():
             continue  # it stands there still
-        ends_s = float(rests.since_s[later].min()) if len(later) else float(rests.until_s.max())
+        if not len(later) and np.linalg.norm(rests.seen[rows, :3], axis=1).max() < SAME_M:
+            continue  # it does as far as anyone saw
+        ends_s = float(rests.since_s[later].min() if len(later) else np.nanmax(rests.seen_s[rows]))
         before, after = np.append(a, alone), np.append(b, alone)
-        found.append(BodyMove(before, after, (float(until_s[rows].max()), ends_s), seen_m[before]))
+        last = int(np.argmax(np.nan_to_num(rests.seen_s[before], nan=-np.inf)))
+        between_s = float(rests.until_s[rows].max()), ends_s
+        found.append(BodyMove(before, after, between_s, last, rests.seen[before[last]]))
     return found
+
+
+def shifts_of(move: BodyMove, place: FloatArray, oriented: BoolArray) -> tuple[FloatArray, float]:
+    """Return (K, 3) displacements of the landmarks of a body that moved, nan where they are not known, and its turn.
+
+    By one of them that was seen at both ends with its orientation, all are known.
+
+    Args:
+        move: of the body.
+        place: (P, 7) places.
+        oriented: (P,) those with an orientation.
+    """
+    stands = move.before != move.after
+    shift = np.where(stands[:, None], (place[move.after] - place[move.before])[:, :3], np.nan)
+    by = np.flatnonzero(stands)
+    if not len(by):
+        shift[move.last], by = move.seen[:3], np.array([move.last])
+    if not oriented[move.before[by[0]]]:
+        return shift, 0.0
+    here = place[move.before[by[0]]]
+    there = place[move.after[by[0]]] if stands.any() else se3.compose(here, move.seen)
+    motion = se3.compose(there, se3.inverse(here))
+    shift = se3.transform(motion, place[move.before, :3]) - place[move.before, :3]
+    return shift, float(se3.angle_between(here, there))
 
 
 def number_moved(number: IntArray, moves: tuple[BodyMove, ...]) -> IntArray:

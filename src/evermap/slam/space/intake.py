@@ -43,14 +43,16 @@ class Rests(NamedTuple):
         landmark: rows of `SpatialIntake.landmark_id` that the places are of.
         body: its number, `UNKNOWN` of what is on no body that moves.
         since_s, until_s: first and last stamp of the rest, on the problem's clock.
-        seen_m: (P, 3) how far from the rest the landmark was last seen before it rested again; nan where it was not.
+        seen_s: when the landmark was last seen as it moved after the rest, before the next one; nan where it was not.
+        seen: (P, 7) motion from the rest to there, in the landmark's own axes; of a point a shift.
     """
 
     landmark: IntArray
     body: IntArray
     since_s: FloatArray
     until_s: FloatArray
-    seen_m: FloatArray
+    seen_s: FloatArray
+    seen: FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from evermap.estimate.measurement import frame_of
 from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.calibration import OF_SCALE
-from evermap.slam.space.bodies import BodyMove
+from evermap.slam.space.bodies import BodyMove, shifts_of
 from evermap.slam.space.intake import SpatialIntake, most_of, start_noise
 from evermap.slam.space.linearise import (
     ACROSS,
@@ -390,13 +390,10 @@ def _change_of_body(told: _Told, move: BodyMove, identities: IntArray) -> MapCha
     """A move of a body during the session, of all landmarks on it."""
     problem, place = told.problem, told.solved.optimum.estimate.place
     stands = move.after != move.before
-    shift = np.where(stands[:, None], (place[move.after] - place[move.before])[:, :3], move.seen_m)
+    shift, turn_rad = shifts_of(move, place, problem.oriented)
     known = shift[np.isfinite(shift[:, 0])]
     used = (told.solved.optimum.now.weight > problem.settings.inlier) & np.isin(problem.place, move.after[stands])
     start_s = told.intake.start_s
-    turn_rad = 0.0
-    if (turns := np.flatnonzero(stands & problem.oriented[move.after])).size:
-        turn_rad = float(np.median(se3.angle_between(place[move.before[turns]], place[move.after[turns]])))
     return MapChange(
         landmark_ids=tuple(np.sort(identities[move.before]).tolist()),
         kind=ChangeKind.MOVED,

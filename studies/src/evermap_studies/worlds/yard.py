@@ -112,12 +112,14 @@ class YardDrive(NamedTuple):
         recording: what the robot reads.
         body: (B, F, 3) places of forklifts at each frame.
         moves: (B, F) whether each drives.
+        tag: (T, F, 7) poses of tags at each frame.
         body_of_tag: (T,) forklift that each tag is on, -1 on the walls; the identity of a tag is its row.
     """
 
     recording: SpatialRecording
     body: FloatArray
     moves: BoolArray
+    tag: FloatArray
     body_of_tag: IntArray
 
 
@@ -132,8 +134,14 @@ def simulate_yard(config: YardConfig | None = None, seed: int = 0) -> list[YardD
     for k, start_s in enumerate(config.starts_s()):
         of_drive = 0 if config.standing else k
         body, moves = _driven(forklifts, config, np.random.default_rng([seed, 1, of_drive]))
-        recording = _recorded(walls, forklifts, body, config, start_s, np.random.default_rng([seed, 2, k]))
-        drives.append(YardDrive(recording, body, moves, body_of_tag))
+        tag = np.concatenate(
+            [
+                np.repeat(walls[:, None], body.shape[1], axis=1),
+                *(se3.compose(upright(way)[None], one.tag[:, None]) for one, way in zip(forklifts, body, strict=True)),
+            ]
+        )
+        recording = _recorded(tag, body_of_tag, body, config, start_s, np.random.default_rng([seed, 2, k]))
+        drives.append(YardDrive(recording, body, moves, tag, body_of_tag))
     return drives
 
 
@@ -238,8 +246,8 @@ def _robot(config: YardConfig) -> FloatArray:
 
 
 def _recorded(
-    walls: FloatArray,
-    forklifts: list[Forklift],
+    tag: FloatArray,
+    body_of_tag: IntArray,
     body: FloatArray,
     config: YardConfig,
     start_s: float,
@@ -248,10 +256,6 @@ def _recorded(
     """What the robot reads in one drive."""
     pose = upright(_robot(config))
     stamp_s = start_s + STEP_S * np.arange(len(pose))
-    parts = [np.broadcast_to(walls[:, None], (len(walls), len(pose), 7))]
-    for one, place in zip(forklifts, body, strict=True):
-        parts.append(se3.compose(upright(place)[None], one.tag[:, None]))
-    tag = np.concatenate(parts)
     eye = pose + [0.0, 0.0, SENSOR_HEIGHT_M, 0.0, 0.0, 0.0, 0.0]
     seen = _in_view(eye, tag, body, _people(config, len(pose), rng), config)
     seen &= rng.uniform(size=seen.shape) < config.p_detect
@@ -278,10 +282,7 @@ def _recorded(
         score=unsaid,
         source_line=2 + np.arange(count),
     )
-    on = [np.full(len(one.tag), k) for k, one in enumerate(forklifts)]
-    first = len(walls)
-    objects = np.column_stack([first + np.arange(len(tag) - first), np.concatenate([*on, np.zeros(0)])])
-    stated = objects.astype(np.int64) if config.stated else np.zeros((0, 2), dtype=np.int64)
+    carried = np.flatnonzero((body_of_tag >= 0) & config.stated)
     return Recording(
         name=f"yard {start_s:.0f}",
         odometry=SpatialOdometry(stamp_s, _odometry(pose, config, rng), np.full((len(stamp_s), 6), np.nan), z_up=True),
@@ -290,7 +291,7 @@ def _recorded(
         sensors=(SpatialSensor(mount_robot_sensor=(0.0, 0.0, SENSOR_HEIGHT_M, 0.0, 0.0, 0.0, 1.0)),),
         truth=Trajectory(stamp_s, pose, np.zeros((len(pose), 6, 6)), frame="truth"),
         true_landmarks=Landmarks.in_space(np.arange(len(tag)), tag[:, -1, :3], rotation=tag[:, -1, 3:]),
-        objects=stated,
+        objects=np.column_stack([carried, body_of_tag[carried]]),
         class_names=("tag",),
     )
 
