@@ -2,10 +2,14 @@
 
     python -m benchmarks.yard --seeds 10          # a row a seed, then all
     python -m benchmarks.yard --seeds 10 --points # tags without orientations
+    python -m benchmarks.yard --seeds 5 --map     # three days in a living map
 
 Three runs a seed: all forklifts drive and stop; the same yard standing; and driving, without what is on them. Errors
 are of positions along the floor [m], after a rigid motion. A change is false unless it is a move of landmarks of one
 forklift that moved in that time, by so much.
+
+In a living map two forklifts drive in each of three drives, and four are parked elsewhere each time; or all stands. A
+statement is false if it is of a wall, of what stands, or of two forklifts; and of one forklift there is one.
 """
 
 from __future__ import annotations
@@ -51,6 +55,40 @@ def is_true(change: MapChange, drive: YardDrive) -> bool:
     return bool(drive.body_of_tag[tags[0]] >= 0 and np.linalg.norm(shifts, axis=1).max() > LEAST_M and told)
 
 
+def enter_drives(usual: YardConfig, seeds: range) -> None:
+    """Run and print days in a living map."""
+    total = np.zeros(4, dtype=np.int64)
+    print("seed  yard      errors                  statements  false  twice  others  verdicts")
+    for seed in seeds:
+        for config in (replace(usual, days=3, moving=2, parked=4), replace(usual, days=3, standing=True)):
+            living, errors, verdicts, count = None, [], [], np.zeros(4, dtype=np.int64)
+            for drive in simulate_yard(config, seed):
+                entered = em.run_session(drive.recording, living)
+                living = entered.living
+                errors.append(error_m(entered.slam, drive))
+                verdicts.append("" if entered.slam.verdict is None else str(entered.slam.verdict.kind.value))
+                told = [_bodies_of(change, drive) for change in entered.changes]
+                right = [len(one) == 1 and -1 not in one and not config.standing for one in told]
+                once = len({min(one) for one, good in zip(told, right, strict=True) if good})
+                others = sum(name >= len(drive.tag) for name in living.members.landmark_id.tolist())
+                count += [len(told), right.count(False), right.count(True) - once, others]
+                for change, good in zip(entered.changes, right, strict=True):
+                    if not good:
+                        print(f"      false: {change}")
+            total += count
+            row = " ".join(f"{one:.4f}" for one in errors)
+            name = "standing" if config.standing else "moving"
+            print(f"{seed:4d}  {name:8s}  {row}  " + " ".join(f"{one:6d}" for one in count.tolist()), *verdicts)
+    print("all", *total.tolist())
+
+
+def _bodies_of(change: MapChange, drive: YardDrive) -> set[int]:
+    """Forklifts that a change is of, -1 of walls, and of identities that nothing has."""
+    known = [name for name in change.landmark_ids if name < len(drive.body_of_tag)]
+    found = set(drive.body_of_tag[known].tolist())
+    return found if len(known) == len(change.landmark_ids) else {*found, -1}
+
+
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -58,8 +96,12 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--points", action="store_true", help="tags without orientations")
     parser.add_argument("--wall-tags", type=int, default=YardConfig().wall_tags)
+    parser.add_argument("--map", action="store_true", help="days in a living map")
     asked = parser.parse_args()
     usual = YardConfig(moving=6, parked=0, oriented=not asked.points, wall_tags=asked.wall_tags)
+    if asked.map:
+        enter_drives(usual, range(asked.first, asked.first + asked.seeds))
+        return
     rows = []
     print("seed  standing  moving  without  changes  false  verdicts")
     for seed in range(asked.first, asked.first + asked.seeds):

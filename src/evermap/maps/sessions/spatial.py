@@ -19,7 +19,7 @@ from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.maps.living import EXISTS, Dated, LivingMap
 from evermap.maps.sessions.believe import Witnessed, aged
-from evermap.maps.sessions.extend import Extended, Found, first_and_last
+from evermap.maps.sessions.extend import Extended, Found, fellows_of, first_and_last
 from evermap.maps.sessions.gaussian import anchored, drifted
 from evermap.maps.sessions.looks import Watch
 from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, Turned, laid_over, places_in, widened
@@ -185,6 +185,7 @@ class SpatialVisit:
         return Found(
             names[row], kind[row], laid[row], probability[row], position, covariance,
             self._bodies(row), first[row], last[row], rotation, alone.rotation[row],
+            fellows_of(names[row], self.recording.objects, living),
         )  # fmt: skip
 
     def _bodies(self, row: IntArray) -> IntArray:

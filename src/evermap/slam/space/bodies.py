@@ -17,7 +17,7 @@ from evermap.config import StillConfig
 from evermap.geometry import se3
 from evermap.slam.space.estimate import SpatialOptimum, as_seen, converged, first_places
 from evermap.slam.space.intake import Rests, SpatialIntake, start_noise
-from evermap.slam.space.problem import SpatialEstimate, SpatialProblem
+from evermap.slam.space.problem import LEAST_WEIGHT, SpatialEstimate, SpatialProblem
 from evermap.tracking.standing import log_factor_of_rest
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
 
@@ -35,6 +35,8 @@ ROUNDS = 2
 ELSEWHERE, SLACK_M = 4.0, 0.05
 """Standard deviations by which two places of a rest differ at least, with this error more."""
 
+FEWEST_FIXED = 3
+"""Landmarks on no body that tell where a session is in a map, at least."""
 SAME_M = 0.5
 """What was seen last within this of its rest has not left it."""
 
@@ -176,6 +178,7 @@ def _with_places(
     whole = intake.problem
     still = (body_of[whole.place] == UNKNOWN) | (rest != UNKNOWN)
     problem, landmark = _by_rest(whole, rest)
+    intake = replace(intake, bodies=body_of)
     if still.all() and len(landmark) == len(intake.landmark_id):
         return intake
     stamp_s, at = whole.stamp_s[whole.pose_row], as_seen(whole, estimate, whole.measured)
@@ -197,6 +200,25 @@ def _with_places(
                 seen[row] = np.append(at[last, :3] - here[:3], se3.NO_TURN)
     rests = Rests(landmark, body, since_s, until_s, seen_s, seen)
     return replace(intake, problem=problem.selected(still), used=intake.used[still], rests=rests)
+
+
+def mistrusted(problem: SpatialProblem, bodies: IntArray) -> SpatialProblem:
+    """Return the problem with a map that is not asked where bodies stand, which may have moved since, if it has others.
+
+    Where the session agrees with the map all the same, it counts in the end (`against_map.compared`).
+
+    Args:
+        problem: in a map.
+        bodies: of landmarks; see `SpatialIntake`.
+    """
+    prior = problem.prior
+    if not len(bodies) or not len(prior.place):
+        return problem
+    carried = bodies[prior.place] != UNKNOWN
+    seen = np.isin(prior.place, problem.place)
+    if np.count_nonzero(seen & ~carried) < FEWEST_FIXED:
+        return problem
+    return replace(problem, prior=replace(prior, weight=np.where(carried, LEAST_WEIGHT, prior.weight)))
 
 
 def join_rests(

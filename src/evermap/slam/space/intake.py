@@ -70,7 +70,8 @@ class SpatialIntake:
         names: texts behind landmark ids.
         boxes: (P,) landmarks that are boxes at rest.
         scale_in_map: standard deviation of the odometry's scale where a given map tells it.
-        rests: of bodies that move; None without any.
+        bodies: (P,) numbers of the bodies that landmarks are on, as stated, `UNKNOWN` of others; empty without any.
+        rests: of those that move; None without any.
     """
 
     problem: SpatialProblem
@@ -83,6 +84,7 @@ class SpatialIntake:
     names: Mapping[int, str] = field(default_factory=dict)
     boxes: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     scale_in_map: float = 0.0
+    bodies: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     rests: Rests | None = None
 
 

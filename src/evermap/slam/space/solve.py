@@ -24,7 +24,7 @@ from evermap.geometry.symmetry import Symmetries
 from evermap.geometry.upright import is_level
 from evermap.slam.calibration import priced
 from evermap.slam.space.against_map import MapComparison, has_contradictions
-from evermap.slam.space.bodies import BodyMove, has_left, join_rests, number_moved
+from evermap.slam.space.bodies import BodyMove, has_left, join_rests, mistrusted, number_moved
 from evermap.slam.space.delays import Delays, with_delays
 from evermap.slam.space.drift import Drift, drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
@@ -123,11 +123,12 @@ def solve_space(
         NumericalError: no finite optimum.
     """
     problem, stated = _with_map(intake, prior_map)
-    problem, framed = _without_frames(problem)
+    problem, framed = _without_frames(mistrusted(problem, intake.bodies))
     settings = problem.settings
     noise = start_noise(settings, driven=problem.driven)
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
-    known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
+    trusted = problem.prior.weight >= 0.5
+    known[problem.prior.place[trusted]], place[problem.prior.place] = True, problem.prior.pose
     scale_in_map = intake.scale_in_map if len(stated) and problem.scale_sigma == 0.0 else 0.0
     problem, noise, drift, counted = _with_drift(problem, noise, intake.driven_pose, in_map=scale_in_map > 0.0)
     stepwise, spread, step_s = incremental(problem, noise, known, place, progress)
@@ -163,7 +164,8 @@ def solve_space(
     identity, whole, bodies = np.arange(len(problem.oriented)), intake.boxes, tuple[BodyMove, ...]()
     if intake.rests is not None:
         optimum, identity, bodies = join_rests(optimum, intake.rests)
-        whole = whole | np.isin(np.arange(len(whole)), intake.rests.landmark[intake.rests.body != UNKNOWN])
+    if len(intake.bodies):
+        whole = whole | (intake.bodies != UNKNOWN)
     explanation = explain_places(optimum, identity, whole, stated, changes)
     optimum, identity, problem = explanation.optimum, explanation.identity, explanation.optimum.smoother.problem
     smoother, sober = optimum.smoother.counted(optimum.estimate, optimum.now, counted), optimum.noise
