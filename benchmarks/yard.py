@@ -111,11 +111,15 @@ def main() -> None:
         without = moving._replace(recording=replace(given, detections=rows_of(given.detections, on_walls)))
         found = [em.run_slam(one.recording) for one in (standing, moving, without)]
         errors = [error_m(result, one) for result, one in zip(found, (standing, moving, without), strict=True)]
-        told = [(change, one) for result, one in zip(found, (standing, moving), strict=False) for change in result.changes]
+        told = [
+            (change, one) for result, one in zip(found, (standing, moving), strict=False) for change in result.changes
+        ]
         false = [change for change, one in told if not is_true(change, one)]
         rows.append([*errors, len(told), len(false)])
         verdicts = " ".join("" if result.verdict is None else str(result.verdict.kind.value) for result in found)
-        print(f"{seed:4d} " + " ".join(f"{one:8.4f}" for one in errors) + f" {len(told):8d} {len(false):6d}  {verdicts}")
+        print(
+            f"{seed:4d} " + " ".join(f"{one:8.4f}" for one in errors) + f" {len(told):8d} {len(false):6d}  {verdicts}"
+        )
         for change in false:
             print(f"      false: {change}")
     table = np.array(rows)

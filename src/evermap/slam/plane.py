@@ -6,8 +6,9 @@ odometry leaves ramps out.
 
 **It is in the plane** if in addition detections are positions, with or without orientations: the calibration of wheels
 that only the plane has is worth more than what orientations say (twice as exact where wheels have usual errors). Tags
-by their corners, whose orientations are exact, stay in space, and so do recordings that state bodies, which are followed
-there as they move, and boxes and directions, for which the plane has no room. In a map in the plane all that can be is, in a map in space nothing.
+by their corners, whose orientations are exact, stay in space, and so do recordings that state bodies, which may move
+there, and boxes and directions, for which the plane has no room. In a map in the plane all that can be is, in a map in
+space nothing.
 """
 
 from __future__ import annotations

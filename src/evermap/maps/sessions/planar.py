@@ -75,7 +75,7 @@ class PlanarVisit:
             living = replace(living, metres=Metres.of(robot, variance, information))
         return living
 
-    def found(self, where: Laid | None, living: LivingMap, config: LivingConfig) -> Found:  # noqa: ARG002
+    def found(self, where: Laid | None, living: LivingMap, config: LivingConfig) -> Found:
         """Return the landmarks of the session in the frame of a map; None for `where` begins one."""
         visit = self.solved
         begins, in_place = where is None, None

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.config import StillConfig
+from evermap.config import BodiesConfig, StillConfig
 from evermap.geometry import se3
 from evermap.slam.space.estimate import SpatialOptimum, as_seen, converged, first_places
 from evermap.slam.space.intake import Rests, SpatialIntake, start_noise
@@ -21,21 +21,15 @@ from evermap.slam.space.problem import LEAST_WEIGHT, SpatialEstimate, SpatialPro
 from evermap.tracking.standing import log_factor_of_rest
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
 
-LIMIT_MPS = 0.15
-"""Speed at which standing and moving are as probable."""
-UNSEEN_S = 5.0
-"""A body may have moved unseen in the meantime."""
-MARGIN_S = 0.5
-"""Before and after a motion, in which a body is hardly static."""
-ERROR_M = 0.02
-"""Of the poses that are looked from, beside a landmark on no body."""
-COVERED_S = 0.5
-"""Time from a frame with a landmark on no body in which the odometry may be believed."""
+STILL_M = 0.02
+"""Error of the poses that are looked from, beside a landmark on no body."""
+NEAR_S = 0.5
+"""Time from a frame with a landmark on no body in which the odometry is believed."""
 ROUNDS = 2
 ELSEWHERE, SLACK_M = 4.0, 0.05
 """Standard deviations by which two places of a rest differ at least, with this error more."""
 
-FEWEST_FIXED = 3
+FEWEST = 3
 """Landmarks on no body that tell where a session is in a map, at least."""
 SAME_M = 0.5
 """What was seen last within this of its rest has not left it."""
@@ -98,7 +92,7 @@ def _poses(intake: SpatialIntake, body: IntArray, rest: IntArray) -> tuple[Spati
         estimate, noise = optimum.estimate, optimum.noise
     seen_s = problem.stamp_s[np.unique(problem.pose_row[known])]
     at_s = problem.stamp_s[problem.pose_row]
-    near = np.searchsorted(seen_s, at_s + COVERED_S, side="right") > np.searchsorted(seen_s, at_s - COVERED_S)
+    near = np.searchsorted(seen_s, at_s + NEAR_S, side="right") > np.searchsorted(seen_s, at_s - NEAR_S)
     range_m = np.linalg.norm(problem.measured[:, :3], axis=1)
     return estimate, np.where(near, 0.0, np.hypot(noise.translation, noise.rotation * range_m))
 
@@ -131,12 +125,14 @@ def _rests(
     found, count = np.full(len(body), UNKNOWN), 0
     at = as_seen(problem, estimate, problem.measured)[:, :3]
     sigma_m = np.sqrt((np.linalg.inv(problem.measured_root) ** 2).sum(axis=(1, 2)) / 3.0)
-    sigma_m = np.sqrt(sigma_m**2 + ERROR_M**2 + uncovered_m**2 * settings.window_s)
+    sigma_m = np.sqrt(sigma_m**2 + STILL_M**2 + uncovered_m**2 * settings.window_s)
     stamp_s = problem.stamp_s[problem.pose_row]
     for one in np.unique(body[body != UNKNOWN]):
         mine = np.flatnonzero(body == one)
-        moves = _moves(stamp_s[mine], at[mine, :2], sigma_m[mine], problem.place[mine], settings)
-        part = np.cumsum(np.diff(stamp_s[mine], prepend=-np.inf) > UNSEEN_S)
+        moves = _moves(
+            stamp_s[mine], at[mine, :2], sigma_m[mine], problem.place[mine], problem.settings.bodies, settings
+        )
+        part = np.cumsum(np.diff(stamp_s[mine], prepend=-np.inf) > problem.settings.bodies.unseen_s)
         part = part + np.cumsum(np.abs(np.diff(moves.astype(np.int64), prepend=0)))
         for run in np.unique(part[~moves]):
             some = mine[(part == run) & ~moves]
@@ -147,7 +143,12 @@ def _rests(
 
 
 def _moves(
-    stamp_s: FloatArray, at: FloatArray, sigma_m: FloatArray, landmark: IntArray, settings: StillConfig
+    stamp_s: FloatArray,
+    at: FloatArray,
+    sigma_m: FloatArray,
+    landmark: IntArray,
+    bodies: BodiesConfig,
+    settings: StillConfig,
 ) -> BoolArray:
     """(K,) whether a body moves when it is seen, by all of its landmarks in a window around each instant.
 
@@ -161,19 +162,21 @@ def _moves(
     for k, (begin, end) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
         for one in np.unique(landmark[begin:end]):
             some = begin + np.flatnonzero(landmark[begin:end] == one)
-            factor[k] += log_factor_of_rest(stamp_s[some], at[some], sigma_m[some], LIMIT_MPS, settings)
+            factor[k] += log_factor_of_rest(stamp_s[some], at[some], sigma_m[some], bodies.limit_mps, settings)
     moves = factor < 0.0
     if not moves.any():
         return np.zeros(len(stamp_s), dtype=np.bool_)
     moves |= factor == 0.0
     moving_s = instants[moves]
-    near = np.searchsorted(moving_s, instants + MARGIN_S, "right") > np.searchsorted(moving_s, instants - MARGIN_S)
+    first, last = (
+        np.searchsorted(moving_s, instants + by, side)
+        for by, side in ((-bodies.margin_s, "left"), (bodies.margin_s, "right"))
+    )
+    near = last > first
     return np.asarray(near[of.ravel()])
 
 
-def _with_places(
-    intake: SpatialIntake, estimate: SpatialEstimate, body_of: IntArray, rest: IntArray
-) -> SpatialIntake:
+def _with_places(intake: SpatialIntake, estimate: SpatialEstimate, body_of: IntArray, rest: IntArray) -> SpatialIntake:
     """The input with a place for every rest."""
     whole = intake.problem
     still = (body_of[whole.place] == UNKNOWN) | (rest != UNKNOWN)
@@ -216,14 +219,12 @@ def mistrusted(problem: SpatialProblem, bodies: IntArray) -> SpatialProblem:
         return problem
     carried = bodies[prior.place] != UNKNOWN
     seen = np.isin(prior.place, problem.place)
-    if np.count_nonzero(seen & ~carried) < FEWEST_FIXED:
+    if np.count_nonzero(seen & ~carried) < FEWEST:
         return problem
     return replace(problem, prior=replace(prior, weight=np.where(carried, LEAST_WEIGHT, prior.weight)))
 
 
-def join_rests(
-    optimum: SpatialOptimum, rests: Rests
-) -> tuple[SpatialOptimum, IntArray, tuple[BodyMove, ...]]:
+def join_rests(optimum: SpatialOptimum, rests: Rests) -> tuple[SpatialOptimum, IntArray, tuple[BodyMove, ...]]:
     """Return the optimum with rests of a body put together at which its landmarks agree; rows of landmarks that its
     places are of; and how bodies moved between those that are left.
 

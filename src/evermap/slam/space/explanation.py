@@ -96,8 +96,8 @@ def _explain_with(
     changes: ChangesConfig | None,
     given: int,
 ) -> SpatialExplanation:
-    """The explanation with these moves: what moved before the session, and identities of several landmarks. The first `given`
-    places are what they are.
+    """The explanation with these moves: what moved before the session, and identities of several landmarks. The first
+    `given` places are what they are.
     """
     problem = optimum.smoother.problem
     if problem.driven and len(problem.prior.place):

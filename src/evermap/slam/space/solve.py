@@ -161,12 +161,12 @@ def solve_space(
         if problem.ranges_share > 0.0 and not metric:
             optimum = _in_shared_metre(optimum)
         problem = optimum.smoother.problem
-    identity, whole, bodies = np.arange(len(problem.oriented)), intake.boxes, tuple[BodyMove, ...]()
+    identity, followed, bodies = np.arange(len(problem.oriented)), intake.boxes, tuple[BodyMove, ...]()
     if intake.rests is not None:
         optimum, identity, bodies = join_rests(optimum, intake.rests)
     if len(intake.bodies):
-        whole = whole | (intake.bodies != UNKNOWN)
-    explanation = explain_places(optimum, identity, whole, stated, changes)
+        followed = followed | (intake.bodies != UNKNOWN)
+    explanation = explain_places(optimum, identity, followed, stated, changes)
     optimum, identity, problem = explanation.optimum, explanation.identity, explanation.optimum.smoother.problem
     smoother, sober = optimum.smoother.counted(optimum.estimate, optimum.now, counted), optimum.noise
     if drift is not None and counted is None and not problem.steady:

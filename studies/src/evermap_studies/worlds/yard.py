@@ -151,7 +151,7 @@ def _tags_on_walls(count: int, rng: np.random.Generator) -> FloatArray:
     corners = np.cumsum([0.0, LENGTH_M, WIDTH_M, LENGTH_M, WIDTH_M])
     wall = np.searchsorted(corners, along, side="right") - 1
     begin = np.array([[0.0, 0.0], [LENGTH_M, 0.0], [LENGTH_M, WIDTH_M], [0.0, WIDTH_M]])[wall]
-    heading = 0.5 * np.pi * wall
+    heading = np.asarray(0.5 * np.pi * wall, dtype=np.float64)
     at = begin + (along - corners[wall])[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
     height_m = rng.uniform(0.8, 2.2, count)
     return _facing(np.column_stack([at, height_m]), heading + 0.5 * np.pi)
@@ -181,9 +181,7 @@ def _forklifts(config: YardConfig, rng: np.random.Generator) -> list[Forklift]:
     return found
 
 
-def _driven(
-    forklifts: list[Forklift], config: YardConfig, rng: np.random.Generator
-) -> tuple[FloatArray, BoolArray]:
+def _driven(forklifts: list[Forklift], config: YardConfig, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
     """(B, F, 3) places of forklifts at each frame, and (B, F) whether they drive."""
     n = round(config.drive_s / STEP_S)
     found, moves = np.zeros((len(forklifts), n, 3)), np.zeros((len(forklifts), n), dtype=np.bool_)
@@ -255,7 +253,7 @@ def _recorded(
 ) -> SpatialRecording:
     """What the robot reads in one drive."""
     pose = upright(_robot(config))
-    stamp_s = start_s + STEP_S * np.arange(len(pose))
+    stamp_s = start_s + STEP_S * np.arange(len(pose), dtype=np.float64)
     eye = pose + [0.0, 0.0, SENSOR_HEIGHT_M, 0.0, 0.0, 0.0, 0.0]
     seen = _in_view(eye, tag, body, _people(config, len(pose), rng), config)
     seen &= rng.uniform(size=seen.shape) < config.p_detect
@@ -296,9 +294,7 @@ def _recorded(
     )
 
 
-def _in_view(
-    eye: FloatArray, tag: FloatArray, body: FloatArray, people: FloatArray, config: YardConfig
-) -> BoolArray:
+def _in_view(eye: FloatArray, tag: FloatArray, body: FloatArray, people: FloatArray, config: YardConfig) -> BoolArray:
     """(T, F) tags that are near, ahead, face the robot, and are behind neither a forklift nor a person."""
     local = se3.transform(se3.inverse(eye)[None], tag[..., :3])
     range_m = np.linalg.norm(local, axis=-1)
