@@ -167,12 +167,9 @@ def _moves(
     if not moves.any():
         return np.zeros(len(stamp_s), dtype=np.bool_)
     moves |= factor == 0.0
-    moving_s = instants[moves]
-    first, last = (
-        np.searchsorted(moving_s, instants + by, side)
-        for by, side in ((-bodies.margin_s, "left"), (bodies.margin_s, "right"))
-    )
-    near = last > first
+    moving_s, margin_s = instants[moves], bodies.margin_s
+    last = np.searchsorted(moving_s, instants + margin_s, side="right")
+    near = last > np.searchsorted(moving_s, instants - margin_s)
     return np.asarray(near[of.ravel()])
 
 
@@ -192,16 +189,18 @@ def _with_places(intake: SpatialIntake, estimate: SpatialEstimate, body_of: IntA
         body_of, body_of[landmark[len(body_of) :]]
     )
     body = np.where(moving[landmark], body_of[landmark], UNKNOWN)
-    seen_s, seen = np.full(len(landmark), np.nan), se3.identity(len(landmark))
+    away_s, seen_s = np.full((2, len(landmark)), np.nan)
+    seen = se3.identity(len(landmark))
     for row in np.flatnonzero((body != UNKNOWN) & np.isfinite(until_s)).tolist():
         next_s = since_s[(landmark == landmark[row]) & (since_s > until_s[row])].min(initial=np.inf)
         later = (whole.place == landmark[row]) & (stamp_s > until_s[row]) & (stamp_s < next_s)
         if later.any():
             here, last = at[np.flatnonzero(still & (problem.place == row))[-1]], int(np.flatnonzero(later)[-1])
-            seen_s[row], seen[row] = stamp_s[last], se3.between(here, at[last])
+            away_s[row], seen_s[row] = stamp_s[np.flatnonzero(later)[0]], stamp_s[last]
+            seen[row] = se3.between(here, at[last])
             if not problem.oriented[row]:
                 seen[row] = np.append(at[last, :3] - here[:3], se3.NO_TURN)
-    rests = Rests(landmark, body, since_s, until_s, seen_s, seen)
+    rests = Rests(landmark, body, since_s, until_s, away_s, seen_s, seen)
     return replace(intake, problem=problem.selected(still), used=intake.used[still], rests=rests)
 
 
@@ -240,18 +239,19 @@ def join_rests(optimum: SpatialOptimum, rests: Rests) -> tuple[SpatialOptimum, I
     for one in np.unique(rests.body[rests.body != UNKNOWN]):
         mine = np.flatnonzero((rests.body == one) & seen)
         groups: list[IntArray] = []
+        before = mine[:0]
         for rows in _in_turn(mine, rests):
             if groups:
                 a, b = _shared(groups[-1], rows, rests.landmark)
-                was_seen_to_move = np.isfinite(rests.seen_s[groups[-1]]).any()
-                stands = not was_seen_to_move
+                stands = not (rests.away_s[before] < rests.since_s[rows].min()).any()
                 if len(a):
                     stands = not _is_elsewhere(optimum, spread.own, spread.own_first[n + np.append(a, b)], a, b)
                 if stands:
                     into[b] = a
-                    groups[-1] = np.append(groups[-1], np.setdiff1d(rows, b))
+                    groups[-1], before = np.append(groups[-1], np.setdiff1d(rows, b)), rows
                     continue
             groups.append(rows)
+            before = rows
         of_bodies.append(groups)
     kept = np.flatnonzero(into == np.arange(len(into)))
     row = np.searchsorted(kept, into)
@@ -313,11 +313,11 @@ def _moves_of(groups: list[IntArray], rests: Rests) -> list[BodyMove]:
         later = groups[k + 1] if k + 1 < len(groups) else np.zeros(0, dtype=np.int64)
         a, b = _shared(rows, later, rests.landmark)
         alone = rows[~np.isin(rests.landmark[rows], rests.landmark[later])]
-        if not len(later) and not np.isfinite(rests.seen_s[rows]).any():
-            continue  # it stands there still
-        if not len(later) and np.linalg.norm(rests.seen[rows, :3], axis=1).max() < SAME_M:
-            continue  # it does as far as anyone saw
-        ends_s = float(rests.since_s[later].min() if len(later) else np.nanmax(rests.seen_s[rows]))
+        if not len(a) and not np.isfinite(rests.seen_s[rows]).any():
+            continue  # it stands there still, as far as anyone saw
+        if not len(a) and np.linalg.norm(rests.seen[rows, :3], axis=1).max() < SAME_M:
+            continue
+        ends_s = float(rests.since_s[later].min() if len(a) else np.nanmax(rests.seen_s[rows]))
         before, after = np.append(a, alone), np.append(b, alone)
         last = int(np.argmax(np.nan_to_num(rests.seen_s[before], nan=-np.inf)))
         between_s = float(rests.until_s[rows].max()), ends_s

@@ -43,7 +43,8 @@ class Rests(NamedTuple):
         landmark: rows of `SpatialIntake.landmark_id` that the places are of.
         body: its number, `UNKNOWN` of what is on no body that moves.
         since_s, until_s: first and last stamp of the rest, on the problem's clock.
-        seen_s: when the landmark was last seen as it moved after the rest, before the next one; nan where it was not.
+        away_s: when the landmark was first seen as it moved after the rest, before the next one; nan where it was not.
+        seen_s: when it was last.
         seen: (P, 7) motion from the rest to there, in the landmark's own axes; of a point a shift.
     """
 
@@ -51,6 +52,7 @@ class Rests(NamedTuple):
     body: IntArray
     since_s: FloatArray
     until_s: FloatArray
+    away_s: FloatArray
     seen_s: FloatArray
     seen: FloatArray
 
