@@ -530,6 +530,14 @@ class TrafficConfig(Section):
     tilt_rad: Positive = key(0.05, "boxes are upright to within this [rad]")
 
 
+class BodiesConfig(Section):
+    """Bodies that carry landmarks, and may move while the robot is there."""
+
+    limit_mps: Positive = key(0.15, "speed at which it is as probable that a body stands as that it moves [m/s]")
+    margin_s: NotNegative = key(0.5, "time before and after a motion in which nothing of it is used [s]")
+    unseen_s: Positive = key(5.0, "a body that was not seen for longer may have moved in the meantime [s]")
+
+
 class UpConfig(Section):
     """Where up is in a map in space, which its floor, figures from above and Nav2's files need."""
 
@@ -625,6 +633,7 @@ class SpaceConfig(Section):
     map: MapInSpaceConfig = part(MapInSpaceConfig, "a map that is given")
     repair: RepairConfig = part(RepairConfig, "other explanations")
     traffic: TrafficConfig = part(TrafficConfig, "boxes without identity")
+    bodies: BodiesConfig = part(BodiesConfig, "landmarks on bodies that move")
 
     @field_validator("kinds")
     @classmethod

@@ -14,6 +14,7 @@ from typer.testing import CliRunner, Result
 from evermap.cli.main import app
 from evermap.geometry import se3
 from evermap.io import read_recording
+from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap_studies.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, looked_at, simulate_building
 
 SIMULATION = ["--days", "2", "--sessions-per-day", "2", "--patrol-s", "20", "--seed", "3"]
@@ -95,6 +96,27 @@ def test_a_street_is_written_with_who_stood_where(tmp_path: Path) -> None:
         assert off.max() < 0.6  # a parked car is detected at its slot
     assert run("simulate", "street", tmp_path / "no", "--doors").exit_code == 2
     assert run("simulate", "stret", tmp_path / "no").exit_code == 2
+
+
+def test_a_yard_is_written_with_its_bodies(tmp_path: Path) -> None:
+    out = tmp_path / "yard"
+    result = run("simulate", "yard", out, "--days", "1", "--moving", "3", "--seed", "2", "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["sessions"] == ["day00_session00"]
+    recording = read_recording(out / "day00_session00")
+    with (out / "bodies_truth.csv").open(encoding="utf-8", newline="") as file:
+        bodies = list(csv.DictReader(file))
+    moved = {int(row["object_id"]) for row in bodies if row["moves"] == "1"}
+    assert moved == {0, 1, 2}
+    assert set(recording.objects[:, 1].tolist()) == {0, 1, 2, 3, 4, 5}
+    np.testing.assert_array_equal(unpack_recording(pack_recording(recording)).objects, recording.objects)
+    standing = tmp_path / "standing"
+    assert run("simulate", "yard", standing, "--days", "1", "--moving", "3", "--seed", "2", "--standing").exit_code == 0
+    with (standing / "bodies_truth.csv").open(encoding="utf-8", newline="") as file:
+        places = {(row["object_id"], row["x_m"], row["y_m"]) for row in csv.DictReader(file)}
+    assert len(places) == 6
+    assert run("simulate", "street", tmp_path / "no", "--standing").exit_code == 2
+    assert run("simulate", "yard", tmp_path / "no", "--doors").exit_code == 2
 
 
 @pytest.mark.parametrize("table_format", ["csv", "parquet"])

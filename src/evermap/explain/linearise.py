@@ -186,6 +186,9 @@ def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> Spat
         undone.recording, problem.settings, robust=problem.robust, estimate_noise=problem.estimate_noise, coarse=True
     )  # of tags in an image the residuals are those of the corners
     intake = fit_to_map(intake, undone.prior_map)
+    if before.rests is not None:  # what was seen of bodies as they moved was left out
+        kept = np.isin(intake.used, before.used)
+        intake = replace(intake, problem=intake.problem.selected(kept), used=intake.used[kept])
     if not (np.array_equal(intake.used, before.used) and len(intake.pose_frame) == len(before.pose_frame)):
         return None
     return replace(_with_measurements(problem, intake), prior=prior)

@@ -72,7 +72,8 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
         planar, table = None, tables["odometry"]
         if table is not None and table.has_any((*_VELOCITIES, *_INCREMENTS)):
             planar, tables = _odometry(table, rig.settings.clock, warnings), {**tables, "odometry": None}
-        return spatial_recording(tables, rig, planar, title=files.title, source=str(path), warnings=warnings)
+        found = spatial_recording(tables, rig, planar, title=files.title, source=str(path), warnings=warnings)
+        return replace(found, objects=_objects(tables["objects"], dict(found.landmark_names)))
     settings = _on_clock(_read_settings(files, warnings), tables, files)
     clock, driven = settings.clock, _needed("odometry", tables, files)
     names: dict[int, str] = {}

@@ -6,8 +6,9 @@ odometry leaves ramps out.
 
 **It is in the plane** if in addition detections are positions, with or without orientations: the calibration of wheels
 that only the plane has is worth more than what orientations say (twice as exact where wheels have usual errors). Tags
-by their corners, whose orientations are exact, stay in space, and so do boxes and directions, for which the plane has
-no room. In a map in the plane all that can be is, in a map in space nothing.
+by their corners, whose orientations are exact, stay in space, and so do recordings that state bodies, which may move
+there, and boxes and directions, for which the plane has no room. In a map in the plane all that can be is, in a map in
+space nothing.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def in_its_space(recording: AnyRecording, settings: SlamConfig, *, dim: int | No
         return _in_plane(recording, "as slam.plane says")
     if obstacle or not is_on_floor(recording, settings.check):
         return recording
-    if dim != 2 and np.isfinite(recording.detections.corner_px[:, 0, 0]).any():
+    if dim != 2 and (np.isfinite(recording.detections.corner_px[:, 0, 0]).any() or len(recording.objects)):
         return recording
     wrong = unusable(recording, settings.check)
     if wrong is not None and not wrong.usable:  # refused by its name there: velocities in mm/s are no velocities

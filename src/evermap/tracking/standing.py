@@ -114,9 +114,21 @@ def _p_static(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: flo
 
 def _p_of(velocity: FloatArray, spread: float, limit: float, settings: StillConfig) -> float:
     """Return the probability that an object with a velocity (2,) of known variance is static; the prior is one half."""
+    return float(1.0 / (1.0 + np.exp(-np.clip(_log_factor(velocity, spread, limit, settings), -700.0, 700.0))))
+
+
+def _log_factor(velocity: FloatArray, spread: float, limit: float, settings: StillConfig) -> float:
     still, moving = (settings.still * limit) ** 2 + spread, (settings.moving * limit) ** 2 + spread
-    log_factor = np.log(moving / still) - 0.5 * float(velocity @ velocity) * (1.0 / still - 1.0 / moving)
-    return float(1.0 / (1.0 + np.exp(-np.clip(log_factor, -700.0, 700.0))))
+    return float(np.log(moving / still) - 0.5 * float(velocity @ velocity) * (1.0 / still - 1.0 / moving))
+
+
+def log_factor_of_rest(
+    stamp_s: FloatArray, at: FloatArray, sigma_m: FloatArray, limit_mps: float, settings: StillConfig
+) -> float:
+    """Return the log Bayes factor that what is detected at (K, 2) stands, over that it moves; 0 of too few."""
+    if not _enough(stamp_s, settings):
+        return 0.0
+    return _log_factor(*_line(stamp_s, at, sigma_m, settings), limit_mps, settings)
 
 
 def _way(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, settings: StillConfig) -> tuple[FloatArray, float]:

@@ -14,11 +14,15 @@ from evermap.errors import ConfigError, suggestion
 
 if TYPE_CHECKING:
     from evermap_studies.sim import BuildingSimulation
+    from evermap_studies.worlds.yard import YardConfig
 
-BUILDING, STREET = WORLDS = ("building", "street")
+BUILDING, STREET, YARD = WORLDS = ("building", "street", "yard")
 OF_BUILDINGS = ("patrol_s", "change_rate", "doors", "wing_opens_day", "clutter")
-"""Options that a street does not have."""
+"""Options of buildings alone."""
+OF_YARDS = ("standing", "moving")
+"""And of yards."""
 STAYS_FILE = "stays_truth.csv"
+BODIES_FILE = "bodies_truth.csv"
 EVENTS_FILE = "changes_truth.jsonl"
 LOOKS_FILE = "looks_truth.csv"
 
@@ -26,7 +30,7 @@ LOOKS_FILE = "looks_truth.csv"
 def simulate(
     context: typer.Context,
     world: Annotated[
-        str, typer.Argument(metavar="WORLD", help="building or street; a folder alone is for a building.")
+        str, typer.Argument(metavar="WORLD", help="building, street or yard; a folder alone is for a building.")
     ],
     out: Annotated[
         Path | None,
@@ -54,13 +58,17 @@ def simulate(
     clutter: Annotated[
         bool, typer.Option("--clutter", help="Add crates, many, that stay in one place for hours.")
     ] = False,
+    moving: Annotated[
+        int, typer.Option(min=0, max=6, help="Forklifts of a yard, of six, that drive while the robot is there.")
+    ] = 4,
+    standing: Annotated[bool, typer.Option("--standing", help="The same yard with nothing that moves.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
     force: Annotated[
         bool,
         typer.Option("--force", help="Write into OUT even if it is not empty; other files stay."),
     ] = False,
 ) -> None:
-    """Record drives in a simulated building or street.
+    """Record drives in a simulated building, street or yard.
 
     Every session is a folder in the native format with its true trajectory and landmarks. What changed and when is in
     changes_truth.jsonl; where each landmark stood in every session, and whether the robot really looked there, in
@@ -69,26 +77,40 @@ def simulate(
     A street has cars and vans that park and leave, some of them in view, and cars that drive along, seen as boxes
     without identity in space; stays_truth.csv has who stood where, from when until when.
 
+    A yard has forklifts that carry tags, seen in space: some drive and stop while the robot is there, the others are
+    parked, elsewhere in each session; bodies_truth.csv has where each forklift was in each frame.
+
     \b
     Example:
       evermap simulate building --days 3 --seed 1
       evermap slam building/day00_session00
       evermap simulate building out/hard --patrol-s 20 --patrol-s 60 --doors --wing-opens-day 3 --clutter
       evermap simulate street --days 3
+      evermap simulate yard --moving 6
     """
     if world not in WORLDS and out is not None:
         raise ConfigError(f"no world '{world}'", field="world", hint=suggestion(world, WORLDS))
     where = out or Path(world)
-    if world == STREET:
-        for name in OF_BUILDINGS:
-            source = context.get_parameter_source(name)
-            if source is not None and source.name == "COMMANDLINE":
-                raise ConfigError("is for buildings", field=f"--{name.replace('_', '-')}", hint="not for a street")
-        names = _write_street(where, days, sessions_per_day, seed, force=force)
+    of_others = [*(OF_BUILDINGS if world in (STREET, YARD) else ()), *(OF_YARDS if world != YARD else ())]
+    for name in of_others:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            whose = "buildings" if name in OF_BUILDINGS else "yards"
+            raise ConfigError(f"is for {whose}", field=f"--{name.replace('_', '-')}", hint="leave it out")
+    if world in (STREET, YARD):
+        if world == STREET:
+            names = _write_street(where, days, sessions_per_day, seed, force=force)
+        else:
+            from evermap_studies.worlds.yard import YardConfig
+
+            config = YardConfig(
+                days=days, drives_per_day=sessions_per_day, moving=moving, parked=6 - moving, standing=standing
+            )
+            names = _write_yard(where, config, seed, force=force)
         if as_json:
             print_json({"out": str(where), "sessions": names, "seed": seed})
         else:
-            say(f"wrote {len(names)} sessions to {where}; next: evermap slam {where / names[0]} --map street.map")
+            say(f"wrote {len(names)} sessions to {where}; next: evermap slam {where / names[0]} --map {world}.map")
         return
     out = where
     from evermap.io import write_native
@@ -96,7 +118,7 @@ def simulate(
     from evermap_studies.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, simulate_building
 
     folder = RunFolder(out, force=force, renew=False)
-    config = BuildingConfig(
+    of_building = BuildingConfig(
         days=days,
         sessions_per_day=sessions_per_day,
         patrol_s=max(patrol_s),
@@ -106,7 +128,7 @@ def simulate(
         doors=ROOM_DOORS if doors else None,
         wing_opens_day=wing_opens_day,
     )
-    building = simulate_building(config, seed=seed)
+    building = simulate_building(of_building, seed=seed)
     names = session_names(building)
     with folder:
         for name, recording in zip(names, building.sessions, strict=True):
@@ -141,6 +163,29 @@ def _write_street(out: Path, days: int, drives_per_day: int, seed: int, *, force
         for name, recording in zip(names, drives, strict=True):
             write_native(recording, folder.path(name))
         write_atomic(folder.path(STAYS_FILE), "".join(lines))
+    return names
+
+
+def _write_yard(out: Path, config: YardConfig, seed: int, *, force: bool) -> list[str]:
+    """Write the drives through a yard and where its forklifts were; return their names."""
+    from evermap.io import write_native
+    from evermap.io.files import write_atomic
+    from evermap.runs.folder import RunFolder
+    from evermap_studies.worlds.yard import simulate_yard
+
+    folder = RunFolder(out, force=force, renew=False)
+    drives, count = simulate_yard(config, seed), config.drives_per_day
+    names = [f"day{k // count:02d}_session{k % count:02d}" for k in range(len(drives))]
+    lines = ["session,object_id,stamp_s,x_m,y_m,yaw_rad,moves\n"]
+    for name, drive in zip(names, drives, strict=True):
+        stamps = drive.recording.frames.stamp_s.tolist()
+        for one, (way, moves) in enumerate(zip(drive.body.tolist(), drive.moves.tolist(), strict=True)):
+            rows = zip(stamps, way, moves, strict=True)
+            lines += [f"{name},{one},{at!r},{x!r},{y!r},{yaw!r},{int(on)}\n" for at, (x, y, yaw), on in rows]
+    with folder:
+        for name, drive in zip(names, drives, strict=True):
+            write_native(drive.recording, folder.path(name))
+        write_atomic(folder.path(BODIES_FILE), "".join(lines))
     return names
 
 

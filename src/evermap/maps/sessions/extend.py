@@ -28,6 +28,7 @@ class Found:
         first_s: (K,) first sighting.
         last_s: (K,) last sighting.
         rotation, rotation_covariance: in space (K, 4) and (K, 3, 3), as of `living.Places`; None in the plane.
+        fellow: (K,) a landmark of the map on the same object, as `fellows_of` has it; -1 for none.
     """
 
     landmark_id: IntArray
@@ -41,6 +42,24 @@ class Found:
     last_s: FloatArray
     rotation: FloatArray | None = None
     rotation_covariance: FloatArray | None = None
+    fellow: IntArray | None = None
+
+
+def fellows_of(landmark_id: IntArray, objects: IntArray, living: LivingMap) -> IntArray:
+    """Return (K,) a landmark of the map on the same object as each of some (K,), seen now or not; -1 for none.
+
+    Of the body that most landmarks of the object are of, as `Recording.objects` (N, 2) states them.
+    """
+    members, found = living.members, np.full(len(landmark_id), -1, dtype=np.int64)
+    _, row, at = np.intersect1d(members.landmark_id, objects[:, 0], return_indices=True)
+    body, clique = objects[at, 1], members.clique_id[row]
+    _, mine, stated = np.intersect1d(landmark_id, objects[:, 0], return_indices=True)
+    for k, one in zip(mine.tolist(), objects[stated, 1].tolist(), strict=True):
+        theirs = np.flatnonzero(body == one)
+        if len(theirs):
+            name, count = np.unique(clique[theirs], return_counts=True)
+            found[k] = members.landmark_id[row[theirs[clique[theirs] == name[np.argmax(count)]][0]]]
+    return found
 
 
 def first_and_last(row: IntArray, stamp_s: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
@@ -216,6 +235,9 @@ def _join_known(clique: IntArray, new: IntArray, members: Members, found: Found,
         body, kind = found.object_id[new[mine[0]]], found.class_id[new[mine[0]]]
         if body >= 0:
             same = old_clique[found.object_id[old] == body]
+            if not len(same) and found.fellow is not None:  # of which nothing was seen this time
+                at = found.fellow[new[mine[:1]]]
+                same = members.clique_id[np.searchsorted(members.landmark_id, at[at >= 0])]
             clique[mine] = same[0] if len(same) else name
             continue
         near = {}

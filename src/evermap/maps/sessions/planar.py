@@ -16,7 +16,7 @@ from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap, Metres
 from evermap.maps.sessions import believe, gaussian, placing
-from evermap.maps.sessions.extend import Extended, Found, first_and_last
+from evermap.maps.sessions.extend import Extended, Found, fellows_of, first_and_last
 from evermap.maps.sessions.gaussian import OwnLandmarks
 from evermap.maps.sessions.looks import Sighting, Watch
 from evermap.maps.sessions.overlay import ELSEWHERE
@@ -75,7 +75,7 @@ class PlanarVisit:
             living = replace(living, metres=Metres.of(robot, variance, information))
         return living
 
-    def found(self, where: Laid | None, living: LivingMap, config: LivingConfig) -> Found:  # noqa: ARG002
+    def found(self, where: Laid | None, living: LivingMap, config: LivingConfig) -> Found:
         """Return the landmarks of the session in the frame of a map; None for `where` begins one."""
         visit = self.solved
         begins, in_place = where is None, None
@@ -97,8 +97,9 @@ class PlanarVisit:
         _, here, there = np.intersect1d(names, visit.recording.objects[:, 0], return_indices=True)
         body[here] = visit.recording.objects[there, 1]
         return Found(
-            names, kind[row], place, probability, own.position_m[seen], covariance, body, first[row], last[row]
-        )
+            names, kind[row], place, probability, own.position_m[seen], covariance, body, first[row], last[row],
+            fellow=fellows_of(names, visit.recording.objects, living),
+        )  # fmt: skip
 
     def watched(self, entry: Extended, config: LivingConfig) -> Watch:
         """Return at which places of the map the session looked, by the nominal field of view."""

@@ -19,7 +19,7 @@ from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.maps.living import EXISTS, Dated, LivingMap
 from evermap.maps.sessions.believe import Witnessed, aged
-from evermap.maps.sessions.extend import Extended, Found, first_and_last
+from evermap.maps.sessions.extend import Extended, Found, fellows_of, first_and_last
 from evermap.maps.sessions.gaussian import anchored, drifted
 from evermap.maps.sessions.looks import Watch
 from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, Turned, laid_over, places_in, widened
@@ -28,6 +28,7 @@ from evermap.sensing import learned
 from evermap.sensing.profile import Assumed, Field, Projection
 from evermap.sensing.visibility import LooksAt
 from evermap.slam.space.against_map import by_itself
+from evermap.slam.space.bodies import with_rests
 from evermap.slam.space.bridge import bridge
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.intake import SpatialIntake, most_of, prepare_space
@@ -194,8 +195,18 @@ class SpatialVisit:
         rotation = self._as_known(row, rotation, laid[row], living)
         return Found(
             names[row], kind[row], laid[row], probability[row], position, covariance,
-            np.full(len(row), UNKNOWN, dtype=np.int64), first[row], last[row], rotation, alone.rotation[row],
+            self._bodies(row), first[row], last[row], rotation, alone.rotation[row],
+            fellows_of(names[row], self.recording.objects, living),
         )  # fmt: skip
+
+    def _bodies(self, row: IntArray) -> IntArray:
+        """Objects (K,) that places (K,) are on, as stated; `UNKNOWN` for none."""
+        found, stated = np.full(len(row), UNKNOWN), self.recording.objects
+        named = self.intake.landmark_id[self.solved.identity[row]]
+        at = np.searchsorted(stated[:, 0], named)
+        on = (at < len(stated)) & (np.append(stated[:, 0], UNKNOWN)[np.minimum(at, len(stated))] == named)
+        found[on] = stated[at[on], 1]
+        return found
 
     def _as_known(self, row: IntArray, rotation: FloatArray, laid: IntArray, living: LivingMap) -> FloatArray:
         """Orientations (K, 4) of places (K,): of those that look the same the nearest to what the map has, where they
@@ -299,13 +310,18 @@ def solve_visit(
     progress: Progress | None = None,
 ) -> SpatialVisit:
     """Return a recording with identities solved, by itself or in a map that is given; arguments as of `run_slam`."""
+    intake = fit_to_map(_taken_in(recording, config, remarks), prior_map, surveyed=True)
+    solved = solve_space(intake, prior_map, progress=progress, changes=config.slam.changes)
+    return SpatialVisit(recording, intake, solved)
+
+
+def _taken_in(recording: SpatialRecording, config: Config, remarks: tuple[str, ...]) -> SpatialIntake:
+    """Return a recording as input of the estimator, with the rests of bodies that move."""
     of_slam = config.slam
     intake = prepare_space(
         recording, of_slam.space, remarks, robust=of_slam.robust, estimate_noise=of_slam.estimate_noise
     )
-    intake = fit_to_map(intake, prior_map, surveyed=True)
-    solved = solve_space(intake, prior_map, progress=progress, changes=of_slam.changes)
-    return SpatialVisit(recording, intake, solved)
+    return with_rests(intake, recording, config.track.still)
 
 
 def solve_visits_together(visits: Sequence[SpatialVisit], rules: LocalizeConfig) -> list[SpatialVisit]:
@@ -336,10 +352,7 @@ def localised_in_space(
     """Return a session solved at its alignment with a map, or with the part of a large one that it can observe. The map
     has the session's classes (`session.admitted`).
     """
-    settings, of_slam = config.living, config.slam
-    intake = prepare_space(
-        recording, of_slam.space, remarks, robust=of_slam.robust, estimate_noise=of_slam.estimate_noise
-    )
+    settings, intake = config.living, _taken_in(recording, config, remarks)
     large, named = len(living.places) > settings.whole_places, cliques_of(living, names_of(intake).ravel())
     part = Vicinity.of(living, named, settings).part if large else living
     p_site = aged(part, settings, intake.start_s).p_here

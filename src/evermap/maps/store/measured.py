@@ -63,6 +63,8 @@ def pack_recording(recording: AnyRecording) -> bytes:
             values["symmetries"] = {name: list(texts) for name, texts in recording.symmetries.items()}
         tables = {table: getattr(recording, table) for table in _IN_SPACE}
         tables |= {f"sensor {k}": sensor for k, sensor in enumerate(recording.sensors)}
+        if len(recording.objects):  # as above
+            arrays["objects"] = recording.objects
     else:
         arrays["objects"] = recording.objects
         tables = {table: getattr(recording, table) for table in _TABLES}
@@ -119,7 +121,8 @@ def unpack_recording(data: bytes) -> AnyRecording:
         }
         sensors = (_table(f"sensor {k}", SpatialSensor, arrays, values) for k in range(values["sensors"]))
         symmetries = {name: tuple(texts) for name, texts in values.get("symmetries", {}).items()}
-        return Recording(**about, **tables, sensors=tuple(sensors), symmetries=symmetries)
+        objects = arrays.get("objects", np.zeros((0, 2), dtype=np.int64))
+        return Recording(**about, **tables, sensors=tuple(sensors), symmetries=symmetries, objects=objects)
     except (KeyError, ValueError, TypeError, OSError, zipfile.BadZipFile) as error:
         raise DamagedError(f"a recording that was kept cannot be read: {error}") from None
 

@@ -46,18 +46,19 @@ class SpatialExplanation:
 
 
 def explain_places(
-    optimum: SpatialOptimum, whole: BoolArray, stated: FloatArray, changes: ChangesConfig | None
+    optimum: SpatialOptimum, identity: IntArray, whole: BoolArray, stated: FloatArray, changes: ChangesConfig | None
 ) -> SpatialExplanation:
     """Return the most probable explanation of the places of a session.
 
     Args:
-        optimum: one place for each landmark.
+        optimum: one place for each landmark, in its row, and more for those that are on bodies that moved.
+        identity: (P,) rows of landmarks that the places are of.
         whole: (L,) landmarks that were followed, and are one each.
         stated: (K, 6) standard deviations of the places of a map; none without.
         changes: settings of the search for landmarks of the map that moved together; None asks each by itself.
     """
-    begun, identity = optimum, np.arange(len(optimum.smoother.problem.oriented))
-    found = _explain_with(begun, identity, (), whole, stated, changes)
+    begun, of_bodies = optimum, len(identity)
+    found = _explain_with(begun, identity, (), whole, stated, changes, of_bodies)
     asked, interval = ~whole, (changes or ChangesConfig()).interval
     gain_nats = optimum.smoother.problem.settings.repair.gain_nats
     for _ in range(ROUNDS):
@@ -69,7 +70,7 @@ def explain_places(
         is_one = two.nats > gain_nats  # else there are two with one identity
         move = MovedWithin(two.before, two.after, two.since_s, two.between_s, 1.0)
         trial = _explain_with(
-            two.optimum, larger, (*found.moves, move) if is_one else found.moves, whole, stated, changes
+            two.optimum, larger, (*found.moves, move) if is_one else found.moves, whole, stated, changes, of_bodies
         )
         if (
             np.count_nonzero(_find_seen_places(trial) & (trial.identity == landmark)) > MOST_PLACES
@@ -93,8 +94,11 @@ def _explain_with(
     whole: BoolArray,
     stated: FloatArray,
     changes: ChangesConfig | None,
+    given: int,
 ) -> SpatialExplanation:
-    """The explanation with these moves: what moved before the session, and identities of several landmarks."""
+    """The explanation with these moves: what moved before the session, and identities of several landmarks. The first
+    `given` places are what they are.
+    """
     problem = optimum.smoother.problem
     if problem.driven and len(problem.prior.place):
         optimum = unjumped(optimum)
@@ -105,6 +109,7 @@ def _explain_with(
         problem, estimate, identity = parts
         optimum = repaired(converged(problem, estimate, optimum.noise, heavy_rounds=0))
     apart = np.isin(np.arange(len(identity)), [row for move in moves for row in (move.before, move.after)])
+    apart[:given] = True
     if (together := rejoined(optimum, identity, apart)) is not None:
         optimum = converged(*together, optimum.noise, heavy_rounds=0)
     if not len(stated):

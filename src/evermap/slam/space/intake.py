@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,6 +40,27 @@ HARDLY = 1.0
 """Standard deviation with which it counts, as a share of the range: as good as nothing."""
 
 
+class Rests(NamedTuple):
+    """Where the landmarks of bodies that move stand in turn: rows (P,), one a place.
+
+    Attributes:
+        landmark: rows of `SpatialIntake.landmark_id` that the places are of.
+        body: its number, `UNKNOWN` of what is on no body that moves.
+        since_s, until_s: first and last stamp of the rest, on the problem's clock.
+        away_s: when the landmark was first seen as it moved after the rest, before the next one; nan where it was not.
+        seen_s: when it was last.
+        seen: (P, 7) motion from the rest to there, in the landmark's own axes; of a point a shift.
+    """
+
+    landmark: IntArray
+    body: IntArray
+    since_s: FloatArray
+    until_s: FloatArray
+    away_s: FloatArray
+    seen_s: FloatArray
+    seen: FloatArray
+
+
 @dataclass(frozen=True, slots=True)
 class SpatialIntake:
     """A recording as input of the estimator.
@@ -53,6 +75,8 @@ class SpatialIntake:
         names: texts behind landmark ids.
         boxes: (P,) landmarks that are boxes at rest.
         scale_in_map: standard deviation of the odometry's scale where a given map tells it.
+        bodies: (P,) numbers of the bodies that landmarks are on, as stated, `UNKNOWN` of others; empty without any.
+        rests: of those that move; None without any.
     """
 
     problem: SpatialProblem
@@ -64,6 +88,8 @@ class SpatialIntake:
     names: Mapping[int, str] = field(default_factory=dict)
     boxes: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     scale_in_map: float = 0.0
+    bodies: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    rests: Rests | None = None
 
     @property
     def pose_frame(self) -> IntArray:

@@ -386,6 +386,14 @@ class SpatialProblem:
             odometry_log=driven,
         )
 
+    def selected(self, some: BoolArray) -> SpatialProblem:
+        """Return the same with some of its detections (M,) only."""
+        names = (
+            "pose_row", "place", "sensor", "kind", "measured", "measured_root", "sigma_rad", "corner", "corner_root",
+            "half_m", "other", "other_log_odds", "share", "ray",
+        )  # fmt: skip
+        return replace(self, **{name: getattr(self, name)[some] for name in names})
+
     def as_points(self) -> SpatialProblem:
         """Return the same with positions only, which has one optimum, near any start."""
         prior = replace(self.prior, sigma=np.hstack([self.prior.sigma[:, :3].max(axis=1, keepdims=True)] * 6))

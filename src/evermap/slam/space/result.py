@@ -14,6 +14,7 @@ from evermap.estimate.measurement import frame_of
 from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.calibration import OF_SCALE
+from evermap.slam.space.bodies import BodyMove, shifts_of
 from evermap.slam.space.bridge import bridge, bridge_covariance
 from evermap.slam.space.intake import SpatialIntake, most_of, start_noise
 from evermap.slam.space.linearise import (
@@ -396,12 +397,33 @@ def _change_within(told: _Told, move: MovedWithin, identities: IntArray) -> MapC
     )
 
 
+def _change_of_body(told: _Told, move: BodyMove, identities: IntArray) -> MapChange:
+    """A move of a body during the session, of all landmarks on it."""
+    problem, place = told.problem, told.solved.optimum.estimate.place
+    stands = move.after != move.before
+    shift, turn_rad = shifts_of(move, place, problem.oriented)
+    known = shift[np.isfinite(shift[:, 0])]
+    used = (told.solved.optimum.now.weight > problem.settings.inlier) & np.isin(problem.place, move.after[stands])
+    start_s = told.intake.start_s
+    return MapChange(
+        landmark_ids=tuple(np.sort(identities[move.before]).tolist()),
+        kind=ChangeKind.MOVED,
+        stamp_from_s=start_s + move.between_s[0],
+        stamp_to_s=start_s + move.between_s[1],
+        displacement_m=tuple(known.mean(axis=0).tolist()) if len(known) else (np.nan,) * 3,
+        rotation_rad=turn_rad,
+        probability=1.0,
+        n_hits=int(np.count_nonzero(used)),
+    )
+
+
 def _changes(told: _Told, identities: IntArray, names: Mapping[int, str]) -> tuple[MapChange, ...]:
     """Return landmarks that moved during the session, and relative to the given map, the most certain first."""
     found = told.solved.from_map
     problem, optimum = told.problem, told.solved.optimum
     used = optimum.now.weight > problem.settings.inlier
     changes = [_change_within(told, move, identities).named(names) for move in told.solved.moves]
+    changes += [_change_of_body(told, move, identities).named(names) for move in told.solved.bodies]
     if found is None:
         return tuple(changes)
     together = [group for group in found.groups if len(group.members) > 1]

@@ -24,6 +24,7 @@ from evermap.geometry.symmetry import Symmetries
 from evermap.geometry.upright import is_level
 from evermap.slam.calibration import priced
 from evermap.slam.space.against_map import MapComparison, has_contradictions
+from evermap.slam.space.bodies import BodyMove, has_left, join_rests, mistrusted, number_moved
 from evermap.slam.space.delays import Delays, with_delays
 from evermap.slam.space.drift import Drift, drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
@@ -37,7 +38,7 @@ from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, Spa
 from evermap.slam.space.repair import repaired
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.starts import by_constellations, lost_frames
-from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Landmarks, Progress
 
 FREE = np.repeat([1e3, ANY_RAD], 3)
 """Deviation by which the first pose is held where a map says where it is [m, rad]. Two points of a map leave it a turn
@@ -84,6 +85,7 @@ class SpatialSolved:
         online_spread: (F, 2) roughly how far off these may be [m, rad].
         step_s: (F,) seconds that each frame took.
         moves: landmarks that moved during the session.
+        bodies: bodies that did, with all landmarks on them.
     """
 
     optimum: SpatialOptimum
@@ -95,11 +97,12 @@ class SpatialSolved:
     online_spread: FloatArray
     step_s: FloatArray
     moves: tuple[MovedWithin, ...] = ()
+    bodies: tuple[BodyMove, ...] = ()
 
     @property
     def left(self) -> BoolArray:
         """(P,) places that their landmarks have left."""
-        return superseded(self.moves, len(self.identity))
+        return superseded(self.moves, len(self.identity)) | has_left(self.bodies, len(self.identity))
 
 
 def solve_space(
@@ -120,11 +123,12 @@ def solve_space(
         NumericalError: no finite optimum.
     """
     problem, stated = _with_map(intake, prior_map)
-    problem, framed = _without_frames(problem)
+    problem, framed = _without_frames(mistrusted(problem, intake.bodies))
     settings = problem.settings
     noise = start_noise(settings, driven=problem.driven)
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
-    known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
+    trusted = problem.prior.weight >= 0.5
+    known[problem.prior.place[trusted]], place[problem.prior.place] = True, problem.prior.pose
     scale_in_map = intake.scale_in_map if len(stated) and problem.scale_sigma == 0.0 else 0.0
     problem, noise, drift, counted = _with_drift(problem, noise, intake.driven_pose, in_map=scale_in_map > 0.0)
     stepwise, unsure_s, step_s = incremental(problem, noise, known, place, progress)
@@ -159,7 +163,12 @@ def solve_space(
         if problem.ranges_share > 0.0 and not metric:
             optimum = _in_shared_metre(optimum)
         problem = optimum.smoother.problem
-    explanation = explain_places(optimum, intake.boxes, stated, changes)
+    identity, followed, bodies = np.arange(len(problem.oriented)), intake.boxes, tuple[BodyMove, ...]()
+    if intake.rests is not None:
+        optimum, identity, bodies = join_rests(optimum, intake.rests)
+    if len(intake.bodies):
+        followed = followed | (intake.bodies != UNKNOWN)
+    explanation = explain_places(optimum, identity, followed, stated, changes)
     optimum, identity, problem = explanation.optimum, explanation.identity, explanation.optimum.smoother.problem
     smoother, sober = optimum.smoother.counted(optimum.estimate, optimum.now, counted), optimum.noise
     if drift is not None and counted is None and not problem.steady:
@@ -173,7 +182,8 @@ def solve_space(
     number, from_map = times_of(identity), explanation.from_map
     for move in reversed(explanation.moves):  # the landmark is where it was last
         number[[move.before, move.after]] = min(number[move.before], number[move.after])
-    return SpatialSolved(optimum, identity, number, from_map, delays, *online, explanation.moves)
+    number = number_moved(number, bodies)
+    return SpatialSolved(optimum, identity, number, from_map, delays, *online, explanation.moves, bodies)
 
 
 def fit_to_map(intake: SpatialIntake, prior_map: Landmarks | None, *, surveyed: bool = False) -> SpatialIntake:

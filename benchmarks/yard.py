@@ -1,0 +1,133 @@
+"""What do tags on forklifts that drive cost? A yard with all of them driving, and the same yard standing.
+
+    python -m benchmarks.yard --seeds 10          # a row a seed, then all
+    python -m benchmarks.yard --seeds 10 --points # tags without orientations
+    python -m benchmarks.yard --seeds 5 --map     # three days in a living map
+
+Three runs a seed: all forklifts drive and stop; the same yard standing; and driving, without what is on them. Errors
+are of positions along the floor [m], after a rigid motion. A change is false unless it is a move of landmarks of one
+forklift that moved in that time, by so much.
+
+In a living map two forklifts drive in each of three drives, and four are parked elsewhere each time; or all stands. A
+statement is false if it is of a wall, of what stands, or of two forklifts; and of one forklift there is one.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+
+import evermap as em
+from evermap.geometry import se3
+from evermap.geometry.rigid import rigid
+from evermap.types import ChangeKind, MapChange, SlamResult, rows_of
+from evermap_studies.worlds.yard import STEP_S, YardConfig, YardDrive, simulate_yard
+
+LEAST_M, WRONG_M = 0.1, 0.5
+"""By which a forklift moved at least, and by which a stated displacement is off at most [m]."""
+
+
+def error_m(result: SlamResult, drive: YardDrive) -> float:
+    """Return the root mean square of errors of positions along the floor."""
+    truth = drive.recording.truth
+    assert truth is not None
+    rows = np.searchsorted(truth.stamp_s, result.trajectory.stamp_s - 1e-6)
+    there, here = truth.pose_world_robot[rows, :3], result.trajectory.pose_world_robot[:, :3]
+    off = se3.transform(rigid(here, there), here) - there
+    return float(np.sqrt((off[:, :2] ** 2).sum(axis=1).mean()))
+
+
+def is_true(change: MapChange, drive: YardDrive) -> bool:
+    """Return whether a change is a move of landmarks of one forklift that moved so."""
+    tags = np.array(change.landmark_ids)
+    if change.kind not in (ChangeKind.MOVED, ChangeKind.ROTATED) or len(np.unique(drive.body_of_tag[tags])) > 1:
+        return False
+    begin_s = float(drive.recording.frames.stamp_s[0])
+    first, last = (
+        min(max(round((at_s - begin_s) / STEP_S), 0), drive.tag.shape[1] - 1)
+        for at_s in (change.stamp_from_s, change.stamp_to_s)
+    )
+    shifts = drive.tag[tags, last, :3] - drive.tag[tags, first, :3]
+    shifts = np.vstack([shifts.mean(axis=0), shifts])  # of points one may be all that was seen
+    told = np.linalg.norm(np.array(change.displacement_m) - shifts, axis=1).min() < WRONG_M
+    return bool(drive.body_of_tag[tags[0]] >= 0 and np.linalg.norm(shifts, axis=1).max() > LEAST_M and told)
+
+
+def enter_drives(usual: YardConfig, seeds: range) -> None:
+    """Run and print days in a living map."""
+    total = np.zeros(4, dtype=np.int64)
+    print("seed  yard      errors                  statements  false  twice  others  verdicts")
+    for seed in seeds:
+        for config in (replace(usual, days=3, moving=2, parked=4), replace(usual, days=3, standing=True)):
+            living, errors, verdicts, count = None, [], [], np.zeros(4, dtype=np.int64)
+            for drive in simulate_yard(config, seed):
+                entered = em.run_session(drive.recording, living)
+                living = entered.living
+                errors.append(error_m(entered.slam, drive))
+                verdicts.append("" if entered.slam.verdict is None else str(entered.slam.verdict.kind.value))
+                told = [_bodies_of(change, drive) for change in entered.changes]
+                right = [len(one) == 1 and -1 not in one and not config.standing for one in told]
+                once = len({min(one) for one, good in zip(told, right, strict=True) if good})
+                others = sum(name >= len(drive.tag) for name in living.members.landmark_id.tolist())
+                count += [len(told), right.count(False), right.count(True) - once, others]
+                for change, good in zip(entered.changes, right, strict=True):
+                    if not good:
+                        print(f"      false: {change}")
+            total += count
+            row = " ".join(f"{one:.4f}" for one in errors)
+            name = "standing" if config.standing else "moving"
+            print(f"{seed:4d}  {name:8s}  {row}  " + " ".join(f"{one:6d}" for one in count.tolist()), *verdicts)
+    print("all", *total.tolist())
+
+
+def _bodies_of(change: MapChange, drive: YardDrive) -> set[int]:
+    """Forklifts that a change is of, -1 of walls, and of identities that nothing has."""
+    known = [name for name in change.landmark_ids if name < len(drive.body_of_tag)]
+    found = set(drive.body_of_tag[known].tolist())
+    return found if len(known) == len(change.landmark_ids) else {*found, -1}
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--points", action="store_true", help="tags without orientations")
+    parser.add_argument("--wall-tags", type=int, default=YardConfig().wall_tags)
+    parser.add_argument("--map", action="store_true", help="days in a living map")
+    asked = parser.parse_args()
+    usual = YardConfig(moving=6, parked=0, oriented=not asked.points, wall_tags=asked.wall_tags)
+    if asked.map:
+        enter_drives(usual, range(asked.first, asked.first + asked.seeds))
+        return
+    rows = []
+    print("seed  standing  moving  without  changes  false  verdicts")
+    for seed in range(asked.first, asked.first + asked.seeds):
+        moving, standing = (simulate_yard(replace(usual, standing=still), seed)[0] for still in (False, True))
+        given = moving.recording
+        on_walls = moving.body_of_tag[given.detections.landmark_id] < 0
+        without = moving._replace(recording=replace(given, detections=rows_of(given.detections, on_walls)))
+        found = [em.run_slam(one.recording) for one in (standing, moving, without)]
+        errors = [error_m(result, one) for result, one in zip(found, (standing, moving, without), strict=True)]
+        told = [
+            (change, one) for result, one in zip(found, (standing, moving), strict=False) for change in result.changes
+        ]
+        false = [change for change, one in told if not is_true(change, one)]
+        rows.append([*errors, len(told), len(false)])
+        verdicts = " ".join("" if result.verdict is None else str(result.verdict.kind.value) for result in found)
+        print(
+            f"{seed:4d} " + " ".join(f"{one:8.4f}" for one in errors) + f" {len(told):8d} {len(false):6d}  {verdicts}"
+        )
+        for change in false:
+            print(f"      false: {change}")
+    table = np.array(rows)
+    rms = np.sqrt((table[:, :3] ** 2).mean(axis=0))
+    ratio = np.median(table[:, 1] / table[:, 0])
+    print(f"rms  {rms[0]:8.4f} {rms[1]:8.4f} {rms[2]:8.4f} {int(table[:, 3].sum()):8d} {int(table[:, 4].sum()):6d}")
+    print(f"moving over standing: {rms[1] / rms[0]:.3f} of the rms, {ratio:.3f} in the median")
+
+
+if __name__ == "__main__":
+    main()
