@@ -13,8 +13,9 @@ from evermap.estimate.measurement import frame_of
 from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.calibration import OF_SCALE
+from evermap.slam.intake import most_of
 from evermap.slam.result import add_scale_error, count_sightings, show_together
-from evermap.slam.space.intake import SpatialIntake, most_of, start_noise
+from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import (
     ACROSS,
     ALONG,
