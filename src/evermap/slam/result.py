@@ -25,13 +25,13 @@ from evermap.slam.calibration import (
     from_front,
 )
 from evermap.slam.estimate import Solved
+from evermap.slam.intake import most_of
 from evermap.slam.kernels import NOISE_NAMES
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive
 from evermap.types import (
     ANY_BEARING_RAD,
-    UNKNOWN,
     Alternative,
     BoolArray,
     FloatArray,
@@ -142,8 +142,7 @@ def _landmarks(solved: Solved, frame: str, position: FloatArray, covariance: Flo
     stamp_s = recording.frames.stamp_s[prepared.pose_frame]
     seen_s = recording.frames.stamp_s[recording.detections.frame[prepared.used]][: len(done)]
     hits, first, last = count_sightings(count, done, seen_s, outcome.problem.measurements, stamp_s)
-    classes = np.full(count, UNKNOWN, dtype=np.int64)
-    classes[prepared.problem.landmark_row] = recording.detections.class_id[prepared.used]
+    classes = most_of(prepared.problem.landmark_row, recording.detections.class_id[prepared.used], count)
     return Landmarks(
         landmark_id=prepared.landmark_id[known],
         position_m=position[known],
