@@ -55,7 +55,7 @@ def test_known_identities_are_laid_over_a_map_by_align_alone() -> None:
     proposed = {name for name, called in users.items() if called - {"accept_alignment"}}
     assert accepted == {
         "maps/sessions/boxes.py", "slam/batch.py", "slam/known_places.py", "slam/space/localize.py",
-        "slam/space/together.py", "slam/together.py",
+        "slam/together.py",
     }  # fmt: skip
     # starts of a search that is judged by all measurements
     assert proposed == {

@@ -16,8 +16,7 @@ from evermap import check_recording, run_session, run_slam
 from evermap.errors import DataError, InputError
 from evermap.io import list_robots, read_mrclam, read_recording, write_template
 from evermap.slam import mistakes as mistakes_of
-from evermap.slam.calibration import SPECS
-from evermap.slam.check import far_off
+from evermap.slam.calibration import SPECS, far_off
 from evermap.slam.mistakes import USUAL
 from evermap.types import Detections, Frames, Odometry, ParameterEstimate, Recording
 from evermap_studies.sim import BuildingConfig, simulate_building
@@ -217,9 +216,9 @@ def test_a_calibration_state_far_outside_of_its_prior_is_told() -> None:
     def state(value: float, fixed: bool = False) -> ParameterEstimate:
         return ParameterEstimate("odometry_forward_scale", value, 0.01, 1.0, 0.05, "1", fixed=fixed)
 
-    assert far_off([state(1.0 + 0.99 * USUAL.far_off * 0.05)]) == ()
-    assert far_off([state(2.0, fixed=True)]) == ()
-    (told,) = far_off([state(1.3)])
+    assert far_off([state(1.0 + 0.99 * USUAL.far_off * 0.05)], USUAL) == ()
+    assert far_off([state(2.0, fixed=True)], USUAL) == ()
+    (told,) = far_off([state(1.3)], USUAL)
     assert "odometry_forward_scale = 1.3 is 6 standard deviations" in told
     assert "wheel radius" in told
     slow = odometry(forward_mps=lambda v: 0.6 * v)(patrol())
@@ -310,6 +309,6 @@ def test_lists_become_arrays() -> None:
 @pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.name)
 def test_every_state_that_is_far_off_has_a_cause(spec) -> None:
     found = ParameterEstimate(spec.name, spec.mean + 1.0, 0.001, spec.mean, 0.01, spec.unit)
-    (told,) = far_off([found])
+    (told,) = far_off([found], USUAL)
     assert told.startswith(f"{spec.name} = ")
     assert told.partition("prior of sensors: ")[2]

@@ -3,7 +3,7 @@
 Variables are poses, then whatever else there is (places, bodies), then the border: calibration states, which many
 factors share. A block holds all factors of one kind, as arrays: which variables each of them ties, and how to fill in
 their whitened Jacobians at given values. Nothing else of the estimator depends on what is measured, so several problems
-together are a concatenation of their blocks (`SharedBlock`), and a new measurement is a new block.
+together are a concatenation of their blocks (`concatenate_blocks`), and a new measurement is a new block.
 """
 
 from __future__ import annotations
@@ -214,6 +214,42 @@ class SharedBlock(Generic[State, Own]):
     def linearise(self, state: State, out: Room) -> Slices[float]:
         """Fill in the factors at the problem's own values."""
         return self.block.linearise(self.select(state), out)
+
+
+def concatenate_blocks(
+    problems: Sequence[Sequence[FactorBlock[Own]]],
+    variable: Sequence[IntArray],
+    first_pose: Sequence[int],
+    select: Sequence[Callable[[State], Own]],
+    *,
+    measured: int,
+    between: Sequence[FactorBlock[State]] = (),
+) -> tuple[FactorBlock[State], ...]:
+    """Return the blocks of several problems as those of one.
+
+    Args:
+        problems: the blocks of each.
+        variable: of each, which of all variables its own are.
+        first_pose: of each, which of all poses its first one is.
+        select: of each, its values among those of all.
+        measured: kinds of block that come first, each of all problems; the others come last, problem by problem.
+        between: blocks that tie the problems to each other.
+    """
+    shared: list[list[FactorBlock[State]]] = [
+        [SharedBlock(block, variable[r], first_pose[r], select[r]) for block in blocks]
+        for r, blocks in enumerate(problems)
+    ]
+    first = [blocks[kind] for kind in range(measured) for blocks in shared]
+    return (*first, *between, *(block for blocks in shared for block in blocks[measured:]))
+
+
+def concatenate_groups(n_poses: Sequence[int], a_leaf: int) -> IntArray:
+    """Return (N,) the groups of the poses of several problems, one after the other, none with poses of two."""
+    groups, count = [], 0
+    for own in n_poses:
+        groups.append(count + grouped(own, a_leaf))
+        count = int(groups[-1][-1]) + 1
+    return np.concatenate(groups)
 
 
 def grouped(n_poses: int, a_leaf: int) -> IntArray:

@@ -27,6 +27,28 @@ def comparable_nis(innovations: Innovations) -> FloatArray:
     return np.asarray(np.where(np.isfinite(nis), -2.0 * log_tail, nis))
 
 
+LEAST_WEIGHT = 1e-6
+"""Smallest weight of a detection that is divided by."""
+
+
+def find_left_out_nis(residual: FloatArray, leverage: FloatArray, left: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the NIS (K,) of detections, each as if it had not been used.
+
+    With H = J S J' of whitened Jacobians and the covariance S, and the weight w, of the residual r it is
+    r' (1 - w H)^-1 (1 - w H + H)^-1 r.
+
+    Args:
+        residual: (K, R) whitened, not weighted.
+        leverage: (K, R, R) w H.
+        left: (K, R, R) 1 - w H, which must have an inverse.
+        weight: (K,) w.
+    """
+    r = residual[..., None]
+    spread = left + leverage / np.maximum(weight, LEAST_WEIGHT)[:, None, None]
+    nis = (np.linalg.solve(left, r) * np.linalg.solve(spread, r)).sum(axis=(1, 2))
+    return np.asarray(np.maximum(nis, 0.0))
+
+
 def lag1_autocorrelation(values: FloatArray, group: FloatArray) -> float | None:
     """Correlate successive values of the same group, pooled over the groups; None with fewer than ten pairs.
 

@@ -17,7 +17,7 @@ from evermap.explain.causes import Inputs
 from evermap.explain.evidence import AnySession
 from evermap.explain.scores import score_session
 from evermap.explain.symptoms import Signs, measure_signs, with_scores
-from evermap.slam.check import far_off
+from evermap.slam.calibration import far_off
 from evermap.slam.mistakes import Finding
 from evermap.types import AnyRecording, Cause, Landmarks, SlamResult, Symptom, Verdict, VerdictKind
 

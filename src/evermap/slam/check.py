@@ -9,7 +9,7 @@ near enough to be mistaken for that.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple, overload
 
@@ -40,7 +40,6 @@ from evermap.types import (
     FloatArray,
     Landmarks,
     Odometry,
-    ParameterEstimate,
     Recording,
     SpatialOdometry,
     SpatialRecording,
@@ -175,41 +174,6 @@ def odd(recording: AnyRecording, settings: SlamConfig) -> tuple[Finding, ...]:
         if finding.code == "own-identities" and not finding.usable:
             raise DataError(f"{recording.name}: {finding.message}", hint="leave landmark_id empty, and `unknown_ids`")
     return tuple(found)
-
-
-def far_off(parameters: Sequence[ParameterEstimate], settings: CheckConfig = USUAL) -> tuple[str, ...]:
-    """Return a warning for every calibration state that a run found far outside of what its prior expects."""
-    told = []
-    for state in parameters:
-        if state.fixed or not state.prior_sigma > 0.0:
-            continue
-        away = abs(state.value - state.prior_mean) / state.prior_sigma
-        if away > settings.far_off:
-            told.append(
-                f"{state.name} = {state.value:.3g} {state.unit}".removesuffix(" 1")
-                + f" is {away:.0f} standard deviations from the prior of sensors: {_CAUSES.get(state.name, OTHER)}"
-            )
-    return tuple(told)
-
-
-OTHER = "another value than stated"
-_CAUSES = {
-    "range_bias_m": "ranges in another unit, or from another origin than the sensor's",
-    "range_slope": "ranges or speeds in another unit",
-    "range_skew_per_rad": "bearings from another axis, or with the wrong sign",
-    "range_curvature_per_rad2": "bearings in another unit",
-    "bearing_bias_rad": "the sensor is turned otherwise than [mount] theta_rad says",
-    "odometry_delay_s": "two clocks: odometry and detections are stamped differently",
-    "odometry_scale": "poses of the odometry or positions in another unit, or a wrong wheel radius",
-    "range_scale": "positions in another unit, or another size of tags",
-    "odometry_forward_scale": "speeds or ranges in another unit, or a wrong wheel radius",
-    "odometry_turn_scale": "turn rates in another unit or with the wrong sign, or a wrong wheel base",
-    "odometry_askew_rad": "the sensor's angle differs from [mount] theta_rad, or the robot drives at an angle to its "
-    "front",
-    "mount_forward_m": "[mount] x_m is missing or wrong, or the odometry is that of another point than the base",
-    "mount_left_m": "[mount] y_m is missing or wrong, or the odometry is that of another point than the base",
-    "odometry_turn_slip_m": "bearings have the wrong sign, or turning costs this robot much of its speed",
-}
 
 
 def contents(recording: AnyRecording) -> dict[str, dict[str, Any]]:

@@ -18,21 +18,20 @@ import numpy as np
 from evermap.estimate.gauss_newton import Steps
 from evermap.estimate.graph import (
     Border,
-    FactorBlock,
     Graph,
     GraphStructure,
     Layout,
     Room,
-    SharedBlock,
     build_structure,
-    grouped,
+    concatenate_blocks,
+    concatenate_groups,
 )
 from evermap.estimate.robust import HEAVY_TAIL, weigh
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, exhausted
 from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES, detection_residual, kernel
 from evermap.slam.problem import Block, Estimate, Marginals
-from evermap.slam.smoother import COST_SLACK, DETECTIONS, HELD, ODOMETRY, POSES_A_LEAF, Smoother, retract
+from evermap.slam.smoother import COST_SLACK, DETECTIONS, HELD, POSES_A_LEAF, Smoother, retract
 from evermap.types import BoolArray, FloatArray, IntArray
 
 OF_ENCOUNTER = 3 + 3 + N_SENSOR + 1
@@ -230,17 +229,19 @@ class Together(Solver[Estimate]):
         """Return all robots as one graph: odometry of each, detections of each, encounters, starts and priors."""
         known, n = state.known, len(state.pose)
         rank, border = np.cumsum(known) - 1, n + int(known.sum())
-        kinds: list[list[FactorBlock[Estimate]]] = []
-        for r, (robot, own) in enumerate(zip(self.robots, self.estimates(state), strict=True)):
+        own, variable = self.estimates(state), []
+        for r, estimate in enumerate(own):
             poses, states = np.arange(self.first[r], self.first[r + 1]), border + 2 * r + np.arange(2)
-            variable = np.concatenate([poses, n + rank[self.places[r][own.known]], states])
-            select = partial(self._own_part, robot=r)
-            kinds.append(
-                [SharedBlock(block, variable, int(self.first[r]), select) for block in robot.blocks(own.known)]
-            )
+            variable.append(np.concatenate([poses, n + rank[self.places[r][estimate.known]], states]))
         met = EncounterFactors(self.met, self._eyes(), border + 2 * np.arange(len(self.robots)))
-        measured = [blocks[kind] for kind in (ODOMETRY, DETECTIONS) for blocks in kinds]
-        blocks = (*measured, met, *(block for own in kinds for block in own[DETECTIONS + 1 :]))
+        blocks = concatenate_blocks(
+            [robot.blocks(estimate.known) for robot, estimate in zip(self.robots, own, strict=True)],
+            variable,
+            self.first.tolist(),
+            [partial(self._own_part, robot=r) for r in range(len(own))],
+            measured=DETECTIONS + 1,
+            between=[met],
+        )
         if self._structure is None or not np.array_equal(self._structure[0], known):
             structure = yield from build_structure(self._layout(state), blocks)
             self._structure = known, structure
@@ -270,12 +271,10 @@ class Together(Solver[Estimate]):
     def _layout(self, state: Estimate) -> Layout:
         """Variables of all; poses by time on the clock of all, position, robot."""
         n, count, n_robots = len(state.pose), int(state.known.sum()), len(self.robots)
-        leaves, coordinates, n_leaves = [], [], 0
-        for r, (robot, own) in enumerate(zip(self.robots, self.estimates(state), strict=True)):
-            leaves.append(n_leaves + grouped(len(own.pose), POSES_A_LEAF))
-            n_leaves = int(leaves[-1][-1]) + 1
-            when = robot.problem.stamp_s + self.start_s[r]
-            coordinates.append(np.column_stack([when, own.pose[:, :2], np.full(len(when), float(r))]))
+        n_poses = np.diff(self.first)
+        when = [robot.problem.stamp_s + by for robot, by in zip(self.robots, self.start_s, strict=True)]
+        robot = np.repeat(np.arange(n_robots, dtype=np.float64), n_poses)
+        coordinates = np.column_stack([np.concatenate(when), state.pose[:, :2], robot])
         dim = np.concatenate([np.full(n, 3), np.full(count, 2), np.tile([N_SENSOR, N_MOTION], n_robots)])
         border = n + count + np.arange(2 * n_robots)
-        return Layout(dim, border, np.concatenate(leaves), np.concatenate(coordinates))
+        return Layout(dim, border, concatenate_groups(n_poses.tolist(), POSES_A_LEAF), coordinates)

@@ -155,6 +155,18 @@ def landmark_ids(recording: AnyRecording, used: IntArray) -> IntArray:
     return np.unique(np.concatenate([recording.detections.landmark_id[used], *measured]))
 
 
+def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
+    """Return (P,) the class that most detections (M,) of each place say, the first of several; unknown where none."""
+    known = class_id != UNKNOWN
+    size = int(class_id.max(initial=0)) + 1
+    pair, times = np.unique(place[known] * size + class_id[known], return_counts=True)
+    pair = pair[np.lexsort((pair, -times, pair // size))]
+    row, first = np.unique(pair // size, return_index=True)
+    found = np.full(count, UNKNOWN)
+    found[row] = pair[first] % size
+    return found
+
+
 def frames_with_pose(recording: AnyRecording, seen_in: IntArray, moving: BoolArray) -> IntArray:
     """Return rows of the frames that get a pose: those `seen_in`, and the last before each other measurement."""
     stamps, instants = recording.frames.stamp_s, [np.zeros(0)]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Self
+from typing import Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -14,6 +15,7 @@ from evermap.align.candidates import Matches, score_motions
 from evermap.config import LocalizeConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
+from evermap.geometry.group import PLANE, Group
 from evermap.slam.batch import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -153,48 +155,86 @@ class Placed(NamedTuple):
     by_places: FloatArray
 
 
-class LocalTrack:
-    """A drive by odometry alone, and where landmarks were seen during it, in the frame of its first pose.
+Seen = TypeVar("Seen")
+"""What a track keeps of a landmark."""
 
-    `mount` is the pose (3,) of the sensor on the robot.
+
+class DriveTrack(Generic[Seen]):
+    """A drive by odometry alone, and what was seen of landmarks during it, in the frame of its first pose.
+
+    Args:
+        group: of its poses.
+        mount: pose of the sensor, or poses of the sensors, on the robot.
+        settings: how long landmarks are kept, and when an alignment is certain.
     """
 
-    def __init__(self, mount: FloatArray, settings: LocalizeConfig) -> None:
-        self._mount, self._settings = mount, settings
-        self._pose = np.zeros(3)
+    def __init__(self, group: Group, mount: FloatArray, settings: LocalizeConfig) -> None:
+        self._group, self._mount, self._settings = group, mount, settings
+        self._pose = group.identity()
         self._began_s = np.nan
-        self._seen: dict[int, tuple[float, FloatArray]] = {}
+        self._seen: dict[int, tuple[float, Seen]] = {}
         self._tried: tuple[float, frozenset[int]] = (-np.inf, frozenset())
 
     def drive(self, increment: FloatArray) -> None:
-        """Advance the pose by a motion (3,)."""
-        self._pose = se2.compose(self._pose, increment)
+        """Advance the pose by a motion."""
+        self._pose = self._group.compose(self._pose, increment)
 
-    def see(self, stamp_s: float, seen: FrameSightings, used: IntArray, states: FloatArray) -> None:
-        """Add sightings (M,) of landmarks of the map; forget those that are too old."""
+    def _keep(self, stamp_s: float, names: Sequence[int], seen: Sequence[Seen]) -> None:
+        """Add what was seen of landmarks; forget what is too old."""
         if np.isnan(self._began_s):
             self._began_s = stamp_s
-        at = sighted_at(self._pose, seen.reading[used], states, self._mount)
-        for name, position in zip(seen.landmark_id[used].tolist(), at, strict=True):
+        for name, one in zip(names, seen, strict=True):
             self._seen.pop(name, None)
-            self._seen[name] = (stamp_s, position)
+            self._seen[name] = (stamp_s, one)
         old = [name for name, (seen_s, _) in self._seen.items() if seen_s < stamp_s - self._settings.track_s]
         for name in [*old, *list(self._seen)[: max(len(self._seen) - len(old) - MOST_LANDMARKS, 0)]]:
             self._seen.pop(name, None)
 
+    def _was_tried(self, stamp_s: float) -> bool:
+        """Return whether no other landmarks were there at the last attempt, a moment before; else this is one."""
+        names = frozenset(self._seen)
+        if names <= self._tried[1] and stamp_s < self._tried[0] + RETRY_S:
+            return True
+        self._tried = (stamp_s, names)
+        return False
+
+    def _pair(self, places: KnownPlaces) -> tuple[IntArray, IntArray]:
+        """Return (K,) which of the landmarks, and (K,) a row of the map: one for every place that each may be at."""
+        first, last = places.rows_of(np.fromiter(self._seen, dtype=np.int64))
+        count = last - first
+        within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        return np.repeat(np.arange(len(first)), count), np.repeat(first, count) + within
+
+    def _candidates(self, places: KnownPlaces) -> tuple[Matches, IntArray]:
+        """Return what was seen with the places that it may be of, and rows (K,) of these; weights are beliefs."""
+        raise NotImplementedError
+
+    def agreement(self, pose_map_robot: FloatArray, places: KnownPlaces) -> float:
+        """Return how well the track fits the map with the robot at a pose: 1 per landmark exactly at a place."""
+        matches = self._candidates(places)[0]
+        motion = self._group.compose(pose_map_robot, self._group.inverse(self._pose))[None]
+        return float(score_motions(motion, replace(matches, weight=np.ones(len(matches))))[0])
+
+
+class LocalTrack(DriveTrack[FloatArray]):
+    """A drive in the plane: it keeps where landmarks were seen. `mount` is the pose (3,) of the sensor on the robot."""
+
+    def __init__(self, mount: FloatArray, settings: LocalizeConfig) -> None:
+        super().__init__(PLANE, mount, settings)
+
+    def see(self, stamp_s: float, seen: FrameSightings, used: IntArray, states: FloatArray) -> None:
+        """Add sightings (M,) of landmarks of the map; forget those that are too old."""
+        at = sighted_at(self._pose, seen.reading[used], states, self._mount)
+        self._keep(stamp_s, seen.landmark_id[used].tolist(), list(at))
+
     def placed(self, stamp_s: float, places: KnownPlaces) -> Placed | None:
         """Align the drive with the map; None if that is uncertain, or was tried before with the same landmarks."""
-        names = frozenset(self._seen)
-        settings = self._settings
+        settings, count = self._settings, len(self._seen)
         alone = stamp_s - self._began_s >= settings.alone_s
-        least = 2 if alone and len(names) == 2 else settings.fewest
-        if len(names) < least or (names <= self._tried[1] and stamp_s < self._tried[0] + RETRY_S):
+        least = 2 if alone and count == 2 else settings.fewest
+        if count < least or self._was_tried(stamp_s):
             return None
-        self._tried = (stamp_s, names)
-        local, row = self._candidates(places)
-        landmark = places.landmark_id[row]
-        belief = np.maximum(places.p_here[row], settings.least_belief)
-        matches = Matches.of(local, places.position_m[row], landmark=landmark, weight=belief)
+        matches, row = self._candidates(places)
         spread = places.errors_at(row)
         found = accept_alignment(
             matches, settings, fewest=least, spread_m=settings.spread_online_m, covariance_m2=spread
@@ -202,22 +242,14 @@ class LocalTrack:
         if not found:
             return None
         motion, agree = found.motion, found.agree
-        return Placed(se2.compose(motion, self._pose), *self._uncertainty(motion[2], local[agree], row[agree]))
+        return Placed(se2.compose(motion, self._pose), *self._uncertainty(motion[2], matches.source[agree], row[agree]))
 
-    def agreement(self, pose_map_robot: FloatArray, places: KnownPlaces) -> float:
-        """Return how well the track fits the map with the robot at a pose (3,): 1 per landmark exactly at a place."""
-        local, row = self._candidates(places)
-        motion = se2.compose(pose_map_robot, se2.inverse(self._pose))[None]
-        matches = Matches.of(local, places.position_m[row], landmark=places.landmark_id[row])
-        return float(score_motions(motion, matches)[0])
-
-    def _candidates(self, places: KnownPlaces) -> tuple[FloatArray, IntArray]:
-        """(K, 2) positions in the track and (K,) rows of the map, one pair for every place a landmark may be at."""
-        first, last = places.rows_of(np.fromiter(self._seen, dtype=np.int64))
-        count = last - first
-        local = np.array([position for _, position in self._seen.values()]).reshape(-1, 2)
-        within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        return np.repeat(local, count, axis=0), np.repeat(first, count) + within
+    def _candidates(self, places: KnownPlaces) -> tuple[Matches, IntArray]:
+        """Return what was seen with the places that it may be of, and rows (K,) of these; weights are beliefs."""
+        of, row = self._pair(places)
+        local = np.array([position for _, position in self._seen.values()]).reshape(-1, 2)[of]
+        weight = np.maximum(places.p_here[row], self._settings.least_belief)
+        return Matches.of(local, places.position_m[row], landmark=places.landmark_id[row], weight=weight), row
 
     def _uncertainty(
         self, turn_rad: float, local: FloatArray, rows: IntArray

@@ -171,7 +171,7 @@ class BaseLocalizer(Shown):
         return there
 
     def _begin_track(self) -> Any:
-        """Return the search for a start: as `LocalTrack`."""
+        """Return the search for a start: a `DriveTrack`."""
         raise NotImplementedError
 
     def _motion(self, drive: Any, start_s: float, stop_s: float) -> Any:

@@ -2,29 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from evermap.estimate.measurement import frame_of
+from evermap.estimate.innovations import find_left_out_nis
+from evermap.estimate.measurement import Tied, frame_of
 from evermap.geometry import se2
 from evermap.slam.batch import Outcome, lay_over
 from evermap.slam.bridge import bridged, dead_reckoned
-from evermap.slam.calibration import BEARING, FORWARD, OF_ANGLE, OF_SCALE, SLOPE, SPECS, CalibrationPrior, from_front
-from evermap.slam.check import far_off
+from evermap.slam.calibration import (
+    BEARING,
+    FORWARD,
+    OF_ANGLE,
+    OF_SCALE,
+    SLOPE,
+    SPECS,
+    CalibrationPrior,
+    far_off,
+    from_front,
+)
 from evermap.slam.estimate import Solved
+from evermap.slam.intake import most_of
 from evermap.slam.kernels import NOISE_NAMES
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive
 from evermap.types import (
     ANY_BEARING_RAD,
-    UNKNOWN,
     Alternative,
     BoolArray,
     FloatArray,
     Innovations,
+    IntArray,
     Landmarks,
     MapChange,
     Misses,
@@ -40,8 +52,8 @@ STRONG = 20.0
 LONGEST_PAUSE_S = 60.0
 """Maximum pause that is subdivided: a clock set forward by a day would give a million poses."""
 
-LEAST_WEIGHT, LEAST_LEFT = 1e-6, 1e-6
-"""Smallest weight of a detection that is divided by; and of a residual, so much is left, or nothing contradicts it."""
+LEAST_LEFT = 1e-6
+"""Of a residual, so much is left, or nothing contradicts it."""
 
 
 def concluded(solved: Solved, scratch: str = "first_pose") -> SlamResult:
@@ -125,29 +137,19 @@ def _landmarks(solved: Solved, frame: str, position: FloatArray, covariance: Flo
     prepared, outcome, recording = solved.prepared, solved.outcome, solved.recording
     known = np.isfinite(position[:, 0])
     position = position * outcome.scale
-    covariance = covariance * outcome.scale**2
-    covariance = covariance + outcome.log_scale_sigma**2 * position[:, :, None] * position[:, None, :]
-    stamps = recording.frames.stamp_s[recording.detections.frame[prepared.used]]
-    count = len(prepared.landmark_id)
-    done = prepared.problem.landmark_row[: len(outcome.inlier)]
-    first, last = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(first, done, stamps[: len(done)])
-    np.maximum.at(last, done, stamps[: len(done)])
-    hits = np.bincount(done, minlength=count)
-    for tied in (tied for tied in outcome.problem.measurements if tied.kind.ties == "pose_place"):
-        hits += np.bincount(tied.other, minlength=count)
-        at_s = recording.frames.stamp_s[prepared.pose_frame[tied.row]]
-        np.minimum.at(first, tied.other, at_s)
-        np.maximum.at(last, tied.other, at_s)
-    classes = np.full(count, UNKNOWN, dtype=np.int64)
-    classes[prepared.problem.landmark_row] = recording.detections.class_id[prepared.used]
+    covariance = add_scale_error(covariance * outcome.scale**2, position, outcome.log_scale_sigma)
+    count, done = len(prepared.landmark_id), prepared.problem.landmark_row[: len(outcome.inlier)]
+    stamp_s = recording.frames.stamp_s[prepared.pose_frame]
+    seen_s = recording.frames.stamp_s[recording.detections.frame[prepared.used]][: len(done)]
+    hits, first, last = count_sightings(count, done, seen_s, outcome.problem.measurements, stamp_s)
+    classes = most_of(prepared.problem.landmark_row, recording.detections.class_id[prepared.used], count)
     return Landmarks(
         landmark_id=prepared.landmark_id[known],
         position_m=position[known],
         covariance_m2=covariance[known],
         class_id=classes[known],
         p_exists=np.ones(int(known.sum())),
-        n_hits=hits[known].astype(np.int64),
+        n_hits=hits[known],
         n_misses=np.zeros(int(known.sum()), dtype=np.int64),
         first_seen_s=first[known],
         last_seen_s=last[known],
@@ -156,6 +158,40 @@ def _landmarks(solved: Solved, frame: str, position: FloatArray, covariance: Flo
         clock=recording.clock,
         names=recording.landmark_names,
     )
+
+
+def count_sightings(
+    count: int, place: IntArray, seen_s: FloatArray, measurements: Sequence[Tied], stamp_s: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return how often each of so many places was seen (P,), when first and when last; infinite where never.
+
+    Args:
+        count: P.
+        place: (M,) places of detections.
+        seen_s: (M,) their stamps.
+        measurements: of other kinds; those of places count, too.
+        stamp_s: (N,) stamps of the poses.
+    """
+    tied = [of for of in measurements if of.kind.ties == "pose_place"]
+    row = np.concatenate([place, *(of.other for of in tied)])
+    at_s = np.concatenate([seen_s, *(stamp_s[of.row] for of in tied)])
+    first, last = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(first, row, at_s)
+    np.maximum.at(last, row, at_s)
+    return np.bincount(row, minlength=count).astype(np.int64), first, last
+
+
+def add_scale_error(covariance: FloatArray, position: FloatArray, log_sigma: float) -> FloatArray:
+    """Return covariances (K, n, n) with what is not known of the metre.
+
+    Args:
+        covariance: (K, n, n), of positions first.
+        position: (K, D) seen from the origin, in the axes of the covariances.
+        log_sigma: standard deviation of the logarithm of all lengths.
+    """
+    found, dim = covariance.copy(), position.shape[1]
+    found[:, :dim, :dim] += log_sigma**2 * position[:, :, None] * position[:, None, :]
+    return found
 
 
 def _changes(solved: Solved, moved: tuple[MapChange, ...]) -> tuple[MapChange, ...]:
@@ -186,26 +222,21 @@ def online(solved: Solved, frame: str) -> Trajectory:
 
 
 def _innovations(solved: Solved) -> Innovations:
-    """Return the NIS of all detections, each as if it had not been used; none of those that say all of a landmark.
-
-    As `space.result` has it: with H = J S J' of whitened Jacobians and the covariance S, and the weight w, of the
-    residual r it is r' (1 - w H)^-1 (1 - w H + H)^-1 r.
-    """
-    outcome, detections = solved.outcome, solved.recording.detections
-    problem, weight = outcome.problem, np.maximum(outcome.inlier, LEAST_WEIGHT)[:, None, None]
+    """Return the NIS of all detections, each as if it had not been used; none of those that say all of a landmark."""
+    outcome, detections, problem = solved.outcome, solved.recording.detections, solved.outcome.problem
     sigma = outcome.noise.noise.of_detections(problem.sigma_given)
     used = outcome.fit_marginals.explained_detections
     left = np.eye(2) - used
     told = np.flatnonzero(np.trace(left, axis1=1, axis2=2) > LEAST_LEFT)
-    r, left, own = (detection_residuals(problem, outcome.graph_estimate) / sigma)[told, :, None], left[told], used[told]
-    nis = (np.linalg.solve(left, r) * np.linalg.solve(left + own / weight[told], r)).sum(axis=(1, 2))
+    residual = detection_residuals(problem, outcome.graph_estimate) / sigma
+    nis = find_left_out_nis(residual[told], used[told], left[told], outcome.inlier[told])
     detection = solved.prepared.used[told]
     measured: BoolArray = ~(detections.sigma_bearing_rad[detection] >= ANY_BEARING_RAD)
     return Innovations(
         stamp_s=solved.recording.frames.stamp_s[detections.frame[detection]],
         detection=detection,
         landmark_id=detections.landmark_id[detection],
-        nis=np.maximum(nis, 0.0),
+        nis=nis,
         p_inlier=outcome.inlier[told],
         dof=None if measured.all() else 1 + measured.astype(np.int64),
     )
@@ -235,7 +266,7 @@ def described(
         meanings["range_slope"] += f"; {scale - 1.0:.4f} if the odometer were right"
         meanings["odometry_forward_scale"] += f"; {scale:.4f} if ranges were right"
         evident = any(_evident(needs[state], prior.p_needed[state]) for state in (SLOPE, FORWARD))
-        pairs |= _shown_together("range_slope", scale - 1.0, "odometry_forward_scale", scale, OF_SCALE, evident)
+        pairs |= show_together("range_slope", scale - 1.0, "odometry_forward_scale", scale, OF_SCALE, evident)
     if askew[1] > 0.0:
         angle = states[BEARING] + askew[0]
         meanings["bearing_bias_rad"] += f"; {angle:.4f} if the robot drove straight"
@@ -243,7 +274,7 @@ def described(
             f"driving direction to the left of the robot's front; {angle:.4f} if the sensor were mounted as stated"
         )
         evident = _evident(needed, prior.p_needed[BEARING])
-        pairs |= _shown_together("bearing_bias_rad", angle, "odometry_askew_rad", angle, OF_ANGLE, evident)
+        pairs |= show_together("bearing_bias_rad", angle, "odometry_askew_rad", angle, OF_ANGLE, evident)
         needs[BEARING] = needed if prior.angle_share > 0.0 else np.nan  # what is needed is the other one
     estimates = [
         ParameterEstimate(
@@ -267,7 +298,7 @@ def described(
     return (*estimates, *_levels(fit))
 
 
-def _shown_together(
+def show_together(
     one: str, one_alone: float, other: str, other_alone: float, decided_by: tuple[str, ...], evident: bool
 ) -> dict[str, dict[str, Any]]:
     """Return what `ParameterEstimate` says of two errors that only show together, by their names."""
@@ -331,6 +362,4 @@ def _in_metres(pose: FloatArray, covariance: FloatArray, outcome: Outcome) -> tu
     stretch = np.array([outcome.scale, outcome.scale, 1.0])
     covariance = covariance * stretch[:, None] * stretch[None, :]
     # a longer world moves a pose away from the origin, along its own position seen in its own frame
-    away = np.zeros((len(pose), 3))
-    away[:, :2] = se2.transform(se2.inverse(pose * [0.0, 0.0, 1.0]), pose[:, :2])
-    return pose, covariance + outcome.log_scale_sigma**2 * away[:, :, None] * away[:, None, :]
+    return pose, add_scale_error(covariance, -se2.inverse(pose)[:, :2], outcome.log_scale_sigma)

@@ -8,8 +8,9 @@ them say (`CalibrationPrior.metre`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -17,6 +18,7 @@ from scipy.linalg import block_diag
 
 from evermap.align.acceptance import MOST_JOINT, SIGMA_M, accept_alignment
 from evermap.align.candidates import Matches
+from evermap.config import LocalizeConfig
 from evermap.errors import DataError
 from evermap.estimate.gauss_newton import Steps
 from evermap.estimate.noise import restricted_level
@@ -49,6 +51,22 @@ ONE_INSTANT_S = 1e-3
 """Instants this close are the same: a robot moves a millimetre in between."""
 MOST_TIES = 200
 """Maximum mutual sightings used to align the frames of two robots."""
+NEEDED = "common landmark ids or mutual sightings, and one clock"
+"""What ties robots in the plane."""
+
+
+class SharedPoints(NamedTuple):
+    """What a robot has in common with others whose frames are known.
+
+    Attributes:
+        matches: its points, or poses, and where the others have them in the frame of all.
+        source_m2: (D K, D K) covariance of the former, in its own frame.
+        covariance_m2: (D K, D K) of the latter, in the frame of all.
+    """
+
+    matches: Matches
+    source_m2: FloatArray
+    covariance_m2: FloatArray
 
 
 def solve_together(alone: Mapping[int, Solved]) -> tuple[list[Solved], list[Trajectory]]:
@@ -170,7 +188,7 @@ def _placed(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], 
         sighted[mine] = sighted_at(pose[met.observer[mine]], met.reading[mine], estimate.states, problem.mount)
     names = [member.prepared.landmark_id for member in members]
 
-    def ties(a: int, b: int) -> tuple[FloatArray, FloatArray, IntArray]:
+    def in_both(a: int, b: int) -> tuple[FloatArray, FloatArray, IntArray]:
         """Return the same points in the frames of robots a and b, and which landmarks of each they are, -1 for none."""
         _, of_a, of_b = np.intersect1d(names[a], names[b], return_indices=True)
         points = [np.hstack([own[a][1].landmark[of_a], own[b][1].landmark[of_b]])]
@@ -184,27 +202,52 @@ def _placed(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], 
         known = np.isfinite(both).all(axis=1)
         return both[known, :2], both[known, 2:], row[known]
 
-    motion, placed = np.zeros((len(own), 3)), {0}
-    while len(placed) < len(own):
+    def tie(b: int, placed: Sequence[int], motion: FloatArray) -> SharedPoints:
+        """Return the points that b has in common with others, and where these have them."""
+        theirs, mine, row = zip(*(in_both(a, b) for a in placed), strict=True)
+        there = [se2.transform(motion[a], at) for a, at in zip(placed, theirs, strict=True)]
+        spread = [_errors(members[a], rows[:, 0], motion[a]) for a, rows in zip(placed, row, strict=True)]
+        errors = _errors(members[b], np.concatenate(row)[:, 1], np.zeros(3))
+        return SharedPoints(Matches.of(np.concatenate(mine), np.concatenate(there)), errors, block_diag(*spread))
+
+    robots = [member.recording.name for member in members]
+    return align_frames(np.zeros((len(own), 3)), tie, robots, NEEDED, members[0].settings.localize)
+
+
+def align_frames(
+    motion: FloatArray,
+    tie: Callable[[int, Sequence[int], FloatArray], SharedPoints],
+    names: Sequence[str],
+    hint: str,
+    rules: LocalizeConfig,
+) -> FloatArray:
+    """Return the motions (R, 3), in space (R, 7), of each robot's frame into that of the first one.
+
+    One after the other is laid over all that are, the surest one first.
+
+    Args:
+        motion: identities, as many as robots.
+        tie: what a robot has in common with others that are placed, by these motions.
+        names: what robots are called in messages.
+        hint: what would tie them, in words.
+        rules: when an alignment is certain.
+
+    Raises:
+        DataError: nothing ties one of them to the others.
+    """
+    motion, placed = motion.copy(), {0}
+    while len(placed) < len(motion):
         best, found, reason = -np.inf, None, "no common landmarks"
-        for b in set(range(len(own))) - placed:
-            theirs, mine, row = zip(*(ties(a, b) for a in placed), strict=True)
-            there = [se2.transform(motion[a], at) for a, at in zip(placed, theirs, strict=True)]
-            spread = [_errors(members[a], rows[:, 0], motion[a]) for a, rows in zip(placed, row, strict=True)]
-            joint = np.asarray(block_diag(*spread), dtype=np.float64)
-            laid = accept_alignment(
-                Matches.of(np.concatenate(mine), np.concatenate(there)),
-                members[0].settings.localize,
-                covariance_m2=joint + SIGMA_M**2 * np.eye(len(joint)),
-                source_m2=_errors(members[b], np.concatenate(row)[:, 1], np.zeros(3)),
-            )
+        for b in set(range(len(motion))) - placed:
+            ties = tie(b, sorted(placed), motion)
+            known = ties.covariance_m2 + SIGMA_M**2 * np.eye(len(ties.covariance_m2))
+            laid = accept_alignment(ties.matches, rules, covariance_m2=known, source_m2=ties.source_m2)
             if laid and laid.log_odds > best:
                 best, found = laid.log_odds, (b, laid.motion)
             reason = laid.reason if len(laid.agree) else reason
         if found is None:
-            lost = ", ".join(members[r].recording.name for r in range(len(own)) if r not in placed)
-            what = f"nothing connects {lost} to {members[0].recording.name}: {reason}"
-            raise DataError(what, hint="common landmark ids or mutual sightings, and one clock")
+            lost = ", ".join(names[b] for b in range(len(motion)) if b not in placed)
+            raise DataError(f"nothing connects {lost} to {names[0]}: {reason}", hint=hint)
         motion[found[0]] = found[1]
         placed.add(found[0])
     return motion
@@ -225,30 +268,44 @@ def _errors(member: Solved, row: IntArray, motion: FloatArray) -> FloatArray:
     return spread.reshape(2 * len(row), 2 * len(row))
 
 
-def _shared(members: Sequence[Solved]) -> list[IntArray]:
-    """Return the common place of each place of each robot: one per id, except for landmarks that a robot saw moving."""
+def _shared(members: Sequence[Solved]) -> tuple[list[IntArray], int]:
+    """Return `share_places` by ids, except for landmarks that a robot saw moving."""
     revisions = [member.outcome.revision for member in members]
     names = [member.prepared.landmark_id for member in members]
     moved = {
         int(own[k]) for own, said in zip(names, revisions, strict=True) for c in said.changes for k in c.landmark_ids
     }
-    stay = np.setdiff1d(np.concatenate(names), list(moved))
-    places, count = [], len(stay)
+    identity = []
     for own, revision in zip(names, revisions, strict=True):
-        rows = np.arange(count, count + len(revision.estimate.landmark))
-        shared = np.flatnonzero(np.isin(own, stay))
-        rows[shared] = np.searchsorted(stay, own[shared])
+        identity.append(np.full(len(revision.estimate.landmark), -1))
+        identity[-1][: len(own)] = np.where(np.isin(own, list(moved)), -1, own)
+    return share_places(identity)
+
+
+def share_places(identity: Sequence[IntArray]) -> tuple[list[IntArray], int]:
+    """Return the common place (P_r,) of each place of each robot, and how many there are.
+
+    Args:
+        identity: (P_r,) of each robot, the ids of its places: one place for all that have it; -1 of those that are its
+            own, which come after these.
+    """
+    stay = np.unique(np.concatenate([own[own >= 0] for own in identity]))
+    places, count = [], len(stay)
+    for own in identity:
+        rows = np.searchsorted(stay, own)
+        alone = np.flatnonzero(own < 0)
+        rows[alone] = count + np.arange(len(alone))
+        count += len(alone)
         places.append(rows)
-        count += len(rows)
-    return places
+    return places, count
 
 
 def _laid_together(
     members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], met: Encounters, motion: FloatArray
 ) -> tuple[Together, Estimate]:
     """The problem of all, and where it is when each robot's own solution is moved by (R, 3)."""
-    places = _shared(members)
-    landmark = np.full((max(int(rows.max()) for rows in places) + 1, 2), np.nan)
+    places, count = _shared(members)
+    landmark = np.full((count, 2), np.nan)
     pose, robots = [], []
     metric = not all(member.prior.shares_scale for member in members)
     for r, (member, (problem, estimate), by) in enumerate(zip(members, own, motion, strict=True)):

@@ -15,7 +15,7 @@ from evermap.maps.sessions.extend import Extended, Found
 from evermap.maps.sessions.looks import Watch
 from evermap.maps.sessions.placing import Laid
 from evermap.maps.sessions.spatial import SpatialVisit
-from evermap.slam.space.intake import most_of
+from evermap.slam.intake import most_of
 from evermap.slam.space.moving import TrafficIntake, boxes_of, conclude_in_traffic, mounts_of
 from evermap.slam.space.solve import SpatialSolved
 from evermap.tracking.frame import heading_of

@@ -27,11 +27,12 @@ from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.sensing import learned
 from evermap.sensing.profile import Assumed, Field, Projection
 from evermap.sensing.visibility import LooksAt
+from evermap.slam.intake import most_of
 from evermap.slam.space.against_map import by_itself
 from evermap.slam.space.bodies import with_rests
 from evermap.slam.space.bridge import bridge
 from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.intake import SpatialIntake, most_of, prepare_space
+from evermap.slam.space.intake import SpatialIntake, prepare_space
 from evermap.slam.space.problem import ANY_RAD, PlacePrior
 from evermap.slam.space.result import concluded_in_space, identities_of, located, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved, fit_to_map, solve_space

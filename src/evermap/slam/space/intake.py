@@ -17,14 +17,13 @@ from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries, Symmetry
 from evermap.slam.gaps import find_gaps
-from evermap.slam.intake import frames_of_usable, frames_with_pose, landmark_ids, usable_detections
+from evermap.slam.intake import frames_of_usable, frames_with_pose, landmark_ids, most_of, usable_detections
 from evermap.slam.space.bridge import PathFrames
 from evermap.slam.space.linearise import CORNERS, JUMP_SHARE, POINT, POSE
 from evermap.slam.space.local_filter import SpatialFrame
 from evermap.slam.space.problem import USUAL, OdometryPath, SpatialNoise, SpatialProblem, Swing
 from evermap.types import (
     ANY_RANGE_M2,
-    UNKNOWN,
     BoolArray,
     FloatArray,
     IntArray,
@@ -235,16 +234,6 @@ def state_sigmas(sensors: Sequence[SpatialSensor], settings: SpaceConfig, *, dri
 def path_of(recording: SpatialRecording, start_s: float) -> OdometryPath | None:
     """Return the odometry, with stamps from an instant on; None without."""
     return lead_on(recording, start_s, 0.0)
-
-
-def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
-    """Return (P,) the class that most detections of each place say."""
-    found = np.full(count, UNKNOWN)
-    for row in range(count):
-        own = class_id[(place == row) & (class_id != UNKNOWN)]
-        if len(own):
-            found[row] = int(np.argmax(np.bincount(own)))
-    return found
 
 
 def _symmetries(recording: SpatialRecording, place: IntArray, used: IntArray, kind: IntArray, count: int) -> Symmetries:

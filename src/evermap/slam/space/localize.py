@@ -6,17 +6,19 @@ A tag tells the whole pose, three points do, and odometry ties those that were s
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from evermap.align.acceptance import SIGMA_M, SIGMA_RAD, accept_alignment
-from evermap.align.candidates import Matches, score_motions
+from evermap.align.candidates import Matches
 from evermap.config import LocalizeConfig, SpaceConfig
 from evermap.geometry import se3
 from evermap.geometry.chunked import JointCovariance
+from evermap.geometry.group import SPACE
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam.filter_kernels import BY_OTHERS
-from evermap.slam.known_places import MOST_LANDMARKS, RETRY_S, KnownPlaces, Placed
+from evermap.slam.known_places import DriveTrack, KnownPlaces, Placed
 from evermap.slam.localize import USUAL, BaseLocalizer
 from evermap.slam.space.linearise import POINT
 from evermap.slam.space.local_filter import OF_PLACE, SpatialFilter, SpatialFrame, SpatialMotion
@@ -89,47 +91,44 @@ class SpatialPlaces(KnownPlaces):
         return found.reshape(OF_PLACE * count, OF_PLACE * count)
 
 
-class SpatialTrack:
-    """A drive by odometry alone, and where landmarks were seen during it, in the frame of its first pose.
+class LandmarkWays(NamedTuple):
+    """A landmark that was seen: (2, 7) both explanations, log odds of the first, and whether it has an orientation."""
+
+    ways: FloatArray
+    log_odds: float
+    turned: bool
+
+
+class SpatialTrack(DriveTrack[LandmarkWays]):
+    """A drive in space.
 
     Without odometry, `driven` False, nothing ties one frame to another: only those of the newest are kept.
     """
 
     def __init__(self, settings: LocalizeConfig, mount: FloatArray, pixel: float, *, driven: bool) -> None:
-        self._settings, self._mount, self._pixel, self._driven = settings, mount, pixel, driven
-        self._pose = se3.identity()
-        self._began_s = np.nan
-        self._seen: dict[int, tuple[float, FloatArray, float, bool]] = {}
-        self._tried: tuple[float, frozenset[int]] = (-np.inf, frozenset())
+        super().__init__(SPACE, mount, settings)
+        self._pixel, self._driven = pixel, driven
 
     def drive(self, increment: FloatArray) -> None:
         """Advance the pose by a motion (7,)."""
-        self._pose = se3.compose(self._pose, increment)
+        super().drive(increment)
         if not self._driven:
             self._seen.clear()
 
     def see(self, stamp_s: float, seen: SpatialFrame, used: IntArray, states: FloatArray) -> None:
         """Add sightings (M,) of landmarks of the map; forget those that are too old."""
-        if np.isnan(self._began_s):
-            self._began_s = stamp_s
         mount = se3.retract(self._mount, states[:-1].reshape(-1, 6))[seen.sensor[used]]
         ways = se3.compose(self._pose, se3.compose(mount, seen.either[:, used]))
         turned = (seen.kind[used] != POINT) & (seen.symmetry[used] == 0)
-        for k, name in enumerate(seen.landmark_id[used].tolist()):
-            self._seen.pop(name, None)
-            odds = float(seen.other_log_odds[used[k]]) / self._pixel**2
-            alike = np.array_equal(ways[0, k], ways[1, k])
-            self._seen[name] = (stamp_s, ways[:, k], np.inf if alike else odds, bool(turned[k]))
-        old = [name for name, (seen_s, *_) in self._seen.items() if seen_s < stamp_s - self._settings.track_s]
-        for name in [*old, *list(self._seen)[: max(len(self._seen) - len(old) - MOST_LANDMARKS, 0)]]:
-            self._seen.pop(name, None)
+        odds = np.where((ways[0] == ways[1]).all(axis=1), np.inf, seen.other_log_odds[used] / self._pixel**2)
+        kept = [LandmarkWays(ways[:, k], float(odds[k]), bool(turned[k])) for k in range(len(used))]
+        self._keep(stamp_s, seen.landmark_id[used].tolist(), kept)
 
     def placed(self, stamp_s: float, places: SpatialPlaces) -> Placed | None:
         """Align the drive with the map; None if that is uncertain, or was tried before with the same landmarks."""
-        names, settings = frozenset(self._seen), self._settings
-        if not names or (self._driven and names <= self._tried[1] and stamp_s < self._tried[0] + RETRY_S):
+        settings = self._settings
+        if not self._seen or (self._driven and self._was_tried(stamp_s)):
             return None
-        self._tried = (stamp_s, names)
         alone = not self._driven or stamp_s - self._began_s >= settings.alone_s
         matches, row = self._candidates(places)
         found = accept_alignment(matches, settings, covariance_m2=places.errors_at(row))
@@ -141,26 +140,14 @@ class SpatialTrack:
         pose = se3.compose(found.motion, self._pose)
         return Placed(pose, *_uncertainty(pose, places.value[row[some]], turned, row[some]))
 
-    def agreement(self, pose_map_robot: FloatArray, places: SpatialPlaces) -> float:
-        """Return how well the track fits the map with the robot at a pose (7,): 1 per landmark exactly at a place."""
-        matches = self._candidates(places)[0]
-        motion = se3.compose(pose_map_robot, se3.inverse(self._pose))[None]
-        return float(score_motions(motion, replace(matches, weight=np.ones(len(matches))))[0])
-
-    def _candidates(self, places: SpatialPlaces) -> tuple[Matches, IntArray]:
-        """One row for every place a landmark may be at, and another where a tag has two explanations; with
-        the rows (K,) of the map.
-        """
-        first, last = places.rows_of(np.fromiter(self._seen, dtype=np.int64))
-        count = last - first
-        within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        name = np.repeat(np.arange(len(first)), count)
-        row = np.repeat(first, count) + within
-        seen = list(self._seen.values())
-        ways = np.array([ways for _, ways, *_ in seen]).reshape(-1, 2, 7)[name]
-        ways[~np.array([turned for *_, turned in seen], dtype=np.bool_)[name], :, 3:] = np.nan
-        odds = np.array([odds for _, _, odds, _ in seen])[name]
-        either = np.flatnonzero(np.isfinite(odds) & np.isfinite(places.rotation[row, 0]))
+    def _candidates(self, places: KnownPlaces) -> tuple[Matches, IntArray]:
+        """Return them as in the plane, twice where a tag has two explanations."""
+        name, row = self._pair(places)
+        seen = [one for _, one in self._seen.values()]
+        ways = np.array([one.ways for one in seen]).reshape(-1, 2, 7)[name]
+        ways[~np.array([one.turned for one in seen], dtype=np.bool_)[name], :, 3:] = np.nan
+        odds = np.array([one.log_odds for one in seen])[name]
+        either = np.flatnonzero(np.isfinite(odds) & np.isfinite(places.value[row, 3]))
         every = np.append(np.arange(len(row)), either)
         matches = Matches.of(
             np.concatenate([ways[:, 0], ways[either, 1]]),

@@ -17,9 +17,10 @@ import numpy as np
 from evermap.config import SpaceConfig, StillConfig, TrackConfig, TrafficConfig
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
+from evermap.slam.intake import most_of
 from evermap.slam.space.drift import Gauge, gauge_of
 from evermap.slam.space.estimate import converged
-from evermap.slam.space.intake import SpatialIntake, most_of, prepare_space, scale_between
+from evermap.slam.space.intake import SpatialIntake, prepare_space, scale_between
 from evermap.slam.space.result import concluded_in_space, distinguished
 from evermap.slam.space.solve import SpatialSolved, solve_space, times_of
 from evermap.tracking.frame import DetectionTable, Poses, heading_of, in_world, with_empty_frames

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -14,9 +13,11 @@ from evermap.estimate.measurement import frame_of
 from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.calibration import OF_SCALE
+from evermap.slam.intake import most_of
+from evermap.slam.result import add_scale_error, count_sightings, show_together
 from evermap.slam.space.bodies import BodyMove, shifts_of
 from evermap.slam.space.bridge import bridge, bridge_covariance
-from evermap.slam.space.intake import SpatialIntake, most_of, start_noise
+from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import (
     ACROSS,
     ALONG,
@@ -131,8 +132,7 @@ def _trajectory(told: _Told, found: BoolArray) -> Trajectory:
     pose = bridge(frames, problem, optimum.estimate, optimum.noise)
     noise, weight = optimum.sober or optimum.noise, optimum.now.odometry_weight
     covariance = bridge_covariance(frames, problem, optimum.estimate, noise, weight, told.spread)
-    away = np.einsum("nji,nj->ni", se3.rotation_of(pose), pose[:, :3])
-    covariance[:, :3, :3] += _undivided(told) ** 2 * away[:, :, None] * away[:, None, :]
+    covariance = add_scale_error(covariance, -se3.inverse(pose)[:, :3], _undivided(told))
     of = slice(None) if problem.driven else found
     return _path(told, pose, covariance, of)
 
@@ -197,9 +197,8 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
     place = optimum.estimate.place
     count, n = len(place), len(problem.stamp_s)
     used = optimum.now.weight > problem.settings.inlier
-    hits = np.bincount(problem.place[used], minlength=count)
-    for tied in (tied for tied in problem.measurements if tied.kind.ties == "pose_place"):
-        hits += np.bincount(tied.other, minlength=count)
+    seen_s = told.stamp_s[problem.pose_row[used]]
+    hits, first, last = count_sightings(count, problem.place[used], seen_s, problem.measurements, told.stamp_s)
     covariance, turned = np.zeros((count, 3, 3)), np.full((count, 3, 3), np.nan)
     for k in range(count):
         dim, at = (6 if problem.oriented[k] else 3), told.spread.own_first[n + k]
@@ -209,14 +208,7 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
             turn = se3.rotation_of(place[k])
             covariance[k] = turn @ own[:3, :3] @ turn.T
             turned[k] = own[3:, 3:]
-        covariance[k] += _undivided(told) ** 2 * np.outer(place[k, :3], place[k, :3])
-    first, last = np.full(count, np.nan), np.full(count, np.nan)
-    stamp_s = told.stamp_s[problem.pose_row]
-    np.fmin.at(first, problem.place[used], stamp_s[used])
-    np.fmax.at(last, problem.place[used], stamp_s[used])
-    for tied in (tied for tied in problem.measurements if tied.kind.ties == "pose_place"):
-        np.fmin.at(first, tied.other, told.stamp_s[tied.row])
-        np.fmax.at(last, tied.other, told.stamp_s[tied.row])
+    covariance = add_scale_error(covariance, place[:, :3], _undivided(told))
     order = np.argsort(identities, kind="stable")
     order = order[(hits[order] > 0) & told.placed[order]]
     oriented = bool(problem.oriented.any())
@@ -333,14 +325,11 @@ def _scales(told: _Told, sigma: float) -> list[ParameterEstimate]:
     of_ranges = float(np.hypot(share * sigma, undivided))
     reads = float(np.exp(problem.ranges_log))
     evident = abs(np.log(scale * reads)) > 2.0 * sigma
-    more: dict[str, Any] = {
-        "meaning": DIVIDED, "alone": scale * reads, "decided_by": OF_SCALE, "evident": bool(evident),
-    }  # fmt: skip
+    both = ("odometry_scale", scale, of_odometer, odometer), ("range_scale", reads, reads * of_ranges, ranges)
+    pairs = show_together(both[0][0], scale * reads, both[1][0], scale * reads, OF_SCALE, bool(evident))
     return [
-        ParameterEstimate("odometry_scale", scale, of_odometer, 1.0, odometer, "", shown_with="range_scale", **more),
-        ParameterEstimate(
-            "range_scale", reads, reads * of_ranges, 1.0, ranges, "", shown_with="odometry_scale", **more
-        ),
+        ParameterEstimate(name, value, own, 1.0, prior, "", meaning=DIVIDED, **pairs[name])
+        for name, value, own, prior in both
     ]
 
 

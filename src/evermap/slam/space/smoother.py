@@ -14,6 +14,7 @@ import numpy as np
 
 from evermap.estimate.gauss_newton import Steps, minimised
 from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, build_structure, grouped
+from evermap.estimate.innovations import find_left_out_nis
 from evermap.estimate.measurement import MeasurementFactors, Tied
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
@@ -174,11 +175,7 @@ class SpatialSmoother:
         return exhausted(factorised.spread(len(self.problem.increment)))
 
     def find_nis(self, now: SpatialLinear, spread: Spread) -> FloatArray:
-        """Return (M,) NIS of all detections, each as if it had not been used, from residuals r and their leverage.
-
-        With H = J S J' of whitened Jacobians and the covariance S, and the weight w:
-        r' (1 - w H)^-1 (1 - w H + H)^-1 r.
-        """
+        """Return (M,) NIS of all detections, each as if it had not been used."""
         problem, nis = self.problem, np.zeros(len(self.problem.kind))
         first = spread.of_factors_first[len(problem.increment) :]
         for kind in range(3):
@@ -186,12 +183,11 @@ class SpatialSmoother:
             if not len(some):
                 continue
             at = first[some][:, None] + np.arange(rows * rows)
-            weight = np.maximum((now.weight * problem.share)[some], 1e-6)[:, None, None]
             used = spread.of_factors[at].reshape(-1, rows, rows)
-            rest = (1.0 + 1e-9) * np.eye(rows) - used
-            r = now.residual[some, :rows, None]
-            nis[some] = (np.linalg.solve(rest, r) * np.linalg.solve(rest + used / weight, r)).sum(axis=(1, 2))
-        return np.maximum(nis, 0.0)
+            left = (1.0 + 1e-9) * np.eye(rows) - used
+            weight = (now.weight * problem.share)[some]
+            nis[some] = find_left_out_nis(now.residual[some, :rows], used, left, weight)
+        return nis
 
     def residual_of(self, now: Linear) -> FloatArray:
         """Return (M, 8) whitened residuals of detections, by the right sides of their factors."""

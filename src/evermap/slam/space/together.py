@@ -15,12 +15,20 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from evermap.align.acceptance import MOST_JOINT, SIGMA_M, Acceptance, accept_alignment
+from evermap.align.acceptance import MOST_JOINT
 from evermap.align.candidates import Matches
 from evermap.config import LocalizeConfig
-from evermap.errors import DataError
 from evermap.estimate.gauss_newton import Minimum, Steps, minimised
-from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, SharedBlock, build_structure, grouped
+from evermap.estimate.graph import (
+    Border,
+    FactorBlock,
+    Graph,
+    Layout,
+    Linear,
+    build_structure,
+    concatenate_blocks,
+    concatenate_groups,
+)
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.geometry import se2, se3
@@ -42,7 +50,11 @@ from evermap.slam.space.smoother import (
     limit_turns,
 )
 from evermap.slam.space.solve import FREE, SpatialSolved
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.slam.together import SharedPoints, align_frames, share_places
+from evermap.types import FloatArray, IntArray
+
+NEEDED = "common landmark ids, at least three points or one tag, and one clock"
+"""What ties robots in space."""
 
 
 class JointEstimate(NamedTuple):
@@ -118,26 +130,23 @@ def align_robots(members: Sequence[SolvedRobot], names: Sequence[str], rules: Lo
     Raises:
         DataError: nothing ties one of them to the others.
     """
-    motion, placed, alone = se3.identity(len(members)), [0], [_errors(member) for member in members]
-    while len(placed) < len(members):
-        best, found, reason = -np.inf, None, "no common landmarks"
-        for b in (b for b in range(len(members)) if b not in placed):
-            place = [se3.compose(motion[a], members[a].solved.optimum.estimate.place) for a in placed]
-            theirs, oriented = np.concatenate(place), np.concatenate([members[a].problem.oriented for a in placed])
-            name = np.concatenate([members[a].identity for a in placed])
-            turn = [se3.rotation_of(motion[a]) for a in placed]
-            spread = [_turned(alone[a], by) for a, by in zip(placed, turn, strict=True)]
-            laid = _align(members[b], alone[b], name, theirs, oriented, spread, rules)
-            if laid and laid.log_odds > best:
-                best, found = laid.log_odds, (b, laid.motion)
-            reason = laid.reason if len(laid.agree) else reason
-        if found is None:
-            lost = ", ".join(names[b] for b in range(len(members)) if b not in placed)
-            what = f"nothing connects {lost} to {names[0]}: {reason}"
-            raise DataError(what, hint="common landmark ids, at least three points or one tag, and one clock")
-        motion[found[0]] = found[1]
-        placed.append(found[0])
-    return motion
+    alone = [_errors(member) for member in members]
+
+    def tie(b: int, placed: Sequence[int], motion: FloatArray) -> SharedPoints:
+        """Return places that b has in common with others, and where these have them, with orientations where known."""
+        by = [(members[a], motion[a]) for a in placed]
+        theirs = np.concatenate([se3.compose(at, member.solved.optimum.estimate.place) for member, at in by])
+        oriented = np.concatenate([member.problem.oriented for member, _ in by])
+        own_name, name = members[b].identity, np.concatenate([member.identity for member, _ in by])
+        row, other = np.nonzero((own_name[:, None] == name) & (own_name >= 0)[:, None])
+        mine, there = members[b].solved.optimum.estimate.place[row], theirs[other]
+        mine[~members[b].problem.oriented[row], 3:] = np.nan
+        there[~oriented[other], 3:] = np.nan
+        at, to = se2.xy_rows(row, 3), se2.xy_rows(other, 3)
+        spread = block_diag(*(_turned(alone[a], se3.rotation_of(motion[a])) for a in placed))
+        return SharedPoints(Matches.of(mine, there, landmark=row), alone[b][np.ix_(at, at)], spread[np.ix_(to, to)])
+
+    return align_frames(se3.identity(len(members)), tie, names, NEEDED, rules)
 
 
 def _errors(member: SolvedRobot) -> FloatArray:
@@ -154,38 +163,9 @@ def _turned(covariance_m2: FloatArray, turn: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ab,ibjc,dc->iajd", turn, every, turn, optimize=True).reshape(covariance_m2.shape))
 
 
-def _align(
-    member: SolvedRobot,
-    alone_m2: FloatArray,
-    name: IntArray,
-    theirs: FloatArray,
-    oriented: BoolArray,
-    spread_m2: list[FloatArray],
-    rules: LocalizeConfig,
-) -> Acceptance:
-    """The motion of a robot's frame that brings most of its places to those of others, if it is accepted."""
-    own_name, own = member.identity, member.solved.optimum.estimate.place
-    row, other = np.nonzero((own_name[:, None] == name) & (own_name >= 0)[:, None])
-    mine, there = own[row].copy(), theirs[other].copy()
-    mine[~member.problem.oriented[row], 3:] = np.nan
-    there[~oriented[other], 3:] = np.nan
-    at, to, joint = se2.xy_rows(row, 3), se2.xy_rows(other, 3), np.asarray(block_diag(*spread_m2), dtype=np.float64)
-    known = joint[np.ix_(to, to)] + SIGMA_M**2 * np.eye(len(to))
-    matches, own = Matches.of(mine, there, landmark=row), alone_m2[np.ix_(at, at)]
-    return accept_alignment(matches, rules, covariance_m2=known, source_m2=own)
-
-
 def _lay_together(members: Sequence[SolvedRobot], motion: FloatArray) -> tuple[SpatialTogether, JointEstimate]:
     """The problem of all, and where it is when each robot's own solution is moved by (R, 7)."""
-    stay = np.unique(np.concatenate([member.identity[member.identity >= 0] for member in members]))
-    places, count = [], len(stay)
-    for member in members:
-        own = member.identity
-        row = np.where(own >= 0, np.searchsorted(stay, own), 0)
-        alone = np.flatnonzero(own < 0)
-        row[alone] = count + np.arange(len(alone))
-        count += len(alone)
-        places.append(row)
+    places, count = share_places([member.identity for member in members])
     oriented, place = np.zeros(count, dtype=np.bool_), se3.identity(count)
     known = np.zeros(count, dtype=np.bool_)
     estimates = [member.solved.optimum.estimate for member in members]
@@ -239,15 +219,12 @@ class SpatialTogether:
                 zip(pairwise(self.first.tolist()), pairwise(self.sensor.tolist()), self.places, strict=True)
             )
         ]
-        leaves, when, last = [], [], 0
-        for robot, begin_s in zip(self.robots, start_s, strict=True):
-            leaves.append(last + grouped(len(robot.problem.stamp_s), POSES_A_LEAF))
-            last = int(leaves[-1][-1]) + 1
-            when.append(begin_s + robot.problem.stamp_s)
+        when = [begin_s + robot.problem.stamp_s for robot, begin_s in zip(self.robots, start_s, strict=True)]
         dim = np.concatenate([np.full(n, 6), np.where(self.oriented, 6, 3), np.full(n_sensors, STATES)])
         dim = np.append(dim, np.ones(len(robots), dtype=np.int64))
         coordinate = np.column_stack([np.concatenate(when), around.pose[:, :3]])
-        layout = Layout(dim, n + count + np.arange(n_sensors + len(robots)), np.concatenate(leaves), coordinate)
+        group = concatenate_groups(np.diff(self.first).tolist(), POSES_A_LEAF)
+        layout = Layout(dim, n + count + np.arange(n_sensors + len(robots)), group, coordinate)
         blocks = self._blocks([SpatialNoise()] * len(robots), heavy=False)
         self.structure = exhausted(build_structure(layout, blocks))
         begin = self.structure.system.tree.begin
@@ -290,15 +267,9 @@ class SpatialTogether:
 
     def _blocks(self, noise: Sequence[SpatialNoise], *, heavy: bool) -> tuple[FactorBlock[JointEstimate], ...]:
         """Odometry of all, detections of all, and what else each has."""
-        kinds = []
-        for r, (robot, own) in enumerate(zip(self.robots, noise, strict=True)):
-            select = partial(self.own, robot=r)
-            first = int(self.first[r])
-            kinds.append(
-                [SharedBlock(block, self.variable[r], first, select) for block in robot.graph(own, heavy=heavy).blocks]
-            )
-        measured = [blocks[kind] for kind in (ODOMETRY, SIGHTINGS) for blocks in kinds]
-        return (*measured, *(block for blocks in kinds for block in blocks[SIGHTINGS + 1 :]))
+        blocks = [robot.graph(own, heavy=heavy).blocks for robot, own in zip(self.robots, noise, strict=True)]
+        select = [partial(self.own, robot=r) for r in range(len(blocks))]
+        return concatenate_blocks(blocks, self.variable, self.first.tolist(), select, measured=SIGHTINGS + 1)
 
     def _retract(self, state: JointEstimate, step: FloatArray) -> tuple[JointEstimate, float]:
         """The values after a step, and how far it went."""
