@@ -49,6 +49,8 @@ DRAWS = 256
 LEAST_SURVIVAL, TRUSTED = 1e-9, 0.02
 """Survival down to which the expected one is that of the usual prior, and of a stated one: what is left of a stated
 hazard later is its ratio to the expected one, the less, the more was seen at that age."""
+ALIKE = 2
+"""Digits after the first to which stays are alike that are learned from together."""
 _NEWTON, _STEP, _SETTLED = 40, 2.0, 1e-4
 NEGLECTED = 1e-6
 """Share of the largest variance below which a direction of the process is dropped."""
@@ -94,6 +96,28 @@ class StayAges:
             np.zeros(n, dtype=np.int64) if group is None else group,
             np.ones((n, 2)), np.zeros(n), np.zeros(n),
         )  # fmt: skip
+
+    @classmethod
+    def empty(cls) -> Self:
+        """Return no stays."""
+        ages, column = np.zeros((0, 1)), np.zeros(0)
+        return cls(ages, ages, ages, column, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), column, column)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """Return all that have a weight; rows that are alike to three digits are one."""
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__}
+        weight = columns.pop("weight")
+        some = weight > 0.0
+        if not some.any():
+            return cls.empty()
+        table = np.column_stack([*columns.values()])[some]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = 10.0 ** (np.floor(np.log10(np.abs(table))) - ALIKE)
+            alike = np.where(np.isfinite(size) & (size > 0.0), np.rint(table / size) * size, table)
+        _, first, row = np.unique(alike, axis=0, return_index=True, return_inverse=True)
+        kept = {name: column[some][first] for name, column in columns.items()}
+        return cls(weight=np.bincount(row.ravel(), weight[some]).astype(np.float64), **kept)
 
     def of_group(self, group: int) -> Self:
         """Return those of one class."""
