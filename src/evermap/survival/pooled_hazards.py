@@ -49,6 +49,11 @@ DRAWS = 256
 LEAST_SURVIVAL, TRUSTED = 1e-9, 0.02
 """Survival down to which the expected one is that of the usual prior, and of a stated one: what is left of a stated
 hazard later is its ratio to the expected one, the less, the more was seen at that age."""
+LINE = np.linspace(-6.0, 6.0, 17)
+FINE_LINE, FAR = np.linspace(-6.0, 6.0, 241), [5, 11]
+"""Standard deviations at which exact densities are computed, and those between; the two which tell whether to."""
+STRAIGHT = 0.1
+"""Difference of log densities there up to which the normal one is kept."""
 ALIKE = 2
 """Digits after the first to which stays are alike that are learned from together."""
 _NEWTON, _STEP, _SETTLED = 40, 2.0, 1e-4
@@ -145,7 +150,21 @@ class _Likelihood:
         self.pairs = np.maximum(self.watched_s / both, 0.5)
         self.share = stays.gap_s / both[:, None]
 
-    def __call__(self, hazard: FloatArray, slopes: bool = True) -> tuple[float, FloatArray, FloatArray]:
+    def values(self, hazards: FloatArray) -> FloatArray:
+        """Return the values (S,) of hazards (S, K)."""
+        stays = self.stays
+        until, stayed, left = (spent @ hazards.T for spent in self.spent)  # (N, J, S)
+        score = -until
+        for part in (0, 1):
+            each = (self.share[:, part] / self.pairs)[:, None, None]
+            come = (stays.back_rate * self.watched_s)[:, None, None] * each
+            score += self.pairs[:, None, None] * _there_again(stayed * each, stays.back[:, None, None], come)[0]
+        come = (stays.back_rate * self.left_s)[:, None, None]
+        score[self.ended] += _log_gone(left, stays.back[:, None, None], come)[0][self.ended]
+        seen, there = (log_sum_exp(np.moveaxis(part, 1, -1)) for part in (score, -until))
+        return np.asarray(stays.weight @ (seen - there))
+
+    def __call__(self, hazard: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Return the value, and gradient (K,) and second derivative (K, K) by log hazards."""
         stays, ended = self.stays, self.ended
         before, during, after = (spent * hazard for spent in self.spent)
@@ -164,8 +183,6 @@ class _Likelihood:
         of_end, of_end_2 = (np.where(ended[:, None], d, 0.0) for d in (of_end, of_end_2))
         seen, there = log_sum_exp(score), log_sum_exp(-until)
         total = float(stays.weight @ (seen - there))
-        if not slopes:
-            return total, np.zeros(0), np.zeros(0)
         w = stays.weight[:, None]
         p, q = w * np.exp(score - seen[:, None]), w * np.exp(-until - there[:, None])
         slope = -before + first[..., None] * during + of_end[..., None] * after
@@ -437,10 +454,10 @@ def _fit_together(likelihoods: list[_Likelihood], scale: _Scale, base: FloatArra
 
     best, slopes, informations = bent(shared, own)
     for _ in range(_NEWTON):
-        slopes = slopes - of_own * (own - shared)
+        pull = slopes - of_own * (own - shared)
         inverse = np.linalg.inv(informations + of_own * np.eye(r))
         matrix = (of_shared + n * of_own) * np.eye(r) - of_own**2 * inverse.sum(axis=0)
-        solved = np.einsum("gij,gj->gi", inverse, slopes)
+        solved = np.einsum("gij,gj->gi", inverse, pull)
         slope = -of_shared * shared + of_own * ((own - shared) + solved).sum(axis=0)
         step = np.linalg.solve(matrix, slope)
         steps = solved + of_own * inverse @ step
@@ -459,13 +476,74 @@ def _fit_together(likelihoods: list[_Likelihood], scale: _Scale, base: FloatArra
     evidence = best + 0.5 * r * (np.log(of_shared) + n * np.log(of_own)) - 0.5 * _logdet(matrix)
     evidence -= 0.5 * sum(_logdet(one) for one in hessian)
     one, other = _normals(r)
-    common = one @ _root(np.linalg.inv(matrix))
-    draws = [
-        (of + of_own * common @ covariance + other @ _root(covariance)) @ columns.T
-        for of, covariance in zip(own, inverse, strict=True)
-    ]
+    of_both = np.linalg.inv(matrix)
+    common = one @ _root(of_both)
+    draws, moved = [], np.zeros_like(common)
+    for row, covariance in enumerate(inverse):
+        spread = of_own * common @ covariance + other @ _root(covariance)
+        line = _Line(likelihoods[row], base, columns, own[row], slopes[row], informations[row])
+        exact, gain = line.bend(spread, covariance + of_own**2 * covariance @ of_both @ covariance)
+        evidence += gain
+        moved += exact - spread
+        draws.append((own[row] + exact) @ columns.T)
+    common = common + of_own / (of_shared + n * of_own) * moved
     draws.append((shared + common + np.sqrt(1.0 / of_own) * other) @ columns.T)
     return float(evidence), draws
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Line:
+    """The likelihood of a class along lines through the most probable numbers.
+
+    Attributes:
+        likelihood: of its stays.
+        base: (K,) hazards that are 1.
+        columns: (K, R) of the scale.
+        mode, slope, information: (R,), (R,), (R, R) most probable numbers, gradient and information there.
+    """
+
+    likelihood: _Likelihood
+    base: FloatArray
+    columns: FloatArray
+    mode: FloatArray
+    slope: FloatArray
+    information: FloatArray
+
+    def excess(self, axes: FloatArray, at: FloatArray) -> FloatArray:
+        """Return by how much (A, T) the log likelihood is over its parabola at steps (T,) along axes (R, A)."""
+        steps = at[:, None] * axes.T[:, None, :]
+        with np.errstate(over="ignore", invalid="ignore"):
+            hazards = self.base * np.exp((self.mode + steps) @ self.columns.T)
+            values = self.likelihood.values(hazards.reshape(-1, len(self.base))).reshape(-1, len(at))
+            middle = self.likelihood.values(self.base * np.exp(self.columns @ self.mode)[None])
+            parabola = steps @ self.slope - 0.5 * np.einsum("ati,ij,atj->at", steps, self.information, steps)
+            found = values - middle - parabola
+        return np.asarray(np.where(np.isfinite(found), found, -1.0 / _TINY))
+
+    def bend(self, spread: FloatArray, covariance: FloatArray) -> tuple[FloatArray, float]:
+        """Return normal deviations (S, R) from the mode with exact densities along the axes, and the log evidence
+        gained.
+
+        A normal posterior has too many high hazards where few ends were seen: the density falls slowly towards low
+        ones, and steeply towards high ones. Axes are those along which likelihood and prior are independent.
+        """
+        from scipy.special import ndtr
+
+        root = _root(covariance)
+        _, turned = np.linalg.eigh(root @ self.information @ root)
+        axes = root @ turned
+        bent = np.flatnonzero(np.abs(self.excess(axes, LINE[FAR])).max(axis=1) > STRAIGHT)
+        if not len(bent):
+            return spread, 0.0
+        normal = spread @ np.linalg.solve(covariance, axes)
+        exact, gain = normal.copy(), 0.0
+        for axis, over in zip(bent.tolist(), self.excess(axes[:, bent], LINE), strict=True):
+            log_p = np.interp(FINE_LINE, LINE, over) - 0.5 * FINE_LINE**2
+            p = np.exp(log_p - log_p.max())
+            gain += log_p.max() + np.log(p.sum() * (FINE_LINE[1] - FINE_LINE[0]) / np.sqrt(2.0 * np.pi))
+            below = (np.cumsum(p) - 0.5 * p) / p.sum()
+            exact[:, axis] = np.interp(ndtr(normal[:, axis]), below, FINE_LINE)
+        return spread + (exact - normal) @ axes.T, float(gain)
 
 
 def _slopes(
@@ -548,7 +626,7 @@ def _fit_alone(
     def goodness(z: FloatArray) -> float:
         v = columns @ z
         with np.errstate(over="ignore", invalid="ignore"):
-            value = likelihood(base * np.exp(v), slopes=False)[0]
+            value = float(likelihood.values(base * np.exp(v)[None])[0])
             value += float(ends @ (v - np.expm1(v))) - 0.5 * float(z @ z)
         return value if np.isfinite(value) else -np.inf
 
