@@ -52,8 +52,8 @@ hazard later is its ratio to the expected one, the less, the more was seen at th
 LINE = np.linspace(-6.0, 6.0, 17)
 FINE_LINE, FAR = np.linspace(-6.0, 6.0, 241), [5, 11]
 """Standard deviations at which exact densities are computed, and those between; the two which tell whether to."""
-STRAIGHT = 0.1
-"""Difference of log densities there up to which the normal one is kept."""
+STRAIGHT, HEAVIEST = 0.1, 16.0
+"""Difference of log densities there up to which the normal one is kept; and the largest weight, in mean ones."""
 ALIKE = 2
 """Digits after the first to which stays are alike that are learned from together."""
 _NEWTON, _STEP, _SETTLED = 40, 2.0, 1e-4
@@ -400,14 +400,16 @@ def learn_hazards(
     risk = [_at_risk(one) for one in likelihoods]
     found: list[HazardPosterior] = [None] * (len(said) + 1)  # type: ignore[list-item]
     base = _usual_base(usual, edges)
-    log_evidence, draws = [], []
+    log_evidence, draws, weights = [], [], []
     for scale in _scales(edges):
-        values, of_free = _fit_together([likelihoods[row] for row in free], scale, base)
-        log_evidence.append(values)
+        evidence, of_free, their_weights = _fit_together([likelihoods[row] for row in free], scale, base)
+        log_evidence.append(evidence)
         draws.append(of_free)
-    weight = _draw_weights(_scales(edges), log_evidence)
+        weights.append(their_weights)
+    of_scales = DRAWS * _draw_weights(_scales(edges), log_evidence)
     for at, row in enumerate([*free, len(said)]):
         rates = base * np.exp(np.concatenate([each[at] for each in draws]))
+        weight = of_scales * np.concatenate([each[at] for each in weights])
         of = np.zeros(len(edges)) if row == len(said) else risk[row]
         found[row] = HazardPosterior(edges_s, rates, weight, None, np.zeros(len(edges)), of)
     for row, one in enumerate(said):
@@ -437,8 +439,10 @@ def _normals(r: int) -> tuple[FloatArray, FloatArray]:
     return np.concatenate([one, -one]), np.concatenate([other, -other])
 
 
-def _fit_together(likelihoods: list[_Likelihood], scale: _Scale, base: FloatArray) -> tuple[float, list[FloatArray]]:
-    """Return the log evidence of a scale and draws (DRAWS, K) of `v` of each class, and of a new one.
+def _fit_together(
+    likelihoods: list[_Likelihood], scale: _Scale, base: FloatArray
+) -> tuple[float, list[FloatArray], list[FloatArray]]:
+    """Return the log evidence of a scale, draws (DRAWS, K) of `v` of each class and of a new one, and their weights.
 
     The numbers of a class are those that all share, of variance `common`, plus its own. Own ones are eliminated first.
     """
@@ -478,17 +482,19 @@ def _fit_together(likelihoods: list[_Likelihood], scale: _Scale, base: FloatArra
     one, other = _normals(r)
     of_both = np.linalg.inv(matrix)
     common = one @ _root(of_both)
-    draws, moved = [], np.zeros_like(common)
+    draws, weights, moved = [], [], np.zeros_like(common)
     for row, covariance in enumerate(inverse):
         spread = of_own * common @ covariance + other @ _root(covariance)
         line = _Line(likelihoods[row], base, columns, own[row], slopes[row], informations[row])
-        exact, gain = line.bend(spread, covariance + of_own**2 * covariance @ of_both @ covariance)
+        found, weight, gain = line.draw(spread, covariance + of_own**2 * covariance @ of_both @ covariance)
         evidence += gain
-        moved += exact - spread
-        draws.append((own[row] + exact) @ columns.T)
+        moved += found - spread
+        draws.append((own[row] + found) @ columns.T)
+        weights.append(weight)
     common = common + of_own / (of_shared + n * of_own) * moved
     draws.append((shared + common + np.sqrt(1.0 / of_own) * other) @ columns.T)
-    return float(evidence), draws
+    weights.append(np.full(DRAWS, 1.0 / DRAWS))
+    return float(evidence), draws, weights
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -509,41 +515,46 @@ class _Line:
     slope: FloatArray
     information: FloatArray
 
-    def excess(self, axes: FloatArray, at: FloatArray) -> FloatArray:
-        """Return by how much (A, T) the log likelihood is over its parabola at steps (T,) along axes (R, A)."""
-        steps = at[:, None] * axes.T[:, None, :]
+    def excess(self, deviations: FloatArray) -> FloatArray:
+        """Return by how much (...) the log likelihood is over its parabola, at deviations (..., R) from the mode."""
         with np.errstate(over="ignore", invalid="ignore"):
-            hazards = self.base * np.exp((self.mode + steps) @ self.columns.T)
-            values = self.likelihood.values(hazards.reshape(-1, len(self.base))).reshape(-1, len(at))
+            hazards = self.base * np.exp((self.mode + deviations) @ self.columns.T)
+            values = self.likelihood.values(hazards.reshape(-1, len(self.base))).reshape(deviations.shape[:-1])
             middle = self.likelihood.values(self.base * np.exp(self.columns @ self.mode)[None])
-            parabola = steps @ self.slope - 0.5 * np.einsum("ati,ij,atj->at", steps, self.information, steps)
-            found = values - middle - parabola
+            bend = 0.5 * ((deviations @ self.information) * deviations).sum(axis=-1)
+            found = values - middle - deviations @ self.slope + bend
         return np.asarray(np.where(np.isfinite(found), found, -1.0 / _TINY))
 
-    def bend(self, spread: FloatArray, covariance: FloatArray) -> tuple[FloatArray, float]:
-        """Return normal deviations (S, R) from the mode with exact densities along the axes, and the log evidence
-        gained.
+    def draw(self, spread: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Return deviations (S, R) from the mode, their weights (S,), and the log evidence gained over normal ones.
 
         A normal posterior has too many high hazards where few ends were seen: the density falls slowly towards low
-        ones, and steeply towards high ones. Axes are those along which likelihood and prior are independent.
+        ones, and steeply towards high ones. Along axes on which likelihood and prior are independent the draws have
+        their exact densities; what is left is made up for by weights (importance sampling, of at most `HEAVIEST`).
         """
         from scipy.special import ndtr
 
         root = _root(covariance)
         _, turned = np.linalg.eigh(root @ self.information @ root)
         axes = root @ turned
-        bent = np.flatnonzero(np.abs(self.excess(axes, LINE[FAR])).max(axis=1) > STRAIGHT)
+        bent = np.flatnonzero(np.abs(self.excess(LINE[FAR, None] * axes.T[:, None])).max(axis=1) > STRAIGHT)
         if not len(bent):
-            return spread, 0.0
+            return spread, np.full(len(spread), 1.0 / len(spread)), 0.0
         normal = spread @ np.linalg.solve(covariance, axes)
-        exact, gain = normal.copy(), 0.0
-        for axis, over in zip(bent.tolist(), self.excess(axes[:, bent], LINE), strict=True):
+        exact, gain, proposed = normal.copy(), 0.0, np.zeros(len(spread))
+        for axis, over in zip(bent.tolist(), self.excess(LINE[:, None] * axes.T[bent, None]), strict=True):
             log_p = np.interp(FINE_LINE, LINE, over) - 0.5 * FINE_LINE**2
             p = np.exp(log_p - log_p.max())
             gain += log_p.max() + np.log(p.sum() * (FINE_LINE[1] - FINE_LINE[0]) / np.sqrt(2.0 * np.pi))
             below = (np.cumsum(p) - 0.5 * p) / p.sum()
             exact[:, axis] = np.interp(ndtr(normal[:, axis]), below, FINE_LINE)
-        return spread + (exact - normal) @ axes.T, float(gain)
+            proposed += np.interp(exact[:, axis], LINE, over)
+        found = spread + (exact - normal) @ axes.T
+        log_weight = self.excess(found) - proposed
+        weight = np.exp(log_weight - log_weight.max())
+        gain += log_weight.max() + np.log(weight.mean())
+        weight = np.minimum(weight, HEAVIEST * weight.mean())
+        return found, weight / weight.sum(), float(gain)
 
 
 def _slopes(
