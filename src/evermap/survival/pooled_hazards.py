@@ -6,7 +6,8 @@
 a class has of its own, both Gaussian processes over log age: a slow one, which tells little of days from seconds, and a
 fast one. Hazards are constant over stretches of age, so the likelihood of a stay is exact: entry, arrival between two
 looks, the end between two looks, or none (MATH.md sections 6 and 9). Scales and the share of the variance that classes
-have in common are on a grid, each weighed by Laplace's evidence, so nothing is searched that could fail to be found.
+have in common are on a grid, each weighed by its evidence, so nothing is searched that could fail to be found. Draws
+are normal about the most probable hazards (Laplace), with exact densities along axes, and weights for the rest.
 
 **What is stated is worth w stays**: in every stretch it has seen `d_k = w P(T in k)` ends at the hazard that it states
 (a power prior, Ibrahim and Chen 2000), to which `v_c = 0` is most probable. The level of `b_c` is chosen such that the
@@ -38,8 +39,8 @@ SLOW = 4.0
 HOUR_S = 3600.0
 YOUNG = 4.0
 """Factor of the distances of ages below an hour, for the slow process: short stops tell little of what is parked."""
-SLOW_SCALE, COMMON = 2.5, (0.3, 0.8)
-"""Standard deviation of log hazards, and the share of their variance that classes have in common."""
+SLOW_SCALE, COMMON = 3.3, (0.3, 0.8)
+"""Standard deviation of log hazards, that of the rates of the general-purpose prior (an hour to ten years), and the share of their variance that classes have in common."""
 FAST = ((0.8, 0.1, 0.85), (0.8, 0.5, 0.1), (0.8, 1.5, 0.03), (0.25, 2.0, 0.02))
 """Lengths and standard deviations of the fast process, and their probabilities: hazards are smooth, as a rule."""
 LEAST_STRETCHES = 14
