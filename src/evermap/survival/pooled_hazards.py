@@ -39,8 +39,9 @@ SLOW = 4.0
 HOUR_S = 3600.0
 YOUNG = 4.0
 """Factor of the distances of ages below an hour, for the slow process: short stops tell little of what is parked."""
-SLOW_SCALE, COMMON = 3.3, (0.3, 0.8)
-"""Standard deviation of log hazards, that of the rates of the general-purpose prior (an hour to ten years), and the share of their variance that classes have in common."""
+SLOW_SCALE, COMMON = 2.8, (0.3, 0.8)
+"""Standard deviation of log hazards (of the rates of the general-purpose prior, an hour to ten years: 3.3), and the
+share of their variance that classes have in common."""
 FAST = ((0.8, 0.1, 0.85), (0.8, 0.5, 0.1), (0.8, 1.5, 0.03), (0.25, 2.0, 0.02))
 """Lengths and standard deviations of the fast process, and their probabilities: hazards are smooth, as a rule."""
 LEAST_STRETCHES = 14
