@@ -984,9 +984,6 @@ class LifetimeConfig(Section):
         "candidate numbers of pseudo-ends of a class in its chunks; learned",
         min_length=1,
     )
-    prior_quantiles: Count = key(64, "number of stay lengths that represent a given prior")
-    prior_shortest_s: Positive = key(60.0, "minimum of these lengths [s]")
-    prior_longest_s: Positive = key(1.5e9, "length at which these are censored [s]")
 
 
 class SightConfig(Section):
@@ -1366,13 +1363,24 @@ def load_config(
     return _overridden(_validate(_read_toml(source), source), overrides, values or {}, within)
 
 
+RETIRED = ("living.lifetimes.prior_quantiles", "living.lifetimes.prior_shortest_s", "living.lifetimes.prior_longest_s")
+"""Keys of earlier versions which nothing reads any more; maps keep them with the settings of their sessions."""
+
+
 def parse_config(text: str) -> Config:
-    """Return the configuration that `to_toml` wrote; '' for the defaults.
+    """Return the configuration that `to_toml` wrote, of this version or of an earlier one; '' for the defaults.
 
     Raises:
         ConfigError: a key or a value that this version does not know.
     """
-    return _validate(tomllib.loads(text), None)
+    content = tomllib.loads(text)
+    for key_path in RETIRED:
+        *sections, name = key_path.split(".")
+        section: Any = content
+        for each in sections:
+            section = section.get(each, {})
+        section.pop(name, None)
+    return _validate(content, None)
 
 
 def with_overrides(config: Config, overrides: Iterable[str]) -> Config:

@@ -18,12 +18,19 @@ from evermap.errors import ConfigError, InputError
 from evermap.existence.lifetimes import Lifetimes
 from evermap.existence.models import NamedModels, lifetimes_of, priors_of, save_models
 from evermap.existence.run_length import RunLength
-from evermap.maps.learning import ClassLives, absence_said, lifetimes_by_class, stay_said, with_priors
+from evermap.maps.learning import ClassLives, lifetimes_by_class, with_priors
 from evermap.maps.lives import Life
 from evermap.maps.living import LivingMap, Stays
 from evermap.maps.store.content import Chunk, pack, unpack
-from evermap.survival import Exponential, Mixture, Weibull, never_leaves
-from evermap.survival.class_lifetimes import LOG_MEAN, LOG_SHAPE, LOGIT_RETURN, finer
+from evermap.survival import (
+    Exponential,
+    LogNormal,
+    Mixture,
+    PiecewiseConstantHazard,
+    Weibull,
+    gone_daily,
+    never_leaves,
+)
 from evermap.types import UNKNOWN
 
 WEIBULL = Weibull(3.0 * DAY_S, 1.5)
@@ -64,21 +71,6 @@ def test_an_unknown_class_is_named_with_the_likely_one() -> None:
         with_priors(LivingMap(class_names=("cart",)), told(crat=WEIBULL), ["wall"], 20)
 
 
-def test_a_stay_that_was_said_counts_as_one_that_was_seen() -> None:
-    """Mean log density over the prior's quantiles, against scipy's; what outlasts everything is censored."""
-    age_s = stats.weibull_min.ppf((np.arange(64) + 0.5) / 64, 1.5, scale=3.0 * DAY_S)
-    shape = np.exp(finer(LOG_SHAPE))[None]
-    scale = np.exp(finer(LOG_MEAN))[:, None] / np.vectorize(stats.weibull_min.mean)(shape)
-    expected = np.mean([stats.weibull_min.logpdf(age, shape, scale=scale) for age in age_s], axis=0)
-    np.testing.assert_allclose(stay_said(WEIBULL), expected, rtol=1e-9)
-    censored = stats.weibull_min.logsf(1.5e9, shape, scale=scale)
-    np.testing.assert_allclose(stay_said(ENDLESS), censored, rtol=1e-9)
-    share, mean = 1.0 / (1.0 + np.exp(-finer(LOGIT_RETURN))), np.exp(finer(LOG_MEAN))[:, None]
-    quantiles = stats.expon.ppf((np.arange(64) + 0.5) / 64, scale=DAY_S)
-    away = np.mean([np.log(share) + stats.expon.logpdf(t, scale=mean) for t in np.maximum(quantiles, 60.0)], axis=0)
-    np.testing.assert_allclose(absence_said(Exponential.from_mean(DAY_S)), away, rtol=1e-9)
-
-
 @pytest.mark.parametrize("prior", [WEIBULL, Exponential.from_mean(10.0 * DAY_S), Weibull(0.2 * DAY_S, 0.8)])
 def test_one_stay_that_goes_on_hardly_moves_a_prior_and_hundreds_do(prior) -> None:
     ages_s = prior.quantile(np.array([0.2, 0.5, 0.8]))
@@ -95,6 +87,38 @@ def test_one_stay_that_goes_on_hardly_moves_a_prior_and_hundreds_do(prior) -> No
     far = abs(np.exp(prior.log_survival(at_s)) - np.exp(without.stay.log_survival(at_s)))
     near = abs(np.exp(many.stay.log_survival(at_s)) - np.exp(without.stay.log_survival(at_s)))
     assert near < max(0.35 * far, 0.02)
+
+
+STATED = {
+    "steps": PiecewiseConstantHazard((0.0, 2.0 * DAY_S), (0.0, 10.0 / DAY_S)),
+    "mixture": Mixture.of([Exponential.from_mean(3600.0), Exponential.from_mean(30.0 * DAY_S)], [0.5, 0.5]),
+    "log-normal": LogNormal.from_half_life(5.0 * DAY_S, 2.0),
+    "nights": gone_daily(0.3, first_seen_hour=10.0, hours=(20.0, 6.0)),
+    "some stay": Mixture.of([WEIBULL, ENDLESS], [0.9, 0.1]),
+}
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_a_stated_hazard_comes_back_where_nothing_was_seen_that_could_change_it(name: str) -> None:
+    """Whatever its form: a stay that has just begun says nothing of any age."""
+    prior, ages_s = STATED[name], np.array([0.02, 0.3, 1.0, 1.9, 3.0, 20.0]) * DAY_S
+    living = with_priors(LivingMap(), told(cart=prior), ["cart"], worth=20)
+    lives = replace(living.lives, looks_s=np.arange(1, 100) * DAY_S)
+    found = ClassLives.of(stays_of(0, [0.0], gone=False), lives, 100.0 * DAY_S).lives.of(0).stay
+    np.testing.assert_allclose(np.exp(found.log_survival(ages_s)), np.exp(prior.log_survival(ages_s)), atol=1e-9)
+    packed = unpacked(replace(living, lives=replace(lives, class_id=np.array([0]), chunk=np.zeros((1, 2), np.int64),
+                                                    life=(Life(stay=found),))))  # fmt: skip
+    assert packed.lives.life[0].stay == found
+
+
+def test_what_was_stated_keeps_its_form_when_stays_are_seen() -> None:
+    """Nothing leaves within two days, all soon after: stays that go on say nothing against it, and it stays a step."""
+    living = with_priors(LivingMap(), told(cart=STATED["steps"]), ["cart"], worth=20)
+    lives = replace(living.lives, looks_s=np.arange(1, 100) * DAY_S)
+    found = ClassLives.of(stays_of(0, [1.0] * 10, gone=False), lives, 100.0 * DAY_S).lives.of(0).stay
+    survival = np.exp(found.log_survival(np.array([1.0, 1.9, 3.0]) * DAY_S))
+    np.testing.assert_allclose(survival[:2], 1.0, atol=1e-12)
+    assert survival[2] < 0.01
 
 
 def test_more_worth_holds_a_prior_longer() -> None:

@@ -280,3 +280,5 @@ def test_a_configuration_is_read_back_from_a_revision() -> None:
     config = Config.model_validate({"living": {"returns": False}, "slam": {"seed": 7}})
     assert parse_config(to_toml(config)) == config
     assert parse_config("") == Config()
+    # of a map that was written before these keys were retired
+    assert parse_config("[living.lifetimes]\nprior_quantiles = 64\nnewest = 200\n").living.lifetimes.newest == 200

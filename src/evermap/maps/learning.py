@@ -1,11 +1,12 @@
-"""Learning of lifetimes from the history of a map, after every session (MATH.md sections 5 and 6).
+"""Learning of lifetimes from the history of a map, after every session (MATH.md sections 5, 6 and 9).
 
-Classes learn from each other (`survival.class_lifetimes`), places lean on their class, and what a user says of a class
-counts as a number of stays. `History` is what a map knows of the comings and goings of its cliques. What happened
-between two looks is not seen. The likelihood of lifetimes takes care of arrivals. Departures can be missed, too: a
-clique that leaves a site and is back at it by the next look has one long stay instead of two, like a door that was
-opened and closed again. With a rate `l` of leaving, and `n` of coming back to this very site, a clique that is there is
-there again at the next look, after `dt`, with probability
+Classes learn from each other, and what a user says of a class counts as a number of stays and keeps its form
+(`survival.pooled_hazards`); places lean on their class. Absences of which nothing was said have a constant hazard and a
+share that never returns (`survival.class_lifetimes`). `History` is what a map knows of the comings and goings of its
+cliques. What happened between two looks is not seen. The likelihood of lifetimes takes care of arrivals. Departures can
+be missed, too: a clique that leaves a site and is back at it by the next look has one long stay instead of two, like a
+door that was opened and closed again. With a rate `l` of leaving, and `n` of coming back to this very site, a clique
+that is there is there again at the next look, after `dt`, with probability
 
     P(dt) = (n + l exp(-(l + n) dt)) / (l + n)          instead of exp(-l dt)
 
@@ -26,22 +27,24 @@ from evermap.errors import ConfigError, suggestion
 from evermap.existence.lifetimes import Lifetimes
 from evermap.maps.lives import DAY_S, EVERYWHERE, Life, Lives, general_purpose
 from evermap.maps.living import LivingMap, Stays
-from evermap.survival import LifetimePrior, PiecewiseConstantHazard
+from evermap.survival.base import LifetimePrior
 from evermap.survival.class_lifetimes import (
+    INSTANTS,
     LOG_MEAN,
     LOG_SHAPE,
     LOGIT_RETURN,
     ClassPosterior,
     Sightings,
     absence_log_likelihood,
-    finer,
     stay_log_likelihood,
 )
+from evermap.survival.hazards import scale_hazard
+from evermap.survival.pooled_hazards import HazardPosterior, Statement, StayAges, learn_hazards
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, rows_of
 
 USUAL = LifetimeConfig()
 AGES_AT_ONCE = 50
-"""Of which the longest credible lifetimes are asked together: each takes a quarter of a megabyte."""
+"""Of which the longest credible lifetimes are asked together."""
 
 
 class History:
@@ -146,12 +149,12 @@ class ClassLives:
     Attributes:
         lives: the same as lifetimes by class and place.
         class_ids: (C,) classes there are.
-        stay: posterior of the stays of each.
+        stay: (C + 1,) posteriors of the stays of each.
     """
 
     lives: Lives
     class_ids: IntArray
-    stay: ClassPosterior
+    stay: tuple[HazardPosterior, ...]
 
     @classmethod
     def of(cls, stays: Stays, before: Lives, now_s: float | None = None, settings: LifetimeConfig = USUAL) -> Self:
@@ -165,10 +168,10 @@ class ClassLives:
         """
         looks_s = before.looks_s if now_s is None else np.append(before.looks_s[before.looks_s < now_s], now_s)
         if not len(stays):
-            nothing = ClassPosterior.of(np.zeros((0, len(LOG_MEAN), len(LOG_SHAPE))))
-            return cls(replace(before, looks_s=looks_s), np.zeros(0, dtype=np.int64), nothing)
+            nothing = learn_hazards(StayAges.empty(), [], general_purpose())
+            return cls(replace(before, looks_s=looks_s), np.zeros(0, dtype=np.int64), tuple(nothing))
         history = History(stays, looks_s, settings)
-        learned = _Learned(history, before, settings)
+        learned = _Learned(history, before)
         entries: list[tuple[int, tuple[int, int], Life]] = []
         for row, class_id in enumerate(history.class_ids.tolist()):
             life = learned.life(row)
@@ -189,7 +192,7 @@ class ClassLives:
         credible interval at each age by itself. All classes that were never seen are alike.
         """
         found = np.flatnonzero(self.class_ids == class_id)
-        return self.stay.band(int(found[0]) if len(found) else -1, ages_s, confidence)
+        return self.stay[int(found[0]) if len(found) else -1].survival(ages_s, confidence)
 
     def longest(self, class_id: IntArray, age_s: FloatArray, confidence: float) -> FloatArray:
         """Return (N,) upper bounds of `P(stay > age)`, of classes (N,) at ages (N,): the longest credible lifetimes."""
@@ -206,58 +209,60 @@ class _Learned:
     """Posteriors and probabilities of all classes, the last row of one that was never seen.
 
     Attributes:
-        stay, absence: posteriors; of_stays, of_absences: (C, M, A) their log likelihoods.
+        stay, absence: posteriors; stated_absence: those of absences of which a user says something, by row.
+        of_absences: (C, M, A) log likelihoods of absences.
         p_hop, p_known: (C + 1,) as of `Life`.
         n_stays, n_ended: (C + 1,) recent stays, and those of them that ended.
     """
 
-    def __init__(self, history: History, before: Lives, settings: LifetimeConfig) -> None:
+    def __init__(self, history: History, before: Lives) -> None:
         stays, n_classes = history.stays, len(history.class_ids)
-        ended = np.isfinite(stays.gone_s)
         said = [before.prior_of(class_id) for class_id in history.class_ids.tolist()]
         away = np.flatnonzero(history.recent & history.away)
-        log_likelihood = absence_log_likelihood(
-            stays.last_s[away], stays.gone_s[away], history.seen_away_s[away], history.back_s[away]
-        )
+        times = stays.last_s[away], stays.gone_s[away], history.seen_away_s[away], history.back_s[away]
+        log_likelihood = absence_log_likelihood(*times)
         log_likelihood *= stays.p_gone[away, None, None]
         self.of_absences = _by_class(log_likelihood, history.kind[away], n_classes)
-        absences_said = [
-            life.n_stays * absence_said(life.absence, settings) if life and life.tells_absence else None
-            for life in said
-        ]
-        self.absence = ClassPosterior.of(self.of_absences, _stacked(absences_said), improper=True)
-        self.p_hop = history.shares(history.hopped, ended)
+        self.absence = ClassPosterior.of(self.of_absences, improper=True)
+        self.stated_absence: dict[int, HazardPosterior] = {}
+        absences = absence_ages(*times, stays.p_gone[away], history.kind[away])
+        for row, life in enumerate(said):
+            if life and life.tells_absence:
+                mine, statement = absences.of_group(row), Statement(life.absence, life.n_stays)
+                mine = replace(mine, group=np.zeros_like(mine.group))
+                self.stated_absence[row] = learn_hazards(mine, [statement], general_purpose())[0]
+        self.p_hop = history.shares(history.hopped, np.isfinite(stays.gone_s))
+        self.seen = self.sightings(history)
+        statements = [Statement(life.stay, life.n_stays) if life else None for life in said]
+        ages = stay_ages(history, self.seen)
+        self.stay = tuple(learn_hazards(ages, statements, general_purpose()))
+        self.p_known = history.shares(history.to_known, history.had_choice)
+        self.n_stays = history.counts(history.recent).astype(np.int64)
+        self.n_ended = history.counts(history.recent & np.isfinite(stays.gone_s)).astype(np.int64)
+
+    def sightings(self, history: History) -> Sightings:
+        """Return the recent stays, with how fast what a look missed is back: who is back before nobody can miss."""
         back_by_hop = self.p_hop * history.shares(history.there_again, history.hopped_twice)
         here_again = history.shares(history.back_here, history.away & np.isfinite(history.back_s))
-        # of those that a look missed: who is back before nobody can miss, and counts as one who never left
         looks_s = history.looks_s
         gap_s = float(np.median(np.diff(looks_s))) if len(looks_s) > 1 else DAY_S  # between two looks, as a rule
         back = [
-            -self.absence.curve(row).log_conditional_survival(gap_s, 2.0 * gap_s) / gap_s
-            for row in range(n_classes + 1)
+            -float(self.absence_of(row).log_conditional_survival(gap_s, 2.0 * gap_s)) / gap_s
+            for row in [*range(len(history.class_ids)), -1]
         ]
         back_rate = (1.0 - self.p_hop) * here_again * np.array(back)
         kind = history.kind[history.recent]
-        seen = history.sightings(back_by_hop[kind], back_rate[kind])
-        log_likelihood = stay_log_likelihood(seen)
-        doubted = ended[history.recent] & (stays.p_gone[history.recent] < settings.sure)
-        if doubted.any():  # expected log likelihood: perhaps it goes on
-            p_gone = stays.p_gone[history.recent][doubted, None, None]
-            going_on = rows_of(seen, doubted)
-            going_on = replace(going_on, gone_s=np.full(len(going_on.gone_s), np.inf))
-            log_likelihood[doubted] = p_gone * log_likelihood[doubted] + (1.0 - p_gone) * stay_log_likelihood(going_on)
-        self.of_stays = _by_class(log_likelihood, kind, n_classes)
-        stays_said = [life.n_stays * stay_said(life.stay, settings) if life else None for life in said]
-        self.stay = ClassPosterior.of(self.of_stays, _stacked(stays_said))
-        self.p_known = history.shares(history.to_known, history.had_choice)
-        self.n_stays = history.counts(history.recent).astype(np.int64)
-        self.n_ended = history.counts(history.recent & ended).astype(np.int64)
+        return history.sightings(back_by_hop[kind], back_rate[kind])
+
+    def absence_of(self, row: int) -> LifetimePrior:
+        """Return the lifetime of the absences of a class."""
+        return self.stated_absence[row].prior() if row in self.stated_absence else self.absence.curve(row)
 
     def life(self, row: int) -> Life:
         """Return the lifetimes of a class."""
         return Life(
-            stay=self.stay.curve(row),
-            absence=self.absence.curve(row),
+            stay=self.stay[row].prior(),
+            absence=self.absence_of(row),
             p_hop=float(self.p_hop[row]),
             p_known=float(self.p_known[row]),
             n_stays=int(self.n_stays[row]),
@@ -291,50 +296,52 @@ class ClassEvidence:
             return cls((), stay, absence, none, none)
         history = History(living.stays, living.lives.looks_s, settings)
         untold = replace(living.lives, prior_class_id=np.zeros(0, dtype=np.int64), prior=())
-        learned, names = _Learned(history, untold, settings), dict(enumerate(living.class_names))
+        learned, names = _Learned(history, untold), dict(enumerate(living.class_names))
         class_names = tuple(names.get(class_id, "") for class_id in history.class_ids.tolist())
-        return cls(class_names, learned.of_stays, learned.of_absences, learned.n_stays[:-1], learned.n_ended[:-1])
+        stay = stays_by_class(history, learned.seen, settings)
+        return cls(class_names, stay, learned.of_absences, learned.n_stays[:-1], learned.n_ended[:-1])
 
 
-def stay_said(prior: LifetimePrior, settings: LifetimeConfig = USUAL) -> FloatArray:
-    """Return the (M, A) mean log likelihood of one stay distributed as a user's prior, on the grid of `ClassPosterior`.
+def stays_by_class(history: History, seen: Sightings, settings: LifetimeConfig) -> FloatArray:
+    """Return the (C, M, A) log likelihoods of the recent stays on the grid of `ClassEvidence`."""
+    log_likelihood = stay_log_likelihood(seen)
+    p_gone = history.stays.p_gone[history.recent]
+    doubted = np.isfinite(seen.gone_s) & (p_gone < settings.sure)
+    if doubted.any():  # expected log likelihood: perhaps it goes on
+        share = p_gone[doubted, None, None]
+        going_on = rows_of(seen, doubted)
+        going_on = replace(going_on, gone_s=np.full(len(going_on.gone_s), np.inf))
+        log_likelihood[doubted] = share * log_likelihood[doubted] + (1.0 - share) * stay_log_likelihood(going_on)
+    return _by_class(log_likelihood, history.kind[history.recent], len(history.class_ids))
 
-    `n` times this is what `n` stays say whose lengths spread as the prior does (a power prior, Ibrahim and Chen 2000);
-    of those beyond `settings.prior_longest_s` only that is known.
+
+def stay_ages(history: History, seen: Sightings) -> StayAges:
+    """Return the recent stays by their ages; an end that is believed in part is one, and none, in proportion.
+
+    What was there at the first look is as old as it was seen: forecasts ask for no other age of it.
     """
-    from scipy.special import gammaln
-
-    age_s, ended = _spread(prior, settings)
-    log_shape = finer(LOG_SHAPE)
-    shape = np.exp(log_shape)
-    log_scale = finer(LOG_MEAN)[:, None] - gammaln(1.0 + 1.0 / shape)
-    log_ratio = shape * (np.log(age_s)[:, None, None] - log_scale)
-    log_density = log_shape - np.log(age_s)[:, None, None] + log_ratio
-    return np.asarray((np.where(ended[:, None, None], log_density, 0.0) - np.exp(log_ratio)).mean(axis=0))
-
-
-def absence_said(prior: LifetimePrior, settings: LifetimeConfig = USUAL) -> FloatArray:
-    """Return the (M, A) same of one absence, on that of absences."""
-    age_s, ended = _spread(prior, settings)
-    age_s, ended = age_s[:, None, None], ended[:, None, None]
-    share, log_mean = 1.0 / (1.0 + np.exp(-finer(LOGIT_RETURN))), finer(LOG_MEAN)[:, None]
-    gone = age_s * np.exp(-log_mean)
-    return np.asarray(
-        np.where(ended, np.log(share) - gone - log_mean, np.log(share * np.exp(-gone) + 1.0 - share)).mean(axis=0)
-    )
+    came = np.isfinite(seen.elsewhere_s)
+    since_s = np.where(came, seen.elsewhere_s, seen.first_s)
+    begin_s = since_s[:, None] + INSTANTS * (seen.first_s - since_s)[:, None]
+    first, last, gone = (stamp_s[:, None] - begin_s for stamp_s in (seen.first_s, seen.last_s, seen.gone_s))
+    kind = history.kind[history.recent]
+    p_gone = np.where(np.isfinite(seen.gone_s), history.stays.p_gone[history.recent], 0.0)
+    never = np.full_like(gone, np.inf)
+    both = [
+        StayAges(first, last, gone, p_gone, kind, seen.gap_s, seen.back_by_stay, seen.back_rate),
+        StayAges(first, last, never, 1.0 - p_gone, kind, seen.gap_s, seen.back_by_stay, seen.back_rate),
+    ]
+    return StayAges.concatenate(both)
 
 
-def _stacked(parts: list[FloatArray | None]) -> FloatArray | float:
-    """Return (C, M, A) log likelihoods of the given classes; 0 for the others."""
-    shape = next((part.shape for part in parts if part is not None), None)
-    return 0.0 if shape is None else np.stack([np.zeros(shape) if part is None else part for part in parts])
-
-
-def _spread(prior: LifetimePrior, settings: LifetimeConfig) -> tuple[FloatArray, BoolArray]:
-    """(Q,) ages by which equal shares of lifetimes end, and whether they do before the longest that counts."""
-    n, longest_s = settings.prior_quantiles, settings.prior_longest_s
-    age_s = np.asarray(prior.quantile((np.arange(n) + 0.5) / n), dtype=np.float64)
-    return np.clip(age_s, settings.prior_shortest_s, longest_s), np.asarray(age_s < longest_s)
+def absence_ages(
+    there_s: FloatArray, first_s: FloatArray, last_s: FloatArray, back_s: FloatArray, p_gone: FloatArray, kind: IntArray
+) -> StayAges:
+    """Return K absences by their ages at looks, with the arguments of `absence_log_likelihood`."""
+    begin_s = there_s[:, None] + INSTANTS * (first_s - there_s)[:, None]
+    first, last, back = (stamp_s[:, None] - begin_s for stamp_s in (first_s, last_s, back_s))
+    n = len(kind)
+    return StayAges(first, last, back, p_gone, kind, np.ones((n, 2)), np.zeros(n), np.zeros(n))
 
 
 def with_priors(living: LivingMap, said: Mapping[str, Lifetimes], class_names: Sequence[str], worth: int) -> LivingMap:
@@ -409,9 +416,7 @@ def _of_chunks(
     factor = (weight / weight.sum()) @ ((firm + n_ended) / (firm + n_expected))
     own: list[tuple[tuple[int, int], Life]] = []
     for k in np.flatnonzero(n_ended >= settings.least_ended):
-        assert isinstance(life.stay, PiecewiseConstantHazard)
-        rates = tuple(float(factor[k]) * rate for rate in life.stay.rates)
-        stay = PiecewiseConstantHazard(life.stay.edges_s, rates)
+        stay = scale_hazard(life.stay, (0.0,), (float(factor[k]),))
         n_stays = int(np.sum(which.ravel() == k))
         here = replace(life, stay=stay, n_stays=n_stays, n_ended=round(n_ended[k]))
         own.append(((int(chunks[k, 0]), int(chunks[k, 1])), here))

@@ -53,7 +53,7 @@ SITE_SPREADS = {
 of log shapes, or logits of the probability of return (`improper`). All pairs are equally probable before."""
 _EDGES_S = np.concatenate([[0.0], np.geomspace(1800.0, 1e9, 23)])
 """Curves have constant hazards between these ages."""
-_INSTANTS = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
+INSTANTS = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
 """Gauss-Legendre nodes of the arrival between two looks, as shares of the gap."""
 _LEAST = 1e-300
 
@@ -224,11 +224,11 @@ def stay_log_likelihood(seen: Sightings) -> FloatArray:
     pairs = np.maximum(watched_s / both_gaps_s, 0.5)
     back, rate = seen.back_by_stay[:, None, None], seen.back_rate
     left_s = seen.gone_s[ended] - seen.last_s[ended]
-    begin_s = seen.elsewhere_s[came, None] + _INSTANTS * (seen.first_s - seen.elsewhere_s)[came, None]
+    begin_s = seen.elsewhere_s[came, None] + INSTANTS * (seen.first_s - seen.elsewhere_s)[came, None]
     stamps = np.stack([seen.first_s, seen.last_s, np.where(ended, seen.gone_s, seen.last_s)])
     ages = stamps[:, came, None] - begin_s
     found = [(row, rows, stamps[row, rows] - seen.first_s[rows]) for row, rows in ((1, ~came), (2, ~came & ended))]
-    hazard = np.zeros((3, len(result), len(_INSTANTS), len(LOG_MEAN)))
+    hazard = np.zeros((3, len(result), len(INSTANTS), len(LOG_MEAN)))
     for a, shape in enumerate(np.exp(LOG_SHAPE)):
         per_scale = np.exp(-shape * (LOG_MEAN - math.lgamma(1.0 + 1.0 / shape)))
         hazard[:, came] = (ages**shape)[..., None] * per_scale
@@ -279,7 +279,7 @@ def absence_log_likelihood(
         back_s: (K,) next sighting; inf if there was none.
     """
     share = 1.0 / (1.0 + np.exp(-LOGIT_RETURN))
-    begin_s = there_s[:, None] + _INSTANTS * (first_s - there_s)[:, None]
+    begin_s = there_s[:, None] + INSTANTS * (first_s - there_s)[:, None]
     first, last, back = (  # (K, 2, M) probabilities that one that returns is still away
         np.exp(-(stamp_s[:, None] - begin_s)[..., None] * np.exp(-LOG_MEAN)) for stamp_s in (first_s, last_s, back_s)
     )

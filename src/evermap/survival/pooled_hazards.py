@@ -6,7 +6,8 @@
 a class has of its own, both Gaussian processes over log age: a slow one, which tells little of days from seconds, and a
 fast one. Hazards are constant over stretches of age, so the likelihood of a stay is exact: entry, arrival between two
 looks, the end between two looks, or none (MATH.md sections 6 and 9). Scales and the share of the variance that classes
-have in common are on a grid, each weighed by Laplace's evidence, so nothing is searched that could fail to be found.
+have in common are on a grid, each weighed by its evidence, so nothing is searched that could fail to be found. Draws
+are normal about the most probable hazards (Laplace), with exact densities along axes, and weights for the rest.
 
 **What is stated is worth w stays**: in every stretch it has seen `d_k = w P(T in k)` ends at the hazard that it states
 (a power prior, Ibrahim and Chen 2000), to which `v_c = 0` is most probable. The level of `b_c` is chosen such that the
@@ -38,8 +39,9 @@ SLOW = 4.0
 HOUR_S = 3600.0
 YOUNG = 4.0
 """Factor of the distances of ages below an hour, for the slow process: short stops tell little of what is parked."""
-SLOW_SCALE, COMMON = 2.5, (0.3, 0.8)
-"""Standard deviation of log hazards, and the share of their variance that classes have in common."""
+SLOW_SCALE, COMMON = 2.8, (0.3, 0.8)
+"""Standard deviation of log hazards (of the rates of the general-purpose prior, an hour to ten years: 3.3), and the
+share of their variance that classes have in common."""
 FAST = ((0.8, 0.1, 0.85), (0.8, 0.5, 0.1), (0.8, 1.5, 0.03), (0.25, 2.0, 0.02))
 """Lengths and standard deviations of the fast process, and their probabilities: hazards are smooth, as a rule."""
 LEAST_STRETCHES = 14
@@ -49,6 +51,13 @@ DRAWS = 256
 LEAST_SURVIVAL, TRUSTED = 1e-9, 0.02
 """Survival down to which the expected one is that of the usual prior, and of a stated one: what is left of a stated
 hazard later is its ratio to the expected one, the less, the more was seen at that age."""
+LINE = np.linspace(-6.0, 6.0, 17)
+FINE_LINE, FAR = np.linspace(-6.0, 6.0, 241), [5, 11]
+"""Standard deviations at which exact densities are computed, and those between; the two which tell whether to."""
+STRAIGHT, HEAVIEST = 0.1, 16.0
+"""Difference of log densities there up to which the normal one is kept; and the largest weight, in mean ones."""
+ALIKE = 2
+"""Digits after the first to which stays are alike that are learned from together."""
 _NEWTON, _STEP, _SETTLED = 40, 2.0, 1e-4
 NEGLECTED = 1e-6
 """Share of the largest variance below which a direction of the process is dropped."""
@@ -95,6 +104,28 @@ class StayAges:
             np.ones((n, 2)), np.zeros(n), np.zeros(n),
         )  # fmt: skip
 
+    @classmethod
+    def empty(cls) -> Self:
+        """Return no stays."""
+        ages, column = np.zeros((0, 1)), np.zeros(0)
+        return cls(ages, ages, ages, column, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), column, column)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """Return all that have a weight; rows that are alike to three digits are one."""
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__}
+        weight = columns.pop("weight")
+        some = weight > 0.0
+        if not some.any():
+            return cls.empty()
+        table = np.column_stack([*columns.values()])[some]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = 10.0 ** (np.floor(np.log10(np.abs(table))) - ALIKE)
+            alike = np.where(np.isfinite(size) & (size > 0.0), np.rint(table / size) * size, table)
+        _, first, row = np.unique(alike, axis=0, return_index=True, return_inverse=True)
+        kept = {name: column[some][first] for name, column in columns.items()}
+        return cls(weight=np.bincount(row.ravel(), weight[some]).astype(np.float64), **kept)
+
     def of_group(self, group: int) -> Self:
         """Return those of one class."""
         mine = self.group == group
@@ -121,7 +152,21 @@ class _Likelihood:
         self.pairs = np.maximum(self.watched_s / both, 0.5)
         self.share = stays.gap_s / both[:, None]
 
-    def __call__(self, hazard: FloatArray, slopes: bool = True) -> tuple[float, FloatArray, FloatArray]:
+    def values(self, hazards: FloatArray) -> FloatArray:
+        """Return the values (S,) of hazards (S, K)."""
+        stays = self.stays
+        until, stayed, left = (spent @ hazards.T for spent in self.spent)  # (N, J, S)
+        score = -until
+        for part in (0, 1):
+            each = (self.share[:, part] / self.pairs)[:, None, None]
+            come = (stays.back_rate * self.watched_s)[:, None, None] * each
+            score += self.pairs[:, None, None] * _there_again(stayed * each, stays.back[:, None, None], come)[0]
+        come = (stays.back_rate * self.left_s)[:, None, None]
+        score[self.ended] += _log_gone(left, stays.back[:, None, None], come)[0][self.ended]
+        seen, there = (log_sum_exp(np.moveaxis(part, 1, -1)) for part in (score, -until))
+        return np.asarray(stays.weight @ (seen - there))
+
+    def __call__(self, hazard: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Return the value, and gradient (K,) and second derivative (K, K) by log hazards."""
         stays, ended = self.stays, self.ended
         before, during, after = (spent * hazard for spent in self.spent)
@@ -140,8 +185,6 @@ class _Likelihood:
         of_end, of_end_2 = (np.where(ended[:, None], d, 0.0) for d in (of_end, of_end_2))
         seen, there = log_sum_exp(score), log_sum_exp(-until)
         total = float(stays.weight @ (seen - there))
-        if not slopes:
-            return total, np.zeros(0), np.zeros(0)
         w = stays.weight[:, None]
         p, q = w * np.exp(score - seen[:, None]), w * np.exp(-until - there[:, None])
         slope = -before + first[..., None] * during + of_end[..., None] * after
@@ -359,14 +402,16 @@ def learn_hazards(
     risk = [_at_risk(one) for one in likelihoods]
     found: list[HazardPosterior] = [None] * (len(said) + 1)  # type: ignore[list-item]
     base = _usual_base(usual, edges)
-    log_evidence, draws = [], []
+    log_evidence, draws, weights = [], [], []
     for scale in _scales(edges):
-        values, of_free = _fit_together([likelihoods[row] for row in free], scale, base)
-        log_evidence.append(values)
+        evidence, of_free, their_weights = _fit_together([likelihoods[row] for row in free], scale, base)
+        log_evidence.append(evidence)
         draws.append(of_free)
-    weight = _draw_weights(_scales(edges), log_evidence)
+        weights.append(their_weights)
+    of_scales = DRAWS * _draw_weights(_scales(edges), log_evidence)
     for at, row in enumerate([*free, len(said)]):
         rates = base * np.exp(np.concatenate([each[at] for each in draws]))
+        weight = of_scales * np.concatenate([each[at] for each in weights])
         of = np.zeros(len(edges)) if row == len(said) else risk[row]
         found[row] = HazardPosterior(edges_s, rates, weight, None, np.zeros(len(edges)), of)
     for row, one in enumerate(said):
@@ -396,8 +441,10 @@ def _normals(r: int) -> tuple[FloatArray, FloatArray]:
     return np.concatenate([one, -one]), np.concatenate([other, -other])
 
 
-def _fit_together(likelihoods: list[_Likelihood], scale: _Scale, base: FloatArray) -> tuple[float, list[FloatArray]]:
-    """Return the log evidence of a scale and draws (DRAWS, K) of `v` of each class, and of a new one.
+def _fit_together(
+    likelihoods: list[_Likelihood], scale: _Scale, base: FloatArray
+) -> tuple[float, list[FloatArray], list[FloatArray]]:
+    """Return the log evidence of a scale, draws (DRAWS, K) of `v` of each class and of a new one, and their weights.
 
     The numbers of a class are those that all share, of variance `common`, plus its own. Own ones are eliminated first.
     """
@@ -413,10 +460,10 @@ def _fit_together(likelihoods: list[_Likelihood], scale: _Scale, base: FloatArra
 
     best, slopes, informations = bent(shared, own)
     for _ in range(_NEWTON):
-        slopes = slopes - of_own * (own - shared)
+        pull = slopes - of_own * (own - shared)
         inverse = np.linalg.inv(informations + of_own * np.eye(r))
         matrix = (of_shared + n * of_own) * np.eye(r) - of_own**2 * inverse.sum(axis=0)
-        solved = np.einsum("gij,gj->gi", inverse, slopes)
+        solved = np.einsum("gij,gj->gi", inverse, pull)
         slope = -of_shared * shared + of_own * ((own - shared) + solved).sum(axis=0)
         step = np.linalg.solve(matrix, slope)
         steps = solved + of_own * inverse @ step
@@ -435,13 +482,81 @@ def _fit_together(likelihoods: list[_Likelihood], scale: _Scale, base: FloatArra
     evidence = best + 0.5 * r * (np.log(of_shared) + n * np.log(of_own)) - 0.5 * _logdet(matrix)
     evidence -= 0.5 * sum(_logdet(one) for one in hessian)
     one, other = _normals(r)
-    common = one @ _root(np.linalg.inv(matrix))
-    draws = [
-        (of + of_own * common @ covariance + other @ _root(covariance)) @ columns.T
-        for of, covariance in zip(own, inverse, strict=True)
-    ]
+    of_both = np.linalg.inv(matrix)
+    common = one @ _root(of_both)
+    draws, weights, moved = [], [], np.zeros_like(common)
+    for row, covariance in enumerate(inverse):
+        spread = of_own * common @ covariance + other @ _root(covariance)
+        line = _Line(likelihoods[row], base, columns, own[row], slopes[row], informations[row])
+        found, weight, gain = line.draw(spread, covariance + of_own**2 * covariance @ of_both @ covariance)
+        evidence += gain
+        moved += found - spread
+        draws.append((own[row] + found) @ columns.T)
+        weights.append(weight)
+    common = common + of_own / (of_shared + n * of_own) * moved
     draws.append((shared + common + np.sqrt(1.0 / of_own) * other) @ columns.T)
-    return float(evidence), draws
+    weights.append(np.full(DRAWS, 1.0 / DRAWS))
+    return float(evidence), draws, weights
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Line:
+    """The likelihood of a class along lines through the most probable numbers.
+
+    Attributes:
+        likelihood: of its stays.
+        base: (K,) hazards that are 1.
+        columns: (K, R) of the scale.
+        mode, slope, information: (R,), (R,), (R, R) most probable numbers, gradient and information there.
+    """
+
+    likelihood: _Likelihood
+    base: FloatArray
+    columns: FloatArray
+    mode: FloatArray
+    slope: FloatArray
+    information: FloatArray
+
+    def excess(self, deviations: FloatArray) -> FloatArray:
+        """Return by how much (...) the log likelihood is over its parabola, at deviations (..., R) from the mode."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            hazards = self.base * np.exp((self.mode + deviations) @ self.columns.T)
+            values = self.likelihood.values(hazards.reshape(-1, len(self.base))).reshape(deviations.shape[:-1])
+            middle = self.likelihood.values(self.base * np.exp(self.columns @ self.mode)[None])
+            bend = 0.5 * ((deviations @ self.information) * deviations).sum(axis=-1)
+            found = values - middle - deviations @ self.slope + bend
+        return np.asarray(np.where(np.isfinite(found), found, -1.0 / _TINY))
+
+    def draw(self, spread: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Return deviations (S, R) from the mode, their weights (S,), and the log evidence gained over normal ones.
+
+        A normal posterior has too many high hazards where few ends were seen: the density falls slowly towards low
+        ones, and steeply towards high ones. Along axes on which likelihood and prior are independent the draws have
+        their exact densities; what is left is made up for by weights (importance sampling, of at most `HEAVIEST`).
+        """
+        from scipy.special import ndtr
+
+        root = _root(covariance)
+        _, turned = np.linalg.eigh(root @ self.information @ root)
+        axes = root @ turned
+        bent = np.flatnonzero(np.abs(self.excess(LINE[FAR, None] * axes.T[:, None])).max(axis=1) > STRAIGHT)
+        if not len(bent):
+            return spread, np.full(len(spread), 1.0 / len(spread)), 0.0
+        normal = spread @ np.linalg.solve(covariance, axes)
+        exact, gain, proposed = normal.copy(), 0.0, np.zeros(len(spread))
+        for axis, over in zip(bent.tolist(), self.excess(LINE[:, None] * axes.T[bent, None]), strict=True):
+            log_p = np.interp(FINE_LINE, LINE, over) - 0.5 * FINE_LINE**2
+            p = np.exp(log_p - log_p.max())
+            gain += log_p.max() + np.log(p.sum() * (FINE_LINE[1] - FINE_LINE[0]) / np.sqrt(2.0 * np.pi))
+            below = (np.cumsum(p) - 0.5 * p) / p.sum()
+            exact[:, axis] = np.interp(ndtr(normal[:, axis]), below, FINE_LINE)
+            proposed += np.interp(exact[:, axis], LINE, over)
+        found = spread + (exact - normal) @ axes.T
+        log_weight = self.excess(found) - proposed
+        weight = np.exp(log_weight - log_weight.max())
+        gain += log_weight.max() + np.log(weight.mean())
+        weight = np.minimum(weight, HEAVIEST * weight.mean())
+        return found, weight / weight.sum(), float(gain)
 
 
 def _slopes(
@@ -524,7 +639,7 @@ def _fit_alone(
     def goodness(z: FloatArray) -> float:
         v = columns @ z
         with np.errstate(over="ignore", invalid="ignore"):
-            value = likelihood(base * np.exp(v), slopes=False)[0]
+            value = float(likelihood.values(base * np.exp(v)[None])[0])
             value += float(ends @ (v - np.expm1(v))) - 0.5 * float(z @ z)
         return value if np.isfinite(value) else -np.inf
 

@@ -14,7 +14,6 @@ from evermap.cli.main import app
 from evermap.config import Config, LivingConfig
 from evermap.errors import InputError
 from evermap.geometry import se3
-from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
 from evermap.maps.store import open_store
@@ -26,7 +25,6 @@ from evermap_studies.worlds.parking import DAY_S, SPEED_MPS, STEP_S, Faults, Par
 COMES = (ChangeKind.APPEARED, ChangeKind.RETURNED)
 PARTS = ((0.0, 1.0), (0.2, 1.0), (0.0, 0.85))
 """What of the street is driven each day."""
-AT_SLOT_M = 3.0
 
 
 class Week(NamedTuple):
@@ -80,31 +78,18 @@ def in_street(living: LivingMap, street: Parking) -> tuple[IntArray, IntArray]:
     its odometry has drifted: aligned as a whole.
     """
     known = living.landmarks()
-    at = known.position_m[:, :2]
-    for reach_m in (5.0, 3.5, AT_SLOT_M):
-        away = np.linalg.norm(at[:, None] - street.slot[None, :, :2], axis=2)
-        near = away.min(axis=1) < reach_m
-        motion = rigid(at[near], street.slot[away.argmin(axis=1)[near], :2])
-        at = (
-            at @ np.array([[np.cos(motion[2]), np.sin(motion[2])], [-np.sin(motion[2]), np.cos(motion[2])]])
-            + motion[:2]
-        )
-    away = np.linalg.norm(at[:, None] - street.slot[None, :, :2], axis=2)
-    return known.landmark_id, np.where(away.min(axis=1) < AT_SLOT_M, away.argmin(axis=1), -1)
+    return known.landmark_id, street.find_slots(known.position_m[:, :2])
 
 
 def passed(street: Parking, part: tuple[float, float]) -> set[int]:
     """Slots that a drive passes: those beside the middle of what it drives."""
-    n = len(street.path)
-    beside = np.linalg.norm(street.slot[:, None, :2] - street.path[None, :, :2], axis=2).argmin(axis=1)
-    low, high = part[0] * n + 12, part[1] * n + 25
-    return set(np.flatnonzero((beside >= low) & (beside < high)).tolist())
+    return street.passed(part)
 
 
 def hidden(street: Parking, part: tuple[float, float]) -> set[int]:
     """Slots of which a drive saw a little, or nothing: nothing is asked of them."""
     n = len(street.path)
-    beside = np.linalg.norm(street.slot[:, None, :2] - street.path[None, :, :2], axis=2).argmin(axis=1)
+    beside = street.beside
     return set(np.flatnonzero((beside > part[1] * n - 3) & (beside < part[1] * n + 60)).tolist()) | set(
         np.flatnonzero((beside < part[0] * n + 12) & (beside > part[0] * n - 3)).tolist()
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from evermap.errors import ConfigError
 from evermap.geometry import se3
+from evermap.geometry.rigid import rigid
 from evermap.survival import Exponential, LifetimePrior, LogNormal
 from evermap.types import (
     UNKNOWN,
@@ -31,6 +32,8 @@ SIZE_SPREAD_M = (0.4, 0.08, 0.1)
 LEAVING_MPS2 = 1.5
 STAYS = LogNormal.from_half_life(36.0 * 3600.0, 1.0), Exponential.from_half_life(6.0 * 3600.0)
 """Of cars, which stand for days, and of vans, which are gone in the evening."""
+AT_SLOT_M = 3.0
+"""Farthest that what stands in a slot is from its middle."""
 EMPTY = Exponential.from_half_life(8.0 * 3600.0)
 
 
@@ -110,6 +113,32 @@ class Parking(NamedTuple):
     def standing(self, stamp_s: float) -> set[int]:
         """Return the slots that are taken."""
         return {one.slot for one in self.spells if one.from_s <= stamp_s < one.until_s}
+
+    def passed(self, part: tuple[float, float] = (0.0, 1.0)) -> set[int]:
+        """Return the slots that a drive along a part of the path passes."""
+        n = len(self.path)
+        beside = self.beside
+        low, high = part[0] * n + 12, part[1] * n + 25
+        return set(np.flatnonzero((beside >= low) & (beside < high)).tolist())
+
+    @property
+    def beside(self) -> IntArray:
+        """(S,) the point of the path that is nearest to each slot."""
+        return np.asarray(np.linalg.norm(self.slot[:, None, :2] - self.path[None, :, :2], axis=2).argmin(axis=1))
+
+    def find_slots(self, position_m: FloatArray) -> IntArray:
+        """Return the slots (N,) of what a map has at positions (N, 2), -1 for none.
+
+        The first drive begins where the street does, and its odometry has drifted: all are aligned as a whole.
+        """
+        at = position_m
+        for reach_m in (5.0, 3.5, AT_SLOT_M):
+            away = np.linalg.norm(at[:, None] - self.slot[None, :, :2], axis=2)
+            near = away.min(axis=1) < reach_m
+            x, y, turn = rigid(at[near], self.slot[away.argmin(axis=1)[near], :2])
+            at = at @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) + np.array([x, y])
+        away = np.linalg.norm(at[:, None] - self.slot[None, :, :2], axis=2)
+        return np.where(away.min(axis=1) < AT_SLOT_M, away.argmin(axis=1), UNKNOWN)
 
     def drive(
         self,
