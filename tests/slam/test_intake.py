@@ -16,7 +16,7 @@ from evermap_studies.sim import BuildingConfig, simulate_building
 @pytest.mark.parametrize("seed", range(5))
 def test_the_class_of_a_place_is_that_of_most_detections(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    place, class_id = rng.integers(0, 9, 40), rng.integers(UNKNOWN, 4, 40)
+    place, class_id = rng.integers(UNKNOWN, 9, 40), rng.integers(UNKNOWN, 4, 40)
     found = most_of(place, class_id, 10)
     for row in range(10):
         own = class_id[(place == row) & (class_id != UNKNOWN)]
@@ -27,6 +27,7 @@ def test_places_without_classes_are_of_none() -> None:
     nothing = np.zeros(0, dtype=np.int64)
     assert most_of(nothing, nothing, 3).tolist() == [UNKNOWN] * 3
     assert most_of(np.zeros(2, dtype=np.int64), np.full(2, UNKNOWN), 1).tolist() == [UNKNOWN]
+    assert most_of(np.full(2, UNKNOWN), np.zeros(2, dtype=np.int64), 0).tolist() == []  # boxes of no stay
 
 
 def test_a_class_that_was_misread_at_last_is_not_the_landmarks() -> None:

@@ -153,6 +153,8 @@ def find_misreadings(recording: AnyRecording, settings: SlamConfig) -> list[Find
     That is all but what the estimator leaves out, and says so itself.
     """
     found = [*find_motion(recording, settings.check)]
+    if is_in_space(recording) and all(finding.usable for finding in found):  # tags look turned by other mistakes, too
+        found += _find_corner_order(recording, settings.check)
     found += _limits_in_space(recording, settings) if is_in_space(recording) else _limits(recording)
     if settings.unknown_ids is not True:
         found += _identities(recording, settings.check)
@@ -293,7 +295,6 @@ def _limits_in_space(recording: SpatialRecording, settings: SlamConfig) -> list[
     most = f"up to {_ranges(recording)[far].max(initial=0.0):.4g} m"
     other = "the calibration is for another resolution"
     found = [
-        *_find_corner_order(recording, settings.check),
         *_find_pose_convention(recording, settings.check),
         *_outside("beyond-range", far, f"detections are beyond range_max_m, {most}", _OTHER_UNIT),
         *_outside("beyond-view", aside, "tags have corners outside of the image", other),

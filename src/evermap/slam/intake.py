@@ -156,8 +156,11 @@ def landmark_ids(recording: AnyRecording, used: IntArray) -> IntArray:
 
 
 def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
-    """Return (P,) the class that most detections (M,) of each place say, the first of several; unknown where none."""
-    known = class_id != UNKNOWN
+    """Return (P,) the class that most detections (M,) of each place say, the first of several; unknown where none.
+
+    Detections of no place (`UNKNOWN`) say nothing.
+    """
+    known = (class_id != UNKNOWN) & (place != UNKNOWN)
     size = int(class_id.max(initial=0)) + 1
     pair, times = np.unique(place[known] * size + class_id[known], return_counts=True)
     pair = pair[np.lexsort((pair, -times, pair // size))]

@@ -119,7 +119,9 @@ def test_a_wrong_identity_alone_in_view_is_no_place_of_the_robot():
     names[alone] = tags.landmark_id[np.argsort(away)[1]]  # its neighbour
     kept = (np.abs(seen.frame - middle) > 2) | (np.arange(len(names)) == alone)
     recording = replace(world.recording, detections=rows_of(replace(seen, landmark_id=names), kept))
-    optimum = solve_space(prepare_space(recording, SpaceConfig()), None).optimum
+    intake = prepare_space(recording, SpaceConfig())
+    middle = int(np.searchsorted(intake.pose_frame, middle))  # frames around it saw nothing
+    optimum = solve_space(intake, None).optimum
     problem, true = optimum.smoother.problem, optimum.estimate.pose
     row = int(np.flatnonzero(problem.pose_row == middle)[0])
     sensed = se3.compose(optimum.estimate.mount(problem)[problem.sensor[row]], problem.measured[row])

@@ -95,7 +95,7 @@ def linearise_odometry(
         lever: (N - 1, 3) of the rotation's noise.
         axes: (N - 1, 3, 3) along which the translation's noise is independent.
         sigma: (N - 1, 6) their standard deviations: of translations along the axes, given the rotation, and of this.
-        log_odds: beyond which half of the squared residual of a step makes a jump of the odometry.
+        log_odds: beyond which half of the squared residual makes a jump of the odometry.
         heavy: tails that never let go, while the estimate may be far off.
         values: filled in: 6 rows by two poses, the scale and the right side each.
         weight: (N - 1,) filled in.
@@ -122,9 +122,8 @@ def linearise_odometry(
         squared = 0.0
         for a in range(6):
             squared += (e[a] / sigma[i, a]) ** 2
-        # nothing says at which step of an interval an error was made: along the chain all share it alike
-        weight[i], loss = weigh(squared / steps[i], log_odds, 6.0 * HEAVY_TAIL if heavy else 0.0, JUMP_SHARE)
-        cost += steps[i] * loss
+        weight[i], loss = weigh(squared, log_odds, 6.0 * HEAVY_TAIL if heavy else 0.0, JUMP_SHARE)
+        cost += loss
         for a in range(6):
             scale = math.sqrt(weight[i]) / sigma[i, a]
             for b in range(6):

@@ -79,7 +79,7 @@ def log_marginal_likelihood(
     if problem.driven:
         of_odometry += 0.5 * float(np.log(problem.swing.variance(noise)[kept]).sum())
         of_odometry += 0.5 * float(np.log(problem.swing.variance(begun)[~kept]).sum())
-        of_odometry += float(problem.swing.steps[~kept].sum()) * problem.settings.jump_log_odds
+        of_odometry += float(np.count_nonzero(~kept)) * problem.settings.jump_log_odds
     priors = _cost_of_priors(smoother, now)
     counted = SpatialSmoother(replace(problem, share=new), optimum.estimate.pose)
     linear = counted.linearised(optimum.estimate, noise, heavy=False)
