@@ -191,7 +191,7 @@ def age_basis(log_age: FloatArray, knots: int) -> Basis:
 def week_basis() -> Basis:
     """Return a daily curve shared by all days, a weekend, and a level and a smoother curve of each day of the week."""
     time = (np.arange(BINS_OF_DAY) + 0.5) / BINS_OF_DAY
-    shared, own = _cyclic_spline(time, DAY_KNOTS), _cyclic_spline(time, DEVIATION_KNOTS)
+    shared, own = cyclic_spline(time, DAY_KNOTS), cyclic_spline(time, DEVIATION_KNOTS)
     weekend = np.repeat(np.arange(7) >= 5, BINS_OF_DAY)[:, None].astype(np.float64)
     levels = np.repeat(np.eye(7), BINS_OF_DAY, axis=0)
     columns = np.hstack([np.tile(shared, (7, 1)), weekend, levels, np.kron(np.eye(7), own)])
@@ -300,7 +300,7 @@ def _spline(points: FloatArray, low: float, spacing: float, knots: int) -> Float
     return np.asarray(BSpline.design_matrix(inside, places, 3).toarray(), dtype=np.float64)
 
 
-def _cyclic_spline(points: FloatArray, knots: int) -> FloatArray:
+def cyclic_spline(points: FloatArray, knots: int) -> FloatArray:
     """Cubic B-splines on the unit circle."""
     columns = _spline(points, 0.0, 1.0 / knots, knots)
     columns[:, :3] += columns[:, knots:]
