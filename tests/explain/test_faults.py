@@ -143,6 +143,7 @@ def test_an_odometry_that_seems_far_too_short_is_asked_about() -> None:
     assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
 
 
+@pytest.mark.slow
 def test_images_of_another_size_than_those_of_the_calibration_are_named() -> None:
     recording = in_space()
     seen = replace(recording.detections, corner_px=0.5 * recording.detections.corner_px)

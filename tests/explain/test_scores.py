@@ -128,7 +128,7 @@ def with_clock(recording: Any, faster: float) -> Any:
     return replace(recording, frames=replace(recording.frames, stamp_s=stamp_s + faster * (stamp_s - stamp_s.mean())))
 
 
-@pytest.mark.parametrize("faster", [0.004, -0.004])
+@pytest.mark.parametrize("faster", [0.004, pytest.param(-0.004, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["plane", "corners"])
 def test_clocks_that_drift_apart_are_suspected(kind: str, faster: float) -> None:
     world = World(seed=1)

@@ -29,7 +29,8 @@ def seen_in_four_weeks(seed: int, warmup_days: float = 60.0) -> Stays:
     return as_seen(histories(DEFAULT_CLASSES, END_S, np.random.default_rng(seed), warmup_days * DAY_S), LOOKS_S)
 
 
-@pytest.mark.parametrize("warmup_days", [0.0, pytest.param(60.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("warmup_days", [0.0, 60.0])
 def test_bands_cover_the_lifetimes_of_the_simulated_building(warmup_days: float) -> None:
     """Between the ages by which 10 % and 90 % are gone: there is nothing to be seen of rarer things in four weeks."""
     covered = []
@@ -100,6 +101,7 @@ def test_a_new_class_gets_what_the_others_have_in_common() -> None:
     assert upper - lower > 2.0 * (upper_known - lower_known)
 
 
+@pytest.mark.slow
 def test_a_site_forecasts_better_with_what_other_sites_have_seen() -> None:
     """Ten sites of three days; what is there now, and its class moves by itself: is it there seven looks later?"""
     names, now_s, then_s = tuple(item.name for item in DEFAULT_CLASSES), LOOKS_S[5], LOOKS_S[12]
