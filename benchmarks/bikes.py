@@ -23,7 +23,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow.csv as pa_csv
 
-from evermap.existence.places import AGE_EDGES_S, PlaceChain, PlaceStays
+from evermap.existence.places import AGE_EDGES_S, PlaceChain, PlaceStays, age_bins
+from evermap.survival.hazard_regression import overlaps
 from evermap.types import UNKNOWN, FloatArray, IntArray
 
 HOUR_S, DAY_S = 3600.0, 86400.0
@@ -94,11 +95,10 @@ def by_place(stays: PlaceStays) -> PlaceChain:
     left = np.where(np.isfinite(stays.gone_s), 0.5 * (stays.until_s + stays.gone_s), stays.until_s)
     age = (left - stays.from_s)[timed]
     place, ended = stays.place[timed], stays.next_place[timed] != UNKNOWN
-    spent = np.clip(age[:, None] - AGE_EDGES_S[:-1], 0.0, np.diff(AGE_EDGES_S))
+    spent = overlaps(np.zeros_like(age), age, AGE_EDGES_S[:-1])
     exposure, events = np.zeros((n, a)), np.zeros((n, a))
     np.add.at(exposure, place, spent)
-    at = np.clip(np.searchsorted(AGE_EDGES_S, age, side="right") - 1, 0, a - 1)
-    np.add.at(events, (place[ended], at[ended]), 1.0)
+    np.add.at(events, (place[ended], age_bins(age[ended])), 1.0)
     overall = (events.sum(0) + 0.5) / (exposure.sum(0) + 0.5 * exposure.sum() / events.sum())
     hazard = (events + 1.0) / (exposure + 1.0 / overall)
     counts = np.zeros((n, n))

@@ -76,7 +76,7 @@ def score_street(seed: int, n_leaving: int, config: Config) -> Counter[str]:
             continue
         before, now = (street.standing(DAY_S * at + 60.0) for at in (day - 1, day))
         true = {(slot, GOES) for slot in before - now} | {(slot, COMES) for slot in now - before}
-        true = {(slot, what) for slot, what in true if slot in street.passed()}
+        true = {(slot, what) for slot, what in true if slot in street.find_passed()}
         told = [
             (slots[change.landmark_ids[0]], KINDS.get(change.kind, change.kind.value)) for change in session.changes
         ]

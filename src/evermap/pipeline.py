@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from evermap.compiled import single_threaded
 from evermap.config import Config
@@ -46,7 +46,6 @@ def run_slam(
         NumericalError: no finite optimum.
     """
     from evermap.explain.causes import Inputs
-    from evermap.explain.faults import find_faults, with_mended
     from evermap.explain.verdict import with_verdict
     from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check, plane
@@ -75,11 +74,24 @@ def run_slam(
     if prior_map is not None:
         result = with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)
     solution = session.solution_of(visit)
-    faults, mended = find_faults(result, under.recording, found, under.prior_map)
-    result = with_verdict(
-        replace(result, causes=(*result.causes, *faults)), under.recording, config.slam, under.prior_map,
-        findings=found, as_read=read, session=solution,
-    )  # fmt: skip
+    return _judge(result, under.recording, config, under.prior_map, found, as_read=read, session=solution)
+
+
+def _judge(
+    result: SlamResult,
+    recording: AnyRecording,
+    config: Config,
+    expected: Landmarks | None,
+    found: tuple[Finding, ...],
+    **more: Any,
+) -> SlamResult:
+    """Return a result with the faults that it shows, and its verdict; `more` is as of `with_verdict`."""
+    from evermap.explain.faults import find_faults, with_mended
+    from evermap.explain.verdict import with_verdict
+
+    faults, mended = find_faults(result, recording, found, expected)
+    result = replace(result, causes=(*result.causes, *faults))
+    result = with_verdict(result, recording, config.slam, expected, findings=found, **more)
     return with_mended(result, mended)
 
 
@@ -206,15 +218,9 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
 
 def _add_verdict(entered: Session, before: LivingMap, config: Config, found: tuple[Finding, ...]) -> Session:
     """Return a session with its verdict, beside the map as it was `before` it."""
-    from evermap.explain.faults import find_faults, with_mended
-    from evermap.explain.verdict import with_verdict
-
     expected = before.landmarks(p_least=0.0) if len(before.places) else None
     reason = entered.set_aside[0] if entered.set_aside else ""
-    faults, mended = find_faults(entered.slam, entered.recording, found, expected)
-    slam = replace(entered.slam, causes=(*entered.slam.causes, *faults))
-    slam = with_verdict(slam, entered.recording, config.slam, expected, findings=found, set_aside=reason)
-    return replace(entered, slam=with_mended(slam, mended))
+    return replace(entered, slam=_judge(entered.slam, entered.recording, config, expected, found, set_aside=reason))
 
 
 @single_threaded()

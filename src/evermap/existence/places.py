@@ -94,6 +94,8 @@ class PlaceChain(Shown):
         Raises:
             DataError: no stay whose beginning is known, or none that ended.
         """
+        from scipy.special import softmax
+
         timed = np.isfinite(stays.from_s)
         if not timed.any() or not np.any(stays.next_place != UNKNOWN):
             raise DataError("no stay was seen from its beginning, or none ended", hint="longer records")
@@ -113,7 +115,7 @@ class PlaceChain(Shown):
         week = np.array([rates.log_week[np.equal(_HOURS, block)].mean() for block in range(2 * _DAY_BLOCKS)])
         log_hazard = rates.log_age[None, :, None] + (week + own)[:, None, :]
         pair, flow = _fit_destinations(counts)
-        return cls(np.exp(log_hazard), _softmax(pair[None] + flow.T[:, None, :]))
+        return cls(np.exp(log_hazard), softmax(pair[None] + flow.T[:, None, :], axis=-1))
 
     @property
     def n_places(self) -> int:
@@ -132,7 +134,7 @@ class PlaceChain(Shown):
         at, age, horizons = np.asarray(place), np.asarray(age_s, dtype=np.float64), np.asarray(horizons_s)
         n, a = len(at), len(AGE_EDGES_S) - 1
         mass = np.zeros((n, self.n_places, a))
-        mass[np.arange(n), at, _age_bin(age)] = 1.0
+        mass[np.arange(n), at, age_bins(age)] = 1.0
         older = np.minimum(BIN_S / np.diff(AGE_EDGES_S), 1.0)
         older[-1] = 0.0
         out = np.empty((n, len(horizons), self.n_places))
@@ -165,12 +167,12 @@ class PlaceChain(Shown):
         """
         times = np.arange(now_s, leaves_s, BIN_S)
         lasts = np.minimum(leaves_s - times, BIN_S)
-        hazards = self.hazard_hz[place, _age_bin(times - now_s + age_s), _block(bin_of_week(times + 0.5 * lasts))]
+        hazards = self.hazard_hz[place, age_bins(times - now_s + age_s), _block(bin_of_week(times + 0.5 * lasts))]
         log_p = -float(np.sum(hazards * lasts))
         if goes_to is None:
             return log_p
         block = int(_block(bin_of_week(leaves_s)))
-        rate = self.hazard_hz[place, int(_age_bin(np.array(leaves_s - now_s + age_s))), block]
+        rate = self.hazard_hz[place, int(age_bins(np.array(leaves_s - now_s + age_s))), block]
         return log_p + float(np.log(rate * BIN_S) + np.log(self.destinations[block, place, goes_to]))
 
 
@@ -184,13 +186,9 @@ def _block(week_bin: IntArray) -> IntArray:
     return np.asarray(_HOURS[week_bin])
 
 
-def _age_bin(age_s: FloatArray) -> IntArray:
+def age_bins(age_s: FloatArray) -> IntArray:
+    """Return which stretch of `AGE_EDGES_S` ages are in."""
     return np.clip(np.searchsorted(AGE_EDGES_S, age_s, side="right") - 1, 0, len(AGE_EDGES_S) - 2)
-
-
-def _softmax(x: FloatArray) -> FloatArray:
-    weight = np.exp(x - x.max(axis=-1, keepdims=True))
-    return np.asarray(weight / weight.sum(axis=-1, keepdims=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,12 +227,12 @@ class _Cells:
         unseen = np.isfinite(stays.gone_s[rows]) & ~seen
         is_last = k == count[stay] - 1
         return cls(
-            stay, stays.place[rows][stay], _age_bin(start - begin[stay]), bin_of_week(0.5 * (start + end_s)),
+            stay, stays.place[rows][stay], age_bins(start - begin[stay]), bin_of_week(0.5 * (start + end_s)),
             end_s - start, (is_last & seen[stay]).astype(np.float64),
             unseen[stay] & (end_s > until[stay]), stays.n_places,
         )  # fmt: skip
 
-    def _expected(self, rates: SmoothRates | None, own: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _expect(self, rates: SmoothRates | None, own: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return (M,) expected ends in each cell, and (M,) expected time spent there."""
         hazard = np.full(len(self.stay), 1e-5)
         if rates is not None:
@@ -254,7 +252,7 @@ class _Cells:
 
     def tables(self, rates: SmoothRates | None, own: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return (A, 1008) expected ends, and exposure times the factors of the places."""
-        ends, spent = self._expected(rates, own)
+        ends, spent = self._expect(rates, own)
         shape = (len(AGE_EDGES_S) - 1, BINS)
         flat = self.age * BINS + self.week
         factor = np.exp(own[self.place, _block(self.week)])
@@ -266,7 +264,7 @@ class _Cells:
 
     def by_place(self, rates: SmoothRates, own: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return (P, 48) ends by place and hour, and how many the shared hazard expects."""
-        ends, spent = self._expected(rates, own)
+        ends, spent = self._expect(rates, own)
         shape = (self.n_places, 2 * _DAY_BLOCKS)
         flat = self.place * shape[1] + _block(self.week)
         expected = spent * np.exp(rates.log_age[self.age] + rates.log_week[self.week])
@@ -314,6 +312,7 @@ def _fit_destinations(counts: FloatArray) -> tuple[FloatArray, FloatArray]:
         counts: (P, P, 48) moves by place, destination and hour.
     """
     from scipy.optimize import minimize
+    from scipy.special import softmax
 
     n = len(counts)
     columns, _ = _own_columns()
@@ -345,7 +344,7 @@ def _fit_destinations(counts: FloatArray) -> tuple[FloatArray, FloatArray]:
         start = np.concatenate([pair.ravel(), flow.ravel()])
         found = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": 200})
         pair, flow = found.x[: n * n].reshape(n, n), found.x[n * n :].reshape(n, k)
-        share = _softmax((base + pair)[None] + (columns @ flow.T)[:, None, :])  # (48, P, P)
+        share = softmax((base + pair)[None] + (columns @ flow.T)[:, None, :], axis=-1)  # (48, P, P)
         spread = share * (1.0 - share) * trips.T[:, :, None]
         of_a = 1.0 / (spread.sum(axis=0) + 1.0 / sigma2)
         of_c = 1.0 / (np.einsum("bd,bk->dk", spread.sum(axis=1), columns**2) + 1.0 / tau2)

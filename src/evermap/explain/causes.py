@@ -19,7 +19,8 @@ import numpy as np
 
 from evermap.geometry import se2, se3
 from evermap.geometry.group import accumulate
-from evermap.geometry.square import square_poses
+from evermap.geometry.square import CORNERS as SQUARE
+from evermap.geometry.square import with_square_poses
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam import mistakes
 from evermap.slam.check import CLOCKWISE, CORNERS, SIGHTED, find_corner_mistake, is_clockwise, read_corners
@@ -745,7 +746,6 @@ def _change_resolution(inputs: Inputs, _: float, rows: Sequence[int], factor: fl
     """Return the same with the calibration of some cameras for images of another size, and the poses of their tags."""
     recording: Any = inputs.recording
     seen, sensors = recording.detections, list(recording.sensors)
-    pose = np.concatenate([seen.position_sensor_m, seen.rotation], axis=1)
     for row in rows:
         size = sensors[row].resolution_px
         sensors[row] = replace(
@@ -753,10 +753,7 @@ def _change_resolution(inputs: Inputs, _: float, rows: Sequence[int], factor: fl
             intrinsics=tuple(factor * each for each in sensors[row].intrinsics),
             resolution_px=None if size is None else (round(factor * size[0]), round(factor * size[1])),
         )
-        mine = np.flatnonzero((seen.sensor == row) & np.isfinite(seen.corner_px[:, 0, 0]))
-        if len(mine):
-            pose[mine] = square_poses(seen.corner_px[mine], seen.tag_size_m[mine], sensors[row]).pose[0]
-    seen = replace(seen, position_sensor_m=pose[:, :3], rotation=pose[:, 3:])
+    seen = with_square_poses(seen, sensors, np.isin(seen.sensor, rows) & np.isfinite(seen.corner_px[:, 0, 0]))
     return replace(inputs, recording=replace(recording, detections=seen, sensors=tuple(sensors)))
 
 
@@ -866,9 +863,8 @@ def _name_axes(quaternion: FloatArray) -> str:
 
 def _name_order(quaternion: FloatArray) -> str:
     """Return in which order to list corners of a tag that is turned by a quaternion, as '3, 2, 1, 0'."""
-    corner = np.array([(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)])
-    back = se3.transform(se3.inverse(se3.turn(quaternion)), corner)
-    return ", ".join(str(int(np.argmin(np.linalg.norm(corner - each, axis=1)))) for each in back)
+    back = se3.transform(se3.inverse(se3.turn(quaternion)), SQUARE)
+    return ", ".join(str(int(np.argmin(np.linalg.norm(SQUARE - each, axis=1)))) for each in back)
 
 
 _AXES_TURNED = sorted(

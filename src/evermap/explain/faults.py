@@ -14,9 +14,9 @@ from math import degrees, nan
 
 import numpy as np
 
-from evermap.geometry import se2, se3
+from evermap.explain.symptoms import find_motions, find_turns_between
 from evermap.slam.check import CLOCKWISE, CORNERS, SILENCE, is_clockwise
-from evermap.slam.gaps import find_gaps
+from evermap.slam.gaps import find_gaps, is_outside
 from evermap.slam.mistakes import Finding
 from evermap.types import AnyRecording, Cause, FloatArray, IntArray, Landmarks, SlamResult, Trajectory, is_in_space
 
@@ -95,8 +95,7 @@ def find_jumps(result: SlamResult, gaps_s: FloatArray) -> list[tuple[float, floa
     beyond = np.zeros(len(last), dtype=np.bool_)
     for size, least in ((shift_m, JUMP_M), (turn_rad, JUMP_RAD)):
         beyond |= size > max(least, TIMES * float(np.quantile(size, 0.99)))
-    for since_s, until_s in gaps_s.tolist():
-        beyond &= (path.stamp_s[1:] <= since_s) | (path.stamp_s[:-1] >= until_s)
+    beyond &= is_outside(gaps_s, path.stamp_s[:-1], path.stamp_s[1:])
     rows = np.flatnonzero(beyond)
     rows = rows[np.argsort(-shift_m[rows])]
     around = np.clip([rows - BESIDE, rows + 1 + BESIDE], 0, len(path) - 1)
@@ -106,11 +105,8 @@ def find_jumps(result: SlamResult, gaps_s: FloatArray) -> list[tuple[float, floa
 
 def _differ(pose: FloatArray, other: FloatArray, first: IntArray, last: IntArray) -> tuple[FloatArray, FloatArray]:
     """Return by how much motions of two paths differ [m, rad]."""
-    group, dim = (se2, 2) if pose.shape[1] == 3 else (se3, 3)
-    one, two = (group.between(each[first], each[last]) for each in (pose, other))
-    apart = group.between(two, one)
-    turn_rad = np.abs(se2.wrap(apart[:, 2])) if dim == 2 else se3.angle_between(two, one)
-    return np.linalg.norm(apart[:, :dim], axis=1), np.asarray(turn_rad)
+    one, two = (find_motions(each, first, last) for each in (pose, other))
+    return np.linalg.norm(one - two, axis=1), np.abs(find_turns_between(pose, other, first, last))
 
 
 def _jump(at_s: float, shift_m: float, turn_rad: float, start_s: float, count: int) -> Cause:

@@ -266,7 +266,7 @@ def _with_motions(
     path = lead_on(recording, at_s[0], problem.settings.delay_sigma_s)
     return replace(
         problem, stamp_s=at_s - at_s[0], increment=se3.scaled(increment, longer),
-        swing=Swing.between(frames.posed, np.diff(path_s), through).scaled(longer),
+        swing=Swing.between(frames.posed, frames.lasted_s, through).scaled(longer),
         path=None if path is None else path._replace(pose=se3.scaled(path.pose, longer)),
     )  # fmt: skip
 

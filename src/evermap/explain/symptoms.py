@@ -16,7 +16,7 @@ from evermap.estimate.innovations import comparable_nis, lag1_autocorrelation
 from evermap.explain.scores import SessionScores
 from evermap.geometry import se2, se3
 from evermap.slam.association.features import medians
-from evermap.slam.gaps import find_gaps
+from evermap.slam.gaps import find_gaps, is_outside
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,
@@ -449,28 +449,29 @@ def compare_odometry(result: SlamResult, odometry: Odometry | SpatialOdometry | 
     first = (
         first[np.linspace(0, len(first) - 1, min(len(first), 20 * WINDOWS)).astype(np.int64)] if len(first) else first
     )
-    for since_s, until_s in [] if odometry is None else find_gaps(odometry).tolist():
-        first = first[(path.stamp_s[first] >= until_s) | (path.stamp_s[last[first]] <= since_s)]
+    if odometry is not None:
+        first = first[is_outside(find_gaps(odometry), path.stamp_s[first], path.stamp_s[last[first]])]
     if len(first) < 3:
         return nan, nan, nan
-    one, two = (_motions(each.pose_world_robot, first, last[first]) for each in (path, other))
-    went = np.stack([np.linalg.norm(each[0], axis=1) for each in (one, two)])
+    one, two = (find_motions(each.pose_world_robot, first, last[first]) for each in (path, other))
+    went = np.stack([np.linalg.norm(each, axis=1) for each in (one, two)])
     moves = went.max(axis=0) > LEAST_MOTION_M
-    turn = float(np.median(np.abs(_turn_between(path.pose_world_robot, other.pose_world_robot, first, last[first]))))
+    turned = find_turns_between(path.pose_world_robot, other.pose_world_robot, first, last[first])
+    turn = float(np.median(np.abs(turned)))
     if moves.sum() < 3:
         return nan, turn, nan
-    apart = np.linalg.norm(one[0] - two[0], axis=1)[moves] / went.max(axis=0)[moves]
+    apart = np.linalg.norm(one - two, axis=1)[moves] / went.max(axis=0)[moves]
     longer = went[0][moves].sum() / max(float(went[1][moves].sum()), 1e-9)
     return float(np.median(apart)), turn, float(longer)
 
 
-def _motions(pose: FloatArray, first: IntArray, last: IntArray) -> tuple[FloatArray]:
-    """Return (W, D) motions in the frame of their start."""
+def find_motions(pose: FloatArray, first: IntArray, last: IntArray) -> FloatArray:
+    """Return (W, D) translations from rows of poses to others, in the frame of their start."""
     group, dim = (se2, 2) if pose.shape[1] == 3 else (se3, 3)
-    return (group.between(pose[first], pose[last])[:, :dim],)
+    return np.asarray(group.between(pose[first], pose[last])[:, :dim])
 
 
-def _turn_between(path: FloatArray, other: FloatArray, first: IntArray, last: IntArray) -> FloatArray:
+def find_turns_between(path: FloatArray, other: FloatArray, first: IntArray, last: IntArray) -> FloatArray:
     """Return (W,) angles between turns by the one and by the other."""
     if path.shape[1] == 3:
         one, two = (each[last, 2] - each[first, 2] for each in (path, other))

@@ -7,13 +7,15 @@ are refined by Gauss-Newton on the pixels, damped after Levenberg and Marquardt.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from evermap.geometry import se3
 from evermap.geometry.camera import project, unproject
-from evermap.types import FloatArray, SpatialSensor
+from evermap.types import BoolArray, FloatArray, SpatialDetections, SpatialSensor
 
 CORNERS = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
 """Corners of a square of edge 1 in its own frame (x right, y up, z towards who looks at it), in the order of
@@ -52,6 +54,19 @@ def square_poses(corner_px: FloatArray, size_m: FloatArray, sensor: SpatialSenso
     order = np.argsort(np.where(np.isnan(error), np.inf, error), axis=0, kind="stable")
     rows = np.arange(len(size_m))
     return SquarePoses(pose[order, rows], error[order, rows], information[order, rows])
+
+
+def with_square_poses(
+    detections: SpatialDetections, sensors: Sequence[SpatialSensor], wanted: BoolArray
+) -> SpatialDetections:
+    """Return detections (M,) with the better pose by their corners of those `wanted` whose camera is calibrated."""
+    position, rotation = detections.position_sensor_m.copy(), detections.rotation.copy()
+    for number, sensor in enumerate(sensors):
+        rows = np.flatnonzero(wanted & (detections.sensor == number))
+        if len(rows) and sensor.intrinsics is not None:
+            found = square_poses(detections.corner_px[rows], detections.tag_size_m[rows], sensor).pose[0]
+            position[rows], rotation[rows] = found[:, :3], found[:, 3:]
+    return replace(detections, position_sensor_m=position, rotation=rotation)
 
 
 def _infinitesimal(plane: FloatArray, size_m: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from evermap.errors import InputError
 from evermap.geometry import se3
 from evermap.geometry.camera import unproject
 from evermap.geometry.group import accumulate
-from evermap.geometry.square import square_poses
+from evermap.geometry.square import with_square_poses
 from evermap.io.assemble import forward_stamps, last_of_equal
 from evermap.io.bad_rows import Flaw
 from evermap.io.table import Table
@@ -203,22 +203,17 @@ def with_tag_poses(
     Tags whose corners cannot be those of a square ahead of the camera, or whose size is not known, are left out;
     `warnings` gets their number.
     """
-    position, rotation = detections.position_sensor_m.copy(), detections.rotation.copy()
-    wanted = np.isnan(position).any(axis=1) & np.isfinite(detections.corner_px).all(axis=(1, 2))
-    for number, sensor in enumerate(sensors):
-        rows = np.flatnonzero(wanted & (detections.sensor == number))
-        if len(rows) and sensor.intrinsics is not None:
-            found = square_poses(detections.corner_px[rows], detections.tag_size_m[rows], sensor).pose[0]
-            position[rows], rotation[rows] = found[:, :3], found[:, 3:]
+    wanted = np.asarray(np.isnan(detections.position_sensor_m).any(axis=1))
+    wanted &= np.isfinite(detections.corner_px).all(axis=(1, 2))
+    filled = with_square_poses(detections, sensors, wanted)
     sizeless = wanted & np.isnan(detections.tag_size_m)
-    broken = wanted & ~sizeless & np.isnan(position).any(axis=1)
+    broken = wanted & ~sizeless & np.isnan(filled.position_sensor_m).any(axis=1)
     if sizeless.any():
         ids = np.unique(detections.landmark_id[sizeless])
         shown = ", ".join(map(str, ids[:5].tolist())) + (", ..." if len(ids) > 5 else "")
         warnings.append(f"{counted(int(sizeless.sum()), 'tag')} of unknown size left out (ids {shown})")
     if broken.any():
         warnings.append(f"{counted(int(broken.sum()), 'tag')} left out: their corners are not those of a square")
-    filled = replace(detections, position_sensor_m=position, rotation=rotation)
     return filled[~sizeless & ~broken] if (sizeless | broken).any() else filled
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from evermap.config import CheckConfig, CleaningConfig, Config, SensorConfig, SlamConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
-from evermap.geometry.square import square_poses
+from evermap.geometry.square import with_square_poses
 from evermap.show import Shown
 from evermap.slam.cleaning import clean, spikes
 from evermap.slam.mistakes import (
@@ -344,13 +344,9 @@ def read_corners(recording: SpatialRecording, how: str) -> SpatialRecording:
     """
     seen, clockwise = recording.detections, is_clockwise(recording)
     size = np.array([sensor.resolution_px or (0, 0) for sensor in recording.sensors], dtype=np.float64)[seen.sensor]
-    corner, pose = seen.corner_px.copy(), np.concatenate([seen.position_sensor_m, seen.rotation], axis=1)
+    corner = seen.corner_px.copy()
     corner[clockwise] = CORNERS[how].read(corner[clockwise], size[clockwise, None])
-    for row, sensor in enumerate(recording.sensors):
-        mine = np.flatnonzero(clockwise & (seen.sensor == row))
-        if sensor.intrinsics is not None and len(mine):
-            pose[mine] = square_poses(corner[mine], seen.tag_size_m[mine], sensor).pose[0]
-    read = replace(seen, corner_px=corner, position_sensor_m=pose[:, :3], rotation=pose[:, 3:])
+    read = with_square_poses(replace(seen, corner_px=corner), recording.sensors, clockwise)
     return replace(recording, detections=read)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.types import FloatArray, Odometry, SpatialOdometry
+from evermap.types import BoolArray, FloatArray, Odometry, SpatialOdometry
 
 SILENT_S, FEW_STEPS = 2.0, 10.0
 """Time, and usual steps, without a row from which the odometry is silent, or with rows by which the robot stands."""
@@ -17,3 +17,11 @@ def find_gaps(odometry: Odometry | SpatialOdometry) -> FloatArray:
         return np.zeros((0, 2))
     row = np.flatnonzero(step_s > max(SILENT_S, FEW_STEPS * float(np.median(step_s))))
     return np.column_stack([odometry.stamp_s[row], odometry.stamp_s[row + 1]])
+
+
+def is_outside(gaps_s: FloatArray, start_s: FloatArray, stop_s: FloatArray) -> BoolArray:
+    """Return (W,) which of some stretches of time have nothing of gaps (K, 2) within them."""
+    found = np.ones(len(start_s), dtype=np.bool_)
+    for since_s, until_s in gaps_s.tolist():
+        found &= (start_s >= until_s) | (stop_s <= since_s)
+    return found

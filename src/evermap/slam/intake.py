@@ -155,6 +155,16 @@ def landmark_ids(recording: AnyRecording, used: IntArray) -> IntArray:
     return np.unique(np.concatenate([recording.detections.landmark_id[used], *measured]))
 
 
+def find_bodies(landmark_id: IntArray, objects: IntArray) -> IntArray:
+    """Return (K,) numbers of the bodies that landmarks (K,) are on, as `Recording.objects` (N, 2) states them;
+    `UNKNOWN` of others.
+    """
+    found = np.full(len(landmark_id), UNKNOWN)
+    _, row, stated = np.intersect1d(landmark_id, objects[:, 0], return_indices=True)
+    found[row] = objects[stated, 1]
+    return found
+
+
 def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
     """Return (P,) the class that most detections (M,) of each place say, the first of several; unknown where none.
 

@@ -81,11 +81,6 @@ def in_street(living: LivingMap, street: Parking) -> tuple[IntArray, IntArray]:
     return known.landmark_id, street.find_slots(known.position_m[:, :2])
 
 
-def passed(street: Parking, part: tuple[float, float]) -> set[int]:
-    """Slots that a drive passes: those beside the middle of what it drives."""
-    return street.passed(part)
-
-
 def hidden(street: Parking, part: tuple[float, float]) -> set[int]:
     """Slots of which a drive saw a little, or nothing: nothing is asked of them."""
     n = len(street.path)
@@ -116,7 +111,7 @@ def counted(made: Week, told: list[tuple[MapChange, ...]], slots: dict[int, int]
         comes = {slots[name] for one in changes if one.kind in COMES for name in one.landmark_ids}
         goes = {slots[name] for one in changes if one.kind is ChangeKind.VANISHED for name in one.landmark_ids}
         doubtful = hidden(made.street, part) if day else set()
-        for slot in passed(made.street, part) - doubtful:
+        for slot in made.street.find_passed(part) - doubtful:
             now, before = spell_at(made.street, slot, end_s), last.get(slot)
             known = slot in last or any(event[:1] == (day,) and event[2] == slot for event in made.in_view)
             if slot not in last:
@@ -158,7 +153,7 @@ def test_what_stands_is_known_once_and_what_changed_is_told(days: Days) -> None:
         for day, session in enumerate(sessions):
             names, at = in_street(session.living, street)
             exists = session.living.landmarks().p_exists >= 0.5
-            here, sure = at[exists], passed(street, PARTS[day]) - hidden(street, PARTS[day])
+            here, sure = at[exists], street.find_passed(PARTS[day]) - hidden(street, PARTS[day])
             assert len(np.unique(here)) == len(here), day  # no duplicates
             standing = street.standing(day * DAY_S + 40.0)
             stands = {slot for slot in here.tolist() if slot in sure}
@@ -211,7 +206,7 @@ def test_stays_are_the_spells_and_what_lifetimes_are_learned_from(days: Days) ->
         found: dict[Spell, int] = {}
         for row in range(len(stays)):
             slot = slots[int(stays.clique_id[row])]
-            if slot not in passed(street, PARTS[1]) - hidden(street, PARTS[1]):
+            if slot not in street.find_passed(PARTS[1]) - hidden(street, PARTS[1]):
                 continue  # one may have left and another come, unseen
             inside = [
                 one

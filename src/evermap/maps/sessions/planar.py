@@ -26,6 +26,7 @@ from evermap.slam import result as of_slam
 from evermap.slam.batch import Outcome, silent_links
 from evermap.slam.cleaning import some_frames
 from evermap.slam.estimate import Solved, solve
+from evermap.slam.intake import find_bodies
 from evermap.slam.mistakes import unusable
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Recording, Sensor, SlamResult
 
@@ -93,9 +94,7 @@ class PlanarVisit:
         names = visit.prepared.landmark_id[row]
         place, probability = placing.places_in(where, names)
         covariance = own.begun(seen, config.whole_places) if begins else of_places(own.covariance_m2, seen)
-        body = np.full(len(names), UNKNOWN, dtype=np.int64)
-        _, here, there = np.intersect1d(names, visit.recording.objects[:, 0], return_indices=True)
-        body[here] = visit.recording.objects[there, 1]
+        body = find_bodies(names, visit.recording.objects)
         return Found(
             names, kind[row], place, probability, own.position_m[seen], covariance, body, first[row], last[row],
             fellow=fellows_of(names, visit.recording.objects, living),

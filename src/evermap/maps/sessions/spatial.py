@@ -27,7 +27,7 @@ from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.sensing import learned
 from evermap.sensing.profile import Assumed, Field, Projection
 from evermap.sensing.visibility import LooksAt
-from evermap.slam.intake import most_of
+from evermap.slam.intake import find_bodies, most_of
 from evermap.slam.space.against_map import by_itself
 from evermap.slam.space.bodies import with_rests
 from evermap.slam.space.bridge import bridge
@@ -39,7 +39,6 @@ from evermap.slam.space.solve import FREE, SpatialSolved, fit_to_map, solve_spac
 from evermap.slam.space.together import SolvedRobot, solve_space_together
 from evermap.slam.space.up import sensor_axes
 from evermap.types import (
-    UNKNOWN,
     BoolArray,
     FloatArray,
     IntArray,
@@ -194,20 +193,12 @@ class SpatialVisit:
             position, covariance = _fused(position, covariance, laid[row], living, where.drift_m)
         kind = most_of(problem.place, self.recording.detections.class_id[self.intake.used], count)
         rotation = self._as_known(row, rotation, laid[row], living)
+        body = find_bodies(self.intake.landmark_id, self.recording.objects)[self.solved.identity[row]]
         return Found(
             names[row], kind[row], laid[row], probability[row], position, covariance,
-            self._bodies(row), first[row], last[row], rotation, alone.rotation[row],
+            body, first[row], last[row], rotation, alone.rotation[row],
             fellows_of(names[row], self.recording.objects, living),
         )  # fmt: skip
-
-    def _bodies(self, row: IntArray) -> IntArray:
-        """Objects (K,) that places (K,) are on, as stated; `UNKNOWN` for none."""
-        found, stated = np.full(len(row), UNKNOWN), self.recording.objects
-        named = self.intake.landmark_id[self.solved.identity[row]]
-        at = np.searchsorted(stated[:, 0], named)
-        on = (at < len(stated)) & (np.append(stated[:, 0], UNKNOWN)[np.minimum(at, len(stated))] == named)
-        found[on] = stated[at[on], 1]
-        return found
 
     def _as_known(self, row: IntArray, rotation: FloatArray, laid: IntArray, living: LivingMap) -> FloatArray:
         """Orientations (K, 4) of places (K,): of those that look the same the nearest to what the map has, where they
@@ -311,12 +302,12 @@ def solve_visit(
     progress: Progress | None = None,
 ) -> SpatialVisit:
     """Return a recording with identities solved, by itself or in a map that is given; arguments as of `run_slam`."""
-    intake = fit_to_map(_taken_in(recording, config, remarks), prior_map, surveyed=True)
+    intake = fit_to_map(_take_in(recording, config, remarks), prior_map, surveyed=True)
     solved = solve_space(intake, prior_map, progress=progress, changes=config.slam.changes)
     return SpatialVisit(recording, intake, solved)
 
 
-def _taken_in(recording: SpatialRecording, config: Config, remarks: tuple[str, ...]) -> SpatialIntake:
+def _take_in(recording: SpatialRecording, config: Config, remarks: tuple[str, ...]) -> SpatialIntake:
     """Return a recording as input of the estimator, with the rests of bodies that move."""
     of_slam = config.slam
     intake = prepare_space(
@@ -353,7 +344,7 @@ def localised_in_space(
     """Return a session solved at its alignment with a map, or with the part of a large one that it can observe. The map
     has the session's classes (`session.admitted`).
     """
-    settings, intake = config.living, _taken_in(recording, config, remarks)
+    settings, intake = config.living, _take_in(recording, config, remarks)
     large, named = len(living.places) > settings.whole_places, cliques_of(living, names_of(intake).ravel())
     part = Vicinity.of(living, named, settings).part if large else living
     p_site = aged(part, settings, intake.start_s).p_here

@@ -104,7 +104,7 @@ def compared(
     problem, shared, begun = optimum.smoother.problem, _measure_shared_errors(optimum), optimum.noise
 
     def judge(found: MapComparison, accuracy: Accuracy) -> MapComparison:
-        found = _judged(problem, found, accuracy.factor * stated, accuracy.alike**2 * shared)
+        found = _judge_places(problem, found, accuracy.factor * stated, accuracy.alike**2 * shared)
         for group in groups:  # other sets of changes are worlds of their own, not this one with half a map
             found.p_stands[group.members] = 0.0
         return replace(found, factor=accuracy.factor)
@@ -140,7 +140,7 @@ def has_contradictions(optimum: SpatialOptimum) -> bool:
     """Tell whether any place of the map seems to be elsewhere."""
     problem = optimum.smoother.problem
     shared = np.zeros((len(problem.prior.place), 6, 6))
-    return bool((_judged(problem, _predict_places(optimum), problem.prior.sigma, shared).p_stands < 0.5).any())
+    return bool((_judge_places(problem, _predict_places(optimum), problem.prior.sigma, shared).p_stands < 0.5).any())
 
 
 def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
@@ -188,7 +188,9 @@ def _predict_places(optimum: SpatialOptimum) -> MapComparison:
     return MapComparison(np.ones(count), off, covariance, 1.0, misread=misread[prior.place])
 
 
-def _judged(problem: SpatialProblem, found: MapComparison, sigma: FloatArray, shared: FloatArray) -> MapComparison:
+def _judge_places(
+    problem: SpatialProblem, found: MapComparison, sigma: FloatArray, shared: FloatArray
+) -> MapComparison:
     """Return predicted places with the probabilities that they stand.
 
     Args:

@@ -15,6 +15,7 @@ import numpy as np
 
 from evermap.config import BodiesConfig, StillConfig
 from evermap.geometry import se3
+from evermap.slam.intake import find_bodies
 from evermap.slam.space.estimate import SpatialOptimum, as_seen, converged, first_places
 from evermap.slam.space.intake import Rests, SpatialIntake, start_noise
 from evermap.slam.space.problem import LEAST_WEIGHT, SpatialEstimate, SpatialProblem
@@ -64,16 +65,14 @@ def with_rests(intake: SpatialIntake, recording: SpatialRecording, settings: Sti
         settings: which tracks stand.
     """
     problem = intake.problem
-    body_of = np.full(len(intake.landmark_id), UNKNOWN)
-    _, row, stated = np.intersect1d(intake.landmark_id, recording.objects[:, 0], return_indices=True)
-    body_of[row] = recording.objects[stated, 1]
+    body_of = find_bodies(intake.landmark_id, recording.objects)
     body = body_of[problem.place]
     if not problem.driven or not (body != UNKNOWN).any():
         return intake
     rest = np.full(len(body), UNKNOWN)
     for _ in range(ROUNDS):
         estimate, uncovered_m = _poses(intake, body, rest)
-        before, rest = rest, _rests(problem, estimate, uncovered_m, body, settings)
+        before, rest = rest, _find_rests(problem, estimate, uncovered_m, body, settings)
         if not uncovered_m.any() or np.array_equal(rest, before):
             break
     return _with_places(intake, estimate, body_of, rest)
@@ -118,7 +117,7 @@ def _by_rest(problem: SpatialProblem, rest: IntArray) -> tuple[SpatialProblem, I
     return replace(problem, place=place, oriented=problem.oriented[of], symmetries=problem.symmetries[of]), of
 
 
-def _rests(
+def _find_rests(
     problem: SpatialProblem, estimate: SpatialEstimate, uncovered_m: FloatArray, body: IntArray, settings: StillConfig
 ) -> IntArray:
     """(M,) rests of bodies that detections are of, numbered over all bodies; `UNKNOWN` while they move."""
@@ -129,7 +128,7 @@ def _rests(
     stamp_s = problem.stamp_s[problem.pose_row]
     for one in np.unique(body[body != UNKNOWN]):
         mine = np.flatnonzero(body == one)
-        moves = _moves(
+        moves = _find_moving(
             stamp_s[mine], at[mine, :2], sigma_m[mine], problem.place[mine], problem.settings.bodies, settings
         )
         part = np.cumsum(np.diff(stamp_s[mine], prepend=-np.inf) > problem.settings.bodies.unseen_s)
@@ -142,7 +141,7 @@ def _rests(
     return found
 
 
-def _moves(
+def _find_moving(
     stamp_s: FloatArray,
     at: FloatArray,
     sigma_m: FloatArray,
@@ -204,7 +203,7 @@ def _with_places(intake: SpatialIntake, estimate: SpatialEstimate, body_of: IntA
     return replace(intake, problem=problem.selected(still), used=intake.used[still], rests=rests)
 
 
-def mistrusted(problem: SpatialProblem, bodies: IntArray) -> SpatialProblem:
+def mistrust_bodies(problem: SpatialProblem, bodies: IntArray) -> SpatialProblem:
     """Return the problem with a map that is not asked where bodies stand, which may have moved since, if it has others.
 
     Where the session agrees with the map all the same, it counts in the end (`against_map.compared`).
@@ -242,7 +241,7 @@ def join_rests(optimum: SpatialOptimum, rests: Rests) -> tuple[SpatialOptimum, I
         before = mine[:0]
         for rows in _in_turn(mine, rests):
             if groups:
-                a, b = _shared(groups[-1], rows, rests.landmark)
+                a, b = _find_shared(groups[-1], rows, rests.landmark)
                 stands = not (rests.away_s[before] < rests.since_s[rows].min()).any()
                 if len(a):
                     stands = not _is_elsewhere(optimum, spread.own, spread.own_first[n + np.append(a, b)], a, b)
@@ -288,7 +287,7 @@ def _in_turn(mine: IntArray, rests: Rests) -> list[IntArray]:
     return [np.array(rows, dtype=np.int64) for rows in found]
 
 
-def _shared(one: IntArray, other: IntArray, landmark: IntArray) -> tuple[IntArray, IntArray]:
+def _find_shared(one: IntArray, other: IntArray, landmark: IntArray) -> tuple[IntArray, IntArray]:
     """Rows of the places of landmarks that are in both."""
     _, a, b = np.intersect1d(landmark[one], landmark[other], return_indices=True)
     return one[a], other[b]
@@ -311,7 +310,7 @@ def _moves_of(groups: list[IntArray], rests: Rests) -> list[BodyMove]:
     found = []
     for k, rows in enumerate(groups):
         later = groups[k + 1] if k + 1 < len(groups) else np.zeros(0, dtype=np.int64)
-        a, b = _shared(rows, later, rests.landmark)
+        a, b = _find_shared(rows, later, rests.landmark)
         alone = rows[~np.isin(rests.landmark[rows], rests.landmark[later])]
         if not len(a) and not np.isfinite(rests.seen_s[rows]).any():
             continue  # it stands there still, as far as anyone saw

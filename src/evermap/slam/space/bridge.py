@@ -134,9 +134,7 @@ class _Chain:
         lasted_s = np.maximum(frames.lasted_s, 1e-9)
         variance = np.repeat([noise.translation**2, noise.rotation**2], 3)
         begin = np.maximum(np.searchsorted(frames.posed, np.arange(1, len(frames.row))) - 1, 0)
-        carried = se3.adjoint(
-            se3.between(driven[frames.posed][begin], driven[1:])
-        )  # of a step's end, at its interval's begin
+        carried = se3.adjoint(se3.between(driven[frames.posed][begin], driven[1:]))  # from a step's end to its begin
         by_step = lasted_s[:, None, None] * (carried * variance) @ np.swapaxes(carried, 1, 2)
         total = np.concatenate([np.zeros((1, 6, 6)), np.cumsum(by_step, axis=0)])
         total = total - total[frames.posed][np.append(0, begin)]
@@ -161,13 +159,9 @@ class _Chain:
         shrunk = np.repeat([1.0 / self.unit, 1.0], 3)
         found = np.zeros((len(self.gain), 6, 13))
         for at, (by, end) in enumerate(zip((self._from - self.gain @ self._whole, self.gain), self._ends, strict=True)):
+            at_origin = -se3.inverse(end)[:, :3]  # seen from the pose, so it moves as all lengths grow
             found[:, :, 6 * at : 6 * at + 6] = by * shrunk
-            found[:, :, 12] -= np.einsum("bij,bj->bi", by[:, :, :3], _seen_origin(end)) / self.unit
+            found[:, :, 12] -= np.einsum("bij,bj->bi", by[:, :, :3], at_origin) / self.unit
         found[:, :3] *= self.unit
-        found[:, :3, 12] += _seen_origin(self.pose)
+        found[:, :3, 12] -= se3.inverse(self.pose)[:, :3]
         return found
-
-
-def _seen_origin(pose: FloatArray) -> FloatArray:
-    """Return (K, 3) positions of poses (K, 7) in their own axes: how they move as all lengths grow."""
-    return np.asarray(np.einsum("kji,kj->ki", se3.rotation_of(pose), pose[:, :3]))

@@ -128,7 +128,7 @@ def prepare_space(
     detections, stamps = recording.detections, recording.frames.stamp_s
     where, usable, moving, warnings = _said(recording, settings, remarks, coarse=coarse)
     seen_in = frames_of_usable(recording, usable, fewest=fewest)
-    frames, used = _frames(recording, seen_in, moving), np.flatnonzero(usable)
+    frames, used = _find_frames(recording, seen_in, moving), np.flatnonzero(usable)
     pose_frame, path_s = frames.pose_frame, stamps[frames.row]
     landmark_id = landmark_ids(recording, used)
     place = np.searchsorted(landmark_id, detections.landmark_id[used])
@@ -144,7 +144,7 @@ def prepare_space(
     problem = SpatialProblem(
         stamp_s=stamps[pose_frame] - stamps[pose_frame[0]],
         increment=se3.between(frames.driven[frames.posed[:-1]], frames.driven[frames.posed[1:]]),
-        lasted_s=_lasted(recording.odometry, stamps[pose_frame]),
+        lasted_s=np.add.reduceat(frames.lasted_s, frames.posed[:-1]),
         swing=Swing.between(frames.posed, frames.lasted_s, frames.driven),
         driven=driven,
         pose_row=np.searchsorted(pose_frame, detections.frame[used]),
@@ -514,7 +514,7 @@ def _has_clock_of_frames(odometry: SpatialOdometry | None, frame_s: FloatArray) 
     return bool(np.mean(off_s < SAME_S) > OF_FRAMES) if len(inside) else True
 
 
-def _frames(recording: SpatialRecording, seen_in: IntArray, moving: BoolArray) -> PathFrames:
+def _find_frames(recording: SpatialRecording, seen_in: IntArray, moving: BoolArray) -> PathFrames:
     """Return the frames of the trajectory: those `seen_in`, or with odometry all during it (F,).
 
     A pose have those with a detection or another measurement, and the ends.
@@ -526,11 +526,11 @@ def _frames(recording: SpatialRecording, seen_in: IntArray, moving: BoolArray) -
         looked = np.union1d(seen_in, recording.detections.frame[moving[recording.detections.frame]])
         posed = np.searchsorted(row, np.union1d(frames_with_pose(recording, looked, moving), row[[0, -1]]))
     at_s = stamp_s[row]
-    lasted_s = _lasted(recording.odometry, at_s)
+    lasted_s = _weigh_steps(recording.odometry, at_s)
     return PathFrames(row, at_s - at_s[0], lasted_s, drive_through(recording, at_s), posed)
 
 
-def _lasted(odometry: SpatialOdometry | None, stamp_s: FloatArray) -> FloatArray:
+def _weigh_steps(odometry: SpatialOdometry | None, stamp_s: FloatArray) -> FloatArray:
     """Return (N - 1,) what the variance of motions between instants (N,) grows with, as of `SpatialProblem`.
 
     In a gap of the odometry, between whose ends it is interpolated, the robot may have gone anywhere: as at a jump.

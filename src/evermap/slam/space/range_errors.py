@@ -36,9 +36,7 @@ def find_range_errors(optimum: SpatialOptimum) -> FloatArray:
     shape, residual = _by_error(optimum), _find_residuals(smoother, now)
     for sensor in np.unique(problem.sensor[problem.has_range]).tolist():
         own = np.where((problem.sensor == sensor)[:, None], shape, 0.0)
-        left = (
-            _find_residuals(smoother, smoother.with_residuals(now, own)) - residual
-        )  # what nothing else can make up for
+        left = _find_residuals(smoother, smoother.with_residuals(now, own)) - residual  # nothing else makes up for it
         information[sensor] = max(float(counts @ (own * left).sum(axis=1)), 0.0)
         pull[sensor] = -float(counts @ (own * residual).sum(axis=1))
     variance = 1.0 / (information + USUAL**-2)

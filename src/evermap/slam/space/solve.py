@@ -24,7 +24,7 @@ from evermap.geometry.symmetry import Symmetries
 from evermap.geometry.upright import is_level
 from evermap.slam.calibration import priced
 from evermap.slam.space.against_map import MapComparison, has_contradictions
-from evermap.slam.space.bodies import BodyMove, has_left, join_rests, mistrusted, number_moved
+from evermap.slam.space.bodies import BodyMove, has_left, join_rests, mistrust_bodies, number_moved
 from evermap.slam.space.delays import Delays, with_delays
 from evermap.slam.space.drift import Drift, drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
@@ -123,7 +123,7 @@ def solve_space(
         NumericalError: no finite optimum.
     """
     problem, stated = _with_map(intake, prior_map)
-    problem, framed = _without_frames(mistrusted(problem, intake.bodies))
+    problem, framed = _without_frames(mistrust_bodies(problem, intake.bodies))
     settings = problem.settings
     noise = start_noise(settings, driven=problem.driven)
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))

@@ -114,7 +114,7 @@ class Parking(NamedTuple):
         """Return the slots that are taken."""
         return {one.slot for one in self.spells if one.from_s <= stamp_s < one.until_s}
 
-    def passed(self, part: tuple[float, float] = (0.0, 1.0)) -> set[int]:
+    def find_passed(self, part: tuple[float, float] = (0.0, 1.0)) -> set[int]:
         """Return the slots that a drive along a part of the path passes."""
         n = len(self.path)
         beside = self.beside

@@ -140,7 +140,7 @@ def simulate_yard(config: YardConfig | None = None, seed: int = 0) -> list[YardD
                 *(se3.compose(upright(way)[None], one.tag[:, None]) for one, way in zip(forklifts, body, strict=True)),
             ]
         )
-        recording = _recorded(tag, body_of_tag, body, config, start_s, np.random.default_rng([seed, 2, k]))
+        recording = _record(tag, body_of_tag, body, config, start_s, np.random.default_rng([seed, 2, k]))
         drives.append(YardDrive(recording, body, moves, tag, body_of_tag))
     return drives
 
@@ -243,7 +243,7 @@ def _robot(config: YardConfig) -> FloatArray:
     return found
 
 
-def _recorded(
+def _record(
     tag: FloatArray,
     body_of_tag: IntArray,
     body: FloatArray,
