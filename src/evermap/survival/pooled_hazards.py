@@ -160,9 +160,9 @@ class _Likelihood:
         for part in (0, 1):
             each = (self.share[:, part] / self.pairs)[:, None, None]
             come = (stays.back_rate * self.watched_s)[:, None, None] * each
-            score += self.pairs[:, None, None] * _there_again(stayed * each, stays.back[:, None, None], come)[0]
-        come = (stays.back_rate * self.left_s)[:, None, None]
-        score[self.ended] += _log_gone(left, stays.back[:, None, None], come)[0][self.ended]
+            score += self.pairs[:, None, None] * _log_there_again(stayed * each, stays.back[:, None, None], come)
+        come = (stays.back_rate * self.left_s)[self.ended, None, None]
+        score[self.ended] += _log_gone(left[self.ended], stays.back[self.ended, None, None], come)
         seen, there = (log_sum_exp(np.moveaxis(part, 1, -1)) for part in (score, -until))
         return np.asarray(stays.weight @ (seen - there))
 
@@ -180,7 +180,7 @@ class _Likelihood:
             score = score + self.pairs[:, None] * value
             first += self.pairs[:, None] * each * d1
             second += self.pairs[:, None] * each**2 * d2
-        value, of_end, of_end_2 = _log_gone(left, stays.back[:, None], (stays.back_rate * self.left_s)[:, None])
+        value, of_end, of_end_2 = _gone(left, stays.back[:, None], (stays.back_rate * self.left_s)[:, None])
         score = score + np.where(ended[:, None], value, 0.0)
         of_end, of_end_2 = (np.where(ended[:, None], d, 0.0) for d in (of_end, of_end_2))
         seen, there = log_sum_exp(score), log_sum_exp(-until)
@@ -205,12 +205,24 @@ def _outer(columns: FloatArray, weight: FloatArray) -> FloatArray:
     return np.asarray((flat * weight.reshape(-1, 1)).T @ flat)
 
 
-def _there_again(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the log probability to be there at the next look, and its derivatives by the integrated hazard of leaving.
+def _log_there_again(leave: FloatArray, back: FloatArray, come: FloatArray) -> FloatArray:
+    """Return the log probability to be there at the next look, by the integrated hazard of leaving.
 
     `log (c + l exp(-c - l)) / (c + l)` with `c = back l + come` (`maps.learning`); `-l` where nothing comes back.
     """
+    leave = np.maximum(leave, _TINY)
+    coming = back * leave + come
+    both = coming + leave
+    with np.errstate(all="ignore"):
+        value = np.log((coming + leave * np.exp(-both)) / both)
+    value = np.where(both < 1e-4, -leave + 0.5 * leave * (both - leave), value)
+    return np.where((back == 0.0) & (come == 0.0), -leave, value)
+
+
+def _there_again(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return `_log_there_again`, and its derivatives by the integrated hazard."""
     plain = (back == 0.0) & (come == 0.0)
+    value = _log_there_again(leave, back, come)
     leave = np.maximum(leave, _TINY)
     coming = back * leave + come
     both = coming + leave
@@ -220,21 +232,27 @@ def _there_again(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple
         top = coming + leave * gone
         rise = back + gone * (1.0 - (1.0 + back) * leave)
         bend = -gone * (1.0 + back) * (2.0 - (1.0 + back) * leave)
-        value = np.log(top / both)
         d1 = rise / top - (1.0 + back) / both
         d2 = bend / top - (rise / top) ** 2 + ((1.0 + back) / both) ** 2
-    value = np.where(small, -leave + 0.5 * leave * (both - leave), value)
     d1 = np.where(small, -1.0 - leave + 0.5 * (both + leave * (1.0 + back)), d1)
     d2 = np.where(small, back, d2)
-    return np.where(plain, -leave, value), np.where(plain, -1.0, d1), np.where(plain, 0.0, d2)
+    return value, np.where(plain, -1.0, d1), np.where(plain, 0.0, d2)
 
 
-def _log_gone(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the log probability to be gone at the next look, and its derivatives by the integrated hazard."""
+def _log_gone(leave: FloatArray, back: FloatArray, come: FloatArray) -> FloatArray:
+    """Return the log probability to be gone at the next look, by the integrated hazard of leaving."""
     leave = np.maximum(leave, _TINY)
     change = (1.0 + back) * leave + come
     with np.errstate(all="ignore"):
-        value = np.log(leave / change) + np.log(-np.expm1(-change))
+        return np.log(leave / change) + np.log(-np.expm1(-change))
+
+
+def _gone(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return `_log_gone`, and its derivatives by the integrated hazard."""
+    value = _log_gone(leave, back, come)
+    leave = np.maximum(leave, _TINY)
+    change = (1.0 + back) * leave + come
+    with np.errstate(all="ignore"):
         odds = 1.0 / np.expm1(np.minimum(change, 700.0))
         d1 = 1.0 / leave - (1.0 + back) / change + (1.0 + back) * odds
         d2 = -1.0 / leave**2 + ((1.0 + back) / change) ** 2 - (1.0 + back) ** 2 * odds * (1.0 + odds)
