@@ -18,7 +18,7 @@ import numpy as np
 
 from evermap.cli.warmup import warm_up
 from evermap.geometry import se3
-from evermap.runs.audit import audit_map
+from evermap.runs.audit.run import audit_map
 from evermap.types import AnyRecording, Landmarks, is_in_space, rows_of
 from evermap_studies.causes.drives import Make, Reading, as_recording, simulate
 

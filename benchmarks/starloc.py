@@ -39,7 +39,7 @@ from evermap.geometry import se3
 from evermap.io import read_recording
 from evermap.io.rig_toml import CAMERA_FILE
 from evermap.metrics.trajectory import align_poses
-from evermap.runs.audit import audit_map
+from evermap.runs.audit.run import audit_map
 from evermap.types import FloatArray, IntArray, Landmarks, SpatialRecording
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "starloc"

@@ -19,9 +19,12 @@ from evermap.errors import DataError
 from evermap.io import read_recording
 from evermap.io.map_formats import MAP_FORMATS, SurveyFile, correct_map, read_landmarks, read_map_file, write_map
 from evermap.pipeline import run_slam
-from evermap.runs import audit as audit_module
-from evermap.runs.audit import Audit, AuditEntry, EntryState, audit_map, in_order, join_drives
-from evermap.runs.audit_report import audit_dict, conclude, entry_row, listed_rows, quiet_lines, write_audit
+from evermap.runs.audit import run as audit_module
+from evermap.runs.audit.drives import in_order
+from evermap.runs.audit.entries import join_drives
+from evermap.runs.audit.report import audit_dict, conclude, entry_row, listed_rows, quiet_lines, write_audit
+from evermap.runs.audit.result import Audit, AuditEntry, EntryState
+from evermap.runs.audit.run import audit_map
 from evermap.runs.summary import RunInfo
 from evermap.types import (
     Cause,

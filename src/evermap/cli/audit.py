@@ -69,8 +69,7 @@ def audit(
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.io import read_recording
     from evermap.io.map_formats import correct_map, read_map_file, write_map_bytes
-    from evermap.runs.audit import audit_map
-    from evermap.runs.audit_report import (
+    from evermap.runs.audit.report import (
         HEAD,
         conclude,
         drive_line,
@@ -79,6 +78,7 @@ def audit(
         sensor_lines,
         write_audit,
     )
+    from evermap.runs.audit.run import audit_map
     from evermap.runs.folder import check_output_file, check_replaceable
     from evermap.runs.summary import RunInfo
     from evermap.types import is_in_space

@@ -12,17 +12,8 @@ import numpy as np
 
 from evermap.io.map_formats import SurveyFile, correct_map, write_map_bytes
 from evermap.io.spatial import AT, QUATERNION
-from evermap.runs.audit import (
-    DECIDED,
-    FEWEST,
-    ORDER,
-    Audit,
-    AuditDrive,
-    AuditEntry,
-    EntryState,
-    count_states,
-    format_percent,
-)
+from evermap.runs.audit.entries import DECIDED, FEWEST
+from evermap.runs.audit.result import ORDER, Audit, AuditDrive, AuditEntry, EntryState, count_states, format_percent
 from evermap.runs.folder import RunFolder
 from evermap.runs.summary import RunInfo, summary_head
 from evermap.types import Clock, json_number, stamp_text
