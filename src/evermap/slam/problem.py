@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -12,10 +12,10 @@ from scipy.sparse.csgraph import connected_components
 
 from evermap.config import OdometryConfig
 from evermap.errors import DataError
-from evermap.estimate.measurement import Tied
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, Slices, exhausted
 from evermap.geometry import se2, se3
+from evermap.slam.base_problem import BaseProblem
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import N_STATES, kernel
 from evermap.slam.preintegration import Intervals, Preintegration
@@ -161,14 +161,13 @@ class ConditionalPrior:
         return np.asarray(self.mean + self.gain @ (landmark[self.given] - landmark_mean[self.given]).ravel())
 
 
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """All measurements and priors.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem(BaseProblem):
+    """All measurements and priors in the plane; stamps are on the clock of `drive`.
 
     Attributes:
-        stamp_s: (N,) instants of the poses, on the clock of `drive`.
         drive: the odometry.
-        pose_row, landmark_row: (M,) which pose saw which landmark; sorted by pose.
+        landmark_row: (M,) which landmark each detection is of.
         reading: (M, 2) range [m] and bearing [rad] as reported.
         sigma_given: (M, 2) standard deviations that came with a detection, nan where none did.
         mount: (3,) pose of the sensor on the robot.
@@ -179,13 +178,12 @@ class Problem:
         landmark_information: (2 L, 2 L) sparse inverse of their joint prior covariance, empty where there is none.
             Blocks off the diagonal tie landmarks to each other, for example those that may have moved together. A dense
             array is taken, too.
-        measurements: of other kinds than odometry and detections; what they say about height and tilt has no effect.
         share: (M,) of the information of each detection that is new; None where all of it is.
     """
 
-    stamp_s: FloatArray
+    COLUMNS = ("pose_row", "landmark_row", "reading", "sigma_given", "share")
+
     drive: Drive
-    pose_row: IntArray
     landmark_row: IntArray
     reading: FloatArray
     sigma_given: FloatArray
@@ -195,16 +193,15 @@ class Problem:
     start_information: float
     landmark_mean: FloatArray
     landmark_information: sparse.csr_array
-    measurements: tuple[Tied, ...] = ()
     share: FloatArray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "landmark_information", sparse.csr_array(self.landmark_information))
 
-    def detections_of(self, pose: int) -> IntArray:
-        """Return the rows of the detections of a pose."""
-        first, last = self.pose_row.searchsorted((pose, pose + 1)).tolist()
-        return np.arange(first, last)
+    @property
+    def seen_place(self) -> IntArray:
+        """(M,) which landmark each detection is of."""
+        return self.landmark_row
 
     @property
     def mapped(self) -> BoolArray:
@@ -274,13 +271,6 @@ class Problem:
         stop = int(np.searchsorted(self.pose_row, n_poses - last_is_blind))
         measurements = tuple(tied.until(n_poses) for tied in self.measurements)
         return replace(self.seeing(slice(stop)), stamp_s=self.stamp_s[:n_poses], measurements=measurements)
-
-    def seeing(self, rows: IntArray | BoolArray | slice) -> Problem:
-        """Return the problem with some of its detections only."""
-        names = ("pose_row", "landmark_row", "reading", "sigma_given")
-        some: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
-        some["share"] = None if self.share is None else self.share[rows]
-        return replace(self, **some)
 
 
 def independent(blocks: FloatArray) -> sparse.csr_array:

@@ -17,7 +17,7 @@ from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
 from evermap.estimate.sparse.tree import tree_of
 from evermap.slam.calibration import BEARING, DELAY
-from evermap.slam.correlation import LEAST_WEIGHT, Lasting, lasting_errors
+from evermap.slam.correlation import LEAST_WEIGHT, Lasting, Pull, sum_by_stretches, variance_of_clusters
 from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES
 from evermap.slam.linearise import (
     OF_DETECTION,
@@ -128,11 +128,10 @@ class Smoother(Solver[Estimate]):
     def worth(self, estimate: Estimate, marginals: Marginals) -> FloatArray:
         """Return (11,) variances of the states with correlated residuals, relative to those of independent ones.
 
-        What each stretch of the recording adds to the states is summed before it is squared, which makes no assumption
-        on how errors hang together within it: White's covariance (1980), with stretches as clusters (Liang and Zeger
-        1986), and once more with landmarks as clusters. Errors that are known to be `lasting` for longer are correlated
-        by landmark. The largest variance holds; 1 for states that are not free, and at least. Errors that come again
-        with a distance or a direction add to it (`misfit`).
+        What each stretch of the recording adds to the states is summed before it is squared (`correlation`), and once
+        more with landmarks as clusters. Errors that are known to be `lasting` for longer are correlated by landmark.
+        The largest variance holds; 1 for states that are not free, and at least. Errors that come again with a distance
+        or a direction add to it (`misfit`).
         """
         problem, n = self.problem, len(estimate.pose)
         if not problem.prior.free.any():
@@ -152,19 +151,15 @@ class Smoother(Solver[Estimate]):
             + np.einsum("nra,nas->nrs", seen[..., 3:5], place[rank[problem.landmark_row]])
             + seen[..., 5:-1] @ states[:N_SENSOR]
         )
-        stamp = problem.stamp_s - problem.stamp_s[0]
-        stretch = np.minimum((stamp / max(stamp[-1], 1e-9) * STRETCHES).astype(np.int64), STRETCHES - 1)
-        by_driven, by_seen = (
-            np.einsum("nrs,nr->ns", of, rows[..., -1]) for of, rows in ((of_driven, driven), (of_seen, seen))
-        )
-        by_stretch, by_place = np.zeros((STRETCHES, N_STATES)), np.zeros((len(estimate.known), N_STATES))
-        np.add.at(by_stretch, stretch[:-1], by_driven)
-        np.add.at(by_stretch, stretch[problem.pose_row], by_seen)
-        np.add.at(by_place, problem.landmark_row, by_seen)
-        alone = (of_driven**2).sum(axis=(0, 1))
-        independent = alone + (of_seen**2).sum(axis=(0, 1))
-        alike = self.lasting(estimate).variance_beside(of_seen, stamp[problem.pose_row], problem.landmark_row)
-        found = np.maximum.reduce([of_clusters(by_stretch), independent + alike, alone + of_clusters(by_place)])
+        odometry = Pull.of(np.arange(n - 1), of_driven, driven[..., -1])
+        detections = Pull.of(problem.pose_row, of_seen, seen[..., -1])
+        by_stretch = sum_by_stretches((odometry, detections), problem.stretches(STRETCHES), STRETCHES)
+        by_place = np.zeros((len(estimate.known), N_STATES))
+        np.add.at(by_place, problem.landmark_row, detections.by)
+        independent = odometry.variance + detections.variance
+        alike = self.lasting(estimate).variance_beside(of_seen, problem.seen_s, problem.landmark_row)
+        by_places = odometry.variance + variance_of_clusters(by_place)
+        found = np.maximum.reduce([variance_of_clusters(by_stretch), independent + alike, by_places])
         free = problem.prior.free & (independent > 0.0)
         independent = np.where(free, independent, 1.0)
         worth = np.where(free, np.maximum(found / independent, 1.0), 1.0)
@@ -221,8 +216,7 @@ class Smoother(Solver[Estimate]):
             return self._lasting[1]
         problem, sigma = self.problem, self.noise.of_detections(self.problem.sigma_given)
         residual = detection_residuals(problem, estimate) / np.where(sigma < ANY_BEARING_RAD, sigma, np.nan)
-        stamp_s = problem.stamp_s[problem.pose_row]
-        found = lasting_errors(residual, self.inlier_probability(estimate), stamp_s, problem.landmark_row)
+        found = problem.lasting(residual, self.inlier_probability(estimate))
         self._lasting = estimate, found
         return found
 
@@ -231,8 +225,8 @@ class Smoother(Solver[Estimate]):
         lasting, problem = self.lasting(estimate), self.problem
         if not lasting.any:
             return marginals
-        share = lasting.information(problem.stamp_s[problem.pose_row], problem.landmark_row)
-        return self.under(self.noise, heavy=self.heavy, problem=replace(problem, share=share)).marginals(estimate)
+        counted = replace(problem, share=problem.new_information(lasting))
+        return self.under(self.noise, heavy=self.heavy, problem=counted).marginals(estimate)
 
     def detections(self, estimate: Estimate) -> FloatArray:
         """Return (M, 2, 13) detections, linearised and whitened: by pose, place, sensor states; and the right side."""
@@ -319,12 +313,6 @@ class Smoother(Solver[Estimate]):
         leaf = grouped(n, POSES_A_LEAF)
         dim = np.concatenate([np.full(n, 3), np.full(count, 2), [N_SENSOR, N_MOTION]])
         return Layout(dim, n + count + np.arange(2), leaf, np.column_stack([leaf, state.pose[:, :2]]))
-
-
-def of_clusters(pull: FloatArray) -> FloatArray:
-    """Return (S,) variances of estimates by what each of some clusters pulls them (K, S)."""
-    count = max(float(np.count_nonzero(pull.any(axis=1))), 2.0)
-    return np.asarray((pull**2).sum(axis=0) * count / (count - 1.0))
 
 
 def retract(state: Estimate, step: FloatArray) -> tuple[Estimate, float]:

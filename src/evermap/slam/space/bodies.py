@@ -86,11 +86,11 @@ def _poses(intake: SpatialIntake, body: IntArray, rest: IntArray) -> tuple[Spati
     known = (body == UNKNOWN) | (rest != UNKNOWN)
     estimate = first_places(split, intake.driven_pose)
     if known.any():
-        some = split.selected(known).as_points()
+        some = split.seeing(known).as_points()
         optimum = converged(some, first_places(some, intake.driven_pose), noise)
         estimate, noise = optimum.estimate, optimum.noise
     seen_s = problem.stamp_s[np.unique(problem.pose_row[known])]
-    at_s = problem.stamp_s[problem.pose_row]
+    at_s = problem.seen_s
     near = np.searchsorted(seen_s, at_s + NEAR_S, side="right") > np.searchsorted(seen_s, at_s - NEAR_S)
     range_m = np.linalg.norm(problem.measured[:, :3], axis=1)
     return estimate, np.where(near, 0.0, np.hypot(noise.translation, noise.rotation * range_m))
@@ -125,7 +125,7 @@ def _find_rests(
     at = as_seen(problem, estimate, problem.measured)[:, :3]
     sigma_m = np.sqrt((np.linalg.inv(problem.measured_root) ** 2).sum(axis=(1, 2)) / 3.0)
     sigma_m = np.sqrt(sigma_m**2 + STILL_M**2 + uncovered_m**2 * settings.window_s)
-    stamp_s = problem.stamp_s[problem.pose_row]
+    stamp_s = problem.seen_s
     for one in np.unique(body[body != UNKNOWN]):
         mine = np.flatnonzero(body == one)
         moves = _find_moving(
@@ -180,7 +180,7 @@ def _with_places(intake: SpatialIntake, estimate: SpatialEstimate, body_of: IntA
     intake = replace(intake, bodies=body_of)
     if still.all() and len(landmark) == len(intake.landmark_id):
         return intake
-    stamp_s, at = whole.stamp_s[whole.pose_row], as_seen(whole, estimate, whole.measured)
+    stamp_s, at = whole.seen_s, as_seen(whole, estimate, whole.measured)
     since_s, until_s = np.full(len(landmark), np.inf), np.full(len(landmark), -np.inf)
     np.minimum.at(since_s, problem.place[still], stamp_s[still])
     np.maximum.at(until_s, problem.place[still], stamp_s[still])
@@ -200,7 +200,7 @@ def _with_places(intake: SpatialIntake, estimate: SpatialEstimate, body_of: IntA
             if not problem.oriented[row]:
                 seen[row] = np.append(at[last, :3] - here[:3], se3.NO_TURN)
     rests = Rests(landmark, body, since_s, until_s, away_s, seen_s, seen)
-    return replace(intake, problem=problem.selected(still), used=intake.used[still], rests=rests)
+    return replace(intake, problem=problem.seeing(still), used=intake.used[still], rests=rests)
 
 
 def mistrust_bodies(problem: SpatialProblem, bodies: IntArray) -> SpatialProblem:

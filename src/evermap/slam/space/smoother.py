@@ -19,7 +19,7 @@ from evermap.estimate.measurement import MeasurementFactors, Tied
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.geometry import se3
-from evermap.slam.correlation import Lasting, lasting_errors
+from evermap.slam.correlation import Lasting, Pull, sum_by_stretches, variance_of_clusters
 from evermap.slam.space.drift import STRETCHES
 from evermap.slam.space.factors import MapFactors, SightingFactors, SpatialOdometryFactors, SpatialStartFactor
 from evermap.slam.space.linearise import MOUNT, OF_SIGHTING, OF_STEP, POINT, ROWS, STATES
@@ -236,7 +236,7 @@ class SpatialSmoother:
         """Return how long errors of detections last, by their residuals there."""
         problem = self.problem
         residual = np.where(np.arange(8) < ROWS[problem.kind][:, None], now.residual, np.nan)
-        return lasting_errors(residual, now.weight, problem.stamp_s[problem.pose_row], problem.place)
+        return problem.lasting(residual, now.weight)
 
     def counted(
         self, estimate: SpatialEstimate, now: SpatialLinear, share: FloatArray | None = None
@@ -251,30 +251,27 @@ class SpatialSmoother:
         problem = self.problem
         share = None if share is None or np.all(share == 1.0) else share
         if share is None and np.all(problem.share == 1.0) and (lasting := self.lasting(now)).any:
-            share = lasting.information(problem.stamp_s[problem.pose_row], problem.place)
+            share = problem.new_information(lasting)
         return self if share is None else SpatialSmoother(replace(problem, share=share), estimate.pose)
 
     def worth_by_stretches(self, now: SpatialLinear, state: int) -> tuple[float, float]:
         """Return the variance of one of the border's numbers, and what one with correlated residuals has over it, at
         least 1.
 
-        As of the states in the plane (`slam.smoother.Smoother.worth`): what each stretch of the drive adds is summed
-        before it is squared.
+        As of states in the plane (`slam.smoother.Smoother.worth`): by stretches of the drive, and by errors that last.
         """
         problem = self.problem
         with_it = self.spread(now).with_border[:, state]
-        share = problem.stamp_s / max(problem.stamp_s[-1], 1e-9)
-        stretch = np.minimum((STRETCHES * share).astype(np.int64), STRETCHES - 1)
-        pull, independent, influence = np.zeros(STRETCHES), 0.0, np.zeros((len(self._seen.kind), 8, 1))
+        pulls, influence = list[Pull](), np.zeros((len(self._seen.kind), 8, 1))
         for pose_row, rows, _, told, some in self._told(now.values, with_it):
-            pull += np.bincount(stretch[pose_row], (told * rows[..., -1]).sum(axis=1), STRETCHES)
-            independent += float((told**2).sum())
+            pulls.append(Pull.of(pose_row, told[..., None], rows[..., -1]))
             influence[some, : told.shape[1], 0] = told[: len(some)]
-        found = (pull**2).sum() * STRETCHES / (STRETCHES - 1.0)
-        alike = self.lasting(now).variance_beside(influence, problem.stamp_s[problem.pose_row], problem.place)
-        found = max(found, independent + float(alike[0]))
+        by_stretch = sum_by_stretches(pulls, problem.stretches(STRETCHES), STRETCHES)
+        independent = sum(float(pull.variance[0]) for pull in pulls)
+        alike = self.lasting(now).variance_beside(influence, problem.seen_s, problem.place)
+        found = max(float(variance_of_clusters(by_stretch, STRETCHES)[0]), independent + float(alike[0]))
         own = with_it[len(with_it) - len(self.states_information) :]
-        return float(own[state]), max(float(found / max(independent, 1e-300)), 1.0)
+        return float(own[state]), max(found / max(independent, 1e-300), 1.0)
 
     def after(self, now: SpatialLinear, step: FloatArray) -> SpatialLinear:
         """Return the problem with the residuals of odometry and detections as they are after a step, by what is linear
