@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
-from evermap.estimate.noise import restricted_level
+from evermap.estimate.noise import Turns, alternate, restricted_level
 from evermap.geometry import se3
 from evermap.slam.space.linearise import (
     ACROSS,
@@ -35,6 +36,10 @@ CONVERGED = 0.02
 """Relative change of all noise levels that ends it."""
 MOST_CANDIDATES = 60
 """Detections whose orientations are asked."""
+
+
+_Solution: TypeAlias = tuple[SpatialEstimate, SpatialLinear]
+"""Values near the optimum of some noise levels, and the linearised problem there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,20 +73,21 @@ def converged(
         noise: levels to start from, which count as a weak prior.
         heavy_rounds: rounds with tails that never let go, before it is decided what is an outlier.
     """
-    estimate, begun = start, noise
     smoother = SpatialSmoother(problem, start.pose)
-    for round_ in range(ROUNDS):
-        heavy = round_ < heavy_rounds
+
+    def optimise(before: _Solution | None, levels: SpatialNoise, heavy: bool) -> _Solution:
         # values and levels settle together: after a short step there is no need for the optimum of these levels
-        steps, near = (FIRST_STEPS, NEAR) if round_ == 0 else (STEPS_A_ROUND, NEAR_ROUND)
-        estimate, now = smoother.optimum(estimate, noise, heavy=heavy, iterations=steps, tolerance=near)
-        following = refined(smoother, now, noise, begun)
-        settled = np.abs(np.log(following.levels / noise.levels)).max() < CONVERGED
-        noise = following
-        if settled and not heavy:
-            break
-    estimate, now = smoother.optimum(estimate, noise, heavy=False, iterations=LAST_STEPS)
-    return SpatialOptimum(estimate, noise, smoother, now)
+        steps, near = (FIRST_STEPS, NEAR) if before is None else (STEPS_A_ROUND, NEAR_ROUND)
+        values = start if before is None else before[0]
+        return smoother.optimum(values, levels, heavy=heavy, iterations=steps, tolerance=near)
+
+    def learn(found: _Solution, levels: SpatialNoise) -> tuple[SpatialNoise, float]:
+        following = refined(smoother, found[1], levels, noise)
+        return following, float(np.abs(np.log(following.levels / levels.levels)).max())
+
+    found, learned = alternate(noise, optimise, learn, lambda _, fit, __: fit, Turns(ROUNDS, heavy_rounds, CONVERGED))
+    estimate, now = smoother.optimum(found[0], learned, heavy=False, iterations=LAST_STEPS)
+    return SpatialOptimum(estimate, learned, smoother, now)
 
 
 def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, begun: SpatialNoise) -> SpatialNoise:
