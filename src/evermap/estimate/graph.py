@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from evermap.estimate.sparse.elimination import curvature
 from evermap.estimate.sparse.system import Factorised, Slices, System
@@ -81,6 +82,23 @@ class Layout:
     leaf_of_pose: IntArray
     coordinate: FloatArray
 
+    @classmethod
+    def of(cls, position: FloatArray, dim: int, places: ArrayLike, border: ArrayLike, a_leaf: int) -> Layout:
+        """Return that of one problem: poses, places, then the border.
+
+        Args:
+            position: (N, c) rough positions of the poses.
+            dim: numbers of a pose.
+            places: (P,) numbers of each place.
+            border: (B,) numbers of each variable of the border.
+            a_leaf: consecutive poses that are eliminated together.
+        """
+        n, of_places, of_border = len(position), np.asarray(places), np.asarray(border)
+        leaf = grouped(n, a_leaf)
+        every = np.concatenate([np.full(n, dim), of_places, of_border]).astype(np.int64)
+        first = n + len(of_places)
+        return cls(every, first + np.arange(len(of_border)), leaf, np.column_stack([leaf, position]))
+
 
 @dataclass(frozen=True, slots=True)
 class GraphStructure:
@@ -102,6 +120,13 @@ class GraphStructure:
         """Return where the values of a block are among those of all."""
         begin = self.system.tree.value_first[[self.first[block], self.first[block + 1]]]
         return slice(int(begin[0]), int(begin[1]))
+
+    def hold_places(self, information: float) -> FloatArray:
+        """Return (numbers,) so much information on all that is neither a pose nor of the border, which comes last."""
+        begin, layout = self.system.tree.begin, self.layout
+        held = np.zeros(begin[-1])
+        held[begin[len(layout.leaf_of_pose)] : begin[len(layout.dim) - len(layout.border)]] = information
+        return held
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,12 +10,13 @@ from dataclasses import replace
 import numpy as np
 
 from evermap.estimate.gauss_newton import Steps
-from evermap.estimate.graph import Border, FactorBlock, Graph, GraphStructure, Layout, build_structure, grouped
-from evermap.estimate.measurement import MeasurementFactors, Tied
+from evermap.estimate.graph import Border, FactorBlock, Graph, GraphStructure, Layout, build_structure
+from evermap.estimate.measurement import MeasurementFactors
 from evermap.estimate.robust import HEAVY_TAIL
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
 from evermap.estimate.sparse.tree import tree_of
+from evermap.estimate.start import StartFactor
 from evermap.slam.calibration import BEARING, DELAY
 from evermap.slam.correlation import LEAST_WEIGHT, Lasting, Pull, sum_by_stretches, variance_of_clusters
 from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES
@@ -26,9 +27,9 @@ from evermap.slam.linearise import (
     OdometryFactors,
     PlacePriors,
     Readings,
-    StartFactor,
     build_place_priors,
     detection_residuals,
+    deviate,
 )
 from evermap.slam.misfit import build_curves, variance_by_curves
 from evermap.slam.problem import Estimate, Marginals, Noise, PlanarView, Problem
@@ -258,12 +259,13 @@ class Smoother(Solver[Estimate]):
         """Return the problem as a graph: poses, landmarks that have a position, sensor and motion states."""
         blocks = self.blocks(state.known)
         if self._structure is None or not np.array_equal(self._structure[0], state.known):
-            structure = yield from build_structure(self._layout(state), blocks)
+            places = np.full(int(state.known.sum()), 2)
+            layout = Layout.of(state.pose[:, :2], 3, places, [N_SENSOR, N_MOTION], POSES_A_LEAF)
+            structure = yield from build_structure(layout, blocks)
             self._structure = state.known, structure
         structure = self._structure[1]
-        held = np.zeros(structure.system.tree.begin[-1])
-        held[3 * len(state.pose) : -N_STATES] = HELD
-        return Graph(blocks, structure, Border(1.0 / self.states_sigma**2, self.off_mean), held, retract)
+        border = Border(1.0 / self.states_sigma**2, self.off_mean)
+        return Graph(blocks, structure, border, structure.hold_places(HELD), retract)
 
     def blocks(self, known: BoolArray) -> tuple[FactorBlock[Estimate], ...]:
         """Return the factors: `ODOMETRY`, `DETECTIONS`, the start, and priors of the `known` (L,) landmarks."""
@@ -276,6 +278,8 @@ class Smoother(Solver[Estimate]):
         if self._priors is None or not np.array_equal(self._priors[0], known):
             self._priors = known, build_place_priors(problem, known, n)
         rank, sensor = np.cumsum(known) - 1, n + int(known.sum())
+        log_odds, heavy = noise.outlier_log_odds if self.robust else np.inf, self.heavy and self.robust
+        place_variable = np.where(known, n + rank, -1)
         seen = Readings(
             problem.pose_row,
             rank[problem.landmark_row],
@@ -284,35 +288,23 @@ class Smoother(Solver[Estimate]):
             np.ones(len(problem.pose_row)) if problem.share is None else problem.share,
             problem.mount,
             problem.prior.free,
-            noise.outlier_log_odds if self.robust else np.inf,
-            HEAVY_TAIL if self.heavy and self.robust else 0.0,
+            log_odds,
+            HEAVY_TAIL if heavy else 0.0,
         )
         return (
             OdometryFactors(problem, noise.odometry**2, sensor + 1),
             DetectionFactors(seen, known, n, sensor),
-            StartFactor(problem.start_pose, problem.start_information),
+            StartFactor(problem.start_pose, np.full(3, np.sqrt(problem.start_information)), deviate),
             *self._priors[1],
-            *(self._measured(tied, known, n + rank) for tied in problem.measurements),
+            *(
+                MeasurementFactors.of(tied, PlanarView(), place_variable, log_odds, heavy=heavy)
+                for tied in problem.measurements
+            ),
         )
-
-    def _measured(self, tied: Tied, known: BoolArray, variable: IntArray) -> MeasurementFactors[Estimate]:
-        """Return measurements of known landmarks, and all others; of landmarks (L,) the variables."""
-        other = tied.others
-        if tied.kind.ties == "pose_place":
-            tied = tied[known[tied.other]]
-            other = variable[tied.others]
-        log_odds = self.noise.outlier_log_odds if self.robust else np.inf
-        return MeasurementFactors(tied, PlanarView(), other, log_odds, self.heavy and self.robust)
 
     def off_mean(self, state: Estimate) -> FloatArray:
         """Return (11,) calibration states less the means of their prior."""
         return state.states - self.problem.prior.mean
-
-    def _layout(self, state: Estimate) -> Layout:
-        n, count = len(state.pose), int(state.known.sum())
-        leaf = grouped(n, POSES_A_LEAF)
-        dim = np.concatenate([np.full(n, 3), np.full(count, 2), [N_SENSOR, N_MOTION]])
-        return Layout(dim, n + count + np.arange(2), leaf, np.column_stack([leaf, state.pose[:, :2]]))
 
 
 def retract(state: Estimate, step: FloatArray) -> tuple[Estimate, float]:

@@ -13,15 +13,16 @@ from functools import cached_property
 import numpy as np
 
 from evermap.estimate.gauss_newton import Steps, minimised
-from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, build_structure, grouped
+from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, build_structure
 from evermap.estimate.innovations import find_left_out_nis
-from evermap.estimate.measurement import MeasurementFactors, Tied
+from evermap.estimate.measurement import MeasurementFactors
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
+from evermap.estimate.start import StartFactor
 from evermap.geometry import se3
 from evermap.slam.correlation import Lasting, Pull, sum_by_stretches, variance_of_clusters
 from evermap.slam.space.drift import STRETCHES
-from evermap.slam.space.factors import MapFactors, SightingFactors, SpatialOdometryFactors, SpatialStartFactor
+from evermap.slam.space.factors import MapFactors, SightingFactors, SpatialOdometryFactors, deviate
 from evermap.slam.space.linearise import MOUNT, OF_SIGHTING, OF_STEP, POINT, ROWS, STATES
 from evermap.slam.space.problem import NO_JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem, SpatialView
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -99,19 +100,11 @@ class SpatialSmoother:
         self._mean[delay] = -problem.delay_jitter * problem.whole_s / information[delay]
         self._border = Border(information, self._off_mean)
         self._start = np.array(around[0])
-        n, count = len(problem.stamp_s), len(problem.oriented)
-        dim = np.concatenate(
-            [np.full(n, 6), np.where(problem.oriented, 6, 3), np.full(len(problem.mount), STATES), [1]]
-        )
-        leaf = grouped(n, POSES_A_LEAF)
-        layout = Layout(
-            dim, n + count + np.arange(len(problem.mount) + 1), leaf, np.column_stack([leaf, around[:, :3]])
-        )
+        places, border = np.where(problem.oriented, 6, 3), [STATES] * len(problem.mount) + [1]
+        layout = Layout.of(around[:, :3], 6, places, border, POSES_A_LEAF)
         self.structure = exhausted(build_structure(layout, self._blocks(SpatialNoise(), heavy=False)))
-        begin = self.structure.system.tree.begin
-        self._held = np.zeros(begin[-1])
-        self._held[6 * n : -len(sigma)] = HELD
-        self.hold(self._held, begin)
+        self._held = self.structure.hold_places(HELD)
+        self.hold(self._held, self.structure.system.tree.begin)
 
     @property
     def states_information(self) -> FloatArray:
@@ -317,21 +310,18 @@ class SpatialSmoother:
         heavy = heavy and problem.robust
         first_seen = np.zeros(count, dtype=np.int64)
         first_seen[problem.place[::-1]] = problem.pose_row[::-1]
-        prior = problem.prior.place
+        prior, view = problem.prior.place, SpatialView(problem.oriented)
+        log_odds = problem.settings.outlier_log_odds[POINT]
         return (
             SpatialOdometryFactors(problem.increment, problem.swing, sigma, jump, heavy, sensor + len(problem.mount)),
             SightingFactors(problem, self._seen, noise.levels, heavy, n, sensor),
-            SpatialStartFactor(self._start, problem.start_sigma),
+            StartFactor(self._start, 1.0 / problem.start_sigma, deviate),
             MapFactors(problem, n + prior, first_seen[prior]),
-            *(self._measured(tied, heavy) for tied in problem.measurements),
+            *(
+                MeasurementFactors.of(tied, view, n + np.arange(count), log_odds, heavy=heavy)
+                for tied in problem.measurements
+            ),
         )
-
-    def _measured(self, tied: Tied, heavy: bool) -> MeasurementFactors[SpatialEstimate]:
-        problem, other = self.problem, tied.others
-        if tied.kind.ties == "pose_place":
-            other = len(problem.stamp_s) + other
-        log_odds = problem.settings.outlier_log_odds[POINT]
-        return MeasurementFactors(tied, SpatialView(problem.oriented), other, log_odds, heavy)
 
     def _retract(self, estimate: SpatialEstimate, step: FloatArray) -> tuple[SpatialEstimate, float]:
         """The estimate after a step, and how far it went."""
