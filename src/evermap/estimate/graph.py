@@ -100,6 +100,38 @@ class Layout:
         return cls(every, first + np.arange(len(of_border)), leaf, np.column_stack([leaf, position]))
 
 
+class AlikeFactors(NamedTuple):
+    """Factors of one block with as many rows, and variables of as many numbers, as each other.
+
+    Attributes:
+        factor: (K,) which of the block they are.
+        first: (K,) where their values begin among those of all factors.
+        rows: r of each.
+        number: (K, w) the number of each column among those of all variables.
+    """
+
+    factor: IntArray
+    first: IntArray
+    rows: int
+    number: IntArray
+
+    @property
+    def at(self) -> IntArray:
+        """(K, r, w + 1) where their rows are among the values of all factors, the right sides last."""
+        width = self.number.shape[1] + 1
+        return np.asarray(self.first[:, None, None] + np.arange(self.rows * width).reshape(self.rows, width))
+
+    @property
+    def right(self) -> IntArray:
+        """(K, r) where the right sides are."""
+        width = self.number.shape[1] + 1
+        return np.asarray(self.first[:, None] + width * np.arange(1, self.rows + 1) - 1)
+
+    def multiply(self, values: FloatArray, numbers: FloatArray) -> FloatArray:
+        """Return (K, r, S) Jacobians, among the values of all factors, times numbers of all variables (numbers, S)."""
+        return np.asarray(np.einsum("kra,kas->krs", values[self.at[..., :-1]], numbers[self.number]))
+
+
 @dataclass(frozen=True, slots=True)
 class GraphStructure:
     """The order of elimination of a graph, which does not depend on values, noise or weights.
@@ -120,6 +152,24 @@ class GraphStructure:
         """Return where the values of a block are among those of all."""
         begin = self.system.tree.value_first[[self.first[block], self.first[block + 1]]]
         return slice(int(begin[0]), int(begin[1]))
+
+    def alike(self, block: int) -> list[AlikeFactors]:
+        """Return the factors of a block by their shapes."""
+        tree, factors, (first, last) = self.system.tree, self.system.factors, self.first[block : block + 2]
+        if first == last:
+            return []
+        ties = factors.variable[factors.first[first] : factors.first[last]].reshape(last - first, -1)
+        dim, found = self.layout.dim[ties], list[AlikeFactors]()
+        kind = np.zeros(last - first, dtype=np.int64)
+        for count in (factors.rows[first:last], *dim.T):
+            _, kind = np.unique(kind * (1 + int(count.max())) + count, return_inverse=True)
+        for one in range(int(kind.max()) + 1):
+            mine = np.flatnonzero(kind == one)
+            sizes, rows = dim[mine[0]].tolist(), int(factors.rows[first + mine[0]])
+            columns = [tree.begin[ties[mine, k]][:, None] + np.arange(size) for k, size in enumerate(sizes)]
+            number = np.concatenate(columns, axis=1)
+            found.append(AlikeFactors(mine, tree.value_first[first + mine], rows, number))
+        return found
 
     def hold_places(self, information: float) -> FloatArray:
         """Return (numbers,) so much information on all that is neither a pose nor of the border, which comes last."""

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.compiled import kept
+from evermap.estimate.graph import AlikeFactors
 from evermap.types import BoolArray, FloatArray, IntArray
 
 kernel = kept(effort=1, error_model="numpy")
@@ -101,7 +102,7 @@ class Pull(NamedTuple):
 
     Attributes:
         pose: (K,) the pose that each belongs to.
-        influence: (K, D, S) of each whitened residual on the numbers.
+        influence: (K, D, S) of each whitened residual on the numbers; zeros behind those of factors with fewer rows.
         by: (K, S) by what they move the numbers: residuals times their influence.
     """
 
@@ -110,9 +111,22 @@ class Pull(NamedTuple):
     by: FloatArray
 
     @classmethod
-    def of(cls, pose: IntArray, influence: FloatArray, residual: FloatArray) -> Pull:
-        """Return that of whitened residuals (K, D)."""
-        return cls(pose, influence, np.einsum("kds,kd->ks", influence, residual))
+    def of(cls, alike: Sequence[AlikeFactors], pose: IntArray, values: FloatArray, covariance: FloatArray) -> Pull:
+        """Return that of a block of factors.
+
+        Args:
+            alike: the factors.
+            pose: (K,) the pose that each belongs to.
+            values: whitened Jacobians and right sides of all factors.
+            covariance: (numbers, S) of all variables with the numbers that are estimated.
+        """
+        most, width = max((one.rows for one in alike), default=0), covariance.shape[1]
+        influence, by = np.zeros((len(pose), most, width)), np.zeros((len(pose), width))
+        for one in alike:
+            own = one.multiply(values, covariance)
+            influence[one.factor, : own.shape[1]] = own
+            by[one.factor] = np.einsum("krs,kr->ks", own, values[one.right])
+        return cls(pose, influence, by)
 
     @property
     def variance(self) -> FloatArray:

@@ -138,27 +138,15 @@ class Smoother(Solver[Estimate]):
         if not problem.prior.free.any():
             return np.ones(N_STATES)
         now, structure, with_states = self.linearised(estimate), self.graph(estimate).structure, marginals.with_states
-        pose, states = with_states[: 3 * n].reshape(n, 3, N_STATES), with_states[-N_STATES:]
-        place = with_states[3 * n : -N_STATES].reshape(-1, 2, N_STATES)
-        driven = now.values[structure.values_of(ODOMETRY)].reshape(-1, 3, OF_INTERVAL)
-        seen, rank = self.detections(estimate), np.cumsum(estimate.known) - 1
-        of_driven = (
-            np.einsum("nra,nas->nrs", driven[..., :3], pose[:-1])
-            + np.einsum("nra,nas->nrs", driven[..., 3:6], pose[1:])
-            + driven[..., 6:-1] @ states[N_SENSOR:]
+        odometry, detections = (
+            Pull.of(structure.alike(block), pose, now.values, with_states)
+            for block, pose in ((ODOMETRY, np.arange(n - 1)), (DETECTIONS, problem.pose_row))
         )
-        of_seen = (
-            np.einsum("nra,nas->nrs", seen[..., :3], pose[problem.pose_row])
-            + np.einsum("nra,nas->nrs", seen[..., 3:5], place[rank[problem.landmark_row]])
-            + seen[..., 5:-1] @ states[:N_SENSOR]
-        )
-        odometry = Pull.of(np.arange(n - 1), of_driven, driven[..., -1])
-        detections = Pull.of(problem.pose_row, of_seen, seen[..., -1])
         by_stretch = sum_by_stretches((odometry, detections), problem.stretches(STRETCHES), STRETCHES)
         by_place = np.zeros((len(estimate.known), N_STATES))
         np.add.at(by_place, problem.landmark_row, detections.by)
         independent = odometry.variance + detections.variance
-        alike = self.lasting(estimate).variance_beside(of_seen, problem.seen_s, problem.landmark_row)
+        alike = self.lasting(estimate).variance_beside(detections.influence, problem.seen_s, problem.landmark_row)
         by_places = odometry.variance + variance_of_clusters(by_place)
         found = np.maximum.reduce([variance_of_clusters(by_stretch), independent + alike, by_places])
         free = problem.prior.free & (independent > 0.0)
@@ -167,6 +155,7 @@ class Smoother(Solver[Estimate]):
         by_curves = self._variance_by_curves(estimate, marginals, worth)
         worth += np.where(free, by_curves / np.where(free, np.diag(marginals.states), 1.0), 0.0)
         # the delay shows where the velocity changes; where it only jitters, no delay explains it
+        driven = now.values[structure.values_of(ODOMETRY)].reshape(-1, 3, OF_INTERVAL)
         jitter = 2.0 * (driven[..., 3:6] ** 2).sum(axis=(0, 1)) @ problem.drive.jitter
         changes = max(float((driven[..., 6] ** 2).sum()), 1e-300)
         worth[DELAY] /= max(1.0 - jitter / changes, LEAST_CHANGE)

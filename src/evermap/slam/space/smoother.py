@@ -6,14 +6,13 @@ share, and the scale of the odometry.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from evermap.estimate.gauss_newton import Steps, minimised
-from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, build_structure
+from evermap.estimate.graph import AlikeFactors, Border, FactorBlock, Graph, Layout, Linear, build_structure
 from evermap.estimate.innovations import find_left_out_nis
 from evermap.estimate.measurement import MeasurementFactors
 from evermap.estimate.sparse.elimination import Spread
@@ -182,24 +181,27 @@ class SpatialSmoother:
             nis[some] = find_left_out_nis(now.residual[some, :rows], used, left, weight)
         return nis
 
+    @cached_property
+    def _odometry(self) -> list[AlikeFactors]:
+        return self.structure.alike(ODOMETRY)
+
+    @cached_property
+    def _sightings(self) -> list[AlikeFactors]:
+        return self.structure.alike(SIGHTINGS)
+
     def residual_of(self, now: Linear) -> FloatArray:
         """Return (M, 8) whitened residuals of detections, by the right sides of their factors."""
-        seen, values = self._seen, now.values[self.structure.values_of(SIGHTINGS)]
-        scale = np.sqrt(now.weights[SIGHTINGS] * seen.share)
-        found = np.zeros((len(seen.kind), 8))
-        rows, width = ROWS[seen.kind], np.diff(seen.first) // ROWS[seen.kind]
-        for k in range(int(rows.max(initial=0))):
-            some = np.flatnonzero(rows > k)
-            found[some, k] = -values[seen.first[some] + (k + 1) * width[some] - 1] / scale[some]
+        scale = np.sqrt(now.weights[SIGHTINGS] * self._seen.share)
+        found = np.zeros((len(scale), 8))
+        for alike in self._sightings:
+            found[alike.factor, : alike.rows] = -now.values[alike.right] / scale[alike.factor, None]
         return found
 
     def with_residuals(self, now: SpatialLinear, more: FloatArray) -> SpatialLinear:
         """Return the linearised problem with more residuals of detections (M, r), whitened and not weighted."""
-        seen, values = self._seen, now.values.copy()
-        own = values[self.structure.values_of(SIGHTINGS)]
-        scale, width = np.sqrt(now.weight * seen.share), np.diff(seen.first) // ROWS[seen.kind]
-        for k in range(more.shape[1]):
-            own[seen.first[:-1] + (k + 1) * width - 1] -= scale * more[:, k]
+        values, weighted = now.values.copy(), np.sqrt(now.weight * self._seen.share)[:, None] * more
+        for alike in self._sightings:
+            values[alike.right[:, : more.shape[1]]] -= weighted[alike.factor]
         return SpatialLinear(replace(now.now, values=values), self)
 
     @cached_property
@@ -215,14 +217,11 @@ class SpatialSmoother:
 
     def information_of_places(self, now: SpatialLinear) -> list[FloatArray]:
         """Return for each place the (3, 3) or (6, 6) information that its detections hold on it, at fixed poses."""
-        seen, dims = self._seen, np.where(self.problem.oriented, 6, 3)
-        values, found = now.values[self.structure.values_of(SIGHTINGS)], np.zeros((len(dims), 6, 6))
-        for kind, n_rows in enumerate(ROWS.tolist()):
-            for dim in (3, 6):
-                some = np.flatnonzero((seen.kind == kind) & (dims[seen.place] == dim))
-                at = seen.first[some][:, None] + np.arange(n_rows * (OF_SIGHTING + dim))
-                rows = values[at].reshape(len(some), n_rows, OF_SIGHTING + dim)[..., 6 : 6 + dim]
-                np.add.at(found[:, :dim, :dim], seen.place[some], np.swapaxes(rows, 1, 2) @ rows)
+        dims, found = np.where(self.problem.oriented, 6, 3), np.zeros((len(self.problem.oriented), 6, 6))
+        for alike in self._sightings:
+            dim = alike.number.shape[1] + 1 - OF_SIGHTING
+            rows = now.values[alike.at[..., 6 : 6 + dim]]
+            np.add.at(found[:, :dim, :dim], self._seen.place[alike.factor], np.swapaxes(rows, 1, 2) @ rows)
         return [one[:dim, :dim] for one, dim in zip(found, dims.tolist(), strict=True)]
 
     def lasting(self, now: SpatialLinear) -> Lasting:
@@ -253,15 +252,17 @@ class SpatialSmoother:
 
         As of states in the plane (`slam.smoother.Smoother.worth`): by stretches of the drive, and by errors that last.
         """
-        problem = self.problem
-        with_it = self.spread(now).with_border[:, state]
-        pulls, influence = list[Pull](), np.zeros((len(self._seen.kind), 8, 1))
-        for pose_row, rows, _, told, some in self._told(now.values, with_it):
-            pulls.append(Pull.of(pose_row, told[..., None], rows[..., -1]))
-            influence[some, : told.shape[1], 0] = told[: len(some)]
-        by_stretch = sum_by_stretches(pulls, problem.stretches(STRETCHES), STRETCHES)
-        independent = sum(float(pull.variance[0]) for pull in pulls)
-        alike = self.lasting(now).variance_beside(influence, problem.seen_s, problem.place)
+        problem, with_it = self.problem, self.spread(now).with_border[:, state]
+        odometry, detections = (
+            Pull.of(alike, pose, now.values, with_it[:, None])
+            for alike, pose in (
+                (self._odometry, np.arange(len(problem.increment))),
+                (self._sightings, problem.pose_row),
+            )
+        )
+        by_stretch = sum_by_stretches((odometry, detections), problem.stretches(STRETCHES), STRETCHES)
+        independent = float((odometry.variance + detections.variance)[0])
+        alike = self.lasting(now).variance_beside(detections.influence, problem.seen_s, problem.place)
         found = max(float(variance_of_clusters(by_stretch, STRETCHES)[0]), independent + float(alike[0]))
         own = with_it[len(with_it) - len(self.states_information) :]
         return float(own[state]), max(found / max(independent, 1e-300), 1.0)
@@ -271,34 +272,9 @@ class SpatialSmoother:
         in it.
         """
         values = now.values.copy()
-        for _, _, at, told, _ in self._told(now.values, step):
-            values[at[..., -1]] -= told
+        for alike in (*self._odometry, *self._sightings):
+            values[alike.right] -= alike.multiply(now.values, step[:, None])[..., 0]
         return SpatialLinear(replace(now.now, values=values), self)
-
-    def _told(
-        self, values: FloatArray, numbers: FloatArray
-    ) -> Iterator[tuple[IntArray, FloatArray, IntArray, FloatArray, IntArray]]:
-        """Yield odometry, and detections of each kind, times numbers of all variables.
-
-        That is their poses (m,), rows (m, r, width), where these are among the values, rows times numbers (m, r), and
-        which detections they are: none of odometry.
-        """
-        problem, structure, seen = self.problem, self.structure, self._seen
-        n, begin, odometry = len(problem.stamp_s), structure.system.tree.begin, structure.values_of(ODOMETRY).stop
-        pose, scale = numbers[: 6 * n].reshape(n, 6), numbers[-1:]
-        by, at = np.hstack([pose[:-1], pose[1:], np.tile(scale, (n - 1, 1))]), np.arange(odometry)
-        parts = [(np.arange(n - 1), at.reshape(n - 1, 6, OF_STEP), by, np.zeros(0, dtype=np.int64))]
-        for kind, n_rows in enumerate(ROWS.tolist()):
-            for dim in (3, 6):
-                some = np.flatnonzero((seen.kind == kind) & (seen.oriented == (dim == 6)))
-                at = odometry + seen.first[some][:, None] + np.arange(n_rows * (OF_SIGHTING + dim))
-                place = begin[n + seen.place[some]][:, None] + np.arange(dim)
-                sensor = begin[n + len(problem.oriented) + seen.sensor[some]][:, None] + np.arange(STATES)
-                by = np.hstack([pose[seen.pose_row[some]], numbers[place], numbers[sensor]])
-                parts.append((seen.pose_row[some], at.reshape(len(some), n_rows, OF_SIGHTING + dim), by, some))
-        for pose_row, at, by, some in parts:
-            rows = values[at]
-            yield pose_row, rows, at, np.einsum("mra,ma->mr", rows[..., :-1], by), some
 
     def _blocks(self, noise: SpatialNoise, *, heavy: bool) -> tuple[FactorBlock[SpatialEstimate], ...]:
         problem = self.problem
