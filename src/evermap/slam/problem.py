@@ -427,8 +427,7 @@ class Marginals:
     @property
     def pose(self) -> FloatArray:
         """(N, 3, 3) covariance of every pose, in its own frame."""
-        first, last = self._held.own_first[[self._block.first, self._block.first + self._n]]
-        return self._held.own[first:last].reshape(self._n, 3, 3)
+        return self._held.of(self._block.first + np.arange(self._n), 3)
 
     @cached_property
     def consecutive(self) -> FloatArray:
@@ -441,8 +440,7 @@ class Marginals:
     def landmark(self) -> FloatArray:
         """(L, 2, 2) covariance of every landmark."""
         landmark = np.zeros((len(self.known), 2, 2))
-        rows = self._held.own_first[self._block.landmarks][:, None] + np.arange(4)
-        landmark[self.known] = self._held.own[rows].reshape(-1, 2, 2)
+        landmark[self.known] = self._held.of(self._block.landmarks, 2)
         return landmark
 
     @cached_property
@@ -472,16 +470,12 @@ class Marginals:
     @property
     def explained_odometry(self) -> FloatArray:
         """(N - 1, 3, 3) `A S A'`: part of whitened odometry residuals that the estimate's own uncertainty explains."""
-        first = self._block.odometry
-        first, last = self._held.of_factors_first[[first, first + self._n - 1]]
-        return self._held.of_factors[first:last].reshape(-1, 3, 3)
+        return self._held.explained(self._block.odometry + np.arange(self._n - 1), 3)
 
     @property
     def explained_detections(self) -> FloatArray:
         """(M, 2, 2) the same of the detections, weighted as inliers."""
-        first = self._block.detections
-        first, last = self._held.of_factors_first[[first, first + self._m]]
-        return self._held.of_factors[first:last].reshape(-1, 2, 2)
+        return self._held.explained(self._block.detections + np.arange(self._m), 2)
 
     def joint(self, landmarks: IntArray, *, poses: IntArray | None = None, states: bool = False) -> FloatArray:
         """Return the joint covariance of some poses, some landmarks and, if wanted, the states, in this order."""

@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from evermap.estimate.noise import Turns, alternate, restricted_level
+from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.space.linearise import (
     ACROSS,
@@ -24,7 +25,7 @@ from evermap.slam.space.linearise import (
 )
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
-from evermap.types import FloatArray, IntArray
+from evermap.types import FloatArray
 
 ROUNDS = 12
 """Optimum and noise levels in turns, at most."""
@@ -101,7 +102,7 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
     if not problem.estimate_noise:
         return noise
     n_steps, spread, worth = len(problem.increment), smoother.spread(now, nearly=True), problem.settings.pseudo_count
-    of_steps, of_detections = _leverages(smoother, spread.of_factors, spread.of_factors_first)
+    of_steps, of_detections = _leverages(smoother, spread)
     levels = noise.levels.copy()
 
     def learn(level: int, squares: float, numbers: float, leverage: float) -> None:
@@ -149,20 +150,17 @@ def correlation(optimum: SpatialOptimum) -> float:
     return float((before * after).sum()) / total if total > 0.0 else 0.0
 
 
-def _leverages(smoother: SpatialSmoother, of_factors: FloatArray, first: IntArray) -> tuple[FloatArray, FloatArray]:
+def _leverages(smoother: SpatialSmoother, spread: Spread) -> tuple[FloatArray, FloatArray]:
     """Diagonals of `A S A'` of odometry (N - 1, 6) and detections (M, 8); weighted, as the Jacobians are: leverages,
     which are in [0, 1] but for rounding.
     """
-    problem = smoother.problem
-    n_steps, kind = len(problem.increment), problem.kind
-    steps = of_factors[: 36 * n_steps].reshape(n_steps, 6, 6)
+    n_steps, kind = len(smoother.problem.increment), smoother.problem.kind
     found = np.zeros((len(kind), 8))
-    begin = first[n_steps : n_steps + len(kind)]
-    for k in range(3):
-        some, rows = kind == k, int(ROWS[k])
-        at = begin[some][:, None] + (rows + 1) * np.arange(rows)
-        found[some, :rows] = of_factors[at]
-    return np.clip(np.einsum("nii->ni", steps), 0.0, 1.0), np.clip(found, 0.0, 1.0)
+    for k, rows in enumerate(ROWS.tolist()):
+        some = np.flatnonzero(kind == k)
+        found[some, :rows] = np.einsum("mrr->mr", spread.explained(n_steps + some, rows))
+    steps = np.einsum("nrr->nr", spread.explained(np.arange(n_steps), 6))
+    return np.clip(steps, 0.0, 1.0), np.clip(found, 0.0, 1.0)
 
 
 def as_seen(problem: SpatialProblem, estimate: SpatialEstimate, measured: FloatArray) -> FloatArray:

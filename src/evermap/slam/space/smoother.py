@@ -169,16 +169,13 @@ class SpatialSmoother:
     def find_nis(self, now: SpatialLinear, spread: Spread) -> FloatArray:
         """Return (M,) NIS of all detections, each as if it had not been used."""
         problem, nis = self.problem, np.zeros(len(self.problem.kind))
-        first = spread.of_factors_first[len(problem.increment) :]
+        weight, first = now.weight * problem.share, self.structure.first[SIGHTINGS]
         for kind in range(3):
             some, rows = np.flatnonzero(problem.kind == kind), int(ROWS[kind])
-            if not len(some):
-                continue
-            at = first[some][:, None] + np.arange(rows * rows)
-            used = spread.of_factors[at].reshape(-1, rows, rows)
-            left = (1.0 + 1e-9) * np.eye(rows) - used
-            weight = (now.weight * problem.share)[some]
-            nis[some] = find_left_out_nis(now.residual[some, :rows], used, left, weight)
+            if len(some):
+                used = spread.explained(first + some, rows)
+                left = (1.0 + 1e-9) * np.eye(rows) - used
+                nis[some] = find_left_out_nis(now.residual[some, :rows], used, left, weight[some])
         return nis
 
     @cached_property
