@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from evermap.estimate.measurement import Tied
-from evermap.slam.correlation import Lasting, lasting_errors
+from evermap.slam.correlation import Lasting, Pull, lasting_errors, sum_by_stretches, variance_of_clusters
 from evermap.types import BoolArray, FloatArray, IntArray
 
 
@@ -61,6 +61,19 @@ class BaseProblem(ABC):
     def lasting(self, residual: FloatArray, weight: FloatArray) -> Lasting:
         """Return how long errors of detections last, by whitened residuals (M, D) and inlier weights (M,)."""
         return lasting_errors(residual, weight, self.seen_s, self.seen_place)
+
+    def correlated_variance(
+        self, odometry: Pull, detections: Pull, lasting: Lasting, stretches: int, clusters: float | None = None
+    ) -> FloatArray:
+        """Return (S,) variances of estimates under errors that are correlated, the larger of two.
+
+        By `stretches` of the recording, which err independently of each other, as `variance_of_clusters` counts them;
+        and by errors of detections that are known to last.
+        """
+        by_stretch = sum_by_stretches((odometry, detections), self.stretches(stretches), stretches)
+        alike = lasting.variance_beside(detections.influence, self.seen_s, self.seen_place)
+        independent = odometry.variance + detections.variance
+        return np.asarray(np.maximum(variance_of_clusters(by_stretch, clusters), independent + alike))
 
     def new_information(self, lasting: Lasting) -> FloatArray:
         """Return (M,) shares of the information of detections that are new, beside others of their places."""

@@ -18,7 +18,7 @@ from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
 from evermap.estimate.sparse.tree import tree_of
 from evermap.estimate.start import StartFactor
 from evermap.slam.calibration import BEARING, DELAY
-from evermap.slam.correlation import LEAST_WEIGHT, Lasting, Pull, sum_by_stretches, variance_of_clusters
+from evermap.slam.correlation import LEAST_WEIGHT, Lasting, Pull, variance_of_clusters
 from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES
 from evermap.slam.linearise import (
     OF_DETECTION,
@@ -142,13 +142,11 @@ class Smoother(Solver[Estimate]):
             Pull.of(structure.alike(block), pose, now.values, with_states)
             for block, pose in ((ODOMETRY, np.arange(n - 1)), (DETECTIONS, problem.pose_row))
         )
-        by_stretch = sum_by_stretches((odometry, detections), problem.stretches(STRETCHES), STRETCHES)
         by_place = np.zeros((len(estimate.known), N_STATES))
         np.add.at(by_place, problem.landmark_row, detections.by)
         independent = odometry.variance + detections.variance
-        alike = self.lasting(estimate).variance_beside(detections.influence, problem.seen_s, problem.landmark_row)
-        by_places = odometry.variance + variance_of_clusters(by_place)
-        found = np.maximum.reduce([variance_of_clusters(by_stretch), independent + alike, by_places])
+        correlated = problem.correlated_variance(odometry, detections, self.lasting(estimate), STRETCHES)
+        found = np.maximum(correlated, odometry.variance + variance_of_clusters(by_place))
         free = problem.prior.free & (independent > 0.0)
         independent = np.where(free, independent, 1.0)
         worth = np.where(free, np.maximum(found / independent, 1.0), 1.0)

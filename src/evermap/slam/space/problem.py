@@ -413,6 +413,15 @@ class SpatialEstimate:
     state: FloatArray
     log_scale: float = 0.0
 
+    def moved(self, by: FloatArray, oriented: BoolArray, by_place: FloatArray | None = None) -> SpatialEstimate:
+        """Return everything moved together by a motion (7,); or poses by (N, 7), places by (P, 7).
+
+        Of places (P,) without an orientation only the positions move.
+        """
+        place = se3.compose(by if by_place is None else by_place, self.place)
+        place[~oriented, 3:] = se3.NO_TURN
+        return replace(self, pose=se3.compose(by, self.pose), place=place)
+
     def mount(self, problem: SpatialProblem) -> FloatArray:
         """Return (S, 7) the sensors' poses on the robot."""
         return se3.retract(problem.mount, self.state[:, :MOUNT])

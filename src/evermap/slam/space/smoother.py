@@ -19,7 +19,7 @@ from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.estimate.start import StartFactor
 from evermap.geometry import se3
-from evermap.slam.correlation import Lasting, Pull, sum_by_stretches, variance_of_clusters
+from evermap.slam.correlation import Lasting, Pull
 from evermap.slam.space.drift import STRETCHES
 from evermap.slam.space.factors import MapFactors, SightingFactors, SpatialOdometryFactors, deviate
 from evermap.slam.space.linearise import MOUNT, OF_SIGHTING, OF_STEP, POINT, ROWS, STATES
@@ -257,10 +257,8 @@ class SpatialSmoother:
                 (self._sightings, problem.pose_row),
             )
         )
-        by_stretch = sum_by_stretches((odometry, detections), problem.stretches(STRETCHES), STRETCHES)
         independent = float((odometry.variance + detections.variance)[0])
-        alike = self.lasting(now).variance_beside(detections.influence, problem.seen_s, problem.place)
-        found = max(float(variance_of_clusters(by_stretch, STRETCHES)[0]), independent + float(alike[0]))
+        found = float(problem.correlated_variance(odometry, detections, self.lasting(now), STRETCHES, STRETCHES)[0])
         own = with_it[len(with_it) - len(self.states_information) :]
         return float(own[state]), max(found / max(independent, 1e-300), 1.0)
 
