@@ -109,3 +109,88 @@ def test_beliefs_and_thresholds_are_keys_of_the_configuration() -> None:
 
 def test_constants_say_what_they_are() -> None:
     assert [name for name, told in numbers() if not told] == []
+
+
+ONE_OF_EACH = {
+    # one damped Gauss-Newton; smoothers in space do not go through `Solver` yet, since their levels are arguments
+    "minimised": {"estimate.solver", "slam.space.smoother", "slam.space.together"},
+    # one rule for noise levels: in the plane, in space, and of what robots measure of each other
+    "restricted_level": {"slam.noise", "slam.space.estimate", "slam.together"},
+    # one loop of values and levels in turns; robots together and landmarks without identities have loops of their own
+    "alternate": {"slam.batch", "slam.space.estimate"},
+    "refine_noise": {"slam.association.in_plane", "slam.batch", "slam.streaming", "slam.together", "slam.warmup"},
+    "refined": {"slam.space.estimate", "slam.space.together"},
+    # one rule that accepts a session over a map, a robot over others, a frame in a map
+    "accept_alignment": {
+        "maps.sessions.boxes", "slam.batch", "slam.known_places", "slam.space.localize", "slam.together",
+    },
+    # one search for the motion that most pairs agree on
+    "find_consensus": {
+        "maps.sessions.placing", "slam.batch", "slam.changes.joint", "slam.space.moved_groups", "slam.space.solve",
+    },
+    # one order of elimination
+    "build_structure": {"slam.encounters", "slam.smoother", "slam.space.smoother", "slam.space.together"},
+    # one density of errors that last
+    "lasting_errors": {"slam.base_problem"},
+}  # fmt: skip
+"""Functions that do what is to be done once, and the modules that may call them: fewer is better, another is a twin."""
+
+SUBCLASSES = {
+    "BaseProblem": {"slam.problem.Problem", "slam.space.problem.SpatialProblem"},
+    "Associator": {"slam.association.in_plane.PlanarAssociator", "slam.association.in_space.SpatialAssociator"},
+    "BaseLocalizer": {"slam.localize.Localizer", "slam.space.localize.SpatialLocalizer"},
+}
+"""Bases of what the plane and space have in common, and what is derived from them."""
+
+SOLVE_BY_THEMSELVES = {
+    "slam.misfit": "values of two curves under each width of their prior: no iteration",
+    "slam.ranges": "damped Gauss-Newton of one position from ranges, from many starts at once",
+    "slam.space.starts": "Gauss-Newton of single poses from three points each, of thousands at once",
+    "slam.space.drift": "two numbers of an odometry, by expectation-maximisation and reweighted",
+    "slam.space.intake": "one point where rays meet, a landmark",
+    "maps.bodies": "Gauss-Newton of one rigid motion of a body",
+    "maps.sessions.gaussian": "one similarity of a session over a map",
+}
+"""Modules of estimators in whose loops linear equations are solved without `estimate`, and of what."""
+
+
+def called(node: ast.AST) -> Iterator[str]:
+    """Names of the functions and methods that are called within a node."""
+    for one in ast.walk(node):
+        if isinstance(one, ast.Call):
+            yield one.func.attr if isinstance(one.func, ast.Attribute) else getattr(one.func, "id", "")
+
+
+def test_one_solver_one_noise_learner_one_overlay() -> None:
+    """What is done in one place is called from few; who is on the list is still double, or asks for the answer."""
+    callers: dict[str, set[str]] = {name: set() for name in ONE_OF_EACH}
+    for module in MODULES:
+        for name in callers.keys() & set(called(tree_of(module))):
+            callers[name].add(module.removeprefix("evermap."))
+    assert {name: more for name in callers if (more := callers[name] - ONE_OF_EACH[name])} == {}
+    homes = [node.name for name in MODULES for node in ast.walk(tree_of(name)) if isinstance(node, ast.FunctionDef)]
+    assert {name: homes.count(name) for name in ONE_OF_EACH} == dict.fromkeys(ONE_OF_EACH, 1)
+
+
+def test_plane_and_space_are_two_of_one_base() -> None:
+    found: dict[str, set[str]] = {base: set() for base in SUBCLASSES}
+    for module in MODULES:
+        for node in tree_of(module).body:
+            bases = node.bases if isinstance(node, ast.ClassDef) else []
+            for base in (one.value if isinstance(one, ast.Subscript) else one for one in bases):
+                if isinstance(base, ast.Name) and base.id in found and isinstance(node, ast.ClassDef):
+                    found[base.id].add(f"{module}.{node.name}".removeprefix("evermap."))
+    assert found == SUBCLASSES
+
+
+def test_who_solves_by_itself_is_known() -> None:
+    """Estimation of many things together is a graph; small problems of one thing are listed."""
+    own = set()
+    for module in MODULES:
+        if not module.startswith(("evermap.slam.", "evermap.maps.", "evermap.align.", "evermap.tracking.")):
+            continue
+        loops = (node for node in ast.walk(tree_of(module)) if isinstance(node, ast.For | ast.While))
+        if any(ast.unparse(one.func) == "np.linalg.solve" for loop in loops for one in ast.walk(loop)
+               if isinstance(one, ast.Call)):  # fmt: skip
+            own.add(module.removeprefix("evermap."))
+    assert own - SOLVE_BY_THEMSELVES.keys() == set()

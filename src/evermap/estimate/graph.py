@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from evermap.estimate.sparse.elimination import curvature
 from evermap.estimate.sparse.system import Factorised, Slices, System
@@ -81,6 +82,55 @@ class Layout:
     leaf_of_pose: IntArray
     coordinate: FloatArray
 
+    @classmethod
+    def of(cls, position: FloatArray, dim: int, places: ArrayLike, border: ArrayLike, a_leaf: int) -> Layout:
+        """Return that of one problem: poses, places, then the border.
+
+        Args:
+            position: (N, c) rough positions of the poses.
+            dim: numbers of a pose.
+            places: (P,) numbers of each place.
+            border: (B,) numbers of each variable of the border.
+            a_leaf: consecutive poses that are eliminated together.
+        """
+        n, of_places, of_border = len(position), np.asarray(places), np.asarray(border)
+        leaf = grouped(n, a_leaf)
+        every = np.concatenate([np.full(n, dim), of_places, of_border]).astype(np.int64)
+        first = n + len(of_places)
+        return cls(every, first + np.arange(len(of_border)), leaf, np.column_stack([leaf, position]))
+
+
+class AlikeFactors(NamedTuple):
+    """Factors of one block with as many rows, and variables of as many numbers, as each other.
+
+    Attributes:
+        factor: (K,) which of the block they are.
+        first: (K,) where their values begin among those of all factors.
+        rows: r of each.
+        number: (K, w) the number of each column among those of all variables.
+    """
+
+    factor: IntArray
+    first: IntArray
+    rows: int
+    number: IntArray
+
+    @property
+    def at(self) -> IntArray:
+        """(K, r, w + 1) where their rows are among the values of all factors, the right sides last."""
+        width = self.number.shape[1] + 1
+        return np.asarray(self.first[:, None, None] + np.arange(self.rows * width).reshape(self.rows, width))
+
+    @property
+    def right(self) -> IntArray:
+        """(K, r) where the right sides are."""
+        width = self.number.shape[1] + 1
+        return np.asarray(self.first[:, None] + width * np.arange(1, self.rows + 1) - 1)
+
+    def multiply(self, values: FloatArray, numbers: FloatArray) -> FloatArray:
+        """Return (K, r, S) Jacobians, among the values of all factors, times numbers of all variables (numbers, S)."""
+        return np.asarray(np.einsum("kra,kas->krs", values[self.at[..., :-1]], numbers[self.number]))
+
 
 @dataclass(frozen=True, slots=True)
 class GraphStructure:
@@ -102,6 +152,31 @@ class GraphStructure:
         """Return where the values of a block are among those of all."""
         begin = self.system.tree.value_first[[self.first[block], self.first[block + 1]]]
         return slice(int(begin[0]), int(begin[1]))
+
+    def alike(self, block: int) -> list[AlikeFactors]:
+        """Return the factors of a block by their shapes."""
+        tree, factors, (first, last) = self.system.tree, self.system.factors, self.first[block : block + 2]
+        if first == last:
+            return []
+        ties = factors.variable[factors.first[first] : factors.first[last]].reshape(last - first, -1)
+        dim, found = self.layout.dim[ties], list[AlikeFactors]()
+        kind = np.zeros(last - first, dtype=np.int64)
+        for count in (factors.rows[first:last], *dim.T):
+            _, kind = np.unique(kind * (1 + int(count.max())) + count, return_inverse=True)
+        for one in range(int(kind.max()) + 1):
+            mine = np.flatnonzero(kind == one)
+            sizes, rows = dim[mine[0]].tolist(), int(factors.rows[first + mine[0]])
+            columns = [tree.begin[ties[mine, k]][:, None] + np.arange(size) for k, size in enumerate(sizes)]
+            number = np.concatenate(columns, axis=1)
+            found.append(AlikeFactors(mine, tree.value_first[first + mine], rows, number))
+        return found
+
+    def hold_places(self, information: float) -> FloatArray:
+        """Return (numbers,) so much information on all that is neither a pose nor of the border, which comes last."""
+        begin, layout = self.system.tree.begin, self.layout
+        held = np.zeros(begin[-1])
+        held[begin[len(layout.leaf_of_pose)] : begin[len(layout.dim) - len(layout.border)]] = information
+        return held
 
 
 @dataclass(frozen=True, slots=True)

@@ -125,6 +125,17 @@ class MeasurementFactors(Generic[State]):
     log_odds: float
     heavy: bool
 
+    @classmethod
+    def of(
+        cls, tied: Tied, view: PoseView[State], place_variable: IntArray, log_odds: float, *, heavy: bool
+    ) -> MeasurementFactors[State]:
+        """Return measurements of places that are variables, `place_variable` (P,), -1 of others; and all else."""
+        other = tied.others
+        if tied.kind.ties == "pose_place":
+            tied = tied[place_variable[tied.other] >= 0]
+            other = place_variable[tied.others]
+        return cls(tied, view, other, log_odds, heavy)
+
     @property
     def ties(self) -> IntArray:
         """Return (K, 1 or 2) the pose, and the other pose or the place."""

@@ -3,14 +3,27 @@
 At the optimum a residual is smaller than the noise that made it, by what the fit absorbed: its leverage, the diagonal
 of `A S A'` of whitened Jacobians A and the covariance S. The level at which squares equal what is left for them is that
 of the marginal likelihood with everything else integrated out (MATH.md, section 8).
+
+The optimum depends on the levels, and the levels on what the optimum leaves: `alternate` seeks them in turns, in the
+plane and in space.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.types import FloatArray
+
+Levels = TypeVar("Levels")
+"""Noise levels."""
+Found = TypeVar("Found")
+"""Values near the optimum of some levels, with what levels are learned from."""
+Fit = TypeVar("Fit")
+"""Levels that were learned."""
 
 
 def restricted_level(squares: ArrayLike, count: ArrayLike, start: ArrayLike, pseudo: float) -> FloatArray:
@@ -24,3 +37,49 @@ def restricted_level(squares: ArrayLike, count: ArrayLike, start: ArrayLike, pse
     """
     total = np.asarray(squares) + pseudo * np.asarray(start) ** 2
     return np.asarray(np.sqrt(total / (np.maximum(count, 0.0) + pseudo)))
+
+
+class Turns(NamedTuple):
+    """Rules of `alternate`.
+
+    Attributes:
+        most: turns, at most.
+        heavy: first turns, in which outliers have tails that never let go: the values may still be far off.
+        within: change of the levels below which they are settled.
+    """
+
+    most: int
+    heavy: int
+    within: float
+
+
+def alternate(
+    levels: Levels,
+    optimise: Callable[[Found | None, Levels, bool], Found],
+    learn: Callable[[Found, Levels], tuple[Fit, float]],
+    follow: Callable[[Levels, Fit, bool], Levels],
+    turns: Turns,
+) -> tuple[Found, Fit]:
+    """Seek values and noise levels in turns until the levels change no more.
+
+    Args:
+        levels: to start from.
+        optimise: values for these levels, from those of the turn before (None in the first); True in `heavy` turns.
+        learn: levels by what these values leave of the residuals, and their change relative to those they belong to.
+        follow: levels of the next turn, by those of this one and what was learned; True after a `heavy` turn.
+        turns: rules.
+
+    Returns:
+        The values of the last turn, and what was learned there.
+    """
+    found, fit = None, None
+    for turn in range(turns.most):
+        heavy = turn < turns.heavy
+        found = optimise(found, levels, heavy)
+        fit, change = learn(found, levels)
+        if change < turns.within and not heavy:
+            break
+        levels = follow(levels, fit, heavy)
+    assert found is not None
+    assert fit is not None
+    return found, fit

@@ -188,7 +188,7 @@ def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> Spat
     intake = fit_to_map(intake, undone.prior_map)
     if before.rests is not None:  # what was seen of bodies as they moved was left out
         kept = np.isin(intake.used, before.used)
-        intake = replace(intake, problem=intake.problem.selected(kept), used=intake.used[kept])
+        intake = replace(intake, problem=intake.problem.seeing(kept), used=intake.used[kept])
     if not (np.array_equal(intake.used, before.used) and len(intake.pose_frame) == len(before.pose_frame)):
         return None
     return replace(_with_measurements(problem, intake), prior=prior)

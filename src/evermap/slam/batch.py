@@ -20,6 +20,7 @@ from evermap.align.candidates import Matches, find_consensus
 from evermap.config import LocalizeConfig, SlamConfig
 from evermap.errors import NumericalError
 from evermap.estimate.measurement import Tied
+from evermap.estimate.noise import Turns, alternate
 from evermap.estimate.sparse.system import Slices, exhausted
 from evermap.geometry import se2, se3
 from evermap.slam.bridge import dead_reckoned
@@ -115,6 +116,14 @@ class SolvedPart(NamedTuple):
     estimate: Estimate
     noise: Noise
     fits: bool
+
+
+class _Solution(NamedTuple):
+    """Values near the optimum of some noise levels, with the smoother at these and the covariances."""
+
+    smoother: Smoother
+    estimate: Estimate
+    marginals: Marginals
 
 
 class FoundOptimum(NamedTuple):
@@ -296,26 +305,36 @@ class Batch:
             heavy: begin with the kernel that never lets go, for values from which it does not show what is an outlier.
             final: to within what rounding leaves; else near enough to decide what comes next.
         """
-        ahead, within = Extrapolation() if ahead is None else ahead, NOISE_CONVERGED if final else NOISE_NEAR
-        ahead.elsewhere()
+        learner, learns = Extrapolation() if ahead is None else ahead, self._estimate_noise
+        learner.elsewhere()
         steps, tolerance, settled = STEPS_A_ROUND, NEAR_NOISE, NEAR_NOISE_GAIN * len(problem.pose_row)
         if final:
             steps, tolerance, settled = FINAL_STEPS, FINAL_TOLERANCE, FINAL_GAIN
-        for _ in range(FINAL_ROUNDS):
-            smoother = smoother.under(noise, heavy=heavy, problem=problem)
+
+        def optimise(before: _Solution | None, levels: Noise, heavy: bool) -> _Solution:
+            last, start = (smoother, estimate) if before is None else before[:2]
+            at = last.under(levels, heavy=heavy, problem=problem)
             # values and noise levels settle together: no need for the optimum of levels that will not stay
-            solved = smoother.solved_in_slices(estimate, iterations=steps, tolerance=tolerance, settled=settled)
-            estimate, marginals = exhausted(solved)
-            weights = smoother.inlier_probability(estimate)
-            fit = refine_noise(problem, estimate, marginals, weights, noise, self._start_noise, scoring=True)
-            if not heavy and (fit.change < within or not self._estimate_noise):
-                break
-            if self._estimate_noise:
-                noise = fit.noise if heavy else ahead.ahead(noise, fit.noise)
-            heavy = False
-        if final or not self._estimate_noise:  # those that the values are an optimum of
-            fit = replace(fit, noise=smoother.noise)
-        return FoundOptimum(smoother, estimate, marginals, fit, ahead)
+            solved = at.solved_in_slices(start, iterations=steps, tolerance=tolerance, settled=settled)
+            return _Solution(at, *exhausted(solved))
+
+        def learn(found: _Solution, levels: Noise) -> tuple[NoiseFit, float]:
+            weights = found.smoother.inlier_probability(found.estimate)
+            fit = refine_noise(
+                problem, found.estimate, found.marginals, weights, levels, self._start_noise, scoring=True
+            )
+            return fit, fit.change if learns else 0.0
+
+        def follow(levels: Noise, fit: NoiseFit, heavy: bool) -> Noise:
+            if not learns:
+                return levels
+            return fit.noise if heavy else learner.ahead(levels, fit.noise)
+
+        turns = Turns(FINAL_ROUNDS, int(heavy), NOISE_CONVERGED if final else NOISE_NEAR)
+        found, fit = alternate(noise, optimise, learn, follow, turns)
+        if final or not learns:  # those that the values are an optimum of
+            fit = replace(fit, noise=found.smoother.noise)
+        return FoundOptimum(*found, fit, learner)
 
 
 def _at_states(estimate: Estimate, marginals: Marginals, states: FloatArray) -> Estimate:

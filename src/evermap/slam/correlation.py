@@ -8,16 +8,22 @@ whatever else is the same for all of its residuals, does not change.
 Of detections whose errors have the correlations `a_mn`, each counts as `1 / sum_n a_mn` of an independent one: for the
 mean of a stationary sequence that is what its information comes to, `n (1 - a) / (1 + a)` of the first-order
 autoregressive one.
+
+What correlated errors make of the variance of an estimate shows in clusters: what each stretch of a recording adds to
+the estimate is summed before it is squared (`Pull`), which makes no assumption on how errors hang together within it:
+White's covariance (1980), with stretches as clusters (Liang and Zeger 1986).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from evermap.compiled import kept
+from evermap.estimate.graph import AlikeFactors
 from evermap.types import BoolArray, FloatArray, IntArray
 
 kernel = kept(effort=1, error_model="numpy")
@@ -89,6 +95,61 @@ class Lasting(NamedTuple):
         flat = np.ascontiguousarray(influence.reshape(len(place), -1))
         both = 2.0 * (flat * carry(flat, stamp_s, place, self.persist_s, self.share)).sum(axis=0)
         return np.asarray(both.reshape(influence.shape[1:]).sum(axis=0))
+
+
+class Pull(NamedTuple):
+    """What factors of one kind contribute to linear estimates of some numbers.
+
+    Attributes:
+        pose: (K,) the pose that each belongs to.
+        influence: (K, D, S) of each whitened residual on the numbers; zeros behind those of factors with fewer rows.
+        by: (K, S) by what they move the numbers: residuals times their influence.
+    """
+
+    pose: IntArray
+    influence: FloatArray
+    by: FloatArray
+
+    @classmethod
+    def of(cls, alike: Sequence[AlikeFactors], pose: IntArray, values: FloatArray, covariance: FloatArray) -> Pull:
+        """Return that of a block of factors.
+
+        Args:
+            alike: the factors.
+            pose: (K,) the pose that each belongs to.
+            values: whitened Jacobians and right sides of all factors.
+            covariance: (numbers, S) of all variables with the numbers that are estimated.
+        """
+        most, width = max((one.rows for one in alike), default=0), covariance.shape[1]
+        influence, by = np.zeros((len(pose), most, width)), np.zeros((len(pose), width))
+        for one in alike:
+            own = one.multiply(values, covariance)
+            influence[one.factor, : own.shape[1]] = own
+            by[one.factor] = np.einsum("krs,kr->ks", own, values[one.right])
+        return cls(pose, influence, by)
+
+    @property
+    def variance(self) -> FloatArray:
+        """(S,) variances that the factors add if all residuals are independent."""
+        return np.asarray((self.influence**2).sum(axis=(0, 1)))
+
+
+def sum_by_stretches(pulls: Sequence[Pull], stretch: IntArray, count: int) -> FloatArray:
+    """Return (count, S) what each stretch of a recording moves estimates by; `stretch` (N,) is that of each pose."""
+    total = np.zeros((count, pulls[0].by.shape[1]))
+    for pull in pulls:
+        np.add.at(total, stretch[pull.pose], pull.by)
+    return total
+
+
+def variance_of_clusters(pull: FloatArray, count: float | None = None) -> FloatArray:
+    """Return (S,) variances of estimates by what each of some clusters pulls them (K, S).
+
+    `count` is how many there are; None: as many as pull at all.
+    """
+    if count is None:
+        count = max(float(np.count_nonzero(pull.any(axis=1))), 2.0)
+    return np.asarray((pull**2).sum(axis=0) * count / (count - 1.0))
 
 
 @kernel

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -84,18 +86,15 @@ def prepare(
     drive, odometry_s, detections = Drive.of(recording, settings), recording.odometry.stamp_s, recording.detections
     stamps = recording.frames.stamp_s
     usable, moving, warnings = usable_detections(recording, remarks)
-    used, seen_in = np.flatnonzero(usable), frames_of_usable(recording, usable, fewest=2)
-    pose_frame, landmark_id = frames_with_pose(recording, seen_in, moving), landmark_ids(recording, used)
-    start_s = float(odometry_s[0])
-    tied, left_out = tie_measurements(
-        recording.measurements, stamps[pose_frame], partial(_driven, drive, start_s), landmark_id
-    )
-    warnings.extend(left_out)
+    seen_in, start_s = frames_of_usable(recording, usable, fewest=2), float(odometry_s[0])
+    pose_frame = frames_with_pose(recording, seen_in, moving)
+    seen = connect(recording, usable, pose_frame, partial(_driven, drive, start_s))
+    used, landmark_id = seen.used, seen.landmark_id
     problem = Problem(
         stamp_s=stamps[pose_frame] - start_s,
         drive=drive,
-        pose_row=np.searchsorted(pose_frame, detections.frame[used]),
-        landmark_row=np.searchsorted(landmark_id, detections.landmark_id[used]),
+        pose_row=seen.pose_row,
+        landmark_row=seen.place,
         reading=np.column_stack([detections.range_m[used], detections.bearing_rad[used]]),
         sigma_given=np.column_stack([detections.sigma_range_m[used], detections.sigma_bearing_rad[used]]),
         mount=np.array(recording.sensor.mount_robot_sensor, dtype=np.float64),
@@ -104,11 +103,58 @@ def prepare(
         start_information=FIRST_POSE_INFORMATION,
         landmark_mean=np.zeros((len(landmark_id), 2)),
         landmark_information=sparse.csr_array((2 * len(landmark_id), 2 * len(landmark_id))),
-        measurements=tuple(of for of in tied if of.kind.frame is None),
+        measurements=tuple(of for of in seen.measurements if of.kind.frame is None),
     )
+    framed = tuple(of for of in seen.measurements if of.kind.frame is not None)
     in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
-    framed = tuple(of for of in tied if of.kind.frame is not None)
-    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings), framed)
+    remarks = (*warnings, *seen.left_out)
+    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, remarks, framed)
+
+
+class Connected(NamedTuple):
+    """What ties poses to places and to each other, in the plane and in space.
+
+    Attributes:
+        used: (M,) rows of the recording's detections that are used.
+        landmark_id: (P,) sorted ids of the places.
+        pose_row, place: (M,) the pose and the place of each detection.
+        measurements: of other kinds.
+        left_out: remarks on those that could not be tied.
+    """
+
+    used: IntArray
+    landmark_id: IntArray
+    pose_row: IntArray
+    place: IntArray
+    measurements: tuple[Tied, ...]
+    left_out: tuple[str, ...]
+
+
+def connect(
+    recording: AnyRecording,
+    usable: BoolArray,
+    pose_frame: IntArray,
+    motion: Callable[[FloatArray, FloatArray], FloatArray],
+) -> Connected:
+    """Return what ties the frames that have a pose to what they saw.
+
+    Args:
+        recording: as read.
+        usable: (D,) detections that are used, all of them in frames with a pose.
+        pose_frame: (N,) rows of these frames.
+        motion: (K, 7) by the odometry between instants (K,), for measurements between frames.
+    """
+    used, detections = np.flatnonzero(usable), recording.detections
+    landmark_id = landmark_ids(recording, used)
+    tied, left_out = tie_measurements(recording.measurements, recording.frames.stamp_s[pose_frame], motion, landmark_id)
+    return Connected(
+        used,
+        landmark_id,
+        np.searchsorted(pose_frame, detections.frame[used]),
+        np.searchsorted(landmark_id, detections.landmark_id[used]),
+        tied,
+        tuple(left_out),
+    )
 
 
 def usable_detections(recording: AnyRecording, remarks: tuple[str, ...]) -> tuple[BoolArray, BoolArray, list[str]]:

@@ -205,42 +205,11 @@ class DetectionFactors(NamedTuple):
         return cost
 
 
-class StartFactor(NamedTuple):
-    """The first pose, held where it is.
-
-    Attributes:
-        mean: (3,) where.
-        information: how firmly, [1/m^2] and [1/rad^2].
-    """
-
-    mean: FloatArray
-    information: float
-
-    @property
-    def ties(self) -> IntArray:
-        """Return (1, 1) the first variable."""
-        return np.zeros((1, 1), dtype=np.int64)
-
-    @property
-    def rows(self) -> IntArray:
-        """Return (1,) 3."""
-        return np.full(1, 3)
-
-    @property
-    def pose(self) -> IntArray:
-        """Return (1,) the first pose."""
-        return np.zeros(1, dtype=np.int64)
-
-    def linearise(self, state: Estimate, out: Room) -> Slices[float]:
-        """Fill in one factor of three rows."""
-        root, first = np.sqrt(self.information), state.pose[0]
-        off = np.array(se2.between(self.mean, first))
-        off[:2] = se2.rotation(-first[2]) @ (first[:2] - self.mean[:2])
-        block = root * np.eye(3, 4)
-        block[:, 3] = -root * off
-        out.values[:] = block.ravel()
-        yield from ()
-        return 0.5 * float(block[:, 3] @ block[:, 3])
+def deviate(mean: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far a pose (3,) is off another (3,), in its own axes; its derivative (3, 3) by a step, near there."""
+    off = np.array(se2.between(mean, pose))
+    off[:2] = se2.rotation(-pose[2]) @ (pose[:2] - mean[:2])
+    return off, np.eye(3)
 
 
 class PlacePriors(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -12,10 +12,10 @@ from scipy.sparse.csgraph import connected_components
 
 from evermap.config import OdometryConfig
 from evermap.errors import DataError
-from evermap.estimate.measurement import Tied
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, Slices, exhausted
 from evermap.geometry import se2, se3
+from evermap.slam.base_problem import BaseProblem
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import N_STATES, kernel
 from evermap.slam.preintegration import Intervals, Preintegration
@@ -161,14 +161,13 @@ class ConditionalPrior:
         return np.asarray(self.mean + self.gain @ (landmark[self.given] - landmark_mean[self.given]).ravel())
 
 
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """All measurements and priors.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem(BaseProblem):
+    """All measurements and priors in the plane; stamps are on the clock of `drive`.
 
     Attributes:
-        stamp_s: (N,) instants of the poses, on the clock of `drive`.
         drive: the odometry.
-        pose_row, landmark_row: (M,) which pose saw which landmark; sorted by pose.
+        landmark_row: (M,) which landmark each detection is of.
         reading: (M, 2) range [m] and bearing [rad] as reported.
         sigma_given: (M, 2) standard deviations that came with a detection, nan where none did.
         mount: (3,) pose of the sensor on the robot.
@@ -179,13 +178,12 @@ class Problem:
         landmark_information: (2 L, 2 L) sparse inverse of their joint prior covariance, empty where there is none.
             Blocks off the diagonal tie landmarks to each other, for example those that may have moved together. A dense
             array is taken, too.
-        measurements: of other kinds than odometry and detections; what they say about height and tilt has no effect.
         share: (M,) of the information of each detection that is new; None where all of it is.
     """
 
-    stamp_s: FloatArray
+    COLUMNS = ("pose_row", "landmark_row", "reading", "sigma_given", "share")
+
     drive: Drive
-    pose_row: IntArray
     landmark_row: IntArray
     reading: FloatArray
     sigma_given: FloatArray
@@ -195,16 +193,15 @@ class Problem:
     start_information: float
     landmark_mean: FloatArray
     landmark_information: sparse.csr_array
-    measurements: tuple[Tied, ...] = ()
     share: FloatArray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "landmark_information", sparse.csr_array(self.landmark_information))
 
-    def detections_of(self, pose: int) -> IntArray:
-        """Return the rows of the detections of a pose."""
-        first, last = self.pose_row.searchsorted((pose, pose + 1)).tolist()
-        return np.arange(first, last)
+    @property
+    def seen_place(self) -> IntArray:
+        """(M,) which landmark each detection is of."""
+        return self.landmark_row
 
     @property
     def mapped(self) -> BoolArray:
@@ -274,13 +271,6 @@ class Problem:
         stop = int(np.searchsorted(self.pose_row, n_poses - last_is_blind))
         measurements = tuple(tied.until(n_poses) for tied in self.measurements)
         return replace(self.seeing(slice(stop)), stamp_s=self.stamp_s[:n_poses], measurements=measurements)
-
-    def seeing(self, rows: IntArray | BoolArray | slice) -> Problem:
-        """Return the problem with some of its detections only."""
-        names = ("pose_row", "landmark_row", "reading", "sigma_given")
-        some: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
-        some["share"] = None if self.share is None else self.share[rows]
-        return replace(self, **some)
 
 
 def independent(blocks: FloatArray) -> sparse.csr_array:
@@ -437,8 +427,7 @@ class Marginals:
     @property
     def pose(self) -> FloatArray:
         """(N, 3, 3) covariance of every pose, in its own frame."""
-        first, last = self._held.own_first[[self._block.first, self._block.first + self._n]]
-        return self._held.own[first:last].reshape(self._n, 3, 3)
+        return self._held.of(self._block.first + np.arange(self._n), 3)
 
     @cached_property
     def consecutive(self) -> FloatArray:
@@ -451,8 +440,7 @@ class Marginals:
     def landmark(self) -> FloatArray:
         """(L, 2, 2) covariance of every landmark."""
         landmark = np.zeros((len(self.known), 2, 2))
-        rows = self._held.own_first[self._block.landmarks][:, None] + np.arange(4)
-        landmark[self.known] = self._held.own[rows].reshape(-1, 2, 2)
+        landmark[self.known] = self._held.of(self._block.landmarks, 2)
         return landmark
 
     @cached_property
@@ -482,16 +470,12 @@ class Marginals:
     @property
     def explained_odometry(self) -> FloatArray:
         """(N - 1, 3, 3) `A S A'`: part of whitened odometry residuals that the estimate's own uncertainty explains."""
-        first = self._block.odometry
-        first, last = self._held.of_factors_first[[first, first + self._n - 1]]
-        return self._held.of_factors[first:last].reshape(-1, 3, 3)
+        return self._held.explained(self._block.odometry + np.arange(self._n - 1), 3)
 
     @property
     def explained_detections(self) -> FloatArray:
         """(M, 2, 2) the same of the detections, weighted as inliers."""
-        first = self._block.detections
-        first, last = self._held.of_factors_first[[first, first + self._m]]
-        return self._held.of_factors[first:last].reshape(-1, 2, 2)
+        return self._held.explained(self._block.detections + np.arange(self._m), 2)
 
     def joint(self, landmarks: IntArray, *, poses: IntArray | None = None, states: bool = False) -> FloatArray:
         """Return the joint covariance of some poses, some landmarks and, if wanted, the states, in this order."""

@@ -10,14 +10,15 @@ from dataclasses import replace
 import numpy as np
 
 from evermap.estimate.gauss_newton import Steps
-from evermap.estimate.graph import Border, FactorBlock, Graph, GraphStructure, Layout, build_structure, grouped
-from evermap.estimate.measurement import MeasurementFactors, Tied
+from evermap.estimate.graph import Border, FactorBlock, Graph, GraphStructure, Layout, build_structure
+from evermap.estimate.measurement import MeasurementFactors
 from evermap.estimate.robust import HEAVY_TAIL
 from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
 from evermap.estimate.sparse.tree import tree_of
+from evermap.estimate.start import StartFactor
 from evermap.slam.calibration import BEARING, DELAY
-from evermap.slam.correlation import LEAST_WEIGHT, Lasting, lasting_errors
+from evermap.slam.correlation import LEAST_WEIGHT, Lasting, Pull, variance_of_clusters
 from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES
 from evermap.slam.linearise import (
     OF_DETECTION,
@@ -26,9 +27,9 @@ from evermap.slam.linearise import (
     OdometryFactors,
     PlacePriors,
     Readings,
-    StartFactor,
     build_place_priors,
     detection_residuals,
+    deviate,
 )
 from evermap.slam.misfit import build_curves, variance_by_curves
 from evermap.slam.problem import Estimate, Marginals, Noise, PlanarView, Problem
@@ -128,49 +129,31 @@ class Smoother(Solver[Estimate]):
     def worth(self, estimate: Estimate, marginals: Marginals) -> FloatArray:
         """Return (11,) variances of the states with correlated residuals, relative to those of independent ones.
 
-        What each stretch of the recording adds to the states is summed before it is squared, which makes no assumption
-        on how errors hang together within it: White's covariance (1980), with stretches as clusters (Liang and Zeger
-        1986), and once more with landmarks as clusters. Errors that are known to be `lasting` for longer are correlated
-        by landmark. The largest variance holds; 1 for states that are not free, and at least. Errors that come again
-        with a distance or a direction add to it (`misfit`).
+        What each stretch of the recording adds to the states is summed before it is squared (`correlation`), and once
+        more with landmarks as clusters. Errors that are known to be `lasting` for longer are correlated by landmark.
+        The largest variance holds; 1 for states that are not free, and at least. Errors that come again with a distance
+        or a direction add to it (`misfit`).
         """
         problem, n = self.problem, len(estimate.pose)
         if not problem.prior.free.any():
             return np.ones(N_STATES)
         now, structure, with_states = self.linearised(estimate), self.graph(estimate).structure, marginals.with_states
-        pose, states = with_states[: 3 * n].reshape(n, 3, N_STATES), with_states[-N_STATES:]
-        place = with_states[3 * n : -N_STATES].reshape(-1, 2, N_STATES)
-        driven = now.values[structure.values_of(ODOMETRY)].reshape(-1, 3, OF_INTERVAL)
-        seen, rank = self.detections(estimate), np.cumsum(estimate.known) - 1
-        of_driven = (
-            np.einsum("nra,nas->nrs", driven[..., :3], pose[:-1])
-            + np.einsum("nra,nas->nrs", driven[..., 3:6], pose[1:])
-            + driven[..., 6:-1] @ states[N_SENSOR:]
+        odometry, detections = (
+            Pull.of(structure.alike(block), pose, now.values, with_states)
+            for block, pose in ((ODOMETRY, np.arange(n - 1)), (DETECTIONS, problem.pose_row))
         )
-        of_seen = (
-            np.einsum("nra,nas->nrs", seen[..., :3], pose[problem.pose_row])
-            + np.einsum("nra,nas->nrs", seen[..., 3:5], place[rank[problem.landmark_row]])
-            + seen[..., 5:-1] @ states[:N_SENSOR]
-        )
-        stamp = problem.stamp_s - problem.stamp_s[0]
-        stretch = np.minimum((stamp / max(stamp[-1], 1e-9) * STRETCHES).astype(np.int64), STRETCHES - 1)
-        by_driven, by_seen = (
-            np.einsum("nrs,nr->ns", of, rows[..., -1]) for of, rows in ((of_driven, driven), (of_seen, seen))
-        )
-        by_stretch, by_place = np.zeros((STRETCHES, N_STATES)), np.zeros((len(estimate.known), N_STATES))
-        np.add.at(by_stretch, stretch[:-1], by_driven)
-        np.add.at(by_stretch, stretch[problem.pose_row], by_seen)
-        np.add.at(by_place, problem.landmark_row, by_seen)
-        alone = (of_driven**2).sum(axis=(0, 1))
-        independent = alone + (of_seen**2).sum(axis=(0, 1))
-        alike = self.lasting(estimate).variance_beside(of_seen, stamp[problem.pose_row], problem.landmark_row)
-        found = np.maximum.reduce([of_clusters(by_stretch), independent + alike, alone + of_clusters(by_place)])
+        by_place = np.zeros((len(estimate.known), N_STATES))
+        np.add.at(by_place, problem.landmark_row, detections.by)
+        independent = odometry.variance + detections.variance
+        correlated = problem.correlated_variance(odometry, detections, self.lasting(estimate), STRETCHES)
+        found = np.maximum(correlated, odometry.variance + variance_of_clusters(by_place))
         free = problem.prior.free & (independent > 0.0)
         independent = np.where(free, independent, 1.0)
         worth = np.where(free, np.maximum(found / independent, 1.0), 1.0)
         by_curves = self._variance_by_curves(estimate, marginals, worth)
         worth += np.where(free, by_curves / np.where(free, np.diag(marginals.states), 1.0), 0.0)
         # the delay shows where the velocity changes; where it only jitters, no delay explains it
+        driven = now.values[structure.values_of(ODOMETRY)].reshape(-1, 3, OF_INTERVAL)
         jitter = 2.0 * (driven[..., 3:6] ** 2).sum(axis=(0, 1)) @ problem.drive.jitter
         changes = max(float((driven[..., 6] ** 2).sum()), 1e-300)
         worth[DELAY] /= max(1.0 - jitter / changes, LEAST_CHANGE)
@@ -221,8 +204,7 @@ class Smoother(Solver[Estimate]):
             return self._lasting[1]
         problem, sigma = self.problem, self.noise.of_detections(self.problem.sigma_given)
         residual = detection_residuals(problem, estimate) / np.where(sigma < ANY_BEARING_RAD, sigma, np.nan)
-        stamp_s = problem.stamp_s[problem.pose_row]
-        found = lasting_errors(residual, self.inlier_probability(estimate), stamp_s, problem.landmark_row)
+        found = problem.lasting(residual, self.inlier_probability(estimate))
         self._lasting = estimate, found
         return found
 
@@ -231,8 +213,8 @@ class Smoother(Solver[Estimate]):
         lasting, problem = self.lasting(estimate), self.problem
         if not lasting.any:
             return marginals
-        share = lasting.information(problem.stamp_s[problem.pose_row], problem.landmark_row)
-        return self.under(self.noise, heavy=self.heavy, problem=replace(problem, share=share)).marginals(estimate)
+        counted = replace(problem, share=problem.new_information(lasting))
+        return self.under(self.noise, heavy=self.heavy, problem=counted).marginals(estimate)
 
     def detections(self, estimate: Estimate) -> FloatArray:
         """Return (M, 2, 13) detections, linearised and whitened: by pose, place, sensor states; and the right side."""
@@ -264,12 +246,13 @@ class Smoother(Solver[Estimate]):
         """Return the problem as a graph: poses, landmarks that have a position, sensor and motion states."""
         blocks = self.blocks(state.known)
         if self._structure is None or not np.array_equal(self._structure[0], state.known):
-            structure = yield from build_structure(self._layout(state), blocks)
+            places = np.full(int(state.known.sum()), 2)
+            layout = Layout.of(state.pose[:, :2], 3, places, [N_SENSOR, N_MOTION], POSES_A_LEAF)
+            structure = yield from build_structure(layout, blocks)
             self._structure = state.known, structure
         structure = self._structure[1]
-        held = np.zeros(structure.system.tree.begin[-1])
-        held[3 * len(state.pose) : -N_STATES] = HELD
-        return Graph(blocks, structure, Border(1.0 / self.states_sigma**2, self.off_mean), held, retract)
+        border = Border(1.0 / self.states_sigma**2, self.off_mean)
+        return Graph(blocks, structure, border, structure.hold_places(HELD), retract)
 
     def blocks(self, known: BoolArray) -> tuple[FactorBlock[Estimate], ...]:
         """Return the factors: `ODOMETRY`, `DETECTIONS`, the start, and priors of the `known` (L,) landmarks."""
@@ -282,6 +265,8 @@ class Smoother(Solver[Estimate]):
         if self._priors is None or not np.array_equal(self._priors[0], known):
             self._priors = known, build_place_priors(problem, known, n)
         rank, sensor = np.cumsum(known) - 1, n + int(known.sum())
+        log_odds, heavy = noise.outlier_log_odds if self.robust else np.inf, self.heavy and self.robust
+        place_variable = np.where(known, n + rank, -1)
         seen = Readings(
             problem.pose_row,
             rank[problem.landmark_row],
@@ -290,41 +275,23 @@ class Smoother(Solver[Estimate]):
             np.ones(len(problem.pose_row)) if problem.share is None else problem.share,
             problem.mount,
             problem.prior.free,
-            noise.outlier_log_odds if self.robust else np.inf,
-            HEAVY_TAIL if self.heavy and self.robust else 0.0,
+            log_odds,
+            HEAVY_TAIL if heavy else 0.0,
         )
         return (
             OdometryFactors(problem, noise.odometry**2, sensor + 1),
             DetectionFactors(seen, known, n, sensor),
-            StartFactor(problem.start_pose, problem.start_information),
+            StartFactor(problem.start_pose, np.full(3, np.sqrt(problem.start_information)), deviate),
             *self._priors[1],
-            *(self._measured(tied, known, n + rank) for tied in problem.measurements),
+            *(
+                MeasurementFactors.of(tied, PlanarView(), place_variable, log_odds, heavy=heavy)
+                for tied in problem.measurements
+            ),
         )
-
-    def _measured(self, tied: Tied, known: BoolArray, variable: IntArray) -> MeasurementFactors[Estimate]:
-        """Return measurements of known landmarks, and all others; of landmarks (L,) the variables."""
-        other = tied.others
-        if tied.kind.ties == "pose_place":
-            tied = tied[known[tied.other]]
-            other = variable[tied.others]
-        log_odds = self.noise.outlier_log_odds if self.robust else np.inf
-        return MeasurementFactors(tied, PlanarView(), other, log_odds, self.heavy and self.robust)
 
     def off_mean(self, state: Estimate) -> FloatArray:
         """Return (11,) calibration states less the means of their prior."""
         return state.states - self.problem.prior.mean
-
-    def _layout(self, state: Estimate) -> Layout:
-        n, count = len(state.pose), int(state.known.sum())
-        leaf = grouped(n, POSES_A_LEAF)
-        dim = np.concatenate([np.full(n, 3), np.full(count, 2), [N_SENSOR, N_MOTION]])
-        return Layout(dim, n + count + np.arange(2), leaf, np.column_stack([leaf, state.pose[:, :2]]))
-
-
-def of_clusters(pull: FloatArray) -> FloatArray:
-    """Return (S,) variances of estimates by what each of some clusters pulls them (K, S)."""
-    count = max(float(np.count_nonzero(pull.any(axis=1))), 2.0)
-    return np.asarray((pull**2).sum(axis=0) * count / (count - 1.0))
 
 
 def retract(state: Estimate, step: FloatArray) -> tuple[Estimate, float]:

@@ -94,7 +94,7 @@ def _in_plane(recording: Recording, settings: SlamConfig) -> tuple[IntArray, Rea
     pose, _ = dead_reckoned(problem.stamp_s, problem.drive, problem.prior.mean, START)
     at = sighted_at(pose[problem.pose_row], problem.reading, problem.prior.mean, problem.mount)
     variance = (settings.votes.sigma_m + settings.votes.sigma_share * problem.reading[:, 0]) ** 2
-    return prepared.used, Read(at, variance, problem.stamp_s[problem.pose_row], problem.pose_row, problem.landmark_row)
+    return prepared.used, Read(at, variance, problem.seen_s, problem.pose_row, problem.landmark_row)
 
 
 def _in_space(recording: SpatialRecording, settings: SlamConfig) -> tuple[IntArray, Read]:

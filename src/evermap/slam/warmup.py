@@ -76,7 +76,7 @@ def smoothed() -> None:
     estimate, marginals = exhausted(smoother.solved_in_slices(start, iterations=1))
     refine_noise(problem, estimate, marginals, smoother.inlier_probability(estimate), START)
     smoother.worth(estimate, marginals)
-    Lasting(np.ones(1), np.ones(1)).information(problem.stamp_s[problem.pose_row], problem.landmark_row)
+    problem.new_information(Lasting(np.ones(1), np.ones(1)))
     _ = marginals.pose, marginals.consecutive
     smoother.information(estimate, np.array([0, len(pose) - 1]))
     seldom_used()

@@ -50,6 +50,16 @@ class Spread(NamedTuple):
     pairs: FloatArray
     held: FloatArray
 
+    def of(self, variable: IntArray, dim: int) -> FloatArray:
+        """Return (K, dim, dim) covariances of variables (K,) that have so many numbers each."""
+        at = self.own_first[variable][:, None] + np.arange(dim * dim)
+        return np.asarray(self.own[at].reshape(-1, dim, dim))
+
+    def explained(self, factor: IntArray, rows: int) -> FloatArray:
+        """Return (K, rows, rows) `A S A'` of factors (K,) with so many rows each."""
+        at = self.of_factors_first[factor][:, None] + np.arange(rows * rows)
+        return np.asarray(self.of_factors[at].reshape(-1, rows, rows))
+
 
 class Elimination(NamedTuple):
     """Numeric state of an elimination, possibly incomplete.

@@ -318,7 +318,7 @@ class Assignment:
 
     def of_visits(self) -> tuple[IntArray, IntArray]:
         """Return `visits_of` these landmarks."""
-        stamp_s = self.measured.stamp_s[self.measured.pose_row]
+        stamp_s = self.measured.seen_s
         return visits_of(stamp_s, self.landmark_row, self.settings.association.forget_s)
 
     def like(self) -> Likeness:

@@ -204,7 +204,7 @@ def laid(assignment: Assignment, stretch: Displaced, before: float) -> Assignmen
         before: duration before the stretch, relative to its length, in which associations with older landmarks are cut.
     """
     since_s = stretch.since_s - before * (stretch.until_s - stretch.since_s)
-    row, stamp_s = assignment.landmark_row, assignment.measured.stamp_s[assignment.measured.pose_row]
+    row, stamp_s = assignment.landmark_row, assignment.measured.seen_s
     old = assignment.first_seen_s < since_s
     inside = np.flatnonzero((row >= 0) & (stamp_s >= since_s) & (stamp_s <= stretch.until_s))
     inside = inside[old[row[inside]]]

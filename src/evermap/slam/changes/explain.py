@@ -108,7 +108,7 @@ def explained(
     information = independent(np.where(given.given[:, None, None], np.linalg.inv(covariance), 0.0))
     landmark, landmark_row = estimate.landmark.copy(), problem.landmark_row.copy()
     places: list[int] = list(range(count))
-    stamp_s = problem.stamp_s[problem.pose_row]
+    stamp_s = problem.seen_s
     for group in groups:
         offset, motion_covariance = group.motion_prior(mean, prior.spread)
         members = group.members
@@ -173,7 +173,7 @@ def parting_time(
     Landmarks `members` (k,) of a group changed from `old` (k, 2) to `new` places, between two stamps `within_s`; with
     probability `interval` it was between the stamps returned.
     """
-    stamp_s = problem.stamp_s[problem.pose_row]
+    stamp_s = problem.seen_s
     inside = (stamp_s >= within_s[0]) & (stamp_s <= within_s[1])
     mine = np.flatnonzero(np.isin(problem.landmark_row, members) & inside)
     if len(mine) < 2:

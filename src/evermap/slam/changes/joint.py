@@ -328,7 +328,7 @@ class Joint(Method):
     def _changes(
         self, groups: Groups, probability: float, base: Problem, smoother: Smoother, estimate: Estimate
     ) -> tuple[MapChange, ...]:
-        first_s, stamp_s = float(base.stamp_s[0]), base.stamp_s[base.pose_row]
+        first_s, stamp_s = float(base.stamp_s[0]), base.seen_s
         used = smoother.inlier_probability(estimate) > 0.5
         moved = tuple(
             replace(_change(group, probability, first_s), n_hits=_count_hits(group, base, used, stamp_s))

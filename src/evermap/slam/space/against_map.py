@@ -179,8 +179,8 @@ def _predict_places(optimum: SpatialOptimum) -> MapComparison:
     for k, place in enumerate(prior.place):
         own_place = optimum.estimate.place[place][None]
         mean = problem.off_map(np.array([k]), own_place, oriented=bool(problem.oriented[place]))[0]
-        dim, at = len(mean), spread.own_first[n + place]
-        own = np.linalg.inv(spread.own[at : at + dim * dim].reshape(dim, dim))
+        dim = len(mean)
+        own = np.linalg.inv(spread.of(n + np.array([place]), dim)[0])
         # the map's own information on it is removed; the rest may be weak, but is positive
         values, vectors = np.linalg.eigh(own - np.diag(prior.weight[k] / prior.sigma[k, :dim] ** 2))
         alone = np.linalg.inv((vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T)

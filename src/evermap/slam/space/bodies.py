@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.config import BodiesConfig, StillConfig
+from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.intake import find_bodies
 from evermap.slam.space.estimate import SpatialOptimum, as_seen, converged, first_places
@@ -86,11 +87,11 @@ def _poses(intake: SpatialIntake, body: IntArray, rest: IntArray) -> tuple[Spati
     known = (body == UNKNOWN) | (rest != UNKNOWN)
     estimate = first_places(split, intake.driven_pose)
     if known.any():
-        some = split.selected(known).as_points()
+        some = split.seeing(known).as_points()
         optimum = converged(some, first_places(some, intake.driven_pose), noise)
         estimate, noise = optimum.estimate, optimum.noise
     seen_s = problem.stamp_s[np.unique(problem.pose_row[known])]
-    at_s = problem.stamp_s[problem.pose_row]
+    at_s = problem.seen_s
     near = np.searchsorted(seen_s, at_s + NEAR_S, side="right") > np.searchsorted(seen_s, at_s - NEAR_S)
     range_m = np.linalg.norm(problem.measured[:, :3], axis=1)
     return estimate, np.where(near, 0.0, np.hypot(noise.translation, noise.rotation * range_m))
@@ -125,7 +126,7 @@ def _find_rests(
     at = as_seen(problem, estimate, problem.measured)[:, :3]
     sigma_m = np.sqrt((np.linalg.inv(problem.measured_root) ** 2).sum(axis=(1, 2)) / 3.0)
     sigma_m = np.sqrt(sigma_m**2 + STILL_M**2 + uncovered_m**2 * settings.window_s)
-    stamp_s = problem.stamp_s[problem.pose_row]
+    stamp_s = problem.seen_s
     for one in np.unique(body[body != UNKNOWN]):
         mine = np.flatnonzero(body == one)
         moves = _find_moving(
@@ -180,7 +181,7 @@ def _with_places(intake: SpatialIntake, estimate: SpatialEstimate, body_of: IntA
     intake = replace(intake, bodies=body_of)
     if still.all() and len(landmark) == len(intake.landmark_id):
         return intake
-    stamp_s, at = whole.stamp_s[whole.pose_row], as_seen(whole, estimate, whole.measured)
+    stamp_s, at = whole.seen_s, as_seen(whole, estimate, whole.measured)
     since_s, until_s = np.full(len(landmark), np.inf), np.full(len(landmark), -np.inf)
     np.minimum.at(since_s, problem.place[still], stamp_s[still])
     np.maximum.at(until_s, problem.place[still], stamp_s[still])
@@ -200,7 +201,7 @@ def _with_places(intake: SpatialIntake, estimate: SpatialEstimate, body_of: IntA
             if not problem.oriented[row]:
                 seen[row] = np.append(at[last, :3] - here[:3], se3.NO_TURN)
     rests = Rests(landmark, body, since_s, until_s, away_s, seen_s, seen)
-    return replace(intake, problem=problem.selected(still), used=intake.used[still], rests=rests)
+    return replace(intake, problem=problem.seeing(still), used=intake.used[still], rests=rests)
 
 
 def mistrust_bodies(problem: SpatialProblem, bodies: IntArray) -> SpatialProblem:
@@ -231,7 +232,7 @@ def join_rests(optimum: SpatialOptimum, rests: Rests) -> tuple[SpatialOptimum, I
         rests: which these are.
     """
     problem, estimate = optimum.smoother.problem, optimum.estimate
-    spread, n = optimum.smoother.spread(optimum.now), len(problem.stamp_s)
+    spread = optimum.smoother.spread(optimum.now)
     into = np.arange(len(rests.landmark))
     seen = np.bincount(problem.place, minlength=len(into)) > 0
     of_bodies: list[list[IntArray]] = []
@@ -244,7 +245,7 @@ def join_rests(optimum: SpatialOptimum, rests: Rests) -> tuple[SpatialOptimum, I
                 a, b = _find_shared(groups[-1], rows, rests.landmark)
                 stands = not (rests.away_s[before] < rests.since_s[rows].min()).any()
                 if len(a):
-                    stands = not _is_elsewhere(optimum, spread.own, spread.own_first[n + np.append(a, b)], a, b)
+                    stands = not _is_elsewhere(optimum, spread, a, b)
                 if stands:
                     into[b] = a
                     groups[-1], before = np.append(groups[-1], np.setdiff1d(rows, b)), rows
@@ -293,13 +294,12 @@ def _find_shared(one: IntArray, other: IntArray, landmark: IntArray) -> tuple[In
     return one[a], other[b]
 
 
-def _is_elsewhere(optimum: SpatialOptimum, own: FloatArray, first: IntArray, a: IntArray, b: IntArray) -> bool:
+def _is_elsewhere(optimum: SpatialOptimum, spread: Spread, a: IntArray, b: IntArray) -> bool:
     """Tell whether landmarks of a body are at other places in one rest (a) than in another one (b)."""
-    oriented = optimum.smoother.problem.oriented[np.append(a, b)]
-    variance = np.empty(2 * len(a))
-    for k, (at, has_turn) in enumerate(zip(first.tolist(), oriented.tolist(), strict=True)):
-        dim = 6 if has_turn else 3
-        variance[k] = np.trace(own[at : at + dim * dim].reshape(dim, dim)[:3, :3]) / 3.0
+    problem, places, variance = optimum.smoother.problem, np.append(a, b), np.empty(2 * len(a))
+    for dim, some in ((3, ~problem.oriented[places]), (6, problem.oriented[places])):
+        own = spread.of(len(problem.stamp_s) + places[some], dim)
+        variance[some] = np.trace(own[:, :3, :3], axis1=1, axis2=2) / 3.0
     off = np.linalg.norm(optimum.estimate.place[b, :3] - optimum.estimate.place[a, :3], axis=1)
     sigma_m = np.sqrt(variance[: len(a)] + variance[len(a) :] + SLACK_M**2)
     return bool(np.median(off / sigma_m) > ELSEWHERE)

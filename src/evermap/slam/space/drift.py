@@ -74,7 +74,7 @@ def drift_of(problem: SpatialProblem, driven: FloatArray) -> Drift:
     Errors of one detector are alike: either all persist, for the same time on average, or none does.
     """
     sensor = se3.compose(driven[problem.pose_row], problem.mount[problem.sensor])
-    at, stamp_s = se3.transform(sensor, problem.measured[:, :3]), problem.stamp_s[problem.pose_row]
+    at, stamp_s = se3.transform(sensor, problem.measured[:, :3]), problem.seen_s
     curves = list[Curve]()
     for place in range(len(problem.oriented)):
         mine = np.flatnonzero(problem.place == place)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
-from evermap.estimate.noise import restricted_level
+from evermap.estimate.noise import Turns, alternate, restricted_level
+from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.space.linearise import (
     ACROSS,
@@ -23,7 +25,7 @@ from evermap.slam.space.linearise import (
 )
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
-from evermap.types import FloatArray, IntArray
+from evermap.types import FloatArray
 
 ROUNDS = 12
 """Optimum and noise levels in turns, at most."""
@@ -35,6 +37,10 @@ CONVERGED = 0.02
 """Relative change of all noise levels that ends it."""
 MOST_CANDIDATES = 60
 """Detections whose orientations are asked."""
+
+
+_Solution: TypeAlias = tuple[SpatialEstimate, SpatialLinear]
+"""Values near the optimum of some noise levels, and the linearised problem there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,20 +74,21 @@ def converged(
         noise: levels to start from, which count as a weak prior.
         heavy_rounds: rounds with tails that never let go, before it is decided what is an outlier.
     """
-    estimate, begun = start, noise
     smoother = SpatialSmoother(problem, start.pose)
-    for round_ in range(ROUNDS):
-        heavy = round_ < heavy_rounds
+
+    def optimise(before: _Solution | None, levels: SpatialNoise, heavy: bool) -> _Solution:
         # values and levels settle together: after a short step there is no need for the optimum of these levels
-        steps, near = (FIRST_STEPS, NEAR) if round_ == 0 else (STEPS_A_ROUND, NEAR_ROUND)
-        estimate, now = smoother.optimum(estimate, noise, heavy=heavy, iterations=steps, tolerance=near)
-        following = refined(smoother, now, noise, begun)
-        settled = np.abs(np.log(following.levels / noise.levels)).max() < CONVERGED
-        noise = following
-        if settled and not heavy:
-            break
-    estimate, now = smoother.optimum(estimate, noise, heavy=False, iterations=LAST_STEPS)
-    return SpatialOptimum(estimate, noise, smoother, now)
+        steps, near = (FIRST_STEPS, NEAR) if before is None else (STEPS_A_ROUND, NEAR_ROUND)
+        values = start if before is None else before[0]
+        return smoother.optimum(values, levels, heavy=heavy, iterations=steps, tolerance=near)
+
+    def learn(found: _Solution, levels: SpatialNoise) -> tuple[SpatialNoise, float]:
+        following = refined(smoother, found[1], levels, noise)
+        return following, float(np.abs(np.log(following.levels / levels.levels)).max())
+
+    found, learned = alternate(noise, optimise, learn, lambda _, fit, __: fit, Turns(ROUNDS, heavy_rounds, CONVERGED))
+    estimate, now = smoother.optimum(found[0], learned, heavy=False, iterations=LAST_STEPS)
+    return SpatialOptimum(estimate, learned, smoother, now)
 
 
 def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, begun: SpatialNoise) -> SpatialNoise:
@@ -95,7 +102,7 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
     if not problem.estimate_noise:
         return noise
     n_steps, spread, worth = len(problem.increment), smoother.spread(now, nearly=True), problem.settings.pseudo_count
-    of_steps, of_detections = _leverages(smoother, spread.of_factors, spread.of_factors_first)
+    of_steps, of_detections = _leverages(smoother, spread)
     levels = noise.levels.copy()
 
     def learn(level: int, squares: float, numbers: float, leverage: float) -> None:
@@ -143,20 +150,17 @@ def correlation(optimum: SpatialOptimum) -> float:
     return float((before * after).sum()) / total if total > 0.0 else 0.0
 
 
-def _leverages(smoother: SpatialSmoother, of_factors: FloatArray, first: IntArray) -> tuple[FloatArray, FloatArray]:
+def _leverages(smoother: SpatialSmoother, spread: Spread) -> tuple[FloatArray, FloatArray]:
     """Diagonals of `A S A'` of odometry (N - 1, 6) and detections (M, 8); weighted, as the Jacobians are: leverages,
     which are in [0, 1] but for rounding.
     """
-    problem = smoother.problem
-    n_steps, kind = len(problem.increment), problem.kind
-    steps = of_factors[: 36 * n_steps].reshape(n_steps, 6, 6)
+    n_steps, kind = len(smoother.problem.increment), smoother.problem.kind
     found = np.zeros((len(kind), 8))
-    begin = first[n_steps : n_steps + len(kind)]
-    for k in range(3):
-        some, rows = kind == k, int(ROWS[k])
-        at = begin[some][:, None] + (rows + 1) * np.arange(rows)
-        found[some, :rows] = of_factors[at]
-    return np.clip(np.einsum("nii->ni", steps), 0.0, 1.0), np.clip(found, 0.0, 1.0)
+    for k, rows in enumerate(ROWS.tolist()):
+        some = np.flatnonzero(kind == k)
+        found[some, :rows] = np.einsum("mrr->mr", spread.explained(n_steps + some, rows))
+    steps = np.einsum("nrr->nr", spread.explained(np.arange(n_steps), 6))
+    return np.clip(steps, 0.0, 1.0), np.clip(found, 0.0, 1.0)
 
 
 def as_seen(problem: SpatialProblem, estimate: SpatialEstimate, measured: FloatArray) -> FloatArray:

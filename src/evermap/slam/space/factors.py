@@ -127,33 +127,10 @@ class SightingFactors(NamedTuple):
         )
 
 
-class SpatialStartFactor(NamedTuple):
-    """The first pose, held where it is: `mean` (7,), to within `sigma` (6,) in its own frame."""
-
-    mean: FloatArray
-    sigma: FloatArray
-
-    @property
-    def ties(self) -> IntArray:
-        """Return (1, 1) the first variable."""
-        return np.zeros((1, 1), dtype=np.int64)
-
-    @property
-    def rows(self) -> IntArray:
-        """Return (1,) 6."""
-        return np.full(1, 6)
-
-    @property
-    def pose(self) -> IntArray:
-        """Return (1,) the first pose."""
-        return np.zeros(1, dtype=np.int64)
-
-    def linearise(self, state: SpatialEstimate, out: Room) -> Slices[float]:
-        """Fill in one factor of six rows."""
-        held, root = se3.local(self.mean, state.pose[0]), 1.0 / self.sigma
-        out.values[:] = np.column_stack([root[:, None] * se3.right_jacobian_inverse(held), -root * held]).ravel()
-        yield from ()
-        return 0.5 * float(np.sum((root * held) ** 2))
+def deviate(mean: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the twist (6,) from a pose (7,) to another, and its derivative (6, 6) by a step of the latter."""
+    off = se3.local(mean, pose)
+    return off, se3.right_jacobian_inverse(off)
 
 
 class MapFactors(NamedTuple):

@@ -11,13 +11,12 @@ import numpy as np
 
 from evermap.config import SpaceConfig
 from evermap.errors import DataError
-from evermap.estimate.tie import tie_measurements
 from evermap.geometry import se3
 from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
 from evermap.geometry.symmetry import HINT, Symmetries, Symmetry
 from evermap.slam.gaps import find_gaps
-from evermap.slam.intake import frames_of_usable, frames_with_pose, landmark_ids, most_of, usable_detections
+from evermap.slam.intake import connect, frames_of_usable, frames_with_pose, most_of, usable_detections
 from evermap.slam.space.bridge import PathFrames
 from evermap.slam.space.linearise import CORNERS, JUMP_SHARE, POINT, POSE
 from evermap.slam.space.local_filter import SpatialFrame
@@ -128,27 +127,23 @@ def prepare_space(
     detections, stamps = recording.detections, recording.frames.stamp_s
     where, usable, moving, warnings = _said(recording, settings, remarks, coarse=coarse)
     seen_in = frames_of_usable(recording, usable, fewest=fewest)
-    frames, used = _find_frames(recording, seen_in, moving), np.flatnonzero(usable)
+    frames = _find_frames(recording, seen_in, moving)
     pose_frame, path_s = frames.pose_frame, stamps[frames.row]
-    landmark_id = landmark_ids(recording, used)
-    place = np.searchsorted(landmark_id, detections.landmark_id[used])
+    seen = connect(recording, usable, pose_frame, partial(_moved, recording.odometry))
+    used, landmark_id, place = seen.used, seen.landmark_id, seen.place
     some = rows_of(where, used)
     symmetries = _symmetries(recording, place, used, some.kind, len(landmark_id))
     oriented = np.bincount(place, some.kind != POINT, minlength=len(landmark_id)) > 0.0
     driven, by_corners = recording.odometry is not None, 2 * np.count_nonzero(some.kind == CORNERS) > len(some.kind)
     scale = scale_between(recording.sensors, settings, settings.scale_sigma if by_corners else 0.0)
-    tied, left_out = tie_measurements(
-        recording.measurements, stamps[pose_frame], partial(_moved, recording.odometry), landmark_id
-    )
-    warnings.extend(left_out)
     problem = SpatialProblem(
         stamp_s=stamps[pose_frame] - stamps[pose_frame[0]],
         increment=se3.between(frames.driven[frames.posed[:-1]], frames.driven[frames.posed[1:]]),
         lasted_s=np.add.reduceat(frames.lasted_s, frames.posed[:-1]),
         swing=Swing.between(frames.posed, frames.lasted_s, frames.driven),
         driven=driven,
-        pose_row=np.searchsorted(pose_frame, detections.frame[used]),
-        place=place.astype(np.int64),
+        pose_row=seen.pose_row,
+        place=place,
         sensor=detections.sensor[used],
         kind=some.kind,
         measured=some.measured,
@@ -173,14 +168,14 @@ def prepare_space(
         ranges_share=scale[1],
         path=lead_on(recording, stamps[pose_frame[0]], settings.delay_sigma_s),
         has_clock_of_frames=_has_clock_of_frames(recording.odometry, path_s),
-        measurements=tied,
-        start_sigma=np.max([[1e-4] * 6, *(of.kind.first_sigma for of in tied)], axis=0),
+        measurements=seen.measurements,
+        start_sigma=np.max([[1e-4] * 6, *(of.kind.first_sigma for of in seen.measurements)], axis=0),
         robust=robust,
         estimate_noise=estimate_noise,
         settings=settings,
     )
     return SpatialIntake(
-        problem, float(stamps[pose_frame[0]]), frames, used, landmark_id, tuple(warnings),
+        problem, float(stamps[pose_frame[0]]), frames, used, landmark_id, (*warnings, *seen.left_out),
         recording.landmark_names,
         np.bincount(place, np.isfinite(detections.size_m[used]).all(axis=1), len(landmark_id)) > 0.0,
         settings.map.scale_sigma if driven and recording.sensors[0].sigma_odometer_scale is None else 0.0,

@@ -14,7 +14,6 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from evermap.align.candidates import AGREE_M, Matches, rank_motions
-from evermap.geometry import se3
 from evermap.slam.space.against_map import log_density_in_map
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.problem import LEAST_WEIGHT, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
@@ -86,9 +85,7 @@ def _overlays(prior: PlacePrior, alone: SpatialOptimum, agree_m: float) -> list[
             for motion, here in _motions(prior, estimate.place, mine, agree_m)[:1]:
                 by_pose[of_pose == part] = by_place[of_place == part] = motion
                 agree = np.where(mine, here, agree)
-        place = se3.compose(by_place, estimate.place)
-        place[~problem.oriented, 3:] = se3.NO_TURN
-        found.append((replace(estimate, pose=se3.compose(by_pose, estimate.pose), place=place), agree))
+        found.append((estimate.moved(by_pose, problem.oriented, by_place), agree))
     return found
 
 

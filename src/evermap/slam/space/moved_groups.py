@@ -14,7 +14,6 @@ import numpy as np
 from evermap.align.candidates import AGREE_M, Matches, find_consensus
 from evermap.config import ChangesConfig
 from evermap.estimate.sparse.system import exhausted
-from evermap.geometry import se3
 from evermap.slam.changes.weigh import MAP_FACTORS, ChangePosterior, weigh
 from evermap.slam.space.against_map import AgainstMap, MovedTogether, evidence_against
 from evermap.slam.space.estimate import SpatialOptimum, converged
@@ -98,9 +97,7 @@ def _loosened(optimum: SpatialOptimum, stated: FloatArray, changes: ChangesConfi
         if np.count_nonzero(agree) < FEWEST or any(np.array_equal(agree, other) for other in tried):
             continue
         tried.append(agree)
-        place = se3.compose(motion, free.estimate.place)
-        place[~problem.oriented, 3:] = se3.NO_TURN
-        start = replace(free.estimate, pose=se3.compose(motion, free.estimate.pose), place=place)
+        start = free.estimate.moved(motion, problem.oriented)
         weight = np.full(len(prior.place), LEAST_WEIGHT)
         weight[seen[agree]] = 1.0
         there = replace(loose, prior=replace(loose.prior, weight=weight))

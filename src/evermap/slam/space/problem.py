@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.config import SpaceConfig
-from evermap.estimate.measurement import Tied
 from evermap.geometry import se3
 from evermap.geometry.symmetry import Symmetries
+from evermap.slam.base_problem import BaseProblem
 from evermap.slam.space.linearise import MOUNT, OF_SIGHTING, POINT, POSE, ROWS, SpatialSightings
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -178,19 +178,18 @@ class OdometryPath(NamedTuple):
         return se3.local(self.at(stamp_s), then), -velocity
 
 
-@dataclass(frozen=True, slots=True)
-class SpatialProblem:
-    """All measurements and priors.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpatialProblem(BaseProblem):
+    """All measurements and priors in space.
 
     Attributes:
-        stamp_s: (N,) instants of the poses.
         increment: (N - 1, 7) motion by the odometry; identity where there is none.
         lasted_s: (N - 1,) what its variance grows with: the time; without odometry the time squared, at a speed of
             which nothing is known but its size.
         swing: of the odometry's noise between the poses.
         driven: True if there is odometry.
         steady: True where the noise of that is not learned, but held where it starts.
-        pose_row, place, sensor, kind: (M,) which pose saw which place how; sorted by pose.
+        place, sensor, kind: (M,) which place each detection is of, and how it was seen.
         measured: (M, 7) the place in the sensor's frame.
         measured_root: (M, 3, 3) whitens the position but for its noise levels; see `SpatialSightings`.
         sigma_rad: (M,) of the orientation, but for its noise level.
@@ -218,18 +217,20 @@ class SpatialProblem:
         whole_s: (S,) what of each delay are whole steps of the odometry; see `OdometryPath`.
         delay_jitter: (S,) information that detections seem to hold on the rest of each delay, since the velocity
             jitters: it pulls to whole steps, and is taken off (errors in variables).
-        measurements: of other kinds than odometry and detections.
         robust: whether outliers are down-weighted.
         estimate_noise: whether noise levels are learned.
         settings: what is believed of sensors and of a map.
     """
 
-    stamp_s: FloatArray
+    COLUMNS = (
+        "pose_row", "place", "sensor", "kind", "measured", "measured_root", "sigma_rad", "corner", "corner_root",
+        "half_m", "other", "other_log_odds", "share", "ray",
+    )  # fmt: skip
+
     increment: FloatArray
     lasted_s: FloatArray
     swing: Swing
     driven: bool
-    pose_row: IntArray
     place: IntArray
     sensor: IntArray
     kind: IntArray
@@ -261,10 +262,14 @@ class SpatialProblem:
     velocity_s: float = 1.0
     whole_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     delay_jitter: FloatArray = field(default_factory=lambda: np.zeros(0))
-    measurements: tuple[Tied, ...] = ()
     robust: bool = True
     estimate_noise: bool = True
     settings: SpaceConfig = USUAL
+
+    @property
+    def seen_place(self) -> IntArray:
+        """(M,) which place each detection is of."""
+        return self.place
 
     def earlier(self, delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return (S, N, 6) twists by the odometry from each pose to where the robot was delays (S,) before, and
@@ -386,14 +391,6 @@ class SpatialProblem:
             odometry_log=driven,
         )
 
-    def selected(self, some: BoolArray) -> SpatialProblem:
-        """Return the same with some of its detections (M,) only."""
-        names = (
-            "pose_row", "place", "sensor", "kind", "measured", "measured_root", "sigma_rad", "corner", "corner_root",
-            "half_m", "other", "other_log_odds", "share", "ray",
-        )  # fmt: skip
-        return replace(self, **{name: getattr(self, name)[some] for name in names})
-
     def as_points(self) -> SpatialProblem:
         """Return the same with positions only, which has one optimum, near any start."""
         prior = replace(self.prior, sigma=np.hstack([self.prior.sigma[:, :3].max(axis=1, keepdims=True)] * 6))
@@ -415,6 +412,15 @@ class SpatialEstimate:
     place: FloatArray
     state: FloatArray
     log_scale: float = 0.0
+
+    def moved(self, by: FloatArray, oriented: BoolArray, by_place: FloatArray | None = None) -> SpatialEstimate:
+        """Return everything moved together by a motion (7,); or poses by (N, 7), places by (P, 7).
+
+        Of places (P,) without an orientation only the positions move.
+        """
+        place = se3.compose(by if by_place is None else by_place, self.place)
+        place[~oriented, 3:] = se3.NO_TURN
+        return replace(self, pose=se3.compose(by, self.pose), place=place)
 
     def mount(self, problem: SpatialProblem) -> FloatArray:
         """Return (S, 7) the sensors' poses on the robot."""

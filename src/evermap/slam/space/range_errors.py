@@ -32,7 +32,7 @@ def find_range_errors(optimum: SpatialOptimum) -> FloatArray:
         return error
     information, pull = np.zeros(len(error)), np.zeros(len(error))
     counts = now.weight * problem.share
-    counts *= smoother.lasting(now).information(problem.stamp_s[problem.pose_row], problem.place)
+    counts *= problem.new_information(smoother.lasting(now))
     shape, residual = _by_error(optimum), _find_residuals(smoother, now)
     for sensor in np.unique(problem.sensor[problem.has_range]).tolist():
         own = np.where((problem.sensor == sensor)[:, None], shape, 0.0)

@@ -200,14 +200,11 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
     seen_s = told.stamp_s[problem.pose_row[used]]
     hits, first, last = count_sightings(count, problem.place[used], seen_s, problem.measurements, told.stamp_s)
     covariance, turned = np.zeros((count, 3, 3)), np.full((count, 3, 3), np.nan)
-    for k in range(count):
-        dim, at = (6 if problem.oriented[k] else 3), told.spread.own_first[n + k]
-        own = told.spread.own[at : at + dim * dim].reshape(dim, dim)
-        covariance[k] = own[:3, :3]
-        if dim == 6:  # a twist's translation is in the place's own axes
-            turn = se3.rotation_of(place[k])
-            covariance[k] = turn @ own[:3, :3] @ turn.T
-            turned[k] = own[3:, 3:]
+    points, turns = np.flatnonzero(~problem.oriented), np.flatnonzero(problem.oriented)
+    covariance[points] = told.spread.of(n + points, 3)
+    own, axes = told.spread.of(n + turns, 6), se3.rotation_of(place[turns])
+    covariance[turns] = axes @ own[:, :3, :3] @ np.swapaxes(axes, 1, 2)  # a twist's translation is in the own axes
+    turned[turns] = own[:, 3:, 3:]
     covariance = add_scale_error(covariance, place[:, :3], _undivided(told))
     order = np.argsort(identities, kind="stable")
     order = order[(hits[order] > 0) & told.placed[order]]

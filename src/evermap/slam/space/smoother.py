@@ -6,22 +6,22 @@ share, and the scale of the odometry.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from evermap.estimate.gauss_newton import Steps, minimised
-from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, build_structure, grouped
+from evermap.estimate.graph import AlikeFactors, Border, FactorBlock, Graph, Layout, Linear, build_structure
 from evermap.estimate.innovations import find_left_out_nis
-from evermap.estimate.measurement import MeasurementFactors, Tied
+from evermap.estimate.measurement import MeasurementFactors
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
+from evermap.estimate.start import StartFactor
 from evermap.geometry import se3
-from evermap.slam.correlation import Lasting, lasting_errors
+from evermap.slam.correlation import Lasting, Pull
 from evermap.slam.space.drift import STRETCHES
-from evermap.slam.space.factors import MapFactors, SightingFactors, SpatialOdometryFactors, SpatialStartFactor
+from evermap.slam.space.factors import MapFactors, SightingFactors, SpatialOdometryFactors, deviate
 from evermap.slam.space.linearise import MOUNT, OF_SIGHTING, OF_STEP, POINT, ROWS, STATES
 from evermap.slam.space.problem import NO_JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem, SpatialView
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -99,19 +99,11 @@ class SpatialSmoother:
         self._mean[delay] = -problem.delay_jitter * problem.whole_s / information[delay]
         self._border = Border(information, self._off_mean)
         self._start = np.array(around[0])
-        n, count = len(problem.stamp_s), len(problem.oriented)
-        dim = np.concatenate(
-            [np.full(n, 6), np.where(problem.oriented, 6, 3), np.full(len(problem.mount), STATES), [1]]
-        )
-        leaf = grouped(n, POSES_A_LEAF)
-        layout = Layout(
-            dim, n + count + np.arange(len(problem.mount) + 1), leaf, np.column_stack([leaf, around[:, :3]])
-        )
+        places, border = np.where(problem.oriented, 6, 3), [STATES] * len(problem.mount) + [1]
+        layout = Layout.of(around[:, :3], 6, places, border, POSES_A_LEAF)
         self.structure = exhausted(build_structure(layout, self._blocks(SpatialNoise(), heavy=False)))
-        begin = self.structure.system.tree.begin
-        self._held = np.zeros(begin[-1])
-        self._held[6 * n : -len(sigma)] = HELD
-        self.hold(self._held, begin)
+        self._held = self.structure.hold_places(HELD)
+        self.hold(self._held, self.structure.system.tree.begin)
 
     @property
     def states_information(self) -> FloatArray:
@@ -177,36 +169,36 @@ class SpatialSmoother:
     def find_nis(self, now: SpatialLinear, spread: Spread) -> FloatArray:
         """Return (M,) NIS of all detections, each as if it had not been used."""
         problem, nis = self.problem, np.zeros(len(self.problem.kind))
-        first = spread.of_factors_first[len(problem.increment) :]
+        weight, first = now.weight * problem.share, self.structure.first[SIGHTINGS]
         for kind in range(3):
             some, rows = np.flatnonzero(problem.kind == kind), int(ROWS[kind])
-            if not len(some):
-                continue
-            at = first[some][:, None] + np.arange(rows * rows)
-            used = spread.of_factors[at].reshape(-1, rows, rows)
-            left = (1.0 + 1e-9) * np.eye(rows) - used
-            weight = (now.weight * problem.share)[some]
-            nis[some] = find_left_out_nis(now.residual[some, :rows], used, left, weight)
+            if len(some):
+                used = spread.explained(first + some, rows)
+                left = (1.0 + 1e-9) * np.eye(rows) - used
+                nis[some] = find_left_out_nis(now.residual[some, :rows], used, left, weight[some])
         return nis
+
+    @cached_property
+    def _odometry(self) -> list[AlikeFactors]:
+        return self.structure.alike(ODOMETRY)
+
+    @cached_property
+    def _sightings(self) -> list[AlikeFactors]:
+        return self.structure.alike(SIGHTINGS)
 
     def residual_of(self, now: Linear) -> FloatArray:
         """Return (M, 8) whitened residuals of detections, by the right sides of their factors."""
-        seen, values = self._seen, now.values[self.structure.values_of(SIGHTINGS)]
-        scale = np.sqrt(now.weights[SIGHTINGS] * seen.share)
-        found = np.zeros((len(seen.kind), 8))
-        rows, width = ROWS[seen.kind], np.diff(seen.first) // ROWS[seen.kind]
-        for k in range(int(rows.max(initial=0))):
-            some = np.flatnonzero(rows > k)
-            found[some, k] = -values[seen.first[some] + (k + 1) * width[some] - 1] / scale[some]
+        scale = np.sqrt(now.weights[SIGHTINGS] * self._seen.share)
+        found = np.zeros((len(scale), 8))
+        for alike in self._sightings:
+            found[alike.factor, : alike.rows] = -now.values[alike.right] / scale[alike.factor, None]
         return found
 
     def with_residuals(self, now: SpatialLinear, more: FloatArray) -> SpatialLinear:
         """Return the linearised problem with more residuals of detections (M, r), whitened and not weighted."""
-        seen, values = self._seen, now.values.copy()
-        own = values[self.structure.values_of(SIGHTINGS)]
-        scale, width = np.sqrt(now.weight * seen.share), np.diff(seen.first) // ROWS[seen.kind]
-        for k in range(more.shape[1]):
-            own[seen.first[:-1] + (k + 1) * width - 1] -= scale * more[:, k]
+        values, weighted = now.values.copy(), np.sqrt(now.weight * self._seen.share)[:, None] * more
+        for alike in self._sightings:
+            values[alike.right[:, : more.shape[1]]] -= weighted[alike.factor]
         return SpatialLinear(replace(now.now, values=values), self)
 
     @cached_property
@@ -222,21 +214,18 @@ class SpatialSmoother:
 
     def information_of_places(self, now: SpatialLinear) -> list[FloatArray]:
         """Return for each place the (3, 3) or (6, 6) information that its detections hold on it, at fixed poses."""
-        seen, dims = self._seen, np.where(self.problem.oriented, 6, 3)
-        values, found = now.values[self.structure.values_of(SIGHTINGS)], np.zeros((len(dims), 6, 6))
-        for kind, n_rows in enumerate(ROWS.tolist()):
-            for dim in (3, 6):
-                some = np.flatnonzero((seen.kind == kind) & (dims[seen.place] == dim))
-                at = seen.first[some][:, None] + np.arange(n_rows * (OF_SIGHTING + dim))
-                rows = values[at].reshape(len(some), n_rows, OF_SIGHTING + dim)[..., 6 : 6 + dim]
-                np.add.at(found[:, :dim, :dim], seen.place[some], np.swapaxes(rows, 1, 2) @ rows)
+        dims, found = np.where(self.problem.oriented, 6, 3), np.zeros((len(self.problem.oriented), 6, 6))
+        for alike in self._sightings:
+            dim = alike.number.shape[1] + 1 - OF_SIGHTING
+            rows = now.values[alike.at[..., 6 : 6 + dim]]
+            np.add.at(found[:, :dim, :dim], self._seen.place[alike.factor], np.swapaxes(rows, 1, 2) @ rows)
         return [one[:dim, :dim] for one, dim in zip(found, dims.tolist(), strict=True)]
 
     def lasting(self, now: SpatialLinear) -> Lasting:
         """Return how long errors of detections last, by their residuals there."""
         problem = self.problem
         residual = np.where(np.arange(8) < ROWS[problem.kind][:, None], now.residual, np.nan)
-        return lasting_errors(residual, now.weight, problem.stamp_s[problem.pose_row], problem.place)
+        return problem.lasting(residual, now.weight)
 
     def counted(
         self, estimate: SpatialEstimate, now: SpatialLinear, share: FloatArray | None = None
@@ -251,64 +240,36 @@ class SpatialSmoother:
         problem = self.problem
         share = None if share is None or np.all(share == 1.0) else share
         if share is None and np.all(problem.share == 1.0) and (lasting := self.lasting(now)).any:
-            share = lasting.information(problem.stamp_s[problem.pose_row], problem.place)
+            share = problem.new_information(lasting)
         return self if share is None else SpatialSmoother(replace(problem, share=share), estimate.pose)
 
     def worth_by_stretches(self, now: SpatialLinear, state: int) -> tuple[float, float]:
         """Return the variance of one of the border's numbers, and what one with correlated residuals has over it, at
         least 1.
 
-        As of the states in the plane (`slam.smoother.Smoother.worth`): what each stretch of the drive adds is summed
-        before it is squared.
+        As of states in the plane (`slam.smoother.Smoother.worth`): by stretches of the drive, and by errors that last.
         """
-        problem = self.problem
-        with_it = self.spread(now).with_border[:, state]
-        share = problem.stamp_s / max(problem.stamp_s[-1], 1e-9)
-        stretch = np.minimum((STRETCHES * share).astype(np.int64), STRETCHES - 1)
-        pull, independent, influence = np.zeros(STRETCHES), 0.0, np.zeros((len(self._seen.kind), 8, 1))
-        for pose_row, rows, _, told, some in self._told(now.values, with_it):
-            pull += np.bincount(stretch[pose_row], (told * rows[..., -1]).sum(axis=1), STRETCHES)
-            independent += float((told**2).sum())
-            influence[some, : told.shape[1], 0] = told[: len(some)]
-        found = (pull**2).sum() * STRETCHES / (STRETCHES - 1.0)
-        alike = self.lasting(now).variance_beside(influence, problem.stamp_s[problem.pose_row], problem.place)
-        found = max(found, independent + float(alike[0]))
+        problem, with_it = self.problem, self.spread(now).with_border[:, state]
+        odometry, detections = (
+            Pull.of(alike, pose, now.values, with_it[:, None])
+            for alike, pose in (
+                (self._odometry, np.arange(len(problem.increment))),
+                (self._sightings, problem.pose_row),
+            )
+        )
+        independent = float((odometry.variance + detections.variance)[0])
+        found = float(problem.correlated_variance(odometry, detections, self.lasting(now), STRETCHES, STRETCHES)[0])
         own = with_it[len(with_it) - len(self.states_information) :]
-        return float(own[state]), max(float(found / max(independent, 1e-300)), 1.0)
+        return float(own[state]), max(found / max(independent, 1e-300), 1.0)
 
     def after(self, now: SpatialLinear, step: FloatArray) -> SpatialLinear:
         """Return the problem with the residuals of odometry and detections as they are after a step, by what is linear
         in it.
         """
         values = now.values.copy()
-        for _, _, at, told, _ in self._told(now.values, step):
-            values[at[..., -1]] -= told
+        for alike in (*self._odometry, *self._sightings):
+            values[alike.right] -= alike.multiply(now.values, step[:, None])[..., 0]
         return SpatialLinear(replace(now.now, values=values), self)
-
-    def _told(
-        self, values: FloatArray, numbers: FloatArray
-    ) -> Iterator[tuple[IntArray, FloatArray, IntArray, FloatArray, IntArray]]:
-        """Yield odometry, and detections of each kind, times numbers of all variables.
-
-        That is their poses (m,), rows (m, r, width), where these are among the values, rows times numbers (m, r), and
-        which detections they are: none of odometry.
-        """
-        problem, structure, seen = self.problem, self.structure, self._seen
-        n, begin, odometry = len(problem.stamp_s), structure.system.tree.begin, structure.values_of(ODOMETRY).stop
-        pose, scale = numbers[: 6 * n].reshape(n, 6), numbers[-1:]
-        by, at = np.hstack([pose[:-1], pose[1:], np.tile(scale, (n - 1, 1))]), np.arange(odometry)
-        parts = [(np.arange(n - 1), at.reshape(n - 1, 6, OF_STEP), by, np.zeros(0, dtype=np.int64))]
-        for kind, n_rows in enumerate(ROWS.tolist()):
-            for dim in (3, 6):
-                some = np.flatnonzero((seen.kind == kind) & (seen.oriented == (dim == 6)))
-                at = odometry + seen.first[some][:, None] + np.arange(n_rows * (OF_SIGHTING + dim))
-                place = begin[n + seen.place[some]][:, None] + np.arange(dim)
-                sensor = begin[n + len(problem.oriented) + seen.sensor[some]][:, None] + np.arange(STATES)
-                by = np.hstack([pose[seen.pose_row[some]], numbers[place], numbers[sensor]])
-                parts.append((seen.pose_row[some], at.reshape(len(some), n_rows, OF_SIGHTING + dim), by, some))
-        for pose_row, at, by, some in parts:
-            rows = values[at]
-            yield pose_row, rows, at, np.einsum("mra,ma->mr", rows[..., :-1], by), some
 
     def _blocks(self, noise: SpatialNoise, *, heavy: bool) -> tuple[FactorBlock[SpatialEstimate], ...]:
         problem = self.problem
@@ -320,21 +281,18 @@ class SpatialSmoother:
         heavy = heavy and problem.robust
         first_seen = np.zeros(count, dtype=np.int64)
         first_seen[problem.place[::-1]] = problem.pose_row[::-1]
-        prior = problem.prior.place
+        prior, view = problem.prior.place, SpatialView(problem.oriented)
+        log_odds = problem.settings.outlier_log_odds[POINT]
         return (
             SpatialOdometryFactors(problem.increment, problem.swing, sigma, jump, heavy, sensor + len(problem.mount)),
             SightingFactors(problem, self._seen, noise.levels, heavy, n, sensor),
-            SpatialStartFactor(self._start, problem.start_sigma),
+            StartFactor(self._start, 1.0 / problem.start_sigma, deviate),
             MapFactors(problem, n + prior, first_seen[prior]),
-            *(self._measured(tied, heavy) for tied in problem.measurements),
+            *(
+                MeasurementFactors.of(tied, view, n + np.arange(count), log_odds, heavy=heavy)
+                for tied in problem.measurements
+            ),
         )
-
-    def _measured(self, tied: Tied, heavy: bool) -> MeasurementFactors[SpatialEstimate]:
-        problem, other = self.problem, tied.others
-        if tied.kind.ties == "pose_place":
-            other = len(problem.stamp_s) + other
-        log_odds = problem.settings.outlier_log_odds[POINT]
-        return MeasurementFactors(tied, SpatialView(problem.oriented), other, log_odds, heavy)
 
     def _retract(self, estimate: SpatialEstimate, step: FloatArray) -> tuple[SpatialEstimate, float]:
         """The estimate after a step, and how far it went."""

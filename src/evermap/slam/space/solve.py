@@ -224,9 +224,7 @@ def _in_measured_frame(
     for tied in framed:
         motion = tied.find_frame(estimate.pose)
         assert motion is not None
-        pose, place = (se3.compose(motion, part) for part in (estimate.pose, estimate.place))
-        place[~problem.oriented, 3:] = se3.NO_TURN
-        estimate = replace(estimate, pose=pose, place=place)
+        estimate = estimate.moved(motion, problem.oriented)
         loose = np.maximum(problem.start_sigma, tied.kind.first_sigma)
         problem = replace(problem, measurements=(*problem.measurements, tied), start_sigma=loose)
     return problem, estimate
