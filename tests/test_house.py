@@ -81,6 +81,24 @@ def test_one_class_a_name() -> None:
     assert {noun: found for noun, found in homes.items() if len(found) > 1} == {}
 
 
+def classes_from(base: str) -> dict[str, ast.ClassDef]:
+    """Classes of all modules that name a base class."""
+    return {
+        node.name: node
+        for name in MODULES
+        for node in ast.walk(tree_of(name))
+        if isinstance(node, ast.ClassDef) and any(isinstance(by, ast.Name) and by.id == base for by in node.bases)
+    }
+
+
+def test_one_filter() -> None:
+    """Plane and space say how detections are linearised and what a step moves; how they are used is written once."""
+    assert list(classes_from("NearbyPlaces")) == ["LocalFilter"]
+    own = {"drive", "ahead", "compare", "update", "bring", "hold", "meet", "sight"}
+    for one in classes_from("LocalFilter").values():
+        assert not own & {node.name for node in one.body if isinstance(node, ast.FunctionDef)}
+
+
 def numbers() -> Iterator[tuple[str, bool]]:
     """Numeric constants of the settled packages, and whether their definition says what they are."""
     settled = (*(f"evermap.{name}." for name in SETTLED), *(f"evermap.slam.{name}." for name in SETTLED_MODULES))
