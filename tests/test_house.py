@@ -87,7 +87,7 @@ def classes_from(base: str) -> dict[str, ast.ClassDef]:
         node.name: node
         for name in MODULES
         for node in ast.walk(tree_of(name))
-        if isinstance(node, ast.ClassDef) and any(isinstance(by, ast.Name) and by.id == base for by in node.bases)
+        if isinstance(node, ast.ClassDef) and base in {ast.unparse(by).partition("[")[0] for by in node.bases}
     }
 
 
@@ -97,6 +97,15 @@ def test_one_filter() -> None:
     own = {"drive", "ahead", "compare", "update", "bring", "hold", "meet", "sight"}
     for one in classes_from("LocalFilter").values():
         assert not own & {node.name for node in one.body if isinstance(node, ast.FunctionDef)}
+
+
+def test_one_problem_of_several_robots() -> None:
+    """Plane and space say what blocks and values each robot has; how they are concatenated is written once."""
+    specialised = classes_from("Together")
+    assert set(specialised) == {"PlanarTogether", "SpatialTogether"}
+    for one in specialised.values():
+        methods = {node.name for node in one.body if isinstance(node, ast.FunctionDef)}
+        assert not methods & {"graph_in_slices", "variables", "minimised_in_slices", "linearised_in_slices"}
 
 
 def numbers() -> Iterator[tuple[str, bool]]:
