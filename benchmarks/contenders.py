@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.world import World
 from evermap.geometry import se2
-from evermap.slam.local_filter import Motion
+from evermap.slam.planar_filter import PlanarMotion
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
 from evermap.types import FloatArray
@@ -46,7 +46,7 @@ def stream_evermap(world: World) -> Answer:
     pose, motion = np.zeros(3), None
     for row in range(len(world.pose)):
         if row > 0:
-            motion = Motion(world.increment[row - 1], np.zeros((3, 4)), np.zeros((3, 3)))
+            motion = PlanarMotion(world.increment[row - 1], np.zeros((3, 4)), np.zeros((3, 3)))
             pose = se2.compose(smoother.last_pose(), motion.increment)
         smoother.add(row, motion, _placed(landmark, world, row, pose))
     elapsed_s = time.perf_counter() - start

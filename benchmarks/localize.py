@@ -18,8 +18,8 @@ import numpy as np
 from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces
-from evermap.slam.local_filter import Motion
 from evermap.slam.localize import FrameSightings, Localizer
+from evermap.slam.planar_filter import PlanarMotion
 from evermap.slam.problem import Drive, Noise
 from evermap.types import FloatArray, Sensor
 
@@ -91,7 +91,7 @@ def draw(n_landmarks: int, n_frames: int = N_FRAMES, seed: int = 0) -> Drives:
     pose, poses, sightings = np.array([radius, 0.0, 0.5 * np.pi]), [], []
     for k in range(n_frames):
         if k > 0:
-            motion = Motion.over(drive, stamp_s[k - 1], stamp_s[k], REPORTED.mean, REPORTED.free, NOISE)
+            motion = PlanarMotion.over(drive, stamp_s[k - 1], stamp_s[k], REPORTED.mean, REPORTED.free, NOISE)
             slip = se2.exp(rng.multivariate_normal(np.zeros(3), motion.covariance))
             pose = se2.compose(se2.compose(pose, motion.increment), slip)
         poses.append(pose)
@@ -133,7 +133,7 @@ def by_gtsam(drives: Drives) -> Answer:
         if k == 0:
             graph.add(gtsam.PriorFactorPose2(_x(0), pose, held))
         else:
-            motion = Motion.over(
+            motion = PlanarMotion.over(
                 drives.drive, drives.stamp_s[k - 1], drives.stamp_s[k], REPORTED.mean, REPORTED.free, NOISE
             )
             step = gtsam.Pose2(*motion.increment)

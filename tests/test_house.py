@@ -81,6 +81,33 @@ def test_one_class_a_name() -> None:
     assert {noun: found for noun, found in homes.items() if len(found) > 1} == {}
 
 
+def classes_from(base: str) -> dict[str, ast.ClassDef]:
+    """Classes of all modules that name a base class."""
+    return {
+        node.name: node
+        for name in MODULES
+        for node in ast.walk(tree_of(name))
+        if isinstance(node, ast.ClassDef) and base in {ast.unparse(by).partition("[")[0] for by in node.bases}
+    }
+
+
+def test_one_filter() -> None:
+    """Plane and space say how detections are linearised and what a step moves; how they are used is written once."""
+    assert list(classes_from("NearbyPlaces")) == ["LocalFilter"]
+    own = {"drive", "ahead", "compare", "update", "bring", "hold", "meet", "sight"}
+    for one in classes_from("LocalFilter").values():
+        assert not own & {node.name for node in one.body if isinstance(node, ast.FunctionDef)}
+
+
+def test_one_problem_of_several_robots() -> None:
+    """Plane and space say what blocks and values each robot has; how they are concatenated is written once."""
+    specialised = classes_from("Together")
+    assert set(specialised) == {"PlanarTogether", "SpatialTogether"}
+    for one in specialised.values():
+        methods = {node.name for node in one.body if isinstance(node, ast.FunctionDef)}
+        assert not methods & {"graph_in_slices", "variables", "minimised_in_slices", "linearised_in_slices"}
+
+
 def numbers() -> Iterator[tuple[str, bool]]:
     """Numeric constants of the settled packages, and whether their definition says what they are."""
     settled = (*(f"evermap.{name}." for name in SETTLED), *(f"evermap.slam.{name}." for name in SETTLED_MODULES))

@@ -116,7 +116,7 @@ def run_together(
     from evermap.estimate.tie import without_frames
     from evermap.explain.verdict import with_verdict
     from evermap.maps.sessions import planar, session, spatial
-    from evermap.slam import check, estimate, together
+    from evermap.slam import check, estimate, planar_together
 
     config = config or Config()
     if len({is_in_space(recording) for recording in recordings.values()}) > 1:
@@ -142,7 +142,7 @@ def run_together(
             result = session.existing(one, one.concluded(frame), config.living)
             results[number] = with_verdict(result, one.recording, config.slam, findings=findings[number])
         return results
-    for number, solved, online in zip(alone, *together.solve_together(alone), strict=True):
+    for number, solved, online in zip(alone, *planar_together.solve_together(alone), strict=True):
         visit = planar.PlanarVisit(solved)
         result = session.existing(visit, replace(visit.concluded(online.frame), online=online), config.living)
         results[number] = with_verdict(result, solved.recording, config.slam, findings=findings[number])

@@ -14,8 +14,8 @@ from recordings import building, first_seconds
 from evermap.config import SlamConfig
 from evermap.geometry import se2
 from evermap.slam.intake import prepare
-from evermap.slam.local_filter import Motion, SessionFilter
 from evermap.slam.noise import START
+from evermap.slam.planar_filter import PlanarMotion, SessionFilter
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import StreamingSlam
@@ -198,7 +198,7 @@ def test_innovations_are_those_of_gtsams_marginals(robust):
     local.restart(optimum, NOISE, whole)
     detections = np.flatnonzero((whole.pose_row == row) & np.isin(whole.landmark_row, known))
     assert len(detections) >= 2
-    motion = Motion.between(whole, NOISE, row, optimum.states)
+    motion = PlanarMotion.between(whole, NOISE, row, optimum.states)
     before = local.covariance.copy()
     local.drive(motion)
     nis, log_det = local.distances(detections, whole.landmark_row[detections])

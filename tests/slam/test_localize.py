@@ -27,8 +27,8 @@ from evermap.sensing.visibility import NominalField
 from evermap.slam import localize
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces, Neighbourhood
-from evermap.slam.local_filter import Motion
 from evermap.slam.localize import FrameSightings, Localizer
+from evermap.slam.planar_filter import PlanarMotion
 from evermap.slam.problem import Drive
 
 COUNT, SIDE_M = 40, 14.0
@@ -147,7 +147,7 @@ def test_the_last_pose_is_that_of_a_batch_solution_by_gtsam(seed):
     for i, seen in enumerate(true.sightings):
         values.insert(i, gtsam.Pose2(*true.pose[i]))
         if i > 0:
-            motion = Motion.over(true.drive, *true.stamp_s[i - 1 : i + 1], true.states, plain.free, NOISE)
+            motion = PlanarMotion.over(true.drive, *true.stamp_s[i - 1 : i + 1], true.states, plain.free, NOISE)
             model = gtsam.noiseModel.Gaussian.Covariance(motion.covariance)
             graph.add(gtsam.BetweenFactorPose2(i - 1, i, gtsam.Pose2(*motion.increment), model))
         for j, (range_m, bearing_rad) in zip(seen.landmark_id.tolist(), seen.reading, strict=True):

@@ -12,9 +12,10 @@ from drives import FRAME_S, NOISE, SENSOR, World, driven, nees, place_randomly, 
 from evermap.config import SlamConfig
 from evermap.geometry import se2
 from evermap.slam.calibration import SLOPE, CalibrationPrior
-from evermap.slam.local_filter import LocalFilter, Motion
+from evermap.slam.local_filter import Motion
 from evermap.slam.localize import FrameSightings
 from evermap.slam.mapper import Mapper
+from evermap.slam.planar_filter import FrameReadings, PlanarFilter
 
 TURN_SCALE, SETTINGS = 7, SlamConfig(robust=False, estimate_noise=False)
 BLIND = range(50, 80)
@@ -73,7 +74,7 @@ def test_new_landmarks_tell_nothing_of_a_heading_that_was_lost():
     """Not by however many updates at however wrong a heading: they only show where the robot is among them."""
     rng, believed = np.random.default_rng(0), prior()
     landmark, still = rng.uniform(-5.0, 5.0, (6, 2)), np.zeros((3, 4))
-    local = LocalFilter(np.zeros(3), CalibrationPrior(believed.mean, believed.sigma, np.zeros(11, dtype=np.bool_)))
+    local = PlanarFilter(np.zeros(3), CalibrationPrior(believed.mean, believed.sigma, np.zeros(11, dtype=np.bool_)))
     lost = np.zeros((12, 12))
     lost[:3, :3] = np.diag([0.1, 0.1, 0.3]) ** 2
     local.hold(np.zeros(3), believed.mean, lost, np.arange(0), np.full((6, 2), np.nan))
@@ -89,5 +90,5 @@ def test_new_landmarks_tell_nothing_of_a_heading_that_was_lost():
         )
         for row in range(0 if frame else 6):
             local.meet(row, landmark[row])
-        local.update(np.arange(6), reading, sigma)
+        local.update(np.arange(6), FrameReadings(reading, sigma))
     assert np.sqrt(local.covariance[2, 2]) == pytest.approx(0.3, rel=0.02)

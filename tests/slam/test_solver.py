@@ -18,7 +18,7 @@ from evermap.slam import streaming
 from evermap.slam.batch import sighted_at
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import beliefs, prepare
-from evermap.slam.local_filter import LocalFilter, Motion, SessionFilter
+from evermap.slam.planar_filter import FrameReadings, PlanarFilter, PlanarMotion, SessionFilter
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import StreamingSlam
@@ -31,7 +31,7 @@ KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False)
 class OneStep(SessionFilter):
     """The filter with the methods of its peer."""
 
-    def add(self, row: int, motion: Motion, landmark: np.ndarray) -> None:
+    def add(self, row: int, motion: PlanarMotion, landmark: np.ndarray) -> None:
         self.drive(motion)
         super().add(row, landmark)
 
@@ -114,7 +114,7 @@ def test_a_step_from_an_optimum_leads_to_the_next(solver_of, name):
     before = optimum_of(world, n - 1)
     solver = solver_of(problem, world.noise, robust=False)
     solver.restart(before, world.noise, problem)
-    motion = Motion.between(problem, world.noise, n - 1, before.states)
+    motion = PlanarMotion.between(problem, world.noise, n - 1, before.states)
     predicted = se2.compose(before.pose[-1], motion.increment)
     last = problem.pose_row == n - 1
     landmark = before.landmark.copy()
@@ -170,7 +170,7 @@ def test_detections_may_be_given_to_a_new_place_between_two_steps(solver_of):
         landmark_mean=np.vstack([problem.landmark_mean, np.zeros(2)]),
         landmark_information=joint,
     )
-    motion = Motion.between(problem, world.noise, n - 1, before.states)
+    motion = PlanarMotion.between(problem, world.noise, n - 1, before.states)
     predicted = se2.compose(before.pose[-1], motion.increment)
     place = sighted_at(predicted, problem.reading[last][0], before.states, problem.mount)
     solver.add(n - 1, motion, np.vstack([before.landmark, place]))
@@ -184,7 +184,7 @@ def test_a_wrong_identity_moves_next_to_nothing(solver_of):
     world = make_world(8)
     problem, n = world.problem, len(world.problem.stamp_s)
     before = optimum_of(world, n - 1)
-    motion = Motion.between(problem, world.noise, n - 1, before.states)
+    motion = PlanarMotion.between(problem, world.noise, n - 1, before.states)
     reading = problem.reading.copy()
     reading[np.flatnonzero(problem.pose_row == n - 1)[0]] += [3.0, 1.0]
     wrong = replace(problem, reading=reading)
@@ -248,22 +248,22 @@ def test_the_filter_is_the_smoother_where_all_is_nearly_linear():
     """From the first frame on, places met by their detections alone."""
     made = make_world(0, n_poses=6, n_landmarks=3, noisy=0.02, prior=KNOWN_SENSORS, p_seen=1.0)
     problem = made.problem
-    local = LocalFilter(problem.mount, problem.prior)
+    local = PlanarFilter(problem.mount, problem.prior)
     start = local.covariance.copy()
     start[:3, :3] = np.eye(3) / problem.start_information
     local.hold(problem.start_pose, problem.prior.mean, start, np.arange(0), np.zeros((0, 2)))
     for row in range(len(problem.stamp_s)):
         if row > 0:
-            local.drive(Motion.between(problem, made.noise, row, local.states))
+            local.drive(PlanarMotion.between(problem, made.noise, row, local.states))
         for m in np.flatnonzero(problem.pose_row == row):
             j, sigma = problem.landmark_row[m : m + 1], made.noise.of_detections(problem.sigma_given[m : m + 1])
             local.know_of(3)
             if np.isnan(local.position[j[0], 0]):
                 local.meet(int(j[0]), sighted_at(local.pose, problem.reading[m], local.states, problem.mount))
-            local.update(j, problem.reading[m : m + 1], sigma)
+            local.update(j, FrameReadings(problem.reading[m : m + 1], sigma))
     smoother = Smoother(problem, made.noise, robust=False)
     estimate = smoother.optimum(Estimate(made.truth.pose, made.truth.landmark, problem.prior.mean))
-    batch = LocalFilter(problem.mount, problem.prior)
+    batch = PlanarFilter(problem.mount, problem.prior)
     batch.begin(estimate, smoother.marginals(estimate), len(problem.stamp_s) - 1, np.arange(3))
     np.testing.assert_allclose(local.position, batch.position, atol=2e-4)
     np.testing.assert_allclose(local.pose, batch.pose, atol=2e-4)
@@ -286,12 +286,13 @@ def test_places_that_are_only_considered_stay_and_the_rest_gets_the_best_gain():
     states, pose = prior.mean, np.array([0.3, 0.1, 0.5])
     held = {}
     for considered in (True, False):
-        local = LocalFilter(mount, prior, considered=considered)
+        local = PlanarFilter(mount, prior, considered=considered)
         local.hold(pose, states, spread, np.arange(n), place.copy())
         true_pose = se2.compose(pose, np.array([1e-3, -1e-3, 5e-4]))
         away = se2.transform(se2.inverse(se2.compose(true_pose, mount)), place)
         reading = np.column_stack([np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])])
-        nis, _, residual, by = local.compare(np.arange(n), reading, sigma)
+        nis, _, frame = local.compare(np.arange(n), FrameReadings(reading, sigma))
+        residual, by = sigma * frame.residual, sigma[..., None] * frame.jacobian
         h = np.zeros((2 * n, 14 + 2 * n))
         for m in range(n):
             h[2 * m : 2 * m + 2, :10], h[2 * m : 2 * m + 2, 14 + 2 * m : 16 + 2 * m] = by[m, :, :10], by[m, :, 10:]
@@ -304,7 +305,7 @@ def test_places_that_are_only_considered_stay_and_the_rest_gets_the_best_gain():
             gain[14:] = 0.0
         expected = spread - gain @ h @ spread - (gain @ h @ spread).T + gain @ s @ gain.T
         moved = -gain @ residual.ravel()
-        local.update(np.arange(n), reading, sigma)
+        local.update(np.arange(n), FrameReadings(reading, sigma))
         size = np.sqrt(np.diag(expected))
         scale = np.outer(size, size)
         assert np.abs((local.covariance[: len(scale), : len(scale)] - expected) / scale).max() < 5e-3

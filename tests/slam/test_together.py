@@ -19,7 +19,7 @@ from evermap.geometry import se2
 from evermap.metrics.trajectory import interpolate
 from evermap.pipeline import run_slam, run_together
 from evermap.slam import together
-from evermap.slam.encounters import Encounters, Together
+from evermap.slam.encounters import Encounters, PlanarTogether
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, Detections, Frames, Odometry, Recording, RobotSightings, SlamResult, Trajectory
@@ -67,9 +67,9 @@ class Three:
         problem = replace(problem, start_pose=by, start_information=held, reading=reading)
         return World(problem, world.noise, Estimate(pose, landmark, truth.states))
 
-    def joint(self) -> Together:
+    def joint(self) -> PlanarTogether:
         smoothers = [Smoother(world.problem, world.noise) for world in self.worlds]
-        return Together(smoothers, self.places, np.zeros(3), self.met, self.sigma)
+        return PlanarTogether(smoothers, self.places, np.zeros(3), self.met, self.sigma)
 
     def start(self) -> Estimate:
         pose = np.concatenate([world.truth.pose for world in self.worlds])

@@ -21,7 +21,6 @@ from evermap.errors import EvermapError
 from evermap.explain.causes import LITTLE, MOUNT_M, Inputs, Suspect, list_suspects, rows_of_kind
 from evermap.explain.evidence import (
     LOG_2PI,
-    ROOM_M,
     AnySession,
     Screen,
     SpatialSession,
@@ -36,6 +35,7 @@ from evermap.explain.symptoms import compare_odometry
 from evermap.slam.check import find_misreadings
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import HONEST, off, pairs_of
+from evermap.slam.room import ROOM_M
 from evermap.types import (
     UNKNOWN,
     BoolArray,

@@ -5,10 +5,10 @@ interpolation*): what the measurements and the priors are worth there, and half 
 the unknowns, which is the price of every state that was needed (Occam). A detection is an inlier of the noise that was
 learned or an outlier whose density is that of the *nominal* noise at the squared residual at which both are alike, so
 that neither a wider noise nor fewer detections come for nothing. Landmarks of which no map says anything are somewhere
-within `ROOM_M`. Odometry says where the robot goes, given what was driven: its density is that of motions, whatever its
-scale, as one of velocities would be the larger the longer the drive is said to be. Solutions of the same measurements
-can be compared, also where the measurements were transformed, if the volume of the transformation is counted
-(`causes.Inputs`).
+within a room (`slam.room`). Odometry says where the robot goes, given what was driven: its density is that of motions,
+whatever its scale, as one of velocities would be the larger the longer the drive is said to be. Solutions of the same
+measurements can be compared, also where the measurements were transformed, if the volume of the transformation is
+counted (`causes.Inputs`).
 
 **Score.** A further number changes all residuals by a known direction `d`. With everything else marginalised, the
 information on it is `h = d'd - b'H^-1 b`, `b = J'd`, and the cost falls by `g^2 / 2 h` at `-g / h`, with
@@ -24,24 +24,22 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from evermap.estimate.graph import Graph, Linear
-from evermap.estimate.sparse.elimination import numbers_of
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.slam import intake
 from evermap.slam.changes.gain import PLANE, log_onset, log_prior
 from evermap.slam.correlation import Lasting
 from evermap.slam.estimate import Solved
 from evermap.slam.linearise import PlacePriors, detection_residuals
+from evermap.slam.room import hold_in_room
 from evermap.slam.smoother import Smoother
 from evermap.slam.space.against_map import log_map_density
 from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PIXEL, POSE, ROWS
-from evermap.slam.space.marginal import ROOM
 from evermap.slam.space.problem import SpatialProblem
 from evermap.slam.space.solve import SpatialSolved
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 
 LOG_2PI = math.log(2.0 * math.pi)
-ROOM_M, ROOM_RAD = ROOM
 LEAST_INFORMATION = 1e-6
 """Information of the border's priors, at least: that on delays may be less than none."""
 TINY = 1e-3
@@ -168,15 +166,13 @@ def _in_plane(solved: Solved, changes: tuple[MapChange, ...]) -> Optimum:
             size = np.linalg.svd(block.root, compute_uv=False)
             size = size[size > 1e-9 * size.max(initial=0.0)]
             log_priors += float(np.log(size).sum()) - 0.5 * len(size) * LOG_2PI
-    held = graph.held.copy()
-    where = 3 * n + np.flatnonzero(np.repeat(free, 2))
-    held[where] = ROOM_M**-2
-    log_priors -= len(where) * (math.log(ROOM_M) + 0.5 * LOG_2PI)
+    held, count, in_room = hold_in_room(graph, n + np.flatnonzero(free))
+    log_priors += in_room - 0.5 * count * LOG_2PI
     table = solved.settings.changes
     prices = sum(_price(change, len(problem.landmark_mean), PLANE, log_prior, table) for change in changes)
     log_priors += _odometry_peak(graph, now, 3, slice(3, 6))
     worth = _worth(smoother.lasting(state), problem.stamp_s[problem.pose_row], problem.landmark_row)
-    return Optimum(replace(graph, held=held), now, state, seen, log_priors, prices, worth)
+    return Optimum(held, now, state, seen, log_priors, prices, worth)
 
 
 def _in_space(session: SpatialSession) -> Optimum:
@@ -195,20 +191,14 @@ def _in_space(session: SpatialSession) -> Optimum:
     extra, prices = log_map_density(problem, session.solved.from_map, state.place)
     free = np.ones(count, dtype=np.bool_)
     free[problem.prior.place] = False
-    begin, held = graph.structure.system.tree.begin, graph.held.copy()
-    some = n + np.flatnonzero(free)
-    dim = graph.structure.layout.dim[some]
-    at = numbers_of(begin[some], np.full(len(some), 3))
-    held[at] = ROOM_M**-2
-    turned = numbers_of(begin[some[dim == 6]] + 3, np.full(int((dim == 6).sum()), 3))
-    held[turned] = np.maximum(held[turned], ROOM_RAD**-2)
-    log_priors -= len(at) * (math.log(ROOM_M) + 0.5 * LOG_2PI) + len(turned) * (math.log(ROOM_RAD) + 0.5 * LOG_2PI)
+    held, count, in_room = hold_in_room(graph, n + np.flatnonzero(free))
+    log_priors += in_room - 0.5 * count * LOG_2PI
     if problem.driven:
         log_priors += _odometry_peak(graph, now, 6, slice(6, 12))
     twice = int((session.solved.number > 1).sum())  # one identity at two places
     prices += twice * math.log(problem.settings.map.p_moved)
     worth = _worth(smoother.lasting(linear), problem.stamp_s[problem.pose_row], problem.place)
-    return Optimum(replace(graph, held=held), now, state, seen, log_priors + extra, prices, worth)
+    return Optimum(held, now, state, seen, log_priors + extra, prices, worth)
 
 
 def _log_peaks(problem: SpatialProblem, level: FloatArray) -> FloatArray:

@@ -3,27 +3,55 @@
 Between two measured instants only odometry speaks. Dead reckoning from both ends, each weighted by how uncertain it
 is by then, is the exact posterior of the linearised chain: a pose in the middle of a blind stretch follows the
 odometry's shape, shares out its closing error in proportion to the noise that was collected, and carries a covariance
-that swells in the middle.
+that swells in the middle. In the plane and in space this is `condition_on_ends`; `bridged` is for the odometry of the
+plane, `space.bridge` for that of space.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from evermap.slam.kernels import (
-    adjoint,
-    composed,
-    integrate_odometry,
-    invert_3x3,
-    inverted,
-    kernel,
-    multiply,
-    odometry_covariance,
-    sandwich,
-    wrapped,
-)
+from evermap.geometry import se2
+from evermap.slam.kernels import adjoint, composed, integrate_odometry, inverted, kernel, odometry_covariance, wrapped
 from evermap.slam.problem import Drive, Noise
-from evermap.types import FloatArray
+from evermap.types import FloatArray, IntArray
+
+
+class HeldChain(NamedTuple):
+    """Poses (K,) of a chain of odometry given the poses before and after; errors have D numbers, each in its own frame.
+
+    Attributes:
+        gain: (K, D, D) of the error that the odometry leaves at the pose after.
+        by_ends: (K, D, 2 D) derivatives by the poses before and after.
+        lost: (K, D, D) covariance given both.
+    """
+
+    gain: FloatArray
+    by_ends: FloatArray
+    lost: FloatArray
+
+
+def condition_on_ends(carry: FloatArray, ahead: FloatArray, at: FloatArray, whole: FloatArray) -> HeldChain:
+    """Condition poses (K,) that odometry leads to on those that it leads to afterwards.
+
+    Args:
+        carry: (K, D, D) what an error of the pose before is here.
+        ahead: (K, D, D) what one here is at the pose after.
+        at: (K, D, D) covariance of the odometry from the pose before to here, and
+        whole: (K, D, D) to the pose after.
+    """
+    shared = ahead @ at
+    gain = np.swapaxes(np.linalg.solve(whole, shared), 1, 2)
+    return HeldChain(gain, np.concatenate([carry - gain @ ahead @ carry, gain], axis=2), at - gain @ shared)
+
+
+def joint_of_ends(before: FloatArray, after: FloatArray, across: FloatArray) -> FloatArray:
+    """Return covariances (K, 2 D, 2 D) of two poses, of those (K, D, D) of each and of the first with the second."""
+    return np.concatenate(
+        [np.concatenate([before, across], axis=2), np.concatenate([np.swapaxes(across, 1, 2), after], axis=2)], axis=1
+    )
 
 
 def bridged(
@@ -51,9 +79,27 @@ def bridged(
     Returns:
         (K, 3) poses and (K, 3, 3) covariances in the robot's frame.
     """
-    out, spread = np.empty((len(stamp_s), 3)), np.empty((len(stamp_s), 3, 3))
+    n, before = len(pose), np.searchsorted(pose_stamp_s, stamp_s, side="right") - 1
+    increment, collected = np.zeros((2, len(stamp_s), 3)), np.zeros((2, len(stamp_s), 3, 3))
     odometry = drive.stamp_s, drive.velocity, drive.unknown
-    _bridge(stamp_s, pose_stamp_s, pose, covariance, consecutive, *odometry, states, noise.odometry**2, out, spread)
+    _integrate_legs(stamp_s, pose_stamp_s, before, *odometry, states, noise.odometry**2, increment, collected)
+    # dead reckoning from the pose before
+    of, carry = np.maximum(before, 0), se2.adjoint(se2.inverse(increment[0]))
+    out = se2.compose(pose[of], increment[0])
+    spread = carry @ covariance[of] @ np.swapaxes(carry, 1, 2) + collected[0]
+    # and backwards from the first pose
+    first = np.flatnonzero(before < 0)
+    back = se2.adjoint(increment[1, first])
+    out[first] = se2.compose(pose[0], se2.inverse(increment[1, first]))
+    spread[first] = back @ (covariance[0] + collected[1, first]) @ np.swapaxes(back, 1, 2)
+    some = np.flatnonzero((before >= 0) & (before < n - 1))
+    of, ahead, at = before[some], se2.adjoint(se2.inverse(increment[1, some])), collected[0, some]
+    whole = ahead @ at @ np.swapaxes(ahead, 1, 2) + collected[1, some]
+    chain = condition_on_ends(carry[some], ahead, at, whole)
+    closing = se2.between(se2.compose(out[some], increment[1, some]), pose[of + 1])
+    out[some] = se2.compose(out[some], np.einsum("kij,kj->ki", chain.gain, closing))
+    joint = joint_of_ends(covariance[of], covariance[of + 1], consecutive[of])
+    spread[some] = chain.by_ends @ joint @ np.swapaxes(chain.by_ends, 1, 2) + chain.lost
     return out, _semidefinite(0.5 * (spread + spread.transpose(0, 2, 1)))
 
 
@@ -98,68 +144,20 @@ def _reckon(
 
 
 @kernel
-def _bridge(
-    stamp: FloatArray, pose_stamp: FloatArray, pose: FloatArray, covariance: FloatArray, consecutive: FloatArray,
-    odometry_stamp: FloatArray, velocity: FloatArray, unknown: FloatArray, states: FloatArray, variance: FloatArray,
-    out: FloatArray, spread: FloatArray,
+def _integrate_legs(
+    stamp: FloatArray, pose_stamp: FloatArray, before: IntArray, odometry_stamp: FloatArray, velocity: FloatArray,
+    unknown: FloatArray, states: FloatArray, variance: FloatArray, increment: FloatArray, collected: FloatArray,
 ) -> None:  # fmt: skip
-    n = len(pose_stamp)
-    motion, noise, floor = np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
-    increment, collected = np.zeros((2, 3)), np.zeros((2, 3, 3))
-    joint = np.zeros((6, 6))
-    ends, ends_part = np.zeros((3, 6)), np.zeros((3, 6))
-    share, gain, part = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    """Fill in increments (2, K, 3) from the pose before and to the pose after, where there is one, and their noise."""
+    n, motion, noise, floor = len(pose_stamp), np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
     for k in range(len(stamp)):
-        i = min(np.searchsorted(pose_stamp, stamp[k], side="right") - 1, n - 1)
-        for side in range(2):  # from the pose before, and to the pose after
+        i = before[k]
+        for side in range(2):
             if (side == 0 and i < 0) or (side == 1 and i >= n - 1):
                 continue
             begin = pose_stamp[i] if side == 0 else stamp[k]
             end = stamp[k] if side == 0 else pose_stamp[i + 1]
             integrate_odometry(
-                odometry_stamp, velocity, unknown, begin, end, states, increment[side], motion, noise, floor
+                odometry_stamp, velocity, unknown, begin, end, states, increment[side, k], motion, noise, floor
             )
-            odometry_covariance(noise, floor, variance, collected[side])
-        if i < 0:  # dead reckoning backwards from the first pose
-            _write(composed(pose[0], inverted(increment[1])), out[k])
-            for a in range(3):
-                for b in range(3):
-                    share[a, b] = covariance[0, a, b] + collected[1, a, b]
-            sandwich(adjoint(increment[1]), share, part, spread[k])
-            continue
-        forward = composed(pose[i], increment[0])
-        from_start = adjoint(inverted(increment[0]))
-        if i >= n - 1:
-            _write(forward, out[k])
-            sandwich(from_start, covariance[i], part, spread[k])
-            for a in range(3):
-                for b in range(3):
-                    spread[k, a, b] += collected[0, a, b]
-            continue
-        closing = composed(inverted(composed(forward, increment[1])), pose[i + 1])
-        closing[2] = wrapped(closing[2])
-        to_end = adjoint(inverted(increment[1]))
-        multiply(collected[0], to_end.T, share)
-        multiply(to_end, share, gain)
-        for a in range(3):
-            for b in range(3):
-                part[a, b] = gain[a, b] + collected[1, a, b]
-        invert_3x3(part, part)
-        multiply(share, part, gain)
-        # perturbations of the two ends, carried to this instant
-        multiply(to_end, from_start, share)
-        multiply(gain, share, part)
-        step = np.zeros(3)
-        for a in range(3):
-            for b in range(3):
-                step[a] += gain[a, b] * closing[b]
-                ends[a, b], ends[a, 3 + b] = from_start[a, b] - part[a, b], gain[a, b]
-                joint[a, b], joint[3 + a, 3 + b] = covariance[i, a, b], covariance[i + 1, a, b]
-                joint[a, 3 + b] = joint[3 + b, a] = consecutive[i, a, b]
-        _write(composed(forward, step), out[k])
-        sandwich(ends, joint, ends_part, spread[k])
-        multiply(collected[0], to_end.T, share)
-        multiply(gain, share.T, part)
-        for a in range(3):
-            for b in range(3):
-                spread[k, a, b] += collected[0, a, b] - part[a, b]
+            odometry_covariance(noise, floor, variance, collected[side, k])

@@ -1,37 +1,27 @@
-"""Several robots that share landmarks and see each other, as one least-squares problem.
+"""Several robots in the plane that share landmarks and see each other, as one least-squares problem.
 
-It is the concatenation of their blocks. Each robot keeps its own poses, calibration and noise; an unmoved landmark is
-one place for all that saw it. A robot that sees another measures range and bearing from its own pose to that of the
-other at the same instant: both have a pose there, tied to their others by odometry, so nothing is interpolated.
+Each robot keeps its own poses, calibration and noise; an unmoved landmark is one place for all that saw it. A robot
+that sees another measures range and bearing from its own pose to that of the other at the same instant: both have a
+pose there, tied to their others by odometry, so nothing is interpolated.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from evermap.estimate.gauss_newton import Steps
-from evermap.estimate.graph import (
-    Border,
-    Graph,
-    GraphStructure,
-    Layout,
-    Room,
-    build_structure,
-    concatenate_blocks,
-    concatenate_groups,
-)
+from evermap.estimate.graph import Border, FactorBlock, Room
 from evermap.estimate.robust import HEAVY_TAIL, weigh
-from evermap.estimate.solver import Solver
 from evermap.estimate.sparse.system import Factorised, Slices, exhausted
 from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES, detection_residual, kernel
 from evermap.slam.problem import Block, Estimate, Marginals
-from evermap.slam.smoother import COST_SLACK, DETECTIONS, HELD, POSES_A_LEAF, Smoother, retract
+from evermap.slam.smoother import COST_SLACK, POSES_A_LEAF, Smoother, retract
+from evermap.slam.together import Together
 from evermap.types import BoolArray, FloatArray, IntArray
 
 OF_ENCOUNTER = 3 + 3 + N_SENSOR + 1
@@ -141,7 +131,7 @@ class EncounterFactors(NamedTuple):
         return float(linearise_encounters(state.pose, states, self.met, self.eyes, out.values, out.weights))
 
 
-class Together(Solver[Estimate]):
+class PlanarTogether(Together[Estimate]):
     """Optimum and covariances of several problems that share places, and of encounters.
 
     Its estimates are those of all robots: (N, 3) poses one robot after the other, (P, 2) places, (11 R,) states. What
@@ -163,15 +153,14 @@ class Together(Solver[Estimate]):
         met: Encounters,
         sigma: FloatArray,
     ) -> None:
-        super().__init__()
-        self.robots, self.places, self.start_s, self.met, self.sigma = tuple(robots), places, start_s, met, sigma
-        self.first = np.cumsum([0, *(len(robot.problem.stamp_s) for robot in robots)])
-        self._structure: tuple[BoolArray, GraphStructure] | None = None
+        n_poses, calibration = [len(robot.problem.stamp_s) for robot in robots], np.arange(2 * len(robots))
+        super().__init__(n_poses, places, list(calibration.reshape(-1, 2)), poses_a_leaf=POSES_A_LEAF)
+        self.robots, self.start_s, self.met, self.sigma = tuple(robots), start_s, met, sigma
         self._own: tuple[Estimate, list[Estimate]] | None = None
 
-    def of(self, robots: Sequence[Smoother], sigma: FloatArray) -> Together:
+    def of(self, robots: Sequence[Smoother], sigma: FloatArray) -> PlanarTogether:
         """Return the same for robots with other noise or priors; its structure is kept."""
-        other = Together(robots, self.places, self.start_s, self.met, sigma)
+        other = PlanarTogether(robots, self.places, self.start_s, self.met, sigma)
         other._structure = self._structure
         return other
 
@@ -211,11 +200,11 @@ class Together(Solver[Estimate]):
 
     def parts(self, estimate: Estimate, marginals: Marginals) -> list[Marginals]:
         """Return the marginals of each robot, for those of all."""
-        n, rank, count = len(estimate.pose), np.cumsum(estimate.known) - 1, len(self.robots)
-        first, border, found = self.graph(estimate).structure.first, n + int(estimate.known.sum()), []
+        n, count, found = len(estimate.pose), len(self.robots), []
+        first, variable = self.graph(estimate).structure.first, self.variables(estimate.known)
         for r, (robot, own) in enumerate(zip(self.robots, self.estimates(estimate), strict=True)):
-            places = n + rank[self.places[r][own.known]]
-            block = Block(int(self.first[r]), places, border + 2 * r, first[r], first[count + r], n - count)
+            places, border = variable[r][len(own.pose) : -2], int(variable[r][-2])
+            block = Block(int(self.first[r]), places, border, first[r], first[count + r], n - count)
             found.append(marginals.of(block, len(own.pose), len(robot.problem.pose_row), own.known))
         return found
 
@@ -225,34 +214,33 @@ class Together(Solver[Estimate]):
         right = now.values[self.graph(estimate).structure.values_of(k)].reshape(-1, 2, OF_ENCOUNTER)[..., -1]
         return (right * self.sigma[self.met.robot]) ** 2, now.weights[k]
 
-    def graph_in_slices(self, state: Estimate) -> Slices[Graph[Estimate]]:
-        """Return all robots as one graph: odometry of each, detections of each, encounters, starts and priors."""
-        known, n = state.known, len(state.pose)
-        rank, border = np.cumsum(known) - 1, n + int(known.sum())
-        own, variable = self.estimates(state), []
-        for r, estimate in enumerate(own):
-            poses, states = np.arange(self.first[r], self.first[r + 1]), border + 2 * r + np.arange(2)
-            variable.append(np.concatenate([poses, n + rank[self.places[r][estimate.known]], states]))
-        met = EncounterFactors(self.met, self._eyes(), border + 2 * np.arange(len(self.robots)))
-        blocks = concatenate_blocks(
-            [robot.blocks(estimate.known) for robot, estimate in zip(self.robots, own, strict=True)],
-            variable,
-            self.first.tolist(),
-            [partial(self._own_part, robot=r) for r in range(len(own))],
-            measured=DETECTIONS + 1,
-            between=[met],
-        )
-        if self._structure is None or not np.array_equal(self._structure[0], known):
-            structure = yield from build_structure(self._layout(state), blocks)
-            self._structure = known, structure
-        structure = self._structure[1]
-        held = np.zeros(structure.system.tree.begin[-1])
-        held[3 * n : -N_STATES * len(self.robots)] = HELD
-        information = 1.0 / np.concatenate([robot.states_sigma for robot in self.robots]) ** 2
-        return Graph(blocks, structure, Border(information, self._off_mean), held, retract)
-
-    def _own_part(self, state: Estimate, robot: int) -> Estimate:
+    def own(self, state: Estimate, robot: int) -> Estimate:
+        """Return the values of a robot."""
         return self.estimates(state)[robot]
+
+    def _known(self, state: Estimate) -> BoolArray:
+        return state.known
+
+    def _dims(self) -> tuple[int, IntArray, IntArray]:
+        count = 1 + max(int(places.max(initial=-1)) for places in self.places)
+        return 3, np.full(count, 2), np.tile([N_SENSOR, N_MOTION], len(self.robots))
+
+    def _coordinate(self, state: Estimate) -> FloatArray:
+        when = [robot.problem.stamp_s + by for robot, by in zip(self.robots, self.start_s, strict=True)]
+        robot = np.repeat(np.arange(len(self.robots), dtype=np.float64), np.diff(self.first))
+        return np.column_stack([np.concatenate(when), state.pose[:, :2], robot])
+
+    def _blocks(self, state: Estimate) -> list[tuple[FactorBlock[Estimate], ...]]:
+        return [robot.blocks(own.known) for robot, own in zip(self.robots, self.estimates(state), strict=True)]
+
+    def _between(self, variable: Sequence[IntArray]) -> list[FactorBlock[Estimate]]:
+        return [EncounterFactors(self.met, self._eyes(), np.array([own[-2] for own in variable]))]
+
+    def _border(self) -> Border[Estimate]:
+        return Border(1.0 / np.concatenate([robot.states_sigma for robot in self.robots]) ** 2, self._off_mean)
+
+    def _retract(self, state: Estimate, step: FloatArray) -> tuple[Estimate, float]:
+        return retract(state, step)
 
     def _off_mean(self, state: Estimate) -> FloatArray:
         own = zip(self.robots, self.estimates(state), strict=True)
@@ -267,14 +255,3 @@ class Together(Solver[Estimate]):
             np.array([robot.noise.outlier_log_odds if robot.robust else np.inf for robot in robots]),
             np.array([HEAVY_TAIL if robot.heavy and robot.robust else 0.0 for robot in robots]),
         )
-
-    def _layout(self, state: Estimate) -> Layout:
-        """Variables of all; poses by time on the clock of all, position, robot."""
-        n, count, n_robots = len(state.pose), int(state.known.sum()), len(self.robots)
-        n_poses = np.diff(self.first)
-        when = [robot.problem.stamp_s + by for robot, by in zip(self.robots, self.start_s, strict=True)]
-        robot = np.repeat(np.arange(n_robots, dtype=np.float64), n_poses)
-        coordinates = np.column_stack([np.concatenate(when), state.pose[:, :2], robot])
-        dim = np.concatenate([np.full(n, 3), np.full(count, 2), np.tile([N_SENSOR, N_MOTION], n_robots)])
-        border = n + count + np.arange(2 * n_robots)
-        return Layout(dim, border, concatenate_groups(n_poses.tolist(), POSES_A_LEAF), coordinates)

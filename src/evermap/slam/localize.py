@@ -21,11 +21,11 @@ from evermap.sensing.visibility import NominalField
 from evermap.show import Shown
 from evermap.slam.batch import sighted_at
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.filter_kernels import BY_OTHERS
 from evermap.slam.kernels import AT_PLACES, N_SENSOR
 from evermap.slam.known_places import FrameSightings, KnownPlaces, LocalTrack, Neighbourhood, Placed
-from evermap.slam.local_filter import LocalFilter, Motion
-from evermap.slam.nearby_places import NO_PLACES, NearbyPlaces
+from evermap.slam.local_filter import BY_OTHERS, LocalFilter, Motion, Updated
+from evermap.slam.nearby_places import NO_PLACES
+from evermap.slam.planar_filter import FrameReadings, PlanarFilter, PlanarMotion
 from evermap.slam.problem import Drive, Noise
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
 
@@ -78,7 +78,7 @@ class BaseLocalizer(Shown):
     """
 
     def __init__(
-        self, places: KnownPlaces, local: NearbyPlaces, settings: LocalizeConfig, *, most: int, learn: bool
+        self, places: KnownPlaces, local: LocalFilter, settings: LocalizeConfig, *, most: int, learn: bool
     ) -> None:
         self.places, self._settings, self._filter, self._most = places, settings, local, most
         self._log_p = np.log(np.maximum(places.p_here, settings.least_belief))
@@ -174,16 +174,16 @@ class BaseLocalizer(Shown):
         """Return the search for a start: a `DriveTrack`."""
         raise NotImplementedError
 
-    def _motion(self, drive: Any, start_s: float, stop_s: float) -> Any:
-        """Return odometry between two instants, with an `increment`."""
+    def _motion(self, drive: Any, start_s: float, stop_s: float) -> Motion:
+        """Return odometry between two instants."""
         raise NotImplementedError
 
     def _compare(self, row: IntArray, seen: Any, which: IntArray) -> tuple[FloatArray, FloatArray]:
         """Compare detections (M,) with a place (M,) each: squared distances, and `log |S|`."""
         raise NotImplementedError
 
-    def _update_by(self, row: IntArray, seen: Any, which: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Update by detections (M,) of places (M,): squared distances of innovations, and weights."""
+    def _update_by(self, row: IntArray, seen: Any, which: IntArray) -> Updated:
+        """Update by detections (M,) of places (M,)."""
         raise NotImplementedError
 
     def _sight(self, row: int, seen: Any, which: int) -> None:
@@ -206,7 +206,7 @@ class BaseLocalizer(Shown):
     def _is_placed(self) -> bool:
         return bool(np.isfinite(self._filter.pose[0]))
 
-    def _drive(self, motion: Any) -> None:
+    def _drive(self, motion: Motion) -> None:
         if self._track is not None:
             self._track.drive(motion.increment)
         if self._is_placed:
@@ -252,7 +252,7 @@ class BaseLocalizer(Shown):
         row = self._chosen(first, last, seen, used)
         row = np.append(row, np.array([self._new[int(seen.landmark_id[m])] for m in met], dtype=np.int64))
         self._filter.bring(row)
-        nis, weight = self._update_by(row, seen, which)
+        nis, weight, _ = self._update_by(row, seen, which)
         doubt = self._log_p[row] - self._believed[row]
         agrees = weight * (1.0 + np.exp(doubt)) > 1.0  # would be more likely there than not, if it were not doubted
         step, most = self._settings.doubt, self._settings.most_doubt
@@ -332,7 +332,7 @@ class Localizer(BaseLocalizer):
     ) -> None:
         self._field, self._prior, self.noise = NominalField(sensor, looks), prior, noise
         self._mount = np.array(sensor.mount_robot_sensor, dtype=np.float64)
-        self._local = LocalFilter(self._mount, prior, most=MOST_CONSIDERED, considered=True)
+        self._local = PlanarFilter(self._mount, prior, most=MOST_CONSIDERED, considered=True)
         super().__init__(places, self._local, settings, most=MOST_CONSIDERED, learn=learn)
         self._near = Neighbourhood(places.position_m, self._field.reach_m)
         self._believed_there = np.zeros(len(places), dtype=np.bool_)
@@ -352,17 +352,19 @@ class Localizer(BaseLocalizer):
         return LocalTrack(self._mount, self._settings)
 
     def _motion(self, drive: Drive, start_s: float, stop_s: float) -> Motion:
-        return Motion.over(drive, start_s, stop_s, self._local.states, self._prior.free, self.noise)
+        return PlanarMotion.over(drive, start_s, stop_s, self._local.states, self._prior.free, self.noise)
 
     def _compare(self, row: IntArray, seen: FrameSightings, which: IntArray) -> tuple[FloatArray, FloatArray]:
-        return self._local.compare(row, *self._readings(seen, which), self.places.covariance_m2[row])[:2]
+        return self._local.compare(row, self._readings(seen, which), self.places.covariance_m2[row])[:2]
 
-    def _update_by(self, row: IntArray, seen: FrameSightings, which: IntArray) -> tuple[FloatArray, FloatArray]:
+    def _update_by(self, row: IntArray, seen: FrameSightings, which: IntArray) -> Updated:
         log_odds = self.noise.outlier_log_odds + self._believed[row]
-        return self._local.update(row, *self._readings(seen, which), weighing=BY_OTHERS, log_odds=log_odds)
+        return self._local.update(row, self._readings(seen, which), weighing=BY_OTHERS, log_odds=log_odds)
 
-    def _readings(self, seen: FrameSightings, which: IntArray) -> tuple[FloatArray, FloatArray]:
-        return np.ascontiguousarray(seen.reading[which]), self.noise.of_detections(seen.sigma_given[which])
+    def _readings(self, seen: FrameSightings, which: IntArray) -> FrameReadings:
+        return FrameReadings(
+            np.ascontiguousarray(seen.reading[which]), self.noise.of_detections(seen.sigma_given[which])
+        )
 
     def _sight(self, row: int, seen: FrameSightings, which: int) -> None:
         local, (_, sigma) = self._local, self._readings(seen, np.array([which]))

@@ -187,14 +187,6 @@ class NearbyPlaces:
         self.covariance[at], self.covariance[:, at] = across, across.T
         self.covariance[np.ix_(at, at)] = across[:, : self.own] @ by_own.T + spread
 
-    def drive(self, motion: Any) -> None:
-        """Advance the newest pose by a motion of its group."""
-        raise NotImplementedError
-
-    def ahead(self, motion: Any) -> tuple[FloatArray, FloatArray]:
-        """Return the pose after a motion, and its covariance; the filter stays where it is."""
-        raise NotImplementedError
-
     def _apart(self, places: FloatArray, others: FloatArray) -> FloatArray:
         """Return (k, D) by which places (k, W) differ from others, as the covariance counts it."""
         return places - others

@@ -32,12 +32,11 @@ from evermap.slam.batch import (
     voted,
 )
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.filter_kernels import told
 from evermap.slam.kernels import N_STATES
-from evermap.slam.local_filter import Motion, SessionFilter
 from evermap.slam.method import Method, Static
 from evermap.slam.nearby_places import grown
 from evermap.slam.noise import refine_noise
+from evermap.slam.planar_filter import PlanarMotion, SessionFilter, told
 from evermap.slam.problem import Drive, Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.types import FloatArray, IntArray
@@ -143,7 +142,7 @@ class StreamingSlam:
         """Return the pose (3,) at a later instant by odometry alone, as `online_pose`, and its covariance (3, 3)."""
         problem, states = self._problem, self._filter.states
         last_s, free = problem.stamp_s[self._n_poses - 1], problem.prior.free
-        motion = Motion.over(drive, last_s, stamp_s, states, free, self._noise)
+        motion = PlanarMotion.over(drive, last_s, stamp_s, states, free, self._noise)
         return self._told(*self._filter.ahead(motion))
 
     def places(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -17,7 +17,10 @@ from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import WindowEvidence, compare
 from evermap.slam.changes.search import find_changes
 from evermap.slam.correlation import Lasting
+from evermap.slam.local_filter import BY_OTHERS
+from evermap.slam.nearby_places import NO_PLACES
 from evermap.slam.noise import START, refine_noise
+from evermap.slam.planar_filter import FrameReadings, PlanarFilter
 from evermap.slam.problem import Drive, Estimate, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import FIRST_RELINEARISATION, StreamingSlam
@@ -50,6 +53,11 @@ def filtered() -> None:
     slam = StreamingSlam(problem, START, problem.prior)
     for _ in range(FRAMES_FILTERED):
         slam.step()
+    local, seen = PlanarFilter(np.zeros(3), problem.prior, considered=True), problem.reading[:1]
+    local.hold(np.zeros(3), problem.prior.mean, np.eye(local.own), NO_PLACES, np.zeros((0, 2)))
+    local.meet(0, np.array(PLACE), 1e-4 * np.eye(2))
+    local.compare(np.zeros(1, dtype=np.int64), FrameReadings(seen, np.ones((1, 2))))
+    local.update(np.zeros(1, dtype=np.int64), FrameReadings(seen, 1e-2 * np.ones((1, 2))), weighing=BY_OTHERS)
     stamps = problem.stamp_s[:2]
     covariance, cross = np.tile(np.eye(3), (2, 1, 1)), np.zeros((1, 3, 3))
     bridged(stamps, stamps, np.zeros((2, 3)), covariance, cross, problem.drive, problem.prior.mean, START)

@@ -121,7 +121,7 @@ def test_it_is_the_kalman_filter_of_pose_mounts_scale_points_and_tags(considered
             noise = np.diag(np.repeat([0.01, 0.004], 3) ** 2)
             dense.drive(step, noise)
             scaled = se3.scaled(step, np.exp(local.log_scale))
-            by_scale = np.append(se3.rotation_of(scaled).T @ scaled[:3], np.zeros(3))
+            by_scale = np.append(se3.rotation_of(scaled).T @ scaled[:3], np.zeros(3))[:, None]
             local.drive(SpatialMotion(scaled, by_scale, noise))
         seen = _seen(random, pose, true, np.sort(random.permutation(count)[:4]))
         dense.update(seen)
@@ -151,7 +151,7 @@ def test_new_landmarks_tell_nothing_of_a_heading_that_was_lost() -> None:
         if frame:
             step = se3.exp([0.2, 0.0, 0.0, 0.0, 0.0, 0.1])
             pose = se3.compose(pose, se3.retract(step, 0.03 * random.normal(size=6)))
-            local.drive(SpatialMotion(step, np.zeros(6), 0.03**2 * np.eye(6)))
+            local.drive(SpatialMotion(step, np.zeros((6, 1)), 0.03**2 * np.eye(6)))
         seen = _seen(random, pose, true, np.arange(count))
         for row in range(0 if frame else count):
             oriented = row % 2 == 0

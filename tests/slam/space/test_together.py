@@ -10,6 +10,7 @@ import pytest
 from evermap import Config, run_slam, run_together
 from evermap.config import LocalizeConfig
 from evermap.errors import DataError, InputError
+from evermap.estimate.gauss_newton import Steps
 from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se3
 from evermap.maps.sessions.spatial import solve_visit
@@ -71,9 +72,9 @@ def test_covariances_are_those_of_a_dense_inverse():
     visits = [solve_visit(one, Config(), None, ()) for one in recordings]
     members = [SolvedRobot(visit.intake, visit.solved) for visit in visits]
     joint, start = _lay_together(members, align_robots(members, ["a", "b"], LocalizeConfig()))
-    noise = [member.solved.optimum.noise for member in members]
-    solution = joint.minimise(start, noise, most=10)
-    system, values = joint.structure.system, solution.now.values
+    solution = exhausted(joint.minimised_in_slices(start, Steps(10, 1e-5)))
+    graph, values = joint.graph(solution.state), solution.now.values
+    system, variable = graph.structure.system, joint.variables(np.ones(len(start.place), dtype=np.bool_))
     size = int(system.tree.begin[-1])
     information = np.zeros((size, size))
     for f, rows in enumerate(system.factors.rows.tolist()):
@@ -81,23 +82,23 @@ def test_covariances_are_those_of_a_dense_inverse():
         tied = system.factors.variable[system.factors.first[f] : system.factors.first[f + 1]]
         at = np.concatenate([system.tree.begin[k] + np.arange(system.tree.dim[k]) for k in tied])
         information[np.ix_(at, at)] += block.T @ block
-    information += np.diag(joint._held)
-    border = size - len(joint._border.information)
-    information[border:, border:] += np.diag(joint._border.information)
+    information += np.diag(graph.held)
+    border = size - len(graph.border.information)
+    information[border:, border:] += np.diag(graph.border.information)
     covariance = np.linalg.inv(information)
-    for r, part in enumerate(joint.parts(solution, noise)):
+    for r, part in enumerate(joint.parts(solution)):
         spread = part.smoother.spread(part.now)
-        for k, variable in enumerate(joint.variable[r].tolist()):
-            dim = int(system.tree.dim[variable])
-            at = system.tree.begin[variable] + np.arange(dim)
+        for k, of in enumerate(variable[r].tolist()):
+            dim = int(system.tree.dim[of])
+            at = system.tree.begin[of] + np.arange(dim)
             own = spread.own[spread.own_first[k] : spread.own_first[k + 1]].reshape(dim, dim)
             expected = covariance[np.ix_(at, at)]
             np.testing.assert_allclose(own, expected, atol=1e-5 * np.abs(expected).max())
-        states = joint.variable[r][-2:]
+        states = variable[r][-2:]
         at = np.concatenate([system.tree.begin[k] + np.arange(system.tree.dim[k]) for k in states])
         found = part.smoother.factorised(part.now).border_covariance()
         np.testing.assert_allclose(found, covariance[np.ix_(at, at)], atol=1e-6 * np.abs(found).max())
-    assert exhausted(joint.structure.system.factorised(values, extra=joint._held)) is not None
+    assert exhausted(system.factorised(values, extra=graph.held)) is not None
 
 
 def test_robots_without_a_common_landmark_are_not_laid_together():

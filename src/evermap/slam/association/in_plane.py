@@ -39,11 +39,12 @@ from evermap.slam.association.revise import likely_real, reassigned, unseen_nats
 from evermap.slam.association.wrong_associations import displaced_stretches, laid, weighed_visits
 from evermap.slam.batch import USUAL, sighted_at
 from evermap.slam.bridge import dead_reckoned
-from evermap.slam.filter_kernels import BY_PLACE, GATED, WIDTH, spread_of_frame
+from evermap.slam.filter_kernels import spread_of_frame
 from evermap.slam.linearise import detection_residuals
-from evermap.slam.local_filter import LocalFilter, Motion
+from evermap.slam.local_filter import GATED
 from evermap.slam.nearby_places import NO_PLACES
 from evermap.slam.noise import Extrapolation, refine_noise
+from evermap.slam.planar_filter import FrameReadings, PlanarFilter, PlanarMotion
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
@@ -133,7 +134,7 @@ class Closures(NamedTuple):
         return float(gammaincc(self.visits, max(self.nats, 0.0))) if self.visits else 1.0
 
 
-class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalFilter]):
+class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, PlanarFilter]):
     """The associator in the plane.
 
     Args:
@@ -157,7 +158,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalF
         traits: Traits | None = None,
         settings: SlamConfig = USUAL,
     ) -> None:
-        local = LocalFilter(problem.mount, problem.prior, most=MOST_COMPARED)
+        local = PlanarFilter(problem.mount, problem.prior, most=MOST_COMPARED)
         covariance = local.covariance.copy()
         covariance[:3, :3] = np.eye(3) / problem.start_information
         local.hold(problem.start_pose, local.states, covariance, NO_PLACES, local.position)
@@ -183,9 +184,9 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalF
             self._go_on_from(self._settled(self._without_chance(self._assignment()), self._sigma, RECENT))
             self._next_batch = self._done + max(FIRST_BATCH, int(BATCH_SHARE * self._done))
 
-    def _driven(self, near: LocalFilter, times: float) -> LocalFilter:
+    def _driven(self, near: PlanarFilter, times: float) -> PlanarFilter:
         local, noise = near.copied(), replace(self.noise, odometry=times * self.noise.odometry)
-        motion = Motion.between(self._problem, noise, self._done, local.states)
+        motion = PlanarMotion.between(self._problem, noise, self._done, local.states)
         away = np.hypot(*(local.position - se2.compose(local.pose, motion.increment)[:2]).T)
         local.bring(np.argsort(away, kind="stable")[:MOST_COMPARED])
         local.drive(motion)
@@ -291,21 +292,21 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalF
         explained = fit + self.noise.outlier_log_odds * nobody
         return explained / self.worth + landmarks + unseen_nats(assignment)
 
-    def _gated(self, near: LocalFilter, view: IntArray) -> tuple[Pairings, BoolArray]:
+    def _gated(self, near: PlanarFilter, view: IntArray) -> tuple[Pairings, BoolArray]:
         labels = self._kind[view], self._of_kind
         return pairings_of_frame(
             near, self._problem, self._sigma, view, density=self._density, kind=labels, settings=self._rules
         )
 
     def _certain(
-        self, near: LocalFilter, pairings: Pairings, followed: BoolArray, probability: FloatArray, known: FloatArray
+        self, near: PlanarFilter, pairings: Pairings, followed: BoolArray, probability: FloatArray, known: FloatArray
     ) -> BoolArray:
         away = self._problem.stamp_s[self._done] - self._seen_s[pairings.target] > self._rules.forget_s
         least = np.where(away & ~followed, self._rules.p_return, self._rules.p_match)
         return np.asarray((probability >= least) | self._harmless(near, pairings, probability, known, least))
 
     def _harmless(
-        self, local: LocalFilter, pairings: Pairings, probability: FloatArray, known: FloatArray, least: FloatArray
+        self, local: PlanarFilter, pairings: Pairings, probability: FloatArray, known: FloatArray, least: FloatArray
     ) -> BoolArray:
         """(K,) the best pairing of a detection if a wrong choice does no harm, and is corrected later.
 
@@ -327,7 +328,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalF
                 best[first] = all(self._may_be_one(local, pairings.target[first], pairings.target[k]) for k in rivals)
         return best
 
-    def _may_be_one(self, local: LocalFilter, a: int, b: int) -> bool:
+    def _may_be_one(self, local: PlanarFilter, a: int, b: int) -> bool:
         """True if the difference of two landmarks is insignificant."""
         at = local.columns(local.bring(np.array([a, b])))
         by = np.hstack([np.eye(2), -np.eye(2)])
@@ -337,13 +338,13 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, LocalF
 
     def _update(self, known: IntArray, new: IntArray) -> None:
         problem, local = self._problem, self._near
-        local.update(self._row[known], problem.reading[known], self._sigma[known], weighing=GATED)
+        local.update(self._row[known], FrameReadings(problem.reading[known], self._sigma[known]), weighing=GATED)
         if not len(new):
             return
         at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
         for row, place in zip(self._row[new].tolist(), at, strict=True):
             local.meet(row, place)
-        local.update(self._row[new], problem.reading[new], self._sigma[new], weighing=GATED)
+        local.update(self._row[new], FrameReadings(problem.reading[new], self._sigma[new]), weighing=GATED)
 
     def _go_on_from(self, solved: PlanarSolution) -> None:
         """Accept a solution: all that was learned with it is that of the frames to come."""
@@ -568,7 +569,7 @@ def _key(rows: IntArray) -> tuple[int, int]:
 
 
 def pairings_of_frame(
-    local: LocalFilter,
+    local: PlanarFilter,
     problem: Problem,
     sigma: FloatArray,
     detections: IntArray,
@@ -594,21 +595,23 @@ def pairings_of_frame(
     same = alike(kind[0][source], kind[1][target])
     source, target = source[same], target[same]
     seen = detections[source]
-    nis, log_det, innovation, by = local.compare(target, problem.reading[seen], sigma[seen])
+    nis, log_det, frame = local.compare(target, FrameReadings(problem.reading[seen], sigma[seen]))
     inside = np.flatnonzero(nis <= gates(1, settings.gate_confidence)[1])
     # the neighbourhood of a tracked landmark is mapped; other gates may contain an unmapped landmark by chance
     wider = 2.0 * math.log(settings.followed**2)
-    followed = log_det[inside] <= 2.0 * np.log(sigma[seen[inside]]).sum(axis=1) + wider
+    followed = log_det[inside] <= wider
     source, target, seen, count = source[inside], target[inside], seen[inside], len(inside)
-    at, joint = np.empty((count, WIDTH), dtype=np.int64), np.empty((2 * count, 2 * count))
-    at[:, :BY_PLACE], at[:, BY_PLACE:] = np.arange(BY_PLACE), local.columns(local.bring(target)).reshape(-1, 2)
+    at, joint = frame.column[inside], np.empty((2 * count, 2 * count))
+    at[:, -2:] = local.columns(local.bring(target)).reshape(-1, 2)
     if count:
         scratch = np.empty((2 * count, len(local.covariance)))
-        spread_of_frame(local.covariance, by[inside].reshape(2 * count, WIDTH), at, scratch, joint)
-    joint[np.diag_indices(2 * count)] += (sigma[seen] ** 2).ravel()
+        spread_of_frame(local.covariance, frame.jacobian[inside], at, scratch, joint)
+    joint[np.diag_indices(2 * count)] += 1.0
+    unit = sigma[seen].ravel()
+    joint *= unit[:, None] * unit
     # area element r dr db
     new = np.log(np.where(followed, settings.unmet_share, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))
-    return Pairings(source, target, innovation[inside], joint, new, len(detections)), followed
+    return Pairings(source, target, frame.residual[inside] * sigma[seen], joint, new, len(detections)), followed
 
 
 LEAST_LEFT = 0.1

@@ -1,7 +1,7 @@
 """Poses between poses in space: where the robot was in frames that saw nothing, of which only the odometry tells.
 
-As `slam.bridge` in the plane: dead reckoning from the pose before and to the pose after, each weighted by how uncertain
-it is by then, is the exact posterior of the linearised chain.
+The chain of the odometry is conditioned on the poses before and after as in the plane (`slam.bridge`); what differs is
+its noise, and its scale, with which poses between others move.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 
 from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
+from evermap.slam.bridge import condition_on_ends, joint_of_ends
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.types import FloatArray, IntArray
 
@@ -99,16 +100,11 @@ def bridge_covariance(
     if not len(blind):
         return found
     chain, of = _Chain(frames, problem, estimate, noise), frames.before[blind]
-    joint = np.zeros((len(of), 13, 13))
-    joint[:, :6, :6], joint[:, 6:12, 6:12], joint[:, :6, 6:12] = own[of], own[of + 1], spread.pairs[of]
-    with_scale = spread.with_border[: 6 * n, -1].reshape(n, 6)
-    joint[:, :6, 12], joint[:, 6:12, 12], joint[:, 12, 12] = (
-        with_scale[of],
-        with_scale[of + 1],
-        spread.with_border[-1, -1],
-    )
-    joint = np.triu(joint) + np.swapaxes(np.triu(joint, 1), 1, 2)
-    by, collected = chain.by_ends(), chain.lost / np.maximum(weight, 1e-12)[of, None, None]
+    joint, with_scale = np.zeros((len(of), 13, 13)), spread.with_border[: 6 * n, -1].reshape(n, 6)
+    joint[:, :12, :12] = joint_of_ends(own[of], own[of + 1], spread.pairs[of])
+    joint[:, :12, 12] = joint[:, 12, :12] = np.hstack([with_scale[of], with_scale[of + 1]])
+    joint[:, 12, 12] = spread.with_border[-1, -1]
+    by, collected = chain.by_ends(), chain.held.lost / np.maximum(weight, 1e-12)[of, None, None]
     collected[:, :3] *= chain.unit
     collected[:, :, :3] *= chain.unit
     found[blind] = by @ joint @ np.swapaxes(by, 1, 2) + collected
@@ -120,8 +116,7 @@ class _Chain:
 
     Attributes:
         pose: (B, 7) where the robot was, in true lengths.
-        gain: (B, 6, 6) of the error that the odometry leaves at the pose after.
-        lost: (B, 6, 6) covariance given both ends.
+        held: the chain given both ends.
         unit: true lengths over those of the odometry.
     """
 
@@ -142,23 +137,20 @@ class _Chain:
         after = frames.posed[of + 1]
         ahead = se3.adjoint(se3.inverse(se3.between(driven[blind], driven[after])))
         way = se3.between(driven[frames.posed][of], driven[after])
-        self._from, self._whole = se3.adjoint(se3.inverse(since[blind])), se3.adjoint(se3.inverse(way))
-        at = self._from @ total[blind] @ np.swapaxes(self._from, 1, 2)
-        whole = self._whole @ total[after] @ np.swapaxes(self._whole, 1, 2)
-        shared = ahead @ at
-        self.gain = np.swapaxes(np.linalg.solve(whole, shared), 1, 2)
-        self.lost = at - self.gain @ shared
+        carry, over = se3.adjoint(se3.inverse(since[blind])), se3.adjoint(se3.inverse(way))
+        at = carry @ total[blind] @ np.swapaxes(carry, 1, 2)
+        self.held = condition_on_ends(carry, ahead, at, over @ total[after] @ np.swapaxes(over, 1, 2))
         own = se3.scaled(estimate.pose, 1.0 / self.unit)
         closing = se3.local(se3.compose(own[of], way), own[of + 1])
         here = se3.compose(own[of], since[blind])
-        here = se3.retract(here, np.einsum("bij,bj->bi", self.gain, closing))
+        here = se3.retract(here, np.einsum("bij,bj->bi", self.held.gain, closing))
         self.pose, self._ends = se3.scaled(here, self.unit), (estimate.pose[of], estimate.pose[of + 1])
 
     def by_ends(self) -> FloatArray:
         """Return derivatives (B, 6, 13) by the poses before and after and by the logarithm of the scale."""
         shrunk = np.repeat([1.0 / self.unit, 1.0], 3)
-        found = np.zeros((len(self.gain), 6, 13))
-        for at, (by, end) in enumerate(zip((self._from - self.gain @ self._whole, self.gain), self._ends, strict=True)):
+        found = np.zeros((len(self.pose), 6, 13))
+        for at, (by, end) in enumerate(zip(np.split(self.held.by_ends, 2, axis=2), self._ends, strict=True)):
             at_origin = -se3.inverse(end)[:, :3]  # seen from the pose, so it moves as all lengths grow
             found[:, :, 6 * at : 6 * at + 6] = by * shrunk
             found[:, :, 12] -= np.einsum("bij,bj->bi", by[:, :, :3], at_origin) / self.unit

@@ -17,8 +17,8 @@ from evermap.geometry import se3
 from evermap.geometry.chunked import JointCovariance
 from evermap.geometry.group import SPACE
 from evermap.geometry.symmetry import Symmetry
-from evermap.slam.filter_kernels import BY_OTHERS
 from evermap.slam.known_places import DriveTrack, KnownPlaces, Placed
+from evermap.slam.local_filter import BY_OTHERS, Motion, Updated
 from evermap.slam.localize import USUAL, BaseLocalizer
 from evermap.slam.space.linearise import POINT
 from evermap.slam.space.local_filter import OF_PLACE, SpatialFilter, SpatialFrame, SpatialMotion
@@ -206,7 +206,7 @@ class SpatialLocalizer(BaseLocalizer):
         there._noise, there._local.levels = self._noise, self._local.levels
         return self._going_on(there)
 
-    def _drive(self, motion: SpatialMotion) -> None:
+    def _drive(self, motion: Motion) -> None:
         super()._drive(motion)
         if np.diag(self._local.covariance)[:3].max() > FARTHEST_M**2:
             self._local.pose = np.full(7, np.nan)  # so it is not known
@@ -229,14 +229,16 @@ class SpatialLocalizer(BaseLocalizer):
 
     def _compare(self, row: IntArray, seen: SpatialFrame, which: IntArray) -> tuple[FloatArray, FloatArray]:
         own = np.array([self.places.joint_of(one) for one in row[:, None]])
-        return self._local.compare(row, seen.rows(which), own)
+        return self._local.compare(row, seen.rows(which), own, is_apart=True)[:2]
 
-    def _update_by(self, row: IntArray, seen: SpatialFrame, which: IntArray) -> tuple[FloatArray, FloatArray]:
+    def _update_by(self, row: IntArray, seen: SpatialFrame, which: IntArray) -> Updated:
         some = seen.rows(which)
         kind = np.where(np.isfinite(self._local.position[row, 3]), some.kind, POINT)
         log_odds = np.array(self._space.outlier_log_odds)[kind] + self._believed[row]
-        noise = self._noise if self._track is None else None  # where it is lost nothing fits
-        found = self._local.update(row, some, weighing=BY_OTHERS, log_odds=log_odds, noise=noise)
+        found = self._local.update(row, some, weighing=BY_OTHERS, log_odds=log_odds)
+        if self._track is None and found.before is not None:  # where it is lost nothing fits
+            self._noise.learn(found.before, found.weight, kind)
+            self._local.levels = self._noise.now.levels
         self._noise.forget_motion()
         return found
 

@@ -12,7 +12,7 @@ import numpy as np
 from evermap.config import SpaceConfig
 from evermap.geometry import se3
 from evermap.geometry.symmetry import Symmetry
-from evermap.slam.filter_kernels import BY_OTHERS
+from evermap.slam.local_filter import BY_OTHERS
 from evermap.slam.localize import Located
 from evermap.slam.nearby_places import NO_PLACES
 from evermap.slam.space.linearise import CORNERS, POINT

@@ -17,10 +17,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
-from evermap.estimate.graph import Graph
-from evermap.estimate.sparse.elimination import numbers_of
 from evermap.estimate.sparse.system import exhausted
 from evermap.slam.correlation import Lasting
+from evermap.slam.room import hold_in_room
 from evermap.slam.space.estimate import SpatialOptimum
 from evermap.slam.space.linearise import (
     ACROSS,
@@ -32,7 +31,7 @@ from evermap.slam.space.linearise import (
     POSE,
     ROWS,
 )
-from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.problem import SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SIGHTINGS, SpatialLinear, SpatialSmoother
 from evermap.types import BoolArray, FloatArray
 
@@ -44,8 +43,6 @@ OUTLIER = 0.5
 """Inlier probability below which a factor is an outlier."""
 NUGGET = 1e-3
 """Share of the variance that is white at least."""
-ROOM = 20.0, np.pi
-"""Standard deviations of where a landmark is of which nothing is known, and of its turn [m, rad]."""
 
 
 def log_marginal_likelihood(
@@ -85,21 +82,10 @@ def log_marginal_likelihood(
     linear = counted.linearised(optimum.estimate, noise, heavy=False)
     graph, of_places = counted.graph(noise, heavy=False), 0.0
     if in_room:
-        graph, of_places = _in_room(problem, graph)
+        free = np.setdiff1d(np.arange(len(problem.oriented)), problem.prior.place)
+        graph, _, of_places = hold_in_room(graph, len(problem.stamp_s) + free)
     information = exhausted(graph.factorised(linear.now))
     return float(of_places - of_inliers - of_outliers - of_odometry - priors - 0.5 * information.log_determinant)
-
-
-def _in_room(problem: SpatialProblem, graph: Graph[SpatialEstimate]) -> tuple[Graph[SpatialEstimate], float]:
-    """Return the graph with a prior of places that no map has, and the log density of that at its peak."""
-    free, n = np.ones(len(problem.oriented), dtype=np.bool_), len(problem.stamp_s)
-    free[problem.prior.place] = False
-    begin, held = graph.structure.system.tree.begin, graph.held.copy()
-    for first, some, sigma in ((0, free, ROOM[0]), (3, free & problem.oriented, ROOM[1])):
-        at = numbers_of(begin[n + np.flatnonzero(some)] + first, np.full(int(some.sum()), 3))
-        held[at] = np.maximum(held[at], sigma**-2)
-    numbers = 3.0 * np.array([free.sum(), (free & problem.oriented).sum()])
-    return replace(graph, held=held), -float(numbers @ np.log(ROOM))
 
 
 def _log_sigmas(problem: SpatialProblem, noise: SpatialNoise) -> FloatArray:

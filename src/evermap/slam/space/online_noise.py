@@ -14,6 +14,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from evermap.config import SpaceConfig
 from evermap.geometry import se3
+from evermap.slam.local_filter import FrameInnovations
 from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS, ORIENTATION, PIXEL, ROTATION, TRANSLATION
 from evermap.slam.space.problem import SpatialNoise
 from evermap.types import FloatArray, IntArray
@@ -46,20 +47,15 @@ class OnlineNoise:
         """Begin anew: the pose came from elsewhere."""
         self._since = np.zeros((2, 6, 6))
 
-    def learn(
-        self, spread: FloatArray, residual: FloatArray, by_pose: FloatArray, weight: FloatArray, kind: IntArray,
-        n_rows: IntArray,
-    ) -> None:  # fmt: skip
+    def learn(self, before: FrameInnovations, weight: FloatArray, kind: IntArray) -> None:
         """Learn from the innovations of a frame.
 
         Args:
-            spread: (M R, M R) their covariance but for the noise, which is 1.
-            residual: (M, R) of M detections; zeros behind the rows that each has.
-            by_pose: (M, R, 6) derivatives.
-            weight: (M,) of detections; outliers are left out, unless most are.
-            kind: (M,) of detections.
-            n_rows: (M,) of detections.
+            before: of M detections.
+            weight: (M,) of them; outliers are left out, unless most are.
+            kind: (M,) of them.
         """
+        spread, residual, by_pose, n_rows = before
         used = weight > 0.5
         if 2 * np.count_nonzero(used) < len(used):
             used[:] = True

@@ -1,15 +1,9 @@
-"""Several robots in space that drove at the same time, as one problem: a concatenation of their blocks.
-
-Each is solved alone first; their frames are aligned by landmarks with the same id. Then all is solved at once, a
-landmark that several saw being one place, with the calibration and the noise levels of each robot.
-"""
+"""Joint solution of several simultaneous recordings in space, as `slam.together`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -18,29 +12,28 @@ from scipy.linalg import block_diag
 from evermap.align.acceptance import MOST_JOINT
 from evermap.align.candidates import Matches
 from evermap.config import LocalizeConfig
-from evermap.estimate.gauss_newton import Minimum, Steps, minimised
-from evermap.estimate.graph import (
-    Border,
-    FactorBlock,
-    Graph,
-    Layout,
-    Linear,
-    build_structure,
-    concatenate_blocks,
-    concatenate_groups,
-)
+from evermap.estimate.gauss_newton import Minimum, Steps
+from evermap.estimate.graph import Border, FactorBlock, Linear
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, exhausted
 from evermap.geometry import se2, se3
 from evermap.slam.space.against_map import by_itself
-from evermap.slam.space.estimate import CONVERGED, ROUNDS, SpatialOptimum, refined
+from evermap.slam.space.estimate import (
+    CONVERGED,
+    FIRST_STEPS,
+    LAST_STEPS,
+    NEAR,
+    ROUNDS,
+    STEPS_A_ROUND,
+    SpatialOptimum,
+    refined,
+)
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.linearise import STATES
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import (
     COST_SLACK,
     FIRST_DAMPING,
-    HELD,
     ODOMETRY,
     POSES_A_LEAF,
     SETTLED,
@@ -50,8 +43,8 @@ from evermap.slam.space.smoother import (
     limit_turns,
 )
 from evermap.slam.space.solve import FREE, SpatialSolved
-from evermap.slam.together import SharedPoints, align_frames, share_places
-from evermap.types import FloatArray, IntArray
+from evermap.slam.together import SharedPoints, Together, align_frames, settle, share_places
+from evermap.types import BoolArray, FloatArray, IntArray
 
 NEEDED = "common landmark ids, at least three points or one tag, and one clock"
 """What ties robots in space."""
@@ -103,25 +96,29 @@ def solve_space_together(
     """
     motion = align_robots(members, names, rules)
     joint, start = _lay_together(members, motion)
-    noise = [member.solved.optimum.noise for member in members]
-    begun = list(noise)
-    for round_ in range(ROUNDS):
-        solution = joint.minimise(start, noise, most=15 if round_ == 0 else 2)
-        start = solution.state
-        parts = joint.parts(solution, noise)
+    begun = joint.noise
+
+    def learn(joint: SpatialTogether, solution: Minimum[JointEstimate], _: int) -> tuple[SpatialTogether, bool]:
+        """Return the problem with levels by a solution, and whether these are as they were."""
         following = [
-            refined(part.smoother, part.now, own, first) for part, own, first in zip(parts, noise, begun, strict=True)
+            refined(part.smoother, part.now, own, first)
+            for part, own, first in zip(joint.parts(solution), joint.noise, begun, strict=True)
         ]
-        before, noise = noise, following
-        changes = [np.abs(np.log(new.levels / old.levels)).max() for new, old in zip(noise, before, strict=True)]
-        if max(changes) < CONVERGED:
-            break
-    optima = joint.parts(joint.minimise(start, noise, most=6), noise)
+        changes = [np.abs(np.log(new.levels / old.levels)) for new, old in zip(following, joint.noise, strict=True)]
+        return joint.of(following), bool(np.max(changes) < CONVERGED)
+
+    steps = [_steps(FIRST_STEPS if round_ == 0 else STEPS_A_ROUND) for round_ in range(ROUNDS)]
+    joint, start = settle(joint, start, learn, steps)
+    optima = joint.parts(exhausted(joint.minimised_in_slices(start, _steps(LAST_STEPS))))
     found = []
     for member, by, optimum in zip(members, motion, optima, strict=True):
         online = se3.compose(by, member.solved.online_pose)
         found.append(replace(member.solved, optimum=optimum, online_pose=online))
     return found
+
+
+def _steps(most: int) -> Steps:
+    return Steps(most, NEAR, SETTLED, 0.0, COST_SLACK, FIRST_DAMPING)
 
 
 def align_robots(members: Sequence[SolvedRobot], names: Sequence[str], rules: LocalizeConfig) -> FloatArray:
@@ -188,75 +185,58 @@ def _lay_together(members: Sequence[SolvedRobot], motion: FloatArray) -> tuple[S
         np.array([estimate.log_scale for estimate in estimates]),
     )
     begin_s = np.array([member.intake.start_s for member in members])
-    return SpatialTogether(robots, places, begin_s, start), start
+    noise = [member.solved.optimum.noise for member in members]
+    return SpatialTogether(robots, places, begin_s, oriented, noise), start
 
 
-class SpatialTogether:
+class SpatialTogether(Together[JointEstimate]):
     """Several problems in space that share places, as one graph.
 
     Args:
         robots: the smoother of each.
         places: (P_r,) of each robot, which of all places its own are.
         start_s: (R,) beginning of each problem's clock on that of all.
-        around: rough values.
+        oriented: (P,) places with an orientation.
+        noise: levels of each robot.
     """
 
     def __init__(
-        self, robots: Sequence[_Member], places: Sequence[IntArray], start_s: FloatArray, around: JointEstimate
+        self,
+        robots: Sequence[_Member],
+        places: Sequence[IntArray],
+        start_s: FloatArray,
+        oriented: BoolArray,
+        noise: Sequence[SpatialNoise],
     ) -> None:
-        self.robots, self.places = tuple(robots), tuple(places)
-        self.first = np.cumsum([0, *(len(robot.problem.stamp_s) for robot in robots)])
         self.sensor = np.cumsum([0, *(len(robot.problem.mount) for robot in robots)])
-        n, count, n_sensors = int(self.first[-1]), len(around.place), int(self.sensor[-1])
-        self.oriented = np.zeros(count, dtype=np.bool_)
-        for robot, row in zip(self.robots, self.places, strict=True):
-            self.oriented[row] |= robot.problem.oriented
-        self.variable = [
-            np.concatenate(
-                [np.arange(a, b), n + row, n + count + np.arange(*span), [n + count + n_sensors + r]]
-            ).astype(np.int64)
-            for r, ((a, b), span, row) in enumerate(
-                zip(pairwise(self.first.tolist()), pairwise(self.sensor.tolist()), self.places, strict=True)
-            )
+        calibration = [
+            np.append(np.arange(self.sensor[r], self.sensor[r + 1]), self.sensor[-1] + r) for r in range(len(robots))
         ]
-        when = [begin_s + robot.problem.stamp_s for robot, begin_s in zip(self.robots, start_s, strict=True)]
-        dim = np.concatenate([np.full(n, 6), np.where(self.oriented, 6, 3), np.full(n_sensors, STATES)])
-        dim = np.append(dim, np.ones(len(robots), dtype=np.int64))
-        coordinate = np.column_stack([np.concatenate(when), around.pose[:, :3]])
-        group = concatenate_groups(np.diff(self.first).tolist(), POSES_A_LEAF)
-        layout = Layout(dim, n + count + np.arange(n_sensors + len(robots)), group, coordinate)
-        blocks = self._blocks([SpatialNoise()] * len(robots), heavy=False)
-        self.structure = exhausted(build_structure(layout, blocks))
-        begin = self.structure.system.tree.begin
-        self._held = np.zeros(begin[-1])
-        self._held[begin[n] : begin[n + count]] = HELD
-        for robot, variable in zip(self.robots, self.variable, strict=True):
-            robot.hold(self._held, begin[variable])
-        of_sensors = [robot.states_information[:-1] for robot in self.robots]
-        of_scales = [robot.states_information[-1:] for robot in self.robots]
-        self._border = Border(np.concatenate([*of_sensors, *of_scales]), _states)
+        n_poses = [len(robot.problem.stamp_s) for robot in robots]
+        super().__init__(n_poses, places, calibration, poses_a_leaf=POSES_A_LEAF)
+        self.robots, self.noise, self.oriented, self.start_s = tuple(robots), tuple(noise), oriented, start_s
 
-    def minimise(self, start: JointEstimate, noise: Sequence[SpatialNoise], *, most: int) -> Minimum[JointEstimate]:
-        """Run damped Gauss-Newton for so many steps at most."""
-        steps = Steps(most, 1e-5, SETTLED, 0.0, COST_SLACK, FIRST_DAMPING)
-        graph = Graph(self._blocks(noise, heavy=False), self.structure, self._border, self._held, self._retract)
-        return exhausted(minimised(graph, start, steps))
+    def of(self, noise: Sequence[SpatialNoise]) -> SpatialTogether:
+        """Return the same with other levels; its structure is kept."""
+        other = SpatialTogether(self.robots, self.places, self.start_s, self.oriented, noise)
+        other._structure = self._structure
+        return other
 
-    def parts(self, solution: Minimum[JointEstimate], noise: Sequence[SpatialNoise]) -> list[SpatialOptimum]:
+    def parts(self, solution: Minimum[JointEstimate]) -> list[SpatialOptimum]:
         """Return what each robot has of the solution, with covariances by all."""
-        graph = Graph(self._blocks(noise, heavy=False), self.structure, self._border, self._held, self._retract)
-        factorised = exhausted(graph.factorised(solution.now))
+        structure, variable = self.graph(solution.state).structure, self.variables(self._known(solution.state))
+        factorised = exhausted(self.factorised_in_slices(solution.state))
         steps = np.cumsum([0, *(len(robot.problem.increment) for robot in self.robots)]).tolist()
         spread = exhausted(factorised.spread(steps[-1]))
         found, count = [], len(self.robots)
         for r, robot in enumerate(self.robots):
-            blocks = [k for kind in (ODOMETRY, SIGHTINGS) for k in [kind * count + r]]
-            values = np.concatenate([solution.now.values[self.structure.values_of(k)] for k in blocks])
+            blocks = [kind * count + r for kind in (ODOMETRY, SIGHTINGS)]
+            values = np.concatenate([solution.now.values[structure.values_of(k)] for k in blocks])
             weights = tuple(solution.now.weights[k] for k in blocks)
-            factors = [self.structure.first[k : k + 2] for k in blocks]
-            robot.learn(factorised, spread, self.variable[r], factors, spread.pairs[steps[r] : steps[r + 1]])
+            factors = [structure.first[k : k + 2] for k in blocks]
+            robot.learn(factorised, spread, variable[r], factors, spread.pairs[steps[r] : steps[r + 1]])
             own = Linear(values, weights, solution.now.cost, np.zeros(0))
-            found.append(SpatialOptimum(self.own(solution.state, r), noise[r], robot, SpatialLinear(own, robot)))
+            found.append(SpatialOptimum(self.own(solution.state, r), self.noise[r], robot, SpatialLinear(own, robot)))
         return found
 
     def own(self, state: JointEstimate, robot: int) -> SpatialEstimate:
@@ -265,21 +245,37 @@ class SpatialTogether:
         place, log_scale = state.place[self.places[robot]], float(state.log_scale[robot])
         return SpatialEstimate(state.pose[poses], place, state.state[sensors], log_scale)
 
-    def _blocks(self, noise: Sequence[SpatialNoise], *, heavy: bool) -> tuple[FactorBlock[JointEstimate], ...]:
-        """Odometry of all, detections of all, and what else each has."""
-        blocks = [robot.graph(own, heavy=heavy).blocks for robot, own in zip(self.robots, noise, strict=True)]
-        select = [partial(self.own, robot=r) for r in range(len(blocks))]
-        return concatenate_blocks(blocks, self.variable, self.first.tolist(), select, measured=SIGHTINGS + 1)
+    def _known(self, state: JointEstimate) -> BoolArray:
+        return np.ones(len(state.place), dtype=np.bool_)
+
+    def _dims(self) -> tuple[int, IntArray, IntArray]:
+        of_sensors, of_scales = np.full(int(self.sensor[-1]), STATES), np.ones(len(self.robots), dtype=np.int64)
+        return 6, np.where(self.oriented, 6, 3), np.append(of_sensors, of_scales)
+
+    def _coordinate(self, state: JointEstimate) -> FloatArray:
+        when = [begin_s + robot.problem.stamp_s for robot, begin_s in zip(self.robots, self.start_s, strict=True)]
+        return np.column_stack([np.concatenate(when), state.pose[:, :3]])
+
+    def _blocks(self, state: JointEstimate) -> list[tuple[FactorBlock[SpatialEstimate], ...]]:  # noqa: ARG002
+        return [robot.graph(own, heavy=False).blocks for robot, own in zip(self.robots, self.noise, strict=True)]
+
+    def _hold(self, held: FloatArray, begin: IntArray, variable: Sequence[IntArray]) -> None:
+        for robot, own in zip(self.robots, variable, strict=True):
+            robot.hold(held, begin[own])
+
+    def _border(self) -> Border[JointEstimate]:
+        of_sensors = [robot.states_information[:-1] for robot in self.robots]
+        of_scales = [robot.states_information[-1:] for robot in self.robots]
+        return Border(np.concatenate([*of_sensors, *of_scales]), _states)
 
     def _retract(self, state: JointEstimate, step: FloatArray) -> tuple[JointEstimate, float]:
-        """The values after a step, and how far it went."""
-        n, count = len(state.pose), len(state.place)
-        begin = self.structure.system.tree.begin
-        by, turned, share, size = limit_turns(step, n, self.oriented, begin[n : n + count])
-        place, on = state.place.copy(), self.oriented
+        n, count, on = len(state.pose), len(state.place), self.oriented
+        begin = np.cumsum([6 * n, *np.where(on, 6, 3)])
+        by, turned, share, size = limit_turns(step, n, on, begin[:-1])
+        place = state.place.copy()
         place[on] = se3.retract(place[on], share * turned[on])
         place[~on, :3] += share * turned[~on, :3]
-        sensors = share * step[begin[n + count] : begin[n + count + len(state.state)]].reshape(-1, STATES)
+        sensors = share * step[begin[count] : begin[count] + STATES * len(state.state)].reshape(-1, STATES)
         log_scale = state.log_scale + share * step[len(step) - len(state.log_scale) :]
         return JointEstimate(se3.retract(state.pose, share * by), place, state.state + sensors, log_scale), size
 

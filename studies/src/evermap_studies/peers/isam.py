@@ -16,7 +16,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from evermap.geometry import se2
 from evermap.slam.kernels import N_STATES
-from evermap.slam.local_filter import Motion
+from evermap.slam.planar_filter import PlanarMotion
 from evermap.slam.problem import ConditionalPrior, Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.types import FloatArray, IntArray
@@ -39,7 +39,7 @@ def _landmark_key(row: int) -> int:
 
 
 class IncrementalSmoother:
-    """The incremental solver to compare `local_filter.SessionFilter` with.
+    """The incremental solver to compare `planar_filter.SessionFilter` with.
 
     The tree holds the last poses only. What the older ones say about them, about the landmarks and the states is one
     linear factor, so that a step costs what the map costs, whatever the age of the recording.
@@ -82,7 +82,7 @@ class IncrementalSmoother:
         self._isam.update(graph, values)
         self._last_pose = self._newest_pose()
 
-    def add(self, row: int, motion: Motion | None, landmark: FloatArray) -> None:
+    def add(self, row: int, motion: PlanarMotion | None, landmark: FloatArray) -> None:
         """Add pose `row` with its odometry and detections, and update the tree."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         if motion is None:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from evermap.slam.batch import sighted_at
-from evermap.slam.filter_kernels import WIDTH
 from evermap.slam.kernels import N_SENSOR, N_STATES, detection_residual, kernel
+from evermap.slam.planar_filter import WIDTH
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, between_rows
 from evermap.types import BoolArray, FloatArray, IntArray
 from evermap_studies.nielsen2024.modes.places import FREE, Modes, at_places, grown, moved_to
