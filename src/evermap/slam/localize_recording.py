@@ -29,6 +29,7 @@ from evermap.slam.space.local_filter import SpatialFrame
 from evermap.slam.space.localize import SpatialLocalizer, SpatialPlaces
 from evermap.slam.space.problem import OdometryPath, SpatialNoise
 from evermap.slam.space.result import SCALE, mount_parameters, noise_parameters
+from evermap.slam.warmup import any_filter
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -327,6 +328,7 @@ def warm_up_in_space() -> None:
     path = OdometryPath(np.array([0.0, 1.0]), se3.identity(2))
     for stamp_s in (0.0, 0.1):
         localizer.step(stamp_s, path, seen)
+    any_filter()
 
 
 def _with_counts(landmarks: Landmarks, run: _Run, misses: Misses) -> Landmarks:

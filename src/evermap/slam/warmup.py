@@ -53,16 +53,25 @@ def filtered() -> None:
     slam = StreamingSlam(problem, START, problem.prior)
     for _ in range(FRAMES_FILTERED):
         slam.step()
-    local, seen = PlanarFilter(np.zeros(3), problem.prior, considered=True), problem.reading[:1]
-    local.hold(np.zeros(3), problem.prior.mean, np.eye(local.own), NO_PLACES, np.zeros((0, 2)))
-    local.meet(0, np.array(PLACE), 1e-4 * np.eye(2))
-    local.compare(np.zeros(1, dtype=np.int64), FrameReadings(seen, np.ones((1, 2))))
-    local.update(np.zeros(1, dtype=np.int64), FrameReadings(seen, 1e-2 * np.ones((1, 2))), weighing=BY_OTHERS)
+    any_filter()
     stamps = problem.stamp_s[:2]
     covariance, cross = np.tile(np.eye(3), (2, 1, 1)), np.zeros((1, 3, 3))
     bridged(stamps, stamps, np.zeros((2, 3)), covariance, cross, problem.drive, problem.prior.mean, START)
     dead_reckoned(stamps, problem.drive, problem.prior.mean, START)
     NominalField(Sensor(range_max_m=5.0)).p_detect(np.zeros((1, 3)), np.array([PLACE]))
+
+
+@functools.cache
+def any_filter() -> None:
+    """Compile what a filter that asks the others of a frame needs, the same in plane and space."""
+    problem, row = _drive(), np.zeros(1, dtype=np.int64)
+    seen = FrameReadings(problem.reading[:1], 1e-2 * np.ones((1, 2)))
+    for considered in (False, True):
+        local = PlanarFilter(np.zeros(3), problem.prior, considered=considered)
+        local.hold(np.zeros(3), problem.prior.mean, np.eye(local.own), NO_PLACES, np.zeros((0, 2)))
+        local.meet(0, np.array(PLACE), 1e-4 * np.eye(2))
+        local.compare(row, seen)
+        local.update(row, seen, weighing=BY_OTHERS)
 
 
 @functools.cache
