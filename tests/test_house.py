@@ -140,12 +140,12 @@ def test_constants_say_what_they_are() -> None:
 
 ONE_OF_EACH = {
     # one damped Gauss-Newton; smoothers in space do not go through `Solver` yet, since their levels are arguments
-    "minimised": {"estimate.solver", "slam.space.smoother", "slam.space.together"},
+    "minimised": {"estimate.solver", "slam.space.smoother"},
     # one rule for noise levels: in the plane, in space, and of what robots measure of each other
-    "restricted_level": {"slam.noise", "slam.space.estimate", "slam.together"},
+    "restricted_level": {"slam.noise", "slam.space.estimate", "slam.planar_together"},
     # one loop of values and levels in turns; robots together and landmarks without identities have loops of their own
     "alternate": {"slam.batch", "slam.space.estimate"},
-    "refine_noise": {"slam.association.in_plane", "slam.batch", "slam.streaming", "slam.together", "slam.warmup"},
+    "refine_noise": {"slam.association.in_plane", "slam.batch", "slam.streaming", "slam.planar_together", "slam.warmup"},
     "refined": {"slam.space.estimate", "slam.space.together"},
     # one rule that accepts a session over a map, a robot over others, a frame in a map
     "accept_alignment": {
@@ -156,7 +156,7 @@ ONE_OF_EACH = {
         "maps.sessions.placing", "slam.batch", "slam.changes.joint", "slam.space.moved_groups", "slam.space.solve",
     },
     # one order of elimination
-    "build_structure": {"slam.encounters", "slam.smoother", "slam.space.smoother", "slam.space.together"},
+    "build_structure": {"slam.smoother", "slam.space.smoother", "slam.together"},
     # one density of errors that last
     "lasting_errors": {"slam.base_problem"},
 }  # fmt: skip
@@ -171,6 +171,7 @@ SUBCLASSES = {
 
 SOLVE_BY_THEMSELVES = {
     "slam.misfit": "values of two curves under each width of their prior: no iteration",
+    "slam.filter_kernels": "distance of one detection from where a filter expects it: no iteration",
     "slam.ranges": "damped Gauss-Newton of one position from ranges, from many starts at once",
     "slam.space.starts": "Gauss-Newton of single poses from three points each, of thousands at once",
     "slam.space.drift": "two numbers of an odometry, by expectation-maximisation and reweighted",
