@@ -22,14 +22,8 @@ from evermap.types import BoolArray, FloatArray, IntArray
 ROUNDS = 30
 NATS = 1.0
 """Standard deviation of the logarithm of a spread around that of the settings."""
-ODD_SHARE = 0.05
-"""Share of boxes that are seen with any size of their class."""
-P_TAKEN, TAKEN_STAYS = 0.2, 5.0
-"""Usual probability that the place of a box that left is taken by another one, worth so many boxes that left."""
-BESIDE_M = 0.5
-"""Usual standard deviation of where that stands, each axis."""
-HASTE_NATS = 1.0
-"""Standard deviation of the logarithm of a factor on the hazards of a session."""
+TAKEN_STAYS = 5.0
+"""Boxes that left that the usual probability of `p_taken` is worth."""
 ALIGNED = 0.8
 """Share of boxes that stand along the one whose place they took."""
 LEAST_P = 1e-6
@@ -37,7 +31,7 @@ LEAST_P = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Pairs:
+class BoxPairs:
     """Boxes of a session (K,) beside those of the map (M,).
 
     Attributes:
@@ -60,7 +54,7 @@ class Pairs:
     p: FloatArray
 
     @classmethod
-    def of(cls, seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> Pairs:
+    def of(cls, seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> BoxPairs:
         """Return all; boxes of the session may be off by `loose_m` (K,) beside what is known."""
         settings, off = known.settings, seen.position_m[:, None, :2] - known.position_m[None, :, :2]
         spread = (
@@ -78,9 +72,9 @@ class Pairs:
             seen.class_id[:, None] == known.class_id, p,
         )  # fmt: skip
 
-    def at(self, mine: IntArray, theirs: IntArray) -> Pairs:
+    def at(self, mine: IntArray, theirs: IntArray) -> BoxPairs:
         """Return some pairs (N,), as columns (N, 1)."""
-        return Pairs(*(getattr(self, item.name)[mine, theirs][:, None] for item in fields(self)))
+        return BoxPairs(*(getattr(self, item.name)[mine, theirs][:, None] for item in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,15 +101,15 @@ class BoxLikeness:
         """Return what is known before anything was seen."""
         return cls(
             np.array(settings.sigma_size_m), np.array(settings.sigma_class_m),
-            P_TAKEN, BESIDE_M, 1.0, settings,
+            settings.p_taken, settings.beside_m, 1.0, settings,
         )  # fmt: skip
 
-    def log_odds(self, pairs: Pairs) -> FloatArray:
+    def log_odds(self, pairs: BoxPairs) -> FloatArray:
         """Return (K, M) log odds that a box of the session is one of the map, against being another one."""
         same, other = self.log_likelihoods(pairs)
         return same - other
 
-    def log_likelihoods(self, pairs: Pairs) -> tuple[FloatArray, FloatArray]:
+    def log_likelihoods(self, pairs: BoxPairs) -> tuple[FloatArray, FloatArray]:
         """Return (K, M) log likelihoods that a box of the session is one of the map, and that it is another one."""
         settings, spread = self.settings, pairs.spread_m2
         squared = squared_length(pairs.off_m, spread)
@@ -136,12 +130,13 @@ class BoxLikeness:
         other = np.where(pairs.over, left + np.log(settings.density + taken), math.log(settings.density))
         return same + np.log(p), other
 
-    def size_nats(self, pairs: Pairs) -> FloatArray:
+    def size_nats(self, pairs: BoxPairs) -> FloatArray:
         """Return (K, M) how much sizes speak for one box; one in `odd_share` is seen with any size of its class."""
         size = pairs.size_m
         like, unlike = (-0.5 * (size / s) ** 2 - np.log(s) for s in (self.same_size_m, self.other_size_m))
         nats = np.nan_to_num((like - unlike).sum(axis=2))
-        return np.asarray(np.logaddexp(math.log1p(-ODD_SHARE) + nats, math.log(ODD_SHARE)))
+        share = self.settings.odd_share
+        return np.asarray(np.logaddexp(math.log1p(-share) + nats, math.log(share)))
 
 
 def learn_likeness(seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> BoxLikeness:
@@ -156,7 +151,7 @@ def learn_likeness(seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> Box
     usual = BoxLikeness.usual(settings)
     if not len(seen.place) or not len(known.place):
         return usual
-    pairs = Pairs.of(seen, known, loose_m)
+    pairs = BoxPairs.of(seen, known, loose_m)
     other_size_m = np.array([_spread(*_within(seen, known, axis), usual.other_size_m[axis]) for axis in range(3)])
     away_m = np.where(pairs.over & pairs.alike, pairs.away_m, np.inf)
     mine = np.flatnonzero(np.isfinite(away_m.min(axis=1)))
@@ -169,13 +164,13 @@ def learn_likeness(seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> Box
     return max(found, key=lambda one: _log_posterior(one, paired, usual))
 
 
-def _maximised(found: BoxLikeness, paired: Pairs, usual: BoxLikeness) -> BoxLikeness:
+def _maximised(found: BoxLikeness, paired: BoxPairs, usual: BoxLikeness) -> BoxLikeness:
     """The most probable one near to where it begins, by pairs (K, 1) of boxes that stand over each other."""
     settings, size_m, away_m = usual.settings, paired.size_m[:, 0], paired.away_m[:, 0]
     sized = np.isfinite(size_m).all(axis=1)
     for _ in range(ROUNDS):
         p_same = 1.0 / (1.0 + np.exp(-found.log_odds(paired)[:, 0]))
-        p_odd = ODD_SHARE / np.exp(found.size_nats(paired)[:, 0])
+        p_odd = settings.odd_share / np.exp(found.size_nats(paired)[:, 0])
         weight = (p_same * (1.0 - np.clip(p_odd, 0.0, 1.0)))[sized]
         same_size_m = np.array([
             _spread(float(weight.sum()), float(weight @ size_m[sized, axis] ** 2), usual.same_size_m[axis])
@@ -197,24 +192,24 @@ def _turnover(p: FloatArray, p_same: FloatArray, settings: BoxesConfig) -> tuple
     stays = np.clip(p[:, None] ** haste, LEAST_P, 1.0 - settings.least_gone)[..., None]
     taken = (1.0 - stays) * p_taken
     fit = np.tensordot(p_same, np.log(stays), 1) + np.tensordot(1.0 - p_same, np.log(taken), 1)
-    fit = fit - np.log(stays + taken).sum(axis=0) + _log_prior(haste[:, None], p_taken)
+    fit = fit - np.log(stays + taken).sum(axis=0) + _log_prior(haste[:, None], p_taken, settings)
     row, column = np.unravel_index(np.argmax(fit), fit.shape)
     return float(haste[row]), float(p_taken[column])
 
 
-def _log_prior(haste: FloatArray, p_taken: FloatArray) -> FloatArray:
+def _log_prior(haste: FloatArray, p_taken: FloatArray, settings: BoxesConfig) -> FloatArray:
     """Log density of a factor on hazards and of the probability that a place is taken again."""
-    often = P_TAKEN * np.log(p_taken) + (1.0 - P_TAKEN) * np.log1p(-p_taken)
-    return np.asarray(TAKEN_STAYS * often - 0.5 * (np.log(haste) / HASTE_NATS) ** 2)
+    often = settings.p_taken * np.log(p_taken) + (1.0 - settings.p_taken) * np.log1p(-p_taken)
+    return np.asarray(TAKEN_STAYS * often - 0.5 * (np.log(haste) / settings.haste_nats) ** 2)
 
 
-def _log_posterior(found: BoxLikeness, paired: Pairs, usual: BoxLikeness) -> float:
+def _log_posterior(found: BoxLikeness, paired: BoxPairs, usual: BoxLikeness) -> float:
     """Log posterior density of what pairs (K, 1) have in common, but for a constant."""
     settings = found.settings
     stays = np.clip(paired.p[:, 0] ** found.haste, LEAST_P, 1.0 - settings.least_gone)
     fit = np.logaddexp(*found.log_likelihoods(paired))[:, 0] - np.log(stays + (1.0 - stays) * found.p_taken)
     spreads = np.append(found.same_size_m, found.beside_m) / np.append(usual.same_size_m, usual.beside_m)
-    prior = float(_log_prior(np.array(found.haste), np.array(found.p_taken)))
+    prior = float(_log_prior(np.array(found.haste), np.array(found.p_taken), settings))
     return float(fit.sum()) + prior - 0.5 * float((np.log(spreads) ** 2).sum()) / NATS**2
 
 

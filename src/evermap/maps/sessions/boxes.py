@@ -26,7 +26,7 @@ from evermap.geometry.chunked import blocks
 from evermap.maps.bodies import squared_length
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import Witnessed, aged
-from evermap.maps.sessions.box_likeness import BoxLikeness, Pairs, learn_likeness
+from evermap.maps.sessions.box_likeness import BoxLikeness, BoxPairs, learn_likeness
 from evermap.maps.sessions.box_search import GATE, MapBoxes, in_space, placed, regained
 from evermap.maps.sessions.box_visit import BoxVisit, SeenBoxes, seen_boxes
 from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, one_to_one, widened
@@ -40,8 +40,6 @@ from evermap.slam.space.solve import FREE, SpatialSolved
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Progress, SpatialRecording, landmark_id_of, rows_of
 
 ROUNDS = 30
-OTHER_CLASS_NATS = -3.0
-"""Log odds of being detected as of another class."""
 STRETCH = 8
 """Boxes, one after the other, whose deviations from the map are averaged."""
 WANDERS = (0.003, 0.0003), (0.01, 0.001), (0.03, 0.003)
@@ -293,7 +291,7 @@ def _matched(
     if len(held_m):
         away = np.linalg.norm(seen.position_m[:, None, :2] - held_m, axis=2).min(axis=1)
         loose_m = np.minimum(settings.drift_share * away, settings.most_drift_m)
-    like, pairs = learn_likeness(seen, known, loose_m), Pairs.of(seen, known, loose_m)
+    like, pairs = learn_likeness(seen, known, loose_m), BoxPairs.of(seen, known, loose_m)
     odds = _log_odds(like, pairs)
     chosen = one_to_one(odds)
     for k in np.flatnonzero(chosen < 0).tolist():
@@ -323,7 +321,7 @@ def _find_replaced(
     seen: SeenBoxes,
     known: MapBoxes,
     log_odds: FloatArray,
-    pairs: Pairs,
+    pairs: BoxPairs,
     chosen: IntArray,
     free: BoolArray,
 ) -> None:
@@ -332,14 +330,14 @@ def _find_replaced(
     """
     may_be = pairs.over & free & (chosen < 0)[:, None] & np.isnan(seen.since_s)[:, None]
     away_m = np.where(may_be, pairs.away_m, np.inf)
-    odds = log_odds + np.where(pairs.alike, 0.0, OTHER_CLASS_NATS)
+    odds = log_odds + np.where(pairs.alike, 0.0, known.settings.other_class_nats)
     for k, m in enumerate(one_to_one(np.where(may_be, 100.0 - away_m, -np.inf)).tolist()):
         if m >= 0:
             found.instead[seen.place[k]] = known.place[m]
             found.p_other[seen.place[k]] = 1.0 / (1.0 + np.exp(odds[k, m]))
 
 
-def _log_odds(like: BoxLikeness, pairs: Pairs) -> FloatArray:
+def _log_odds(like: BoxLikeness, pairs: BoxPairs) -> FloatArray:
     """Return (K, M) log odds that a box of the session is one of the map, against being new; -inf beyond gates."""
     near = squared_length(pairs.off_m, pairs.spread_m2) < GATE * like.settings.far_factor**2
     return np.where(near & pairs.alike, like.log_odds(pairs), -np.inf)
