@@ -78,8 +78,12 @@ def score_street(seed: int, n_leaving: int, config: Config) -> Counter[str]:
         true = {(slot, GOES) for slot in before - now} | {(slot, COMES) for slot in now - before}
         true = {(slot, what) for slot, what in true if slot in street.find_passed()}
         told = [
-            (slots[change.landmark_ids[0]], KINDS.get(change.kind, change.kind.value)) for change in session.changes
+            (slots[change.landmark_ids[0]], KINDS.get(change.kind, change.kind.value))
+            for change in session.changes
+            if change.kind is not ChangeKind.REPLACED
         ]
+        replaced = [change.landmark_ids for change in session.changes if change.kind is ChangeKind.REPLACED]
+        told += [(slots[name], what) for pair in replaced for name, what in zip(pair, (GOES, COMES), strict=True)]
         late = owed - true
         found.update(told=len(told), right=sum(one in true | late for one in told), true=len(true))
         found.update(found=len(true & set(told)), late=len(late & set(told)))

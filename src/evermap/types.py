@@ -894,6 +894,8 @@ class ChangeKind(StrEnum):
     """Not where the map has it, and nowhere else."""
     RETURNED = "returned"
     """It had vanished before; its displacement says whether to the place it had left."""
+    REPLACED = "replaced"
+    """Without identities: another one stands where one stood; or, with the rest of the probability, it is the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -901,7 +903,7 @@ class MapChange(Shown):
     """A difference between world and map: a change of a group of landmarks.
 
     Attributes:
-        landmark_ids: the group, sorted.
+        landmark_ids: the group, sorted; of a replacement those that stood there, then those that took their place.
         kind: kind of the change.
         stamp_from_s, stamp_to_s: it happened between these two; nan and the first stamp for 'before the session'.
         displacement_m: (x, y), in space (x, y, z), of the group's centroid, in the map's frame; nan where it was not,

@@ -47,6 +47,15 @@ def a_map(places: dict[int, tuple[float, float]], away: tuple[int, ...] = (), st
     )  # fmt: skip
 
 
+def test_a_replacement_is_one_change_until_more_is_told_of_either() -> None:
+    before, after = a_map({1: HERE}), a_map({2: HERE}, away=(1,))
+    other = told(ChangeKind.REPLACED, 1, 2, by=(0.1, 0.0))
+    assert net([((other,), False), ((), False)], before, after) == (other,)
+    left = told(VANISHED, 2, at=20.0)
+    found = net([((other,), False), ((left,), False)], before, a_map({}, away=(1, 2)))
+    assert [(one.kind, one.landmark_ids) for one in found] == [(VANISHED, (1,))]
+
+
 def told(kind: ChangeKind, *names: int, at: float = 10.0, by: tuple[float, float] | None = None, p: float = 0.9):
     nowhere = (np.nan, np.nan)
     return MapChange(names, kind, at, at + 5.0, nowhere if by is None else by, 0.0, p, 3, 2)

@@ -133,7 +133,13 @@ def net(
     """
     if len(sessions) == 1 and not sessions[0][1]:
         return tuple(sessions[0][0])
-    told = [Told(one, undone, k) for k, (changes, undone) in enumerate(sessions) for one in changes]
+    parts = {id(one): _parted(one) for changes, _ in sessions for one in changes}
+    told = [
+        Told(part, undone, k)
+        for k, (changes, undone) in enumerate(sessions)
+        for one in changes
+        for part in parts[id(one)]
+    ]
     steps: dict[int, list[int]] = {}
     for number, one in enumerate(told):
         for name in one.change.landmark_ids:
@@ -158,7 +164,24 @@ def net(
         change = _composed(path, tuple(names), (a, b), settings)
         if change is not None and (forth or _possible(change.kind, before, after)):
             found.append(change)
+    for change in (change for changes, _ in sessions for change in changes if change.kind is ChangeKind.REPLACED):
+        both = parts[id(change)]
+        if all(any(part is other for other in found) for part in both):  # nothing else is told of either
+            found = [other for other in found if not any(other is part for part in both)] + [change]
     return with_swaps(found, a, b, settings) if len({one.session for one in told}) > 1 else tuple(found)
+
+
+def _parted(change: MapChange) -> tuple[MapChange, ...]:
+    """A replacement as what left and what came; any other change as it is."""
+    if change.kind is not ChangeKind.REPLACED:
+        return (change,)
+    half = len(change.landmark_ids) // 2
+    nowhere = tuple([math.nan] * len(change.displacement_m))
+    left, came = change.landmark_ids[:half], change.landmark_ids[half:]
+    return (
+        replace(change, kind=ChangeKind.VANISHED, landmark_ids=left, displacement_m=nowhere, n_hits=0),
+        replace(change, kind=ChangeKind.APPEARED, landmark_ids=came, displacement_m=nowhere, n_misses=0),
+    )
 
 
 def grown(known: IntArray, b: LivingMap, changes: Iterable[MapChange]) -> IntArray:

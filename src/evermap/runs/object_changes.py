@@ -46,6 +46,9 @@ def _rows(result: SlamResult) -> Iterator[dict[str, Any]]:
     for number, change in enumerate(result.changes, start=1):
         for identity, name in zip(change.landmark_ids, change.labels, strict=True):
             places = _PLACES.get(change.kind, (BEFORE, AFTER))
+            if change.kind is ChangeKind.REPLACED:
+                half = len(change.landmark_ids) // 2
+                places = (BEFORE,) if identity in change.landmark_ids[:half] else (AFTER,)
             for place in places:
                 at = where.get((id(change), identity), {}).get(place, [])
                 now = place == AFTER or len(places) == 1

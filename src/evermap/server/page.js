@@ -144,9 +144,14 @@ function draw(landmarks, changes) {
 
 const metre = () => Math.max(view.w / ($("map").clientWidth || 800), view.h / ($("map").clientHeight || 500)); // a pixel's
 
+function kindOf(change, k) { // of a replacement the first ones are gone
+  if (change.kind !== "replaced") return change.kind;
+  return k < change.landmarks.length / 2 ? "vanished" : "appeared";
+}
+
 function paint() {
   const size = 5 * metre(), of = new Map(placed.map((one) => [one.landmark, one])), nodes = [];
-  const kinds = new Map(told.flatMap((change) => change.landmarks.map((id) => [id, change.kind])));
+  const kinds = new Map(told.flatMap((change) => change.landmarks.map((id, k) => [id, kindOf(change, k)])));
   if (tile) nodes.push(shape("rect", { ...tile, "stroke-width": size / 3 }, "tile"));
   for (const one of placed) {
     const kind = kinds.get(one.landmark), x = one.x_m, y = -one.y_m;

@@ -363,7 +363,8 @@ def _find_corner_order(recording: SpatialRecording, settings: CheckConfig) -> li
 def _left_out(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:
     """Return detections that the estimator cannot use. Boxes without identity are associated by position."""
     from evermap.slam.space.intake import prepare_space
-    from evermap.slam.space.moving import boxes_of, has_traffic
+    from evermap.slam.space.moving import has_traffic
+    from evermap.tracking.frame import boxes_of
 
     some, unknown = recording, recording.detections.landmark_id == UNKNOWN
     if has_traffic(recording):

@@ -10,7 +10,7 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.geometry import se3
-from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.types import UNKNOWN, FloatArray, IntArray, SpatialRecording
 from evermap.valid import STAMP_S
 
 
@@ -220,6 +220,49 @@ class Poses:
             problem = f"has no pose at {stamp_s[np.argmax(outside)]:g} s, where there are detections"
             raise InputError(problem, path=self.path, field=STAMP_S.name, hint="poses from the first frame to the last")
         return se3.interpolate(self.stamp_s, self.pose, stamp_s)
+
+
+def boxes_of(recording: SpatialRecording) -> IntArray:
+    """Return rows of boxes without identity."""
+    given = recording.detections
+    return np.flatnonzero((given.landmark_id == UNKNOWN) & np.isfinite(given.size_m).all(axis=1))
+
+
+def mounts_of(recording: SpatialRecording) -> FloatArray:
+    """Return (M, 7) poses on the robot of the sensor of each detection."""
+    return np.array([sensor.mount_robot_sensor for sensor in recording.sensors])[recording.detections.sensor]
+
+
+def box_table(recording: SpatialRecording, range_scale: float = 1.0) -> DetectionTable:
+    """Return the boxes of a recording, on the robot, as the tracker takes them; a frame of the recording each.
+
+    Args:
+        recording: with boxes.
+        range_scale: by which measured ranges are too short.
+    """
+    given, rows, stamps = recording.detections, boxes_of(recording), recording.frames.stamp_s
+    mount = mounts_of(recording)[rows]
+    local = np.column_stack([range_scale * given.position_sensor_m[rows], given.rotation[rows]])
+    local[:, 3:] = np.where(np.isfinite(local[:, 3:]), local[:, 3:], se3.NO_TURN)
+    local = se3.compose(mount, local)
+    names = recording.class_names or ("",)
+    turn = se3.rotation_of(mount)
+    covariance = turn @ given.covariance_sensor_m2[rows] @ turn.transpose(0, 2, 1)
+    return DetectionTable(
+        stamp_s=stamps,
+        first=np.searchsorted(given.frame[rows], np.arange(len(stamps) + 1)),
+        position_m=local[:, :3].copy(),
+        class_names=names,
+        class_id=given.class_id[rows],
+        covariance_m2=covariance if np.isfinite(covariance).any() else None,
+        appearance=None,
+        sensor_m=None,
+        line=given.source_line[rows],
+        source=recording.source,
+        box=np.column_stack([given.size_m[rows], heading_of(local)]),
+        score=given.score[rows] if np.isfinite(given.score[rows]).any() else None,
+        warnings=(),
+    )
 
 
 def in_world(table: DetectionTable, poses: Poses) -> DetectionTable:

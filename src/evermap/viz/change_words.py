@@ -53,6 +53,10 @@ def what(change: MapChange) -> str:
         return f"{_group(change)} exchanged their identities"
     if change.kind is ChangeKind.VANISHED:
         return f"{_group(change)} vanished"
+    if change.kind is ChangeKind.REPLACED:
+        half, beside = len(change.labels) // 2, math.hypot(*change.displacement_m)
+        left, came = (_listed(names) for names in (change.labels[:half], change.labels[half:]))
+        return f"{came} stands {beside:.2f} m from where {left} stood, which was replaced or is the same"
     if change.kind is ChangeKind.APPEARED:
         return f"{_group(change)} appeared"
     if change.kind is ChangeKind.RETURNED:

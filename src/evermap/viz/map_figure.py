@@ -443,7 +443,7 @@ def places_of(
         after = np.array([place[identity] for identity in ids])
         if change.kind is ChangeKind.SWAPPED:
             before = after[::-1]
-        elif not np.all(np.isfinite(change.displacement_m)):  # it was nowhere before
+        elif change.kind is ChangeKind.REPLACED or not np.all(np.isfinite(change.displacement_m)):  # nothing moved
             before = after
         else:
             turn = change.rotation_rad if after.shape[1] == 2 else None  # in space nobody knows about which axis

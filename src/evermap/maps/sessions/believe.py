@@ -7,19 +7,19 @@ one remains: the first at which it was gone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from evermap.config import LivingConfig
 from evermap.existence.sites import Evidence, SiteBeliefs, SiteDynamics, SiteLooks, SiteSensor, follow_sites
 from evermap.maps.lives import Life
-from evermap.maps.living import EXISTS, LivingMap, Places, Sites, class_of, clique_rows, site_middles
+from evermap.maps.living import EXISTS, LivingMap, Places, Sites, class_of, clique_rows, rows_among, site_middles
 from evermap.maps.sessions.extend import Extended, first_and_last
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Watch
 from evermap.sensing.sightlines import KNOWN, Lines, nominal_lines
 from evermap.survival.hazards import never_leaves
-from evermap.types import FloatArray, IntArray, Sensor, rows_of
+from evermap.types import UNKNOWN, FloatArray, IntArray, Sensor, rows_of
 
 WITNESSED_NATS = 50.0
 """Log likelihood ratio of having been seen to leave: more than any lifetime outweighs."""
@@ -186,6 +186,7 @@ class Witnessed:
         since_s, until_s: when it arrived, and when it left; nan if that was not seen.
         probability: of that.
         when_s: half width of the intervals of both times.
+        instead: (W,) landmark that took its place while nobody looked, `UNKNOWN` where it was seen to leave.
     """
 
     landmark_id: IntArray
@@ -193,6 +194,7 @@ class Witnessed:
     until_s: FloatArray
     probability: FloatArray
     when_s: float = 0.0
+    instead: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @classmethod
     def nothing(cls) -> Witnessed:
@@ -201,22 +203,27 @@ class Witnessed:
 
     def sites(self, entry: Extended) -> IntArray:
         """Return (W,) rows of their sites in the map with the session, -1 for none."""
-        place, living = entry.places_of(self.landmark_id), entry.living
+        place, living = self._places(entry), entry.living
         site = np.searchsorted(living.sites.site_id, np.append(living.places.site_id, -1)[place])
         return np.where(place >= 0, site, -1)
 
+    def _places(self, entry: Extended) -> IntArray:
+        """(W,) rows of the places at which they were seen in the session, or stood before it; -1 for none."""
+        living, place = entry.living, entry.places_of(self.landmark_id)
+        member = rows_among(living.members.landmark_id, self.landmark_id)
+        stood = living.place_row(self.landmark_id, np.append(living.site_of(entry.p_start), UNKNOWN)[member])
+        return np.where(place >= 0, place, stood)
+
     def unlooked(self, watch: Watch, entry: Extended) -> Watch:
         """Return the watched places without those of these landmarks before they arrived and after they left."""
-        place = entry.places_of(self.landmark_id)
-        mine, count = place >= 0, 1 + int(entry.place.max(initial=0))
+        place = self._places(entry)
+        mine, count = place >= 0, len(entry.living.places)
         since, until = np.full(count, -np.inf), np.full(count, np.inf)
         since[place[mine]] = np.nan_to_num(self.since_s[mine] + self.when_s, nan=-np.inf)
         until[place[mine]] = np.nan_to_num(self.until_s[mine] - self.when_s, nan=np.inf)
         listed = watch.listed
-        row = np.minimum(listed.landmark, len(since) - 1)
-        ours = listed.landmark < len(since)
-        stamp_s = watch.stamp_s[listed.pose]
-        there = ~ours | listed.hit | ((stamp_s > since[row]) & (stamp_s < until[row]))
+        row, stamp_s = listed.landmark, watch.stamp_s[listed.pose]
+        there = listed.hit | ((stamp_s > since[row]) & (stamp_s < until[row]))
         return watch._replace(listed=listed.rows(there))
 
 

@@ -16,9 +16,9 @@ from evermap.maps.sessions.looks import Watch
 from evermap.maps.sessions.placing import Laid
 from evermap.maps.sessions.spatial import SpatialVisit
 from evermap.slam.intake import most_of
-from evermap.slam.space.moving import TrafficIntake, boxes_of, conclude_in_traffic, mounts_of
+from evermap.slam.space.moving import TrafficIntake, conclude_in_traffic
 from evermap.slam.space.solve import SpatialSolved
-from evermap.tracking.frame import heading_of
+from evermap.tracking.frame import boxes_of, heading_of, mounts_of
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SlamResult, SpatialRecording
 
 

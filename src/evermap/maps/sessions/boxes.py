@@ -10,7 +10,6 @@ probably the map's box still stands. Held by these, the session is solved again,
 
 from __future__ import annotations
 
-import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -27,7 +26,8 @@ from evermap.geometry.chunked import blocks
 from evermap.maps.bodies import squared_length
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import Witnessed, aged
-from evermap.maps.sessions.box_search import GATE, MapBoxes, half_turn, in_space, placed, regained
+from evermap.maps.sessions.box_likeness import BoxLikeness, BoxPairs, learn_likeness
+from evermap.maps.sessions.box_search import GATE, MapBoxes, in_space, placed, regained
 from evermap.maps.sessions.box_visit import BoxVisit, SeenBoxes, seen_boxes
 from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, one_to_one, widened
 from evermap.maps.sessions.spatial import SpatialVisit, localised_in_space
@@ -37,7 +37,7 @@ from evermap.slam.space.moving import TrafficIntake, has_traffic, rescaled, solv
 from evermap.slam.space.problem import PlacePrior
 from evermap.slam.space.result import identities_of, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved
-from evermap.types import BoolArray, FloatArray, IntArray, Progress, SpatialRecording, landmark_id_of, rows_of
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Progress, SpatialRecording, landmark_id_of, rows_of
 
 ROUNDS = 30
 STRETCH = 8
@@ -46,8 +46,6 @@ WANDERS = (0.003, 0.0003), (0.01, 0.001), (0.03, 0.003)
 """How much less, one after the other [m/sqrt(s), rad/sqrt(s)]."""
 TILTED = 0.9
 """Cosine of the tilt up to which the frame of an odometry is upright."""
-LEAST_P = 1e-6
-"""No box is believed to stand less, or its logarithm would be infinite."""
 
 
 def localised(
@@ -95,15 +93,24 @@ def localised(
 
 @dataclass(frozen=True, slots=True)
 class _Matched:
-    """Matches of (P,) places of a session: rows of the map's places, -1 for none, and their probabilities."""
+    """Matches of (P,) places of a session.
+
+    Attributes:
+        place, probability: rows of the map's places, -1 for none, and their probabilities.
+        instead, p_other: rows of those whose room they take without being matched, -1 for none, and the probability
+            that they are others.
+    """
 
     place: IntArray
     probability: FloatArray
+    instead: IntArray
+    p_other: FloatArray
 
     @classmethod
     def nothing(cls, solved: SpatialSolved) -> _Matched:
         count = len(solved.identity)
-        return cls(np.full(count, -1, dtype=np.int64), np.ones(count))
+        nowhere = np.full(count, -1, dtype=np.int64)
+        return cls(nowhere, np.ones(count), nowhere.copy(), np.ones(count))
 
 
 def _agrees(taken: TrafficIntake, held: SpatialSolved, matched: _Matched, living: LivingMap, known: MapBoxes) -> bool:
@@ -284,7 +291,8 @@ def _matched(
     if len(held_m):
         away = np.linalg.norm(seen.position_m[:, None, :2] - held_m, axis=2).min(axis=1)
         loose_m = np.minimum(settings.drift_share * away, settings.most_drift_m)
-    odds = _log_odds(seen, known, loose_m)
+    like, pairs = learn_likeness(seen, known, loose_m), BoxPairs.of(seen, known, loose_m)
+    odds = _log_odds(like, pairs)
     chosen = one_to_one(odds)
     for k in np.flatnonzero(chosen < 0).tolist():
         other = int(np.argmax(odds[k])) if odds.shape[1] else 0
@@ -300,41 +308,39 @@ def _matched(
     total = np.logaddexp(np.logaddexp.reduce(odds[some], axis=1), np.logaddexp(0.0, clutter[some]))
     found.place[seen.place[some]] = known.place[chosen[some]]
     found.probability[seen.place[some]] = np.exp(odds[some, chosen[some]] - total)
+    members, places = living.members, living.places
+    told = living.told_site()[np.searchsorted(members.landmark_id, known.landmark_id)]
+    free = (told == places.site_id[known.place]) & ~np.isin(np.arange(len(known.place)), chosen)
+    _find_replaced(found, seen, known, like.log_odds(pairs), pairs, chosen, free)
     assert len(found.place) == count
     return found
 
 
-def _log_odds(seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> FloatArray:
-    """Return (K, M) log odds that a box of the session is one of the map, against being new; -inf beyond gates.
-
-    Each may be off by `loose_m` (K,) beside what is known.
+def _find_replaced(
+    found: _Matched,
+    seen: SeenBoxes,
+    known: MapBoxes,
+    log_odds: FloatArray,
+    pairs: BoxPairs,
+    chosen: IntArray,
+    free: BoolArray,
+) -> None:
+    """Find boxes of the map, of those (M,) that are `free`, whose room is taken by one that is not matched, and was not
+    seen to come.
     """
-    settings, off = known.settings, seen.position_m[:, None, :2] - known.position_m[None, :, :2]
-    spread = (
-        seen.covariance_m2[:, None, :2, :2] + known.covariance_m2[None, :, :2, :2] + settings.drift_m**2 * np.eye(2)
-    )
-    spread = spread + (loose_m**2)[:, None, None, None] * np.eye(2)
-    squared = squared_length(off, spread)
-    tails = (1.0 - settings.far_share, 1.0), (settings.far_share, settings.far_factor)
-    near, far = (math.log(share) - 0.5 * squared / wide**2 - 2.0 * math.log(wide) for share, wide in tails)
-    odds = np.logaddexp(near, far) - 0.5 * np.linalg.slogdet(spread)[1] - math.log(2.0 * math.pi * settings.density)
-    size = seen.size_m[:, None] - known.size_m[None]
-    sizes = settings.sigma_size_m, settings.sigma_class_m
-    like, unlike = (-0.5 * (size / np.array(sigma)) ** 2 - np.log(sigma) for sigma in sizes)
-    odds += np.maximum(np.nan_to_num((like - unlike).sum(axis=2)), -settings.size_nats)
-    turn = half_turn(seen.heading_rad[:, None] - known.heading_rad[None])
-    sigma_rad = settings.heading_rad
-    of_turn = -0.5 * (turn / sigma_rad) ** 2 - math.log(math.sqrt(2.0 * math.pi) * sigma_rad / math.pi)
-    odds += np.maximum(np.nan_to_num(of_turn), -settings.size_nats)
-    # what was seen to come did not stand there, but may have come back
-    p = np.clip(np.where(np.isfinite(seen.since_s)[:, None], settings.returns * (1.0 - known.p), known.p), LEAST_P, 1.0)
-    # and where a box stands there is no room for another one: it must have left
-    width = np.nan_to_num(0.5 * (seen.size_m[:, None, 1] + known.size_m[None, :, 1]), nan=0.5)
-    full = np.linalg.norm(off, axis=2) < settings.same_share * width
-    odds += np.log(p) - np.where(full, np.log(np.clip(1.0 - p, settings.least_gone, 1.0)), 0.0)
-    return np.where(
-        (squared < GATE * settings.far_factor**2) & (seen.class_id[:, None] == known.class_id), odds, -np.inf
-    )
+    may_be = pairs.over & free & (chosen < 0)[:, None] & np.isnan(seen.since_s)[:, None]
+    away_m = np.where(may_be, pairs.away_m, np.inf)
+    odds = log_odds + np.where(pairs.alike, 0.0, known.settings.other_class_nats)
+    for k, m in enumerate(one_to_one(np.where(may_be, 100.0 - away_m, -np.inf)).tolist()):
+        if m >= 0:
+            found.instead[seen.place[k]] = known.place[m]
+            found.p_other[seen.place[k]] = 1.0 / (1.0 + np.exp(odds[k, m]))
+
+
+def _log_odds(like: BoxLikeness, pairs: BoxPairs) -> FloatArray:
+    """Return (K, M) log odds that a box of the session is one of the map, against being new; -inf beyond gates."""
+    near = squared_length(pairs.off_m, pairs.spread_m2) < GATE * like.settings.far_factor**2
+    return np.where(near & pairs.alike, like.log_odds(pairs), -np.inf)
 
 
 def _visit(
@@ -370,8 +376,16 @@ def _visit(
     count = len(identity)
     solved = replace(solved, identity=np.arange(count), number=np.ones(count, dtype=np.int64))
     moving = np.flatnonzero((np.isfinite(seen.since_s) | np.isfinite(seen.until_s)) & kept[seen.place])
-    since_s, until_s, when_s = seen.since_s[moving], seen.until_s[moving], config.track.still.when_s
-    witnessed = Witnessed(identity[seen.place[moving]], since_s, until_s, seen.p_stay[moving], when_s)
+    other = np.flatnonzero((matched.instead[seen.place] >= 0) & kept[seen.place])
+    row = seen.place[other]
+    witnessed = Witnessed(
+        np.append(identity[seen.place[moving]], living.places.landmark_id[matched.instead[row]]),
+        np.append(seen.since_s[moving], np.full(len(other), np.nan)),
+        np.append(seen.until_s[moving], seen.first_s[other]),
+        np.append(seen.p_stay[moving], matched.p_other[row]),
+        config.track.still.when_s,
+        np.append(np.full(len(moving), UNKNOWN), identity[row]),
+    )
     return BoxVisit(
         recording=taken.standing, intake=intake, solved=solved, witnessed=witnessed, taken=taken,
         track=config.track, boxes=seen, kept=kept, tied_m=solved.optimum.estimate.place[at, :2],

@@ -11,11 +11,13 @@ from evermap.geometry.chunked import taken
 from evermap.maps.diff import elsewhere, motion_of, with_swaps
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
-from evermap.maps.sessions.believe import Believed
+from evermap.maps.sessions.believe import Believed, Witnessed
+from evermap.maps.sessions.extend import Extended
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks
-from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange, landmark_id_of
+from evermap.types import UNKNOWN, BoolArray, ChangeKind, FloatArray, IntArray, MapChange, landmark_id_of
 
 USUAL = DecisionConfig()
+COMES = (ChangeKind.APPEARED, ChangeKind.RETURNED)
 
 
 def decided(
@@ -66,6 +68,44 @@ def decided(
         sightlines=entered.sightlines.after_session(hidden, shown),
     )
     return after, with_swaps(session.found, before, after, settings)
+
+
+def with_replaced(
+    after: LivingMap, changes: tuple[MapChange, ...], what: Witnessed, entry: Extended
+) -> tuple[LivingMap, tuple[MapChange, ...]]:
+    """Return the map and the changes of a session in which another landmark without identity stands where one stood.
+
+    That one left and another one came, or it is the same, has one probability. With it the stay ended.
+
+    Args:
+        after: the map after the session.
+        changes: the session's, with both as departure and arrival, if they were told at all.
+        what: which are where others were, and how probably they are others.
+        entry: the map before its beliefs were updated, with the places of both.
+    """
+    pairs = np.flatnonzero(what.instead != UNKNOWN)
+    if not len(pairs):
+        return after, changes
+    told, stays = list(changes), after.stays
+    p_gone, place = stays.p_gone.copy(), entry.living.places
+    for k in pairs.tolist():
+        old, new, p = int(what.landmark_id[k]), int(what.instead[k]), float(what.probability[k])
+        left = [one for one in told if one.kind is ChangeKind.VANISHED and one.landmark_ids == (old,)]
+        came = [one for one in told if one.kind in COMES and one.landmark_ids == (new,)]
+        told = [one for one in told if one not in (*left, *came)]
+        clique_id = entry.living.members.clique_id[np.searchsorted(entry.living.members.landmark_id, old)]
+        ended = np.flatnonzero((stays.clique_id == clique_id) & np.isfinite(stays.gone_s))[-1:]
+        p_gone[ended] = p
+        if p < EXISTS:
+            continue
+        was, now = (place.position_m[np.flatnonzero(place.landmark_id == one)[-1]] for one in (old, new))
+        last_s = left[0].stamp_from_s if left else float(np.append(np.nan, stays.last_s[ended])[-1])
+        hits, misses = (sum(getattr(one, name) for one in (*left, *came)) for name in ("n_hits", "n_misses"))
+        shift_m = tuple((now - was).tolist())
+        told.append(
+            MapChange((old, new), ChangeKind.REPLACED, last_s, float(what.until_s[k]), shift_m, 0.0, p, hits, misses)
+        )
+    return replace(after, stays=replace(stays, p_gone=p_gone)), tuple(told)
 
 
 class _Session:

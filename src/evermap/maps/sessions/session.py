@@ -310,6 +310,7 @@ def judged(
     after, changes = decide.decided(
         entry.before, entry.living, now, seen, came, span_s[0], classes, settings=config.decisions
     )
+    after, changes = decide.with_replaced(after, changes, visit.witnessed, entry)
     if config.cliques and config.existence and config.misses:
         after = without_missed(entry.before, after, config.grouping)
     after = decide.without_forgotten(after, config.most_sites, config.decisions)

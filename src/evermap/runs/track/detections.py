@@ -11,16 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
-from evermap.errors import ConfigError, InputError
+from evermap.errors import ConfigError, DataError, InputError
 from evermap.geometry import se3
+from evermap.io import read_recording
 from evermap.io.columns import Columns, read_columns
 from evermap.io.native_space import IMAGE_BOX
 from evermap.io.spatial import BOX as SIDES
 from evermap.io.spatial import COVARIANCE
 from evermap.io.table import ENDINGS
 from evermap.io.text import quote
-from evermap.tracking.frame import DetectionTable, Poses, in_world
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+from evermap.tracking.frame import DetectionTable, Poses, box_table, boxes_of, in_world
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, is_in_space, rows_of
 from evermap.valid import QUATERNION, STAMP_S, X_M, Y_M, Z_M, Quantity
 
 POSITION = tuple(replace(axis, optional=True) for axis in (X_M, Y_M, Z_M))
@@ -207,13 +208,34 @@ _POSE = (X_M, Y_M, Z_M, *(replace(one, hint="a unit quaternion") for one in QUAT
 def read_input(path: str | Path, *, min_score: float | None = None) -> DetectionTable:
     """Return what `read_detections` takes, or of a folder its tables `detections`, in a sensor's frame, and `odometry`.
 
+    A recording with boxes, as `evermap slam` takes it, is followed along its odometry.
+
     Raises:
         InputError: a folder without these tables, or anything wrong in them.
+        DataError: a recording without boxes, or without odometry.
+        ConfigError: `min_score` without scores.
     """
     if not Path(path).is_dir():
         return read_detections(path, min_score=min_score)
+    if "sensor" in read_columns(_table_of(Path(path), "detections"), []):
+        return _boxes_of_recording(Path(path), min_score)
     detections = read_detections(_table_of(Path(path), "detections"), min_score=min_score)
     return in_world(detections, read_poses(_table_of(Path(path), "odometry")))
+
+
+def _boxes_of_recording(path: Path, min_score: float | None) -> DetectionTable:
+    """The boxes of a recording of `evermap slam`, in the frame of its odometry."""
+    recording = read_recording(path)
+    if not is_in_space(recording) or recording.odometry is None or not len(boxes_of(recording)):
+        hint = "boxes with a size and without an id, and odometry"
+        raise DataError(f"{path}: a recording without boxes to track", hint=hint)
+    seen, odometry, stamp_s = recording.detections, recording.odometry, recording.frames.stamp_s
+    if min_score is not None:
+        if not np.isfinite(seen.score).any() and min_score > 0.0:
+            raise ConfigError("the table has no scores", field="min_score", hint="a column score in the table")
+        recording = replace(recording, detections=rows_of(seen, ~(seen.score < min_score)))
+    driven = Poses(odometry.stamp_s, odometry.pose_world_robot, path)
+    return in_world(box_table(recording), Poses(stamp_s, driven.at(stamp_s), path))
 
 
 def _table_of(folder: Path, name: str) -> Path:

@@ -23,7 +23,7 @@ from evermap.slam.space.estimate import converged
 from evermap.slam.space.intake import SpatialIntake, prepare_space, scale_between
 from evermap.slam.space.result import concluded_in_space, distinguished
 from evermap.slam.space.solve import SpatialSolved, solve_space, times_of
-from evermap.tracking.frame import DetectionTable, Poses, heading_of, in_world, with_empty_frames
+from evermap.tracking.frame import Poses, box_table, boxes_of, in_world, mounts_of, with_empty_frames
 from evermap.tracking.run import TrackResult, run_track
 from evermap.tracking.standing import Stood, long_enough, standing
 from evermap.types import (
@@ -187,12 +187,6 @@ def conclude_in_traffic(
     ), followed
 
 
-def boxes_of(recording: SpatialRecording) -> IntArray:
-    """Return rows of boxes without identity."""
-    given = recording.detections
-    return np.flatnonzero((given.landmark_id == UNKNOWN) & np.isfinite(given.size_m).all(axis=1))
-
-
 def _whole(recording: SpatialRecording) -> tuple[SpatialRecording, IntArray]:
     """The frames while there is odometry, with those of which only a pose tells: nothing was seen in them; and rows of
     the detections in these.
@@ -231,38 +225,14 @@ def _settled(
     return stands, gauge
 
 
-def mounts_of(recording: SpatialRecording) -> FloatArray:
-    """Return (M, 7) poses on the robot of the sensor of each detection."""
-    return np.array([sensor.mount_robot_sensor for sensor in recording.sensors])[recording.detections.sensor]
-
-
 def _followed(recording: SpatialRecording, pose: FloatArray, gauge: Gauge, track: TrackConfig) -> TrackResult | None:
     """Return the tracks of the boxes, with the robot at poses (F, 7)."""
-    given, rows, stamps = recording.detections, boxes_of(recording), recording.frames.stamp_s
-    mount = mounts_of(recording)[rows]
-    local = np.column_stack([gauge.range_scale * given.position_sensor_m[rows], given.rotation[rows]])
-    local[:, 3:] = np.where(np.isfinite(local[:, 3:]), local[:, 3:], se3.NO_TURN)
-    local = se3.compose(mount, local)
-    names = recording.class_names or ("",)
-    turn = se3.rotation_of(mount)
-    covariance = turn @ given.covariance_sensor_m2[rows] @ turn.transpose(0, 2, 1)
-    table = DetectionTable(
-        stamp_s=stamps,
-        first=np.searchsorted(given.frame[rows], np.arange(len(stamps) + 1)),
-        position_m=local[:, :3].copy(),
-        class_names=names,
-        class_id=given.class_id[rows],
-        covariance_m2=covariance if np.isfinite(covariance).any() else None,
-        appearance=None,
-        sensor_m=None,
-        line=given.source_line[rows],
-        source=recording.source,
-        box=np.column_stack([given.size_m[rows], heading_of(local)]),
-        score=given.score[rows] if np.isfinite(given.score[rows]).any() else None,
-        warnings=(),
+    table, poses = (
+        box_table(recording, gauge.range_scale),
+        Poses(recording.frames.stamp_s, pose, Path(recording.source)),
     )
     try:
-        return run_track(in_world(table, Poses(stamps, pose, Path(recording.source))), track)
+        return run_track(in_world(table, poses), track)
     except DataError:  # nothing was seen often enough to be an object
         return None
 
