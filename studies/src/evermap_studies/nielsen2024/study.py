@@ -2,7 +2,8 @@
 
 That is the joint search, changes during a run, changes of other kinds, and probabilities that mean what they say.
 Four parts, each of which can be run alone: what an older run left in the folder of the other parts, data sets and
-methods stays in the tables.
+methods stays in the tables. Every run is kept at once in a file beside the folder (`evermap_studies.rows`), from which
+a study that was ended goes on; each row says of which commit its code is.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from evermap_studies.nielsen2024.plan import METHODS, PARTS, QUICK, Settings, jo
 from evermap_studies.nielsen2024.runs import NOTHING, Job, Reference, reference_of, run_job, warm_up
 from evermap_studies.nielsen2024.simulation import BUDGET_NOISE_M2, budget_rows, selector_rows, slam_rows
 from evermap_studies.nielsen2024.table import as_markdown, verdicts
+from evermap_studies.rows import RowsFile, commit_of_code
 from evermap_studies.workers import sheltered
 
 Row = dict[str, Any]
@@ -57,7 +59,7 @@ def reproduce(
         data: folder with the MRCLAM recordings.
         out: folder; rows of an older run that were not asked for are kept, all else is replaced. Untouched if this
             run fails; an interrupt keeps what was done.
-        settings: everything where None.
+        settings: everything where None. What the file beside the folder has is not run again.
         progress: told after every run.
         force: write into a folder that holds other files, too; they stay.
 
@@ -71,28 +73,34 @@ def reproduce(
     from evermap.runs.folder import RunFolder
 
     settings = settings or Settings()
-    planned = jobs(settings, Path(data))
     earlier, paths = _earlier(Path(out))
+    kept = RowsFile.beside(out)
+    done: dict[tuple[Any, ...], Row] = {}
+    for line in kept.read():
+        done[_key(line["row"])] = line["row"]
+        paths |= line["paths"]
+    planned = [job for job in jobs(settings, Path(data)) if _key(job.key) not in done]
     with RunFolder(out, force=force, inputs=[data]) as folder:
         stopwatch = Stopwatch()
         simulation = earlier["simulation"]
         if "simulation" in settings.parts:
             asked = (settings.noises_m2, settings.runs, settings.modes, settings.seed)
             simulation = [*selector_rows(*asked), *slam_rows(*asked), *budget_rows(BUDGET_NOISE_M2, *asked[1:])]
-        done: list[Row] = []
+            simulation = [{**row, "commit": commit_of_code()} for row in simulation]
         interrupted = False
         try:
             with watched() as watch:
                 for job, row, path in _run_all(planned, Path(data), settings.processes, progress):
-                    done.append(row)
-                    if path is not None:
-                        paths[_path_key(job)] = path
+                    done[_key(row)] = row
+                    drawn = {} if path is None else {_path_key(job): path}
+                    paths |= drawn
+                    kept.add({"row": row, "paths": drawn})
                     watch.stop_if_asked()
         except KeyboardInterrupt:
             if not done:
                 raise
             interrupted = True
-        runs = _merged(earlier["runs"], done)
+        runs = _merged(earlier["runs"], done.values())
         table: dict[str, Any] = {
             **stopwatch.head(EXPERIMENT, SCHEMA_VERSION, SCORING, settings),
             "expected": verdicts(simulation, runs),
@@ -104,7 +112,8 @@ def reproduce(
         folder.path(PATHS).write_text(json.dumps(paths, sort_keys=True) + "\n", encoding="utf-8")
         table = folder.finish(table)
     if interrupted:
-        raise KeyboardInterrupt(f"{len(done)} of {len(planned)} runs were done; they are in {out}")
+        raise KeyboardInterrupt(f"{len(done)} runs were done; they are in {out}, and go on from {kept.path}")
+    kept.remove()
     return table
 
 
