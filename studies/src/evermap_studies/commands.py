@@ -221,6 +221,7 @@ def nielsen2024(
     dataset: Annotated[
         list[int] | None, typer.Option(help="Only this data set; repeatable.", show_default=False)
     ] = None,
+    robot: Annotated[list[int] | None, typer.Option(help="Only this robot; repeatable.", show_default=False)] = None,
     method: Annotated[list[str] | None, typer.Option(help="Only this method; repeatable.", show_default=False)] = None,
     sensor: Annotated[
         list[str] | None,
@@ -245,7 +246,7 @@ def nielsen2024(
     def compute(target: Path, progress: Progress | None) -> tuple[dict[str, Any], AsText]:
         from evermap_studies.nielsen2024 import study
 
-        chosen = _given(parts=part, datasets=dataset, methods=method, sensors=sensor)
+        chosen = _given(parts=part, datasets=dataset, robots=robot, methods=method, sensors=sensor)
         wanted = replace(study.QUICK if quick else study.Settings(), seed=seed, processes=jobs, **chosen)
         return study.reproduce(data, target, wanted, progress=progress, force=force), study.as_markdown
 

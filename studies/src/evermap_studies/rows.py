@@ -16,6 +16,8 @@ Row = dict[str, Any]
 
 ROWS = ".rows.jsonl"
 """End of the name of the file with a line a run, beside the folder of results."""
+SOURCES = (":/src", ":/studies", ":/benchmarks")
+"""Folders of the code, from the top of the clone."""
 CHANGED = "+"
 """Behind a commit: the code differed from it."""
 
@@ -74,7 +76,7 @@ def commit_of_code() -> str | None:
     """
     here = ["git", "-C", str(Path(__file__).resolve().parent)]
     try:
-        asked = (["show", "-s", "--abbrev=8", "--format=%h %cs", "HEAD"], ["status", "--porcelain", "-uno", "."])
+        asked = (["show", "-s", "--abbrev=8", "--format=%h %cs", "HEAD"], ["status", "--porcelain", *SOURCES])
         head, changed = (
             subprocess.run([*here, *one], capture_output=True, text=True, check=True).stdout  # nosec  # B603: as above
             for one in asked

@@ -25,7 +25,16 @@ from evermap.types import Progress, SlamResult
 from evermap_studies.frame import Stopwatch
 from evermap_studies.nielsen2024.figures import draw_all
 from evermap_studies.nielsen2024.plan import METHODS, PARTS, QUICK, Settings, jobs
-from evermap_studies.nielsen2024.runs import NOTHING, Job, Reference, reference_of, run_job, warm_up
+from evermap_studies.nielsen2024.runs import (
+    NOTHING,
+    Job,
+    Reference,
+    recording_of,
+    reference_of,
+    run_job,
+    survey_of,
+    warm_up,
+)
 from evermap_studies.nielsen2024.simulation import BUDGET_NOISE_M2, budget_rows, selector_rows, slam_rows
 from evermap_studies.nielsen2024.table import as_markdown, verdicts
 from evermap_studies.rows import RowsFile, commit_of_code
@@ -165,11 +174,12 @@ def _run(job: Job, data: Path, reference: Reference) -> tuple[Row, Row | None]:
     """A row, and what a figure of trajectories needs where the run is in one."""
     row, result = run_job(job, data, reference)
     drawn = job.part == "recordings" and job.delta_m == _DRAWN_DELTA_M[job.dataset]
-    return row, _path(result, reference) if drawn and result is not None else None
+    return row, _path(result, reference, job, data) if drawn and result is not None else None
 
 
-def _path(result: SlamResult, reference: Reference) -> Row:
+def _path(result: SlamResult, reference: Reference, job: Job, data: Path) -> Row:
     """Estimate and reference, thinned out, with the landmarks: what is drawn."""
+    truth = survey_of(recording_of(data, job.dataset, job.robot))
     stamps = result.trajectory.stamp_s
     rows = np.unique(np.searchsorted(stamps, np.arange(stamps[0], stamps[-1], _PATH_STEP_S)))
     known = np.searchsorted(reference.trajectory.stamp_s, stamps[rows])
@@ -177,7 +187,11 @@ def _path(result: SlamResult, reference: Reference) -> Row:
     return {
         "estimate_m": np.round(result.trajectory.pose_world_robot[rows, :2], 3).tolist(),
         "reference_m": np.round(reference.trajectory.pose_world_robot[known, :2], 3).tolist(),
+        "delta_m": job.delta_m,
         "landmarks_m": np.round(result.landmarks.position_m, 3).tolist(),
+        "true_landmarks": dict(
+            zip(map(str, truth.landmark_id.tolist()), np.round(truth.position_m, 3).tolist(), strict=True)
+        ),
     }
 
 

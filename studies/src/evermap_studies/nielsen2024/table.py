@@ -8,6 +8,8 @@ from typing import Any
 from evermap.metrics.belief import belief_scores
 from evermap_studies.markdown import markdown_table, number
 from evermap_studies.nielsen2024.expected import Row, Rows, chosen, mean, verdicts, weights
+from evermap_studies.nielsen2024.plan import GROUP, MANY_DATASET, MANY_SCENARIO, WINDOW_DATASET, WINDOW_SCENARIO
+from evermap_studies.rows import sources
 
 SELECTORS = ("nn", "em", "mcts", "viterbi")
 PARTLY_TRUE = 3
@@ -20,17 +22,18 @@ def as_markdown(table: Mapping[str, Any]) -> str:
     simulation, runs = table["simulation"], table["runs"]
     parts = [_expected(table["expected"]), _machine(table)]
     if simulation:
-        parts += ["### Simulation (figures 6 and 7)", _wrong_modes(simulation), _errors(simulation), _costs(simulation)]
-        parts += [_budgets(simulation)]
+        parts += ["### Simulation (figures 6 and 7)", sources(simulation)]
+        parts += [_wrong_modes(simulation), _errors(simulation), _costs(simulation), _budgets(simulation)]
     compared = chosen(runs, part="recordings", scenario="group")
     for dataset in _distinct(compared, "dataset"):
-        parts += [f"### Dataset {dataset}: the map's group displaced (figure 9)"]
+        of_dataset = chosen(compared, dataset=dataset)
+        parts += [f"### Dataset {dataset}: the map's group displaced (figure 9)", sources(of_dataset)]
         for sensor, title in SENSOR_TITLES.items():
-            rows = chosen(compared, dataset=dataset, sensor=sensor)
+            rows = chosen(of_dataset, sensor=sensor)
             if rows:
                 parts += [f"Position / landmark error [m], mean of {_robots(rows)}, {title}:"]
                 parts += [_by_delta(rows, "method", _both)]
-        own = chosen(compared, dataset=dataset, sensor="ours")
+        own = chosen(of_dataset, sensor="ours")
         if own:
             parts += ["Position error while landmarks were in view [m], our sensor model:"]
             parts += [_by_delta(own, "method", _mean_of("pose_seen_rmse_m"))]
@@ -40,18 +43,74 @@ def as_markdown(table: Mapping[str, Any]) -> str:
         joint = chosen(own, method="joint")
         if joint:
             parts += ["Joint search, what was found:", _by_delta(joint, "method", _exact_of)]
-    many = chosen(runs, part="recordings", scenario="many modes")
+    many = _complete(chosen(runs, part="recordings", scenario=MANY_SCENARIO))
     if many:
-        parts += ["### Dataset 1, many modes (figure 10)", _by_delta(many, "method", _both)]
+        parts += [f"### Dataset {MANY_DATASET}, many modes (figures 10 and 11)", sources(many), *_many_modes(many)]
+    whole = _complete(chosen(runs, part="recordings", scenario=WINDOW_SCENARIO))
+    if whole:
+        parts += [f"### Dataset {WINDOW_DATASET}, tree search with and without the window of 40 s (section 8.3)"]
+        parts += [sources(whole), *_windows(whole, compared)]
     if compared:
-        parts += ["### Execution time", _times(compared)]
+        parts += ["### Execution time", sources(compared), _times(compared)]
     during = chosen(runs, part="during")
     if during:
-        parts += ["### The group moves at half time", _during(during)]
+        parts += ["### The group moves at half time", sources(during), _during(during)]
     search = chosen(runs, part="search")
     if search:
-        parts += ["### Changes of other kinds, joint search", _search(search), _reliability(runs)]
-    return "\n\n".join(parts)
+        parts += ["### Changes of other kinds, joint search", sources(search), _search(search), _reliability(runs)]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _complete(rows: Rows) -> list[Row]:
+    """Return the rows of the robots that have all methods at all displacements: of a study that goes on, those done."""
+    most = max((sum(row["robot"] == robot for row in rows) for robot in _distinct(rows, "robot")), default=0)
+    whole = {robot for robot in _distinct(rows, "robot") if sum(row["robot"] == robot for row in rows) == most}
+    return [row for row in rows if row["robot"] in whole]
+
+
+def _many_modes(rows: Rows) -> list[str]:
+    """Errors, times and places by method, figures 10 and 11."""
+    moved = set(GROUP[MANY_DATASET])
+
+    def places(of_moved: bool) -> Callable[[Rows], str]:
+        return lambda own: number("{:.1f}", _mean_places(own, moved, of_moved))
+
+    return [
+        f"Position / landmark error [m], mean of {_robots(rows)}:",
+        _by_delta(rows, "method", _both),
+        "Seconds a recording:",
+        _by_delta(rows, "method", _mean_of("cpu_s", "{:.1f}")),
+        "Landmarks that did not move, places made for them, mean of a recording (right: 0):",
+        _by_delta(rows, "method", places(False)),
+        f"The {len(moved)} landmarks that moved, places beside the first (right: {len(moved)} from 0.1 m on):",
+        _by_delta(rows, "method", places(True)),
+    ]
+
+
+def _mean_places(rows: Rows, moved: set[int], of_moved: bool) -> float:
+    """Return how many places beside one each landmark was given, in sum, mean of the runs."""
+    extra = 0
+    for row in rows:
+        own = [place["landmark"] for place in row["places"] if (place["landmark"] in moved) == of_moved]
+        extra += len(own) - len(set(own))
+    return extra / len(rows) if rows else 0.0
+
+
+def _windows(whole: Rows, compared: Rows) -> list[str]:
+    """Errors and times of the tree search with its window and without, the same recordings and displacements."""
+    pairs = {(row["robot"], row["delta_m"]) for row in whole}
+    windowed = [
+        row
+        for row in chosen(compared, dataset=WINDOW_DATASET, sensor="paper", method="mcts")
+        if (row["robot"], row["delta_m"]) in pairs
+    ]
+    rows = [{**row, "method": name} for name, some in (("40 s", windowed), ("none", whole)) for row in some]
+    return [
+        f"Position / landmark error [m], mean of {_robots(rows)}, the paper's sensor model and limits:",
+        _by_delta(rows, "method", _both),
+        "Seconds a recording:",
+        _by_delta(rows, "method", _mean_of("cpu_s", "{:.1f}")),
+    ]
 
 
 def _expected(rows: Sequence[Row]) -> str:
@@ -142,8 +201,8 @@ def _both(rows: Rows) -> str:
     return text if len(placed) == len(rows) else f"{text} ({len(placed)} of {len(rows)})"
 
 
-def _mean_of(key: str) -> Callable[[Rows], str]:
-    return lambda rows: number("{:.3f}", mean(rows, key))
+def _mean_of(key: str, form: str = "{:.3f}") -> Callable[[Rows], str]:
+    return lambda rows: number(form, mean(rows, key))
 
 
 def _exact_of(rows: Rows) -> str:
