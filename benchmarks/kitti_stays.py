@@ -11,6 +11,7 @@ drive is there an hour later. Nobody came back after an hour: of that there is n
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -212,10 +213,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("evermap-out/kitti-stays"), help="folder for the table")
     parser.add_argument("--set", action="append", default=[], dest="overrides", help="setting, as of `evermap slam`")
     chosen = parser.parse_args(arguments)
-    rows = run(chosen.folder, RowsFile.beside(chosen.out), chosen.overrides, chosen.only)
+    file = RowsFile.beside(chosen.out)
+    rows = run(chosen.folder, file, chosen.overrides, chosen.only)
     text = as_markdown(rows)
     chosen.out.mkdir(parents=True, exist_ok=True)
     (chosen.out / "table.md").write_text(text + "\n", encoding="utf-8")
+    (chosen.out / "summary.json").write_text(json.dumps({"commit": commit_of_code(), "rows": rows}), encoding="utf-8")
+    file.remove()
     print(text)
     return 0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import shutil
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -113,7 +114,8 @@ def test_a_run_of_a_part_keeps_rows_and_sections_of_an_older_one_with_their_comm
     claims = "|  | expected | measured | met |\n| --- | ---: | ---: | ---: |\n"
     old = (
         f"{claims}| a | 1 | 1.0 | yes |\n| b | 1 | 2.0 | **no** |\n\n"
-        "### One\n\nErrors:\n\n| method | 0 m |\n| --- | ---: |\n| em | 0.1 |\n| joint | 0.2 |\n\n### Two\n\ntext"
+        "### One\n\nErrors:\n\n| method | 0 m |\n| --- | ---: |\n| em | 0.1 |\n| joint | 0.2 |\n\n"
+        "Times:\n\n| method | 0 m |\n| --- | ---: |\n| em | 7 |\n\n### Two\n\ntext"
     )
     new = (
         f"{claims}| a | 1 | 0.9 | yes |\n| b | 1 | – | – |\n\n"
@@ -128,7 +130,10 @@ def test_a_run_of_a_part_keeps_rows_and_sections_of_an_older_one_with_their_comm
         "| em | 0.3 | `bbbbbbb`, 2021-01-01 |",
         "| mcts | 0.4 | `bbbbbbb`, 2021-01-01 |",
         "| joint | 0.2 | `aaaaaaa`, 2020-01-01 |",
+        "| method | 0 m | code |",
+        "| em | 7 | `aaaaaaa`, 2020-01-01 |",
     ]
+    assert "\n\nTimes:\n\n| method" in text
     assert [line for line in text.splitlines() if line.startswith("###")] == ["### One", "### Three", "### Two"]
     assert "### Two\n\nRows of commit `aaaaaaa`, 2020-01-01.\n\ntext" in text
     again = results.merged(text, new, "`aaaaaaa`, 2020-01-01", "`ccccccc`, 2022-01-01")
@@ -186,3 +191,32 @@ def test_tables_of_a_run_replace_those_of_the_page(tmp_path: Path, monkeypatch: 
     assert "<!-- mrclam:begin -->\nnew\n<!-- mrclam:end -->\nthe end" in text
     assert "Tables of commit `def5678`, 2026-01-02." in text
     assert (tmp_path / "images" / "mrclam-a.png").read_bytes() == b"picture"
+
+
+def test_all_studies_are_computed_by_the_commands_of_their_pages_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One fails: the others are done, and only that one is run again."""
+    ran: list[list[str]] = []
+    broken = ["robots"]
+    monkeypatch.setattr(results, "renew", lambda name, folder: None)
+    monkeypatch.setattr(results, "DOCS", tmp_path / "docs")
+    shutil.copytree(DOCS, tmp_path / "docs")
+
+    def run(command: list[str], **_: object) -> object:
+        ran.append(command[1:])
+        return type("Done", (), {"returncode": int(any(name in command for name in broken))})()
+
+    monkeypatch.setattr(results.subprocess, "run", run)
+    out = tmp_path / "out"
+    assert results.recompute(out) == ["robots"]
+    assert len(ran) == len(results.STUDIES) + len(results.PARTS)
+    assert ["-m", "evermap", "reproduce", "rosen2016", "--data", "../shared/golden", "--out", f"{out}/rosen2016"] in ran
+    assert ["-m", "evermap", "bench", "--only", "kitti", "--out", f"{out}/kitti"] in ran
+    assert ["-m", "benchmarks.kitti_stays", "../shared/data/kitti_tracking", "--out", f"{out}/kitti-stays"] in ran
+    assert ["-m", "evermap", "reproduce", "soak"] in ran
+    assert "nielsen2024" in ran[-1]
+    broken.clear()
+    ran.clear()
+    assert results.recompute(out) == []
+    assert [command[3] for command in ran] == ["robots"]

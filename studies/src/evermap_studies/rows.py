@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import json
 import subprocess  # nosec  # B404: git of our own clone
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
+from os import SEEK_END
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 Row = dict[str, Any]
+Key = TypeVar("Key")
 
 ROWS = ".rows.jsonl"
 """End of the name of the file with a line a run, beside the folder of results."""
@@ -47,14 +49,40 @@ class RowsFile:
         self.path.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Add a row."""
+        """Add a row, on a line of its own also where the last one was not written whole."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("a", encoding="utf-8") as lines:
-            lines.write(f"{json.dumps(row)}\n")
+        with self.path.open("ab+") as lines:
+            size = lines.seek(0, SEEK_END)
+            lines.seek(max(size - 1, 0))
+            before = "" if lines.read(1) in (b"", b"\n") else "\n"
+            lines.write(f"{before}{json.dumps(row)}\n".encode())
 
     def remove(self) -> None:
         """Remove the file: what is in it is in the results."""
         self.path.unlink(missing_ok=True)
+
+
+def run_missing(file: RowsFile, keys: Sequence[Key], run_all: Callable[[list[Key]], Iterable[Row]]) -> Iterator[Row]:
+    """Yield a row for each key, those in the file as they are and the others as they are run and added to it.
+
+    Rows in the file count if the code was of the same commit, so that a table is of one.
+
+    Args:
+        file: is read, and added to.
+        keys: plain JSON values that tell runs apart, with all settings that they depend on.
+        run_all: runs keys, in their order.
+    """
+    done = {_as_key(line["key"]): line["row"] for line in file.read() if line["commit"] == commit_of_code()}
+    found = iter(run_all([key for key in keys if _as_key(key) not in done]))
+    for key in keys:
+        if _as_key(key) not in done:
+            done[_as_key(key)] = row = next(found)
+            file.add({"key": key, "commit": commit_of_code(), "row": row})
+        yield done[_as_key(key)]
+
+
+def _as_key(key: Any) -> str:
+    return json.dumps(key)
 
 
 def read_rows(path: Path) -> list[Row]:
