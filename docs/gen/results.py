@@ -27,6 +27,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 DOCS = Path(__file__).resolve().parents[1]
 TESTS = DOCS.parent / "tests"
@@ -87,6 +88,7 @@ On pages of studies and all others; of the latter *code* is the commit that wrot
 MOST_COLUMNS = 4
 """Of a table, named on the page of claims."""
 UNKNOWN = "–"
+Name = TypeVar("Name")
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class Table:
         heading: nearest one above it.
         note: the line above it.
         head, rows: cells.
-        code: commit and date that the line above, its section or its page names; '' where none does.
+        code: commit and date that the line above, its section or its page names, or its rows; '' where none does.
     """
 
     heading: str
@@ -168,6 +170,8 @@ def tables(text: str) -> list[Table]:
         if block:
             measured = MEASURED.match(before)
             code = _code(measured) if measured else of_section or of_page
+            if block[0][-1] == CODE:
+                code = "; ".join(dict.fromkeys(row[-1].replace("`, ", "` ") for row in block[2:]))
             found.append(Table(heading, before, block[0], block[2:], code))
             block = []
         if made := PROVENANCE.search(line):
@@ -203,6 +207,7 @@ def _claim(table: Table, row: list[str]) -> list[Claim]:
     code = table.code
     if table.head[-1] == CODE:
         *rest, code = rest
+        code = code.replace("`, ", "` ")
     head = table.head[2:-1] if table.head[-1] == CODE else table.head[2:]
     plain = len(head) == 2 and head[1] == "met"
     if measured.startswith(UNKNOWN) or (expected == UNKNOWN and not plain):
@@ -432,7 +437,7 @@ def _sections(text: str) -> dict[str, str]:
     return {name: part.strip() for name, part in found.items()}
 
 
-def _in_order(before: list[str], now: list[str]) -> list[str]:
+def _in_order(before: list[Name], now: list[Name]) -> list[Name]:
     """Return names in the order of the page, new ones behind those that they follow in the run."""
     order = list(before)
     for at, name in enumerate(now):
@@ -460,31 +465,40 @@ def _merged_section(old: str, new: str, old_code: str, new_code: str) -> str:
 
     Tables are the same if head and paragraph before are. A claim that the run did not measure is the older one's.
     """
-    earlier = {key: (rows, block) for key, rows, block in _tables_of(old, _code_of(old, old_code))}
-    for key, rows, block in _tables_of(new, _code_of(new, new_code)):
-        older, _ = earlier.pop(key, ({}, ""))
+    earlier = {key: body for key, body, _ in _tables_of(old, _code_of(old, old_code))}
+    for key, body, block in _tables_of(new, _code_of(new, new_code)):
+        was = earlier.pop(key, [])
+        count = _cells_that_tell(was, body)
+        older, rows = ({tuple(row[:count]): row for row in one} for one in (was, body))
         claimed = key[2].startswith(CLAIMED) if len(key) > 2 else False
-        names = list(rows) if claimed else _in_order(list(older), list(rows))
         lacks = [name for name in older if name not in rows or (claimed and rows[name][2].startswith(UNKNOWN))]
+        names = list(rows) if claimed else _in_order(list(older), list(rows))
         taken = {name: older[name] if name in lacks else rows[name] for name in names}
-        if any(taken[name] is older.get(name) for name in names):
+        if any(name in lacks for name in names):
             head, rule = block.splitlines()[:2]
             lines = [f"{head} {CODE} |", f"{rule} --- |", *(f"| {' | '.join(row)} |" for row in taken.values())]
             new = new.replace(block, "\n".join(lines))
     if new.startswith("#"):
-        for (paragraph, *names), (rows, _) in earlier.items():
-            lines = [
-                f"| {' | '.join(row)} |" for row in ([*names, CODE], ["---"] * len([*names, CODE]), *rows.values())
-            ]
+        for (paragraph, *head), body in earlier.items():
+            lines = [f"| {' | '.join(row)} |" for row in ([*head, CODE], ["---"] * len([*head, CODE]), *body)]
             new = "\n\n".join(part for part in (new, paragraph, "\n".join(lines)) if part)
     return new
 
 
-def _tables_of(section: str, code: str) -> Iterator[tuple[tuple[str, ...], dict[str, list[str]], str]]:
-    """Yield the tables of a section whose first cells tell their rows apart.
+def _cells_that_tell(*bodies: list[list[str]]) -> int:
+    """Return how many of the first cells tell the rows of each table apart."""
+    most = max(len(row) for body in bodies for row in body)
+    for count in range(1, most):
+        if all(len({tuple(row[:count]) for row in body}) == len(body) for body in bodies):
+            return count
+    return most
+
+
+def _tables_of(section: str, code: str) -> Iterator[tuple[tuple[str, ...], list[list[str]], str]]:
+    """Yield the tables of a section.
 
     Each as what tells it from the others (the paragraph before, unless it names commits, and the head), its rows with
-    their commits by first cell, and its text.
+    their commits, and its text.
     """
     blocks = [block for block in section.split("\n\n") if block.strip()]
     for before, block in zip(["", *blocks], blocks, strict=False):
@@ -492,10 +506,9 @@ def _tables_of(section: str, code: str) -> Iterator[tuple[tuple[str, ...], dict[
             continue
         head, _, *body = [cells(line) for line in block.splitlines()]
         own = head[-1] == CODE
-        rows = {row[0]: row if own else [*row, code] for row in body}
+        rows = [row if own else [*row, code] for row in body]
         paragraph = "" if before.startswith(("#", "|")) or ROWS_OF.match(before) else before
-        if len(rows) == len(body):
-            yield (paragraph, *(head[:-1] if own else head)), rows, block
+        yield (paragraph, *(head[:-1] if own else head)), rows, block
 
 
 def ages() -> Iterator[str]:
@@ -503,10 +516,9 @@ def ages() -> Iterator[str]:
     where = dict[str, set[str]]()
     for page in pages():
         for table in tables(page.read_text(encoding="utf-8")):
-            codes = [row[-1] for row in table.rows] if table.head[-1] == CODE else [table.code]
-            for code in codes if table.has_claims or table.has_figures else []:
+            for code in table.code.split("; ") if table.has_claims or table.has_figures else []:
                 if code:
-                    where.setdefault(code.replace("`", "").replace(",", ""), set()).add(page.stem)
+                    where.setdefault(code.replace("`", ""), set()).add(page.stem)
     for code, names in where.items():
         git = ["git", "-C", str(DOCS), "rev-list", "--count", f"{code.split()[0].rstrip('+')}..HEAD"]
         count = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or "?"

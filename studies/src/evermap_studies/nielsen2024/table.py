@@ -62,10 +62,11 @@ def as_markdown(table: Mapping[str, Any]) -> str:
 
 
 def _complete(rows: Rows) -> list[Row]:
-    """Return the rows of the robots that have all methods at all displacements: of a study that goes on, those done."""
-    most = max((sum(row["robot"] == robot for row in rows) for robot in _distinct(rows, "robot")), default=0)
-    whole = {robot for robot in _distinct(rows, "robot") if sum(row["robot"] == robot for row in rows) == most}
-    return [row for row in rows if row["robot"] in whole]
+    """Return the rows of robots and displacements that have all methods: of a study that goes on, what is done."""
+    robots = {robot: sum(row["robot"] == robot for row in rows) for robot in _distinct(rows, "robot")}
+    whole = [row for row in rows if robots[row["robot"]] == max(robots.values())]
+    deltas = {delta: sum(row["delta_m"] == delta for row in whole) for delta in _distinct(whole, "delta_m")}
+    return [row for row in whole if deltas[row["delta_m"]] == max(deltas.values())]
 
 
 def _many_modes(rows: Rows) -> list[str]:
@@ -87,13 +88,13 @@ def _many_modes(rows: Rows) -> list[str]:
     ]
 
 
-def _mean_places(rows: Rows, moved: set[int], of_moved: bool) -> float:
-    """Return how many places beside one each landmark was given, in sum, mean of the runs."""
+def _mean_places(rows: Rows, moved: set[int], of_moved: bool) -> float | None:
+    """Return how many places beside one each landmark was given, in sum, mean of the runs; None of no runs."""
     extra = 0
     for row in rows:
         own = [place["landmark"] for place in row["places"] if (place["landmark"] in moved) == of_moved]
         extra += len(own) - len(set(own))
-    return extra / len(rows) if rows else 0.0
+    return extra / len(rows) if rows else None
 
 
 def _windows(whole: Rows, compared: Rows) -> list[str]:
