@@ -2,7 +2,7 @@
 
 Each sequence begins a map of its own with the defaults, also where its verdict would keep it out of one. Listed are
 stays, which of them ended in view and what the labels say of these, and how probably what stands at the end of the
-drive is there an hour later. Nobody came back after an hour: of that there is no truth, only of the ends in view.
+drive is there an hour later. No recording is an hour long: of that there is no truth, only of the ends in view.
 
     python -m benchmarks.kitti_stays ../shared/data/kitti_tracking                     # goes on where it was ended
     python -m benchmarks.kitti_stays ../shared/data/kitti_tracking --only 0011 --out out/kitti-stays

@@ -468,7 +468,7 @@ def _merged_section(old: str, new: str, old_code: str, new_code: str) -> str:
     earlier = {key: body for key, body, _ in _tables_of(old, _code_of(old, old_code))}
     for key, body, block in _tables_of(new, _code_of(new, new_code)):
         was = earlier.pop(key, [])
-        count = _cells_that_tell(was, body)
+        count = _count_distinguishing_cells(was, body)
         older, rows = ({tuple(row[:count]): row for row in one} for one in (was, body))
         claimed = key[2].startswith(CLAIMED) if len(key) > 2 else False
         lacks = [name for name in older if name not in rows or (claimed and rows[name][2].startswith(UNKNOWN))]
@@ -485,8 +485,8 @@ def _merged_section(old: str, new: str, old_code: str, new_code: str) -> str:
     return new
 
 
-def _cells_that_tell(*bodies: list[list[str]]) -> int:
-    """Return how many of the first cells tell the rows of each table apart."""
+def _count_distinguishing_cells(*bodies: list[list[str]]) -> int:
+    """Return how many of the first cells distinguish the rows of each table."""
     most = max(len(row) for body in bodies for row in body)
     for count in range(1, most):
         if all(len({tuple(row[:count]) for row in body}) == len(body) for body in bodies):
@@ -497,7 +497,7 @@ def _cells_that_tell(*bodies: list[list[str]]) -> int:
 def _tables_of(section: str, code: str) -> Iterator[tuple[tuple[str, ...], list[list[str]], str]]:
     """Yield the tables of a section.
 
-    Each as what tells it from the others (the paragraph before, unless it names commits, and the head), its rows with
+    Each as what distinguishes it from the others (the paragraph before, unless it names commits, and the head), its rows with
     their commits, and its text.
     """
     blocks = [block for block in section.split("\n\n") if block.strip()]

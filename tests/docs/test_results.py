@@ -194,7 +194,7 @@ def test_tables_of_a_run_replace_those_of_the_page(tmp_path: Path, monkeypatch: 
     assert (tmp_path / "images" / "mrclam-a.png").read_bytes() == b"picture"
 
 
-def test_rows_are_told_apart_by_as_many_cells_as_it_takes() -> None:
+def test_rows_are_distinguished_by_as_many_cells_as_it_takes() -> None:
     head = "### Times\n\n| method | sensor | s |\n| --- | --- | ---: |\n"
     text = results.merged(
         f"{head}| em | ours | 1 |\n| em | paper | 2 |\n", f"{head}| em | paper | 3 |\n| mcts | paper | 4 |\n", "a", "b"

@@ -69,7 +69,7 @@ def run_missing(file: RowsFile, keys: Sequence[Key], run_all: Callable[[list[Key
 
     Args:
         file: is read, and added to.
-        keys: plain JSON values that tell runs apart, with all settings that they depend on.
+        keys: plain JSON values that distinguish runs, with all settings that they depend on.
         run_all: runs keys, in their order.
     """
     done = {_as_key(line["key"]): line["row"] for line in file.read() if line["commit"] == commit_of_code()}
