@@ -252,15 +252,16 @@ def places_of(result: SlamResult) -> list[Row]:
 
     Nothing of a landmark that is at one place all the time.
     """
-    last = dict(zip(result.landmarks.landmark_id.tolist(), result.landmarks.position_m, strict=True))
     found: list[Row] = []
-    for identity, position_m in last.items():
-        mine = [change for change in result.changes if identity in change.landmark_ids]
+    for identity, position_m in zip(
+        result.landmarks.landmark_id.tolist(), result.landmarks.position_m.tolist(), strict=True
+    ):
         trail = [position_m]
-        for change in reversed(mine):
-            trail.append(trail[-1] - np.array(change.displacement_m))
-        distinct = {tuple(np.round(place, PLACE_DECIMALS).tolist()) for place in trail}
-        found += [{"landmark": identity, "at_m": list(place)} for place in sorted(distinct)] if mine else []
+        for change in reversed(result.changes):
+            if identity in change.landmark_ids:
+                trail.append([at - by for at, by in zip(trail[-1], change.displacement_m, strict=True)])
+        distinct = {tuple(round(float(at), PLACE_DECIMALS) for at in place) for place in trail}
+        found += [{"landmark": identity, "at_m": list(place)} for place in sorted(distinct)] if len(trail) > 1 else []
     return found
 
 
