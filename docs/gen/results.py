@@ -171,7 +171,8 @@ def tables(text: str) -> list[Table]:
             measured = MEASURED.match(before)
             code = _code(measured) if measured else of_section or of_page
             if block[0][-1] == CODE:
-                code = "; ".join(dict.fromkeys(row[-1].replace("`, ", "` ") for row in block[2:]))
+                every = (one.replace("`, ", "` ") for row in block[2:] for one in row[-1].split("; "))
+                code = "; ".join(dict.fromkeys(every))
             found.append(Table(heading, before, block[0], block[2:], code))
             block = []
         if made := PROVENANCE.search(line):
@@ -474,7 +475,9 @@ def _merged_section(old: str, new: str, old_code: str, new_code: str) -> str:
         lacks = [name for name in older if name not in rows or (claimed and rows[name][2].startswith(UNKNOWN))]
         names = list(rows) if claimed else _in_order(list(older), list(rows))
         taken = {name: older[name] if name in lacks else rows[name] for name in names}
-        if any(name in lacks for name in names):
+        if not claimed:
+            taken |= {name: _filled_from(older[name], rows[name]) for name in older if name in rows}
+        if any(taken[name] is not rows.get(name) for name in names):
             head, rule = block.splitlines()[:2]
             lines = [f"{head} {CODE} |", f"{rule} --- |", *(f"| {' | '.join(row)} |" for row in taken.values())]
             new = new.replace(block, "\n".join(lines))
@@ -483,6 +486,12 @@ def _merged_section(old: str, new: str, old_code: str, new_code: str) -> str:
             lines = [f"| {' | '.join(row)} |" for row in ([*head, CODE], ["---"] * len([*head, CODE]), *body)]
             new = "\n\n".join(part for part in (new, paragraph, "\n".join(lines)) if part)
     return new
+
+
+def _filled_from(older: list[str], row: list[str]) -> list[str]:
+    """Return a row with the cells of an older one where only that has a number, of both commits then."""
+    taken = [was if now.startswith(UNKNOWN) else now for was, now in zip(older[:-1], row[:-1], strict=True)]
+    return row if taken == row[:-1] else [*taken, "; ".join(dict.fromkeys([older[-1], row[-1]]))]
 
 
 def _count_distinguishing_cells(*bodies: list[list[str]]) -> int:
@@ -497,8 +506,8 @@ def _count_distinguishing_cells(*bodies: list[list[str]]) -> int:
 def _tables_of(section: str, code: str) -> Iterator[tuple[tuple[str, ...], list[list[str]], str]]:
     """Yield the tables of a section.
 
-    Each as what distinguishes it from the others (the paragraph before, unless it names commits, and the head), its rows with
-    their commits, and its text.
+    Each as what distinguishes it from the others (the paragraph before, unless it names commits, and the head), its
+    rows with their commits, and its text.
     """
     blocks = [block for block in section.split("\n\n") if block.strip()]
     for before, block in zip(["", *blocks], blocks, strict=False):

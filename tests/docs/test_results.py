@@ -195,6 +195,7 @@ def test_tables_of_a_run_replace_those_of_the_page(tmp_path: Path, monkeypatch: 
 
 
 def test_rows_are_distinguished_by_as_many_cells_as_it_takes() -> None:
+    """And a cell that only the older run has is kept, in a row of both commits."""
     head = "### Times\n\n| method | sensor | s |\n| --- | --- | ---: |\n"
     text = results.merged(
         f"{head}| em | ours | 1 |\n| em | paper | 2 |\n", f"{head}| em | paper | 3 |\n| mcts | paper | 4 |\n", "a", "b"
@@ -204,6 +205,8 @@ def test_rows_are_distinguished_by_as_many_cells_as_it_takes() -> None:
         "| em | paper | 3 | b |",
         "| mcts | paper | 4 | b |",
     ]
+    text = results.merged(f"{head}| em | 1 | 2 |", f"{head}| em | – | 3 |", "a", "b")
+    assert text.endswith("| em | 1 | 3 | a; b |")
 
 
 def test_all_studies_are_computed_by_the_commands_of_their_pages_once(

@@ -72,6 +72,19 @@ def mean(rows: Iterable[Row], key: str) -> float | None:
     return sum(values) / len(values) if values else None
 
 
+def distinct(rows: Rows, key: str) -> list[Any]:
+    """Values that there are, in their order."""
+    return list(dict.fromkeys(row[key] for row in rows))
+
+
+def complete(rows: Rows) -> list[Row]:
+    """Return the rows of robots and displacements that have all methods: of a study that goes on, what is done."""
+    robots = {robot: sum(row["robot"] == robot for row in rows) for robot in distinct(rows, "robot")}
+    whole = [row for row in rows if robots[row["robot"]] == max(robots.values())]
+    deltas = {delta: sum(row["delta_m"] == delta for row in whole) for delta in distinct(whole, "delta_m")}
+    return [row for row in whole if deltas[row["delta_m"]] == max(deltas.values())]
+
+
 def weights(runs: Rows) -> tuple[list[float], list[bool]]:
     """Probability of every change that random draws made the joint search report, and whether it was right."""
     drawn = [change for row in runs if row["scenario"].startswith("random") for change in row["changes"]]

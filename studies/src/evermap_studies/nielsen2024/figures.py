@@ -22,7 +22,7 @@ from evermap.viz.style import (
     settle,
 )
 from evermap_studies.frame import save_all
-from evermap_studies.nielsen2024.expected import Row, Rows, chosen, mean, weights
+from evermap_studies.nielsen2024.expected import Row, Rows, chosen, complete, mean, weights
 from evermap_studies.nielsen2024.plan import GROUP, GROUP_SCENARIO, MANY_DATASET, MANY_METHODS, MANY_SCENARIO
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def draw_all(simulation: Rows, runs: Rows, paths: Mapping[str, Row], path: Calla
     compared = chosen(runs, part="recordings", scenario=GROUP_SCENARIO)
     if compared:
         figures["fig9-displacement"] = _draw_displacements(compared)
-    many = chosen(runs, part="recordings", scenario=MANY_SCENARIO)
+    many = complete(chosen(runs, part="recordings", scenario=MANY_SCENARIO))
     if many:
         figures["fig10-many-modes"] = _draw_many(many)
         made = {key: value for key, value in paths.items() if key.startswith(MANY_SCENARIO)}

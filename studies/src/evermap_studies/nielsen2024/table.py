@@ -7,7 +7,7 @@ from typing import Any
 
 from evermap.metrics.belief import belief_scores
 from evermap_studies.markdown import markdown_table, number
-from evermap_studies.nielsen2024.expected import Row, Rows, chosen, mean, verdicts, weights
+from evermap_studies.nielsen2024.expected import Row, Rows, chosen, complete, distinct, mean, verdicts, weights
 from evermap_studies.nielsen2024.plan import GROUP, MANY_DATASET, MANY_SCENARIO, WINDOW_DATASET, WINDOW_SCENARIO
 from evermap_studies.rows import sources
 
@@ -25,7 +25,7 @@ def as_markdown(table: Mapping[str, Any]) -> str:
         parts += ["### Simulation (figures 6 and 7)", sources(simulation)]
         parts += [_wrong_modes(simulation), _errors(simulation), _costs(simulation), _budgets(simulation)]
     compared = chosen(runs, part="recordings", scenario="group")
-    for dataset in _distinct(compared, "dataset"):
+    for dataset in distinct(compared, "dataset"):
         of_dataset = chosen(compared, dataset=dataset)
         parts += [f"### Dataset {dataset}: the map's group displaced (figure 9)", sources(of_dataset)]
         for sensor, title in SENSOR_TITLES.items():
@@ -43,10 +43,10 @@ def as_markdown(table: Mapping[str, Any]) -> str:
         joint = chosen(own, method="joint")
         if joint:
             parts += ["Joint search, what was found:", _by_delta(joint, "method", _exact_of)]
-    many = _complete(chosen(runs, part="recordings", scenario=MANY_SCENARIO))
+    many = complete(chosen(runs, part="recordings", scenario=MANY_SCENARIO))
     if many:
         parts += [f"### Dataset {MANY_DATASET}, many modes (figures 10 and 11)", sources(many), *_many_modes(many)]
-    whole = _complete(chosen(runs, part="recordings", scenario=WINDOW_SCENARIO))
+    whole = complete(chosen(runs, part="recordings", scenario=WINDOW_SCENARIO))
     if whole:
         parts += [f"### Dataset {WINDOW_DATASET}, tree search with and without the window of 40 s (section 8.3)"]
         parts += [sources(whole), *_windows(whole, compared)]
@@ -59,14 +59,6 @@ def as_markdown(table: Mapping[str, Any]) -> str:
     if search:
         parts += ["### Changes of other kinds, joint search", sources(search), _search(search), _reliability(runs)]
     return "\n\n".join(part for part in parts if part)
-
-
-def _complete(rows: Rows) -> list[Row]:
-    """Return the rows of robots and displacements that have all methods: of a study that goes on, what is done."""
-    robots = {robot: sum(row["robot"] == robot for row in rows) for robot in _distinct(rows, "robot")}
-    whole = [row for row in rows if robots[row["robot"]] == max(robots.values())]
-    deltas = {delta: sum(row["delta_m"] == delta for row in whole) for delta in _distinct(whole, "delta_m")}
-    return [row for row in whole if deltas[row["delta_m"]] == max(deltas.values())]
 
 
 def _many_modes(rows: Rows) -> list[str]:
@@ -136,7 +128,7 @@ def _machine(table: Mapping[str, Any]) -> str:
 def _wrong_modes(simulation: Rows) -> str:
     rows = chosen(simulation, figure="6")
     lines = []
-    for noise in _distinct(rows, "noise_m2"):
+    for noise in distinct(rows, "noise_m2"):
         cells = [_with_error(_one(rows, noise, name), "wrong_share", "{:.4f}") for name in SELECTORS]
         lines.append((f"{noise:g}", *cells))
     head = ("r [m²]", *(f"{name}, wrong modes" for name in SELECTORS))
@@ -146,7 +138,7 @@ def _wrong_modes(simulation: Rows) -> str:
 def _errors(simulation: Rows) -> str:
     rows = chosen(simulation, figure="7")
     lines = []
-    for noise in _distinct(rows, "noise_m2"):
+    for noise in distinct(rows, "noise_m2"):
         cells = [_with_error(_one(rows, noise, name), "rmse_m", "{:.3f}") for name in SELECTORS]
         lines.append((f"{noise:g}", *cells))
     return markdown_table(("r [m²]", *(f"{name}, error [m]" for name in SELECTORS)), lines)
@@ -187,10 +179,10 @@ def _budgets(simulation: Rows) -> str:
 
 
 def _by_delta(rows: Rows, key: str, cell: Callable[[Rows], str]) -> str:
-    deltas = _distinct(rows, "delta_m")
+    deltas = distinct(rows, "delta_m")
     lines = [
         (str(value), *(cell(chosen(rows, delta_m=delta, **{key: value})) for delta in deltas))
-        for value in _distinct(rows, key)
+        for value in distinct(rows, key)
     ]
     return markdown_table((key, *(f"{delta:g} m" for delta in deltas)), lines)
 
@@ -214,7 +206,7 @@ def _exact_of(rows: Rows) -> str:
 
 def _times(rows: Rows) -> str:
     lines = []
-    for method in _distinct(rows, "method"):
+    for method in distinct(rows, "method"):
         for sensor in SENSOR_TITLES:
             cells = [_time_of(chosen(rows, method=method, sensor=sensor, dataset=dataset)) for dataset in (1, 2, 3, 6)]
             lines.append((method, sensor, *cells))
@@ -234,9 +226,9 @@ def _time_of(rows: Rows) -> str:
 
 def _during(rows: Rows) -> str:
     lines = []
-    for dataset in _distinct(rows, "dataset"):
-        for delta in _distinct(rows, "delta_m"):
-            for method in _distinct(rows, "method"):
+    for dataset in distinct(rows, "dataset"):
+        for delta in distinct(rows, "delta_m"):
+            for method in distinct(rows, "method"):
                 own = chosen(rows, dataset=dataset, delta_m=delta, method=method)
                 joint = method == "joint"
                 lines.append(
@@ -257,8 +249,8 @@ def _during(rows: Rows) -> str:
 
 def _search(rows: Rows) -> str:
     lines = []
-    for scenario in _distinct([{**row, "scenario": _scenario(row)} for row in rows], "scenario"):
-        for dataset in _distinct(rows, "dataset"):
+    for scenario in distinct([{**row, "scenario": _scenario(row)} for row in rows], "scenario"):
+        for dataset in distinct(rows, "dataset"):
             own = [row for row in rows if _scenario(row) == scenario and row["dataset"] == dataset]
             if own:
                 name = f"{dataset}" if dataset else "building"
@@ -301,12 +293,8 @@ def _one(rows: Rows, noise: float, selector: str) -> Row:
 
 
 def _robots(rows: Rows) -> str:
-    count = len(_distinct(rows, "robot"))
+    count = len(distinct(rows, "robot"))
     return f"{count} robots" if count > 1 else "one robot"
-
-
-def _distinct(rows: Rows, key: str) -> list[Any]:
-    return list(dict.fromkeys(row[key] for row in rows))
 
 
 __all__ = ["as_markdown", "verdicts"]
