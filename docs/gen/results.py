@@ -334,7 +334,7 @@ def page_with(block: str) -> Path:
 def renew(study: str, folder: Path) -> None:
     """Put the table and the figures of a run into the page of its study, with the commit of its code.
 
-    The commit stands in the last line above the tables that names one.
+    The commit stands in the last line above the tables that names one. A run of a part replaces no figure.
     """
     page = page_with(study)
     text = page.read_text(encoding="utf-8")
@@ -348,9 +348,12 @@ def renew(study: str, folder: Path) -> None:
     old, new = f"`{made['commit']}`, {made['date']}", _commit_of_run(folder)
     said = f"Computed by `{made['command']}`. Tables of commit {new}"
     before = f"{before[: made.start()]}{said}{before[made.end() :]}"
-    text = f"{before}{begin}\n{merged(block.strip(), table, old, new)}\n{end}{after}"
+    together = merged(block.strip(), table, old, new)
+    text = f"{before}{begin}\n{together}\n{end}{after}"
     page.write_text(text, encoding="utf-8")
     for image in re.findall(r"\(\.\./images/([\w.-]+)\)", text):
+        if together != table and (DOCS / "images" / image).exists():
+            continue  # the run is of a part, and has less to draw
         names = (image, image.removeprefix(f"{study}-"))
         for source in (folder / place / name for place in (".", "figures") for name in names):
             if source.exists():
@@ -483,7 +486,8 @@ def _merged_section(old: str, new: str, old_code: str, new_code: str) -> str:
             new = new.replace(block, "\n".join(lines))
     if new.startswith("#"):
         for (paragraph, *head), body in earlier.items():
-            lines = [f"| {' | '.join(row)} |" for row in ([*head, CODE], ["---"] * len([*head, CODE]), *body)]
+            rule = ["---", *["---:"] * (len(head) - 1), "---"]
+            lines = [f"| {' | '.join(row)} |" for row in ([*head, CODE], rule, *body)]
             new = "\n\n".join(part for part in (new, paragraph, "\n".join(lines)) if part)
     return new
 
