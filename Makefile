@@ -5,6 +5,7 @@
 #   make bench   compare with the committed baseline    make clean   remove what make made
 #   make browser    a Chromium, for the tests of the server's page, which are skipped without one
 #   make experiments    whole experiments, most on the recordings in ../shared/data, minutes long
+#   make results    compute docs/results.md and its pages again, about a day in the background; goes on where it was ended
 # Use another interpreter or folder with `make PYTHON=python3.12 VENV=/somewhere/venv test`.
 PYTHON ?= python3
 VENV ?= .venv
@@ -21,10 +22,10 @@ DEVELOPMENT = $(VENV)/.stamp-development
 DOCUMENTATION = $(VENV)/.stamp-documentation
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo browser test test-slow test-all experiments lint audit format docs docs-check bench lock clean
+.PHONY: help setup setup-dev demo browser test test-slow test-all experiments results lint audit format docs docs-check bench lock clean
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 8
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 9
 
 setup: $(RUNTIME)
 setup-dev: $(DEVELOPMENT)
@@ -54,6 +55,11 @@ test-all: $(DEVELOPMENT)
 
 experiments: $(DEVELOPMENT)
 	$(VENV)/bin/python -m pytest -m experiment
+
+# One study after the other at the lowest priority, with the commands of their pages; what is done is in out/results, and
+# is not run again until that folder is removed.
+results: $(DEVELOPMENT)
+	OPENBLAS_NUM_THREADS=1 nice -n 19 $(VENV)/bin/python docs/gen/results.py --all out/results
 
 lint: $(DEVELOPMENT)
 	$(VENV)/bin/ruff check .

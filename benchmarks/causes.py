@@ -16,6 +16,7 @@ from typing import Any
 
 from evermap_studies.causes import study
 from evermap_studies.causes.catalogue import GROUPS
+from evermap_studies.rows import read_rows
 
 Row = dict[str, Any]
 WORSE = 1.1
@@ -79,11 +80,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--show", type=Path, metavar="ROWS")
     chosen = parser.parse_args(arguments)
     if chosen.compare:
-        better, worse = compare(*(study.read_rows(path) for path in chosen.compare))
+        better, worse = compare(*(read_rows(path) for path in chosen.compare))
         print(*[f"better: {line}" for line in better], *[f"worse: {line}" for line in worse], sep="\n")
         return int(bool(worse))
     if chosen.show:
-        rows = study.read_rows(chosen.show)
+        rows = read_rows(chosen.show)
         print(*map(line_of, rows), sep="\n")
     else:
         groups = tuple(chosen.part) if chosen.part else GROUPS

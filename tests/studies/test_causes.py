@@ -20,6 +20,7 @@ from evermap_studies.causes.answers import ANSWERS
 from evermap_studies.causes.catalogue import World, catalogue
 from evermap_studies.causes.drives import MAKES, NEXT, Drive, Reading, as_recording, simulate
 from evermap_studies.causes.judge import compare_changes, conclude, errors, make_case, solve, true_changes
+from evermap_studies.rows import ROWS
 
 pytestmark = pytest.mark.slow
 
@@ -266,7 +267,7 @@ def test_a_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytes
     settings = study.Settings(worlds=("laser alone: odometer +10%", "laser alone: sign of turning"), runs=1)
     table = study.reproduce(tmp_path / "out", settings)
     assert [row["world"] for row in table["runs"]] == [world.name for world, _ in study.planned(settings)]
-    rows = tmp_path / f"out{study.ROWS}"
+    rows = tmp_path / f"out{ROWS}"
     kept = [json.loads(line) for line in rows.read_text().splitlines()]
     assert kept == table["runs"]
     rows.write_text(rows.read_text() + '{"world": "half a l')

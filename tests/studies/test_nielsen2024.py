@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,9 +19,9 @@ from evermap.types import ChangeKind, Landmarks, MapChange, Trajectory
 from evermap_studies import commands
 from evermap_studies.nielsen2024 import plan as nielsen2024_plan
 from evermap_studies.nielsen2024 import study as nielsen2024
-from evermap_studies.nielsen2024.expected import PROMISES, verdicts
+from evermap_studies.nielsen2024.expected import OTHERS_NAME, PROMISES, verdicts
 from evermap_studies.nielsen2024.figures import draw_all
-from evermap_studies.nielsen2024.runs import Job, inputs_of, recording_of, reference_of, run_job
+from evermap_studies.nielsen2024.runs import NOTHING, Job, inputs_of, places_of, recording_of, reference_of, run_job
 from evermap_studies.nielsen2024.scores import change_scores, run_scores
 
 FEW = nielsen2024.Settings(
@@ -109,7 +110,8 @@ def test_figures_are_drawn_of_whatever_was_run(made: tuple[dict[str, Any], Path]
     path = {"estimate_m": [[0.0, 0.0], [1.0, 0.0]], "reference_m": [[0.0, 0.1], [1.0, 0.1]], "landmarks_m": []}
     for name, rows, drawn, wanted in (
         ("nothing", [], {}, set()),
-        ("paper", [r for r in runs if r["sensor"] == "paper"], {"group paper em dataset 6 robot 2": path}, {"fig9"}),
+        ("paper", [r for r in runs if r["sensor"] == "paper"], {"group paper em dataset 6 robot 2": path},
+         {"fig8", "fig9"}),
         ("ours", [r for r in runs if r["sensor"] == "ours"], {"group ours joint dataset 6 robot 2": path},
          {"fig8", "fig9"}),
     ):  # fmt: skip
@@ -117,6 +119,94 @@ def test_figures_are_drawn_of_whatever_was_run(made: tuple[dict[str, Any], Path]
         folder.mkdir()
         draw_all([], rows, drawn, lambda file, folder=folder: folder / file)
         assert {file.name.partition("-")[0] for file in folder.iterdir()} == wanted
+
+
+def test_what_was_ended_goes_on_from_its_rows(
+    made: tuple[dict[str, Any], Path], made_up_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed in its second run, with half a line written: the first is not run again, and nothing is lost."""
+    monkeypatch.setitem(nielsen2024_plan.GROUP, 6, GROUP)
+    settings = replace(FEW, parts=("recordings",), sensors=("ours",))
+    first = row_of(made[0], part="recordings", sensor="ours", delta_m=0.0)
+    ran: list[float] = []
+
+    def fake(job: Job, *_: Any) -> tuple[dict[str, Any], None]:
+        if len(ran) == 1:
+            raise SystemExit  # as good as a signal: nothing of ours is asked
+        ran.append(job.delta_m)
+        return {**first, **job.key}, None
+
+    monkeypatch.setattr(nielsen2024, "run_job", fake)
+    out, rows = tmp_path / "out", tmp_path / "out.rows.jsonl"
+    with pytest.raises(SystemExit):
+        nielsen2024.reproduce(made_up_data, out, settings)
+    assert not out.exists()
+    assert len(rows.read_text(encoding="utf-8").splitlines()) == 1
+    rows.write_text(rows.read_text(encoding="utf-8") + '{"row": {"part', encoding="utf-8")
+    ran.clear()
+    table = nielsen2024.reproduce(made_up_data, out, settings)
+    assert ran == [0.5]
+    assert [row["delta_m"] for row in table["runs"]] == [0.0, 0.5]
+    assert not rows.exists()
+
+
+def test_all_selectors_make_many_modes_of_data_set_1_and_the_window_is_left_out_of_data_set_2() -> None:
+    planned = {}
+    for dataset in (1, 2, 6):
+        rows = nielsen2024_plan._compared(
+            nielsen2024.Settings(deltas_m=(0.3,)), dataset, partial(Job, dataset=dataset, robot=1)
+        )
+        planned[dataset] = {(job.scenario, job.sensor, job.method) for job in rows}
+    many = {method for scenario, _, method in planned[1] if scenario == "many modes"}
+    assert many == {"max-mixture", "nn", "em", "mcts", "viterbi", "joint"}
+    assert {one for one in planned[2] if one[0] == "no window"} == {("no window", "paper-no-window", "mcts")}
+    assert {scenario for scenario, _, _ in planned[6]} == {"group"}
+    with_window = Job("recordings", "group", 2, 1, "paper", "mcts").config().slam.modes
+    without = Job("recordings", "no window", 2, 1, "paper-no-window", "mcts").config().slam.modes
+    assert with_window.mcts_window_s == 40.0
+    assert without.mcts_window_s > 1e5
+    assert replace_window(without) == replace_window(with_window)
+
+
+def replace_window(modes: Any) -> Any:
+    return modes.model_copy(update={"mcts_window_s": None})
+
+
+def test_places_are_those_that_the_changes_of_a_landmark_lead_through() -> None:
+    landmarks = Landmarks.at([1, 2, 3], [(1.0, 0.0), (5.0, 5.0), (2.0, 2.0)])
+    moves = [change((1,)), replace(change((1,)), displacement_m=(-0.3, 0.0)), change((1,)), change((3,))]
+    result = replace(SimpleResult(changes=tuple(moves)), landmarks=landmarks)
+    assert [(row["landmark"], row["at_m"]) for row in places_of(result)] == [
+        (1, [0.7, 0.0]), (1, [1.0, 0.0]), (3, [1.7, 2.0]), (3, [2.0, 2.0]),
+    ]  # fmt: skip
+
+
+def test_figures_10_and_11_are_of_the_robots_that_have_all(tmp_path: Path) -> None:
+    """Two places too many for a landmark that did not move, one for one that did; robot 2 is half done."""
+    places = [{"landmark": one, "at_m": [0.1 * k, 0.0]} for one, n in ((7, 3), (11, 2)) for k in range(n)]
+    base = {
+        **NOTHING, "part": "recordings", "scenario": "many modes", "dataset": 1, "sensor": "many-modes", "placed": True,
+        "pose_rmse_m": 0.1, "landmark_rmse_m": 0.2, "cpu_s": 21.0, "commit": "abc1234, 2020-01-01",
+    }  # fmt: skip
+    rows = [
+        {**base, "robot": 1, "method": method, "delta_m": 1.0, "places": places if method == "em" else []}
+        for method in ("em", "mcts")
+    ]
+    rows.append({**base, "robot": 2, "method": "em", "delta_m": 1.0, "pose_rmse_m": 9.0})
+    text = nielsen2024.as_markdown(
+        {"simulation": [], "runs": rows, "expected": verdicts([], rows), "evermap": "0",
+         "machine": {"versions": {"python": "3"}, "processor": "x"}, "settings": {"seed": 0, "processes": 1}}
+    )  # fmt: skip
+    section = text.partition("### Dataset 1, many modes (figures 10 and 11)")[2]
+    assert "Rows of commit `abc1234`, 2020-01-01." in section
+    assert "mean of one robot:" in section
+    cells = [line for line in section.splitlines() if line.startswith("| em")]
+    assert cells == ["| em | 0.100 / 0.200 |", "| em | 21.0 |", "| em | 2.0 |", "| em | 1.0 |"]
+    path = {"estimate_m": [[0.0, 0.0], [1.0, 0.0]], "reference_m": [[0.0, 0.1], [1.0, 0.1]], "landmarks_m": [],
+            "delta_m": 1.0, "true_landmarks": {"7": [0.0, 0.0], "11": [0.1, 0.0]}}  # fmt: skip
+    drawn = {f"many modes many-modes {method} dataset 1 robot 1": path for method in ("em", "mcts")}
+    draw_all([], rows, drawn, lambda file: tmp_path / file)
+    assert {file.name.partition("-")[0] for file in tmp_path.iterdir()} == {"fig10", "fig11"}
 
 
 def test_inputs_are_a_wrong_map_or_an_edited_recording(made_up_data: Path) -> None:
@@ -288,7 +378,7 @@ def test_promises_are_measured_at_their_worst() -> None:
     assert found["data set 6, joint: exact set where nothing moved, and from 0.3 m on"]["met"] is True
     assert found["data set 6, joint: no worse than the static map"]["measured"] == 0.5
     assert found["viterbi and joint, slowest recording"]["measured"] == pytest.approx(300.0)
-    assert found["data sets 1 to 3, joint: landmark error"]["met"] is None
+    assert found[f"{OTHERS_NAME}, joint: landmark error"]["met"] is None
 
 
 def test_command_runs_what_is_asked_for(

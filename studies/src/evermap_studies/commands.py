@@ -221,14 +221,22 @@ def nielsen2024(
     dataset: Annotated[
         list[int] | None, typer.Option(help="Only this data set; repeatable.", show_default=False)
     ] = None,
+    robot: Annotated[list[int] | None, typer.Option(help="Only this robot; repeatable.", show_default=False)] = None,
     method: Annotated[list[str] | None, typer.Option(help="Only this method; repeatable.", show_default=False)] = None,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Only this setting of sensor and modes: ours, paper, many-modes or paper-no-window; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
     seed: Seed = 0,
     quick: Quick = False,
     jobs: Jobs = 1,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Find landmarks that moved by all methods, in simulation and in the UTIAS recordings.
+    """Find landmarks that moved by all methods, in simulation and in the UTIAS recordings; goes on where it was ended.
 
     \b
     Example:
@@ -238,7 +246,7 @@ def nielsen2024(
     def compute(target: Path, progress: Progress | None) -> tuple[dict[str, Any], AsText]:
         from evermap_studies.nielsen2024 import study
 
-        chosen = _given(parts=part, datasets=dataset, methods=method)
+        chosen = _given(parts=part, datasets=dataset, robots=robot, methods=method, sensors=sensor)
         wanted = replace(study.QUICK if quick else study.Settings(), seed=seed, processes=jobs, **chosen)
         return study.reproduce(data, target, wanted, progress=progress, force=force), study.as_markdown
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from evermap import __version__, compiled
 from evermap.errors import ConfigError
+from evermap_studies.rows import commit_of_code
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -49,6 +50,7 @@ class Stopwatch:
             "schema_version": schema_version,
             "evermap": __version__,
             "experiment": experiment,
+            "commit": commit_of_code(),
             "scoring": scoring,
             "settings": json.loads(json.dumps(asdict(settings))),
             "machine": machine(cpu / wall),

@@ -1,12 +1,11 @@
 """What a recording contradicts has a cause: is the right one named, and nothing false told?
 
 Every world has one thing that is wrong, or nothing; an oracle that knows it solves the same readings. Rows of runs that
-are done are kept beside the results (`ROWS`), one line each, so that a run that was stopped goes on where it was.
+are done are kept beside the results (`evermap_studies.rows`), so that a run that was stopped goes on where it was.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,14 +18,13 @@ from evermap_studies.causes.catalogue import GROUPS, World, catalogue
 from evermap_studies.causes.judge import Row, errors, judge, make_case, solve
 from evermap_studies.frame import Stopwatch, check_least
 from evermap_studies.markdown import markdown_table, number
+from evermap_studies.rows import RowsFile
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA_VERSION = "1"
 EXPERIMENT = "causes"
-ROWS = ".rows.jsonl"
-"""End of the name of the file with a line a run, beside the folder of results."""
 MOST_WORLDS = 80
 """Worlds that have a line each in the table; of more there is a line for each cause."""
 SCORING = (
@@ -102,7 +100,7 @@ def reproduce(
 
     settings = settings or Settings()
     jobs = planned(settings)
-    path = Path(f"{Path(out)}{ROWS}")
+    path = RowsFile.beside(out).path
     with RunFolder(out, force=force) as folder:
         stopwatch = Stopwatch()
         rows = []
@@ -118,30 +116,18 @@ def reproduce(
 
 def run_all(jobs: Sequence[tuple[World, int]], path: Path | None) -> Iterator[Row]:
     """Return the rows of worlds and seeds, one after the other; those in a file are not run again, others added."""
-    rows = [] if path is None else read_rows(path)
+    file = None if path is None else RowsFile(path)
+    rows = [] if file is None else file.read()
     done = {(row["world"], row["seed"]): row for row in rows}
     oracles = {row["oracle_key"]: {"error_m": row["oracle_m"]} for row in rows if row["oracle_m"] is not None}
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
+    if file is not None:
+        file.write(rows)
     for world, seed in jobs:
         if (world.name, seed) not in done:
             done[world.name, seed] = run(world, seed, oracles)
-            if path is not None:
-                with path.open("a", encoding="utf-8") as lines:
-                    lines.write(f"{json.dumps(done[world.name, seed])}\n")
+            if file is not None:
+                file.add(done[world.name, seed])
         yield done[world.name, seed]
-
-
-def read_rows(path: Path) -> list[Row]:
-    """Return the rows of runs that are done; a last line that was not written whole is none."""
-    rows = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
-        try:
-            rows.append(json.loads(line))
-        except ValueError:
-            continue
-    return rows
 
 
 def run(world: World, seed: int, oracles: dict[str, Row]) -> Row:

@@ -21,6 +21,7 @@ from evermap_studies.lifelong.scores import NOTHING
 from evermap_studies.lifelong.table import as_markdown, verdicts
 from evermap_studies.lifelong.world import DATASET, recorded_world, simulated_world
 from evermap_studies.mrclam.study import find_dataset
+from evermap_studies.rows import RowsFile, run_missing
 
 Row = dict[str, Any]
 
@@ -97,9 +98,9 @@ def reproduce(
     Args:
         data: folder with the MRCLAM recordings.
         out: folder; rows of an older run of parts that were not asked for are kept, all else is replaced. Untouched if
-            this run fails.
+            this run fails, but for the rows beside it, from which it goes on.
         settings: everything where None.
-        progress: told after every session.
+        progress: told after every life of a map.
         force: write into a folder that holds other files, too; they stay.
 
     Returns:
@@ -115,10 +116,10 @@ def reproduce(
     settings = settings or Settings()
     if set(settings.parts) != {SIMULATED_PART}:
         find_dataset(Path(data), DATASET)
-    kept = [row for row in _earlier(Path(out)) if row["part"] not in settings.parts]
+    kept, file = [row for row in _earlier(Path(out)) if row["part"] not in settings.parts], RowsFile.beside(out)
     with RunFolder(out, force=force, inputs=[data]) as folder:
         stopwatch = Stopwatch()
-        rows = [*kept, *_run_all(settings, Path(data), progress)]
+        rows = [*kept, *_run_all(settings, Path(data), file, progress)]
         rows.sort(key=lambda row: PARTS.index(row["part"]))
         table: dict[str, Any] = {
             **stopwatch.head(EXPERIMENT, SCHEMA_VERSION, SCORING, settings),
@@ -127,7 +128,9 @@ def reproduce(
         }
         save_all(_figures(rows), folder.path)
         folder.path("table.md").write_text(as_markdown(table) + "\n", encoding="utf-8")
-        return folder.finish(table)
+        table = folder.finish(table)
+    file.remove()
+    return table
 
 
 def jobs(settings: Settings) -> list[Job]:
@@ -144,22 +147,30 @@ def jobs(settings: Settings) -> list[Job]:
     return [job for part in PARTS if part in settings.parts for job in planned[part]]
 
 
-def _run_all(settings: Settings, data: Path, progress: Progress | None) -> Iterator[Row]:
+def _run_all(settings: Settings, data: Path, file: RowsFile, progress: Progress | None) -> Iterator[Row]:
+    """Yield all rows; those of a life that is in the file are not run again."""
     from evermap.slam.warmup import warm_up
 
     warm_up()  # compiling is no part of the first session
     planned = jobs(settings)
     total, done = sum(job.sessions * len(job.contenders) for job in planned), 0
-    for job in planned:
-        if job.is_simulated:
-            world = simulated_world(job.sessions // 2, job.seed)
-        else:
-            world = recorded_world(data, job.sessions, job.seed)
-        for row in live(world, job.contenders, SIMULATED if job.is_simulated else ()):
-            done += 1
-            if progress is not None:
-                progress(done, total)
-            yield {"part": job.part, "seed": job.seed, **row}
+    keys = [(job.part, job.seed, job.sessions, [who.name for who in job.contenders]) for job in planned]
+    of_key = {str(key): job for key, job in zip(keys, planned, strict=True)}
+    for life in run_missing(file, keys, lambda missing: (_life(of_key[str(key)], data) for key in missing)):
+        done += len(life["sessions"])
+        if progress is not None:
+            progress(done, total)
+        yield from life["sessions"]
+
+
+def _life(job: Job, data: Path) -> Row:
+    """Return the rows of all sessions of a job."""
+    if job.is_simulated:
+        world = simulated_world(job.sessions // 2, job.seed)
+    else:
+        world = recorded_world(data, job.sessions, job.seed)
+    lived = live(world, job.contenders, SIMULATED if job.is_simulated else ())
+    return {"sessions": [{"part": job.part, "seed": job.seed, **row} for row in lived]}
 
 
 def _figures(rows: list[Row]) -> dict[str, Any]:

@@ -22,7 +22,8 @@ from evermap.viz.style import (
     settle,
 )
 from evermap_studies.frame import save_all
-from evermap_studies.nielsen2024.expected import Row, Rows, chosen, mean, weights
+from evermap_studies.nielsen2024.expected import Row, Rows, chosen, complete, mean, weights
+from evermap_studies.nielsen2024.plan import GROUP, GROUP_SCENARIO, MANY_DATASET, MANY_METHODS, MANY_SCENARIO
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,15 +54,19 @@ def draw_all(simulation: Rows, runs: Rows, paths: Mapping[str, Row], path: Calla
     figures: dict[str, Figure] = {}
     if simulation:
         figures["fig6-7-selectors"] = _draw_selectors(simulation)
-    drawn = {key: value for key, value in paths.items() if key.startswith("group ours")}
-    if drawn:
-        figures["fig8-trajectories"] = _draw_paths(drawn)
-    compared = chosen(runs, part="recordings", scenario="group")
+    for sensor in _SENSORS:
+        drawn = {key: value for key, value in paths.items() if key.startswith(f"{GROUP_SCENARIO} {sensor} ")}
+        if drawn:
+            figures[f"fig8-trajectories-{sensor}"] = _draw_paths(drawn)
+    compared = chosen(runs, part="recordings", scenario=GROUP_SCENARIO)
     if compared:
         figures["fig9-displacement"] = _draw_displacements(compared)
-    many = chosen(runs, part="recordings", scenario="many modes")
+    many = complete(chosen(runs, part="recordings", scenario=MANY_SCENARIO))
     if many:
         figures["fig10-many-modes"] = _draw_many(many)
+        made = {key: value for key, value in paths.items() if key.startswith(MANY_SCENARIO)}
+        if made:
+            figures["fig11-many-places"] = _draw_places(made, many)
     said, right = weights(runs)
     if said:
         figures["reliability"] = _draw_reliability(said, right)
@@ -170,10 +175,56 @@ def _draw_paths(paths: Mapping[str, Row]) -> Figure:
             )
             for method in (method for method in _DRAWN_METHODS if method in own):
                 axes.plot(*np.array(own[method]["estimate_m"]).T, color=_STYLE[method][0], lw=0.7, label=method)
+            _draw_landmarks(axes, int(name.split()[0]), next(iter(own.values())))
             axes.set(aspect="equal", xlabel="x [m]", title=f"data set {name}")
         panels[0].set_ylabel("y [m]")
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        settle(figure)
+    return figure
+
+
+def _draw_landmarks(axes: Axes, dataset: int, path: Row) -> None:
+    """True places; those of the group that the map has displaced in colour."""
+    true = path.get("true_landmarks", {})
+    for colour, label, moved in ((MUTED, "landmarks", False), (ODOMETRY, "displaced in the map", True)):
+        at = [place for identity, place in true.items() if (int(identity) in GROUP[dataset]) == moved]
+        if at:
+            axes.plot(*np.array(at).T, "o", color=colour, ms=3, label=label, zorder=0)
+
+
+def _draw_places(paths: Mapping[str, Row], rows: Rows) -> Figure:
+    """Figure 11: trajectory, and every place of every landmark, of the first robot by each method."""
+    robot = min(key.rpartition(" robot ")[2] for key in paths)
+    own = {
+        key.removeprefix(MANY_SCENARIO).split()[1]: value
+        for key, value in paths.items()
+        if key.endswith(f" robot {robot}")
+    }
+    methods = [method for method in MANY_METHODS if method in own]
+    with house_style():
+        figure = new_figure(7.2, 2.6 * ((len(methods) + 2) // 3) + 0.6)
+        panels = figure.subplots((len(methods) + 2) // 3, 3, squeeze=False, sharex=True, sharey=True).ravel()
+        for axes in panels[len(methods) :]:
+            axes.set_visible(False)
+        for axes, method in zip(panels, methods, strict=False):
+            path = own[method]
+            axes.plot(*np.array(path["reference_m"]).T, color=INK, lw=2.0, alpha=0.2, label="reference")
+            axes.plot(*np.array(path["estimate_m"]).T, color=_STYLE[method][0], lw=0.6, label="estimate")
+            _draw_landmarks(axes, MANY_DATASET, path)
+            run = next(
+                row for row in rows
+                if (row["method"], str(row["robot"])) == (method, robot) and row["delta_m"] == path["delta_m"]
+            )  # fmt: skip
+            if run["places"]:
+                at = np.array([place["at_m"] for place in run["places"]])
+                axes.plot(*at.T, "*", color=ALERT, ms=4, label="places of landmarks with several")
+            axes.set(aspect="equal", title=f"{method}")
+        handles: dict[str, Any] = {}
+        for axes in panels[: len(methods)]:
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                handles.setdefault(label, handle)
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3)
         settle(figure)
     return figure
 

@@ -17,6 +17,7 @@ from evermap.metrics.trajectory import interpolate
 from evermap.types import FloatArray, Landmarks, MapChange, Recording, SlamResult, Trajectory
 from evermap_studies.mrclam.study import PRIOR_SIGMA_M, find_dataset
 from evermap_studies.nielsen2024.scores import change_scores, run_scores
+from evermap_studies.rows import commit_of_code
 from evermap_studies.worlds.edited import edited, limited
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ Row = dict[str, Any]
 
 BUILDING = 0
 """'Data set' of the simulated building; its 'robots' are seeds."""
+PLACE_DECIMALS = 3
 PAPER_RANGE_M, PAPER_BEARING_RAD = 5.0, 0.4
 """Detections beyond these were disregarded by the paper."""
 _PAPER = (
@@ -41,12 +43,15 @@ _PAPER = (
     f"sensor.bearing_min_rad={-PAPER_BEARING_RAD}",
     f"sensor.bearing_max_rad={PAPER_BEARING_RAD}",
 )
+_PAPER_MODES = ("slam.modes.gate_probability=0.95", "slam.modes.switch_probability=0.0001")
 SENSORS: dict[str, tuple[str, ...]] = {
     "ours": (),
-    "paper": (*_PAPER, "slam.modes.gate_probability=0.95", "slam.modes.switch_probability=0.0001"),
+    "paper": (*_PAPER, *_PAPER_MODES),
     "many-modes": (*_PAPER, "slam.modes.gate_probability=0.8", "slam.modes.switch_probability=0.1"),
+    "paper-no-window": (*_PAPER, *_PAPER_MODES, "slam.modes.mcts_window_s=1e6"),
 }
-"""Settings by name: our defaults, the paper's of section 8.2.2, and those of 8.2.4 that make many modes.
+"""Settings by name: our defaults, the paper's of section 8.2.2, those of 8.2.4 that make many modes, and the paper's
+with a tree search that decides from the start of the recording on (8.3), instead of over the last 40 s.
 
 The paper's odometry noise is not in its text. Three times what a run starts from is about what a static run with the
 paper's sensor model learns from the recordings (0.15 rad for every square root of a radian turned); with less, the
@@ -60,6 +65,8 @@ NOTHING: Row = {
     "exact": False,
     "changes": [],
     "alternatives": [],
+    "places": [],
+    "commit": None,
     **dict.fromkeys(
         (
             "pose_rmse_m", "pose_seen_rmse_m", "pose_max_m", "heading_rmse_deg", "pose_true_rmse_m",
@@ -219,7 +226,7 @@ def run_job(job: Job, data: Path, reference: Reference) -> tuple[Row, SlamResult
     try:
         result = run_slam(replace(recording, truth=None, true_landmarks=None), config, prior_map=prior)
     except (DataError, NumericalError) as error:
-        return {**job.key, **NOTHING, "failure": error.one_line()}, None
+        return {**job.key, **NOTHING, "failure": error.one_line(), "commit": commit_of_code()}, None
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     if result.interrupted:
         raise KeyboardInterrupt
@@ -229,6 +236,8 @@ def run_job(job: Job, data: Path, reference: Reference) -> tuple[Row, SlamResult
         **NOTHING,
         **run_scores(recording, result, reference.trajectory, original.truth, at),
         **change_scores(true_changes(job, original), result, original, job.during),
+        "places": places_of(result),
+        "commit": commit_of_code(),
         "recording_s": float(np.ptp(recording.frames.stamp_s)),
         "frames": len(result.step_s),
         "wall_s": wall,
@@ -236,6 +245,24 @@ def run_job(job: Job, data: Path, reference: Reference) -> tuple[Row, SlamResult
         "step_p99_ms": float(np.percentile(1e3 * result.step_s, 99)),
     }
     return row, result
+
+
+def places_of(result: SlamResult) -> list[Row]:
+    """Return where each landmark was by the run, a row a place: the last one, and those that its changes led from.
+
+    Nothing of a landmark that is at one place all the time.
+    """
+    found: list[Row] = []
+    for identity, position_m in zip(
+        result.landmarks.landmark_id.tolist(), result.landmarks.position_m.tolist(), strict=True
+    ):
+        trail = [position_m]
+        for change in reversed(result.changes):
+            if identity in change.landmark_ids:
+                trail.append([at - by for at, by in zip(trail[-1], change.displacement_m, strict=True)])
+        distinct = {tuple(round(float(at), PLACE_DECIMALS) for at in place) for place in trail}
+        found += [{"landmark": identity, "at_m": list(place)} for place in sorted(distinct)] if len(trail) > 1 else []
+    return found
 
 
 def warm_up(jobs: Sequence[Job], data: Path) -> None:

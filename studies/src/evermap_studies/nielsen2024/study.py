@@ -2,7 +2,8 @@
 
 That is the joint search, changes during a run, changes of other kinds, and probabilities that mean what they say.
 Four parts, each of which can be run alone: what an older run left in the folder of the other parts, data sets and
-methods stays in the tables.
+methods stays in the tables. Every run is kept at once in a file beside the folder (`evermap_studies.rows`), from which
+a study that was ended goes on; each row says of which commit its code is.
 """
 
 from __future__ import annotations
@@ -24,9 +25,19 @@ from evermap.types import Progress, SlamResult
 from evermap_studies.frame import Stopwatch
 from evermap_studies.nielsen2024.figures import draw_all
 from evermap_studies.nielsen2024.plan import METHODS, PARTS, QUICK, Settings, jobs
-from evermap_studies.nielsen2024.runs import NOTHING, Job, Reference, reference_of, run_job, warm_up
+from evermap_studies.nielsen2024.runs import (
+    NOTHING,
+    Job,
+    Reference,
+    recording_of,
+    reference_of,
+    run_job,
+    survey_of,
+    warm_up,
+)
 from evermap_studies.nielsen2024.simulation import BUDGET_NOISE_M2, budget_rows, selector_rows, slam_rows
 from evermap_studies.nielsen2024.table import as_markdown, verdicts
+from evermap_studies.rows import RowsFile, commit_of_code
 from evermap_studies.workers import sheltered
 
 Row = dict[str, Any]
@@ -57,7 +68,7 @@ def reproduce(
         data: folder with the MRCLAM recordings.
         out: folder; rows of an older run that were not asked for are kept, all else is replaced. Untouched if this
             run fails; an interrupt keeps what was done.
-        settings: everything where None.
+        settings: everything where None. What the file beside the folder has is not run again.
         progress: told after every run.
         force: write into a folder that holds other files, too; they stay.
 
@@ -71,28 +82,34 @@ def reproduce(
     from evermap.runs.folder import RunFolder
 
     settings = settings or Settings()
-    planned = jobs(settings, Path(data))
     earlier, paths = _earlier(Path(out))
+    kept = RowsFile.beside(out)
+    done: dict[tuple[Any, ...], Row] = {}
+    for line in kept.read():
+        done[_key(line["row"])] = line["row"]
+        paths |= line["paths"]
+    planned = [job for job in jobs(settings, Path(data)) if _key(job.key) not in done]
     with RunFolder(out, force=force, inputs=[data]) as folder:
         stopwatch = Stopwatch()
         simulation = earlier["simulation"]
         if "simulation" in settings.parts:
             asked = (settings.noises_m2, settings.runs, settings.modes, settings.seed)
             simulation = [*selector_rows(*asked), *slam_rows(*asked), *budget_rows(BUDGET_NOISE_M2, *asked[1:])]
-        done: list[Row] = []
+            simulation = [{**row, "commit": commit_of_code()} for row in simulation]
         interrupted = False
         try:
             with watched() as watch:
                 for job, row, path in _run_all(planned, Path(data), settings.processes, progress):
-                    done.append(row)
-                    if path is not None:
-                        paths[_path_key(job)] = path
+                    done[_key(row)] = row
+                    drawn = {} if path is None else {_path_key(job): path}
+                    paths |= drawn
+                    kept.add({"row": row, "paths": drawn})
                     watch.stop_if_asked()
         except KeyboardInterrupt:
             if not done:
                 raise
             interrupted = True
-        runs = _merged(earlier["runs"], done)
+        runs = _merged(earlier["runs"], done.values())
         table: dict[str, Any] = {
             **stopwatch.head(EXPERIMENT, SCHEMA_VERSION, SCORING, settings),
             "expected": verdicts(simulation, runs),
@@ -104,7 +121,8 @@ def reproduce(
         folder.path(PATHS).write_text(json.dumps(paths, sort_keys=True) + "\n", encoding="utf-8")
         table = folder.finish(table)
     if interrupted:
-        raise KeyboardInterrupt(f"{len(done)} of {len(planned)} runs were done; they are in {out}")
+        raise KeyboardInterrupt(f"{len(done)} runs were done; they are in {out}, and go on from {kept.path}")
+    kept.remove()
     return table
 
 
@@ -156,11 +174,12 @@ def _run(job: Job, data: Path, reference: Reference) -> tuple[Row, Row | None]:
     """A row, and what a figure of trajectories needs where the run is in one."""
     row, result = run_job(job, data, reference)
     drawn = job.part == "recordings" and job.delta_m == _DRAWN_DELTA_M[job.dataset]
-    return row, _path(result, reference) if drawn and result is not None else None
+    return row, _path(result, reference, job, data) if drawn and result is not None else None
 
 
-def _path(result: SlamResult, reference: Reference) -> Row:
+def _path(result: SlamResult, reference: Reference, job: Job, data: Path) -> Row:
     """Estimate and reference, thinned out, with the landmarks: what is drawn."""
+    truth = survey_of(recording_of(data, job.dataset, job.robot))
     stamps = result.trajectory.stamp_s
     rows = np.unique(np.searchsorted(stamps, np.arange(stamps[0], stamps[-1], _PATH_STEP_S)))
     known = np.searchsorted(reference.trajectory.stamp_s, stamps[rows])
@@ -168,7 +187,11 @@ def _path(result: SlamResult, reference: Reference) -> Row:
     return {
         "estimate_m": np.round(result.trajectory.pose_world_robot[rows, :2], 3).tolist(),
         "reference_m": np.round(reference.trajectory.pose_world_robot[known, :2], 3).tolist(),
+        "delta_m": job.delta_m,
         "landmarks_m": np.round(result.landmarks.position_m, 3).tolist(),
+        "true_landmarks": dict(
+            zip(map(str, truth.landmark_id.tolist()), np.round(truth.position_m, 3).tolist(), strict=True)
+        ),
     }
 
 

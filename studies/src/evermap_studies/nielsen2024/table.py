@@ -7,7 +7,9 @@ from typing import Any
 
 from evermap.metrics.belief import belief_scores
 from evermap_studies.markdown import markdown_table, number
-from evermap_studies.nielsen2024.expected import Row, Rows, chosen, mean, verdicts, weights
+from evermap_studies.nielsen2024.expected import Row, Rows, chosen, complete, distinct, mean, verdicts, weights
+from evermap_studies.nielsen2024.plan import GROUP, MANY_DATASET, MANY_SCENARIO, WINDOW_DATASET, WINDOW_SCENARIO
+from evermap_studies.rows import sources
 
 SELECTORS = ("nn", "em", "mcts", "viterbi")
 PARTLY_TRUE = 3
@@ -20,17 +22,18 @@ def as_markdown(table: Mapping[str, Any]) -> str:
     simulation, runs = table["simulation"], table["runs"]
     parts = [_expected(table["expected"]), _machine(table)]
     if simulation:
-        parts += ["### Simulation (figures 6 and 7)", _wrong_modes(simulation), _errors(simulation), _costs(simulation)]
-        parts += [_budgets(simulation)]
+        parts += ["### Simulation (figures 6 and 7)", sources(simulation)]
+        parts += [_wrong_modes(simulation), _errors(simulation), _costs(simulation), _budgets(simulation)]
     compared = chosen(runs, part="recordings", scenario="group")
-    for dataset in _distinct(compared, "dataset"):
-        parts += [f"### Dataset {dataset}: the map's group displaced (figure 9)"]
+    for dataset in distinct(compared, "dataset"):
+        of_dataset = chosen(compared, dataset=dataset)
+        parts += [f"### Dataset {dataset}: the map's group displaced (figure 9)", sources(of_dataset)]
         for sensor, title in SENSOR_TITLES.items():
-            rows = chosen(compared, dataset=dataset, sensor=sensor)
+            rows = chosen(of_dataset, sensor=sensor)
             if rows:
                 parts += [f"Position / landmark error [m], mean of {_robots(rows)}, {title}:"]
                 parts += [_by_delta(rows, "method", _both)]
-        own = chosen(compared, dataset=dataset, sensor="ours")
+        own = chosen(of_dataset, sensor="ours")
         if own:
             parts += ["Position error while landmarks were in view [m], our sensor model:"]
             parts += [_by_delta(own, "method", _mean_of("pose_seen_rmse_m"))]
@@ -40,18 +43,67 @@ def as_markdown(table: Mapping[str, Any]) -> str:
         joint = chosen(own, method="joint")
         if joint:
             parts += ["Joint search, what was found:", _by_delta(joint, "method", _exact_of)]
-    many = chosen(runs, part="recordings", scenario="many modes")
+    many = complete(chosen(runs, part="recordings", scenario=MANY_SCENARIO))
     if many:
-        parts += ["### Dataset 1, many modes (figure 10)", _by_delta(many, "method", _both)]
+        parts += [f"### Dataset {MANY_DATASET}, many modes (figures 10 and 11)", sources(many), *_many_modes(many)]
+    whole = complete(chosen(runs, part="recordings", scenario=WINDOW_SCENARIO))
+    if whole:
+        parts += [f"### Dataset {WINDOW_DATASET}, tree search with and without the window of 40 s (section 8.3)"]
+        parts += [sources(whole), *_windows(whole, compared)]
     if compared:
-        parts += ["### Execution time", _times(compared)]
+        parts += ["### Execution time", sources(compared), _times(compared)]
     during = chosen(runs, part="during")
     if during:
-        parts += ["### The group moves at half time", _during(during)]
+        parts += ["### The group moves at half time", sources(during), _during(during)]
     search = chosen(runs, part="search")
     if search:
-        parts += ["### Changes of other kinds, joint search", _search(search), _reliability(runs)]
-    return "\n\n".join(parts)
+        parts += ["### Changes of other kinds, joint search", sources(search), _search(search), _reliability(runs)]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _many_modes(rows: Rows) -> list[str]:
+    """Errors, times and places by method, figures 10 and 11."""
+    moved = set(GROUP[MANY_DATASET])
+
+    def places(of_moved: bool) -> Callable[[Rows], str]:
+        return lambda own: number("{:.1f}", _mean_places(own, moved, of_moved))
+
+    return [
+        f"Position / landmark error [m], mean of {_robots(rows)}:",
+        _by_delta(rows, "method", _both),
+        "Seconds a recording:",
+        _by_delta(rows, "method", _mean_of("cpu_s", "{:.1f}")),
+        "Landmarks that did not move, places made for them, mean of a recording (right: 0):",
+        _by_delta(rows, "method", places(False)),
+        f"The {len(moved)} landmarks that moved, places beside the first (right: {len(moved)} from 0.1 m on):",
+        _by_delta(rows, "method", places(True)),
+    ]
+
+
+def _mean_places(rows: Rows, moved: set[int], of_moved: bool) -> float | None:
+    """Return how many places beside one each landmark was given, in sum, mean of the runs; None of no runs."""
+    extra = 0
+    for row in rows:
+        own = [place["landmark"] for place in row["places"] if (place["landmark"] in moved) == of_moved]
+        extra += len(own) - len(set(own))
+    return extra / len(rows) if rows else None
+
+
+def _windows(whole: Rows, compared: Rows) -> list[str]:
+    """Errors and times of the tree search with its window and without, the same recordings and displacements."""
+    pairs = {(row["robot"], row["delta_m"]) for row in whole}
+    windowed = [
+        row
+        for row in chosen(compared, dataset=WINDOW_DATASET, sensor="paper", method="mcts")
+        if (row["robot"], row["delta_m"]) in pairs
+    ]
+    rows = [{**row, "method": name} for name, some in (("40 s", windowed), ("none", whole)) for row in some]
+    return [
+        f"Position / landmark error [m], mean of {_robots(rows)}, the paper's sensor model and limits:",
+        _by_delta(rows, "method", _both),
+        "Seconds a recording:",
+        _by_delta(rows, "method", _mean_of("cpu_s", "{:.1f}")),
+    ]
 
 
 def _expected(rows: Sequence[Row]) -> str:
@@ -76,7 +128,7 @@ def _machine(table: Mapping[str, Any]) -> str:
 def _wrong_modes(simulation: Rows) -> str:
     rows = chosen(simulation, figure="6")
     lines = []
-    for noise in _distinct(rows, "noise_m2"):
+    for noise in distinct(rows, "noise_m2"):
         cells = [_with_error(_one(rows, noise, name), "wrong_share", "{:.4f}") for name in SELECTORS]
         lines.append((f"{noise:g}", *cells))
     head = ("r [m²]", *(f"{name}, wrong modes" for name in SELECTORS))
@@ -86,7 +138,7 @@ def _wrong_modes(simulation: Rows) -> str:
 def _errors(simulation: Rows) -> str:
     rows = chosen(simulation, figure="7")
     lines = []
-    for noise in _distinct(rows, "noise_m2"):
+    for noise in distinct(rows, "noise_m2"):
         cells = [_with_error(_one(rows, noise, name), "rmse_m", "{:.3f}") for name in SELECTORS]
         lines.append((f"{noise:g}", *cells))
     return markdown_table(("r [m²]", *(f"{name}, error [m]" for name in SELECTORS)), lines)
@@ -127,10 +179,10 @@ def _budgets(simulation: Rows) -> str:
 
 
 def _by_delta(rows: Rows, key: str, cell: Callable[[Rows], str]) -> str:
-    deltas = _distinct(rows, "delta_m")
+    deltas = distinct(rows, "delta_m")
     lines = [
         (str(value), *(cell(chosen(rows, delta_m=delta, **{key: value})) for delta in deltas))
-        for value in _distinct(rows, key)
+        for value in distinct(rows, key)
     ]
     return markdown_table((key, *(f"{delta:g} m" for delta in deltas)), lines)
 
@@ -142,8 +194,8 @@ def _both(rows: Rows) -> str:
     return text if len(placed) == len(rows) else f"{text} ({len(placed)} of {len(rows)})"
 
 
-def _mean_of(key: str) -> Callable[[Rows], str]:
-    return lambda rows: number("{:.3f}", mean(rows, key))
+def _mean_of(key: str, form: str = "{:.3f}") -> Callable[[Rows], str]:
+    return lambda rows: number(form, mean(rows, key))
 
 
 def _exact_of(rows: Rows) -> str:
@@ -154,7 +206,7 @@ def _exact_of(rows: Rows) -> str:
 
 def _times(rows: Rows) -> str:
     lines = []
-    for method in _distinct(rows, "method"):
+    for method in distinct(rows, "method"):
         for sensor in SENSOR_TITLES:
             cells = [_time_of(chosen(rows, method=method, sensor=sensor, dataset=dataset)) for dataset in (1, 2, 3, 6)]
             lines.append((method, sensor, *cells))
@@ -174,9 +226,9 @@ def _time_of(rows: Rows) -> str:
 
 def _during(rows: Rows) -> str:
     lines = []
-    for dataset in _distinct(rows, "dataset"):
-        for delta in _distinct(rows, "delta_m"):
-            for method in _distinct(rows, "method"):
+    for dataset in distinct(rows, "dataset"):
+        for delta in distinct(rows, "delta_m"):
+            for method in distinct(rows, "method"):
                 own = chosen(rows, dataset=dataset, delta_m=delta, method=method)
                 joint = method == "joint"
                 lines.append(
@@ -197,8 +249,8 @@ def _during(rows: Rows) -> str:
 
 def _search(rows: Rows) -> str:
     lines = []
-    for scenario in _distinct([{**row, "scenario": _scenario(row)} for row in rows], "scenario"):
-        for dataset in _distinct(rows, "dataset"):
+    for scenario in distinct([{**row, "scenario": _scenario(row)} for row in rows], "scenario"):
+        for dataset in distinct(rows, "dataset"):
             own = [row for row in rows if _scenario(row) == scenario and row["dataset"] == dataset]
             if own:
                 name = f"{dataset}" if dataset else "building"
@@ -241,12 +293,8 @@ def _one(rows: Rows, noise: float, selector: str) -> Row:
 
 
 def _robots(rows: Rows) -> str:
-    count = len(_distinct(rows, "robot"))
+    count = len(distinct(rows, "robot"))
     return f"{count} robots" if count > 1 else "one robot"
-
-
-def _distinct(rows: Rows, key: str) -> list[Any]:
-    return list(dict.fromkeys(row[key] for row in rows))
 
 
 __all__ = ["as_markdown", "verdicts"]

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from evermap.maps.living import LivingMap
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
 from evermap_studies.frame import Stopwatch, check_least
 from evermap_studies.partial_views.table import as_markdown
+from evermap_studies.rows import RowsFile, run_missing
 from evermap_studies.sim import (
     CLUTTER,
     DEFAULT_CLASSES,
@@ -96,7 +98,7 @@ def reproduce(
     """Run everything, and write `summary.json`, `table.md` and the figures.
 
     Args:
-        out: folder for the results; untouched if this run fails.
+        out: folder for the results; untouched if this run fails, but for the rows beside it, from which it goes on.
         settings: what to run; None for everything.
         progress: told after every world.
         force: write into a folder that holds other files, too; they stay.
@@ -112,7 +114,7 @@ def reproduce(
     from evermap_studies.frame import save_all
     from evermap_studies.partial_views.figures import draw_false_changes, draw_reliability
 
-    settings = settings or Settings()
+    settings, kept = settings or Settings(), RowsFile.beside(out)
     worlds = [(settings.seed + k, patrol) for patrol in settings.patrols_s for k in range(settings.buildings)]
     total = float(len(worlds) * settings.sessions * len(settings.parts))
     with RunFolder(out, force=force) as folder:
@@ -120,7 +122,8 @@ def reproduce(
         found: dict[str, list[Row]] = {part: [] for part in PARTS}
         for part in settings.parts:
             of_part = settings if part == "changing" else replace(settings, change_rate=0.0)
-            for row in _each_world(of_part, worlds):
+            runs = [(part, *world, settings.sessions, of_part.change_rate) for world in worlds]
+            for row in run_missing(kept, runs, partial(_each_world, of_part)):
                 found[part].append(row)
                 if progress is not None:
                     progress(float(sum(map(len, found.values())) * settings.sessions), total)
@@ -133,10 +136,13 @@ def reproduce(
             figures = {"reliability": draw_reliability(content), "false-changes": draw_false_changes(content)}
             save_all(figures, folder.path)
         folder.path("table.md").write_text(as_markdown(content) + "\n", encoding="utf-8")
-        return folder.finish(content)
+        content = folder.finish(content)
+    kept.remove()
+    return content
 
 
-def _each_world(settings: Settings, worlds: list[tuple[int, int]]) -> Iterable[Row]:
+def _each_world(settings: Settings, runs: list[tuple[str, int, int, int, float]]) -> Iterable[Row]:
+    worlds = [(seed, patrol_s) for _, seed, patrol_s, *_ in runs]
     if settings.processes == 1:
         yield from (live(settings, *world) for world in worlds)
         return

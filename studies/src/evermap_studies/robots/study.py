@@ -17,6 +17,7 @@ from evermap.slam.calibration import NAMES
 from evermap.types import Progress, Recording
 from evermap_studies.frame import Stopwatch, check_least
 from evermap_studies.markdown import markdown_table, number
+from evermap_studies.rows import RowsFile, run_missing
 from evermap_studies.worlds.robots import Robot, draw_robot, simulate_robot
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def reproduce(
     """Run everything, and write `summary.json`, `table.md` and the figure.
 
     Args:
-        out: folder for the results; untouched if this run fails.
+        out: folder for the results; untouched if this run fails, but for the rows beside it, from which it goes on.
         settings: what to run; None for everything.
         progress: told after every robot.
         force: write into a folder that holds other files, too; they stay.
@@ -75,17 +76,20 @@ def reproduce(
     from evermap.runs.folder import RunFolder
     from evermap_studies.frame import save_all
 
-    settings = settings or Settings()
+    settings, kept = settings or Settings(), RowsFile.beside(out)
     with RunFolder(out, force=force) as folder:
         stopwatch, robots = Stopwatch(), []
-        for number_ in range(settings.robots):
-            robots.append(run(settings.seed + number_))
+        seeds = range(settings.seed, settings.seed + settings.robots)
+        for row in run_missing(kept, seeds, lambda missing: map(run, missing)):
+            robots.append(row)
             if progress is not None:
-                progress(float(number_ + 1), float(settings.robots))
+                progress(float(len(robots)), float(settings.robots))
         content = {**stopwatch.head(EXPERIMENT, SCHEMA_VERSION, SCORING, settings), "robots": robots}
         save_all({"errors": draw(content)}, folder.path)
         folder.path("table.md").write_text(as_markdown(content) + "\n", encoding="utf-8")
-        return folder.finish(content)
+        content = folder.finish(content)
+    kept.remove()
+    return content
 
 
 def run(seed: int) -> Row:
