@@ -140,7 +140,7 @@ LIMITS = (
         "the calibration is not as stated", "what is known of it, in sensor.toml",
     ),
     Limit(
-        "clocks", "shift", "poses by the other clock are {:.1f} standard deviations away", -inf, 2.0, WEAK,
+        "clocks", "shift", "poses by the other clock are {:.1f} standard deviations away", -inf, 1.0, WEAK,
         "odometry and detections are stamped differently, and nothing says which clock is right",
         "stamps of one clock, or the delay of the odometry taken off its stamps",
     ),
