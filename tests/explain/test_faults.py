@@ -133,6 +133,31 @@ def test_a_robot_that_is_carried_is_told_and_the_run_is_sound(make: Any) -> None
     assert result.verdict.causes == (cause,)
 
 
+def displaced_unseen(blind_s: float, ahead_m: float) -> Any:
+    """The odometry begins anew elsewhere, and the frames about it saw nothing."""
+    recording = in_space()
+    odometry, seen = recording.odometry, recording.detections
+    pose = odometry.pose_world_robot.copy()
+    pose[odometry.stamp_s >= 15.0, 0] += ahead_m
+    away = np.abs(recording.frames.stamp_s[seen.frame] - 15.0) > 0.5 * blind_s
+    return replace(recording, odometry=replace(odometry, pose_world_robot=pose), detections=seen[np.flatnonzero(away)])
+
+
+def test_poses_are_unknown_where_the_odometry_jumps_unseen() -> None:
+    """Where among the frames that saw nothing the jump was, nothing tells, and no step is as long as it."""
+    result = run_slam(displaced_unseen(1.0, 6.0))
+    (cause,) = result.causes
+    assert cause.code == "odometry-jumps"
+    assert cause.value == pytest.approx(6.0, abs=0.2)
+    assert "while nothing was seen" in cause.message
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+
+
+def test_frames_that_saw_nothing_are_no_jump() -> None:
+    assert not run_slam(displaced_unseen(1.0, 0.0)).causes
+
+
 def test_an_odometry_that_seems_far_too_short_is_asked_about() -> None:
     """Alone, tags of another size than stated only bend the odometry, which is taken for noisy."""
     result = run_slam(World(seed=4, longer=1.25).space())

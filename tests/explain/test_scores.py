@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evermap import run_slam
+from evermap import run_session, run_slam
 from evermap.config import Config
 from evermap.explain import scores
 from evermap.explain.causes import Inputs, list_suspects
-from evermap.explain.scores import SIGNIFICANT, CalibrationScore, SessionScores, _count_adrift, score_session
+from evermap.explain.scores import DRIFT, SIGNIFICANT, CalibrationScore, SessionScores, _count_adrift, score_session
 from evermap.explain.symptoms import Signs, with_scores
 from evermap.explain.verdict import judge_signs
 from evermap.geometry import se3
@@ -145,6 +145,44 @@ def test_clocks_that_drift_apart_are_suspected(kind: str, faster: float) -> None
     assert f"{'fast' if faster > 0.0 else 'slow'} of that of the odometry" in verdict.message
 
 
+def with_blind_frames(recording: Any) -> Any:
+    """See nothing in two of three frames of every fourth second."""
+    seen = recording.detections
+    at_s = recording.frames.stamp_s[seen.frame]
+    return replace(recording, detections=seen[np.flatnonzero((at_s.astype(int) % 4 > 0) | (seen.frame % 3 == 0))])
+
+
+def test_clocks_that_drift_apart_are_suspected_though_frames_saw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within an interval of several steps the axes of the odometry's noise are any: a clock does not turn them."""
+    recording = with_clock(with_blind_frames(World(seed=1).space()), 0.004)
+    found = scored(recording, None)
+    (own,) = (one for one in found.calibrations if one.suspect is DRIFT)
+    assert found.suspected is own
+    assert own.value == pytest.approx(0.004, rel=0.25)
+    monkeypatch.setattr(scores, "FINE_STEP", 0.2 * scores.FINE_STEP)
+    (again,) = (one for one in scored(recording, None).calibrations if one.suspect is DRIFT)
+    assert (again.gain, again.sigma) == pytest.approx((own.gain, own.sigma), rel=0.05)
+
+
+def test_clocks_that_drift_apart_move_poses_at_the_ends_most() -> None:
+    world = World(seed=1)
+    recording = with_clock(world.plane(), 0.004)
+    result = run_slam(recording)
+    (own,) = (one for one in scored(recording, None).calibrations if one.suspect is DRIFT)
+    path = result.trajectory
+    speed = np.linalg.norm(np.gradient(path.pose_world_robot[:, :2], path.stamp_s, axis=0), axis=1)
+    off_m = own.value * np.abs(path.stamp_s - path.stamp_s.mean()) * speed
+    sigma_m = math.sqrt(np.median(np.trace(path.covariance[:, :2, :2], axis1=1, axis2=2)))
+    assert own.shift == pytest.approx(off_m.max() / sigma_m, rel=0.3)
+    assert off_m.max() > 2.0 * np.median(off_m)
+
+
+def test_a_clock_that_is_slewed_over_a_network_is_as_usual() -> None:
+    slewed, wrong = (CalibrationScore(DRIFT, rate, 1e-5, 50.0, 3.0) for rate in (0.0004, 0.0007))
+    assert SessionScores((slewed,)).suspected is None
+    assert SessionScores((slewed, wrong)).suspected is wrong
+
+
 @pytest.mark.parametrize("kind", ["plane", "corners"])
 def test_clocks_are_asked_where_frames_begin_and_end_with_the_odometry(kind: str) -> None:
     world = World(seed=1, seconds=20.0)
@@ -242,3 +280,24 @@ def test_runs_are_asked_what_they_held() -> None:
         assert verdict is not None
         assert verdict.kind is kind, verdict.message
         assert ("mounts of all sensors are -0.0" in verdict.message) is (recording is wrong)
+
+
+@pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow)])
+def test_sessions_of_a_map_are_asked_what_they_held(kind: str) -> None:
+    """They fit the map, and the clock that drifts is taken for noise: only the score tells."""
+    living, kinds = None, []
+    for seed, faster in ((1, 0.0), (2, 0.0), (3, 0.004)):
+        world = World(seed=seed)
+        recording: Any = with_clock(world.plane() if kind == "plane" else world.space(), faster)
+        frames, driven, day_s = recording.frames, recording.odometry, 86400.0 * seed
+        recording = replace(
+            recording,
+            frames=replace(frames, stamp_s=frames.stamp_s + day_s),
+            odometry=replace(driven, stamp_s=driven.stamp_s + day_s),
+        )
+        entered = run_session(recording, living)
+        assert entered.found
+        assert entered.slam.verdict is not None
+        living, kinds = entered.living, [*kinds, entered.slam.verdict.kind]
+    assert kinds == [VerdictKind.SOUND, VerdictKind.SOUND, VerdictKind.SENSOR_SUSPECT]
+    assert "fast of that of the odometry" in entered.slam.verdict.message

@@ -148,17 +148,20 @@ def test_a_scale_far_from_what_is_stated_is_weak_until_a_map_says_which_is_right
         assert "stated-scale" not in alarms(result, recording, given)
 
 
-def test_a_long_delay_is_weak_since_nothing_says_whose_it_is() -> None:
+def test_a_delay_is_weak_where_it_may_be_the_sensors() -> None:
     recording, survey = recorded()
     result = run_slam(recording, prior_map=survey)
-    for delay_s, expected in ((-0.3, True), (0.3, True), (0.14, False)):
+    late = (-0.3, 0.001, True), (0.3, 0.001, True), (0.14, 0.001, False), (0.14, 0.01, True)
+    early = (-0.12, 0.001, True), (-0.04, 0.001, False)  # nothing is stamped before it happened
+    for delay_s, sigma_s, expected in (*late, *early):
         parameters = tuple(
-            replace(one, value=delay_s) if one.name == "odometry_delay_s" else one for one in result.parameters
+            replace(one, value=delay_s, sigma=sigma_s) if one.name == "odometry_delay_s" else one
+            for one in result.parameters
         )
-        late = replace(result, parameters=parameters)
-        assert ("clocks" in alarms(late, recording, survey)) is expected
+        delayed = replace(result, parameters=parameters)
+        assert ("clocks" in alarms(delayed, recording, survey)) is expected
         fixed = tuple(replace(one, fixed=True) for one in parameters)  # stated by who knows it
-        assert "clocks" not in alarms(replace(late, parameters=fixed), recording, survey)
+        assert "clocks" not in alarms(replace(delayed, parameters=fixed), recording, survey)
 
 
 def test_a_solution_that_scatters_detections_more_than_odometry_does_is_lost() -> None:

@@ -52,8 +52,9 @@ WITH_BEARINGS = 0.5
 """Share of the detections without a bearing from which ranges alone must say what is wrong."""
 DELAY_S, MOUNT_M, MOUNT_RAD, FOCAL, DISTORTION = 0.5, 0.2, 0.3, 0.1, 0.2
 """Standard deviations of a delay, of a mount's position and turn, of the logarithm of a focal length, and of k1."""
-CLOCK_RATE = 0.01
-"""Standard deviation of how much faster one clock runs than another, where they do at all."""
+CLOCK_RATE = 0.005
+"""Standard deviation of how much faster one clock runs than another, where they do at all; a tenth of it is as fast as
+a clock is slewed that is set by another over a network. Crystals differ by less."""
 LITTLE = 0.1
 """Standard deviations beforehand within which a state is as is usual of sensors: 2 cm of a mount, 50 ms of a clock."""
 

@@ -14,7 +14,7 @@ from math import degrees, nan
 
 import numpy as np
 
-from evermap.explain.symptoms import find_motions, find_turns_between
+from evermap.explain.symptoms import USED, find_motions, find_turns_between
 from evermap.slam.check import CLOCKWISE, CORNERS, SILENCE, is_clockwise
 from evermap.slam.gaps import find_gaps, is_outside
 from evermap.slam.mistakes import Finding
@@ -26,6 +26,8 @@ TIMES = 10.0
 """That over what all but a hundredth of the steps differ by."""
 BESIDE = 2
 """Steps on both sides to which the estimator may have shared out a jump."""
+SAME_S = 1e-6
+"""Difference of the stamps of a frame and of its detections."""
 POORLY, LEAST_M = 5.0, 0.02
 """Standard deviation of positions during a silence, over the usual one, from which they are not known, and the least
 [m]."""
@@ -47,8 +49,11 @@ def find_faults(
     if recording.odometry is None or len(result.trajectory) < 3:
         return order, ()
     gaps_s = find_gaps(recording.odometry)
+    start_s = float(recording.odometry.stamp_s[0])
     jumps = find_jumps(result, gaps_s)
-    told = [_jump(*jump, float(recording.odometry.stamp_s[0]), len(jumps)) for jump in jumps[:1]]
+    told = [_jump(*jump, start_s, len(jumps)) for jump in jumps[:1]]
+    if not jumps and (unseen := find_unseen_jumps(result, gaps_s)):
+        order = (*order, _jump(*unseen[0], start_s, len(unseen), "while nothing was seen, so that nobody knows when"))
     if not silent or not len(gaps_s):
         return order, tuple(told)
     long_s = float(np.diff(gaps_s, axis=1).sum())
@@ -103,18 +108,44 @@ def find_jumps(result: SlamResult, gaps_s: FloatArray) -> list[tuple[float, floa
     return list(zip(path.stamp_s[rows + 1].tolist(), shift_m.tolist(), turn_rad.tolist(), strict=True))
 
 
+def find_unseen_jumps(result: SlamResult, gaps_s: FloatArray) -> list[tuple[float, float, float]]:
+    """Return as `find_jumps` what odometry and trajectory differ by between two poses that saw something, with others
+    between these that did not: where among them the jump was is not known, nor are they.
+    """
+    path, other = result.trajectory, result.dead_reckoning
+    if len(other) != len(path) or not np.array_equal(path.stamp_s, other.stamp_s):
+        return []
+    poses = path.pose_world_robot, other.pose_world_robot
+    steps = np.arange(1, len(path))
+    usual_m = float(np.median(_differ(*poses, steps - 1, steps)[0]))
+    seen_s = np.unique(result.innovations.stamp_s[result.innovations.p_inlier >= USED])
+    seen = np.unique(np.searchsorted(path.stamp_s, seen_s - SAME_S).clip(0, len(path) - 1))
+    first, last = seen[:-1], seen[1:]
+    blind = (last - first > 1) & is_outside(gaps_s, path.stamp_s[first], path.stamp_s[last])
+    first, last = first[blind], last[blind]
+    shift_m, turn_rad = _differ(*poses, first, last)
+    went_m = np.min([np.linalg.norm(find_motions(each, first, last), axis=1) for each in poses], axis=0)
+    # more than the robot went at all: clocks that differ are no jump
+    beyond = shift_m > np.maximum(np.maximum(JUMP_M, went_m), TIMES * usual_m * (last - first))
+    rows = np.flatnonzero(beyond)
+    rows = rows[np.argsort(-shift_m[rows])]
+    found = path.stamp_s[first[rows]], shift_m[rows], turn_rad[rows]
+    return list(zip(*(each.tolist() for each in found), strict=True))
+
+
 def _differ(pose: FloatArray, other: FloatArray, first: IntArray, last: IntArray) -> tuple[FloatArray, FloatArray]:
     """Return by how much motions of two paths differ [m, rad]."""
     one, two = (find_motions(each, first, last) for each in (pose, other))
     return np.linalg.norm(one - two, axis=1), np.abs(find_turns_between(pose, other, first, last))
 
 
-def _jump(at_s: float, shift_m: float, turn_rad: float, start_s: float, count: int) -> Cause:
+def _jump(at_s: float, shift_m: float, turn_rad: float, start_s: float, count: int, when: str = "") -> Cause:
     more = f", the largest of {count}" if count > 1 else ""
+    when = f" {when}" if when else ""
     message = (
         f"the robot was displaced by {shift_m:.2g} m and {degrees(turn_rad):.0f} deg against its odometry, "
-        f"{at_s - start_s:.1f} s after its start{more}: an estimate that was corrected, or begins anew, wheels that "
-        "slip, or the robot was carried"
+        f"{at_s - start_s:.1f} s after its start{when}{more}: an estimate that was corrected, or begins anew, wheels "
+        "that slip, or the robot was carried"
     )
     return Cause("odometry-jumps", "odometry", message, shift_m, nan, 1.0, "odometry: steps that the robot did not go")
 

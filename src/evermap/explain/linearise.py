@@ -157,9 +157,11 @@ def _residuals_in_plane(session: Solved, optimum: Optimum, inputs: Inputs, undon
 def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Inputs, undone: Inputs) -> FloatArray | None:
     solved = session.solved.optimum
     moved = _problem_of(session, inputs, undone)
-    if moved is None:
+    before = (solved.fitted or (solved.smoother, solved.now))[0].problem.swing
+    if moved is None or not np.array_equal(moved.swing.steps, before.steps):
         return None
-    smoother = SpatialSmoother(moved, solved.estimate.pose)
+    # noise stays: the axes of an arm turn as they like where two are as long
+    smoother = SpatialSmoother(replace(moved, swing=before), solved.estimate.pose)
     now = exhausted(smoother.graph(solved.noise, heavy=False).linearised(solved.estimate))
     if not np.array_equal(smoother.structure.system.tree.value_first, optimum.graph.structure.system.tree.value_first):
         return None

@@ -82,7 +82,8 @@ class CalibrationScore:
         suspect: what is held, and its words.
         value, sigma: the step, and its standard deviation.
         gain: log likelihood that it gains [nats], errors that last counted once.
-        shift: median of how far poses would move, over the median of their standard deviations.
+        shift: median of how far poses would move, over the median of their standard deviations; of clocks that drift
+            apart the most.
     """
 
     suspect: Suspect
@@ -166,8 +167,10 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
         pull -= float(taken @ [each for _, each, _ in usual])
         value = -pull / known
         moved = column.step()[at] - sum((by * step for by, (_, _, step) in zip(taken, usual, strict=True)), np.zeros(1))
-        moved = moved + _went_by_clock(session, suspect, dim)
-        shift = float(np.median(np.linalg.norm(value * moved, axis=1)))
+        moved = np.linalg.norm(value * (moved + _went_by_clock(session, suspect, dim)), axis=1)
+        shift = float(
+            np.max(moved) if suspect is DRIFT else np.median(moved)
+        )  # a drift goes on, and is worst at an end
         gain = 0.5 * pull**2 / known * optimum.worth
         if gain > CHANCE:
             gain /= max(screen.variance(column, value) / column.information_with(column), 1.0)
