@@ -107,12 +107,16 @@ class SessionScores:
     adrift: int = 0
 
     @property
-    def suspected(self) -> CalibrationScore | None:
-        """Return the significant step, larger than sensors usually need, that moves the poses most; None without."""
-        told = (
+    def told(self) -> tuple[CalibrationScore, ...]:
+        """Return the steps that are significant, and larger than sensors usually need."""
+        return tuple(
             one for one in self.calibrations if one.gain > SIGNIFICANT and abs(one.value) > LITTLE * one.suspect.sigma
         )
-        return max(told, key=lambda one: one.shift, default=None)
+
+    @property
+    def suspected(self) -> CalibrationScore | None:
+        """Return the step of those that are told that moves the poses most; None without."""
+        return max(self.told, key=lambda one: one.shift, default=None)
 
 
 def score_session(session: AnySession, inputs: Inputs, trajectory: Trajectory) -> SessionScores:
