@@ -160,7 +160,7 @@ def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Input
     if moved is None:
         return None
     smoother = SpatialSmoother(moved, solved.estimate.pose)
-    now = exhausted(smoother.graph(solved.noise, heavy=False).linearised(solved.estimate))
+    now = exhausted(smoother.graph(solved.noise, heavy=True).linearised(solved.estimate))
     if not np.array_equal(smoother.structure.system.tree.value_first, optimum.graph.structure.system.tree.value_first):
         return None
     return residuals_of(optimum.graph, now)[1]
