@@ -67,14 +67,25 @@ def run_slam(
         return with_verdict(result, recording, config.slam, findings=found)
     given = Inputs.of(recording, prior_map)
     is_read_well = recording.detections is read.detections and all(finding.usable for finding in found)
-    visit, result, under = session.explained(
-        given, config, remarks, realtime=realtime, progress=progress, is_read_well=is_read_well
-    )
-    result = replace(session.existing(visit, result, config.living), association=evidence)
-    if prior_map is not None:
-        result = with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)
-    solution = session.solution_of(visit)
-    return _judge(result, under.recording, config, under.prior_map, found, as_read=read, session=solution)
+
+    def conclude(**more: Any) -> SlamResult:
+        visit, result, under = session.explained(given, config, remarks, is_read_well=is_read_well, **more)
+        result = replace(session.existing(visit, result, config.living), association=evidence)
+        if prior_map is not None:
+            result = with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)
+        solution = session.solution_of(visit)
+        return _judge(result, under.recording, config, under.prior_map, found, as_read=read, session=solution)
+
+    result = conclude(realtime=realtime, progress=progress)
+    if result.causes or realtime or not config.slam.explain.on or not _is_held(result):
+        return result
+    return conclude(is_suspected=True)  # its scores cost too much to be asked before all else is sound
+
+
+def _is_held(result: SlamResult) -> bool:
+    """Return whether a calibration that was held as stated seems to be another."""
+    verdict = result.verdict
+    return verdict is not None and any(one.is_alarming and one.code == "held" for one in verdict.symptoms)
 
 
 def _judge(

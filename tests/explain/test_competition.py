@@ -10,6 +10,10 @@ import pytest
 from evermap import run_session, run_slam
 from evermap.config import Config
 from evermap.errors import NumericalError
+from evermap.explain.causes import Inputs, list_suspects
+from evermap.explain.evidence import Screen, optimum_of
+from evermap.explain.linearise import FINE_STEP, STEP, change_by
+from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.geometry.se2 import transform as transform_plane
 from evermap.geometry.se3 import transform as transform_space
@@ -270,6 +274,46 @@ def test_a_lens_of_which_no_distortion_is_stated_is_named() -> None:
     assert result.changes == ()
     as_stated = run_slam(recording, without_causes(), prior_map=survey)
     assert error_m(result, recording, in_map=True) < 0.3 * error_m(as_stated, recording, in_map=True)
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+def test_a_centre_of_the_image_that_is_elsewhere_is_named(mapped: bool) -> None:
+    """All else seems sound: noise takes in what the images are off by."""
+    recording, survey = recorded(World(seed=1), "corners")
+    other = tuple(
+        replace(one, intrinsics=(fx, fy, cx + 40.0, cy))
+        for one in recording.sensors
+        for fx, fy, cx, cy in [one.intrinsics or (0.0,) * 4]
+    )
+    result = run_slam(replace(recording, sensors=other), prior_map=survey if mapped else None)
+    assert named(result, "intrinsics").value == pytest.approx(-40.0, abs=2.0)
+    assert result.changes == ()
+
+
+def test_mounts_that_are_turned_together_are_named() -> None:
+    recording = World(seed=1).space()
+    turned = []
+    for one in recording.sensors:
+        mount = np.array(one.mount_robot_sensor)
+        turn = se3.compose(se3.from_angles([0.0, 0.0, 0.5]), se3.turn(mount[3:]))
+        turned.append(replace(one, mount_robot_sensor=(*mount[:3].tolist(), *turn[3:].tolist())))
+    cause = named(run_slam(replace(recording, sensors=tuple(turned))), "mount")
+    assert cause.subject == "all sensors yaw"
+    assert cause.value == pytest.approx(-0.5, abs=0.02)
+
+
+def test_a_step_that_rejects_detections_says_as_much_as_a_fine_one() -> None:
+    """A mount turned by 6 mrad moves corners by many times their noise."""
+    recording, survey = recorded(World(seed=1), "corners")
+    visit, _, inputs = session.explained(Inputs.of(recording, survey), without_causes(), ())
+    solved = session.solution_of(visit)
+    screen = Screen.of(optimum_of(solved))
+    for suspect in list_suspects(inputs, discrete=False):
+        if suspect.code == "mount":
+            coarse, fine = (change_by(solved, screen, inputs, suspect, share) for share in (STEP, FINE_STEP))
+            assert coarse is not None
+            assert fine is not None
+            assert np.linalg.norm(coarse - fine) < 0.1 * np.linalg.norm(fine), suspect.subject
 
 
 @pytest.mark.slow

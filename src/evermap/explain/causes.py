@@ -548,7 +548,7 @@ def _of_mount(row: int, sensor: SpatialSensor, *, many: bool, driven: bool) -> I
     for axis, part in enumerate(("x", "y", "z", "roll", "pitch", "yaw")):
         unit, sigma = ("rad", MOUNT_RAD) if axis > 2 else ("m", MOUNT_M)
         yield Suspect(
-            "mount", f"{name} {part}", USUAL_P, partial(_move_mount, sensor=row, axis=axis),
+            "mount", f"{name} {part}", USUAL_P, partial(_move_mounts, sensors=(row,), axis=axis),
             lambda s, part=part, unit=unit: f"the mount of {name} is {s:.3g} {unit} off in {part} of the robot",  # type: ignore[misc]
             told, sigma,
         )  # fmt: skip
@@ -577,6 +577,13 @@ def _of_all_mounts(sensors: Sequence[SpatialSensor], *, driven: bool) -> Iterabl
         )  # fmt: skip
     if not driven:  # nothing says which way the robot looks
         return
+    for axis, part in enumerate(("x", "y", "z", "roll", "pitch", "yaw")):
+        unit, sigma = ("rad", MOUNT_RAD) if axis > 2 else ("m", MOUNT_M)
+        yield Suspect(
+            "mount", f"all sensors {part}", USUAL_P, partial(_move_mounts, sensors=rows, axis=axis),
+            lambda s, part=part, unit=unit: f"mounts of all sensors are {s:.3g} {unit} off in {part} of the robot",  # type: ignore[misc]
+            _constant("[camera.*.mount]"), sigma,
+        )  # fmt: skip
     turned: list[tuple[str, str, Callable[[FloatArray], FloatArray], float]] = [
         (each.code, each.message, partial(_turn_within, by=se3.turn(each.turned)), USUAL_P) for each in mistakes.AXES
     ]
@@ -643,17 +650,16 @@ _FLIPS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
 _OFTEN = frozenset(_FLIPS[row][0] for row in (0, 1, 4, 6))
 
 
-def _move_mount(inputs: Inputs, state: float, sensor: int, axis: int) -> Inputs:
-    """Return the same with a mount moved along, or turned about, an axis of the robot."""
+def _move_mounts(inputs: Inputs, state: float, sensors: Iterable[int], axis: int) -> Inputs:
+    """Return the same with mounts moved along, or turned about, an axis of the robot."""
+    by = np.zeros(6)
+    by[axis] = state
+    turn = se3.from_angles(by[3:])
 
     def how(mount: FloatArray) -> FloatArray:
-        if axis < 3:
-            moved = mount.copy()
-            moved[axis] += state
-            return moved
-        return _make_turn(axis - 3, state, of_robot=True)(mount)
+        return np.concatenate([mount[:3] + by[:3], se3.compose(turn, se3.turn(mount[3:]))[3:]])
 
-    return _change_mount(inputs, state, sensor, how)
+    return _change_mounts(inputs, 0.0, sensors, how)
 
 
 def _change_mount(inputs: Inputs, state: float, sensor: int, how: Callable[[FloatArray], FloatArray]) -> Inputs:

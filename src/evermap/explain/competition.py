@@ -29,6 +29,7 @@ from evermap.explain.evidence import (
     used_rows,
 )
 from evermap.explain.linearise import change_by, cost_nearby, gain_by, held_by_map, solve_nearby
+from evermap.explain.scores import score_session
 from evermap.explain.seeds import FALLS, find_mount, find_scales, find_shape, find_single_scales
 from evermap.explain.shape import FEWEST, compare_shapes
 from evermap.explain.symptoms import compare_odometry
@@ -239,6 +240,7 @@ def explain(
     say: Callable[[str], None] = lambda _: None,
     *,
     is_read_well: bool = False,
+    is_suspected: bool = False,
 ) -> Explained[VisitT] | None:
     """Return the solution under the causes that explain a session best; None where nothing can be solved.
 
@@ -249,6 +251,7 @@ def explain(
         config: settings of the estimator.
         say: told what is done.
         is_read_well: as of `find_symptoms`, of the inputs as given.
+        is_suspected: whether scores say that a calibration is not as stated (`scores`), which is a symptom, too.
 
     Without symptoms the solution is returned as it is.
     """
@@ -256,12 +259,12 @@ def explain(
     screens: tuple[Callable[..., Asked], ...] = (_plain, _screen_continuous)  # what costs nothing first
     if solution is not None:
         symptoms = find_symptoms(solution.result, inputs, config, is_read_well=is_read_well)
-        if not symptoms:
+        if not (symptoms or is_suspected):
             sound = Trial(inputs, solution, (), math.nan, 1.0)
             return Explained(sound, find_put_right(solution.result, inputs, rules))
         few = count_changed(solution.result) <= rules.map_changed * len(solution.result.landmarks)
-        if symptoms == (CHANGES,) and few:  # calibrations that differ little would show in innovations, too
-            screens = screens[:1]
+        if symptoms == (CHANGES,) and few and not (is_suspected or _find_score(solution, inputs) > 0.0):
+            screens = screens[:1]  # a landmark or two moved, and no calibration earns anything
     base = None if solution is None else _trial(inputs, solution, ())
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
     budget = _Budget(rules.most_solutions)
@@ -282,6 +285,13 @@ def explain(
     named = {cause.code for cause in causes}
     others = find_put_right(best.solution.result, best.inputs, rules)
     return Explained(best, (*causes, *(one for one in others if one.code not in named)), tuple(weighed))
+
+
+def _find_score(solution: SessionSolution[VisitT], inputs: Inputs) -> float:
+    """Return what the calibration that earns most would gain, of those whose score is significant [nats]; 0 without."""
+    return max(
+        (one.gain for one in score_session(solution.session, inputs, solution.result.trajectory).told), default=0.0
+    )
 
 
 def find_put_right(result: SlamResult, inputs: Inputs, rules: ExplainConfig) -> tuple[Cause, ...]:
@@ -412,14 +422,20 @@ def count_changed(result: SlamResult) -> int:
 
 
 def _relieves(trial: Trial[VisitT], best: Trial[VisitT], config: SlamConfig) -> bool:
-    """Return whether a trial has fewer symptoms, fewer landmarks that are told to have changed, or rejects far less."""
+    """Return whether a trial has fewer symptoms, fewer landmarks that are told to have changed, or rejects far less; or
+    leaves far less for scores to say, where these were all that was asked.
+    """
     was, now = best.solution.result, trial.solution.result
     before, after = find_symptoms(was, best.inputs, config), find_symptoms(now, trial.inputs, config)
     if any(symptom.endswith(OF_NOISE) for symptom in after if symptom not in before):
         return False  # under a sensor that measures hardly anything all else fits
     changed = [count_changed(result) for result in (was, now)]
     rejected = [share_rejected(result) for result in (was, now)]
-    return len(after) < len(before) or changed[1] < changed[0] or rejected[1] < FEWER * rejected[0]
+    if len(after) < len(before) or changed[1] < changed[0] or rejected[1] < FEWER * rejected[0]:
+        return True
+    if not {*before, *after} <= {CHANGES}:
+        return False
+    return _find_score(trial.solution, trial.inputs) < FEWER * _find_score(best.solution, best.inputs)
 
 
 def _solve_alone(

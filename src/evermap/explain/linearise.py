@@ -160,9 +160,9 @@ def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Input
     before = (solved.fitted or (solved.smoother, solved.now))[0].problem.swing
     if moved is None or not np.array_equal(moved.swing.steps, before.steps):
         return None
-    # noise stays: the axes of an arm turn as they like where two are as long
+    # noise stays: the axes of an arm turn as they like where two are as long; with tails that never let go no weight is 0
     smoother = SpatialSmoother(replace(moved, swing=before), solved.estimate.pose)
-    now = exhausted(smoother.graph(solved.noise, heavy=False).linearised(solved.estimate))
+    now = exhausted(smoother.graph(solved.noise, heavy=True).linearised(solved.estimate))
     if not np.array_equal(smoother.structure.system.tree.value_first, optimum.graph.structure.system.tree.value_first):
         return None
     return residuals_of(optimum.graph, now)[1]

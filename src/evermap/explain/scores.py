@@ -27,8 +27,6 @@ from evermap.explain.causes import (
     DELAY_S,
     FOCAL,
     LITTLE,
-    MOUNT_M,
-    MOUNT_RAD,
     RARE_P,
     USUAL_P,
     Inputs,
@@ -38,9 +36,8 @@ from evermap.explain.causes import (
 )
 from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Column, Optimum, Screen, optimum_of, residuals_of
 from evermap.explain.linearise import FINE_STEP, change_by, change_by_motion
-from evermap.geometry import se3
 from evermap.slam.estimate import Solved
-from evermap.types import FloatArray, IntArray, SpatialRecording, SpatialSensor, Trajectory, is_in_space
+from evermap.types import FloatArray, IntArray, SpatialRecording, Trajectory, is_in_space
 
 Intrinsics: TypeAlias = tuple[float, float, float, float]
 """Focal lengths and centre of an image [px]."""
@@ -108,12 +105,16 @@ class SessionScores:
     adrift: int = 0
 
     @property
-    def suspected(self) -> CalibrationScore | None:
-        """Return the significant step, larger than sensors usually need, that moves the poses most; None without."""
-        told = (
+    def told(self) -> tuple[CalibrationScore, ...]:
+        """Return the steps that are significant, and larger than sensors usually need."""
+        return tuple(
             one for one in self.calibrations if one.gain > SIGNIFICANT and abs(one.value) > LITTLE * one.suspect.sigma
         )
-        return max(told, key=lambda one: one.shift, default=None)
+
+    @property
+    def suspected(self) -> CalibrationScore | None:
+        """Return the step of those that are told that moves the poses most; None without."""
+        return max(self.told, key=lambda one: one.shift, default=None)
 
 
 def score_session(session: AnySession, inputs: Inputs, trajectory: Trajectory) -> SessionScores:
@@ -225,21 +226,14 @@ def _list_calibrations(inputs: Inputs) -> Iterable[Suspect]:
     if not is_in_space(recording):
         return
     if len(recording.sensors) > 1 and recording.odometry is not None:
-        yield from _of_rig(recording)
+        yield from _of_clocks(recording)
     if np.isfinite(recording.detections.corner_px).any():
         for intrinsics in {one.intrinsics: None for one in recording.sensors if one.intrinsics is not None}:
             yield _of_pixels(recording, intrinsics)
 
 
-def _of_rig(recording: SpatialRecording) -> Iterable[Suspect]:
-    """Yield what may be off of all sensors together, and the clock of each."""
-    for axis, part in enumerate(("x", "y", "z", "roll", "pitch", "yaw")):
-        unit, sigma = ("rad", MOUNT_RAD) if axis > 2 else ("m", MOUNT_M)
-        yield Suspect(
-            "mount", f"all sensors {part}", USUAL_P, partial(_move_rig, axis=axis),
-            lambda s, part=part, unit=unit: f"mounts of all sensors are {s:.3g} {unit} off in {part} of the robot",  # type: ignore[misc]
-            lambda _: "[camera.*.mount]", sigma,
-        )  # fmt: skip
+def _of_clocks(recording: SpatialRecording) -> Iterable[Suspect]:
+    """Yield what may be off of the clock of each sensor."""
     for row, sensor in enumerate(recording.sensors):
         name = sensor.name
         yield Suspect(
@@ -261,22 +255,6 @@ def _of_pixels(recording: SpatialRecording, intrinsics: Intrinsics) -> Suspect:
         f"[{fx * math.exp(0.5 * s):.5g}, {fy * math.exp(-0.5 * s):.5g}, {cx:g}, {cy:g}]",
         FOCAL,
     )  # fmt: skip
-
-
-def _move_rig(inputs: Inputs, state: float, axis: int) -> Inputs:
-    """Return the same with all mounts moved along, or turned about, an axis of the robot."""
-    by = np.zeros(3)
-    by[axis % 3] = state
-    recording: Any = inputs.recording
-    sensors = list[SpatialSensor]()
-    for one in recording.sensors:
-        mount = np.array(one.mount_robot_sensor)
-        if axis < 3:
-            mount[:3] += by
-        else:
-            mount[3:] = se3.compose(se3.from_angles(by), se3.turn(mount[3:]))[3:]
-        sensors.append(replace(one, mount_robot_sensor=tuple(mount.tolist())))
-    return replace(inputs, recording=replace(recording, sensors=tuple(sensors)))
 
 
 def _shift_sensor(inputs: Inputs, state: float, sensor: int) -> Inputs:

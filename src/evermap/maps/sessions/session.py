@@ -422,6 +422,7 @@ def explained(
     realtime: bool = False,
     progress: Progress | None = None,
     is_read_well: bool = False,
+    is_suspected: bool = False,
 ) -> tuple[Visit, SlamResult, Inputs]:
     """Return a session solved, its result, and what that is of: as given, or under the causes that explain it better
     (`explain`).
@@ -433,6 +434,7 @@ def explained(
         realtime: as of `run_slam`, of the session as given.
         progress: the same.
         is_read_well: whether pairs of sightings are known to show no mistake.
+        is_suspected: whether scores say that a calibration is not as stated.
 
     Raises:
         DataError, NumericalError: as of `run_slam`.
@@ -457,7 +459,9 @@ def explained(
     else:
         if not config.slam.explain.on or as_given.result.interrupted or realtime:
             return as_given.visit, as_given.result, inputs
-        found = explain(inputs, as_given, under, config.slam, told.append, is_read_well=is_read_well)
+        found = explain(
+            inputs, as_given, under, config.slam, told.append, is_read_well=is_read_well, is_suspected=is_suspected
+        )
         assert found is not None
     best = found.best.solution
     if not found.causes:
