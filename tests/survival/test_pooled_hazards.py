@@ -6,9 +6,24 @@ import numpy as np
 import pytest
 
 from evermap.maps.lives import general_purpose
-from evermap.survival import Exponential, LifetimePrior, Mixture, PiecewiseConstantHazard, Weibull, never_leaves
+from evermap.survival import (
+    Exponential,
+    LifetimePrior,
+    Mixture,
+    PiecewiseConstantHazard,
+    Weibull,
+    never_leaves,
+)
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.pooled_hazards import EDGES_S, HazardPosterior, Statement, StayAges, _Likelihood, learn_hazards
+from evermap.survival.pooled_hazards import (
+    EDGES_S,
+    HazardPosterior,
+    Statement,
+    StayAges,
+    _Likelihood,
+    learn_hazards,
+)
+from evermap.types import IntArray
 
 HOUR_S, DAY_S = 3600.0, 86_400.0
 USUAL = general_purpose()
@@ -102,6 +117,27 @@ def test_vans_that_leave_in_view_leave_the_others_standing(leaving: int) -> None
     there = [float(np.exp(of.prior().log_conditional_survival(60.0, DAY_S))) for of in (van, car)]
     assert there[0] > 0.25
     assert there[1] >= there[0]
+
+
+def test_the_same_evidence_is_learned_from_once_and_in_any_order() -> None:
+    """Equal stays and statements give the very posterior that is there; the order of stays is nothing."""
+    rng, n = np.random.default_rng(4), 60
+    lasting, group = rng.weibull(0.8, n) * DAY_S, rng.integers(0, 3, n)
+    left, gone = np.minimum(lasting, 2.0 * DAY_S), np.where(lasting < 2.0 * DAY_S, 1.2 * lasting, np.inf)
+
+    def taught(order: IntArray, worth: float = 20.0) -> list[HazardPosterior]:
+        said = [Statement(Exponential.from_mean(DAY_S), worth), None, None]
+        return learn_hazards(
+            StayAges.of_samples(CensoredLifetimes.of(left[order], gone[order]), group[order]), said, USUAL
+        )
+
+    once = taught(np.arange(n))
+    assert all(one is other for one, other in zip(once, taught(np.arange(n)), strict=True))
+    assert taught(np.arange(n), 21.0)[0] is not once[0]
+    ages_s, other = np.array([0.01, 0.3, 1.0, 3.0]) * DAY_S, taught(rng.permutation(n))
+    for kind in range(4):
+        assert other[kind] is not once[kind]
+        np.testing.assert_allclose(other[kind].survival(ages_s), once[kind].survival(ages_s), atol=1e-9)
 
 
 def test_classes_lean_on_each_other_and_a_new_one_on_all() -> None:
