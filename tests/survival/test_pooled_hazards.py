@@ -13,13 +13,16 @@ from evermap.survival import (
     PiecewiseConstantHazard,
     Weibull,
     never_leaves,
+    pooled_hazards,
 )
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.pooled_hazards import (
+    DRAWS,
     EDGES_S,
     HazardPosterior,
     Statement,
     StayAges,
+    _learn_once,
     _Likelihood,
     learn_hazards,
 )
@@ -101,7 +104,7 @@ def test_a_short_stop_shortens_no_parked_life() -> None:
     found = learned(CensoredLifetimes.of(watched, np.append(np.full(41, np.inf), 5.0)))
     hour_later = np.exp(found.prior().log_conditional_survival(20.0, HOUR_S))
     assert hour_later >= 0.9
-    assert found.prior().log_survival(60.0) < 4.0 * USUAL.log_survival(60.0)  # that cars stop is learned
+    assert found.prior().log_survival(60.0) < 4.5 * USUAL.log_survival(60.0)  # that cars stop is learned
 
 
 @pytest.mark.parametrize("leaving", [0, 2, 4, 6])
@@ -116,7 +119,7 @@ def test_vans_that_leave_in_view_leave_the_others_standing(leaving: int) -> None
     van, car, _ = learn_hazards(stays, [None, None], USUAL)
     there = [float(np.exp(of.prior().log_conditional_survival(60.0, DAY_S))) for of in (van, car)]
     assert there[0] > 0.25
-    assert there[1] >= there[0]
+    assert there[1] >= there[0] - 1e-3  # where none left they are alike, but for the draws
 
 
 def test_the_same_evidence_is_learned_from_once_and_in_any_order() -> None:
@@ -138,6 +141,22 @@ def test_the_same_evidence_is_learned_from_once_and_in_any_order() -> None:
     for kind in range(4):
         assert other[kind] is not once[kind]
         np.testing.assert_allclose(other[kind].survival(ages_s), once[kind].survival(ages_s), atol=1e-9)
+
+
+def test_likely_members_of_the_grid_have_most_draws() -> None:
+    """An unlikely one has few, and its probability all the same: what is expected is what many draws tell."""
+    data, ages_s = followed(Exponential.from_mean(DAY_S), 60, 5.0 * DAY_S, seed=6), np.array([0.1, 1.0, 3.0]) * DAY_S
+    few = learned(data)
+    assert len(few.weight) < 3 * DRAWS
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pooled_hazards, "LEAST_DRAWS", 16 * DRAWS)
+        patch.setattr(pooled_hazards, "NEGLIGIBLE", 0.0)
+        _learn_once.cache_clear()
+        many = learned(data)
+        _learn_once.cache_clear()
+    assert len(many.weight) == 8 * 16 * DRAWS
+    for one, other, within in zip(few.survival(ages_s), many.survival(ages_s), (0.01, 0.03, 0.03), strict=True):
+        np.testing.assert_allclose(one, other, atol=within)
 
 
 def test_classes_lean_on_each_other_and_a_new_one_on_all() -> None:

@@ -47,7 +47,7 @@ FAST = ((0.8, 0.1, 0.85), (0.8, 0.5, 0.1), (0.8, 1.5, 0.03), (0.25, 2.0, 0.02))
 """Lengths and standard deviations of the fast process, and their probabilities: hazards are smooth, as a rule."""
 LEAST_STRETCHES = 14
 """Stretches between the ages of the first and the last ends that were seen."""
-DRAWS, LEAST_DRAWS, NEGLIGIBLE = 256, 256, 0.0
+DRAWS, LEAST_DRAWS, NEGLIGIBLE = 256, 32, 5e-3
 """Draws for the most probable member of the grid, half of them mirror images of the other half, and for others in
 proportion to their probability, but so many; and the probability below which there are none."""
 LEAST_SURVIVAL, TRUSTED = 1e-9, 0.02
