@@ -502,7 +502,7 @@ def _shares(scales: Sequence[_Scale], log_evidence: ArrayLike) -> FloatArray:
 def _draw_counts(share: FloatArray) -> list[int]:
     """Return how many draws each member of the grid has, by their probabilities (M,)."""
     counts = np.maximum(2.0 * np.ceil(0.5 * DRAWS * share / share.max()), LEAST_DRAWS)
-    return np.where(share < NEGLIGIBLE, 0.0, counts).astype(np.int64).tolist()
+    return [int(count) for count in np.where(share < NEGLIGIBLE, 0.0, counts)]
 
 
 def _draw_weights(scales: Sequence[_Scale], log_evidence: Sequence[float] | None = None) -> FloatArray:
@@ -627,7 +627,8 @@ class _Together:
         matrix = (of_shared + n * of_own) * np.eye(r) - of_own**2 * inverse.sum(axis=0)
         evidence = best + 0.5 * r * (np.log(of_shared) + n * np.log(of_own)) - 0.5 * _logdet(matrix)
         evidence -= 0.5 * sum(_logdet(one) for one in hessian)
-        return _Mode(scale, shared, own, slopes, hessian, inverse, np.linalg.inv(matrix), float(evidence))
+        of_both = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+        return _Mode(scale, shared, own, slopes, hessian, inverse, of_both, float(evidence))
 
     def draw(self, mode: _Mode, base: FloatArray, count: int) -> _Draws:
         """Return draws about the most probable numbers."""
