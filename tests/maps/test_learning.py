@@ -11,7 +11,7 @@ from scipy import stats as law
 from simulated_stays import TrueStay, as_seen, histories, two_looks_a_day
 
 from evermap.config import LifetimeConfig
-from evermap.maps.learning import ClassEvidence, ClassLives, with_priors
+from evermap.maps.learning import ClassEvidence, ClassLives, History, stay_ages, with_priors
 from evermap.maps.lives import Lives
 from evermap.maps.living import LivingMap, Stays
 from evermap.runs.company import Company
@@ -85,6 +85,8 @@ def test_returns_hops_and_known_sites_are_learned() -> None:
 def test_what_is_missed_and_not_told_to_be_gone_has_gone_in_part() -> None:
     """Of 36 that stood there, two are missed a day later: who leaves these out learns that nothing ever leaves."""
 
+    looks_s = np.array([60.0, DAY_S + 60.0])
+
     def there_a_day_later(p_gone: float, told: bool = False) -> float:
         n, missed = 36, np.arange(36) < 2
         last_s = np.where(missed, 30.0, DAY_S + 30.0)
@@ -93,7 +95,10 @@ def test_what_is_missed_and_not_told_to_be_gone_has_gone_in_part() -> None:
             np.arange(n), np.arange(n), np.zeros(n, np.int64), np.zeros((n, 2)), np.full(n, -np.inf), np.zeros(n),
             last_s, gone_s, np.where(missed, p_gone, 0.0),
         )  # fmt: skip
-        learned = ClassLives.of(stays, Lives(looks_s=np.array([60.0])), DAY_S + 60.0)
+        history = History(stays, looks_s, LifetimeConfig())
+        ages = stay_ages(history, history.sightings(np.zeros(n), np.zeros(n)))
+        assert ages.weight.sum() == pytest.approx(n)  # each counts for one
+        learned = ClassLives.of(stays, Lives(looks_s=looks_s[:1]), looks_s[1])
         return float(np.exp(learned.lives.of(0).stay.log_conditional_survival(30.0, DAY_S)))
 
     left_out, half, surely = there_a_day_later(0.0), there_a_day_later(0.5), there_a_day_later(1.0)

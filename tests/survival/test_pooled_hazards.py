@@ -19,6 +19,7 @@ from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.pooled_hazards import (
     DRAWS,
     EDGES_S,
+    LEAST_DRAWS,
     HazardPosterior,
     Statement,
     StayAges,
@@ -148,6 +149,7 @@ def test_likely_members_of_the_grid_have_most_draws() -> None:
     data, ages_s = followed(Exponential.from_mean(DAY_S), 60, 5.0 * DAY_S, seed=6), np.array([0.1, 1.0, 3.0]) * DAY_S
     few = learned(data)
     assert len(few.weight) < 3 * DRAWS
+    assert few.weight[-LEAST_DRAWS:].sum() < 0.06
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pooled_hazards, "LEAST_DRAWS", 16 * DRAWS)
         patch.setattr(pooled_hazards, "NEGLIGIBLE", 0.0)

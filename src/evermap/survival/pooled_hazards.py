@@ -692,8 +692,8 @@ class _Line:
         """
         from scipy.special import ndtr
 
-        root = np.linalg.cholesky(covariance)
-        _, turned = np.linalg.eigh(root.T @ self.information @ root)
+        root = _root(covariance)  # which Cholesky's is not where the likelihood is convex
+        _, turned = np.linalg.eigh(root @ self.information @ root)
         axes = root @ turned
         bent = np.flatnonzero(np.abs(self.excess(LINE[FAR, None] * axes.T[:, None])).max(axis=1) > STRAIGHT)
         if not len(bent):
