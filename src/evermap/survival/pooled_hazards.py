@@ -627,8 +627,8 @@ class _Together:
         matrix = (of_shared + n * of_own) * np.eye(r) - of_own**2 * inverse.sum(axis=0)
         evidence = best + 0.5 * r * (np.log(of_shared) + n * np.log(of_own)) - 0.5 * _logdet(matrix)
         evidence -= 0.5 * sum(_logdet(one) for one in hessian)
-        of_both = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-        return _Mode(scale, shared, own, slopes, hessian, inverse, of_both, float(evidence))
+        of_each, of_both = (np.asarray(np.linalg.inv(one), dtype=np.float64) for one in (hessian, matrix))
+        return _Mode(scale, shared, own, slopes, hessian, of_each, of_both, float(evidence))
 
     def draw(self, mode: _Mode, base: FloatArray, count: int) -> _Draws:
         """Return draws about the most probable numbers."""
