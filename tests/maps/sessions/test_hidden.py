@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evermap.config import LivingConfig, LooksConfig
+from evermap.config import LivingConfig
 from evermap.existence.sites import SiteLooks
 from evermap.maps.living import LivingMap, clique_rows
 from evermap.maps.sessions.believe import believed
 from evermap.maps.sessions.extend import Extended
-from evermap.maps.sessions.looks import PlaceLooks, Sighting, Watch, _sides, looked_at
+from evermap.maps.sessions.looks import PlaceLooks, Sighting, Watch, looked_at
 from evermap.sensing.sightlines import SightLines
 from evermap.types import FloatArray, Sensor
 
@@ -173,13 +173,3 @@ def test_sight_that_is_not_learned_takes_the_field_of_view_for_the_truth() -> No
     assert looks.counts.all()
     assert len(looks.rows) == 10
     np.testing.assert_array_equal(looks.lines.p_free, 1.0)
-
-
-@pytest.mark.parametrize(("arc_deg", "sides"), [(2.0, 1.0), (30.0, 1.5), (60.0, 2.0), (90.0, 2.5), (350.0, 3.0)])
-def test_sides_are_the_same_however_a_map_lies(arc_deg: float, sides: float) -> None:
-    """Where a robot drives by, it sees a place from an arc; sectors that begin somewhere cut it, or do not."""
-    angle = np.deg2rad(np.linspace(0.0, arc_deg, 400))
-    for turn in np.deg2rad([0.0, 13.0, 58.0, 190.0]):
-        away = 8.0 * np.column_stack([np.cos(angle + turn), np.sin(angle + turn)])
-        found = _sides(np.ones(len(away), dtype=np.int64), away, 2, LooksConfig())
-        np.testing.assert_allclose(found, [1.0, sides], atol=0.1)

@@ -36,8 +36,6 @@ USUAL_RANGE = 0.9
 """Share of the detections within whose range a miss says something: data sheets promise more."""
 EXPECTED = 1.5
 """Detections that one position must lead to expect, or its misses are chance."""
-TURNS = 12
-"""Ways in which sectors around a place may begin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,19 +242,15 @@ def _hidden(
     return counts, sight, of_clique
 
 
-def _sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) -> FloatArray:
+def _sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) -> IntArray:
     """(C,) number of sides from which each of `n` cliques was looked at, at least one, by the cliques (N,) of the looks
     that count and missed, and (N, 2) from the places to the sensor.
-
-    Sides are sectors around the place, of which the first may begin anywhere: their number is the mean over that, so
-    that it is the same however a map lies in its frame.
     """
-    every = settings.sides * TURNS
+    every = settings.sides
     side = np.floor(np.mod(np.arctan2(away[:, 1], away[:, 0]), 2.0 * np.pi) * (every / (2.0 * np.pi))).astype(np.int64)
     count = np.bincount(clique * every + side % every, minlength=n * every).reshape(n, every)
-    sector = sum(np.roll(count, -k, axis=1) for k in range(TURNS))
-    sides = np.sum(sector >= settings.witnesses, axis=1) / TURNS
-    return np.asarray(np.clip(sides, 1.0, settings.most_sides))
+    sides: IntArray = np.sum(count >= settings.witnesses, axis=1)
+    return np.asarray(np.clip(sides, 1, settings.most_sides))
 
 
 def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolArray, p_gone: FloatArray) -> FloatArray:
