@@ -11,7 +11,7 @@ from scipy import stats as law
 from simulated_stays import TrueStay, as_seen, histories, two_looks_a_day
 
 from evermap.config import LifetimeConfig
-from evermap.maps.learning import ClassEvidence, ClassLives, with_priors
+from evermap.maps.learning import ClassEvidence, ClassLives, History, stay_ages, with_priors
 from evermap.maps.lives import Lives
 from evermap.maps.living import LivingMap, Stays
 from evermap.runs.company import Company
@@ -80,6 +80,31 @@ def test_returns_hops_and_known_sites_are_learned() -> None:
     assert wanders.p_hop > 0.9
     assert wanders.p_known < 0.1
     assert np.exp(is_taken.absence.log_conditional_survival(DAY_S, 14 * DAY_S)) > 0.9
+
+
+def test_what_is_missed_and_not_told_to_be_gone_has_gone_in_part() -> None:
+    """Of 36 that stood there, two are missed a day later: who leaves these out learns that nothing ever leaves."""
+
+    looks_s = np.array([60.0, DAY_S + 60.0])
+
+    def there_a_day_later(p_gone: float, told: bool = False) -> float:
+        n, missed = 36, np.arange(36) < 2
+        last_s = np.where(missed, 30.0, DAY_S + 30.0)
+        gone_s = np.where(missed & told, DAY_S + 30.0, np.inf)
+        stays = Stays(
+            np.arange(n), np.arange(n), np.zeros(n, np.int64), np.zeros((n, 2)), np.full(n, -np.inf), np.zeros(n),
+            last_s, gone_s, np.where(missed, p_gone, 0.0),
+        )  # fmt: skip
+        history = History(stays, looks_s, LifetimeConfig())
+        ages = stay_ages(history, history.sightings(np.zeros(n), np.zeros(n)))
+        assert ages.weight.sum() == pytest.approx(n)  # each counts for one
+        learned = ClassLives.of(stays, Lives(looks_s=looks_s[:1]), looks_s[1])
+        return float(np.exp(learned.lives.of(0).stay.log_conditional_survival(30.0, DAY_S)))
+
+    left_out, half, surely = there_a_day_later(0.0), there_a_day_later(0.5), there_a_day_later(1.0)
+    assert left_out > half + 0.005 > surely + 0.01
+    assert surely == pytest.approx(there_a_day_later(1.0, told=True), abs=1e-3)
+    assert surely == pytest.approx(34 / 36, abs=0.04)
 
 
 def test_without_stays_nothing_is_believed_but_looks_are_counted() -> None:

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from evermap.errors import InputError
+from evermap.existence.lifetimes import Lifetimes
 from evermap.existence.sites import Evidence
+from evermap.maps.learning import with_priors
 from evermap.maps.lives import EVERYWHERE, Life, Lives
 from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
 from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
 from evermap.maps.why import probability_text, why
-from evermap.survival import Exponential
+from evermap.survival import Exponential, never_leaves
 from evermap.types import ChangeKind, Clock, MapChange
 
 HOUR_S = 3600.0
@@ -104,6 +106,17 @@ def test_why_it_is_gone(store: MapStore) -> None:
         in text
     )
     assert "shares a body with landmark 6" in text
+
+
+def test_why_says_which_stays_taught_its_lifetime(store: MapStore) -> None:
+    text = " / ".join(why(store, 5).reasons)
+    life = store.load().lives.of(0)
+    assert f"known from {life.n_stays} stays of class pallet, {life.n_ended} of which ended" in text
+    assert "stated" not in text
+    living = store.load()
+    told = with_priors(living, {"pallet": Lifetimes(Exponential.from_mean(HOUR_S), never_leaves())}, (), 20)
+    store.commit(told, Provenance(), parent=3)
+    assert "; what a user stated, which is worth 20 stays" in " / ".join(why(store, 5).reasons)
 
 
 def test_why_it_is_there(store: MapStore) -> None:

@@ -6,9 +6,28 @@ import numpy as np
 import pytest
 
 from evermap.maps.lives import general_purpose
-from evermap.survival import Exponential, LifetimePrior, Mixture, PiecewiseConstantHazard, Weibull, never_leaves
+from evermap.survival import (
+    Exponential,
+    LifetimePrior,
+    Mixture,
+    PiecewiseConstantHazard,
+    Weibull,
+    never_leaves,
+    pooled_hazards,
+)
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.pooled_hazards import EDGES_S, HazardPosterior, Statement, StayAges, _Likelihood, learn_hazards
+from evermap.survival.pooled_hazards import (
+    DRAWS,
+    EDGES_S,
+    LEAST_DRAWS,
+    HazardPosterior,
+    Statement,
+    StayAges,
+    _learn_once,
+    _Likelihood,
+    learn_hazards,
+)
+from evermap.types import IntArray
 
 HOUR_S, DAY_S = 3600.0, 86_400.0
 USUAL = general_purpose()
@@ -86,7 +105,7 @@ def test_a_short_stop_shortens_no_parked_life() -> None:
     found = learned(CensoredLifetimes.of(watched, np.append(np.full(41, np.inf), 5.0)))
     hour_later = np.exp(found.prior().log_conditional_survival(20.0, HOUR_S))
     assert hour_later >= 0.9
-    assert found.prior().log_survival(60.0) < 4.0 * USUAL.log_survival(60.0)  # that cars stop is learned
+    assert found.prior().log_survival(60.0) < 4.5 * USUAL.log_survival(60.0)  # that cars stop is learned
 
 
 @pytest.mark.parametrize("leaving", [0, 2, 4, 6])
@@ -101,7 +120,45 @@ def test_vans_that_leave_in_view_leave_the_others_standing(leaving: int) -> None
     van, car, _ = learn_hazards(stays, [None, None], USUAL)
     there = [float(np.exp(of.prior().log_conditional_survival(60.0, DAY_S))) for of in (van, car)]
     assert there[0] > 0.25
-    assert there[1] >= there[0]
+    assert there[1] >= there[0] - 1e-3  # where none left they are alike, but for the draws
+
+
+def test_the_same_evidence_is_learned_from_once_and_in_any_order() -> None:
+    """Equal stays and statements give the very posterior that is there; the order of stays is nothing."""
+    rng, n = np.random.default_rng(4), 60
+    lasting, group = rng.weibull(0.8, n) * DAY_S, rng.integers(0, 3, n)
+    left, gone = np.minimum(lasting, 2.0 * DAY_S), np.where(lasting < 2.0 * DAY_S, 1.2 * lasting, np.inf)
+
+    def taught(order: IntArray, worth: float = 20.0) -> list[HazardPosterior]:
+        said = [Statement(Exponential.from_mean(DAY_S), worth), None, None]
+        return learn_hazards(
+            StayAges.of_samples(CensoredLifetimes.of(left[order], gone[order]), group[order]), said, USUAL
+        )
+
+    once = taught(np.arange(n))
+    assert all(one is other for one, other in zip(once, taught(np.arange(n)), strict=True))
+    assert taught(np.arange(n), 21.0)[0] is not once[0]
+    ages_s, other = np.array([0.01, 0.3, 1.0, 3.0]) * DAY_S, taught(rng.permutation(n))
+    for kind in range(4):
+        assert other[kind] is not once[kind]
+        np.testing.assert_allclose(other[kind].survival(ages_s), once[kind].survival(ages_s), atol=1e-9)
+
+
+def test_likely_members_of_the_grid_have_most_draws() -> None:
+    """An unlikely one has few, and its probability all the same: what is expected is what many draws tell."""
+    data, ages_s = followed(Exponential.from_mean(DAY_S), 60, 5.0 * DAY_S, seed=6), np.array([0.1, 1.0, 3.0]) * DAY_S
+    few = learned(data)
+    assert len(few.weight) < 3 * DRAWS
+    assert few.weight[-LEAST_DRAWS:].sum() < 0.06
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pooled_hazards, "LEAST_DRAWS", 16 * DRAWS)
+        patch.setattr(pooled_hazards, "NEGLIGIBLE", 0.0)
+        _learn_once.cache_clear()
+        many = learned(data)
+        _learn_once.cache_clear()
+    assert len(many.weight) == 8 * 16 * DRAWS
+    for one, other, within in zip(few.survival(ages_s), many.survival(ages_s), (0.01, 0.03, 0.03), strict=True):
+        np.testing.assert_allclose(one, other, atol=within)
 
 
 def test_classes_lean_on_each_other_and_a_new_one_on_all() -> None:

@@ -43,6 +43,8 @@ from evermap.survival.pooled_hazards import HazardPosterior, Statement, StayAges
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, rows_of
 
 USUAL = LifetimeConfig()
+BELIEVED = 2
+"""Digits of the belief in an end that are learned from: less is no other evidence."""
 AGES_AT_ONCE = 50
 """Of which the longest credible lifetimes are asked together."""
 
@@ -318,14 +320,16 @@ def stays_by_class(history: History, seen: Sightings, settings: LifetimeConfig) 
 def stay_ages(history: History, seen: Sightings) -> StayAges:
     """Return the recent stays by their ages; an end that is believed in part is one, and none, in proportion.
 
-    What was there at the first look is as old as it was seen: forecasts ask for no other age of it.
+    What was there at the first look is as old as it was seen: forecasts ask for no other age of it. What was missed and
+    is not told to be gone has gone in part, too, at any time until now: who learns of those alone that were seen again
+    takes all for lasting.
     """
     came = np.isfinite(seen.elsewhere_s)
     since_s = np.where(came, seen.elsewhere_s, seen.first_s)
     begin_s = since_s[:, None] + INSTANTS * (seen.first_s - since_s)[:, None]
-    first, last, gone = (stamp_s[:, None] - begin_s for stamp_s in (seen.first_s, seen.last_s, seen.gone_s))
-    kind = history.kind[history.recent]
-    p_gone = np.where(np.isfinite(seen.gone_s), history.stays.p_gone[history.recent], 0.0)
+    gone_s = np.where(np.isfinite(seen.gone_s), seen.gone_s, np.maximum(history.looks_s[-1], seen.last_s))
+    first, last, gone = (stamp_s[:, None] - begin_s for stamp_s in (seen.first_s, seen.last_s, gone_s))
+    kind, p_gone = history.kind[history.recent], np.round(history.stays.p_gone[history.recent], BELIEVED)
     never = np.full_like(gone, np.inf)
     both = [
         StayAges(first, last, gone, p_gone, kind, seen.gap_s, seen.back_by_stay, seen.back_rate),

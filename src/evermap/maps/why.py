@@ -14,7 +14,7 @@ from evermap.maps.living import EXISTS, LivingMap, Stays
 from evermap.maps.store.protocol import MapStore, Revision, RevisionKind
 from evermap.show import Shown
 from evermap.survival.durations import duration_text
-from evermap.types import Clock, MapChange, stamp_text
+from evermap.types import UNKNOWN, Clock, MapChange, stamp_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +185,7 @@ def _with_words(answer: Answer, living: LivingMap) -> Answer:
         reasons.append(f"it shares a body with {word} {others}: hits and misses of all of them count")
     if answer.pinned:
         reasons.append("it is pinned: it is never removed from the map")
+    reasons += _on_learning(answer, living)
     return replace(answer, headline=headline, reasons=tuple(reasons))
 
 
@@ -234,6 +235,29 @@ def _on_time(answer: Answer, living: LivingMap, last_s: float) -> list[str]:
     known = f"learned from {life.n_stays} stays" if life.n_stays else "nothing was learned for its class yet"
     like = f"of its class, {stay:.0%} of those that have stayed for {duration_text(age_s)}"
     return [f"{like} stay for another {duration_text(waited_s)} ({known})"]
+
+
+def _on_learning(answer: Answer, living: LivingMap) -> list[str]:
+    """Return a line on which stays, and which statement of a user, taught how long it stays."""
+    row = np.flatnonzero(living.members.landmark_id == answer.landmark_id)
+    place = living.place_row(living.members.landmark_id[row], living.site_of()[row])
+    class_id, lives = int(living.members.class_id[row[0]]), living.lives
+    life = lives.of(class_id, living.places.position_m[place[0]] if place[0] >= 0 else None)
+    taught = []
+    if life.n_stays:
+        name = f"class {answer.class_name}" if answer.class_name else "landmarks without a class"
+        whole = lives.of(class_id)
+        of = f"{life.n_stays} stays of {name}, {life.n_ended} of which ended"
+        if life != whole:
+            of += f", in its {lives.chunk_m:g} m of the floor, and {whole.n_stays}, {whole.n_ended}, on all of it"
+        taught.append(of)
+        others = np.setdiff1d(lives.class_id, [class_id, UNKNOWN])
+        if len(others):
+            taught.append(f"{len(others)} other class{'es' if len(others) > 1 else ''}, as far as classes are alike")
+    said = lives.prior_of(class_id)
+    if said is not None:
+        taught.append(f"what a user stated, which is worth {said.n_stays} stays")
+    return [f"how long it stays is known from {'; '.join(taught)}"] if taught else []
 
 
 def _looks(seen: Evidence) -> str:

@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -46,8 +47,9 @@ FAST = ((0.8, 0.1, 0.85), (0.8, 0.5, 0.1), (0.8, 1.5, 0.03), (0.25, 2.0, 0.02))
 """Lengths and standard deviations of the fast process, and their probabilities: hazards are smooth, as a rule."""
 LEAST_STRETCHES = 14
 """Stretches between the ages of the first and the last ends that were seen."""
-DRAWS = 256
-"""Draws for each member of the grid; half of them mirror images of the other half."""
+DRAWS, LEAST_DRAWS, NEGLIGIBLE = 256, 32, 5e-3
+"""Draws for the most probable member of the grid, half of them mirror images of the other half, and for others in
+proportion to their probability, but so many; and the probability below which there are none."""
 LEAST_SURVIVAL, TRUSTED = 1e-9, 0.02
 """Survival down to which the expected one is that of the usual prior, and of a stated one: what is left of a stated
 hazard later is its ratio to the expected one, the less, the more was seen at that age."""
@@ -168,8 +170,15 @@ class _Likelihood:
 
     def __call__(self, hazard: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Return the value, and gradient (K,) and second derivative (K, K) by log hazards."""
+        value, gradients, curvatures = self.by_class(hazard[None], np.zeros(len(self.stays.weight), dtype=np.int64))
+        return value, gradients[0], curvatures[0]
+
+    def by_class(self, hazards: FloatArray, row: IntArray) -> tuple[float, FloatArray, FloatArray]:
+        """Return the value under hazards (C, K), of which each stay has one (N,), in order; and gradients (C, K) and
+        second derivatives (C, K, K) by log hazards.
+        """
         stays, ended = self.stays, self.ended
-        before, during, after = (spent * hazard for spent in self.spent)
+        before, during, after = (spent * hazards[row, None] for spent in self.spent)
         until, stayed, left = (part.sum(axis=-1) for part in (before, during, after))
         score, first, second = -until, np.zeros_like(until), np.zeros_like(until)
         for part in (0, 1):
@@ -189,14 +198,20 @@ class _Likelihood:
         p, q = w * np.exp(score - seen[:, None]), w * np.exp(-until - there[:, None])
         slope = -before + first[..., None] * during + of_end[..., None] * after
         mean, mean_before = (slope * p[..., None]).sum(axis=1), (before * q[..., None]).sum(axis=1)
-        gradient = mean.sum(axis=0) + mean_before.sum(axis=0)
-        curvature = np.diag(gradient)
-        curvature += _outer(during, p * second) + _outer(after, p * of_end_2)
-        if slope.shape[1] > 1:  # one instant: both are 0
-            per = 1.0 / stays.weight
-            curvature += _outer(slope, p) - (mean * per[:, None]).T @ mean
-            curvature += (mean_before * per[:, None]).T @ mean_before - _outer(before, q)
-        return total, gradient, curvature
+        columns, weights = [during, after], [p * second, p * of_end_2]
+        if slope.shape[1] > 1:  # of one instant these are 0 in sum
+            per = 1.0 / w
+            columns += [slope, mean[:, None], mean_before[:, None], before]
+            weights += [p, -per, per, -q]
+        of_all, by = np.concatenate(columns, axis=1), np.concatenate(weights, axis=1)
+        n_classes, n_stretches = hazards.shape
+        gradients, curvatures = np.zeros((n_classes, n_stretches)), np.zeros((n_classes, n_stretches, n_stretches))
+        ends = np.searchsorted(row, np.arange(n_classes + 1))
+        for k, (low, high) in enumerate(pairwise(ends.tolist())):
+            gradients[k] = (mean[low:high] + mean_before[low:high]).sum(axis=0)
+            curvatures[k] = _outer(of_all[low:high], by[low:high])
+            curvatures[k].flat[:: n_stretches + 1] += gradients[k]
+        return total, gradients, curvatures
 
 
 def _outer(columns: FloatArray, weight: FloatArray) -> FloatArray:
@@ -369,7 +384,7 @@ def _integrate_expected(rates: FloatArray, weight: FloatArray, edges_s: FloatArr
     return np.asarray(np.maximum(-np.diff(log_expected), 0.0))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class Statement:
     """What a user states of a class, worth some stays; on stretches.
 
@@ -413,23 +428,62 @@ def learn_hazards(
     Returns:
         (C + 1,) posteriors, the last one of a class without stays.
     """
-    edges_s = stretches(stays) if edges_s is None else np.asarray(edges_s, dtype=np.float64)
+    evidence = _Evidence(stays, tuple(said), usual, stretches(stays) if edges_s is None else np.asarray(edges_s))
+    try:
+        hash(evidence)
+    except TypeError:  # a lifetime of another package may not be comparable
+        return _learn(evidence)
+    return list(_learn_once(evidence))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evidence:
+    """What hazards are learned from, as the arguments of `learn_hazards`; two of the same content are equal."""
+
+    stays: StayAges
+    said: tuple[Statement | None, ...]
+    usual: LifetimePrior
+    edges_s: FloatArray
+
+    @property
+    def content(self) -> tuple[Any, ...]:
+        """Return what makes it equal to another one."""
+        columns = (getattr(self.stays, name) for name in StayAges.__slots__)
+        arrays = [np.asarray(column, dtype=np.float64) for column in (*columns, self.edges_s)]
+        return (self.said, self.usual, *((one.shape, one.tobytes()) for one in arrays))
+
+    def __hash__(self) -> int:
+        return hash(self.content)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Evidence) and self.content == other.content
+
+
+@lru_cache(maxsize=8)
+def _learn_once(evidence: _Evidence) -> tuple[HazardPosterior, ...]:
+    """Return what was learned from the same evidence: sessions that change nothing, and who asks again."""
+    return tuple(_learn(evidence))
+
+
+def _learn(evidence: _Evidence) -> list[HazardPosterior]:
+    stays, said, edges_s = evidence.stays, evidence.said, evidence.edges_s
     edges = tuple(edges_s.tolist())
     free = [row for row, one in enumerate(said) if one is None]
     likelihoods = [_Likelihood(stays.of_group(row), edges_s) for row in range(len(said))]
     risk = [_at_risk(one) for one in likelihoods]
     found: list[HazardPosterior] = [None] * (len(said) + 1)  # type: ignore[list-item]
-    base = _usual_base(usual, edges)
-    log_evidence, draws, weights = [], [], []
-    for scale in _scales(edges):
-        evidence, of_free, their_weights = _fit_together([likelihoods[row] for row in free], scale, base)
-        log_evidence.append(evidence)
-        draws.append(of_free)
-        weights.append(their_weights)
-    of_scales = DRAWS * _draw_weights(_scales(edges), log_evidence)
+    base, scales = _usual_base(evidence.usual, edges), _scales(edges)
+    together = _Together.of([likelihoods[row] for row in free], stays, free, edges_s)
+    modes = list[_Mode]()
+    for scale in scales:
+        near = modes[-1] if modes and modes[-1].scale.columns is scale.columns else modes[0] if modes else None
+        modes.append(together.mode(scale, base, near))
+    counts = _draw_counts(_shares(scales, [mode.evidence for mode in modes]))
+    drawn = [(mode, together.draw(mode, base, n)) for mode, n in zip(modes, counts, strict=True) if n]
+    share = _shares([mode.scale for mode, _ in drawn], [mode.evidence + each.gain for mode, each in drawn])
     for at, row in enumerate([*free, len(said)]):
-        rates = base * np.exp(np.concatenate([each[at] for each in draws]))
-        weight = of_scales * np.concatenate([each[at] for each in weights])
+        rates = base * np.exp(np.concatenate([each.v[at] for _, each in drawn]))
+        weight = np.concatenate([p * each.weight[at] for p, (_, each) in zip(share, drawn, strict=True)])
         of = np.zeros(len(edges)) if row == len(said) else risk[row]
         found[row] = HazardPosterior(edges_s, rates, weight, None, np.zeros(len(edges)), of)
     for row, one in enumerate(said):
@@ -438,11 +492,23 @@ def learn_hazards(
     return found
 
 
+def _shares(scales: Sequence[_Scale], log_evidence: ArrayLike) -> FloatArray:
+    """(M,) probabilities of members of the grid."""
+    log_p = np.log([scale.p for scale in scales]) + np.asarray(log_evidence)
+    weight = np.exp(log_p - log_p.max())
+    return np.asarray(weight / weight.sum())
+
+
+def _draw_counts(share: FloatArray) -> list[int]:
+    """Return how many draws each member of the grid has, by their probabilities (M,)."""
+    counts = np.maximum(2.0 * np.ceil(0.5 * DRAWS * share / share.max()), LEAST_DRAWS)
+    return [int(count) for count in np.where(share < NEGLIGIBLE, 0.0, counts)]
+
+
 def _draw_weights(scales: Sequence[_Scale], log_evidence: Sequence[float] | None = None) -> FloatArray:
     """(S,) of the draws of all members of the grid, before any data where no evidence is given."""
-    log_p = np.log([scale.p for scale in scales]) + (0.0 if log_evidence is None else np.array(log_evidence))
-    weight = np.exp(log_p - log_p.max())
-    return np.asarray(np.repeat(weight / weight.sum() / DRAWS, DRAWS))
+    share = _shares(scales, np.zeros(len(scales)) if log_evidence is None else log_evidence)
+    return np.repeat(share / DRAWS, DRAWS)
 
 
 def _at_risk(likelihood: _Likelihood) -> FloatArray:
@@ -451,70 +517,141 @@ def _at_risk(likelihood: _Likelihood) -> FloatArray:
     return np.asarray(likelihood.stays.weight @ ((during + after) > 0.0))
 
 
-@lru_cache(maxsize=32)
-def _normals(r: int) -> tuple[FloatArray, FloatArray]:
-    """Return standard normal draws (DRAWS, R) twice, the same for all, each with its mirror image."""
+@lru_cache(maxsize=64)
+def _normals(r: int, n: int = DRAWS) -> tuple[FloatArray, FloatArray]:
+    """Return standard normal draws (N, R) twice, the same for all, each with its mirror image."""
     rng = np.random.default_rng(0)
-    one, other = (rng.standard_normal((DRAWS // 2, r)) for _ in range(2))
+    one, other = (rng.standard_normal((n // 2, r)) for _ in range(2))
     return np.concatenate([one, -one]), np.concatenate([other, -other])
 
 
-def _fit_together(
-    likelihoods: list[_Likelihood], scale: _Scale, base: FloatArray
-) -> tuple[float, list[FloatArray], list[FloatArray]]:
-    """Return the log evidence of a scale, draws (DRAWS, K) of `v` of each class and of a new one, and their weights.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Mode:
+    """The most probable hazards of all classes under one member of the grid.
+
+    Attributes:
+        scale: the member.
+        shared, own: (R,) numbers that all classes share, (C, R) those of each class, with the shared ones.
+        slopes, hessian: (C, R), (C, R, R) gradients of the log likelihoods there, and informations with the prior's.
+        inverse, of_shared: (C, R, R) inverse of these, (R, R) covariance of the shared numbers.
+        evidence: log evidence of the member, by a normal posterior.
+    """
+
+    scale: _Scale
+    shared: FloatArray
+    own: FloatArray
+    slopes: FloatArray
+    hessian: FloatArray
+    inverse: FloatArray
+    of_shared: FloatArray
+    evidence: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Draws:
+    """Draws under one member of the grid, of each class and of a new one.
+
+    Attributes:
+        v: (C + 1,) of them (S, K), logarithms of hazards.
+        weight: (C + 1,) of them (S,) of sum 1.
+        gain: log evidence over that of a normal posterior.
+    """
+
+    v: list[FloatArray]
+    weight: list[FloatArray]
+    gain: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Together:
+    """The stays of C classes that lean on each other.
 
     The numbers of a class are those that all share, of variance `common`, plus its own. Own ones are eliminated first.
+
+    Attributes:
+        each: likelihoods of the classes.
+        every: of the stays of all, in their order.
+        row: (N,) class of each of these.
     """
-    columns, n, r = scale.columns, len(likelihoods), scale.columns.shape[1]
-    of_shared, of_own = 1.0 / scale.common, 1.0 / (1.0 - scale.common)
-    shared, own = np.zeros(r), np.zeros((n, r))
 
-    def bent(s: FloatArray, v: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        with np.errstate(over="ignore", invalid="ignore"):
-            value, slopes, informations = _slopes(likelihoods, v, base, columns, of_own)
-        value -= 0.5 * of_shared * float(s @ s) + 0.5 * of_own * float(np.square(v - s).sum())
-        return value if np.isfinite(value) else -np.inf, slopes, informations
+    each: list[_Likelihood]
+    every: _Likelihood
+    row: IntArray
 
-    best, slopes, informations = bent(shared, own)
-    for _ in range(_NEWTON):
-        pull = slopes - of_own * (own - shared)
-        inverse = np.linalg.inv(informations + of_own * np.eye(r))
+    @classmethod
+    def of(cls, each: list[_Likelihood], stays: StayAges, classes: list[int], edges_s: FloatArray) -> Self:
+        order = np.argsort(stays.group, kind="stable")
+        order = order[np.isin(stays.group[order], classes)]
+        mine = StayAges(*(getattr(stays, name)[order] for name in StayAges.__slots__))
+        return cls(each, _Likelihood(mine, edges_s), np.searchsorted(classes, mine.group))
+
+    def mode(self, scale: _Scale, base: FloatArray, near: _Mode | None = None) -> _Mode:
+        """Return the most probable numbers, by Newton's method from those of another member, else from none."""
+        columns, n, r = scale.columns, len(self.each), scale.columns.shape[1]
+        of_shared, of_own = 1.0 / scale.common, 1.0 / (1.0 - scale.common)
+        shared, own = np.zeros(r), np.zeros((n, r))
+
+        def bent(s: FloatArray, v: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+            with np.errstate(over="ignore", invalid="ignore"):
+                value, gradients, curvatures = self.every.by_class(base * np.exp(v @ columns.T), self.row)
+            value -= 0.5 * of_shared * float(s @ s) + 0.5 * of_own * float(np.square(v - s).sum())
+            informations = np.array([_usable(one, of_own) for one in -columns.T @ curvatures @ columns])
+            informations = informations.reshape(n, r, r)
+            return value if np.isfinite(value) else -np.inf, gradients @ columns, informations
+
+        best, slopes, informations = bent(shared, own)
+        if near is not None:
+            onto = np.eye(r) if near.scale.columns is columns else near.scale.columns.T @ np.linalg.pinv(columns).T
+            start = near.shared @ onto, near.own @ onto
+            if (there := bent(*start))[0] > best:
+                (shared, own), (best, slopes, informations) = start, there
+        for _ in range(_NEWTON):
+            pull = slopes - of_own * (own - shared)
+            inverse = np.linalg.inv(informations + of_own * np.eye(r))
+            matrix = (of_shared + n * of_own) * np.eye(r) - of_own**2 * inverse.sum(axis=0)
+            solved = np.einsum("gij,gj->gi", inverse, pull)
+            slope = -of_shared * shared + of_own * ((own - shared) + solved).sum(axis=0)
+            step = np.linalg.solve(matrix, slope)
+            steps = solved + of_own * inverse @ step
+            factor = min(1.0, _STEP / max(float(np.abs(steps @ columns.T).max(initial=0.0)), 1e-300))
+            while (after := bent(shared + factor * step, own + factor * steps))[0] < best and factor > 1e-4:
+                factor *= 0.5
+            gain = after[0] - best
+            if gain > 0.0:
+                shared, own = shared + factor * step, own + factor * steps
+                best, slopes, informations = after
+            if gain < _SETTLED:
+                break
+        hessian = informations + of_own * np.eye(r)
+        inverse = np.linalg.inv(hessian)
         matrix = (of_shared + n * of_own) * np.eye(r) - of_own**2 * inverse.sum(axis=0)
-        solved = np.einsum("gij,gj->gi", inverse, pull)
-        slope = -of_shared * shared + of_own * ((own - shared) + solved).sum(axis=0)
-        step = np.linalg.solve(matrix, slope)
-        steps = solved + of_own * inverse @ step
-        factor = min(1.0, _STEP / max(float(np.abs(steps @ columns.T).max(initial=0.0)), 1e-300))
-        while (after := bent(shared + factor * step, own + factor * steps))[0] < best and factor > 1e-4:
-            factor *= 0.5
-        gain = after[0] - best
-        if gain > 0.0:
-            shared, own = shared + factor * step, own + factor * steps
-            best, slopes, informations = after
-        if gain < _SETTLED:
-            break
-    hessian = informations + of_own * np.eye(r)
-    inverse = np.linalg.inv(hessian)
-    matrix = (of_shared + n * of_own) * np.eye(r) - of_own**2 * inverse.sum(axis=0)
-    evidence = best + 0.5 * r * (np.log(of_shared) + n * np.log(of_own)) - 0.5 * _logdet(matrix)
-    evidence -= 0.5 * sum(_logdet(one) for one in hessian)
-    one, other = _normals(r)
-    of_both = np.linalg.inv(matrix)
-    common = one @ _root(of_both)
-    draws, weights, moved = [], [], np.zeros_like(common)
-    for row, covariance in enumerate(inverse):
-        spread = of_own * common @ covariance + other @ _root(covariance)
-        line = _Line(likelihoods[row], base, columns, own[row], slopes[row], informations[row])
-        found, weight, gain = line.draw(spread, covariance + of_own**2 * covariance @ of_both @ covariance)
-        evidence += gain
-        moved += found - spread
-        draws.append((own[row] + found) @ columns.T)
-        weights.append(weight)
-    common = common + of_own / (of_shared + n * of_own) * moved
-    draws.append((shared + common + np.sqrt(1.0 / of_own) * other) @ columns.T)
-    weights.append(np.full(DRAWS, 1.0 / DRAWS))
-    return float(evidence), draws, weights
+        evidence = best + 0.5 * r * (np.log(of_shared) + n * np.log(of_own)) - 0.5 * _logdet(matrix)
+        evidence -= 0.5 * sum(_logdet(one) for one in hessian)
+        of_each, of_both = (np.asarray(np.linalg.inv(one), dtype=np.float64) for one in (hessian, matrix))
+        return _Mode(scale, shared, own, slopes, hessian, of_each, of_both, float(evidence))
+
+    def draw(self, mode: _Mode, base: FloatArray, count: int) -> _Draws:
+        """Return draws about the most probable numbers."""
+        scale, columns, n = mode.scale, mode.scale.columns, len(self.each)
+        of_shared, of_own = 1.0 / scale.common, 1.0 / (1.0 - scale.common)
+        one, other = _normals(columns.shape[1], count)
+        common = one @ _root(mode.of_shared)
+        draws, weights, moved, gain = [], [], np.zeros_like(common), 0.0
+        for row, covariance in enumerate(mode.inverse):
+            spread = of_own * common @ covariance + other @ _root(covariance)
+            information = mode.hessian[row] - of_own * np.eye(len(covariance))
+            value = float(self.each[row].values(base * np.exp(columns @ mode.own[row])[None])[0])
+            line = _Line(self.each[row], base, columns, mode.own[row], mode.slopes[row], information, value)
+            whole = covariance + of_own**2 * covariance @ mode.of_shared @ covariance
+            found, weight, more = line.draw(spread, whole)
+            gain += more
+            moved += found - spread
+            draws.append((mode.own[row] + found) @ columns.T)
+            weights.append(weight)
+        common = common + of_own / (of_shared + n * of_own) * moved
+        draws.append((mode.shared + common + np.sqrt(1.0 / of_own) * other) @ columns.T)
+        weights.append(np.full(count, 1.0 / count))
+        return _Draws(draws, weights, gain)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -526,6 +663,7 @@ class _Line:
         base: (K,) hazards that are 1.
         columns: (K, R) of the scale.
         mode, slope, information: (R,), (R,), (R, R) most probable numbers, gradient and information there.
+        value: log likelihood there.
     """
 
     likelihood: _Likelihood
@@ -534,15 +672,15 @@ class _Line:
     mode: FloatArray
     slope: FloatArray
     information: FloatArray
+    value: float
 
     def excess(self, deviations: FloatArray) -> FloatArray:
         """Return by how much (...) the log likelihood is over its parabola, at deviations (..., R) from the mode."""
         with np.errstate(over="ignore", invalid="ignore"):
             hazards = self.base * np.exp((self.mode + deviations) @ self.columns.T)
             values = self.likelihood.values(hazards.reshape(-1, len(self.base))).reshape(deviations.shape[:-1])
-            middle = self.likelihood.values(self.base * np.exp(self.columns @ self.mode)[None])
             bend = 0.5 * ((deviations @ self.information) * deviations).sum(axis=-1)
-            found = values - middle - deviations @ self.slope + bend
+            found = values - self.value - deviations @ self.slope + bend
         return np.asarray(np.where(np.isfinite(found), found, -1.0 / _TINY))
 
     def draw(self, spread: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, float]:
@@ -554,7 +692,7 @@ class _Line:
         """
         from scipy.special import ndtr
 
-        root = _root(covariance)
+        root = _root(covariance)  # which Cholesky's is not where the likelihood is convex
         _, turned = np.linalg.eigh(root @ self.information @ root)
         axes = root @ turned
         bent = np.flatnonzero(np.abs(self.excess(LINE[FAR, None] * axes.T[:, None])).max(axis=1) > STRAIGHT)
@@ -575,19 +713,6 @@ class _Line:
         gain += log_weight.max() + np.log(weight.mean())
         weight = np.minimum(weight, HEAVIEST * weight.mean())
         return found, weight / weight.sum(), float(gain)
-
-
-def _slopes(
-    likelihoods: list[_Likelihood], own: FloatArray, base: FloatArray, columns: FloatArray, least: float
-) -> tuple[float, FloatArray, FloatArray]:
-    """Return the log likelihood, gradients (C, R), and informations (C, R, R), positive definite with the prior's."""
-    r, total = columns.shape[1], 0.0
-    gradients, informations = np.zeros((len(own), r)), np.zeros((len(own), r, r))
-    for row, (one, of) in enumerate(zip(likelihoods, own, strict=True)):
-        value, gradient, curvature = one(base * np.exp(columns @ of))
-        total += value
-        gradients[row], informations[row] = gradient @ columns, _usable(-columns.T @ curvature @ columns, least)
-    return total, gradients, informations
 
 
 def _usable(information: FloatArray, least: float) -> FloatArray:
@@ -700,13 +825,15 @@ def _not_impossible(base: FloatArray, likelihood: _Likelihood, said: Statement, 
 
 
 def _usual_base(usual: LifetimePrior, edges: tuple[float, ...]) -> FloatArray:
-    draws = []
-    for scale in _scales(edges):
-        one, other = _normals(scale.columns.shape[1])
+    """Return hazards (K,) such that draws as those of a class without stays have the usual expected survival."""
+    scales, draws, weights = _scales(edges), [], []
+    share = _shares(scales, np.zeros(len(scales)))
+    for scale, p, n in zip(scales, share.tolist(), _draw_counts(share), strict=True):
+        one, other = _normals(scale.columns.shape[1], n)
         numbers = np.sqrt(scale.common) * one + np.sqrt(1.0 - scale.common) * other
         draws.append(numbers @ scale.columns.T)
-    even = _draw_weights(_scales(edges))
-    return _match_survival(usual, np.asarray(edges), np.concatenate(draws), even)
+        weights.append(np.full(n, p / n))
+    return _match_survival(usual, np.asarray(edges), np.concatenate(draws), np.concatenate(weights))
 
 
 def _match_survival(

@@ -20,7 +20,7 @@ from evermap.maps.store import open_store
 from evermap.pipeline import run_session
 from evermap.runs.sessions import enter_session
 from evermap.types import ChangeKind, IntArray, MapChange, SpatialRecording
-from evermap_studies.worlds.parking import DAY_S, SPEED_MPS, STEP_S, Faults, Parking, Spell
+from evermap_studies.worlds.parking import CAR, DAY_S, SPEED_MPS, STEP_S, VAN, Faults, Parking, Spell
 
 COMES = (ChangeKind.APPEARED, ChangeKind.RETURNED)
 PARTS = ((0.0, 1.0), (0.2, 1.0), (0.0, 0.85))
@@ -195,6 +195,23 @@ def test_what_comes_and_leaves_in_view_is_told_with_its_instant(days: Days) -> N
             when = day * DAY_S + at_s
             seen += len(mine) == 1 and when - 2.0 < mine[0].stamp_from_s <= mine[0].stamp_to_s < when + 2.5
         assert seen >= 3  # of four; one may be behind another car then
+
+
+def test_a_van_where_a_car_had_stood_came_after_it() -> None:
+    """It was not seen to come, and lifetimes alone do not tell: but two bodies are never in one spot."""
+    rng, street, slot = np.random.default_rng(1), Parking.of(1, class_names=(CAR, VAN)), 27
+    for one in range(len(street.slot)):
+        street.park(rng, one, -1e6, 0.5 * DAY_S if one == slot else 1e6, 0)
+    street.park(rng, slot, 1.5 * DAY_S, 1e6, 1)
+    living, slots = None, dict[int, int]()
+    for day in range(3):
+        session = run_session(street.drive(100 + day, day * DAY_S), living)
+        living = session.living
+        slots |= dict(zip(*(column.tolist() for column in in_street(living, street)), strict=True))
+    came = [one for one in session.changes if one.kind in COMES]
+    assert [slots[one.landmark_ids[0]] for one in came] == [slot]
+    assert came[0].probability > 0.9
+    assert 0.0 < came[0].stamp_from_s < 40.0  # when the car was seen last
 
 
 def test_stays_are_the_spells_and_what_lifetimes_are_learned_from(days: Days) -> None:

@@ -294,3 +294,29 @@ def arrived(came: Arrivals, what: Witnessed, entry: Extended) -> Arrivals:
     new = ~np.isin(entry.living.sites.site_id[site], entry.before.sites.site_id) | np.isfinite(what.since_s)
     left = np.flatnonzero(np.isfinite(what.until_s) & (site >= 0) & new)
     return replace(came, came=seen, left_s={int(site[k]): float(what.until_s[k] + what.when_s) for k in left})
+
+
+def follow_occupants(came: Arrivals, now: Believed, entry: Extended) -> Arrivals:
+    """Return arrivals of which some are at the spot of a box that is away by now.
+
+    Two bodies are never in one spot: what is new within half a width of the middle of a former box came after that was
+    last seen, as surely as the box is away.
+    """
+    before, sites, middle = entry.before, now.sites, site_middles(entry.living)
+    width_m = before.boxes.of(before.places.landmark_id)[:, :2].min(axis=1)
+    boxes = np.flatnonzero(np.isfinite(width_m))
+    if not len(boxes) or not len(came.site):
+        return came
+    old = np.searchsorted(sites.site_id, before.places.site_id[boxes])
+    cliques, row = clique_rows(sites)
+    p_away = 1.0 - np.bincount(row, sites.p_here, minlength=len(cliques))
+    looked, p_appeared = came.looked_s.copy(), came.p_appeared.copy()
+    for k, site in enumerate(came.site.tolist()):
+        away_m = np.linalg.norm(before.places.position_m[boxes] - middle[site], axis=1)
+        there = np.flatnonzero((away_m < 0.5 * width_m[boxes]) & (row[old] != row[site]))
+        if not len(there):
+            continue
+        last = old[there[np.argmax(sites.seen_s[old[there]])]]
+        if p_away[row[last]] > p_appeared[k]:
+            looked[k], p_appeared[k] = float(sites.seen_s[last]), float(p_away[row[last]])
+    return replace(came, looked_s=looked, p_appeared=p_appeared)

@@ -17,7 +17,7 @@ from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Places, Stays
 from evermap.maps.sessions import believe, decide
-from evermap.maps.sessions.believe import Believed, arrived, departed
+from evermap.maps.sessions.believe import Believed, arrived, departed, follow_occupants
 from evermap.maps.sessions.extend import Extended, Found, extended
 from evermap.maps.sessions.looks import (
     Arrivals,
@@ -304,6 +304,7 @@ def judged(
     seen = looked_at(entry.living, entry.p_start, watch, config)
     now = believe.believed(entry, seen, sensor, span_s, config)
     came = arrivals(entry.before, entry.living, now.until_s, seen, sensor, config.looks)
+    came = follow_occupants(came, now, entry)
     if len(visit.witnessed.landmark_id):
         came = arrived(came, visit.witnessed, entry)
         now, seen = departed(now, seen, visit.witnessed, entry)
