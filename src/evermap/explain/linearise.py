@@ -151,7 +151,8 @@ def _residuals_in_plane(session: Solved, optimum: Optimum, inputs: Inputs, undon
         mount=other.mount, landmark_mean=mean,
     )  # fmt: skip
     smoother = Smoother(moved, session.outcome.noise.noise, robust=session.settings.robust)
-    return residuals_of(optimum.graph, smoother.linearised(optimum.state))[1]
+    graph = replace(optimum.graph, blocks=smoother.blocks(optimum.state.known))  # which ties the same
+    return residuals_of(graph, exhausted(graph.linearised(optimum.state)))[1]
 
 
 def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Inputs, undone: Inputs) -> FloatArray | None:
