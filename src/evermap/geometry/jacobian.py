@@ -12,7 +12,7 @@ from math import factorial
 
 import numpy as np
 
-from evermap.types import BoolArray, FloatArray
+from evermap.types import FloatArray
 
 SERIES_BELOW = 1.0
 """Squared rotation below which coefficients are sums of `TERMS` terms; the rest is below 1e-18 there."""
@@ -23,44 +23,31 @@ SERIES = np.array([B_SERIES, C_SERIES, [0.0, *np.polyder(B_SERIES)]])
 """Coefficients of `b`, of `c` and of the derivative of `b`, the highest powers first."""
 
 
-def coefficients(q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return `b = (1 - cos t) / t^2` and `c = (t - sin t) / t^3` of `q = t^2`, without cancellation.
+def inverse_coefficient(q: FloatArray) -> FloatArray:
+    """Return `d = (1 - (t / 2) cot(t / 2)) / t^2` of `q = t^2 < 4 pi^2`, without cancellation.
 
-    The left Jacobian of a rotation vector is `1 + b W + c W^2`, `W` its cross product matrix.
+    The inverse of the left Jacobian of a rotation vector is `1 - W / 2 + d W^2`. The Jacobian is `1 + b W + c W^2` with
+    `b = (1 - cos t) / t^2` and `c = (t - sin t) / t^3`, `W` its cross product matrix.
     """
     small = q < SERIES_BELOW
-    b, c = _sum_series(SERIES[:2], q)
-    return (b, c) if small.all() else _beyond_series(q, small, b, c)
-
-
-def _beyond_series(q: FloatArray, small: BoolArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return `coefficients`, in closed form where the sums `b` and `c` do not hold."""
-    safe = np.where(small, 1.0, q)
-    t = np.sqrt(safe)
-    return np.where(small, b, 2.0 * np.sin(t / 2) ** 2 / safe), np.where(small, c, (t - np.sin(t)) / (safe * t))
+    b, c, slope = _sum_series(SERIES, q)
+    if not small.all():
+        safe = np.where(small, 1.0, q)
+        t = np.sqrt(safe)
+        b = np.where(small, b, 2.0 * np.sin(t / 2) ** 2 / safe)
+        c = np.where(small, c, (t - np.sin(t)) / (safe * t))
+        slope = np.where(small, slope, (1.0 - 2.0 * b - q * c) / (2.0 * safe))
+    return np.asarray(-slope / b)
 
 
 def _sum_series(series: FloatArray, q: FloatArray) -> FloatArray:
     """Return (K, ...) sums of power series (K, T) at `q`, by Horner's rule for all together."""
     coefficient = series.T.reshape(series.shape[1], len(series), *(1,) * q.ndim)
-    found = coefficient[0] * np.ones_like(q)
+    found: FloatArray = coefficient[0] * np.ones_like(q)
     for each in coefficient[1:]:
         found *= q
         found += each
     return found
-
-
-def inverse_coefficient(q: FloatArray) -> FloatArray:
-    """Return `d = (1 - (t / 2) cot(t / 2)) / t^2` of `q = t^2 < 4 pi^2`.
-
-    The inverse of the left Jacobian of a rotation vector is `1 - W / 2 + d W^2`.
-    """
-    small = q < SERIES_BELOW
-    b, c, slope = _sum_series(SERIES, q)
-    if not small.all():
-        b, c = _beyond_series(q, small, b, c)
-        slope = np.where(small, slope, (1.0 - 2.0 * b - q * c) / np.where(small, 2.0, 2.0 * q))
-    return np.asarray(-slope / b)
 
 
 def inverse_slope(q: FloatArray, d: FloatArray) -> FloatArray:
