@@ -160,10 +160,9 @@ def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Input
     moved = _problem_of(session, inputs, undone)
     if moved is None:
         return None
-    smoother = SpatialSmoother(moved, solved.estimate.pose)
+    # what a cause changes are measurements, not what they tie
+    smoother = SpatialSmoother(moved, solved.estimate.pose, optimum.graph.structure)
     now = exhausted(smoother.graph(solved.noise, heavy=False).linearised(solved.estimate))
-    if not np.array_equal(smoother.structure.system.tree.value_first, optimum.graph.structure.system.tree.value_first):
-        return None
     return residuals_of(optimum.graph, now)[1]
 
 
@@ -223,7 +222,8 @@ def gain_by(session: AnySession, before: float, inputs: Inputs, suspect: Suspect
         moved = _problem_of(session, inputs, suspect.undo(inputs, 0.0))
         if moved is None:
             return -np.inf
-        smoother = SpatialSmoother(moved, solved.estimate.pose)
+        fitted = (solved.fitted or (solved.smoother, solved.now))[0]
+        smoother = SpatialSmoother(moved, solved.estimate.pose, fitted.structure)
         _, now = smoother.optimum(solved.estimate, solved.noise, heavy=True, iterations=FEW_STEPS, wanted=before)
     except EvermapError:
         return -np.inf
@@ -245,7 +245,8 @@ def solve_nearby(session: AnySession, inputs: Inputs, undone: Inputs) -> Spatial
         moved = _problem_of(session, inputs, undone)
         if moved is None:
             return None
-        smoother = SpatialSmoother(moved, solved.estimate.pose)
+        fitted = (solved.fitted or (solved.smoother, solved.now))[0]
+        smoother = SpatialSmoother(moved, solved.estimate.pose, fitted.structure)
         estimate, now = smoother.optimum(solved.estimate, solved.noise, heavy=False, iterations=STEPS_NEARBY)
     except EvermapError:
         return None

@@ -13,7 +13,16 @@ from functools import cached_property
 import numpy as np
 
 from evermap.estimate.gauss_newton import Steps, minimised
-from evermap.estimate.graph import Border, FactorBlock, Graph, Layout, Linear, build_structure, grouped
+from evermap.estimate.graph import (
+    Border,
+    FactorBlock,
+    Graph,
+    GraphStructure,
+    Layout,
+    Linear,
+    build_structure,
+    grouped,
+)
 from evermap.estimate.innovations import find_left_out_nis
 from evermap.estimate.measurement import MeasurementFactors, Tied
 from evermap.estimate.sparse.elimination import Spread
@@ -86,9 +95,10 @@ class SpatialSmoother:
     Args:
         problem: the measurements.
         around: (N, 7) rough poses, along whose positions the elimination may be cut; the first is held where it is.
+        structure: of a problem with the same variables and detections, if one is known.
     """
 
-    def __init__(self, problem: SpatialProblem, around: FloatArray) -> None:
+    def __init__(self, problem: SpatialProblem, around: FloatArray, structure: GraphStructure | None = None) -> None:
         self.problem = problem
         self._seen = problem.sightings
         sigma = np.append(np.column_stack([problem.mount_sigma, problem.delay_sigma_s]), problem.scale_sigma)
@@ -107,7 +117,9 @@ class SpatialSmoother:
         layout = Layout(
             dim, n + count + np.arange(len(problem.mount) + 1), leaf, np.column_stack([leaf, around[:, :3]])
         )
-        self.structure = exhausted(build_structure(layout, self._blocks(SpatialNoise(), heavy=False)))
+        if structure is None:
+            structure = exhausted(build_structure(layout, self._blocks(SpatialNoise(), heavy=False)))
+        self.structure = structure
         begin = self.structure.system.tree.begin
         self._held = np.zeros(begin[-1])
         self._held[6 * n : -len(sigma)] = HELD
