@@ -187,6 +187,14 @@ def rigid_directions(point: ArrayLike) -> FloatArray:
     return np.concatenate([shift, -_crossing(at)], axis=-1).reshape(-1, 6)
 
 
+def warm_up() -> None:
+    """Compile what motions need, or load it where that was done before: for steps that may not wait for it."""
+    pose = compose(inverse(identity(1)), normalised(exp(np.zeros((1, 6)))))
+    log(between(pose, pose))
+    transform(pose, np.zeros(point_dim))
+    rotation_of(pose)
+
+
 def _rows(*given: ArrayLike) -> tuple[Any, ...]:
     """Return the leading axes of arrays (..., k), broadcast, and the rows (N, k) of each, or (1, k)."""
     arrays = [np.asarray(each, dtype=np.float64) for each in given]
