@@ -23,7 +23,7 @@ RULES = {
     "show": "errors",
     "types": "errors show",
     "config": "errors types",
-    "geometry": "types",
+    "geometry": "compiled types",
     "survival": "errors show types",
     "valid": "errors types",
     "estimate": "errors compiled types geometry",

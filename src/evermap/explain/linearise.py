@@ -151,7 +151,8 @@ def _residuals_in_plane(session: Solved, optimum: Optimum, inputs: Inputs, undon
         mount=other.mount, landmark_mean=mean,
     )  # fmt: skip
     smoother = Smoother(moved, session.outcome.noise.noise, robust=session.settings.robust)
-    return residuals_of(optimum.graph, smoother.linearised(optimum.state))[1]
+    graph = replace(optimum.graph, blocks=smoother.blocks(optimum.state.known))  # which ties the same
+    return residuals_of(graph, exhausted(graph.linearised(optimum.state)))[1]
 
 
 def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Inputs, undone: Inputs) -> FloatArray | None:
@@ -160,11 +161,11 @@ def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Input
     before = (solved.fitted or (solved.smoother, solved.now))[0].problem.swing
     if moved is None or not np.array_equal(moved.swing.steps, before.steps):
         return None
-    # noise stays: the axes of an arm turn as they like where two are as long; with tails that never let go no weight is 0
-    smoother = SpatialSmoother(replace(moved, swing=before), solved.estimate.pose)
+    # what a cause changes are measurements, not what they tie; noise stays, as the axes of an arm turn as they like where
+    # two are as long; and no weight is 0 with tails that never let go
+    fixed = replace(moved, swing=before)
+    smoother = SpatialSmoother(fixed, solved.estimate.pose, optimum.graph.structure)
     now = exhausted(smoother.graph(solved.noise, heavy=True).linearised(solved.estimate))
-    if not np.array_equal(smoother.structure.system.tree.value_first, optimum.graph.structure.system.tree.value_first):
-        return None
     return residuals_of(optimum.graph, now)[1]
 
 
@@ -224,7 +225,8 @@ def gain_by(session: AnySession, before: float, inputs: Inputs, suspect: Suspect
         moved = _problem_of(session, inputs, suspect.undo(inputs, 0.0))
         if moved is None:
             return -np.inf
-        smoother = SpatialSmoother(moved, solved.estimate.pose)
+        fitted = (solved.fitted or (solved.smoother, solved.now))[0]
+        smoother = SpatialSmoother(moved, solved.estimate.pose, fitted.structure)
         _, now = smoother.optimum(solved.estimate, solved.noise, heavy=True, iterations=FEW_STEPS, wanted=before)
     except EvermapError:
         return -np.inf
@@ -246,7 +248,8 @@ def solve_nearby(session: AnySession, inputs: Inputs, undone: Inputs) -> Spatial
         moved = _problem_of(session, inputs, undone)
         if moved is None:
             return None
-        smoother = SpatialSmoother(moved, solved.estimate.pose)
+        fitted = (solved.fitted or (solved.smoother, solved.now))[0]
+        smoother = SpatialSmoother(moved, solved.estimate.pose, fitted.structure)
         estimate, now = smoother.optimum(solved.estimate, solved.noise, heavy=False, iterations=STEPS_NEARBY)
     except EvermapError:
         return None

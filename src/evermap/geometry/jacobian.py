@@ -19,34 +19,35 @@ SERIES_BELOW = 1.0
 TERMS = 10
 B_SERIES = [(-1) ** m / factorial(2 * m + 2) for m in reversed(range(TERMS))]
 C_SERIES = [(-1) ** m / factorial(2 * m + 3) for m in reversed(range(TERMS))]
-BY_B_SERIES = np.polyder(B_SERIES)
-
-
-def coefficients(q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return `b = (1 - cos t) / t^2` and `c = (t - sin t) / t^3` of `q = t^2`, without cancellation.
-
-    The left Jacobian of a rotation vector is `1 + b W + c W^2`, `W` its cross product matrix.
-    """
-    small = q < SERIES_BELOW
-    safe = np.where(small, 1.0, q)
-    t = np.sqrt(safe)
-    b = np.where(small, np.polyval(B_SERIES, q), 2.0 * np.sin(t / 2) ** 2 / safe)
-    return b, np.where(small, np.polyval(C_SERIES, q), (t - np.sin(t)) / (safe * t))
-
-
-def slope(q: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """Return the derivative by `q` of the first of both `coefficients`."""
-    small = q < SERIES_BELOW
-    return np.where(small, np.polyval(BY_B_SERIES, q), (1.0 - 2.0 * b - q * c) / np.where(small, 2.0, 2.0 * q))
+SERIES = np.array([B_SERIES, C_SERIES, [0.0, *np.polyder(B_SERIES)]])
+"""Coefficients of `b`, of `c` and of the derivative of `b`, the highest powers first."""
 
 
 def inverse_coefficient(q: FloatArray) -> FloatArray:
-    """Return `d = (1 - (t / 2) cot(t / 2)) / t^2` of `q = t^2 < 4 pi^2`.
+    """Return `d = (1 - (t / 2) cot(t / 2)) / t^2` of `q = t^2 < 4 pi^2`, without cancellation.
 
-    The inverse of the left Jacobian of a rotation vector is `1 - W / 2 + d W^2`.
+    The inverse of the left Jacobian of a rotation vector is `1 - W / 2 + d W^2`. The Jacobian is `1 + b W + c W^2` with
+    `b = (1 - cos t) / t^2` and `c = (t - sin t) / t^3`, `W` its cross product matrix.
     """
-    b, c = coefficients(q)
-    return np.asarray(-slope(q, b, c) / b)
+    small = q < SERIES_BELOW
+    b, c, slope = _sum_series(SERIES, q)
+    if not small.all():
+        safe = np.where(small, 1.0, q)
+        t = np.sqrt(safe)
+        b = np.where(small, b, 2.0 * np.sin(t / 2) ** 2 / safe)
+        c = np.where(small, c, (t - np.sin(t)) / (safe * t))
+        slope = np.where(small, slope, (1.0 - 2.0 * b - q * c) / (2.0 * safe))
+    return np.asarray(-slope / b)
+
+
+def _sum_series(series: FloatArray, q: FloatArray) -> FloatArray:
+    """Return (K, ...) sums of power series (K, T) at `q`, by Horner's rule for all together."""
+    coefficient = series.T.reshape(series.shape[1], len(series), *(1,) * q.ndim)
+    found: FloatArray = coefficient[0] * np.ones_like(q)
+    for each in coefficient[1:]:
+        found *= q
+        found += each
+    return found
 
 
 def inverse_slope(q: FloatArray, d: FloatArray) -> FloatArray:

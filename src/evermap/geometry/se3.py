@@ -8,6 +8,8 @@ that is not zero is positive. They may be given with any sign; `normalised` acce
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -45,45 +47,51 @@ def from_angles(roll_pitch_yaw: ArrayLike) -> FloatArray:
 
 def normalised(pose: ArrayLike) -> FloatArray:
     """Return poses (..., 7) with quaternions of unit length and of one sign."""
-    return _normalise(np.array(pose, dtype=np.float64))
+    from evermap.geometry import se3_kernels
 
-
-def _normalise(pose: FloatArray) -> FloatArray:
-    """Normalise in place."""
-    quaternion = pose[..., 3:]
-    scalar = quaternion[..., 3]
-    backwards = scalar < 0.0
-    if not np.all(scalar):  # whichever of qw, qz, qy, qx is the first that is not zero outweighs all that follow
-        backwards = np.sign(quaternion) @ [1.0, 2.0, 4.0, 8.0] < 0.0
-    length = np.sqrt(_dot(quaternion, quaternion))
-    quaternion /= np.where(backwards[..., None], -length, length)
-    return pose
+    found = np.array(pose, dtype=np.float64, order="C")
+    se3_kernels.normalise(found.reshape(-1, 7))
+    return found
 
 
 def compose(a: ArrayLike, b: ArrayLike) -> FloatArray:
     """Return `a * b`: the pose `b`, given in the frame `a`. Shapes (..., 7), broadcast."""
-    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
-    return _pose(transform(a, b[..., :3]), _times(a[..., 3:], b[..., 3:]))
+    from evermap.geometry import se3_kernels
+
+    lead, one, other = _rows(a, b)
+    found = np.empty((*lead, 7))
+    se3_kernels.compose(one, other, found.reshape(-1, 7))
+    return found
 
 
 def inverse(a: ArrayLike) -> FloatArray:
     """Return the motion that undoes `a`. Shape (..., 7)."""
-    a = np.asarray(a, dtype=np.float64)
-    back = _conjugate(a[..., 3:])
-    return _pose(-_turned(back, a[..., :3]), back)
+    from evermap.geometry import se3_kernels
+
+    lead, one = _rows(a)
+    found = np.empty((*lead, 7))
+    se3_kernels.inverse(one, found.reshape(-1, 7))
+    return found
 
 
 def between(a: ArrayLike, b: ArrayLike) -> FloatArray:
     """Return `a^-1 * b`: the pose `b` seen from `a`. Shapes (..., 7), broadcast."""
-    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
-    back = _conjugate(a[..., 3:])
-    return _pose(_turned(back, b[..., :3] - a[..., :3]), _times(back, b[..., 3:]))
+    from evermap.geometry import se3_kernels
+
+    lead, one, other = _rows(a, b)
+    found = np.empty((*lead, 7))
+    se3_kernels.between(one, other, found.reshape(-1, 7))
+    return found
 
 
 def transform(pose: ArrayLike, point: ArrayLike) -> FloatArray:
     """Return points (..., 3) of the frame `pose` in the frame that `pose` is given in."""
-    pose = np.asarray(pose, dtype=np.float64)
-    return pose[..., :3] + _turned(pose[..., 3:], np.asarray(point, dtype=np.float64))
+    from evermap.geometry import se3_kernels
+
+    lead, one, other = _rows(pose, point)
+    found = np.empty((*lead, 3))
+    se3_kernels.transform(one, other, found.reshape(-1, 3))
+    return found
 
 
 def scaled(pose: ArrayLike, factor: float) -> FloatArray:
@@ -94,33 +102,32 @@ def scaled(pose: ArrayLike, factor: float) -> FloatArray:
 
 def rotation_of(pose: ArrayLike) -> FloatArray:
     """Return the rotation matrices (..., 3, 3) of poses (..., 7)."""
-    quaternion = np.asarray(pose, dtype=np.float64)[..., None, 3:]
-    return np.swapaxes(_turned(quaternion, np.eye(3)), -1, -2)
+    from evermap.geometry import se3_kernels
+
+    lead, one = _rows(pose)
+    found = np.empty((*lead, 3, 3))
+    se3_kernels.rotation_of(one, found.reshape(-1, 3, 3))
+    return found
 
 
 def exp(twist: ArrayLike) -> FloatArray:
     """Return the motion along a constant twist for unit time. Shapes (..., 6) and (..., 7)."""
-    twist = np.asarray(twist, dtype=np.float64)
-    shift, turn = twist[..., :3], twist[..., 3:]
-    q = _dot(turn, turn)
-    b, c = jacobian.coefficients(q)
-    half = np.sqrt(q) / 2
-    across = _cross(turn, shift)
-    position = shift + b * across + c * _cross(turn, across)
-    return _pose(position, np.concatenate([0.5 * np.sinc(half / np.pi) * turn, np.cos(half)], axis=-1))
+    from evermap.geometry import se3_kernels
+
+    lead, one = _rows(twist)
+    found = np.empty((*lead, 7))
+    se3_kernels.exp(one, found.reshape(-1, 7))
+    return found
 
 
 def log(pose: ArrayLike) -> FloatArray:
     """Return the twist whose `exp` is `pose`, of smallest rotation. Shapes (..., 7) and (..., 6)."""
-    pose = normalised(pose)
-    axis, scalar = pose[..., 3:6], pose[..., 6:]
-    length = np.sqrt(_dot(axis, axis))
-    small = length < 1e-8  # the arc tangent of a tiny length is that length, whose square may underflow
-    safe = np.where(small, 1.0, length)
-    turn = np.where(small, 2.0, 2.0 * np.arctan2(safe, scalar) / safe) * axis
-    d = jacobian.inverse_coefficient(_dot(turn, turn))
-    across = _cross(turn, pose[..., :3])
-    return np.concatenate([pose[..., :3] - 0.5 * across + d * _cross(turn, across), turn], axis=-1)
+    from evermap.geometry import se3_kernels
+
+    normal = np.array(pose, dtype=np.float64, order="C")
+    found = np.empty((*normal.shape[:-1], 6))
+    se3_kernels.log(normal.reshape(-1, 7), found.reshape(-1, 6))
+    return found
 
 
 def retract(pose: ArrayLike, twist: ArrayLike) -> FloatArray:
@@ -180,36 +187,34 @@ def rigid_directions(point: ArrayLike) -> FloatArray:
     return np.concatenate([shift, -_crossing(at)], axis=-1).reshape(-1, 6)
 
 
-def _pose(position: FloatArray, quaternion: FloatArray) -> FloatArray:
-    lead = np.broadcast_shapes(position.shape[:-1], quaternion.shape[:-1])
-    pose = np.empty((*lead, 7))
-    pose[..., :3], pose[..., 3:] = position, quaternion
-    return _normalise(pose)
+def warm_up() -> None:
+    """Compile what motions need, or load it where that was done before: for steps that may not wait for it."""
+    pose = compose(inverse(identity(1)), normalised(exp(np.zeros((1, 6)))))
+    log(between(pose, pose))
+    transform(pose, np.zeros(point_dim))
+    rotation_of(pose)
 
 
-def _conjugate(quaternion: FloatArray) -> FloatArray:
-    return quaternion * [-1.0, -1.0, -1.0, 1.0]
-
-
-def _times(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Products of quaternions (..., 4)."""
-    axis_a, axis_b, scalar_a, scalar_b = a[..., :3], b[..., :3], a[..., 3:], b[..., 3:]
-    axis = scalar_a * axis_b + scalar_b * axis_a + _cross(axis_a, axis_b)
-    return np.concatenate([axis, scalar_a * scalar_b - _dot(axis_a, axis_b)], axis=-1)
-
-
-def _turned(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
-    """Vectors (..., 3), rotated by quaternions (..., 4)."""
-    axis = quaternion[..., :3]
-    across = 2.0 * _cross(axis, vector)
-    return np.asarray(vector + quaternion[..., 3:] * across + _cross(axis, across))
+def _rows(*given: ArrayLike) -> tuple[Any, ...]:
+    """Return the leading axes of arrays (..., k), broadcast, and the rows (N, k) of each, or (1, k)."""
+    arrays = [np.asarray(each, dtype=np.float64) for each in given]
+    lead = arrays[0].shape[:-1]
+    if any(each.shape[:-1] != lead for each in arrays):
+        lead = np.broadcast_shapes(*(each.shape[:-1] for each in arrays))
+        arrays = [
+            each if each.size == each.shape[-1] else np.broadcast_to(each, (*lead, each.shape[-1])) for each in arrays
+        ]
+    # of rows that may not be written to machine code would be made once more
+    rows = (np.ascontiguousarray(each) for each in arrays)
+    return lead, *((each if each.flags.writeable else each.copy()).reshape(-1, each.shape[-1]) for each in rows)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return `np.cross`, in a fifth of the time."""
+    """Return `np.cross`, in a tenth of the time."""
     ax, ay, az, bx, by, bz = a[..., 0], a[..., 1], a[..., 2], b[..., 0], b[..., 1], b[..., 2]
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    out[..., 0], out[..., 1], out[..., 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    x = ay * bz - az * by
+    out = np.empty((*x.shape, 3))
+    out[..., 0], out[..., 1], out[..., 2] = x, az * bx - ax * bz, ax * by - ay * bx
     return out
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from evermap.compiled import single_threaded
 from evermap.config import Config
 from evermap.errors import ConfigError, InputError
+from evermap.geometry import se3
 from evermap.geometry.group import PLANE, SPACE, Group
 from evermap.geometry.symmetry import Symmetry
 from evermap.live.inbox import Inbox, LiveFrame, recording_of
@@ -345,6 +346,7 @@ class Engine:
     @single_threaded()
     def warm_up(self) -> None:
         """Compile the kernels, or load them, so that no step has to wait for it."""
+        se3.warm_up()
         if self._rig is not None:
             warm_up_in_space()
         else:

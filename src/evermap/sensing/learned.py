@@ -261,14 +261,24 @@ def _collected(
     """Return the profile with what pends of certain cliques, which is taken from there in place."""
     from evermap.sensing import kernels
 
-    before = {name: np.atleast_1d(getattr(profile, name)) for name in SUMS}
-    sums, log_weight = np.concatenate([*before.values(), np.zeros(2)]), profile.log_weight.copy()
+    sums, log_weight = _sums_of(profile), profile.log_weight.copy()
     kernels.collect(there, gone, pending, log_chain, sums, log_weight)
-    parts = np.split(sums[:-2], np.cumsum([len(part) for part in before.values()])[:-1])
+    return _with_sums(profile, sums, log_weight - log_weight.max())
+
+
+def _sums_of(profile: Profile) -> FloatArray:
+    """Return what a profile sums up as the kernels take it, and room behind it."""
+    return np.concatenate([*(np.atleast_1d(getattr(profile, name)) for name in SUMS), np.zeros(2)])
+
+
+def _with_sums(profile: Profile, sums: FloatArray, log_weight: FloatArray) -> Profile:
+    """Return a profile with other sums (`_sums_of`) and weights of its chains."""
+    count = [np.size(getattr(profile, name)) for name in SUMS]
+    parts = np.split(sums[: sum(count)], np.cumsum(count)[:-1])
     after: dict[str, Any] = {
         name: part if len(part) > 1 else float(part[0]) for name, part in zip(SUMS, parts, strict=True)
     }
-    return replace(profile, **after, log_weight=log_weight - log_weight.max())
+    return replace(profile, **after, log_weight=log_weight)
 
 
 def _sensor(position_m: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -345,19 +355,24 @@ def watched(
     cliques = kernels.CliqueRows(after.first, after.occluded, after.log_chain, after.pending)
     log_there, log_gone, occluded = np.empty((3, len(model)))
     out = kernels.LookRows(log_there, log_gone, occluded, np.empty(len(model), dtype=np.int64))
-    profile, nobody, law = after.profile, np.zeros(len(model), dtype=np.bool_), _law(after.profile)
+    nobody, law, sums = np.zeros(len(model), dtype=np.bool_), _law(after.profile), _sums_of(after.profile)
+    facing, false = 2 * len(law.range_rate), 2 * len(law.range_rate) + 2 * len(law.facing_rate)
     for stamp, one, hit, active in zip(stamp_s.tolist(), pose, detected, there, strict=True):
         if not active.any():
             continue
         seen_now = kernels.FrameSeen(hit, active, np.nan_to_num(stamp - after.stamp_s))
-        kernels.look(_frame(profile, one[:3, 3], one[:3, :3]), law, rows, cliques, seen_now, out)
+        kernels.look(_frame(after.profile, one[:3, 3], one[:3, :3]), law, rows, cliques, seen_now, out)
         in_view = out.looked > 0
         after.stamp_s[in_view] = stamp
         again = in_view & (out.p_occluded < p_occluded)
         if again.any():
-            profile = _collected(profile, again, nobody, after.pending, after.log_chain)
-            rates = profile.range_rate, profile.facing_rate, profile.p_false
+            log_weight = law.log_weight.copy()
+            kernels.collect(again, nobody, after.pending, after.log_chain, sums, log_weight)
+            of_range, of_facing = sums[:facing].reshape(2, -1), sums[facing:false].reshape(2, -1)
             law = law._replace(
-                range_rate=rates[0], facing_rate=rates[1], p_false=rates[2], log_weight=profile.log_weight
+                range_rate=of_range[0] / of_range[1],
+                facing_rate=of_facing[0] / of_facing[1],
+                p_false=float(sums[false] / sums[false + 1]),
+                log_weight=log_weight - log_weight.max(),
             )
-    return replace(after, profile=profile)
+    return replace(after, profile=_with_sums(after.profile, sums, law.log_weight))

@@ -17,7 +17,7 @@ Quaternion = tuple[float, float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 """(3, 3), row after row. Tuples live in registers: nothing is allocated."""
 
-kernel = kept(effort=1, error_model="numpy")
+kernel = kept(effort=3, error_model="numpy")
 
 
 @kernel
@@ -27,8 +27,8 @@ def odometry_residual(
     """Compute `log(increment^-1 * between(pose, following))` (6,), with (6, 6) derivatives by both poses."""
     r_pose, r_increment = matrix_of(pose), matrix_of(increment)
     moved = _times(_conjugate(_quaternion(pose)), _quaternion(following))
-    x, y, z = _turned_back(r_pose, following[0] - pose[0], following[1] - pose[1], following[2] - pose[2])
-    ex, ey, ez = _turned_back(r_increment, x - increment[0], y - increment[1], z - increment[2])
+    x, y, z = turn_vector_back(r_pose, following[0] - pose[0], following[1] - pose[1], following[2] - pose[2])
+    ex, ey, ez = turn_vector_back(r_increment, x - increment[0], y - increment[1], z - increment[2])
     a, b, c = _rotation_vector(_times(_conjugate(_quaternion(increment)), moved))
     q = a * a + b * b + c * c
     d, by_d = _inverse_coefficients(q)
@@ -52,8 +52,8 @@ def odometry_residual(
     # by the first pose: the same, of minus the adjoint of the motion's inverse
     r_moved = _matrix(moved)
     for i in range(3):
-        f, g, h = _turned(r_moved, j2[i, 0], j2[i, 1], j2[i, 2])
-        u, v, w = _turned(r_moved, j2[i, 3], j2[i, 4], j2[i, 5])
+        f, g, h = turn_vector(r_moved, j2[i, 0], j2[i, 1], j2[i, 2])
+        u, v, w = turn_vector(r_moved, j2[i, 3], j2[i, 4], j2[i, 5])
         j1[i, 0], j1[i, 1], j1[i, 2] = -f, -g, -h
         j1[3 + i, 3], j1[3 + i, 4], j1[3 + i, 5] = -f, -g, -h
         j1[i, 3], j1[i, 4], j1[i, 5] = g * z - h * y - u, h * x - f * z - v, f * y - g * x - w
@@ -136,8 +136,8 @@ def _by_turns(
             j_pose[3 + i, k] = j_mount[3 + i, k] = j_landmark[3 + i, k] = j_landmark[i, 3 + k] = 0.0
             j_landmark[i, k] = -r_seen[3 * i + k]
         j_mount[3 + i, 3], j_mount[3 + i, 4], j_mount[3 + i, 5] = u, v, w
-        j_pose[3 + i, 3], j_pose[3 + i, 4], j_pose[3 + i, 5] = _turned(r_mount, u, v, w)
-        f, g, h = _turned_back(r_seen, u, v, w)
+        j_pose[3 + i, 3], j_pose[3 + i, 4], j_pose[3 + i, 5] = turn_vector(r_mount, u, v, w)
+        f, g, h = turn_vector_back(r_seen, u, v, w)
         j_landmark[3 + i, 3], j_landmark[3 + i, 4], j_landmark[3 + i, 5] = -f, -g, -h
 
 
@@ -170,7 +170,7 @@ def nearest_turn(
 @kernel
 def compose(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Compute `a * b` as `se3.compose`; may be in place."""
-    x, y, z = _turned(matrix_of(a), b[0], b[1], b[2])
+    x, y, z = turn_vector(matrix_of(a), b[0], b[1], b[2])
     _put(out, a[0] + x, a[1] + y, a[2] + z, _times(_quaternion(a), _quaternion(b)))
 
 
@@ -191,7 +191,7 @@ def retract(pose: FloatArray, twist: FloatArray, out: FloatArray) -> None:
     x = u + once * (b * w - c * v) + twice * (a * along - q * u)
     y = v + once * (c * u - a * w) + twice * (b * along - q * v)
     z = w + once * (a * v - b * u) + twice * (c * along - q * w)
-    x, y, z = _turned(matrix_of(pose), x, y, z)
+    x, y, z = turn_vector(matrix_of(pose), x, y, z)
     turned = _times(_quaternion(pose), (scale * a, scale * b, scale * c, math.cos(half)))
     _put(out, pose[0] + x, pose[1] + y, pose[2] + z, turned)
 
@@ -215,7 +215,7 @@ def position_residual(
 ) -> None:  # fmt: skip
     """Compute the first three rows of a detection, with derivatives by the robot's and the sensor's pose (3, 6)."""
     r_pose, r_mount = matrix_of(pose), matrix_of(mount)
-    x, y, z = _turned_back(r_pose, landmark[0] - pose[0], landmark[1] - pose[1], landmark[2] - pose[2])
+    x, y, z = turn_vector_back(r_pose, landmark[0] - pose[0], landmark[1] - pose[1], landmark[2] - pose[2])
     for i in range(3):
         f, g, h = r_mount[i], r_mount[3 + i], r_mount[6 + i]
         j_pose[i, 0], j_pose[i, 1], j_pose[i, 2] = f, g, h
@@ -223,7 +223,7 @@ def position_residual(
         for k in range(6):
             j_mount[i, k] = 0.0
         j_mount[i, i] = 1.0
-    x, y, z = _turned_back(r_mount, x - mount[0], y - mount[1], z - mount[2])
+    x, y, z = turn_vector_back(r_mount, x - mount[0], y - mount[1], z - mount[2])
     residual[0], residual[1], residual[2] = measured[0] - x, measured[1] - y, measured[2] - z
     j_mount[0, 4], j_mount[0, 5] = z, -y
     j_mount[1, 3], j_mount[1, 5] = -z, x
@@ -265,14 +265,14 @@ def _matrix(a: Quaternion) -> Matrix:
 
 
 @kernel
-def _turned(r: Matrix, x: float, y: float, z: float) -> Triple:
-    """`r v`."""
+def turn_vector(r: Matrix, x: float, y: float, z: float) -> Triple:
+    """Return `r v`."""
     return r[0] * x + r[1] * y + r[2] * z, r[3] * x + r[4] * y + r[5] * z, r[6] * x + r[7] * y + r[8] * z
 
 
 @kernel
-def _turned_back(r: Matrix, x: float, y: float, z: float) -> Triple:
-    """`r' v`."""
+def turn_vector_back(r: Matrix, x: float, y: float, z: float) -> Triple:
+    """Return `r' v`."""
     return r[0] * x + r[3] * y + r[6] * z, r[1] * x + r[4] * y + r[7] * z, r[2] * x + r[5] * y + r[8] * z
 
 

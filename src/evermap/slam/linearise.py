@@ -248,6 +248,8 @@ def build_place_priors(problem: Problem, known: BoolArray, places: int) -> tuple
 
     Landmarks that it ties to each other are one factor; those of as many landmarks and the same rank are one block.
     """
+    if not problem.landmark_information.nnz:
+        return ()
     information = problem.prior_information(known)
     row: IntArray = np.flatnonzero(known)
     at, to = information.nonzero()

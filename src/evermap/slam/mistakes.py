@@ -73,6 +73,8 @@ class Mistake:
 
     def after(self, other: Mistake) -> Mistake:
         """Return both, the other one undone first."""
+        if other is HONEST:
+            return self
         turned = self.turned
         if other.turned != HONEST.turned:
             turned = tuple(se3.compose(se3.turn(self.turned), se3.turn(other.turned))[3:].tolist())

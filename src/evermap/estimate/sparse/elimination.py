@@ -298,6 +298,26 @@ def _eliminate_rows(front: FloatArray, diagonal: FloatArray, own: int, size: int
 
 
 @kernel
+def _dot_from(stored: FloatArray, at: Any, x: FloatArray, first: Any, end: Any) -> float:
+    """Return the product of `stored` from `at` on with `x`, of the numbers from `first` to before `end`.
+
+    Four sums do not wait for each other.
+    """
+    a, b, c, d, j = 0.0, 0.0, 0.0, 0.0, first
+    one, two, three, four = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
+    while j + three < end:
+        a += stored[at + j] * x[j]
+        b += stored[at + j + one] * x[j + one]
+        c += stored[at + j + two] * x[j + two]
+        d += stored[at + j + three] * x[j + three]
+        j += four
+    while j < end:
+        a += stored[at + j] * x[j]
+        j += one
+    return (a + b) + (c + d)
+
+
+@kernel
 def back_substitute(
     tree: Tree, stored: FloatArray, right: FloatArray, border: FloatArray, x: FloatArray, low: int, high: int
 ) -> None:
@@ -321,11 +341,8 @@ def back_substitute(
                 at = tree.begin[v] + a
                 mine[tree.at[k] + a] = right[at] if tree.at[k] < own else x[at]
         for i in range(own - 1, -1, -1):
-            at = tree.stored[node] + i * size
-            total = mine[i]
-            for j in range(i + 1, size):
-                total -= stored[at + j] * mine[j]
-            mine[i] = total / stored[at + i]
+            at, row, end = np.uint64(tree.stored[node] + i * size), np.uint64(i), np.uint64(size)
+            mine[row] = (mine[row] - _dot_from(stored, at, mine, row + np.uint64(1), end)) / stored[at + row]
         for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
             v = tree.variable[k]
             for a in range(tree.dim[v]):

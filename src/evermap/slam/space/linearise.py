@@ -16,8 +16,9 @@ from evermap.slam.kernels3d import (
     odometry_residual,
     point_residual,
     pose_residual,
-    position_residual,
     retract,
+    turn_vector,
+    turn_vector_back,
 )
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -38,7 +39,7 @@ BEHIND = 0.02
 JUMP_SHARE = 1e-4
 """Information of odometry that jumped, as a share of what it has else: it may be wrong by a hundred times as much."""
 
-kernel = kept(effort=1, error_model="numpy")
+kernel = kept(effort=3, error_model="numpy")
 
 
 class SpatialSightings(NamedTuple):
@@ -304,23 +305,12 @@ def _corners(
     e: FloatArray, jx: FloatArray, jl: FloatArray, jm: FloatArray,
 ) -> None:  # fmt: skip
     """Residuals (8,) of four corners of a tag, in standard deviations, with their Jacobians (8, 6)."""
-    nothing, point, seen_at = np.zeros(3), np.zeros(3), np.zeros(3)
-    by_robot, by_mount = np.zeros((3, 6)), np.zeros((3, 6))
-    r, into, onto = matrix_of(place), matrix_of(pose), matrix_of(mount)
-    turn = np.zeros((3, 3))  # of the tag in the sensor's frame
-    for a in range(3):
-        for b in range(3):
-            total = 0.0
-            for c in range(3):
-                for d in range(3):
-                    total += onto[3 * d + a] * into[3 * c + d] * r[3 * c + b]
-            turn[a, b] = total
+    into, onto, r = matrix_of(pose), matrix_of(mount), matrix_of(place)
     for k in range(4):
         x, y = seen.half_m[m] * (-1.0, 1.0, 1.0, -1.0)[k], seen.half_m[m] * (-1.0, -1.0, 1.0, 1.0)[k]
-        for a in range(3):
-            point[a] = place[a] + r[3 * a] * x + r[3 * a + 1] * y
-        position_residual(pose, point, mount, nothing, seen_at, by_robot, by_mount)
-        px, py, pz = -seen_at[0], -seen_at[1], -seen_at[2]
+        f, g, h = turn_vector(r, x, y, 0.0)
+        f, g, h = turn_vector_back(into, place[0] + f - pose[0], place[1] + g - pose[1], place[2] + h - pose[2])
+        px, py, pz = turn_vector_back(onto, f - mount[0], g - mount[1], h - mount[2])
         for a in range(2):
             row = 2 * k + a
             e[row] = 0.0
@@ -335,14 +325,14 @@ def _corners(
             row = 2 * k + a
             w0, w1 = seen.corner_root[m, k, a, 0] / sigma_px, seen.corner_root[m, k, a, 1] / sigma_px
             e[row] = w0 * (seen.corner[m, k, 0] - u) + w1 * (seen.corner[m, k, 1] - v)
-            # derivatives of the residual by the point in the sensor's frame, which `position_residual` has with a minus
+            # minus the derivatives of the residual by the point, in the frames of the sensor, the robot and the tag
             d0, d1, d2 = w0 / pz, w1 / pz, -(w0 * u + w1 * v) / pz
-            for b in range(6):
-                jx[row, b] = d0 * by_robot[0, b] + d1 * by_robot[1, b] + d2 * by_robot[2, b]
-                jm[row, b] = d0 * by_mount[0, b] + d1 * by_mount[1, b] + d2 * by_mount[2, b]
-            t0 = -(d0 * turn[0, 0] + d1 * turn[1, 0] + d2 * turn[2, 0])
-            t1 = -(d0 * turn[0, 1] + d1 * turn[1, 1] + d2 * turn[2, 1])
-            t2 = -(d0 * turn[0, 2] + d1 * turn[1, 2] + d2 * turn[2, 2])
+            b0, b1, b2 = turn_vector(onto, d0, d1, d2)
+            t0, t1, t2 = turn_vector_back(r, *turn_vector(into, -b0, -b1, -b2))
+            jm[row, 0], jm[row, 1], jm[row, 2] = d0, d1, d2
+            jm[row, 3], jm[row, 4], jm[row, 5] = d2 * py - d1 * pz, d0 * pz - d2 * px, d1 * px - d0 * py
+            jx[row, 0], jx[row, 1], jx[row, 2] = b0, b1, b2
+            jx[row, 3], jx[row, 4], jx[row, 5] = b2 * g - b1 * h, b0 * h - b2 * f, b1 * f - b0 * g
             jl[row, 0], jl[row, 1], jl[row, 2] = t0, t1, t2
             # a turn of the tag by w moves the corner by w x c, with c = (x, y, 0)
             jl[row, 3], jl[row, 4], jl[row, 5] = t2 * y, -t2 * x, t1 * x - t0 * y

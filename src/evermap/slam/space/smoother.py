@@ -12,7 +12,16 @@ from functools import cached_property
 import numpy as np
 
 from evermap.estimate.gauss_newton import Steps, minimised
-from evermap.estimate.graph import AlikeFactors, Border, FactorBlock, Graph, Layout, Linear, build_structure
+from evermap.estimate.graph import (
+    AlikeFactors,
+    Border,
+    FactorBlock,
+    Graph,
+    GraphStructure,
+    Layout,
+    Linear,
+    build_structure,
+)
 from evermap.estimate.innovations import find_left_out_nis
 from evermap.estimate.measurement import MeasurementFactors
 from evermap.estimate.sparse.elimination import Spread
@@ -86,9 +95,10 @@ class SpatialSmoother:
     Args:
         problem: the measurements.
         around: (N, 7) rough poses, along whose positions the elimination may be cut; the first is held where it is.
+        structure: of a problem with the same variables and detections, if one is known.
     """
 
-    def __init__(self, problem: SpatialProblem, around: FloatArray) -> None:
+    def __init__(self, problem: SpatialProblem, around: FloatArray, structure: GraphStructure | None = None) -> None:
         self.problem = problem
         self._seen = problem.sightings
         sigma = np.append(np.column_stack([problem.mount_sigma, problem.delay_sigma_s]), problem.scale_sigma)
@@ -99,9 +109,11 @@ class SpatialSmoother:
         self._mean[delay] = -problem.delay_jitter * problem.whole_s / information[delay]
         self._border = Border(information, self._off_mean)
         self._start = np.array(around[0])
-        places, border = np.where(problem.oriented, 6, 3), [STATES] * len(problem.mount) + [1]
-        layout = Layout.of(around[:, :3], 6, places, border, POSES_A_LEAF)
-        self.structure = exhausted(build_structure(layout, self._blocks(SpatialNoise(), heavy=False)))
+        if structure is None:
+            places, border = np.where(problem.oriented, 6, 3), [STATES] * len(problem.mount) + [1]
+            layout = Layout.of(around[:, :3], 6, places, border, POSES_A_LEAF)
+            structure = exhausted(build_structure(layout, self._blocks(SpatialNoise(), heavy=False)))
+        self.structure = structure
         self._held = self.structure.hold_places(HELD)
         self.hold(self._held, self.structure.system.tree.begin)
 
