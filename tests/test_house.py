@@ -145,21 +145,35 @@ ONE_OF_EACH = {
     "restricted_level": {"slam.noise", "slam.space.estimate", "slam.planar_together"},
     # one loop of values and levels in turns; robots together and landmarks without identities have loops of their own
     "alternate": {"slam.batch", "slam.space.estimate"},
-    "refine_noise": {"slam.association.in_plane", "slam.batch", "slam.streaming", "slam.planar_together", "slam.warmup"},
+    "refine_noise": {
+        "slam.association.in_plane",
+        "slam.batch",
+        "slam.streaming",
+        "slam.planar_together",
+        "slam.warmup",
+    },
     "refined": {"slam.space.estimate", "slam.space.together"},
     # one rule that accepts a session over a map, a robot over others, a frame in a map
     "accept_alignment": {
-        "maps.sessions.boxes", "slam.batch", "slam.known_places", "slam.space.localize", "slam.together",
+        "maps.sessions.boxes",
+        "slam.batch",
+        "slam.known_places",
+        "slam.space.localize",
+        "slam.together",
     },
     # one search for the motion that most pairs agree on
     "find_consensus": {
-        "maps.sessions.placing", "slam.batch", "slam.changes.joint", "slam.space.moved_groups", "slam.space.solve",
+        "maps.sessions.placing",
+        "slam.batch",
+        "slam.changes.joint",
+        "slam.space.moved_groups",
+        "slam.space.solve",
     },
     # one order of elimination
     "build_structure": {"slam.smoother", "slam.space.smoother", "slam.together"},
     # one density of errors that last
     "lasting_errors": {"slam.base_problem"},
-}  # fmt: skip
+}
 """Functions that do what is to be done once, and the modules that may call them: fewer is better, another is a twin."""
 
 SUBCLASSES = {

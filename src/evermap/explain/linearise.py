@@ -161,8 +161,8 @@ def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Input
     before = (solved.fitted or (solved.smoother, solved.now))[0].problem.swing
     if moved is None or not np.array_equal(moved.swing.steps, before.steps):
         return None
-    # what a cause changes are measurements, not what they tie; noise stays, as the axes of an arm turn as they like where
-    # two are as long; and no weight is 0 with tails that never let go
+    # what a cause changes are measurements, not what they tie; noise stays, since the axes of an arm turn as they like
+    # where two are as long; and no weight is 0 with tails that never let go
     fixed = replace(moved, swing=before)
     smoother = SpatialSmoother(fixed, solved.estimate.pose, optimum.graph.structure)
     now = exhausted(smoother.graph(solved.noise, heavy=True).linearised(solved.estimate))
