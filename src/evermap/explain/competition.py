@@ -288,10 +288,9 @@ def explain(
 
 
 def _find_score(solution: SessionSolution[VisitT], inputs: Inputs) -> float:
-    """Return what the calibration that earns most would gain, of those whose score is significant [nats]; 0 without."""
-    return max(
-        (one.gain for one in score_session(solution.session, inputs, solution.result.trajectory).told), default=0.0
-    )
+    """Return what the calibration that earns most would gain, of those that move the poses [nats]; 0 without."""
+    scores = score_session(solution.session, inputs, solution.result.trajectory)
+    return max((one.gain for one in scores.harmful), default=0.0)
 
 
 def find_put_right(result: SlamResult, inputs: Inputs, rules: ExplainConfig) -> tuple[Cause, ...]:

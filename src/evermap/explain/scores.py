@@ -43,6 +43,8 @@ Intrinsics: TypeAlias = tuple[float, float, float, float]
 """Focal lengths and centre of an image [px]."""
 SIGNIFICANT = 10.0
 """Gain of a score test [nats]: 4.5 standard deviations, of thirty or so that are asked of a run."""
+MOST_SHIFT = 0.5
+"""Standard deviations by which a calibration may move the poses and be let be."""
 USUAL = frozenset({"odometry-scale", "turn-scale"})
 """Calibrations that are off on every robot: they may be so beside any other."""
 OF_MOTION = USUAL | {"clock", "clock-drift"}
@@ -110,6 +112,11 @@ class SessionScores:
         return tuple(
             one for one in self.calibrations if one.gain > SIGNIFICANT and abs(one.value) > LITTLE * one.suspect.sigma
         )
+
+    @property
+    def harmful(self) -> tuple[CalibrationScore, ...]:
+        """Return those of `told` that move the poses by what matters."""
+        return tuple(one for one in self.told if one.shift > MOST_SHIFT)
 
     @property
     def suspected(self) -> CalibrationScore | None:

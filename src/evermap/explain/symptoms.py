@@ -564,6 +564,7 @@ def _blind(result: SlamResult) -> tuple[float, float]:
 
 
 ELSEWHERE = (ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED)
+GONE = (ChangeKind.VANISHED, ChangeKind.REPLACED)
 
 
 def _of_map(result: SlamResult, recording: AnyRecording, prior_map: Landmarks | None) -> tuple[int, float, float]:
@@ -575,5 +576,5 @@ def _of_map(result: SlamResult, recording: AnyRecording, prior_map: Landmarks | 
     if not len(common):
         return 0, nan, nan
     moved = [one for change in result.changes if change.kind in ELSEWHERE for one in change.landmark_ids]
-    gone = [one for change in result.changes if change.kind is ChangeKind.VANISHED for one in change.landmark_ids]
+    gone = [one for change in result.changes if change.kind in GONE for one in change.landmark_ids]
     return len(common), float(np.isin(common, [*moved, *gone]).mean()), float(np.isin(common, moved).mean())

@@ -15,7 +15,7 @@ from math import inf, isfinite, isnan
 from evermap.config import SlamConfig
 from evermap.explain.causes import Inputs
 from evermap.explain.evidence import AnySession
-from evermap.explain.scores import score_session
+from evermap.explain.scores import MOST_SHIFT, score_session
 from evermap.explain.symptoms import Signs, measure_signs, with_scores
 from evermap.slam.calibration import far_off
 from evermap.slam.mistakes import Finding
@@ -108,7 +108,7 @@ LIMITS = (
         "units and scale of the odometry, or the size of tags and the unit of ranges",
     ),
     Limit(
-        "held", "held", "poses {:.1f} standard deviations elsewhere if {name}", -inf, 0.5, SUSPECT,
+        "held", "held", "poses {:.1f} standard deviations elsewhere if {name}", -inf, MOST_SHIFT, SUSPECT,
         "a calibration that was held as stated is another",
         "the calibration of the sensor measured again, or stated as uncertain in sensor.toml",
     ),

@@ -213,7 +213,7 @@ def _words(result: SlamResult, start_s: float) -> dict[int, Word]:
     """What a drive says of each landmark that it saw."""
     p_moved, told, instead = dict[int, float](), dict[int, MapChange](), dict[int, str]()
     for change in result.changes:
-        if change.kind in (ChangeKind.APPEARED, ChangeKind.RETURNED, ChangeKind.VANISHED):
+        if change.kind in (ChangeKind.APPEARED, ChangeKind.RETURNED, ChangeKind.VANISHED, ChangeKind.REPLACED):
             continue
         for name in change.landmark_ids:
             p_moved[name] = min(p_moved.get(name, 0.0) + change.probability, 1.0)
