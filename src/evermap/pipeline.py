@@ -197,7 +197,7 @@ def run_session(
         living, found = session.with_names_of(living, alone.recording), alone.findings
         located = planar.localised(alone, living, config)
     entered = session.with_causes(session.brought_in(located, living, config.living), living, config)
-    return _add_verdict(session.begun_with(entered, whole), living, config, found, located.visit)
+    return _add_verdict(session.begun_with(entered, whole), living, config, found)
 
 
 @single_threaded()
@@ -223,29 +223,15 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
     from evermap.maps.sessions import planar, session
 
     living = session.with_names_of(living, alone.recording)
-    located = planar.localised(alone, living, config)
-    entered = session.brought_in(located, living, config.living)
-    return _add_verdict(entered, living, config, alone.findings, located.visit)
+    entered = session.brought_in(planar.localised(alone, living, config), living, config.living)
+    return _add_verdict(entered, living, config, alone.findings)
 
 
-def _add_verdict(
-    entered: Session,
-    before: LivingMap,
-    config: Config,
-    found: tuple[Finding, ...],
-    visit: PlanarVisit | SpatialVisit,
-) -> Session:
-    """Return a session with its verdict, beside the map as it was `before` it, whose landmarks are no survey."""
-    from evermap.explain.causes import Inputs
-    from evermap.maps.sessions.session import solution_of
-
+def _add_verdict(entered: Session, before: LivingMap, config: Config, found: tuple[Finding, ...]) -> Session:
+    """Return a session with its verdict, beside the map as it was `before` it."""
     expected = before.landmarks(p_least=0.0) if len(before.places) else None
     reason = entered.set_aside[0] if entered.set_aside else ""
-    solution = solution_of(visit) if entered.found else None
-    asked = {"session": solution, "inputs": Inputs.of(visit.recording, None)}
-    return replace(
-        entered, slam=_judge(entered.slam, entered.recording, config, expected, found, set_aside=reason, **asked)
-    )
+    return replace(entered, slam=_judge(entered.slam, entered.recording, config, expected, found, set_aside=reason))
 
 
 @single_threaded()

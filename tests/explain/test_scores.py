@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evermap import run_session, run_slam
+from evermap import run_slam
 from evermap.config import Config
 from evermap.explain import scores
 from evermap.explain.causes import Inputs, list_suspects
@@ -280,24 +280,3 @@ def test_runs_are_asked_what_they_held() -> None:
         assert verdict is not None
         assert verdict.kind is kind, verdict.message
         assert ("mounts of all sensors are -0.0" in verdict.message) is (recording is wrong)
-
-
-@pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow)])
-def test_sessions_of_a_map_are_asked_what_they_held(kind: str) -> None:
-    """They fit the map, and the clock that drifts is taken for noise: only the score tells."""
-    living, kinds = None, []
-    for seed, faster in ((1, 0.0), (2, 0.0), (3, 0.004)):
-        world = World(seed=seed)
-        recording: Any = with_clock(world.plane() if kind == "plane" else world.space(), faster)
-        frames, driven, day_s = recording.frames, recording.odometry, 86400.0 * seed
-        recording = replace(
-            recording,
-            frames=replace(frames, stamp_s=frames.stamp_s + day_s),
-            odometry=replace(driven, stamp_s=driven.stamp_s + day_s),
-        )
-        entered = run_session(recording, living)
-        assert entered.found
-        assert entered.slam.verdict is not None
-        living, kinds = entered.living, [*kinds, entered.slam.verdict.kind]
-    assert kinds == [VerdictKind.SOUND, VerdictKind.SOUND, VerdictKind.SENSOR_SUSPECT]
-    assert "fast of that of the odometry" in entered.slam.verdict.message

@@ -200,12 +200,11 @@ def with_verdict(
     set_aside: str = "",
     as_read: AnyRecording | None = None,
     session: AnySession | None = None,
-    inputs: Inputs | None = None,
 ) -> SlamResult:
     """Return the result with its verdict; arguments as of `judge`."""
     verdict = judge(
         result, recording, settings, prior_map,
-        findings=findings, set_aside=set_aside, as_read=as_read, session=session, inputs=inputs,
+        findings=findings, set_aside=set_aside, as_read=as_read, session=session,
     )  # fmt: skip
     return replace(result, verdict=verdict)
 
@@ -220,7 +219,6 @@ def judge(
     set_aside: str = "",
     as_read: AnyRecording | None = None,
     session: AnySession | None = None,
-    inputs: Inputs | None = None,
 ) -> Verdict:
     """Return how far a run can be trusted.
 
@@ -233,7 +231,6 @@ def judge(
         set_aside: why a session could not be localised in its map; '' where it was, or there is none.
         as_read: the recording with the identities that it was read with; None where they are the same.
         session: the solution that the result is of. If all else is sound, it is asked what it held as stated.
-        inputs: of which it is the solution; None for the recording and the prior map.
     """
     signs = measure_signs(result, recording, prior_map, as_read)
     wrong = [finding.message for finding in findings if not finding.usable]
@@ -241,7 +238,7 @@ def judge(
     found = judge_signs(signs, suspicions, result.causes, set_aside)
     if found.kind is not VerdictKind.SOUND or session is None:
         return found
-    scores = score_session(session, inputs or Inputs.of(recording, prior_map), result.trajectory)
+    scores = score_session(session, Inputs.of(recording, prior_map), result.trajectory)
     return judge_signs(with_scores(signs, scores), suspicions, result.causes, set_aside)
 
 
