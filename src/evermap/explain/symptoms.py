@@ -51,12 +51,12 @@ LEAST_MOTION_M = 0.05
 """Motion within a window, below which the robot stands: its relative error says nothing."""
 PER_LANDMARK = 5
 """Detections of a landmark, in each half of the drive, of which a mean says something."""
-LATE_S, EARLY_S = 0.15, 0.05
+LATE_S, EARLY_S = 0.14, 0.05
 """Delay up to which the odometry is taken to be what is late, by its filters and bridges; a longer one is as well the
 sensor's, whose readings are processed. And by how much odometry may seem early, as two clocks differ: no driver stamps
 what has not happened yet, so that by more it is the sensor that is late."""
 SURELY = 2.0
-"""Standard deviations of a delay by which it must be below these."""
+"""Standard deviations by which a delay must be one, and an early odometry be earlier than that."""
 LEAST_STREAK = 0.2
 """Share of its detections that a landmark is contradicted by in a row: fewer may be one bad look."""
 
@@ -525,7 +525,8 @@ def _shift_by_clock_m(result: SlamResult) -> float:
     delay = next((each for each in result.parameters if each.name == "odometry_delay_s" and not each.fixed), None)
     if delay is None or len(path) < 3:
         return nan
-    if delay.value > -EARLY_S and delay.value + SURELY * delay.sigma < LATE_S:
+    is_late = delay.value > max(LATE_S, SURELY * delay.sigma)
+    if not (is_late or delay.value + SURELY * delay.sigma < -EARLY_S):
         return nan
     dim = 2 if path.pose_world_robot.shape[1] == 3 else 3
     went = np.linalg.norm(np.diff(path.pose_world_robot[:, :dim], axis=0), axis=1)

@@ -208,10 +208,11 @@ def test_a_van_where_a_car_had_stood_came_after_it() -> None:
         session = run_session(street.drive(100 + day, day * DAY_S), living)
         living = session.living
         slots |= dict(zip(*(column.tolist() for column in in_street(living, street)), strict=True))
-    came = [one for one in session.changes if one.kind in COMES]
-    assert [slots[one.landmark_ids[0]] for one in came] == [slot]
-    assert came[0].probability > 0.9
-    assert 0.0 < came[0].stamp_from_s < 40.0  # when the car was seen last
+    (told,) = session.changes
+    assert told.kind is ChangeKind.REPLACED
+    assert [slots[one] for one in told.landmark_ids] == [slot, slot]
+    assert told.probability > 0.9
+    assert 0.0 < told.stamp_from_s < 40.0  # when the car was seen last
 
 
 def test_stays_are_the_spells_and_what_lifetimes_are_learned_from(days: Days) -> None:
