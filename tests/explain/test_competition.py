@@ -276,7 +276,7 @@ def test_a_lens_of_which_no_distortion_is_stated_is_named() -> None:
     assert error_m(result, recording, in_map=True) < 0.3 * error_m(as_stated, recording, in_map=True)
 
 
-@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("mapped", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_centre_of_the_image_that_is_elsewhere_is_named(mapped: bool) -> None:
     """All else seems sound: noise takes in what the images are off by."""
     recording, survey = recorded(World(seed=1), "corners")
@@ -290,6 +290,7 @@ def test_a_centre_of_the_image_that_is_elsewhere_is_named(mapped: bool) -> None:
     assert result.changes == ()
 
 
+@pytest.mark.slow
 def test_mounts_that_are_turned_together_are_named() -> None:
     recording = World(seed=1).space()
     turned = []
