@@ -131,7 +131,7 @@ def with_clock(recording: Any, faster: float) -> Any:
 
 
 @pytest.mark.parametrize("faster", [0.004, pytest.param(-0.004, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", ["plane", "corners"])
+@pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow)])
 def test_clocks_that_drift_apart_are_suspected(kind: str, faster: float) -> None:
     world = World(seed=1)
     recording: Any = with_clock(world.plane() if kind == "plane" else world.space(), faster)

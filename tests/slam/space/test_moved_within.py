@@ -53,7 +53,7 @@ def check_moves(world: World, recording: SpatialRecording, moves: tuple[Move, ..
     return result
 
 
-@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("mapped", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("corners", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("move", [FAR, pytest.param(TURN, marks=pytest.mark.slow)])
 def test_a_tag_that_is_moved_is_one_tag_that_moved(move, corners, mapped):
