@@ -260,10 +260,10 @@ def _marks(tree: ast.Module, function: ast.FunctionDef) -> Iterator[tuple[str, s
             if isinstance(made, ast.Call) and ast.unparse(made.func) == function.name:
                 said = {keyword.arg: ast.literal_eval(keyword.value) for keyword in made.keywords}
                 case = ", ".join(ast.unparse(argument) for argument in made.args)
-                yield f"{_test_around(tree, made)}[{case}]", str(_filled(reason, said))
+                yield f"{_test_around(tree, made)}[{case}]", str(_fill(reason, said))
 
 
-def _filled(text: ast.expr, said: dict[str | None, str]) -> str:
+def _fill(text: ast.expr, said: dict[str | None, str]) -> str:
     """Return a text with braces, of names that a call states."""
     assert isinstance(text, ast.JoinedStr)
     parts = (ast.unparse(part.value) if isinstance(part, ast.FormattedValue) else part for part in text.values)
@@ -348,7 +348,7 @@ def renew(study: str, folder: Path) -> None:
     old, new = f"`{made['commit']}`, {made['date']}", _commit_of_run(folder)
     said = f"Computed by `{made['command']}`. Tables of commit {new}"
     before = f"{before[: made.start()]}{said}{before[made.end() :]}"
-    together = merged(block.strip(), table, old, new)
+    together = merge_pages(block.strip(), table, old, new)
     text = f"{before}{begin}\n{together}\n{end}{after}"
     page.write_text(text, encoding="utf-8")
     for image in re.findall(r"\(\.\./images/([\w.-]+)\)", text):
@@ -412,7 +412,7 @@ def _commit_of_run(folder: Path) -> str:
     return f"`{commit}`, {date}"
 
 
-def merged(old: str, new: str, old_code: str, new_code: str) -> str:
+def merge_pages(old: str, new: str, old_code: str, new_code: str) -> str:
     """Return the tables of a run, with sections and rows of an older one that the run does not have.
 
     Args:
@@ -423,9 +423,9 @@ def merged(old: str, new: str, old_code: str, new_code: str) -> str:
     """
     before, now = _sections(old), _sections(new)
     parts = [
-        _merged_section(before.get(heading, ""), now[heading], old_code, new_code)
+        _merge_section(before.get(heading, ""), now[heading], old_code, new_code)
         if heading in now
-        else _pinned(before[heading], old_code)
+        else _pin(before[heading], old_code)
         for heading in _in_order(list(before), list(now))
     ]
     return "\n\n".join(part for part in parts if part)
@@ -456,7 +456,7 @@ def _code_of(section: str, otherwise: str) -> str:
     return next((f"`{made['commit']}`, {made['date']}" for made in named if made), otherwise)
 
 
-def _pinned(section: str, code: str) -> str:
+def _pin(section: str, code: str) -> str:
     """Return a section that says of which commit it is."""
     if not section or _code_of(section, ""):
         return section
@@ -464,7 +464,7 @@ def _pinned(section: str, code: str) -> str:
     return f"{heading}\n\nRows of commit {code}.\n\n{rest.strip()}"
 
 
-def _merged_section(old: str, new: str, old_code: str, new_code: str) -> str:
+def _merge_section(old: str, new: str, old_code: str, new_code: str) -> str:
     """Return a section of a run with what only the older section has, rows and tables, with their commits.
 
     Tables are the same if head and paragraph before are. A claim that the run did not measure is the older one's.
@@ -479,7 +479,7 @@ def _merged_section(old: str, new: str, old_code: str, new_code: str) -> str:
         names = list(rows) if claimed else _in_order(list(older), list(rows))
         taken = {name: older[name] if name in lacks else rows[name] for name in names}
         if not claimed:
-            taken |= {name: _filled_from(older[name], rows[name]) for name in older if name in rows}
+            taken |= {name: _fill_from(older[name], rows[name]) for name in older if name in rows}
         if any(taken[name] is not rows.get(name) for name in names):
             head, rule = block.splitlines()[:2]
             lines = [f"{head} {CODE} |", f"{rule} --- |", *(f"| {' | '.join(row)} |" for row in taken.values())]
@@ -492,7 +492,7 @@ def _merged_section(old: str, new: str, old_code: str, new_code: str) -> str:
     return new
 
 
-def _filled_from(older: list[str], row: list[str]) -> list[str]:
+def _fill_from(older: list[str], row: list[str]) -> list[str]:
     """Return a row with the cells of an older one where only that has a number, of both commits then."""
     taken = [was if now.startswith(UNKNOWN) else now for was, now in zip(older[:-1], row[:-1], strict=True)]
     return row if taken == row[:-1] else [*taken, "; ".join(dict.fromkeys([older[-1], row[-1]]))]

@@ -122,7 +122,7 @@ def test_a_run_of_a_part_keeps_rows_and_sections_of_an_older_one_with_their_comm
         f"{claims}| a | 1 | 0.9 | yes |\n| b | 1 | – | – |\n\n"
         "### One\n\nErrors:\n\n| method | 0 m |\n| --- | ---: |\n| em | 0.3 |\n| mcts | 0.4 |\n\n### Three\n\nmore"
     )
-    text = results.merged(old, new, "`aaaaaaa`, 2020-01-01", "`bbbbbbb`, 2021-01-01")
+    text = results.merge_pages(old, new, "`aaaaaaa`, 2020-01-01", "`bbbbbbb`, 2021-01-01")
     assert [line for line in text.splitlines() if line.startswith("| ") and "---" not in line] == [
         "|  | expected | measured | met | code |",
         "| a | 1 | 0.9 | yes | `bbbbbbb`, 2021-01-01 |",
@@ -137,11 +137,11 @@ def test_a_run_of_a_part_keeps_rows_and_sections_of_an_older_one_with_their_comm
     assert "\n\nTimes:\n\n| method" in text
     assert [line for line in text.splitlines() if line.startswith("###")] == ["### One", "### Three", "### Two"]
     assert "### Two\n\nRows of commit `aaaaaaa`, 2020-01-01.\n\ntext" in text
-    again = results.merged(text, new, "`aaaaaaa`, 2020-01-01", "`ccccccc`, 2022-01-01")
+    again = results.merge_pages(text, new, "`aaaaaaa`, 2020-01-01", "`ccccccc`, 2022-01-01")
     assert "| b | 1 | 2.0 | **no** | `aaaaaaa`, 2020-01-01 |" in again
     assert "| joint | 0.2 | `aaaaaaa`, 2020-01-01 |" in again
     assert "| em | 0.3 | `ccccccc`, 2022-01-01 |" in again
-    assert results.merged(old, old, "a", "b") == old
+    assert results.merge_pages(old, old, "a", "b") == old
 
 
 def test_every_page_of_a_study_is_listed() -> None:
@@ -197,7 +197,7 @@ def test_tables_of_a_run_replace_those_of_the_page(tmp_path: Path, monkeypatch: 
 def test_rows_are_distinguished_by_as_many_cells_as_it_takes() -> None:
     """And a cell that only the older run has is kept, in a row of both commits."""
     head = "### Times\n\n| method | sensor | s |\n| --- | --- | ---: |\n"
-    text = results.merged(
+    text = results.merge_pages(
         f"{head}| em | ours | 1 |\n| em | paper | 2 |\n", f"{head}| em | paper | 3 |\n| mcts | paper | 4 |\n", "a", "b"
     )
     assert [line for line in text.splitlines() if line.startswith(("| em", "| mcts"))] == [
@@ -205,7 +205,7 @@ def test_rows_are_distinguished_by_as_many_cells_as_it_takes() -> None:
         "| em | paper | 3 | b |",
         "| mcts | paper | 4 | b |",
     ]
-    text = results.merged(f"{head}| em | 1 | 2 |", f"{head}| em | – | 3 |", "a", "b")
+    text = results.merge_pages(f"{head}| em | 1 | 2 |", f"{head}| em | – | 3 |", "a", "b")
     assert text.endswith("| em | 1 | 3 | a; b |")
 
 

@@ -83,7 +83,7 @@ def test_returns_hops_and_known_sites_are_learned() -> None:
 
 
 def test_what_is_missed_and_not_told_to_be_gone_has_gone_in_part() -> None:
-    """Of 36 that stood there, two are missed a day later: who leaves these out learns that nothing ever leaves."""
+    """Of 36 that stood there, two are missed a day later: without these, nothing would ever seem to leave."""
 
     looks_s = np.array([60.0, DAY_S + 60.0])
 

@@ -545,13 +545,7 @@ def _of_mount(row: int, sensor: SpatialSensor, *, many: bool, driven: bool) -> I
     if not (many or driven):
         return
     name, told = sensor.name, _constant(f"[camera.{sensor.name}.mount]")
-    for axis, part in enumerate(("x", "y", "z", "roll", "pitch", "yaw")):
-        unit, sigma = ("rad", MOUNT_RAD) if axis > 2 else ("m", MOUNT_M)
-        yield Suspect(
-            "mount", f"{name} {part}", USUAL_P, partial(_move_mounts, sensors=(row,), axis=axis),
-            lambda s, part=part, unit=unit: f"the mount of {name} is {s:.3g} {unit} off in {part} of the robot",  # type: ignore[misc]
-            told, sigma,
-        )  # fmt: skip
+    yield from _of_axes((row,), name, f"the mount of {name} is", told)
     for mistake in mistakes.AXES:
         by = se3.turn(mistake.turned)
         yield Suspect(
@@ -562,6 +556,17 @@ def _of_mount(row: int, sensor: SpatialSensor, *, many: bool, driven: bool) -> I
         yield Suspect(
             "mount-flip", name, USUAL_P if words in _OFTEN else RARE_P,
             partial(_change_mount, sensor=row, how=how), _constant(f"{name} seems {words}"), told,
+        )  # fmt: skip
+
+
+def _of_axes(rows: Sequence[int], name: str, what_is: str, fix: Callable[[float], str]) -> Iterable[Suspect]:
+    """Return offsets and turns of mounts, together, along and about each axis of the robot."""
+    for axis, part in enumerate(("x", "y", "z", "roll", "pitch", "yaw")):
+        unit, sigma = ("rad", MOUNT_RAD) if axis > 2 else ("m", MOUNT_M)
+        yield Suspect(
+            "mount", f"{name} {part}", USUAL_P, partial(_move_mounts, sensors=rows, axis=axis),
+            lambda s, part=part, unit=unit: f"{what_is} {s:.3g} {unit} off in {part} of the robot",  # type: ignore[misc]
+            fix, sigma,
         )  # fmt: skip
 
 
@@ -577,13 +582,7 @@ def _of_all_mounts(sensors: Sequence[SpatialSensor], *, driven: bool) -> Iterabl
         )  # fmt: skip
     if not driven:  # nothing says which way the robot looks
         return
-    for axis, part in enumerate(("x", "y", "z", "roll", "pitch", "yaw")):
-        unit, sigma = ("rad", MOUNT_RAD) if axis > 2 else ("m", MOUNT_M)
-        yield Suspect(
-            "mount", f"all sensors {part}", USUAL_P, partial(_move_mounts, sensors=rows, axis=axis),
-            lambda s, part=part, unit=unit: f"mounts of all sensors are {s:.3g} {unit} off in {part} of the robot",  # type: ignore[misc]
-            _constant("[camera.*.mount]"), sigma,
-        )  # fmt: skip
+    yield from _of_axes(rows, "all sensors", "mounts of all sensors are", _constant("[camera.*.mount]"))
     turned: list[tuple[str, str, Callable[[FloatArray], FloatArray], float]] = [
         (each.code, each.message, partial(_turn_within, by=se3.turn(each.turned)), USUAL_P) for each in mistakes.AXES
     ]

@@ -703,7 +703,7 @@ def _may_relieve(session: AnySession, inputs: Inputs, suspect: Suspect, state: f
 def _find_fit(session: SpatialSession) -> tuple[float, float]:
     """Return the mean squared innovation of a session in space, a number, and the share of detections rejected."""
     optimum = session.solved.optimum
-    smoother, now = optimum.fitted or (optimum.smoother, optimum.now)
+    smoother, now = optimum.last
     inlier = now.weight >= INLIER
     nis = smoother.find_nis(now, smoother.spread(now))
     return _mean_square(nis, smoother.problem.dof, inlier), float(np.mean(~inlier))

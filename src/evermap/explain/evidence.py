@@ -177,7 +177,7 @@ def _in_plane(solved: Solved, changes: tuple[MapChange, ...]) -> Optimum:
 
 def _in_space(session: SpatialSession) -> Optimum:
     optimum = session.solved.optimum
-    smoother, linear = optimum.fitted or (optimum.smoother, optimum.now)
+    smoother, linear = optimum.last
     problem, state, noise = smoother.problem, optimum.estimate, optimum.noise
     graph, now = smoother.graph(noise, heavy=False), linear.now
     nominal = start_noise(problem.settings, driven=problem.driven)

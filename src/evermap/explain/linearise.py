@@ -46,7 +46,7 @@ def held_by_map(session: AnySession) -> AnySession:
     if isinstance(session, Solved):
         return session
     optimum = session.solved.optimum
-    problem = (optimum.fitted or (optimum.smoother, optimum.now))[0].problem
+    problem = optimum.last[0].problem
     if not len(problem.prior.place) or problem.prior.weight.min() > problem.settings.inlier:
         return session
     prior = replace(problem.prior, weight=np.ones_like(problem.prior.weight))
@@ -108,7 +108,7 @@ def _driven_as_estimated(session: AnySession, inputs: Inputs) -> Inputs:
         driven = replace(driven, forward_mps=forward, lateral_mps=lateral, angular_radps=turn)
     else:
         optimum = session.solved.optimum
-        problem = (optimum.fitted or (optimum.smoother, optimum.now))[0].problem
+        problem = optimum.last[0].problem
         pose, knot_s = optimum.estimate.pose, inputs.recording.frames.stamp_s[session.intake.pose_frame]
         row = np.clip(np.searchsorted(knot_s, driven.stamp_s, side="right") - 1, 0, len(knot_s) - 2)
         part = (driven.stamp_s - knot_s[row]) / np.diff(knot_s)[row]  # beyond the ends it goes on as there
@@ -158,7 +158,7 @@ def _residuals_in_plane(session: Solved, optimum: Optimum, inputs: Inputs, undon
 def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Inputs, undone: Inputs) -> FloatArray | None:
     solved = session.solved.optimum
     moved = _problem_of(session, inputs, undone)
-    before = (solved.fitted or (solved.smoother, solved.now))[0].problem.swing
+    before = solved.last[0].problem.swing
     if moved is None or not np.array_equal(moved.swing.steps, before.steps):
         return None
     # what a cause changes are measurements, not what they tie; noise stays, since the axes of an arm turn as they like
@@ -172,7 +172,7 @@ def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Input
 def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> SpatialProblem | None:
     """Return the problem of a session with other inputs; None if other detections or poses would be in it."""
     solved, before = session.solved.optimum, session.intake
-    problem = (solved.fitted or (solved.smoother, solved.now))[0].problem
+    problem = solved.last[0].problem
     assert is_in_space(undone.recording)
     prior = problem.prior
     if undone.prior_map is not inputs.prior_map and undone.prior_map is not None:
@@ -202,7 +202,7 @@ def cost_nearby(session: AnySession) -> float:
     if isinstance(session, Solved):
         return np.nan
     solved = session.solved.optimum
-    smoother = (solved.fitted or (solved.smoother, solved.now))[0]
+    smoother = solved.last[0]
     return smoother.optimum(solved.estimate, solved.noise, heavy=True, iterations=FEW_STEPS)[1].cost
 
 
@@ -225,7 +225,7 @@ def gain_by(session: AnySession, before: float, inputs: Inputs, suspect: Suspect
         moved = _problem_of(session, inputs, suspect.undo(inputs, 0.0))
         if moved is None:
             return -np.inf
-        fitted = (solved.fitted or (solved.smoother, solved.now))[0]
+        fitted = solved.last[0]
         smoother = SpatialSmoother(moved, solved.estimate.pose, fitted.structure)
         _, now = smoother.optimum(solved.estimate, solved.noise, heavy=True, iterations=FEW_STEPS, wanted=before)
     except EvermapError:
@@ -248,7 +248,7 @@ def solve_nearby(session: AnySession, inputs: Inputs, undone: Inputs) -> Spatial
         moved = _problem_of(session, inputs, undone)
         if moved is None:
             return None
-        fitted = (solved.fitted or (solved.smoother, solved.now))[0]
+        fitted = solved.last[0]
         smoother = SpatialSmoother(moved, solved.estimate.pose, fitted.structure)
         estimate, now = smoother.optimum(solved.estimate, solved.noise, heavy=False, iterations=STEPS_NEARBY)
     except EvermapError:

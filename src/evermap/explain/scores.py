@@ -176,9 +176,8 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
         value = -pull / known
         moved = column.step()[at] - sum((by * step for by, (_, _, step) in zip(taken, usual, strict=True)), np.zeros(1))
         moved = np.linalg.norm(value * (moved + _went_by_clock(session, suspect, dim)), axis=1)
-        shift = float(
-            np.max(moved) if suspect is DRIFT else np.median(moved)
-        )  # a drift goes on, and is worst at an end
+        # a drift goes on, and is worst at an end
+        shift = float(np.max(moved) if suspect is DRIFT else np.median(moved))
         gain = 0.5 * pull**2 / known * optimum.worth
         if gain > CHANCE:
             gain /= max(screen.variance(column, value) / column.information_with(column), 1.0)

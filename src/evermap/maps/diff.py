@@ -29,7 +29,7 @@ from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, 
 USUAL = DecisionConfig()
 ToldBySession = tuple[Sequence[MapChange], bool]
 """Changes reported by a session, and whether they are inverted."""
-_COMES = frozenset({ChangeKind.APPEARED, ChangeKind.RETURNED})
+COMES = frozenset({ChangeKind.APPEARED, ChangeKind.RETURNED})
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +49,12 @@ class Told:
     @property
     def comes(self) -> bool:
         """Whether its landmarks are present after it, and were absent before."""
-        return self.change.kind is ChangeKind.VANISHED if self.undone else self.change.kind in _COMES
+        return self.change.kind is ChangeKind.VANISHED if self.undone else self.change.kind in COMES
 
     @property
     def goes(self) -> bool:
         """Whether its landmarks are absent after it, and were present before."""
-        return self.change.kind in _COMES if self.undone else self.change.kind is ChangeKind.VANISHED
+        return self.change.kind in COMES if self.undone else self.change.kind is ChangeKind.VANISHED
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ def net(
     """
     if len(sessions) == 1 and not sessions[0][1]:
         return tuple(sessions[0][0])
-    parts = {id(one): _parted(one) for changes, _ in sessions for one in changes}
+    parts = {id(one): _split_replacement(one) for changes, _ in sessions for one in changes}
     told = [
         Told(part, undone, k)
         for k, (changes, undone) in enumerate(sessions)
@@ -171,7 +171,7 @@ def net(
     return with_swaps(found, a, b, settings) if len({one.session for one in told}) > 1 else tuple(found)
 
 
-def _parted(change: MapChange) -> tuple[MapChange, ...]:
+def _split_replacement(change: MapChange) -> tuple[MapChange, ...]:
     """A replacement as what left and what came; any other change as it is."""
     if change.kind is not ChangeKind.REPLACED:
         return (change,)
@@ -341,4 +341,4 @@ def _standing(living: LivingMap) -> set[int]:
 
 def _possible(kind: ChangeKind, before: bool, after: bool) -> bool:
     """Return whether a change is consistent with presence in the maps before and after it."""
-    return (before, after) == (kind not in _COMES, kind is not ChangeKind.VANISHED)
+    return (before, after) == (kind not in COMES, kind is not ChangeKind.VANISHED)

@@ -218,7 +218,7 @@ class PlanarTogether(Together[Estimate]):
         """Return the values of a robot."""
         return self.estimates(state)[robot]
 
-    def _known(self, state: Estimate) -> BoolArray:
+    def _find_known(self, state: Estimate) -> BoolArray:
         return state.known
 
     def _dims(self) -> tuple[int, IntArray, IntArray]:

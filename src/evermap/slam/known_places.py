@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Generic, NamedTuple, Self, TypeVar
@@ -159,7 +160,7 @@ Seen = TypeVar("Seen")
 """What a track keeps of a landmark."""
 
 
-class DriveTrack(Generic[Seen]):
+class DriveTrack(ABC, Generic[Seen]):
     """A drive by odometry alone, and what was seen of landmarks during it, in the frame of its first pose.
 
     Args:
@@ -205,9 +206,9 @@ class DriveTrack(Generic[Seen]):
         within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         return np.repeat(np.arange(len(first)), count), np.repeat(first, count) + within
 
+    @abstractmethod
     def _candidates(self, places: KnownPlaces) -> tuple[Matches, IntArray]:
         """Return what was seen with the places that it may be of, and rows (K,) of these; weights are beliefs."""
-        raise NotImplementedError
 
     def agreement(self, pose_map_robot: FloatArray, places: KnownPlaces) -> float:
         """Return how well the track fits the map with the robot at a pose: 1 per landmark exactly at a place."""

@@ -19,6 +19,7 @@ What depends on the dimension is in two specialisations, `planar_filter.PlanarFi
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -121,23 +122,23 @@ class Updated(NamedTuple):
     before: FrameInnovations | None
 
 
-class LocalFilter(NearbyPlaces):
+class LocalFilter(NearbyPlaces, ABC):
     """The newest pose, the calibration states and the places around: drive, compare, update.
 
-    A subclass says how a motion moves the pose (`_driven`), how detections are linearised (`_sight_frame`), and how a
-    step moves all that stands in the world (`_carry`).
+    A subclass says how a motion moves the pose (`_move_pose`), how detections are linearised (`_sight_frame`), and how
+    a step moves all that stands in the world (`_carry`).
     """
 
     def drive(self, motion: Motion) -> None:
         """Advance the newest pose."""
         self._now += 1
-        self.pose, carry = self._driven(motion)
+        self.pose, carry = self._move_pose(motion)
         drive_on(self.covariance, self.own, carry, motion.by_states, motion.covariance)
 
     def ahead(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
         """Return the pose after a motion, and its covariance; the filter stays where it is."""
         covariance = self.covariance[: self.own, : self.own].copy()
-        pose, carry = self._driven(motion)
+        pose, carry = self._move_pose(motion)
         drive_on(covariance, self.own, carry, motion.by_states, motion.covariance)
         return pose, covariance[: self.group.dim, : self.group.dim].copy()
 
@@ -228,16 +229,16 @@ class LocalFilter(NearbyPlaces):
         self._carry(step)
         return Updated(nis, weight, before)
 
-    def _driven(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
+    @abstractmethod
+    def _move_pose(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
         """Return the pose after a motion, and the derivatives (D, D) of its error by that of the pose before."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _sight_frame(self, rows: IntArray, seen: Any) -> SightedFrame:
         """Return detections (M,) of places (M,), to be linearised around where pose and places are now."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _carry(self, step: FloatArray) -> None:
         """Move the pose and all places in the covariance by a step of all its numbers, or, if places are considered, of
         pose and calibration alone; re-express the covariance there.
         """
-        raise NotImplementedError

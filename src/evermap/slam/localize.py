@@ -9,6 +9,7 @@ away.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -64,7 +65,7 @@ class Located:
 BaseLocalizerT = TypeVar("BaseLocalizerT", bound="BaseLocalizer")
 
 
-class BaseLocalizer(Shown):
+class BaseLocalizer(Shown, ABC):
     """Localisation in a fixed map, in the plane or in space: feed frames in order with `step`.
 
     A subclass brings the filter, the search for a start, and the measurements.
@@ -170,25 +171,25 @@ class BaseLocalizer(Shown):
             there.place_at(self._stamp_s, before.pose.copy(), before.covariance[:pose_dim, :pose_dim].copy())
         return there
 
+    @abstractmethod
     def _begin_track(self) -> Any:
         """Return the search for a start: a `DriveTrack`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _motion(self, drive: Any, start_s: float, stop_s: float) -> Motion:
         """Return odometry between two instants."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _compare(self, row: IntArray, seen: Any, which: IntArray) -> tuple[FloatArray, FloatArray]:
         """Compare detections (M,) with a place (M,) each: squared distances, and `log |S|`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _update_by(self, row: IntArray, seen: Any, which: IntArray) -> Updated:
         """Update by detections (M,) of places (M,)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _sight(self, row: int, seen: Any, which: int) -> None:
         """Store the place of a landmark that the map lacks."""
-        raise NotImplementedError
 
     def _expect(self, _: IntArray) -> tuple[IntArray, FloatArray, BoolArray]:
         """Return rows of places in view, P(detect) of each, and those missed, of landmarks that were not seen (M,).

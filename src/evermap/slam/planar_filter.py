@@ -90,7 +90,7 @@ class PlanarFilter(LocalFilter):
         self.hold(estimate.pose[pose_row], estimate.states, covariance, rows, estimate.landmark.copy())
         self.lean_on(estimate.landmark, marginals.joint)
 
-    def _driven(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
+    def _move_pose(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
         return drive(self.pose, motion.increment)
 
     def _sight_frame(self, rows: IntArray, seen: FrameReadings) -> _PlanarFrame:

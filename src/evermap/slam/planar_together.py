@@ -64,16 +64,16 @@ def solve_together(alone: Mapping[int, Solved]) -> tuple[list[Solved], list[Traj
         NumericalError: no finite optimum.
     """
     members = list(alone.values())
-    met, stamps, remarks = _sighted(np.array(list(alone)), members)
-    own = [_extended(member, stamp_s) for member, stamp_s in zip(members, stamps, strict=True)]
-    motion = _placed(members, own, met)
-    joint, estimate = _laid_together(members, own, met, motion)
-    joint, estimate, _ = _levelled(members, joint, estimate, heavy=True)
-    joint, estimate, p_needed = _as_needed(joint, estimate)
-    joint, estimate, fits = _levelled(members, joint, estimate)
+    met, stamps, remarks = _find_sightings(np.array(list(alone)), members)
+    own = [_extend(member, stamp_s) for member, stamp_s in zip(members, stamps, strict=True)]
+    motion = _place(members, own, met)
+    joint, estimate = _lay_together(members, own, met, motion)
+    joint, estimate, _ = _learn_levels(members, joint, estimate, heavy=True)
+    joint, estimate, p_needed = _keep_needed(joint, estimate)
+    joint, estimate, fits = _learn_levels(members, joint, estimate)
     joint, estimate = _ahead(members[0], joint, estimate)
     estimate, marginals = joint.solved(estimate, Steps(tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN))
-    outcomes = _divided(members, joint, estimate, marginals, p_needed, fits)
+    outcomes = _divide(members, joint, estimate, marginals, p_needed, fits)
     solved, online = [], []
     frames = ["first_pose", *["first_robot"] * (len(members) - 1)]
     for one, outcome, by, said, frame in zip(members, outcomes, motion, remarks, frames, strict=True):
@@ -88,7 +88,9 @@ def solve_together(alone: Mapping[int, Solved]) -> tuple[list[Solved], list[Traj
     return solved, online
 
 
-def _sighted(number: IntArray, members: Sequence[Solved]) -> tuple[Encounters, list[FloatArray], list[tuple[str, ...]]]:
+def _find_sightings(
+    number: IntArray, members: Sequence[Solved]
+) -> tuple[Encounters, list[FloatArray], list[tuple[str, ...]]]:
     """Encounters of robots while both have poses; instants of the poses of each, those of the sightings included."""
     start_s = np.array([member.prepared.start_s for member in members])
     stamps = [member.outcome.problem.stamp_s for member in members]
@@ -135,7 +137,7 @@ def _nearest(own_s: FloatArray, stamp_s: FloatArray) -> IntArray:
     return after - (stamp_s - own_s[after - 1] < own_s[after] - stamp_s)
 
 
-def _extended(member: Solved, stamp_s: FloatArray) -> tuple[Problem, Estimate]:
+def _extend(member: Solved, stamp_s: FloatArray) -> tuple[Problem, Estimate]:
     """A robot's problem with poses at more instants, without priors of places, and where it puts everything [m]."""
     outcome, problem = member.outcome, member.outcome.problem
     graph, spread = outcome.graph_estimate, outcome.graph_marginals
@@ -156,7 +158,7 @@ def _extended(member: Solved, stamp_s: FloatArray) -> tuple[Problem, Estimate]:
     return extended, Estimate(pose * [scale, scale, 1.0], graph.landmark * scale, states)
 
 
-def _placed(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], met: Encounters) -> FloatArray:
+def _place(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], met: Encounters) -> FloatArray:
     """(R, 3) motions of each robot's frame into that of the first one, by landmarks and sightings that agree.
 
     Raises:
@@ -189,15 +191,15 @@ def _placed(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], 
         """Return the points that b has in common with others, and where these have them."""
         theirs, mine, row = zip(*(in_both(a, b) for a in placed), strict=True)
         there = [se2.transform(motion[a], at) for a, at in zip(placed, theirs, strict=True)]
-        spread = [_errors(members[a], rows[:, 0], motion[a]) for a, rows in zip(placed, row, strict=True)]
-        errors = _errors(members[b], np.concatenate(row)[:, 1], np.zeros(3))
+        spread = [_find_errors(members[a], rows[:, 0], motion[a]) for a, rows in zip(placed, row, strict=True)]
+        errors = _find_errors(members[b], np.concatenate(row)[:, 1], np.zeros(3))
         return SharedPoints(Matches.of(np.concatenate(mine), np.concatenate(there)), errors, block_diag(*spread))
 
     robots = [member.recording.name for member in members]
     return align_frames(np.zeros((len(own), 3)), tie, robots, NEEDED, members[0].settings.localize)
 
 
-def _errors(member: Solved, row: IntArray, motion: FloatArray) -> FloatArray:
+def _find_errors(member: Solved, row: IntArray, motion: FloatArray) -> FloatArray:
     """(2 K, 2 K) covariance of landmarks (K,) of a robot that solved alone, in the frame that a motion leads to; zero
     for those that are -1, and for very many, of which none matters.
     """
@@ -212,7 +214,7 @@ def _errors(member: Solved, row: IntArray, motion: FloatArray) -> FloatArray:
     return spread.reshape(2 * len(row), 2 * len(row))
 
 
-def _shared(members: Sequence[Solved]) -> tuple[list[IntArray], int]:
+def _share(members: Sequence[Solved]) -> tuple[list[IntArray], int]:
     """Return `share_places` by ids, except for landmarks that a robot saw moving."""
     revisions = [member.outcome.revision for member in members]
     names = [member.prepared.landmark_id for member in members]
@@ -226,11 +228,11 @@ def _shared(members: Sequence[Solved]) -> tuple[list[IntArray], int]:
     return share_places(identity)
 
 
-def _laid_together(
+def _lay_together(
     members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], met: Encounters, motion: FloatArray
 ) -> tuple[PlanarTogether, Estimate]:
     """The problem of all, and where it is when each robot's own solution is moved by (R, 3)."""
-    places, count = _shared(members)
+    places, count = _share(members)
     landmark = np.full((count, 2), np.nan)
     pose, robots = [], []
     metric = not all(member.prior.shares_scale for member in members)
@@ -251,7 +253,7 @@ def _laid_together(
     return joint, Estimate(np.concatenate(pose), landmark, states)
 
 
-def _levelled(
+def _learn_levels(
     members: Sequence[Solved], joint: PlanarTogether, estimate: Estimate, *, heavy: bool = False
 ) -> tuple[PlanarTogether, Estimate, list[NoiseFit]]:
     """The optimum and its noise levels, in turns until neither changes; `heavy` outliers at first, if wanted."""
@@ -278,7 +280,7 @@ def _levelled(
             learning.append(robot.under(noise, heavy=False))
         if settled:
             return joint, True
-        return joint.of(learning, _refined(members, joint, estimate, marginals, start)), False
+        return joint.of(learning, _refine(members, joint, estimate, marginals, start)), False
 
     begun = joint.of([robot.under(robot.noise, heavy=heavy) for robot in joint.robots], joint.sigma)
     joint, estimate = settle(begun, estimate, learn, [Steps(STEPS_A_ROUND, NEAR_NOISE)] * FINAL_ROUNDS)
@@ -290,7 +292,7 @@ def _start(member: Solved) -> Noise:
     return beliefs(member.recording.sensor, member.settings)[1]
 
 
-def _refined(
+def _refine(
     members: Sequence[Solved], joint: PlanarTogether, estimate: Estimate, marginals: Marginals, start: FloatArray
 ) -> FloatArray:
     """(R, 2) noise of what each robot measures of others, as `refine_noise` has that of landmarks."""
@@ -305,7 +307,7 @@ def _refined(
     return sigma
 
 
-def _as_needed(joint: PlanarTogether, estimate: Estimate) -> tuple[PlanarTogether, Estimate, list[FloatArray]]:
+def _keep_needed(joint: PlanarTogether, estimate: Estimate) -> tuple[PlanarTogether, Estimate, list[FloatArray]]:
     """Return the same under priors of the needed calibration states, with their probabilities."""
     marginals = joint.marginals(estimate)
     robots, states, p_needed = [], [], []
@@ -330,7 +332,7 @@ def _ahead(first: Solved, joint: PlanarTogether, estimate: Estimate) -> tuple[Pl
     return joint.of(robots, joint.sigma), estimate.moved(turn)
 
 
-def _divided(
+def _divide(
     members: Sequence[Solved],
     joint: PlanarTogether,
     estimate: Estimate,

@@ -91,7 +91,7 @@ class Together(Solver[State]):
 
     def graph_in_slices(self, state: State) -> Slices[Graph[State]]:
         """Return all robots as one graph: odometry of each, detections of each, what ties robots, and all else."""
-        known, n = self._known(state), int(self.first[-1])
+        known, n = self._find_known(state), int(self.first[-1])
         variable = self.variables(known)
         blocks = concatenate_blocks(
             self._blocks(state),
@@ -119,7 +119,7 @@ class Together(Solver[State]):
         """Return the values of a robot."""
 
     @abstractmethod
-    def _known(self, state: State) -> BoolArray:
+    def _find_known(self, state: State) -> BoolArray:
         """Return which of all places (P,) have values."""
 
     @abstractmethod

@@ -217,16 +217,16 @@ def test_wheels_that_did_not_slip_leave_the_filter_as_it_was(monkeypatch: pytest
     """A frame that no landmark matches is asked whether the wheels slipped: a trial in a filter of its own."""
     made = world(1, p_seen=0.3, p_outlier=0.3)
     rules = NAMELESS.association.model_copy(update={"slip_nats": math.inf})
-    tried, drive = set[float](), PlanarAssociator._driven
+    tried, drive = set[float](), PlanarAssociator._drive
     with monkeypatch.context() as watched:
         watched.setattr(
-            PlanarAssociator, "_driven", lambda self, near, times: tried.add(times) or drive(self, near, times)
+            PlanarAssociator, "_drive", lambda self, near, times: tried.add(times) or drive(self, near, times)
         )
         asked = driven(made, NAMELESS.model_copy(update={"association": rules}))
     assert tried == {1.0, 3.0, 9.0, 27.0}  # a jump may be far beyond the noise
 
     def never(self: PlanarAssociator, view: np.ndarray) -> Any:
-        self._near = self._driven(self._near, 1.0)
+        self._near = self._drive(self._near, 1.0)
         return self._match(self._near, view)
 
     monkeypatch.setattr(PlanarAssociator, "_after_driving", never)

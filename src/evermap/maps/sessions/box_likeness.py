@@ -160,11 +160,11 @@ def learn_likeness(seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> Box
         replace(usual, other_size_m=other_size_m),
         replace(usual, other_size_m=other_size_m, p_taken=0.7, beside_m=0.3 * usual.beside_m, haste=3.0),
     )
-    found = [_maximised(start, paired, usual) for start in starts]
+    found = [_maximise(start, paired, usual) for start in starts]
     return max(found, key=lambda one: _log_posterior(one, paired, usual))
 
 
-def _maximised(found: BoxLikeness, paired: BoxPairs, usual: BoxLikeness) -> BoxLikeness:
+def _maximise(found: BoxLikeness, paired: BoxPairs, usual: BoxLikeness) -> BoxLikeness:
     """The most probable one near to where it begins, by pairs (K, 1) of boxes that stand over each other."""
     settings, size_m, away_m = usual.settings, paired.size_m[:, 0], paired.away_m[:, 0]
     sized = np.isfinite(size_m).all(axis=1)

@@ -8,7 +8,7 @@ import numpy as np
 
 from evermap.config import DecisionConfig
 from evermap.geometry.chunked import taken
-from evermap.maps.diff import elsewhere, motion_of, with_swaps
+from evermap.maps.diff import COMES, elsewhere, motion_of, with_swaps
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
 from evermap.maps.sessions.believe import Believed, Witnessed
@@ -17,7 +17,6 @@ from evermap.maps.sessions.looks import Arrivals, PlaceLooks
 from evermap.types import UNKNOWN, BoolArray, ChangeKind, FloatArray, IntArray, MapChange, landmark_id_of
 
 USUAL = DecisionConfig()
-COMES = (ChangeKind.APPEARED, ChangeKind.RETURNED)
 
 
 def decided(

@@ -133,13 +133,13 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
     def _after_driving(self, view: IntArray) -> FrameMatch:
         """Compare the next frame with the map; if no landmark matches, again with the noise of slipping wheels."""
         before = self._near
-        self._near = self._driven(before, 1.0)
+        self._near = self._drive(before, 1.0)
         match = self._match(self._near, view)
         if len(match.certain):
             return match
         # did the wheels slip, or stamps jitter in a turn?
         for times in range(1, SLIPS + 1):
-            slipped = self._driven(before, self._rules.slip**times)
+            slipped = self._drive(before, self._rules.slip**times)
             other = self._match(slipped, view)
             if len(other.certain) and other.evidence >= match.evidence + times * self._rules.slip_nats:
                 self._near = slipped
@@ -148,7 +148,7 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
 
     def _match(self, near: NearT, view: IntArray) -> FrameMatch:
         """Weigh the detections of a view against the landmarks nearby."""
-        pairings, followed = self._gated(near, view)
+        pairings, followed = self._gate(near, view)
         source, target = view[pairings.source], pairings.target
         new = pairings.log_density_new - self._rules.name_nats * same_name(self._kind[source], self._of_kind[target])
         new -= self._traits.same(self._traits.singly(source), self._like.part(target))
@@ -258,11 +258,11 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         return [detections]
 
     @abstractmethod
-    def _driven(self, near: NearT, times: float) -> NearT:
+    def _drive(self, near: NearT, times: float) -> NearT:
         """The landmarks nearby after the motion to the next frame, with a multiple of the odometry noise."""
 
     @abstractmethod
-    def _gated(self, near: NearT, view: IntArray) -> tuple[Pairings, BoolArray]:
+    def _gate(self, near: NearT, view: IntArray) -> tuple[Pairings, BoolArray]:
         """The detections of a view, paired with the landmarks whose gates they pass, by place; and (K,) whether these
         are tracked: known relative to the robot as well as they are measured.
         """

@@ -184,7 +184,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
             self._go_on_from(self._settled(self._without_chance(self._assignment()), self._sigma, RECENT))
             self._next_batch = self._done + max(FIRST_BATCH, int(BATCH_SHARE * self._done))
 
-    def _driven(self, near: PlanarFilter, times: float) -> PlanarFilter:
+    def _drive(self, near: PlanarFilter, times: float) -> PlanarFilter:
         local, noise = near.copied(), replace(self.noise, odometry=times * self.noise.odometry)
         motion = PlanarMotion.between(self._problem, noise, self._done, local.states)
         away = np.hypot(*(local.position - se2.compose(local.pose, motion.increment)[:2]).T)
@@ -292,7 +292,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         explained = fit + self.noise.outlier_log_odds * nobody
         return explained / self.worth + landmarks + unseen_nats(assignment)
 
-    def _gated(self, near: PlanarFilter, view: IntArray) -> tuple[Pairings, BoolArray]:
+    def _gate(self, near: PlanarFilter, view: IntArray) -> tuple[Pairings, BoolArray]:
         labels = self._kind[view], self._of_kind
         return pairings_of_frame(
             near, self._problem, self._sigma, view, density=self._density, kind=labels, settings=self._rules

@@ -310,13 +310,13 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
     def _views(self, detections: IntArray) -> list[IntArray]:
         return [detections[self._view[detections] == one] for one in np.unique(self._view[detections])]
 
-    def _driven(self, near: _Nearby, times: float) -> _Nearby:
+    def _drive(self, near: _Nearby, times: float) -> _Nearby:
         problem, row = self._problem, self._done - 1
         variance = problem.lasted_s[row] * np.array([self._noise.translation, self._noise.rotation]) ** 2
         away_s = problem.stamp_s[self._done] - self._seen_s[near.row]
         return near.part(away_s <= self._rules.forget_s).driven(problem.increment[row], times**2 * variance)
 
-    def _gated(self, near: _Nearby, view: IntArray) -> tuple[Pairings, BoolArray]:
+    def _gate(self, near: _Nearby, view: IntArray) -> tuple[Pairings, BoolArray]:
         rules = self._rules
         source, target = (each.ravel() for each in np.indices((len(view), len(near.row))))
         kept = alike(self._kind[view[source]], self._of_kind[near.row[target]])

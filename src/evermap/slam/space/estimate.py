@@ -62,6 +62,11 @@ class SpatialOptimum:
     fitted: tuple[SpatialSmoother, SpatialLinear] | None = None
     sober: SpatialNoise | None = None
 
+    @property
+    def last(self) -> tuple[SpatialSmoother, SpatialLinear]:
+        """Return the problem that the values are the optimum of, linearised there, whatever covariances count."""
+        return self.fitted or (self.smoother, self.now)
+
 
 def converged(
     problem: SpatialProblem, start: SpatialEstimate, noise: SpatialNoise, *, heavy_rounds: int = 2

@@ -157,7 +157,7 @@ class SpatialFilter(LocalFilter):
     def _mount_at(self, states: FloatArray) -> FloatArray:
         return se3.retract(self._mount, states[:-1].reshape(-1, MOUNT))
 
-    def _driven(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
+    def _move_pose(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
         return se3.compose(self.pose, motion.increment), se3.adjoint(se3.inverse(motion.increment))
 
     def _sight_frame(self, rows: IntArray, seen: SpatialFrame) -> _SpatialFrame:

@@ -333,11 +333,8 @@ def _scales(told: _Told, sigma: float) -> list[ParameterEstimate]:
 def _innovations(told: _Told, identities: IntArray) -> Innovations:
     """Return the NIS of all detections, each as if it had not been used."""
     optimum = told.solved.optimum
-    if optimum.fitted is None:
-        smoother, now, spread = optimum.smoother, optimum.now, told.spread
-    else:  # residuals are told by the fit, whatever the covariances count
-        smoother, now = optimum.fitted
-        spread = smoother.spread(now)
+    smoother, now = optimum.last  # residuals are those of the fit, whatever the covariances count
+    spread = told.spread if optimum.fitted is None else smoother.spread(now)
     problem = smoother.problem
     return Innovations(
         stamp_s=told.stamp_s[problem.pose_row],

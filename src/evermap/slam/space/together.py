@@ -224,7 +224,7 @@ class SpatialTogether(Together[JointEstimate]):
 
     def parts(self, solution: Minimum[JointEstimate]) -> list[SpatialOptimum]:
         """Return what each robot has of the solution, with covariances by all."""
-        structure, variable = self.graph(solution.state).structure, self.variables(self._known(solution.state))
+        structure, variable = self.graph(solution.state).structure, self.variables(self._find_known(solution.state))
         factorised = exhausted(self.factorised_in_slices(solution.state))
         steps = np.cumsum([0, *(len(robot.problem.increment) for robot in self.robots)]).tolist()
         spread = exhausted(factorised.spread(steps[-1]))
@@ -245,7 +245,7 @@ class SpatialTogether(Together[JointEstimate]):
         place, log_scale = state.place[self.places[robot]], float(state.log_scale[robot])
         return SpatialEstimate(state.pose[poses], place, state.state[sensors], log_scale)
 
-    def _known(self, state: JointEstimate) -> BoolArray:
+    def _find_known(self, state: JointEstimate) -> BoolArray:
         return np.ones(len(state.place), dtype=np.bool_)
 
     def _dims(self) -> tuple[int, IntArray, IntArray]:
