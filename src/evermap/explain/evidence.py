@@ -18,7 +18,7 @@ information on it is `h = d'd - b'H^-1 b`, `b = J'd`, and the cost falls by `g^2
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -239,18 +239,11 @@ def _worth(lasting: Lasting, stamp_s: FloatArray, place: Any) -> float:
     return float(lasting.information(stamp_s, place).mean()) if len(place) else 1.0
 
 
-def residuals_of(graph: Graph[Any], now: Linear) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return (R,) where the right sides of all rows are among the values, (R,) whitened residuals that are not
-    weighted, and (R,) roots of the weights.
-    """
-    tree, factors = graph.structure.system.tree, graph.structure.system.factors
-    rows = factors.rows
-    width = np.diff(tree.value_first) // np.maximum(rows, 1)
-    factor = np.repeat(np.arange(len(rows)), rows)
-    row = np.arange(rows.sum()) - np.repeat(np.cumsum(rows) - rows, rows)
-    at = tree.value_first[factor] + (row + 1) * width[factor] - 1
-    root = np.sqrt(np.maximum(np.concatenate(now.weights), 1e-12))[factor]
-    return at, -now.values[at] / root, root
+def residuals_of(graph: Graph[Any], now: Linear) -> tuple[FloatArray, FloatArray]:
+    """Return (R,) whitened residuals of all rows that are not weighted, and (R,) roots of the weights."""
+    system = graph.structure.system
+    root = np.repeat(np.sqrt(np.maximum(np.concatenate(now.weights), 1e-12)), system.factors.rows)
+    return -now.values[system.right_at] / root, root
 
 
 class Score(NamedTuple):
@@ -296,12 +289,11 @@ class Screen:
 
     Attributes:
         optimum: the optimum.
-        at, residual, root: as `residuals_of`.
+        residual, root: as `residuals_of`.
         solved: its normal equations.
     """
 
     optimum: Optimum
-    at: IntArray
     residual: FloatArray
     root: FloatArray
     solved: Factorised
@@ -309,8 +301,8 @@ class Screen:
     @classmethod
     def of(cls, optimum: Optimum) -> Screen:
         """Return the screen of an optimum."""
-        at, residual, root = residuals_of(optimum.graph, optimum.now)
-        return cls(optimum, at, residual, root, exhausted(optimum.graph.factorised(optimum.now)))
+        residual, root = residuals_of(optimum.graph, optimum.now)
+        return cls(optimum, residual, root, exhausted(optimum.graph.factorised(optimum.now)))
 
     def of_detections(self, some: BoolArray) -> BoolArray:
         """Return (R,) which rows are of some of the detections (M,)."""
@@ -322,12 +314,8 @@ class Screen:
 
     def column(self, direction: FloatArray) -> Column:
         """Return a further number by which residuals (R,), not weighted, change so for a unit."""
-        graph, now = self.optimum.graph, self.optimum.now
         told = direction * self.root
-        values = now.values.copy()
-        values[self.at] = -told
-        moved = replace(now, values=values, border_right=np.zeros_like(now.border_right))
-        solved = exhausted(graph.factorised(moved))
+        solved = self.solved.with_right(-told)
         return Column(told, solved, np.asarray(np.linalg.solve(solved.information, solved.right), dtype=np.float64))
 
     def pull(self, column: Column) -> float:
@@ -344,7 +332,7 @@ class Screen:
         """
         graph, state = self.optimum.graph, self.optimum.state
         there, _ = graph.retract(state, TINY * value * column.step())
-        residual = residuals_of(graph, exhausted(graph.linearised(there)))[1]
+        residual = residuals_of(graph, exhausted(graph.linearised(there)))[0]
         with_all = column.told + (residual - self.residual) * self.root / (TINY * value)
         before = self.residual * self.root
         return min(float(np.sum((with_all * left) ** 2)) for left in (before, before + value * with_all))

@@ -152,7 +152,7 @@ def _residuals_in_plane(session: Solved, optimum: Optimum, inputs: Inputs, undon
     )  # fmt: skip
     smoother = Smoother(moved, session.outcome.noise.noise, robust=session.settings.robust)
     graph = replace(optimum.graph, blocks=smoother.blocks(optimum.state.known))  # which ties the same
-    return residuals_of(graph, exhausted(graph.linearised(optimum.state)))[1]
+    return residuals_of(graph, exhausted(graph.linearised(optimum.state)))[0]
 
 
 def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Inputs, undone: Inputs) -> FloatArray | None:
@@ -166,7 +166,7 @@ def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Input
     fixed = replace(moved, swing=before)
     smoother = SpatialSmoother(fixed, solved.estimate.pose, optimum.graph.structure)
     now = exhausted(smoother.graph(solved.noise, heavy=True).linearised(solved.estimate))
-    return residuals_of(optimum.graph, now)[1]
+    return residuals_of(optimum.graph, now)[0]
 
 
 def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> SpatialProblem | None:

@@ -203,7 +203,7 @@ def _measure_alternation(optimum: Optimum) -> float:
     rows = structure.system.factors.rows[structure.first[ODOMETRY] : structure.first[ODOMETRY + 1]]
     if len(rows) < FEWEST_STEPS:
         return math.nan
-    residual = residuals_of(optimum.graph, optimum.now)[1][: rows.sum()].reshape(len(rows), -1)
+    residual = residuals_of(optimum.graph, optimum.now)[0][: rows.sum()].reshape(len(rows), -1)
     residual = residual * np.sqrt(np.minimum(weight, 1.0))[:, None]
     residual = residual[:, np.mean(residual**2, axis=0) > KNOWN]
     product = residual[1:] * residual[:-1]

@@ -119,6 +119,25 @@ def test_solution_and_covariances_are_those_of_dense_algebra(large, dims, seed, 
     assert close(solved.columns(some), covariance[:, at])
 
 
+@pytest.mark.parametrize("dims", [PLANE, SPACE])
+@pytest.mark.parametrize("border", [[18], [0, 5, 11]], ids=["calibration", "poses"])
+def test_another_right_side_is_solved_as_if_factorised_with_it(dims, border):
+    world = World(7, 12, 6, dims)
+    solved = world.solved(np.array(border))
+    right = np.random.default_rng(1).normal(size=world.factors.rows.sum())
+    before, (information, _, jacobians) = solved.own_right.copy(), world.dense()
+    expected = np.linalg.solve(information, np.concatenate(jacobians).T @ right)
+    other = solved.with_right(right)
+    assert close(exhausted(other.solution()), expected)
+    world.values = world.values.copy()
+    world.values[solved.system.right_at] = right
+    again = world.solved(np.array(border))
+    assert close(other.own_right, again.own_right)
+    assert close(other.right, again.right)
+    assert close(other.information, again.information)
+    assert np.array_equal(solved.own_right, before)
+
+
 def test_places_that_all_depend_on_each_other_are_solved_as_by_dense_algebra():
     world = World(5, 30, 150, PLANE, known=True)
     information, right, _ = world.dense()

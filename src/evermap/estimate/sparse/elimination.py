@@ -318,6 +318,51 @@ def _dot_from(stored: FloatArray, at: Any, x: FloatArray, first: Any, end: Any) 
 
 
 @kernel
+def multiply_transposed(tree: Tree, factors: Factors, values: FloatArray, right: FloatArray) -> FloatArray:
+    """Return (numbers,) the transposed Jacobians of all factors, among their values, times a right side (rows,)."""
+    out, at, row = np.zeros(tree.begin[-1]), 0, 0
+    for f in range(len(factors.rows)):
+        for _ in range(factors.rows[f]):
+            for k in range(factors.first[f], factors.first[f + 1]):
+                begin = tree.begin[factors.variable[k]]
+                for a in range(tree.dim[factors.variable[k]]):
+                    out[begin + a] += values[at] * right[row]
+                    at += 1
+            at += 1
+            row += 1
+    return out
+
+
+@kernel
+def forward_substitute(tree: Tree, stored: FloatArray, right: FloatArray) -> None:
+    """Make a right side (numbers,) `L^-1` times it, in place; that of the border is what the others leave of it.
+
+    `stored` are the rows of the Cholesky factor.
+    """
+    largest = 0
+    for node in range(len(tree.parent)):
+        largest = max(largest, tree.size[node])
+    mine = np.empty(largest)
+    for node in range(len(tree.parent) - 1, -1, -1):
+        size, own = tree.size[node], tree.own[node]
+        for k in range(tree.first[node], tree.first[node + 1]):
+            begin = tree.begin[tree.variable[k]]
+            for a in range(tree.dim[tree.variable[k]]):
+                mine[tree.at[k] + a] = right[begin + a]
+        for i in range(own):
+            at, row, end = np.uint64(tree.stored[node] + i * size), np.uint64(i), np.uint64(size)
+            value = mine[row] / stored[at + row]
+            mine[row] = value
+            if value != 0.0:
+                for j in range(row + np.uint64(1), end):
+                    mine[j] -= value * stored[at + j]
+        for k in range(tree.first[node], tree.first[node + 1]):
+            begin = tree.begin[tree.variable[k]]
+            for a in range(tree.dim[tree.variable[k]]):
+                right[begin + a] = mine[tree.at[k] + a]
+
+
+@kernel
 def back_substitute(
     tree: Tree, stored: FloatArray, right: FloatArray, border: FloatArray, x: FloatArray, low: int, high: int
 ) -> None:

@@ -21,6 +21,8 @@ from evermap.estimate.sparse.elimination import (
     columns_of_inverse,
     eliminate,
     eliminate_large,
+    forward_substitute,
+    multiply_transposed,
     numbers_of,
     spread,
     spread_room,
@@ -92,6 +94,18 @@ class Factorised:
             back_substitute(tree, self.rows, self.own_right, border, x, low, high)
             yield share
         return x
+
+    def with_right(self, right: FloatArray) -> Factorised:
+        """Return the same with another right side of the factors' rows (R,), and none of the border from elsewhere.
+
+        Nothing is factorised again: it costs no more than a solution.
+        """
+        tree = self.system.tree
+        own = multiply_transposed(tree, self.system.factors, self.values, right)
+        forward_substitute(tree, self.rows, own)
+        at = numbers_of(tree.begin[tree.border], tree.dim[tree.border])
+        border, own[at] = own[at], 0.0
+        return Factorised(self.system, self.values, self.rows, own, self.information, border)
 
     @property
     def log_determinant(self) -> float:
@@ -209,6 +223,14 @@ class System:
         fronts = np.repeat(np.arange(len(rows)), np.diff(self.tree.factor_first))
         np.maximum.at(rows, fronts, factors.rows[self.tree.factor])
         self._large = np.maximum(self.tree.own, rows) * self.tree.size**2 >= LARGE
+
+    @cached_property
+    def right_at(self) -> IntArray:
+        """(R,) where the right sides of all rows are among the values of the factors."""
+        rows = self.factors.rows
+        width = np.repeat(np.diff(self.tree.value_first) // np.maximum(rows, 1), rows)
+        row = np.arange(len(width)) - np.repeat(np.cumsum(rows) - rows, rows)
+        return np.asarray(np.repeat(self.tree.value_first[:-1], rows) + (row + 1) * width - 1)
 
     @cached_property
     def has_border_throughout(self) -> bool:
