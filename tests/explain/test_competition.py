@@ -309,7 +309,7 @@ def test_a_step_that_rejects_detections_says_as_much_as_a_fine_one() -> None:
     visit, _, inputs = session.explained(Inputs.of(recording, survey), without_causes(), ())
     solved = session.solution_of(visit)
     screen = Screen.of(optimum_of(solved))
-    for suspect in list_suspects(inputs, discrete=False):
+    for suspect in list_suspects(inputs, calibrations=True):
         if suspect.code == "mount":
             coarse, fine = (change_by(solved, screen, inputs, suspect, share) for share in (STEP, FINE_STEP))
             assert coarse is not None

@@ -8,15 +8,15 @@ together are a concatenation of their blocks (`concatenate_blocks`), and a new m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evermap.estimate.sparse.elimination import curvature
-from evermap.estimate.sparse.system import Factorised, Slices, System
+from evermap.estimate.sparse.elimination import curvature, multiply_rows
+from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
 from evermap.estimate.sparse.tree import MS, Factors, tree_of
 from evermap.types import FloatArray, IntArray
 
@@ -129,7 +129,7 @@ class AlikeFactors(NamedTuple):
 
     def multiply(self, values: FloatArray, numbers: FloatArray) -> FloatArray:
         """Return (K, r, S) Jacobians, among the values of all factors, times numbers of all variables (numbers, S)."""
-        return np.asarray(np.einsum("kra,kas->krs", values[self.at[..., :-1]], numbers[self.number]))
+        return multiply_rows(values, self.first, self.rows, self.number, np.ascontiguousarray(numbers))
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,6 +220,21 @@ class Graph(Generic[State]):
         offset = self.border.offset(state)
         cost += 0.5 * float(offset @ (self.border.information * offset))
         return Linear(values, tuple(weights), cost, -self.border.information * offset)
+
+    def relinearised(self, now: Linear, state: State, blocks: Mapping[int, FactorBlock[State]]) -> Linear:
+        """Return the graph with other blocks in place of some of its own, linearised at the values where it is already.
+
+        Args:
+            now: the graph itself, linearised; its cost stays, and is not that of the others.
+            state: values of all variables.
+            blocks: the others, by the numbers of those that they replace, and which tie the same.
+        """
+        values, weights = now.values.copy(), list(now.weights)
+        for k, block in blocks.items():
+            at = self.structure.values_of(k)
+            values[at], weights[k] = 0.0, np.ones(len(weights[k]))
+            exhausted(block.linearise(state, Room(values[at], weights[k])))
+        return replace(now, values=values, weights=tuple(weights))
 
     def factorised(self, now: Linear, damping: float = 0.0) -> Slices[Factorised]:
         """Eliminate everything but the border, in slices.

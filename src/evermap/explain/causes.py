@@ -130,23 +130,32 @@ class Suspect:
         return self.sigma > 0.0
 
     @property
+    def is_of_landmark(self) -> bool:
+        """Whether it is of a single landmark."""
+        return self.rows is not None and self.rows[0] == "id"
+
+    @property
     def log_p(self) -> float:
         """Return its price [nats], negative."""
         return math.log(self.p)
 
 
-def list_suspects(inputs: Inputs, *, discrete: bool = True) -> tuple[Suspect, ...]:
+def list_suspects(inputs: Inputs, *, calibrations: bool = False) -> tuple[Suspect, ...]:
     """Return all causes that may be asked of a recording, and of the map that is given with it.
 
     Args:
         inputs: the recording and the map.
-        discrete: with all that have no state; some of these are first sought in the readings.
+        calibrations: only those with a state that is one for the sensor, the odometry or the map as a whole. Of the
+            others there is one for each landmark, and some are first sought in the readings.
     """
     recording, found = inputs.recording, list[Suspect]()
-    found += _in_space(recording, discrete=discrete) if is_in_space(recording) else _in_plane(recording)
+    if is_in_space(recording):
+        found += _in_space(recording, calibrations=calibrations)
+    else:
+        found += _in_plane(recording, calibrations=calibrations)
     if inputs.prior_map is not None:
         found += _of_map(inputs.prior_map, recording)
-    return tuple(one for one in found if discrete or one.is_continuous)
+    return tuple(one for one in found if not calibrations or (one.is_continuous and not one.is_of_landmark))
 
 
 def _constant(text: str) -> Callable[[float], str]:
@@ -187,7 +196,7 @@ def _late_stamps(subject: str) -> Suspect:
 # ---- in the plane
 
 
-def _in_plane(recording: Recording) -> Iterable[Suspect]:
+def _in_plane(recording: Recording, *, calibrations: bool) -> Iterable[Suspect]:
     names = recording.landmark_names
     yield Suspect(
         "range-scale", "sensor", USUAL_P, partial(_stretch_ranges, of=None),
@@ -216,7 +225,7 @@ def _in_plane(recording: Recording) -> Iterable[Suspect]:
             mistake.code, mistake.field, USUAL_P, partial(_undo_in_plane, mistake=mistake), _constant(mistake.message),
             _constant(_fix_of(mistake)), pairs=False, shows=True,
         )  # fmt: skip
-    for identity in _seen_often(recording):
+    for identity in () if calibrations else _seen_often(recording):
         yield _one_size(names.get(identity, str(identity)), _stretch_ranges, ("id", identity), "")
     for row, name in enumerate(recording.class_names):
         yield _kind_size(f"class {name}", _stretch_ranges, ("class", row), "")
@@ -374,7 +383,7 @@ def _undo_in_plane(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Input
 # ---- in space
 
 
-def _in_space(recording: SpatialRecording, *, discrete: bool) -> Iterable[Suspect]:
+def _in_space(recording: SpatialRecording, *, calibrations: bool) -> Iterable[Suspect]:
     seen, sensors = recording.detections, recording.sensors
     sizes = np.unique(np.round(seen.tag_size_m[np.isfinite(seen.tag_size_m)], 6))
     one = f"{sizes[0]:.12g}" if len(sizes) == 1 else ""
@@ -395,12 +404,12 @@ def _in_space(recording: SpatialRecording, *, discrete: bool) -> Iterable[Suspec
             yield _kind_size(f"size {size:g} m", _stretch_positions, ("size", size), f"{size:.12g}")
     for row, name in enumerate(recording.class_names if len(recording.class_names) > 1 else ()):
         yield _kind_size(f"class {name}", _stretch_positions, ("class", row), "")
-    for identity in _seen_often(recording):
+    for identity in () if calibrations else _seen_often(recording):
         own = seen.tag_size_m[seen.landmark_id == identity]
         size = f"{np.nanmedian(own):.12g}" if np.isfinite(own).any() else ""
         name = recording.landmark_names.get(identity, str(identity))
         yield _one_size(name, _stretch_positions, ("id", identity), size)
-    if discrete:
+    if not calibrations:
         yield from _read_otherwise(recording)
     if recording.odometry is not None:
         yield _odometry_scale()

@@ -10,7 +10,7 @@ import numpy as np
 from evermap.errors import EvermapError
 from evermap.estimate.sparse.system import exhausted
 from evermap.explain.causes import Inputs, Suspect
-from evermap.explain.evidence import AnySession, Optimum, Screen, SpatialSession, residuals_of
+from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Optimum, Screen, SpatialSession, residuals_of
 from evermap.geometry import se2, se3
 from evermap.slam.calibration import DELAY
 from evermap.slam.estimate import Solved
@@ -30,6 +30,8 @@ STEP, FINE_STEP = 0.02, 1e-4
 better state, where what is rejected yet hides the way; and one at which residuals grow by far less than their noise, so
 that those of outliers don't vanish with their weights: the slope at the solution itself. Rounding is smaller still."""
 
+SEEN = ("reading", "sigma_given", "mount")
+"""What detections in the plane depend on, beside the estimate."""
 EDGE_S = 1e-3
 """Time by which frames may move beyond the ends of the odometry."""
 FEW_STEPS = 6
@@ -151,8 +153,12 @@ def _residuals_in_plane(session: Solved, optimum: Optimum, inputs: Inputs, undon
         mount=other.mount, landmark_mean=mean,
     )  # fmt: skip
     smoother = Smoother(moved, session.outcome.noise.noise, robust=session.settings.robust)
-    graph = replace(optimum.graph, blocks=smoother.blocks(optimum.state.known))  # which ties the same
-    return residuals_of(graph, exhausted(graph.linearised(optimum.state)))[0]
+    blocks = dict(enumerate(smoother.blocks(optimum.state.known)))  # which tie the same
+    if moved.drive.is_alike(problem.drive) and np.array_equal(moved.stamp_s, problem.stamp_s):
+        del blocks[ODOMETRY]
+    if all(np.array_equal(getattr(moved, of), getattr(problem, of), equal_nan=True) for of in SEEN):
+        del blocks[DETECTIONS]
+    return residuals_of(optimum.graph, optimum.graph.relinearised(optimum.now, optimum.state, blocks))[0]
 
 
 def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Inputs, undone: Inputs) -> FloatArray | None:

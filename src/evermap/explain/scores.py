@@ -223,9 +223,8 @@ def _count_adrift(optimum: Optimum, pose_row: IntArray) -> int:
 def _list_calibrations(inputs: Inputs) -> Iterable[Suspect]:
     """Yield all that may be off of a sensor as a whole, of the odometry and of the map."""
     recording = inputs.recording
-    for suspect in list_suspects(inputs, discrete=False):
-        of_all = suspect.rows is None or suspect.rows[0] != "id"
-        if of_all and (is_in_space(recording) or suspect.code not in OF_LENGTHS):
+    for suspect in list_suspects(inputs, calibrations=True):
+        if is_in_space(recording) or suspect.code not in OF_LENGTHS:
             yield suspect
     if recording.odometry is not None:
         yield DRIFT

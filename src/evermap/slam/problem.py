@@ -59,6 +59,10 @@ class Drive:
         square = np.sort(np.diff(self.velocity[:, :3], n=2, axis=0) ** 2, axis=0)[: int(0.9 * (len(self.velocity) - 2))]
         return np.asarray(square.mean(axis=0) / (6.0 * TRIMMED))
 
+    def is_alike(self, other: Drive) -> bool:
+        """Return whether another has the same rows."""
+        return all(np.array_equal(getattr(self, of), getattr(other, of)) for of in ("stamp_s", "velocity", "unknown"))
+
     def between(self, stamp_s: FloatArray, states: FloatArray) -> Intervals:
         """Return motion between each two consecutive of the (N,) stamps, for (11,) calibration states."""
         return exhausted(self.in_slices(stamp_s, states))

@@ -8,7 +8,14 @@ import numpy as np
 from scipy import sparse
 
 from evermap.config import ChangesConfig
-from evermap.estimate.sparse.elimination import Elimination, curvature, eliminate_large, ways_to_border
+from evermap.estimate.sparse.elimination import (
+    Elimination,
+    curvature,
+    eliminate_large,
+    forward_substitute,
+    multiply_transposed,
+    ways_to_border,
+)
 from evermap.estimate.sparse.system import System, exhausted
 from evermap.estimate.sparse.tree import Factors
 from evermap.sensing.visibility import NominalField
@@ -106,6 +113,7 @@ def seldom_used() -> None:
     curvature(alone.tree, alone.factors, np.zeros(2))
     eliminate_large(alone.tree, alone.factors, np.ones(2), np.ones(1), Elimination.of(alone.tree), 0)
     stored = np.ones(int(alone.tree.stored[-1]))
+    forward_substitute(alone.tree, stored, multiply_transposed(alone.tree, alone.factors, np.zeros(2), np.zeros(1)))
     ways_to_border(alone.tree, stored, alone.node_of, np.zeros(1, dtype=np.int64), np.eye(1))
 
 

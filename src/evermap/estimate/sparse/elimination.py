@@ -334,6 +334,27 @@ def multiply_transposed(tree: Tree, factors: Factors, values: FloatArray, right:
 
 
 @kernel
+def multiply_rows(values: FloatArray, first: Any, rows: int, number: Any, numbers: FloatArray) -> FloatArray:
+    """Return (K, rows, S) Jacobians times numbers of all variables (numbers, S).
+
+    The values of each of K factors begin at `first`, a right side behind each row; `number` (K, w) is which of all
+    numbers each column is.
+    """
+    count, width = number.shape
+    out = np.zeros((count, rows, numbers.shape[1]))
+    for k in range(count):
+        at = first[k]
+        for r in range(rows):
+            for a in range(width):
+                value = values[at + a]
+                if value != 0.0:
+                    for s in range(numbers.shape[1]):
+                        out[k, r, s] += value * numbers[number[k, a], s]
+            at += width + 1
+    return out
+
+
+@kernel
 def forward_substitute(tree: Tree, stored: FloatArray, right: FloatArray) -> None:
     """Make a right side (numbers,) `L^-1` times it, in place; that of the border is what the others leave of it.
 
