@@ -199,14 +199,27 @@ def _rows(*given: ArrayLike) -> tuple[Any, ...]:
     """Return the leading axes of arrays (..., k), broadcast, and the rows (N, k) of each, or (1, k)."""
     arrays = [np.asarray(each, dtype=np.float64) for each in given]
     lead = arrays[0].shape[:-1]
-    if any(each.shape[:-1] != lead for each in arrays):
-        lead = np.broadcast_shapes(*(each.shape[:-1] for each in arrays))
-        arrays = [
-            each if each.size == each.shape[-1] else np.broadcast_to(each, (*lead, each.shape[-1])) for each in arrays
-        ]
-    # of rows that may not be written to machine code would be made once more
-    rows = (np.ascontiguousarray(each) for each in arrays)
-    return lead, *((each if each.flags.writeable else each.copy()).reshape(-1, each.shape[-1]) for each in rows)
+    if len(arrays) > 1 and arrays[1].shape[:-1] != lead:
+        one, other = arrays
+        if one.ndim == 1 or other.ndim == 1:
+            lead = other.shape[:-1] if one.ndim == 1 else lead
+        else:
+            lead = np.broadcast_shapes(lead, other.shape[:-1])
+            arrays = [
+                each if each.size == each.shape[-1] else np.broadcast_to(each, (*lead, each.shape[-1]))
+                for each in arrays
+            ]
+    return lead, *[_as_rows(each) for each in arrays]
+
+
+def _as_rows(array: FloatArray) -> FloatArray:
+    """Return arrays (..., k) as rows (N, k) in one piece; of those that may not be written to machine code would be
+    made once more.
+    """
+    flags = array.flags
+    if not (flags.c_contiguous and flags.writeable):
+        array = np.array(array, order="C")
+    return array if array.ndim == 2 else array.reshape(-1, array.shape[-1])
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
