@@ -22,7 +22,8 @@ from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
-from evermap.slam.changes.gain import Tables, hypothesis_gain, log_onset, log_prior, turning_columns
+from evermap.slam.changes.gain import PLANE, Tables, hypothesis_gain, log_onset, log_prior, turning_columns
+from evermap.slam.changes.gain import gain_of as gain_alone
 from evermap.slam.changes.search import item_columns
 from evermap.slam.problem import Estimate
 
@@ -55,6 +56,28 @@ def gain_of(
             log_onset(n_windows),
         ),
     )
+
+
+@pytest.mark.parametrize(
+    "label", [[0] * 7, [0, 0, 1, 0, 0, 0, 0], [1, 0, 1, 0, 0, 1, 0], [0, 3, 0, 3, 0, 0, 0], [1] * 7]
+)
+@pytest.mark.parametrize("onset", [0, 2])
+def test_one_group_that_only_moves_gains_in_closed_form_what_any_do(label: list[int], onset: int) -> None:
+    random = np.random.default_rng(len(label) + onset)
+    count, windows, columns = 7, 3, PLANE + len(turning_columns(PLANE))
+    root = random.normal(size=(columns * windows * count, columns * windows * count))
+    tables = Tables(
+        root @ root.T,
+        random.normal(size=len(root)),
+        random.normal(size=(count, PLANE)),
+        turning_columns(PLANE),
+        PRIOR.spread,
+        log_prior(PRIOR, 9, count),
+        log_onset(windows),
+    )
+    for other in (label, [2 if i == 6 and g == 0 else g for i, g in enumerate(label)]):  # two groups: as any
+        of = np.array(other), np.array([0, onset, 1, onset]), np.zeros(4, dtype=np.bool_)
+        assert gain_alone(*of, tables) == pytest.approx(hypothesis_gain(*of, tables)[0], rel=1e-10, abs=1e-10)
 
 
 @pytest.mark.parametrize(

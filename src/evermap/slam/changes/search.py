@@ -13,6 +13,7 @@ from evermap.slam.changes.evidence import Comparison, WindowEvidence
 from evermap.slam.changes.gain import (
     PLACES,
     Tables,
+    gain_of,
     hypothesis_gain,
     log_onset,
     log_prior,
@@ -268,7 +269,7 @@ def _weigh(label: IntArray, onset: IntArray, turns: Any, tables: Tables, weighed
         if weighed.key[slot] == key:
             return float(weighed.value[slot])
         slot = (slot + 1) & (SLOTS - 1)
-    gain, _ = hypothesis_gain(label, onset, turns, tables)
+    gain = gain_of(label, onset, turns, tables)
     if 2 * weighed.used[1] < SLOTS:
         weighed.key[slot] = key
         weighed.value[slot] = gain
@@ -299,10 +300,12 @@ def _climb(
     n_windows = len(tables.log_onset)
     trial, trial_onset, trial_turns = label.copy(), onset.copy(), turns.copy()
     best = _weigh(label, onset, turns, tables, weighed) if uphill else np.inf
-    improved = True
+    improved, used = True, label.max()
     while improved:
         improved = False
         for move in range(_count_moves(len(label), len(onset) - 1, n_windows)):
+            if used + 1 < move // len(label) < len(onset):  # to begin one empty group is to begin any
+                continue
             _copy(label, onset, turns, trial, trial_onset, trial_turns)
             if not _apply(trial, trial_onset, trial_turns, move, n_windows, may_turn):
                 continue
@@ -310,7 +313,7 @@ def _climb(
             if gain > best + 1e-9:
                 best = gain
                 _copy(trial, trial_onset, trial_turns, label, onset, turns)
-                improved = True
+                improved, used = True, label.max()
     return best
 
 
@@ -402,7 +405,7 @@ def _add_best_pair(
                 continue
             label[landmark] = group
             label[other] = group
-            gain, _ = hypothesis_gain(label, onset, turns, tables)
+            gain = gain_of(label, onset, turns, tables)
             label[landmark] = 0
             label[other] = 0
             if gain > best:
