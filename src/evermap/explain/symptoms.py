@@ -387,14 +387,21 @@ def _count_unexplained(result: SlamResult) -> int:
     """
     located = _poses_at(result.trajectory, result.innovations.stamp_s)[1]
     innovations = result.innovations[np.flatnonzero(located)]
-    known = {one for change in result.changes for one in change.landmark_ids}
-    found = 0
-    for one in np.setdiff1d(innovations.landmark_id, list(known)).tolist():
-        mine = np.flatnonzero(innovations.landmark_id == one)
-        used = innovations.p_inlier[mine[np.argsort(innovations.stamp_s[mine], kind="stable")]] >= USED
-        edges = np.concatenate([[-1], np.flatnonzero(used), [len(used)]])
-        found += int(np.diff(edges).max()) - 1 >= max(PER_LANDMARK, LEAST_STREAK * len(used))
-    return found
+    name, row, count = np.unique(innovations.landmark_id, return_inverse=True, return_counts=True)
+    order = np.lexsort((innovations.stamp_s, row))
+    first = np.cumsum(count) - count
+    # before the first of each landmark, and after its last, it is as if one was used
+    used = np.flatnonzero(innovations.p_inlier[order] >= USED)
+    of_used = row[order[used]]
+    edges = np.concatenate([first - 1, used, first + count])
+    of_edge = np.concatenate([np.arange(len(name)), of_used, np.arange(len(name))])
+    by_landmark = np.lexsort((edges, of_edge))
+    streak, of_streak = np.diff(edges[by_landmark]) - 1, of_edge[by_landmark]
+    longest = np.zeros(len(name), dtype=np.int64)
+    same = of_streak[1:] == of_streak[:-1]
+    np.maximum.at(longest, of_streak[1:][same], streak[same])
+    known = np.isin(name, [one for change in result.changes for one in change.landmark_ids])
+    return int(np.count_nonzero(~known & (longest >= np.maximum(PER_LANDMARK, LEAST_STREAK * count))))
 
 
 def _over_odometry(compared: Compared, result: SlamResult) -> float:

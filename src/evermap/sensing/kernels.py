@@ -386,6 +386,40 @@ def witnessed(
     return beside, along
 
 
+@exact
+def within_reach(pose: Any, landmark: Any, eye: FloatArray, position: FloatArray, reach_m: float) -> BoolArray:
+    """Return (N,) looks from poses at landmarks that are nearer along both axes."""
+    near = np.zeros(len(pose), np.bool_)
+    for k in range(len(pose)):
+        i, j = pose[k], landmark[k]
+        near[k] = abs(position[j, 0] - eye[i, 0]) < reach_m and abs(position[j, 1] - eye[i, 1]) < reach_m
+    return near
+
+
+@exact
+def add_around(
+    key: IntArray, counted: FloatArray, wanted: IntArray, shift: IntArray, weight: FloatArray, out: FloatArray
+) -> None:
+    """Add to `out` (N, C) what is counted (K, C) at the keys `wanted` (N,), each shifted by all (S,), times a weight.
+
+    Keys (K,) are sorted and different; it is fastest where those that are wanted are sorted, too.
+    """
+    for s in range(len(shift)):
+        at, before = 0, wanted[0] + shift[s] if len(wanted) else 0
+        for n in range(len(wanted)):
+            one, steps = wanted[n] + shift[s], 0
+            if one < before:
+                at = np.searchsorted(key, one)
+            while at < len(key) and key[at] < one:
+                at, steps = at + 1, steps + 1
+                if steps == 8:
+                    at = np.searchsorted(key, one)
+            before = one
+            if at < len(key) and key[at] == one:
+                for c in range(counted.shape[1]):
+                    out[n, c] += weight[s] * counted[at, c]
+
+
 @kernel
 def grouped(group: Any, n_groups: int) -> Any:
     """Return (N,) rows sorted by their group, 0 to `n_groups` - 1, in their order within each."""

@@ -198,20 +198,17 @@ class SightLines:
         self, places: tuple[IntArray, IntArray], place: IntArray, cell: IntArray
     ) -> tuple[FloatArray, FloatArray]:
         """(N,) hits and looks along lines, and along those from the cells around as far as they count."""
-        hits, looks = np.zeros(len(cell)), np.zeros(len(cell))
+        from evermap.sensing.kernels import add_around
+
+        found = np.zeros((len(cell), 2))
         mine = pair_rows(places, (self.site_id, self.landmark_id))
         order = np.argsort(mine * _SPAN + self.cell, kind="stable")
         order = order[mine[order] >= 0]
-        if not len(order):
-            return hits, looks
-        key = mine[order] * _SPAN + self.cell[order]
-        for dx, dy in _AROUND:
-            wanted = place * _SPAN + cell + dx * _REACH + dy
-            at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-            counts = (key[at] == wanted) * (1.0 if dx == dy == 0 else self.rules.neighbour)
-            hits += counts * self.hits[order[at]]
-            looks += counts * self.looks[order[at]]
-        return hits, looks
+        key, counted = mine[order] * _SPAN + self.cell[order], np.column_stack([self.hits[order], self.looks[order]])
+        shift = np.array([dx * _REACH + dy for dx, dy in _AROUND])
+        weight = np.where(shift == 0, 1.0, self.rules.neighbour)
+        add_around(key, counted, np.ascontiguousarray(place * _SPAN + cell), shift, weight, found)
+        return found[:, 0], found[:, 1]
 
     def _kinds(self, nominal: float) -> tuple[FloatArray, float]:
         """Rates along clear lines by length, and the share of clear ones, by expectation maximisation.

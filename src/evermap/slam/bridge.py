@@ -105,10 +105,14 @@ def bridged(
 
 def _semidefinite(covariance: FloatArray) -> FloatArray:
     """(K, 3, 3) without the negative eigenvalues that rounding leaves of the difference of two huge ones."""
-    size, direction = np.linalg.eigh(covariance)
+    c = covariance
+    minor = c[:, 0, 0] * c[:, 1, 1] - c[:, 0, 1] ** 2
+    definite = (c[:, 0, 0] > 0.0) & (minor > 0.0) & (np.linalg.det(c) > 0.0)  # nearly all, in a tenth of the time
+    rest = np.flatnonzero(~definite)
+    size, direction = np.linalg.eigh(c[rest])
     for k in np.flatnonzero(size[:, 0] < 0.0):
-        covariance[k] = (direction[k] * np.maximum(size[k], 0.0)) @ direction[k].T
-    return covariance
+        c[rest[k]] = (direction[k] * np.maximum(size[k], 0.0)) @ direction[k].T
+    return c
 
 
 def dead_reckoned(stamp_s: FloatArray, drive: Drive, states: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:

@@ -9,7 +9,7 @@ import numpy as np
 from evermap.config import LivingConfig
 from evermap.geometry.chunked import JointCovariance, blocks, of_places, taken
 from evermap.maps.bodies import Displacements, Fate, group, regrouped, relabelled
-from evermap.maps.living import LivingMap, Members, Places, Sites
+from evermap.maps.living import LivingMap, Members, Places, Sites, rows_among
 from evermap.maps.sessions.gaussian import with_session
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -230,6 +230,8 @@ def _join_known(clique: IntArray, new: IntArray, members: Members, found: Found,
     """A body of which another landmark was missed at first: the same object, or within reach of all of its class."""
     old = np.flatnonzero(np.isin(found.landmark_id, members.landmark_id))
     old_clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id[old])]
+    if not len(old) and (found.object_id[new] < 0).all():
+        return
     for name in np.unique(clique):
         mine = np.flatnonzero(clique == name)
         body, kind = found.object_id[new[mine[0]]], found.class_id[new[mine[0]]]
@@ -326,12 +328,14 @@ def _with_sites(
 ) -> tuple[Sites, FloatArray, BoolArray]:
     """The map's sites and the new ones, with beliefs before the session's looks are counted."""
     p_start, (fresh, new_ids) = aged.p_here.copy(), new
-    p_new, first, last = np.zeros(len(fresh)), np.zeros(len(fresh)), np.zeros(len(fresh))
-    for k, name in enumerate(fresh):
-        mine = np.flatnonzero((clique == name) & (found.place < 0))
-        first[k], last[k] = found.first_s[mine].min(), found.last_s[mine].max()
-        old = np.flatnonzero(living.sites.clique_id == name)
-        p_new[k] = min(float(found.probability[mine].min()), 0.999) if len(old) else p_fresh
+    p_new, first, last = np.full(len(fresh), p_fresh), np.full(len(fresh), np.inf), np.full(len(fresh), -np.inf)
+    at = rows_among(fresh, clique)
+    mine = np.flatnonzero((at >= 0) & (found.place < 0))
+    np.minimum.at(first, at[mine], found.first_s[mine])
+    np.maximum.at(last, at[mine], found.last_s[mine])
+    for k in np.flatnonzero(np.isin(fresh, living.sites.clique_id)):
+        old = np.flatnonzero(living.sites.clique_id == fresh[k])
+        p_new[k] = min(float(found.probability[mine[at[mine] == k]].min()), 0.999)
         p_start[old] *= 1.0 - p_new[k]
     old_sites = replace(living.sites, p_kept=aged.p_kept)
     sites = old_sites.joined(Sites(new_ids, fresh, p_new, p_new, first, last))

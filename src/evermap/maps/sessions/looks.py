@@ -111,14 +111,14 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
     The map has the sites that the session found, with beliefs (S,) when it began. Without `learn_sight` nothing is ever
     in the way.
     """
-    from evermap.sensing.kernels import close_to_hits, grouped, witnessed
+    from evermap.sensing.kernels import close_to_hits, grouped, within_reach, witnessed
 
     places, (stamp_s, listed, eye) = living.places, watch
     floor_m = np.ascontiguousarray(places.position_m[:, :2])  # lines of sight are told apart on the floor
     used = ~np.isin(places.landmark_id, living.members.landmark_id[living.members.deleted])  # those nobody looks for
-    away_m = np.abs(floor_m[listed.landmark] - eye[listed.pose, :2])
-    near = np.maximum(away_m[:, 0], away_m[:, 1]) < living.sightlines.reach_m  # ranges may be in millimetres
-    used = used[listed.landmark] & near
+    # ranges may be in millimetres
+    near = within_reach(listed.pose, listed.landmark, eye, floor_m, living.sightlines.reach_m)
+    used = near if used.all() else used[listed.landmark] & near
     if not used.all():
         listed = listed.rows(used)
     cliques, clique_of_site = clique_rows(living.sites)
