@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from typing import Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from evermap.align.acceptance import SIGMA_M, accept_alignment
 from evermap.align.candidates import Matches, score_motions
@@ -92,9 +91,11 @@ class KnownPlaces:
 
     def joint_of(self, rows: IntArray) -> FloatArray:
         """Return (2 K, 2 K) covariance of some places together."""
-        if self.joint_m2 is None:
-            return self.covariance_m2[rows[0]] if len(rows) == 1 else np.asarray(block_diag(*self.covariance_m2[rows]))
         dim = self.position_m.shape[1]
+        if self.joint_m2 is None:
+            apart, at = np.zeros((len(rows), dim, len(rows), dim)), np.arange(len(rows))
+            apart[at, :, at, :] = self.covariance_m2[rows]
+            return apart.reshape(dim * len(rows), -1)
         return of_places(self.joint_m2, self.joint_row[rows], dim) + LEAST_VARIANCE * np.eye(dim * len(rows))
 
     def errors_at(self, rows: IntArray) -> FloatArray:

@@ -245,6 +245,8 @@ class NearbyPlaces:
             left, is_solved = self._left.pop(row, None), row < len(solved) and bool(solved[row])
             if left is not None and not (is_solved and 2 * np.count_nonzero(here[left.rows]) < len(left.rows)):
                 ties[row] = left
+            elif not self._neighbours:
+                near[row] = NO_PLACES
             else:
                 near[row] = of[self._nearest(self._given_position[of], self._given_position[row], self._neighbours)]
             here[row] = True
@@ -262,8 +264,13 @@ class NearbyPlaces:
 
     def _return(self, row: int, ties: Ties) -> None:
         """Put a known place back where those of its neighbours that are in the covariance take it."""
-        there = np.flatnonzero(self._slot[ties.rows] >= 0) if len(ties.rows) else NO_PLACES
         dim = self.dim
+        if not len(ties.rows):
+            self._enter(row, NO_PLACES, np.zeros((dim, 0)), ties.joint[:dim, :dim])
+            if not self._considered:
+                self.position[row] = self._moved(ties.place, np.zeros(dim))
+            return
+        there = np.flatnonzero(self._slot[ties.rows] >= 0)
         given, own = ties.rows[there], ties.joint[:dim, :dim]
         gain: FloatArray = np.zeros((dim, 0))
         at = self._columns_of(1 + there)
@@ -282,10 +289,15 @@ class NearbyPlaces:
         """Put a place in a free slot."""
         slot = int(np.argmax(self._row == UNKNOWN))
         first = self.own + self.dim * slot
-        others, own = self.columns(self._slot[given]), slice(first, first + self.dim)
-        across = gain @ self.covariance[others]
-        self.covariance[own], self.covariance[:, own] = across, across.T
-        self.covariance[own, own] = across[:, others] @ gain.T + 0.5 * (spread + spread.T)
+        own, alone = slice(first, first + self.dim), 0.5 * (spread + spread.T)
+        if len(given):
+            others = self.columns(self._slot[given])
+            across = gain @ self.covariance[others]
+            self.covariance[own], self.covariance[:, own] = across, across.T
+            alone = across[:, others] @ gain.T + alone
+        else:
+            self.covariance[own], self.covariance[:, own] = 0.0, 0.0
+        self.covariance[own, own] = alone
         self._row[slot], self._slot[row], self._used_at[slot] = row, slot, self._now
 
     def _columns_of(self, rows: IntArray) -> IntArray:
