@@ -19,7 +19,7 @@ from evermap.slam.problem import Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.space.bridge import PathFrames
 from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.intake import SpatialIntake, drive_through, lead_on, prepare_space
+from evermap.slam.space.intake import SpatialIntake, drive_through, find_corners, lead_on, prepare_space
 from evermap.slam.space.problem import PlacePrior, SpatialProblem, Swing
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.solve import fit_to_map
@@ -185,12 +185,20 @@ def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> Spat
         prior = _prior_from(prior, undone.prior_map, before.landmark_id[session.solved.identity])
     one, other = inputs.recording, undone.recording
     lens = [[(each.intrinsics, each.distortion, each.distortion_model) for each in of.sensors] for of in (one, other)]
+    drives_alike = other.odometry is one.odometry and other.frames is one.frames
     if other.detections is one.detections and lens[0] == lens[1]:  # but for mounts and motions all is as it was
         problem = replace(problem, prior=prior, mount=np.array([each.mount_robot_sensor for each in other.sensors]))
-        if other.odometry is one.odometry and other.frames is one.frames:
+        if drives_alike:
             return problem
         if other.odometry is not None:
             return _with_motions(problem, other, other.odometry, before.frames)
+    elif other.detections is one.detections and drives_alike and not problem.range_error.any():
+        used, corner, root = find_corners(undone.recording, problem.settings)
+        kept = np.isin(used, before.used) if before.rests is not None else np.ones(len(used), dtype=np.bool_)
+        if not np.array_equal(used[kept], before.used):
+            return None
+        mount = np.array([each.mount_robot_sensor for each in other.sensors])
+        return replace(problem, prior=prior, mount=mount, corner=corner[kept], corner_root=root[kept])
     intake = prepare_space(
         undone.recording, problem.settings, robust=problem.robust, estimate_noise=problem.estimate_noise, coarse=True
     )  # of tags in an image the residuals are those of the corners

@@ -263,6 +263,15 @@ def _said(
     return where, usable, moving, warnings
 
 
+def find_corners(recording: SpatialRecording, settings: SpaceConfig) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return what `prepare_space` has of a recording by the lenses of its cameras: the detections that are used, and
+    their corners and the roots of their information (`SpatialProblem`).
+    """
+    where, usable, _, _ = _said(recording, settings, (), coarse=True)
+    used = np.flatnonzero(usable)
+    return used, where.corner[used], where.corner_root[used]
+
+
 @dataclass(frozen=True, slots=True)
 class _Where:
     """Measurements of all detections; see `SpatialProblem`."""
