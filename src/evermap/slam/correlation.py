@@ -208,7 +208,7 @@ def _pooled(residual: FloatArray, used: BoolArray, stamp_s: FloatArray, place: I
         if not len(one):
             break
         lags.append(stamp_s[other] - stamp_s[one])
-        squares.append(np.nanmean((residual[other] - residual[one]) ** 2, axis=1))
+        squares.append(_mean_square(residual[other] - residual[one]))
         apart += max(1, apart // 2)
     if not lags:
         return Curve(*np.zeros((3, 0)))
@@ -220,8 +220,10 @@ def _pooled(residual: FloatArray, used: BoolArray, stamp_s: FloatArray, place: I
     row = np.digitize(lag_s, edges)
     count = np.bincount(row, minlength=BINS)
     bins = [k for k in range(1, BINS) if count[k] >= FEWEST_PAIRS]
-    lag = np.array([np.median(lag_s[row == k]) for k in bins])
-    mean = np.array([square[row == k].mean() for k in bins])
+    order, last = np.argsort(row.astype(np.int16), kind="stable"), np.cumsum(count)
+    lag_s, square = lag_s[order], square[order]
+    lag = np.array([np.median(lag_s[last[k] - count[k] : last[k]]) for k in bins])
+    mean = np.array([square[last[k] - count[k] : last[k]].mean() for k in bins])
     # pairs that overlap in time say the same: so many differ, of all landmarks
     first, last = np.full((2, place.max() + 1), np.inf)
     np.minimum.at(first, place[rows], stamp_s[rows])
@@ -231,6 +233,15 @@ def _pooled(residual: FloatArray, used: BoolArray, stamp_s: FloatArray, place: I
     return Curve(
         lag, np.maximum(mean, 1e-12), 0.5 * residual.shape[1] * np.maximum(np.minimum(worth, count[bins]), 1.0)
     )
+
+
+def _mean_square(difference: FloatArray) -> FloatArray:
+    """Return (K,) means of squares (K, D), a few, of those that are no nan: `np.nanmean` in a third of the time."""
+    square = difference**2
+    known = ~np.isnan(square)
+    if known.all():
+        return np.asarray(sum(square.T) / square.shape[1])
+    return np.asarray(sum(np.where(known, square, 0.0).T) / known.sum(axis=1))
 
 
 def curve_columns(curve: Curve, persist_s: tuple[float, ...] | list[float]) -> list[FloatArray]:
