@@ -237,9 +237,11 @@ class Joint(Method):
     ) -> Slices[tuple[ChangePosterior, GivenMap]]:
         """The posterior, and the map with the landmarks that carry each other's identity at each other's place."""
         posterior = yield from weigh(evidence, given, self._prior, n_windows, before=self.posterior, thorough=thorough)
+        if not given.given.any():
+            return posterior, given
         soft = evidence.softened(self._prior.usual_softness_m)
         yield dense_ms(len(soft.pull))
-        while given.given.any():
+        while True:
             comparison = compare(soft, given.mean, given.covariance, given.given)
             yield dense_ms(len(soft.pull))
             swap = likeliest_swap(soft, comparison, given, self._prior.p_swapped)
